@@ -19,14 +19,14 @@ from room import furnish
 
 
 def camera_row(world_to_camera: np.ndarray, frame: Frame) -> np.ndarray:
-    """[16]: the ray caster's camera of focal length 1 and without a lens at a pose of the scene frame."""
+    """[16]: a camera of the ray caster, with focal length 1 and without distortion, at a pose of the scene frame."""
     turn = world_to_camera[:3, :3].T
     center = frame.rotation.T @ (-turn @ world_to_camera[:3, 3] - frame.offset) / frame.scale
     return np.array([1.0, 0.0, 0.0, 0.0, *(frame.rotation.T @ turn).ravel(), *center])
 
 
 def background_depth(seed: int, kind: Kind, world_to_camera: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Camera z [...] in the scene frame's unit of what the rays (x, y, 1) [..., 2] meet first, the object gone."""
+    """Camera z [...], in the scene frame's unit, of what the rays (x, y, 1) [..., 2] hit first without the object."""
     furniture, _ = furnish(seed, kind)
     solids, _ = furniture.arrays(defaultdict(int), kind.node)  # any textures: only shapes count
     frame = scene_frame(seed)

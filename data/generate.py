@@ -1,25 +1,25 @@
-"""Synthetic scenes with known truth: `python data/generate.py --out data/demo --seed 0 --kind demo`.
+"""Generates synthetic scenes with known truth: `python data/generate.py --out data/demo --seed 0 --kind demo`.
 
 A furnished room is ray-cast with and without one object. Kinds:
   demo    100 views in SPIn-NeRF's layout: 40 test views without the object, 60 training views with it
   mini    the same, 3 + 8 views of 64 x 48 px, for tests
   wide    demo with cameras +-50 degrees around the object
   360     demo with cameras all around an object that lies on the floor
-  seen    demo with an object that hangs in mid-air: whatever it hides is seen by other views, nothing is to be invented
-  behind  wide with a thing before the object that stays: it hides a part of what is to be filled from the reference
+  seen    demo with an object that hangs in mid-air: other views see all that it hides, nothing is to be invented
+  behind  wide with an object that stays in front, and hides a part of what is to be filled from the reference
   table   an object on the edge of a table, free space under it, some cameras low enough to look there
-  corner  an object before the corner of a wall that juts out: behind it the depth has a step
+  corner  an object in front of the corner of a wall that juts out: behind it the depth has a step
   pair    two objects side by side, each with masks of its own, and two references
-  sparse  nothing to remove; of four training views alone the pixels may be used, the others are cameras
-  grass   an object on a lawn before a hedge: thousands of blades and leaves, nothing flat
-  insert  the same turned round: an object on the floor, in the test views and four references only; it is to be put in
-  outpaint  the room as photographed, and a sphere beyond which references that show all of that continue it
+  sparse  nothing to remove; only four training views have pixels, the others are cameras
+  grass   an object on a lawn in front of a hedge: thousands of blades and leaves, nothing flat
+  insert  the reverse: an object on the floor, only in the test views and four references; it is to be inserted
+  outpaint  the room as photographed, and a sphere beyond which references continue it
   photos  26 larger photographs and masks without poses, for structure from motion
 
 Poses are written in a scene frame of arbitrary scale, rotation and origin, as SfM leaves it. As in SPIn-NeRF the
-COLMAP model and poses_bounds.npy are those of the full resolution, 4 times `images_4`; the model names `<view>.jpg`.
-`truth/` holds what the pipeline must not read, every picture in the photo's own lens. Nothing outside the masks
-differs between a view with and one without the object: it casts no shadow, and masks hold every pixel it touches.
+COLMAP model and poses_bounds.npy belong to the full resolution, 4 times `images_4`; the model names `<view>.jpg`.
+`truth/` holds what the pipeline must not read, every picture with the photographs' lens. Outside the masks, views with
+and without the object are equal: it casts no shadow, and masks hold every pixel it touches.
 """
 
 from __future__ import annotations
@@ -34,31 +34,31 @@ from pathlib import Path
 import numpy as np
 from files import write_image, write_model, write_poses_bounds, write_truth_cameras
 from kinds import KINDS, Kind
-from photographs import Session, corner_shift, photographed
+from photographs import Session, corner_shift, take_photographs
 from reconstruction import Frame, scene_frame, sparse_points
 from room import furnish
-from tasks import SPHERE, bare, beyond, covering, depth, on_axis, region_around
+from tasks import SPHERE, bounding_region, choose_covering_views, depth, outside_sphere, point_on_axis, without_object
 from world import World, bake
 
 AWAY = 2.5  # metres from the middle camera to the sphere's centre, about where the views look
-MOST_NEVER_SEEN = 0.005  # of the masks, where the object hangs: crannies behind furniture
+MOST_NEVER_SEEN = 0.005  # share of the masks, where the object hangs: crannies behind furniture
 PROFILE = "profile: laptop # small pictures, made for it; `make profile=paper` has precedence\n"
 
 
 def generate(out: Path, seed: int, kind: Kind) -> dict:
-    """Write the scene to `out`, all of it or nothing, and return its facts.
+    """Write the scene to `out` atomically, and return its facts.
 
     Raises:
-        ValueError: where `out` holds something that this script did not write, or that was changed since; where less
-            than the kind's share of the masks hides background that no training view saw (where any does, if the
-            object hangs).
+        ValueError: `out` holds something that this script did not write, or that was changed since; or less than the
+            kind's share of the masks hides background that no training view sees (for a hanging object: or too much
+            does).
     """
     if out.exists() and any(out.iterdir()) and not (out / "truth/facts.json").exists():
         raise ValueError(f"{out} holds files that data/generate.py did not write; name another folder, or empty it")
     partial = out.with_name(out.name + ".writing")
     shutil.rmtree(partial, ignore_errors=True)
     facts = _write_scene(partial, seed, kind)
-    if theirs := _by_hand(out, partial):
+    if theirs := _changed_by_hand(out, partial):
         shutil.rmtree(partial)
         raise ValueError(f"{theirs[0]} was put there or changed by hand; move it away, or name another folder")
     shutil.rmtree(out, ignore_errors=True)
@@ -66,8 +66,8 @@ def generate(out: Path, seed: int, kind: Kind) -> dict:
     return facts
 
 
-def _by_hand(out: Path, made: Path) -> list[Path]:
-    """Files of `out` that a scene made anew would not have, or that are younger than the sign that it was made."""
+def _changed_by_hand(out: Path, made: Path) -> list[Path]:
+    """Files of `out` that a new scene would not have, or that are younger than the stamp of its generation."""
     sign = out / ".generated"
     files = [path for path in out.rglob("*") if path.is_file() and path != sign] if sign.exists() else []
     young = lambda path: path.stat().st_mtime > sign.stat().st_mtime
@@ -77,7 +77,7 @@ def _by_hand(out: Path, made: Path) -> list[Path]:
 def _write_scene(out: Path, seed: int, kind: Kind) -> dict:
     furniture, target = furnish(seed, kind)
     world = bake(furniture, seed, kind)
-    session = photographed(seed, kind, world, target)
+    session = take_photographs(seed, kind, world, target)
     facts = _facts(seed, session)
     shares, asked = [s for s in facts["never_seen_share"].values() if s is not None], f"{kind.least} or more"
     if kind.hangs:
@@ -91,10 +91,13 @@ def _write_scene(out: Path, seed: int, kind: Kind) -> dict:
         _write_photos(out, session)
         return facts
     _write_pictures(out, session)
-    {"remove": _ask_removal, "insert": _ask_insertion, "outpaint": _ask_outpainting, "sparse": _ask_views}[kind.task](
-        out, session, kind, world, frame
-    )
-    captured = replace(world, solids=bare(world.solids)) if kind.task == "insert" else world
+    {
+        "remove": _write_removal,
+        "insert": _write_insertion,
+        "outpaint": _write_outpainting,
+        "sparse": _write_sparse_views,
+    }[kind.task](out, session, kind, world, frame)
+    captured = replace(world, solids=without_object(world.solids)) if kind.task == "insert" else world
     points = sparse_points(seed, kind, captured, session.cameras[kind.test :], session.photos[kind.test :])
     write_model(out / "sparse/0", kind, session.names, session.cameras, frame, points)
     write_poses_bounds(out / "poses_bounds.npy", kind, session.cameras, frame, points)
@@ -135,8 +138,8 @@ def _write_test_masks(out: Path, session: Session, masks: Sequence[np.ndarray]) 
         write_image(out / f"truth/masks_test/{session.names[k]}.png", mask * np.uint8(255))
 
 
-def _ask_removal(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
-    """Masks of the object, or of each of them, and where there is something to invent the references."""
+def _write_removal(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
+    """Write masks of the object, or of each object, and the references if something has to be invented."""
     _write_test_masks(out, session, session.masks[: session.test])
     for k, name in enumerate(session.names):
         write_image(out / f"truth/never_seen/{name}.png", session.hidden[k] * np.uint8(255))
@@ -150,7 +153,7 @@ def _ask_removal(out: Path, session: Session, kind: Kind, world: World, frame: F
 
 
 def _write_references(out: Path, session: Session) -> str:
-    """Write the completed views; the lines of scene.yaml that name them."""
+    """Write the completed views; returns the lines of scene.yaml that name them."""
     files = ["reference.png", *(f"reference_{session.names[k]}.png" for k in list(session.completed)[1:])]
     said = []
     for (k, picture), file in zip(session.completed.items(), files, strict=True):
@@ -161,8 +164,8 @@ def _write_references(out: Path, session: Session) -> str:
     return "reference:\n" + "".join(f"- {each}\n" for each in said)
 
 
-def _ask_views(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
-    """A few photographs, each a reference; the other training views are cameras."""
+def _write_sparse_views(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
+    """Name a few photographs as training views and references; the other training views are cameras only."""
     shown = [session.names[k] for k in session.spread[: kind.shown]]
     given = "".join(f"- {{view: {name}, image: images_4/{name}.png}}\n" for name in shown)
     listed = lambda names: f"[{', '.join(names)}]\n"
@@ -172,21 +175,21 @@ def _ask_views(out: Path, session: Session, kind: Kind, world: World, frame: Fra
     )
 
 
-def _ask_insertion(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
-    """References that show the object, their depth, and a sphere in which it stands."""
+def _write_insertion(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
+    """Write references that show the object, with depth, and a sphere that contains it."""
     _write_test_masks(out, session, session.masks[: session.test])
-    center, radius = region_around(world.solids)
+    center, radius = bounding_region(world.solids)
     region = {"center": frame.points(center).tolist(), "radius": frame.scale * radius}
     _write_region(out, region, _write_measured(out, session, session.completed, kind, world, frame))
 
 
-def _ask_outpainting(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
-    """A sphere on the middle view's optical axis, and whole pictures of some views with their depth."""
-    center = on_axis(session.cameras[session.middle], AWAY)
-    masks = [beyond(camera, kind, world, center, SPHERE) for camera in session.cameras[: session.test]]
+def _write_outpainting(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
+    """Write a sphere on the middle view's optical axis, and whole pictures of some views with depth."""
+    center = point_on_axis(session.cameras[session.middle], AWAY)
+    masks = [outside_sphere(camera, kind, world, center, SPHERE) for camera in session.cameras[: session.test]]
     _write_test_masks(out, session, masks)
     middle = session.middle - session.test
-    chosen = covering(session.cameras[session.test :], kind, world, center, middle)
+    chosen = choose_covering_views(session.cameras[session.test :], kind, world, center, middle)
     whole = {session.test + k: session.photos[session.test + k] for k in chosen}
     sphere = {"view": session.names[session.middle], "distance": frame.scale * AWAY}
     sphere |= {"radius": frame.scale * SPHERE, "outside": True}
@@ -196,7 +199,7 @@ def _ask_outpainting(out: Path, session: Session, kind: Kind, world: World, fram
 def _write_measured(
     out: Path, session: Session, pictures: dict[int, np.ndarray], kind: Kind, world: World, frame: Frame
 ) -> str:
-    """Write pictures of views and their depth; the lines of scene.yaml that name them."""
+    """Write pictures of views and their depth; returns the lines of scene.yaml that name them."""
     said = ["reference:\n"]
     for k, picture in pictures.items():
         name = session.names[k]

@@ -1,4 +1,4 @@
-"""The kinds of synthetic scenes, and where their randomness comes from."""
+"""The kinds of synthetic scenes, and the source of their randomness."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ FULL = 4  # full resolution over that of images_4
 
 @dataclass(frozen=True)
 class Kind:
-    """What differs between kinds.
+    """The parameters of a kind of scene.
 
     Attributes:
-        width, height: pixels of the written images; samples: rays a side of a pixel.
+        width, height: pixels of the written images; samples: rays along a side of a pixel.
         train, test: numbers of views; photos: write photographs and masks only.
-        spread: degrees the cameras reach to either side of the object; from 180 on they circle it.
-        texture: pixels a side of the largest textures; node: metres between nodes of the light map.
-        bend: SIMPLE_RADIAL's k1 at its largest; points: sparse points wanted.
+        spread: degrees that the cameras reach to either side of the object; from 180 on they circle it.
+        texture: pixels along a side of the largest textures; node: metres between nodes of the light map.
+        bend: largest k1 of SIMPLE_RADIAL; points: number of sparse points.
         hangs: the object hangs in mid-air, so that other views show all that it hides.
-        place: where the object is: "room", "behind" (a kept thing before it), "table" (on the edge of one), "corner"
-            (before the corner of a wall), "grass", "floor" or "pair" (two objects side by side).
-        task: what the scene asks for: "remove" the object; "insert" it: the training views are without it, the test
-            views and the references with it; "outpaint" what lies beyond a sphere, nothing else is changed; "sparse":
-            nothing is changed, but few views have pixels.
-        references: how many views the scene brings completed; to be continued beyond a sphere, as many as show it all.
-        shown: of so many training views the pixels may be used, the others are cameras only; 0: of all.
-        least: share of the masks that no training view may show, at least.
-        low: metres above the floor of the lowest cameras; None: all at the height of a person's eyes.
+        place: where the object is: "room", "behind" (an object that stays is in front), "table" (on its edge), "corner"
+            (in front of the corner of a wall), "grass", "floor" or "pair" (two objects side by side).
+        task: what the scene asks for: "remove" the object; "insert" it: it is only in the test views and the
+            references; "outpaint" what lies beyond a sphere, nothing else is changed; "sparse": nothing is changed, but
+            few views have pixels.
+        references: number of completed views that the scene brings; for outpainting, as many as show everything.
+        shown: number of training views with pixels, the others are cameras only; 0: all have pixels.
+        least: smallest share of the masks that no training view shows.
+        low: metres above the floor of the lowest cameras; None: all are at eye level.
     """
 
     width: int = 320
@@ -53,7 +53,7 @@ class Kind:
 
     @property
     def around(self) -> bool:
-        """Whether the cameras circle the object."""
+        """Do the cameras circle the object?"""
         return self.spread >= 180
 
 
@@ -76,5 +76,5 @@ KINDS = {
 
 
 def randomness(seed: int, label: str) -> np.random.Generator:
-    """A generator of its own for each part, so that changing one part leaves the others as they were."""
+    """A generator for each part, so that changing one part leaves the others as they were."""
     return np.random.default_rng([seed, zlib.crc32(label.encode())])

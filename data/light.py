@@ -1,4 +1,4 @@
-"""Light baked into a map: nodes on every face, lamps that reach them, bounces between them."""
+"""Bakes light into a map: nodes on every face, lamps that reach them, bounces between them."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def direct_light(solids, points, normals, owner, lamps, side):
 
 @kernel()
 def _received(solids, with_object, point, normal, lamp, side):
-    """Sum over side x side points of the lamp of both cosines over the squared distance, 0 where it is hidden."""
+    """Sum over side x side points of the lamp of both cosines over the squared distance; 0 for hidden points."""
     total = 0.0
     for s in range(side * side):
         a, b = 2.0 * (s % side + 0.5) / side - 1.0, 2.0 * (s // side + 0.5) / side - 1.0
@@ -91,7 +91,8 @@ def _received(solids, with_object, point, normal, lamp, side):
 
 @kernel(parallel=True)
 def bounced_light(solids, faces, textures, points, normals, owner, light, ambient, rays):
-    """One bounce [M, 3]: the mean over a cosine-weighted hemisphere of what the surfaces seen there send back.
+    """One bounce [M, 3]: mean radiance over a cosine-weighted hemisphere of the surfaces that reflect light to each
+    node.
 
     Every node uses the same low-discrepancy directions, so neighbours agree and nothing is noisy.
     """

@@ -1,4 +1,4 @@
-"""Pictures with all their mip levels, and what colour a face shows where a ray meets it."""
+"""Pictures with all their mip levels, and the colour of a face at a point."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Textures(NamedTuple):
     linear: np.ndarray
 
 
-def mipmapped(pictures: dict[str, np.ndarray]) -> tuple[Textures, dict[str, int]]:
-    """Mip levels of each picture, made in linear light; and each name's index."""
+def build_mipmaps(pictures: dict[str, np.ndarray]) -> tuple[Textures, dict[str, int]]:
+    """Mip levels of each picture, computed in linear light; and each name's index."""
     linear = (np.arange(256) / 255.0) ** 2.2
     levels = max(int(np.log2(p.shape[0])) for p in pictures.values()) + 1
     texels, start, side, mean, total = [], [], [], [], 0

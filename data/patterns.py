@@ -75,6 +75,6 @@ def rim(t):
     return np.minimum(t, 1 - t)
 
 
-def varied(rng, rows, columns, row, column):
+def random_per_cell(rng, rows, columns, row, column):
     """Three random values in [0, 1) for each of rows x columns pieces, at the pixels of piece (row, column)."""
     return tuple(rng.random((rows, columns)).astype(np.float32)[row, column] for _ in range(3))

@@ -1,4 +1,5 @@
-"""The photographer: a walk with a camera, exposure, and which of what a mask covers no photograph shows."""
+"""Photographs a made scene: a walk with a camera, exposure, and the masked pixels whose background no photograph
+shows."""
 
 from __future__ import annotations
 
@@ -14,16 +15,16 @@ SPREAD = 8  # views of `Session.spread`
 
 @dataclass(frozen=True)
 class Session:
-    """V photographs, those of test views first and without the object (`shows_object`).
+    """V photographs; those of test views come first, without the object (`shows_object`).
 
     Attributes:
-        names: of the views; cameras: [V, 16]; test: how many are test views.
+        names: of the views; cameras: [V, 16]; test: number of test views.
         photos: [V, H, W, 3] uint8; masks: bool [V, H, W], pixels that the object touches or would touch.
-        hidden: bool [V, H, W], never-seen pixels of the masks.
+        hidden: bool [V, H, W], masked pixels whose background no training view shows.
         middle: the view from the middle of the training views' walk.
-        completed: view -> uint8 [H, W, 3] as it is wanted, of the middle one and those farthest from it.
+        completed: view -> uint8 [H, W, 3], the desired picture, of the middle view and those farthest from it.
         spread: training views, each the one farthest from those before it, the middle one first.
-        apart: object -> bool [V, H, W], what its mask holds: of objects that are named apart.
+        apart: object -> bool [V, H, W], its mask, for objects with masks of their own.
     """
 
     names: list[str]
@@ -38,25 +39,27 @@ class Session:
     apart: dict[str, np.ndarray]
 
 
-def photographed(seed: int, kind: Kind, world: World, target: np.ndarray) -> Session:
+def take_photographs(seed: int, kind: Kind, world: World, target: np.ndarray) -> Session:
     """All photographs of a scene, at one exposure."""
     train, test = (path(seed, kind, target, n, label) for n, label in ((kind.train, "train"), (kind.test, "test")))
     cameras = np.concatenate([test, train])
     names = [f"IMG_{k + 2000:04d}" for k in range(len(cameras))]
     middle = kind.test + _middle(train, kind)
-    world = exposed(world, cameras[middle], kind)
+    world = set_exposure(world, cameras[middle], kind)
     shots = [shoot(world, camera, kind, shows_object(kind, k)) for k, camera in enumerate(cameras)]
     photos, masks = (np.stack(pictures) for pictures in zip(*shots, strict=True))
     in_training = train, masks[kind.test :]
     hidden = [never_seen(world, camera, mask, *in_training) for camera, mask in zip(cameras, masks, strict=True)]
     spread = [kind.test + k for k in _spread(train, middle - kind.test, min(SPREAD, kind.train))]
     whole = {k: shoot(world, cameras[k], kind, kind.task != "remove")[0] for k in spread[: kind.references]}
-    apart = {name: np.stack([_alone(world, c, kind, own) for c in cameras]) for name, own in world.objects.items()}
+    apart = {
+        name: np.stack([_object_mask(world, c, kind, own) for c in cameras]) for name, own in world.objects.items()
+    }
     return Session(names, cameras, kind.test, photos, masks, np.stack(hidden), middle, whole, spread, apart)
 
 
 def _spread(cameras: np.ndarray, first: int, count: int) -> list[int]:
-    """So many cameras, each the one farthest from those before it."""
+    """`count` cameras, each the one farthest from those before it."""
     chosen, away = [first], np.full(len(cameras), np.inf)
     while len(chosen) < count:
         away = np.minimum(away, np.linalg.norm(cameras[:, 13:] - cameras[chosen[-1], 13:], axis=1))
@@ -64,8 +67,8 @@ def _spread(cameras: np.ndarray, first: int, count: int) -> list[int]:
     return chosen
 
 
-def _alone(world: World, camera: np.ndarray, kind: Kind, own: np.ndarray) -> np.ndarray:
-    """Bool [H, W]: pixels in which this object, bool [n] of the solids, is met before anything else."""
+def _object_mask(world: World, camera: np.ndarray, kind: Kind, own: np.ndarray) -> np.ndarray:
+    """bool [H, W]: pixels whose ray hits this object, bool [n] of the solids, first."""
     alone = replace(world, solids=world.solids._replace(removable=own))
     return _radiance(alone, camera, kind, True, kind.samples)[1]
 
@@ -76,7 +79,7 @@ def shows_object(kind: Kind, k: int) -> bool:
 
 
 def path(seed: int, kind: Kind, target: np.ndarray, count: int, label: str) -> np.ndarray:
-    """Cameras [count, 16] of a walk around the target with an unsteady hand; `label` names the walk."""
+    """Cameras [count, 16] along an unsteady walk around the target; `label` names the walk."""
     draw = randomness(seed, f"path {label}")
     azimuth, height, radius = _walk(kind, count, 1.0 if label == "train" else 0.88, draw)
     angle = np.radians(azimuth + draw.normal(0, 0.6, count))
@@ -88,13 +91,13 @@ def path(seed: int, kind: Kind, target: np.ndarray, count: int, label: str) -> n
     bend = kind.bend * randomness(seed, "lens").uniform(0.7, 1.0)
     cameras = np.empty((count, 16))
     for k in range(count):
-        turn = _looking(aim[k] - center[k], roll[k])
+        turn = _look_at(aim[k] - center[k], roll[k])
         cameras[k] = focal, kind.width / 2, kind.height / 2, bend, *turn.ravel(), *center[k]
     return cameras
 
 
 def _middle(cameras: np.ndarray, kind: Kind) -> int:
-    """The camera nearest to the mean of all; where some are low, to the mean at the height of the highest."""
+    """The camera nearest to the mean of all; if some are low, to the mean at the height of the highest."""
     wanted = cameras[:, 13:].mean(0)
     if kind.low is not None:
         wanted[1] = cameras[:, 14].max()
@@ -117,8 +120,8 @@ def _walk(kind: Kind, count: int, reach: float, draw: np.random.Generator) -> tu
     return azimuth, height, 2.45 + 0.08 * np.sin(6.28 * 4 * s + phase[2])
 
 
-def _looking(along: np.ndarray, roll: float) -> np.ndarray:
-    """[3, 3] camera-to-room rotation that looks along a direction, turned about it by `roll`."""
+def _look_at(along: np.ndarray, roll: float) -> np.ndarray:
+    """[3, 3] camera-to-room rotation that looks along a direction, rolled by `roll` radians."""
     forward = along / np.linalg.norm(along)
     right = np.cross(forward, (0, 1, 0))
     right /= np.linalg.norm(right)
@@ -134,7 +137,7 @@ def develop(color: np.ndarray, exposure: float) -> np.ndarray:
 
 
 def shoot(world: World, camera: np.ndarray, kind: Kind, with_object: bool) -> tuple[np.ndarray, np.ndarray]:
-    """(photograph uint8 [H, W, 3], pixels that the object touches, in it or not: bool [H, W])."""
+    """(photograph uint8 [H, W, 3], bool [H, W]: pixels that the object touches, or would touch)."""
     color, mask = _radiance(world, camera, kind, with_object, kind.samples)
     return develop(color, world.exposure), mask
 
@@ -145,8 +148,8 @@ def _radiance(world: World, camera, kind: Kind, with_object: bool, samples: int)
     )
 
 
-def exposed(world: World, camera: np.ndarray, kind: Kind) -> World:
-    """The world with the exposure that puts this view's mean, object left out, at a comfortable grey."""
+def set_exposure(world: World, camera: np.ndarray, kind: Kind) -> World:
+    """The world with the exposure that makes the mean of this view, without the object, a medium grey."""
     color, _ = _radiance(world, camera, kind, False, 1)
     low, high = 0.01, 1000.0
     for _ in range(40):

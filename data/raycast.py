@@ -1,4 +1,4 @@
-"""What cameras see of the room: pictures, surface points, and which points are hidden from them.
+"""Renders the room: pictures, surface points, and which points are hidden from a camera.
 
 A camera is one row of 16 numbers: f, cx, cy [pixels], k1, camera-to-room rotation (9, row by row; the camera looks
 along +z, x right, y down), centre (3). The lens is COLMAP's SIMPLE_RADIAL: a ray (x, y, 1) lands at
@@ -22,7 +22,7 @@ TILE = 16  # pixels
 
 @kernel(inline="always")
 def ray(camera, x, y):
-    """Unit direction in the room through image point (x, y), the lens undone by Newton's method."""
+    """Unit direction in the room through image point (x, y); the distortion is inverted by Newton's method."""
     f, k = camera[0], camera[3]
     x, y = (x - camera[1]) / f, (y - camera[2]) / f
     bent = math.hypot(x, y)
@@ -41,7 +41,7 @@ def ray(camera, x, y):
 
 @kernel()
 def project(camera, px, py, pz):
-    """(x, y, z): image point through the lens, and the camera z of a room point."""
+    """(x, y, z): distorted image point and camera z of a room point."""
     ax, ay, az = px - camera[13], py - camera[14], pz - camera[15]
     x = camera[4] * ax + camera[7] * ay + camera[10] * az
     y = camera[5] * ax + camera[8] * ay + camera[11] * az
@@ -55,7 +55,7 @@ def project(camera, px, py, pz):
 
 @kernel()
 def _in_tile(solids, camera, left, top, listed):
-    """Number the solids that may show in a tile of the picture, the room first, into `listed`; return how many."""
+    """Write the numbers of the solids that may be visible in a tile into `listed`, the room first; return how many."""
     ax, ay, az = ray(camera, left + 0.5 * TILE, top + 0.5 * TILE)
     widest = 1.0
     for corner in range(4):
@@ -79,7 +79,7 @@ def _in_tile(solids, camera, left, top, listed):
 
 @kernel()
 def _first(solids, listed, camera, with_object, dx, dy, dz):
-    """(distance, solid) of what the ray shows, with the object or without it; would it meet the object first?"""
+    """(distance, solid) that the ray hits, with or without the object; and whether it would hit the object first."""
     t, i, least, on_object = 1e30, -1, 1e30, False
     for solid in listed:
         far = distance(solids, solid, camera[13], camera[14], camera[15], dx, dy, dz)
@@ -92,7 +92,7 @@ def _first(solids, listed, camera, with_object, dx, dy, dz):
 
 @kernel()
 def _add_radiance(solids, faces, textures, light, camera, i, t, dx, dy, dz, samples, scratch, out):
-    """Add to `out` [3] what the ray sees at distance t on solid i; `scratch` is [2, 3]."""
+    """Add the radiance along the ray, at distance t on solid i, to `out` [3]; `scratch` is [2, 3]."""
     face, u, v, nx, ny, nz = surface(solids, i, camera[13] + t * dx, camera[14] + t * dy, camera[15] + t * dz)
     # The footprint of one ray on the surface; its long side is shared between blur and supersampling.
     cosine = max(abs(nx * dx + ny * dy + nz * dz), 0.05)
@@ -134,7 +134,7 @@ def render(solids, faces, textures, light, camera, width, height, with_object, s
 
 @kernel(parallel=True)
 def surface_points(solids, camera, pixels, with_object):
-    """Where the rays through image points [P, 2] first meet a surface: points [P, 3] in the room, solid [P]."""
+    """Where the rays through image points [P, 2] first hit a surface: points [P, 3] in the room, solid [P]."""
     points, which = np.empty((pixels.shape[0], 3)), np.empty(pixels.shape[0], np.int32)
     for n in prange(pixels.shape[0]):
         dx, dy, dz = ray(camera, pixels[n, 0], pixels[n, 1])
@@ -169,7 +169,7 @@ def observations(solids, cameras, width, height, points):
 
 @kernel(parallel=True)
 def never_seen(solids, cameras, masks, points):
-    """Which background points [P, 3] no training view shows outside its mask. masks: bool [V, H, W] of those views."""
+    """bool [P]: background points [P, 3] that no training view shows outside its mask, bool [V, H, W]."""
     unseen = np.ones(points.shape[0], np.bool_)
     for n in prange(points.shape[0]):
         px, py, pz = points[n, 0], points[n, 1], points[n, 2]

@@ -1,4 +1,4 @@
-"""What structure from motion would have made of the photographs: its arbitrary frame, its sparse points."""
+"""Imitates structure from motion of the photographs: an arbitrary frame, and sparse points."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class SparsePoints:
 
 
 def sparse_points(seed: int, kind: Kind, world: World, cameras: np.ndarray, photos: np.ndarray) -> SparsePoints:
-    """Surface points where the training views have texture, seen by at least 3 of them, with SfM's inaccuracy."""
+    """Points on textured surfaces that at least 3 training views see, with errors as of SfM."""
     draw = randomness(seed, "points")
     per_view = -(-kind.points * 3 // (2 * len(cameras)))
     positions, colors = [], []
@@ -67,7 +67,7 @@ def sparse_points(seed: int, kind: Kind, world: World, cameras: np.ndarray, phot
 
 
 def _textured_pixels(photo: np.ndarray, count: int, draw: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """(rows, columns) drawn with the steepness of the photograph's greys as probability."""
+    """(rows, columns) drawn with the gradient of the photograph's grey levels as probability."""
     grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY).astype(np.float32)
     edges = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)).ravel() + 4
     return np.divmod(draw.choice(edges.size, count, replace=False, p=edges / edges.sum()), photo.shape[1])

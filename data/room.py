@@ -1,5 +1,5 @@
-"""How the room is furnished: a corner with a cabinet or a lantern, or a room all around a daybed; for the places where
-removal is harder than against a wall see `places.py`."""
+"""Furnishes the room: a corner with a cabinet or a lantern, or a room all around a daybed. `places.py` has the harder
+places."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from places import PLAIN, RUG, WALL, garden, shell, table_room, wall_corner
 
 
 def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
-    """The room and what stands in it; the point the cameras look at."""
+    """The furnished room, and the point that the cameras look at."""
     f, draw = Furniture(), randomness(seed, "layout")
     planks = Material("floor", 3.0, turned=bool(draw.integers(2)))
     if kind.around:

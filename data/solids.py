@@ -95,7 +95,7 @@ def _in_cylinder(ox, oy, oz, dx, dy, dz, radius, half):
 
 @kernel(inline="always")
 def distance(solids, i, ox, oy, oz, dx, dy, dz):
-    """Along the ray to solid i, 1e30 if missed. From inside a solid: to its far side."""
+    """Distance along the ray to solid i, 1e30 if missed. From inside a solid: to its far side."""
     if solids.kind[i] == THICKET:  # apart from the others: in one function with it they would take twice the time
         return _to_thicket(solids, i, ox, oy, oz, dx, dy, dz)
     return _to_solid(solids, i, ox, oy, oz, dx, dy, dz)
@@ -150,7 +150,7 @@ def nearest(solids, with_object, ox, oy, oz, dx, dy, dz):
 
 @kernel()
 def blocked(solids, with_object, ox, oy, oz, dx, dy, dz, limit):
-    """Is there a solid nearer than `limit`? The room itself hides nothing inside it."""
+    """Is a solid nearer than `limit`? The room itself hides nothing inside it."""
     for i in range(1, solids.kind.shape[0]):
         if solids.removable[i] and not with_object:
             continue

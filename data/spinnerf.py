@@ -1,4 +1,4 @@
-"""What of SPIn-NeRF's published scenes a folder holds, a line a scene: `python data/spinnerf.py --data FOLDER`."""
+"""Lists which of SPIn-NeRF's published scenes a folder holds, one per line: `python data/spinnerf.py --data FOLDER`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="the folder that holds the scenes")
     try:
-        print("\n".join(spinnerf.told(parser.parse_args().data.expanduser())), flush=True)
+        print("\n".join(spinnerf.summarize_scenes(parser.parse_args().data.expanduser())), flush=True)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 

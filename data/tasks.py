@@ -1,4 +1,4 @@
-"""What a scene asks for beside removal: an object put into it, or the space beyond a sphere."""
+"""The tasks of scenes other than removal: an object to insert, or the space beyond a sphere to continue."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ from reconstruction import Frame
 from solids import Solids
 from world import World
 
-ROOM_FOR_IT = 1.08  # radius of the region over that of the object within
-GRID, NEAR = 61, 0.03  # every so many-th pixel tells what is covered; relative depth within which a point is shown
-COVERED = 0.995  # of what lies beyond the sphere and the views show: what references show of it, at least
+ROOM_FOR_IT = 1.08  # radius of the region over that of the object inside
+# distance of the pixels that tell what is covered; relative depth within which a point is visible
+GRID, NEAR = 61, 0.03
+COVERED = 0.995  # share that references must show of what lies beyond the sphere and any view shows
 SPHERE = 0.95  # metres: radius of the sphere beyond which the scene is to be continued
 
 
-def bare(solids: Solids) -> Solids:
+def without_object(solids: Solids) -> Solids:
     """The room without the object."""
     return solids._replace(**{name: each[~solids.removable] for name, each in solids._asdict().items()})
 
 
-def region_around(solids: Solids) -> tuple[np.ndarray, float]:
-    """A sphere (centre [3], radius), metres, around the object."""
+def bounding_region(solids: Solids) -> tuple[np.ndarray, float]:
+    """A sphere (centre [3], radius) around the object, in metres."""
     center, reach = solids.center[solids.removable], solids.reach[solids.removable]
     half = solids.half[solids.removable]
     middle = ((center - half).min(0) + (center + half).max(0)) / 2
@@ -38,36 +39,35 @@ def rays(camera: np.ndarray, kind: Kind, world: World) -> tuple[np.ndarray, np.n
 
 
 def depth(camera: np.ndarray, kind: Kind, world: World, frame: Frame) -> np.ndarray:
-    """[H, W] camera z of what the photograph shows, in the scene frame's unit."""
+    """[H, W] camera z of the photograph, in the scene frame's unit."""
     points, _ = rays(camera, kind, world)
     return (frame.scale * ((points - camera[13:]) @ camera[4:13].reshape(3, 3)[:, 2])).astype(np.float32)
 
 
-def beyond(camera: np.ndarray, kind: Kind, world: World, center: np.ndarray, radius: float) -> np.ndarray:
+def outside_sphere(camera: np.ndarray, kind: Kind, world: World, center: np.ndarray, radius: float) -> np.ndarray:
     """bool [H, W]: pixels whose rays miss the sphere."""
     _, along = rays(camera, kind, world)
     offset = center - camera[13:]
     return offset @ offset - (along @ offset) ** 2 > radius**2
 
 
-def covering(cameras: np.ndarray, kind: Kind, world: World, center: np.ndarray, first: int) -> list[int]:
-    """Cameras that show `COVERED` of what lies beyond the sphere: `first`, then each the one that shows most of what no
-    earlier one shows."""
+def choose_covering_views(cameras: np.ndarray, kind: Kind, world: World, center: np.ndarray, first: int) -> list[int]:
+    """Cameras that show `COVERED` of what lies beyond the sphere: `first`, then greedily the one that adds most."""
     depths, pooled = [], []
     for camera in cameras:
         points, _ = rays(camera, kind, world)
         depths.append((points - camera[13:]) @ camera[4:13].reshape(3, 3)[:, 2])
-        pooled.append(points[beyond(camera, kind, world, center, SPHERE)][::GRID])
+        pooled.append(points[outside_sphere(camera, kind, world, center, SPHERE)][::GRID])
     points = np.concatenate(pooled)
-    shown = np.stack([_seen(points, *each, kind) for each in zip(cameras, depths, strict=True)])
+    shown = np.stack([_is_visible(points, *each, kind) for each in zip(cameras, depths, strict=True)])
     chosen = [first]
     while shown[chosen].any(0).mean() < COVERED * shown.any(0).mean():
         chosen.append(int((shown & ~shown[chosen].any(0)).sum(1).argmax()))
     return chosen
 
 
-def _seen(points: np.ndarray, camera: np.ndarray, depth: np.ndarray, kind: Kind) -> np.ndarray:
-    """bool [N]: points that the camera shows, the lens's bend left out."""
+def _is_visible(points: np.ndarray, camera: np.ndarray, depth: np.ndarray, kind: Kind) -> np.ndarray:
+    """bool [N]: points that the camera shows; distortion is ignored."""
     at = (points - camera[13:]) @ camera[4:13].reshape(3, 3)
     z = np.maximum(at[:, 2], 1e-6)
     column, row = (np.floor(camera[0] * at[:, k] / z + camera[1 + k]).astype(int) for k in (0, 1))
@@ -77,6 +77,6 @@ def _seen(points: np.ndarray, camera: np.ndarray, depth: np.ndarray, kind: Kind)
     return found
 
 
-def on_axis(camera: np.ndarray, distance: float) -> np.ndarray:
+def point_on_axis(camera: np.ndarray, distance: float) -> np.ndarray:
     """The point at that distance along a camera's optical axis."""
     return camera[13:] + distance * camera[4:13].reshape(3, 3)[:, 2]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from patterns import blend, cell, fbm, grid, noise, ramp, rim, shifted, srgb, step, varied
+from patterns import blend, cell, fbm, grid, noise, ramp, random_per_cell, rim, shifted, srgb, step
 
 WOODS = (
     ((96, 58, 32), (150, 98, 56), (196, 146, 94)),  # oak
@@ -23,7 +23,7 @@ def wood_planks(rng, size, rows=24, pieces=3, palette=None):
     x, y = grid(size)
     row, across = cell(y * rows)
     piece, along = cell((x + rng.random(rows)[row]) % 1 * pieces)
-    tone, dx, dy = varied(rng, rows, pieces, row, piece)
+    tone, dx, dy = random_per_cell(rng, rows, pieces, row, piece)
     warp = shifted(noise(rng, size, 4, 4), x + dx, y + dy)
     grain = shifted(fbm(rng, size, min(128, size // 4), 4, 4), x * 2 + dx, y + dy)
     fine = shifted(fbm(rng, size, size // 4, 16, 2), x + dy, y + dx)
@@ -44,7 +44,7 @@ def herringbone(rng, size, cells=32, long=4):
     left = np.where(flat, i - phase, i)
     top = np.where(flat, j, j - (2 * long - 1 - phase))
     along, across = np.where(flat, a - left, b - top) / long, np.where(flat, b - top, a - left)
-    tone, dx, dy = varied(rng, cells, cells, top % cells, left % cells)
+    tone, dx, dy = random_per_cell(rng, cells, cells, top % cells, left % cells)
     grain = shifted(fbm(rng, size, min(128, size // 4), 8, 4), along * 0.25 + dx, across * 0.06 + dy)
     color = ramp(0.5 + 0.5 * (tone - 0.5) + 0.12 * (flat - 0.5) + 0.16 * grain, *palette)
     edge = np.minimum(rim(across), long * rim(along))
@@ -63,7 +63,7 @@ def stone_tiles(rng, size, cells=8):
     *palette, grout = STONES[rng.integers(len(STONES))]
     x, y = grid(size)
     (i, fx), (j, fy) = cell(x * cells), cell(y * cells)
-    tone, dx, dy = varied(rng, cells, cells, j, i)
+    tone, dx, dy = random_per_cell(rng, cells, cells, j, i)
     cloud = shifted(fbm(rng, size, 8, 8, 6), x + dx, y + dy)
     vein = np.exp(-((shifted(fbm(rng, size, 4, 4, 6), x + dy, y + dx) / 0.09) ** 2))
     color = ramp(0.5 + 0.5 * (tone - 0.5) + 0.17 * cloud - 0.3 * vein, *palette)
@@ -88,7 +88,7 @@ def bricks(rng, size, rows=24, columns=8):
     wobble = 0.012 * fbm(rng, size, 16, 16, 3)
     row, fy = cell(y * rows)
     column, fx = cell(x * columns + 0.5 * (row % 2))
-    tone, dx, dy = varied(rng, rows, columns, row, column % columns)
+    tone, dx, dy = random_per_cell(rng, rows, columns, row, column % columns)
     rough = shifted(fbm(rng, size, 32, 32, 5), x + dx, y + dy)
     color = ramp(0.5 + 0.75 * (tone - 0.5) + 0.13 * rough + 0.06 * fbm(rng, size, 4, 4, 3), *palette)
     aspect = rows / columns

@@ -1,4 +1,4 @@
-"""The furnished room made ready for cameras: its textures painted, its light baked."""
+"""A furnished room with painted textures and baked light, ready for the ray caster."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from furniture import Furniture
 from greens import foliage
 from kinds import Kind, randomness
 from light import bounced_light, direct_light, light_nodes
-from mipmaps import Textures, mipmapped
+from mipmaps import Textures, build_mipmaps
 from solids import Faces, Solids
 
 
 @dataclass(frozen=True)
 class World:
-    """All that `raycast.render` needs: geometry, materials, baked light [M, 3], and the exposure; for masks `objects`,
-    name -> bool [n], the solids of each object that is named apart.
-    """
+    """Input of `raycast.render`: geometry, materials, baked light [M, 3] and exposure; and for masks `objects`, name ->
+    bool [n], the solids of each object with masks of its own."""
 
     solids: Solids
     faces: Faces
@@ -29,7 +28,7 @@ class World:
 
 
 def paint_textures(seed: int, size: int) -> dict[str, np.ndarray]:
-    """Every texture of the scene, its style drawn from the seed; large for floor and walls, half for the rest."""
+    """Every texture of the scene, in a style drawn from the seed; full size for floor and walls, half for the rest."""
     small = max(size // 2, 128)
     draw = randomness(seed, "styles")
     floors = (paint.wood_planks, paint.wood_planks, paint.stone_tiles, paint.herringbone)
@@ -73,7 +72,7 @@ def paint_textures(seed: int, size: int) -> dict[str, np.ndarray]:
 
 def bake(furniture: Furniture, seed: int, kind: Kind) -> World:
     """Textures and light: a ceiling lamp, a window, two bounces."""
-    pictures, index = mipmapped(paint_textures(seed, kind.texture))
+    pictures, index = build_mipmaps(paint_textures(seed, kind.texture))
     solids, faces = furniture.arrays(index, kind.node)
     draw = randomness(seed, "light")
     room, width = solids.center[0], solids.half[0, 0]

@@ -10,10 +10,10 @@ from reffusion.types import Camera
 
 
 class Degenerate(ValueError):
-    """What is known does not determine what is asked for.
+    """What is known does not determine the result.
 
     Attributes:
-        reason: in a word or two, to be counted where the loss of one view is no harm.
+        reason: one or two words, to be counted where the loss of one view does no harm.
     """
 
     def __init__(self, reason: str, message: str):

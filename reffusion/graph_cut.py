@@ -1,4 +1,4 @@
-"""Least cuts through graphs of neighbours, pixels or Gaussians."""
+"""Minimum cuts through graphs of neighbouring pixels or Gaussians."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 
-UNIT = 1000  # of capacity: a cost of 1 in whole numbers
+UNIT = 1000  # capacity of a cost of 1, since capacities are integers
 HARD = 1e4  # a cost that no sum of links outweighs
 
 
 def least_cut(true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray) -> np.ndarray:
-    """bool [N], the labels of the least total cost.
+    """bool [N], the labels with the smallest total cost, by a minimum cut.
 
     Args:
         true_cost, false_cost: [N] >= 0, cost of each label.
@@ -35,11 +35,11 @@ def least_cut(true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, 
 
 
 def least_labels(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """int [N], labels of a low total cost, by expansion moves (Boykov et al. 2001): each takes one label as far as that
-    pays, until none does.
+    """int [N], labels with a low total cost, by expansion moves (Boykov et al. 2001): each move gives one label to all
+    that gain from it, until no move lowers the cost.
 
     Args:
-        cost: [K, N] >= 0 of each label. start: int [N], labels to begin with.
+        cost: [K, N] >= 0 of each label. start: int [N], initial labels.
         pairs: [E, 2] int, neighbours, each pair once. strength: [E] >= 0, cost of a pair with different labels.
     """
     labels, changed = start.copy(), True
@@ -49,7 +49,7 @@ def least_labels(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, star
         for label in range(len(cost)):
             apart = labels[here] != labels[there]
             keep = cost[labels, np.arange(len(labels))]
-            # Neighbours that differ pay once unless both move: half of it is a gain for each that does.
+            # Neighbours with different labels cost once unless both move: each that moves gains half of it.
             gain = np.bincount(pairs[apart].T.ravel(), np.tile(strength[apart] / 2, 2), len(labels))
             stay = np.where(labels == label, HARD, keep)  # what has the label is as if it had moved
             moves = least_cut(cost[label] - gain, stay, pairs, np.where(apart, strength / 2, strength))

@@ -1,4 +1,4 @@
-"""Generators that depend on a seed and on labels, never on what was drawn before."""
+"""Random generators that depend on a seed and on labels, never on what was drawn before."""
 
 from __future__ import annotations
 
@@ -22,6 +22,6 @@ def generator(seed: int, *labels: object, device: str = "cpu") -> torch.Generato
 
 
 def in_epochs(turn: int, count: int, seed: int, *labels: object) -> int:
-    """Which of `count` things has its turn: each once an epoch, in an order of the epoch's own."""
+    """Index of the item, of `count`, whose turn it is: each item once per epoch, in a new order in every epoch."""
     order = torch.randperm(count, generator=generator(seed, *labels, turn // count))
     return int(order[turn % count])

@@ -1,4 +1,4 @@
-"""Error against time, checkpoints, seeded generators, progress: what every long stage needs."""
+"""What long stages share: error over time, checkpoints, a step budget, progress."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ import torch
 from reffusion.io.traces import read_trace
 
 CHECKPOINT = "checkpoint.pt"
-LENGTH = "length.json"  # the number of steps that fit into a time budget
-WORTH = 50  # times what the last checkpoint took, that work goes on before the next: under 2 % of the time is for them
-TRIAL = 4  # steps by which a stage measures its speed
+LENGTH = "length.json"  # holds the number of steps that fit into a time budget
+# times the duration of the last checkpoint, as the least time between two: under 2 % goes into them
+WORK_PER_CHECKPOINT = 50
+TRIAL_STEPS = 4  # steps for measuring the speed of a stage
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
-    """Write `folder/checkpoint.pt` at once or not at all. `state` holds tensors and plain Python values."""
+    """Write `folder/checkpoint.pt` atomically. `state` holds tensors and plain Python values."""
     partial = folder / (CHECKPOINT + ".writing")
     with open(partial, "wb") as file:
         torch.save(state, file)
@@ -35,8 +36,10 @@ def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
 
 
 def load_checkpoint(folder: Path) -> dict[str, Any] | None:
-    """The state last saved in `folder`, or None, also where it is not whole, which is said. The runner hands a stage
-    only folders of its own key."""
+    """The state last saved in `folder`; None without one, and with a message where it is damaged.
+
+    The runner hands a stage only folders of its own key.
+    """
     path = folder / CHECKPOINT
     if not path.exists():
         return None
@@ -52,14 +55,14 @@ def load_checkpoint(folder: Path) -> dict[str, Any] | None:
 
 
 def clear_checkpoint(folder: Path) -> None:
-    """Remove what `save_checkpoint` wrote: the stage is done."""
+    """Remove what `save_checkpoint` wrote, when the stage is done."""
     (folder / CHECKPOINT).unlink(missing_ok=True)
     (folder / (CHECKPOINT + ".writing")).unlink(missing_ok=True)
 
 
 class Checkpoints:
-    """When the next one is due: `seconds` after the last was written, and later where that took long, as with a million
-    Gaussians or a slow disk. The clock starts anew after writing."""
+    """Decides when a checkpoint is due: `seconds` after the last one, or later where writing took long, as with a
+    million Gaussians or a slow disk. The clock starts anew after writing."""
 
     def __init__(self, folder: Path, seconds: float):
         self._folder, self._seconds = folder, seconds
@@ -70,18 +73,18 @@ class Checkpoints:
         return time.monotonic() - self._since > self._wait
 
     def save(self, state: Callable[[], dict[str, Any]]) -> None:
-        """Write the state, which is put together only now: that is a part of what it takes."""
+        """Write the state. It is a function, because assembling the state is part of the duration."""
         began = time.monotonic()
         save_checkpoint(self._folder, state())
         self._since = time.monotonic()
-        self._wait = max(self._seconds, WORTH * (self._since - began))
+        self._wait = max(self._seconds, WORK_PER_CHECKPOINT * (self._since - began))
 
 
 class Trace:
-    """Writes `trace.jsonl`, one line per moment; what stands in a line says docs/traces.md.
+    """Writes `trace.jsonl`, one line per measurement; docs/traces.md describes the lines.
 
-    The clock counts work only: it stops inside `with trace.paused():` and continues from `start_seconds`
-    after a resume; lines from `start_iteration` on are dropped.
+    The clock counts work only: it stops inside `with trace.paused():`, and continues from `start_seconds` after a
+    resume, which drops the lines from `start_iteration` on.
     """
 
     def __init__(self, folder: Path, start_seconds: float = 0.0, start_iteration: int = 0):
@@ -91,24 +94,24 @@ class Trace:
         partial.write_text("".join(json.dumps(r) + "\n" for r in kept))
         os.replace(partial, self.path)
         self._offset, self._since = start_seconds, time.perf_counter()
-        self._standing = False
+        self._is_paused = False
 
     @property
     def seconds(self) -> float:
-        return self._offset + (0.0 if self._standing else time.perf_counter() - self._since)
+        return self._offset + (0.0 if self._is_paused else time.perf_counter() - self._since)
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Stop the clock while something is measured or drawn. May be nested."""
-        was_standing = self._standing
-        self._offset, self._standing = self.seconds, True
+        """Stop the clock while something is measured or rendered. May be nested."""
+        was_standing = self._is_paused
+        self._offset, self._is_paused = self.seconds, True
         try:
             yield
         finally:
-            self._since, self._standing = time.perf_counter(), was_standing
+            self._since, self._is_paused = time.perf_counter(), was_standing
 
     def log(self, iteration: int, **errors: float | str) -> None:
-        """Append a line; the clock stands meanwhile. FloatingPointError, naming it, for a value that is not finite."""
+        """Append a line; the clock stands still meanwhile. FloatingPointError naming a value that is not finite."""
         for name, value in errors.items():
             if not isinstance(value, str) and not isfinite(value):
                 raise FloatingPointError(f"step {iteration}: {name} is {value}")
@@ -124,7 +127,7 @@ def decibels(squared_error: float) -> float:
 
 
 def log_spaced(iteration: int, last: int, per_octave: int = 2, first: int = 1) -> bool:
-    """True at iterations 0, 1 and `last`, and `per_octave` times in each doubling from `first` on: when to measure."""
+    """Is it time to measure? True at iterations 0, 1 and `last`, and `per_octave` times per doubling from `first`."""
     if iteration in (0, 1, last):
         return True
     step = lambda i: floor(log2(i) * per_octave)
@@ -134,14 +137,14 @@ def log_spaced(iteration: int, last: int, per_octave: int = 2, first: int = 1) -
 def affordable(
     folder: Path, asked: int, seconds: float, spent: Callable[[], float], trial: Callable[[Path, int], object]
 ) -> int:
-    """How many of `asked` steps a stage does in its `seconds`: at least a twentieth of them.
+    """The number of `asked` steps that a stage can do in its `seconds`: at least a twentieth of them.
 
-    The answer depends on the machine and its load; it is written to `folder/length.json` and read back on a resume.
+    The answer depends on the machine and its load. It is written to `folder/length.json`, and read back on a resume.
 
     Args:
         seconds: for the whole stage; 0: no limit, and nothing is measured or written.
-        spent: gives the seconds that are gone when the steps begin.
-        trial: does so many steps, a trace in the folder it is given; must leave everything else as it was.
+        spent: returns the seconds used up when the steps begin.
+        trial: runs that many steps, with a trace in the given folder; must leave everything else unchanged.
     """
     if not seconds:
         return asked
@@ -151,21 +154,22 @@ def affordable(
     tried = folder / ".trial"
     shutil.rmtree(tried, ignore_errors=True)  # of a run that was killed
     tried.mkdir(parents=True)
-    trial(tried, TRIAL)
+    trial(tried, TRIAL_STEPS)
     at = {line["iteration"]: line["seconds"] for line in read_trace(tried / "trace.jsonl")}
     shutil.rmtree(tried)
-    step = (at[TRIAL] - at[1]) / (TRIAL - 1)  # the first step compiles and fills caches
+    step = (at[TRIAL_STEPS] - at[1]) / (TRIAL_STEPS - 1)  # the first step compiles and fills caches
     steps = min(asked, max(-(-asked // 20), int((seconds - spent()) / max(step, 1e-9))))
-    said = {"steps": steps, "of": asked, "seconds_per_step": step, "seconds": seconds}
+    record = {"steps": steps, "of": asked, "seconds_per_step": step, "seconds": seconds}
     partial = path.with_suffix(".writing")
-    partial.write_text(json.dumps(said) + "\n")
+    partial.write_text(json.dumps(record) + "\n")
     os.replace(partial, path)
     print(f"{steps} of {asked} steps fit into {seconds:.0f} s, at {step:.3g} s each", flush=True)
     return steps
 
 
 def progress(total: int, label: str, start: int = 0) -> Iterator[int]:
-    """`range(start, total)` with a bar that shows the time left; one line every few seconds where no one watches."""
+    """`range(start, total)` with a progress bar and the remaining time; where output is no terminal, one line every few
+    seconds."""
     from tqdm import tqdm
 
     watched = sys.stderr.isatty()

@@ -23,7 +23,7 @@ class Camera:
         width, height: image size in pixels.
         fx, fy, cx, cy: focal lengths and principal point in pixels.
         world_to_camera: [4, 4] float64 rigid transform; the camera looks along +z, x right, y down.
-        every: 1; of a view `sampled` from another, how many of that one's pixels lie from one pixel to the next.
+        every: 1; for a view `sampled` from another, the distance of its pixels in pixels of that view.
     """
 
     name: str
@@ -48,15 +48,15 @@ class Camera:
         return -rotation.T @ translation
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view sampled at another size."""
+        """The same view at another resolution."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
     def sampled(self, every: int, left: int, top: int) -> Camera:
-        """Every so manieth pixel of this view each way, from (left, top) on: what is drawn is what is drawn there, with
-        Gaussians as wide as in this view."""
+        """Every `every`-th pixel of this view in both directions, from (left, top) on. A rendering has the same values
+        at these pixels, since Gaussians keep the width that they have in this view."""
         sparse = lambda at, first: (at - first - 0.5) / every + 0.5  # the centre of the first pixel stays at 0.5
         return replace(
             self,
@@ -70,7 +70,7 @@ class Camera:
         )
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
-        """The window of this view whose upper left pixel is (left, top); it may reach outside the image."""
+        """The window of this view whose upper left pixel is (left, top); it may extend beyond the image."""
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
 
@@ -97,7 +97,7 @@ class Similarity:
 
 @dataclass(frozen=True)
 class Scene:
-    """What the `poses` stage leaves behind: pinhole cameras and sparse points in the normalised frame.
+    """The result of the `poses` stage: pinhole cameras and sparse points in the normalised frame.
 
     Attributes:
         cameras: view name -> Camera, sorted by name.
@@ -107,8 +107,8 @@ class Scene:
         point_colors: [P, 3] uint8.
         similarity: from the scene's own frame to this one.
         blank: names of further views, without pixels: they are distilled, and supervise nothing.
-        suspects: names of the views here whose photographs contradict their poses.
-        outliers: names of the views that were left out for it; they have no camera here.
+        suspects: names of views that stay although their photographs contradict their poses.
+        outliers: names of the views that were left out for that reason; they have no camera here.
     """
 
     cameras: dict[str, Camera]
@@ -132,10 +132,10 @@ class Gaussians:
         quaternions: [N, 4], wxyz, any length (a zero quaternion is the identity).
         log_scales: [N, 3], natural logarithm of the standard deviations.
         opacity_logits: [N].
-        sh: [N, K, 3] spherical harmonics, K = (degree + 1)^2 in {1, 4, 9, 16}; colour = 0.5 + sum_k Y_k sh_k,
-            clamped from below at 0.
-        antialiased: how they are meant to be drawn: what the low-pass widens loses opacity in proportion
-            (Mip-Splatting's 2D filter), so that a Gaussian adds up to the same from any distance. 3DGS: no.
+        sh: [N, K, 3] spherical harmonics, K = (degree + 1)^2 in {1, 4, 9, 16}; colour = 0.5 + sum_k Y_k sh_k, clamped
+            from below at 0.
+        antialiased: they are meant for rendering with Mip-Splatting's 2D filter: what the low-pass widens loses opacity
+            in proportion, so that a Gaussian adds up to the same from any distance. 3DGS: no.
     """
 
     means: Tensor
@@ -157,7 +157,7 @@ class Gaussians:
         return Gaussians(*(function(getattr(self, name)) for name in PARAMETERS), antialiased=self.antialiased)
 
     def zipped(self, other: Gaussians, function: Callable[[Tensor, Tensor], Tensor]) -> Gaussians:
-        """`function` applied to each pair of parameters, e.g. concatenation; drawn as `self` is."""
+        """`function` applied to each pair of parameters, e.g. concatenation; `antialiased` is that of `self`."""
         pairs = ((getattr(self, name), getattr(other, name)) for name in PARAMETERS)
         return Gaussians(*(function(*pair) for pair in pairs), antialiased=self.antialiased)
 
@@ -166,7 +166,7 @@ PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 
 class Rendering(NamedTuple):
-    """What `splat.render` returns; every tensor is differentiable in the Gaussians unless said otherwise.
+    """The result of `splat.render`; every tensor is differentiable in the Gaussians unless stated otherwise.
 
     Attributes:
         color: [H, W, 3], background included.
@@ -190,8 +190,8 @@ class MaskSet:
     Attributes:
         raw: the given 2D mask (all False where none was given).
         consistent: C, rendered back from the labelled Gaussians; it must not supervise.
-        unobserved: U, inside C: no other photograph shows what is to be seen there.
-        invent: I, the pixels to be made up: U, and the region the scene asks to fill.
+        unobserved: U, inside C: no other photograph shows what is visible there without the object.
+        invent: I, the pixels to be invented: U, and the region the scene asks to fill.
     """
 
     raw: np.ndarray
@@ -208,9 +208,9 @@ class Reference:
         camera: the view.
         image: [H, W, 3] uint8.
         mask: [H, W] bool, the pixels the reference stands for (the view's invent mask).
-        depth: [H, W] float32 as the scene brings it, depth or disparity of any scale and offset, in this frame's unit
-            where it was in the scene's, NaN where it says nothing (`alignment.align_either` brings it to the scene);
-            None where it brings none.
+        depth: [H, W] float32, depth or disparity of any scale and offset, in the unit of the normalised frame where the
+            scene's was its own, NaN where unknown (`alignment.align_either` aligns it with the scene); None where the
+            scene brings none.
     """
 
     camera: Camera

@@ -1,4 +1,4 @@
-"""poses: pictures without distortion, cameras and sparse points in the normalised frame, the split."""
+"""poses: undistorted pictures, cameras and sparse points in the normalised frame, and the roles of the views."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from reffusion.capture.checks import sanity
 from reffusion.capture.checks.pose_check import check_poses, judge
 from reffusion.capture.layouts import cameras, ring
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.lens import undoing
+from reffusion.capture.lens import undistortion_map
 from reffusion.capture.lenses import save_lenses
-from reffusion.capture.refine import refined
+from reffusion.capture.refine import refine_cameras
 from reffusion.capture.roles import Roles
-from reffusion.capture.scene_folder import check_brought, read_scene, unphotographed
-from reffusion.capture.undistort import fitting_size, lens_of, load_at, save_undistorted
+from reffusion.capture.scene_folder import check_gaussian_files, is_gaussians_only, read_scene
+from reffusion.capture.undistort import fitting_size, load_resized, resized_lens, save_undistorted_view
 from reffusion.capture.views import check_outliers
 from reffusion.gaussians import matching
 from reffusion.io.arrays import save_json, save_labels
@@ -34,48 +34,50 @@ from reffusion.params.reference import reference_list
 from reffusion.splat.conventions import SH0
 from reffusion.types import Scene
 
-LEAST_POINTS = 100  # with fewer sparse points, some of optical flow are added to them
-MORE_POINTS = 10_000  # how many at most; random ones, where flow finds too few
+LEAST_POINTS = 100  # with fewer sparse points, some from optical flow are added
+MORE_POINTS = 10_000  # at most, that are added; random ones, where flow finds too few
 SEED = 0
-SOLVED = "sfm.json"  # `sfm.Solution.facts`
+SFM_FACTS = "sfm.json"  # `sfm.Reconstruction.facts`
 
 
 def run(params: Params, out: Path, *, scene: Path) -> None:
     """Write images/, sparse/0/, lenses.json, transform.json, views.json; refine.json where cameras were adjusted;
     gaussians.ply and deleted.npy where the scene brings them; warnings.json where something is odd."""
-    own = _load_own_splats(params, scene)  # before the work, not after it
-    if unphotographed(params, scene):
-        _save_unphotographed(params, out, scene, own)
+    own_splats = _load_own_splats(params, scene)  # before the work, not after it
+    if is_gaussians_only(params, scene):
+        _save_gaussians_only(params, out, scene, own_splats)
         return
     capture, roles = read_scene(params, scene, params.longest)
-    said = [*capture.warnings, *(own.notes if own else ())]
+    messages = [*capture.warnings, *(own_splats.notes if own_splats else ())]
     sizes = {name: image_size(path, upright=capture.upright) for name, path in capture.pictures.items()}
     if capture.poses is None:
-        everyone, capture = sorted(capture.pictures), _place(params, out, capture)
+        everyone, capture = sorted(capture.pictures), _run_sfm(params, out, capture)
         if lost := [name for name in everyone if name not in capture.pictures]:
-            said.append(f"{len(lost)} views were not placed and are left out: {', '.join(lost)}")
-        roles = roles.among(set(capture.pictures))
+            messages.append(f"{len(lost)} views were not placed and are left out: {', '.join(lost)}")
+        roles = roles.restrict(set(capture.pictures))
     views, longest = sorted({*roles.train, *roles.test}), _supported_size(params, capture, roles)
     lenses, pinholes = {}, {}
     for k in trace.progress(len(views), "poses"):
-        lenses[views[k]], pinholes[views[k]] = save_undistorted(out, views[k], capture, longest)
+        lenses[views[k]], pinholes[views[k]] = save_undistorted_view(out, views[k], capture, longest)
     for name in roles.blank:
-        lenses[name], pinholes[name] = lens_of(name, capture, longest)
-    normalised = frame.normalised(capture.poses, pinholes, roles.train, roles.test, roles.clean)
-    normalised, contradictions = _drop_outliers(params, roles, replace(normalised, blank=roles.blank), out)
-    views = [name for name in views if name in normalised.cameras]
-    lenses, pinholes = ({n: each[n] for n in each if n in normalised.cameras} for each in (lenses, pinholes))
+        lenses[name], pinholes[name] = resized_lens(name, capture, longest)
+    normalized = frame.normalize_scene(capture.poses, pinholes, roles.train, roles.test, roles.clean)
+    normalized, contradictions = _drop_outliers(params, roles, replace(normalized, blank=roles.blank), out)
+    views = [name for name in views if name in normalized.cameras]
+    lenses, pinholes = ({n: each[n] for n in each if n in normalized.cameras} for each in (lenses, pinholes))
     save_lenses(out, lenses, capture.upright, {name: sizes[name] for name in lenses})
-    _save_warnings(out, [*said, *contradictions, *_oddities(normalised, out)])
-    if len(normalised.points) < LEAST_POINTS:
-        ranges = frame.ranges_of(capture.poses, pinholes) * normalised.similarity.scale
+    _save_warnings(out, [*messages, *contradictions, *_oddities(normalized, out)])
+    if len(normalized.points) < LEAST_POINTS:
+        ranges = frame.view_depth_ranges(capture.poses, pinholes) * normalized.similarity.scale
         draws = seeding.generator(SEED, "poses", "random points")
-        shown = replace(normalised, cameras={name: normalised.cameras[name] for name in views})
-        filled = frame.filled_up(shown, ranges[: len(views)], MORE_POINTS, draws, lambda v: load_views(out, [v])[v])
-        normalised = replace(filled, cameras=normalised.cameras)
-    save_scene(out, normalised)
-    if own is not None:
-        _save_own_splats(out, normalised, own)
+        shown = replace(normalized, cameras={name: normalized.cameras[name] for name in views})
+        filled = frame.add_random_points(
+            shown, ranges[: len(views)], MORE_POINTS, draws, lambda v: load_views(out, [v])[v]
+        )
+        normalized = replace(filled, cameras=normalized.cameras)
+    save_scene(out, normalized)
+    if own_splats is not None:
+        _save_own_splats(out, normalized, own_splats)
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ class OwnSplats:
 
     Attributes:
         splats: in the scene's own frame; properties: of its .ply, in order.
-        deleted: bool [N], those that `cleaned` lacks; None where the scene has none.
+        deleted: bool [N], those that `cleaned` lacks; None where the scene has no such file.
         notes: sentences about both files.
     """
 
@@ -95,28 +97,28 @@ class OwnSplats:
 
 
 def _load_own_splats(params: Params, scene: Path) -> OwnSplats | None:
-    """BadInput where `gaussians` or `cleaned` cannot be used. None where the scene has neither."""
-    check_brought(params, scene)
+    """The Gaussians that the scene brings, or None. BadInput where `gaussians` or `cleaned` cannot be used."""
+    check_gaussian_files(params, scene)
     if params.gaussians is None:
         return None
     path = scene / params.gaussians
     splats, deleted = load_splats(path), None
     notes = [f"{path.name}: {note}" for note in splats.notes]
     if params.cleaned is not None:
-        cleaned, said = _load_positions(scene / params.cleaned)
-        notes += [f"{params.cleaned}: {note}" for note in said]
-        deleted = _deleted((path, scene / params.cleaned), splats.rows.means, cleaned)
+        cleaned, messages = _load_positions(scene / params.cleaned)
+        notes += [f"{params.cleaned}: {note}" for note in messages]
+        deleted = _find_deleted((path, scene / params.cleaned), splats.rows.means, cleaned)
     return OwnSplats(splats, properties_of(path), deleted, tuple(notes))
 
 
 def _load_positions(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    """[M, 3], and what reading changed: the rest of millions of splats is not held while they are matched."""
+    """[M, 3], and what reading changed. The other parameters of millions of splats are freed before matching."""
     splats = load_splats(path)
     return splats.rows.means, splats.notes
 
 
-def _deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -> np.ndarray:
-    """bool [N], those of the whole scene's positions [N, 3] that the cleaned scene's [M, 3] lack."""
+def _find_deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -> np.ndarray:
+    """bool [N]: which of the whole scene's positions [N, 3] are missing from the cleaned scene's [M, 3]."""
     match = matching.match_gaussians(whole, cleaned)
     if match.found < matching.MIN_MATCHED_SHARE:
         raise BadInput(
@@ -131,72 +133,76 @@ def _deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -
     return match.deleted
 
 
-def _save_own_splats(out: Path, placed: Scene, own: OwnSplats) -> None:
-    """The scene's own Gaussians in the normalised frame, properties in the order of its file, and which of them were
+def _save_own_splats(out: Path, placed: Scene, own_splats: OwnSplats) -> None:
+    """Write the scene's own Gaussians in the normalised frame, with properties in the order of its file, and which were
     deleted."""
-    save_ply(out / "gaussians.ply", own.splats.gaussians(placed.similarity), properties=own.properties)
-    if own.deleted is not None:
-        save_labels(out / "deleted.npy", own.deleted)
+    save_ply(out / "gaussians.ply", own_splats.splats.gaussians(placed.similarity), properties=own_splats.properties)
+    if own_splats.deleted is not None:
+        save_labels(out / "deleted.npy", own_splats.deleted)
 
 
-def _save_unphotographed(params: Params, out: Path, scene: Path, own: OwnSplats) -> None:
-    """The same without photographs: cameras that a capture left, or some around the hole; nothing in images/."""
-    rows, found = own.splats.rows, cameras.read(scene)
+def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: OwnSplats) -> None:
+    """The stage for a scene without photographs: cameras that a capture left, or some around the hole; nothing in
+    images/."""
+    rows, found = own_splats.splats.rows, cameras.read(scene)
     means, opaque, sizes = rows.means, rows.opacity_logits > 0, np.exp(np.median(rows.log_scales, axis=1))
-    poses, source = found or (ring.cameras_around(means, sizes, opaque, own.deleted, params.longest), None)
+    poses, source = found or (ring.place_cameras(means, sizes, opaque, own_splats.deleted, params.longest), None)
     some = np.flatnonzero(opaque)
     draws = seeding.generator(SEED, "poses", "points of Gaussians")
     some = some[torch.randperm(len(some), generator=draws)[:MORE_POINTS].numpy()]
     colors = (255 * (0.5 + SH0 * rows.sh[some, 0]).clip(0, 1)).round().astype(np.uint8)
     poses = replace(poses, points=means[some], colors=colors)
     at = {n: each.resized(*fitting_size(each.width, each.height, params.longest)) for n, each in poses.lenses.items()}
-    pinholes = {name: undoing(lens)[0] for name, lens in at.items()}
-    placed = frame.normalised(poses, pinholes, sorted(pinholes), (), frozenset())
+    pinholes = {name: undistortion_map(lens)[0] for name, lens in at.items()}
+    placed = frame.normalize_scene(poses, pinholes, sorted(pinholes), (), frozenset())
     save_lenses(out, pinholes, False, {n: (each.width, each.height) for n, each in pinholes.items()})
     where = f"the {len(pinholes)} cameras of {source}" if source else f"{len(pinholes)} cameras around the hole"
     _save_warnings(out, [
         f"no photographs: {where} look at renders of {params.gaussians} instead; what it does not hold, or holds "
         "blurred, stays so: with photographs results are sharper",
-        *own.notes,
+        *own_splats.notes,
     ])  # fmt: skip
     save_scene(out, placed)
-    _save_own_splats(out, placed, own)
+    _save_own_splats(out, placed, own_splats)
 
 
 def _drop_outliers(params: Params, roles: Roles, scene: Scene, out: Path) -> tuple[Scene, list[str]]:
-    """The scene without the training views whose photographs contradict their poses, adjusted to the others; and
-    sentences about them."""
-    # Where there are no sparse points, those of flow tie the views together.
-    tied = scene if len(scene.points) >= LEAST_POINTS else _adjust_cameras(params, scene, out)
-    shown = [camera for name, camera in tied.cameras.items() if name not in tied.blank]
-    check = check_poses(shown, tied.points, lambda name: load_views(out, [name])[name])
-    verdict = judge(check, tied, roles.keep, params.exclude)
+    """Leave out the training views whose photographs contradict their poses, and adjust the cameras of the others.
+
+    Returns:
+        the scene, and sentences about these views.
+    """
+    # Without sparse points, those of flow connect the views.
+    connected = scene if len(scene.points) >= LEAST_POINTS else _adjust_cameras(params, scene, out)
+    shown = [camera for name, camera in connected.cameras.items() if name not in connected.blank]
+    check = check_poses(shown, connected.points, lambda name: load_views(out, [name])[name])
+    verdict = judge(check, connected, roles.keep, params.exclude)
     check_outliers("reference", [each.view for each in reference_list(params.reference)], verdict.outliers)
     check_outliers("clicks", params.clicks or (), verdict.outliers)
     if params.region is not None and params.region.view is not None:
         check_outliers("region", [params.region.view], verdict.outliers)
-    if verdict.outliers or tied is scene:
-        tied = _adjust_cameras(params, verdict.applied_to(scene), out)
-    return replace(tied, suspects=verdict.suspects), list(verdict.sentences)
+    if verdict.outliers or connected is scene:
+        connected = _adjust_cameras(params, verdict.apply(scene), out)
+    return replace(connected, suspects=verdict.suspects), list(verdict.sentences)
 
 
 def _adjust_cameras(params: Params, scene: Scene, out: Path) -> Scene:
-    """The scene with cameras that agree with flow, and with points of flow where it has few."""
+    """The scene with cameras adjusted to flow where asked for, and with points of flow where it has few."""
     if params.refine and params.gaussians is None:  # Gaussians that the scene brings were fitted with its cameras
-        scene = _refined(scene, out)
-    return scene if len(scene.points) >= LEAST_POINTS else _with_flow_points(scene, out)
+        scene = _refine_cameras(scene, out)
+    return scene if len(scene.points) >= LEAST_POINTS else _add_flow_points(scene, out)
 
 
 def _oddities(scene: Scene, out: Path) -> list[str]:
     return sanity.find_odd_exposures(scene, lambda name: load_views(out, [name])[name])
 
 
-def _save_warnings(out: Path, said: list[str]) -> None:
-    """Say them, and keep them for `make check` and for runs that find this stage done."""
-    for line in said:
+def _save_warnings(out: Path, messages: list[str]) -> None:
+    """Print warnings, and keep them for `make check` and for runs that find this stage done."""
+    for line in messages:
         warnings.warn(line, stacklevel=1)
-    if said:
-        save_json(out / WARNINGS, said)
+    if messages:
+        save_json(out / WARNINGS, messages)
 
 
 def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
@@ -204,18 +210,18 @@ def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
     if params.detail == 0:
         return params.longest
     chosen = roles.train[:: max(1, len(roles.train) // 8)]
-    images = [load_at(capture.pictures[name], params.longest, capture.upright) for name in chosen]
-    if not image_detail.enlarged(images, params.detail):
+    images = [load_resized(capture.pictures[name], params.longest, capture.upright) for name in chosen]
+    if not image_detail.is_enlarged(images, params.detail):
         return params.longest
     side = max(max(image.shape[:2]) for image in images)
     print(f"pictures of {side} px show no more than {side // 2} px would: taken at that size", flush=True)
     return side // 2
 
 
-def _refined(scene: Scene, out: Path) -> Scene:
-    """The scene with cameras that agree with optical flow; test views too, as they are in structure from motion."""
+def _refine_cameras(scene: Scene, out: Path) -> Scene:
+    """The scene with cameras adjusted to optical flow, test views too, as in structure from motion."""
     shown = {name: camera for name, camera in scene.cameras.items() if name not in scene.blank}
-    found = refined(list(shown.values()), load_views(out, shown))
+    found = refine_cameras(list(shown.values()), load_views(out, shown))
     if np.isnan(found.before):
         print("cameras as given: optical flow matches nothing between the views", flush=True)
     elif found.after is None:
@@ -227,8 +233,8 @@ def _refined(scene: Scene, out: Path) -> Scene:
     return replace(scene, cameras=scene.cameras | found.cameras)
 
 
-def _with_flow_points(scene: Scene, out: Path) -> Scene:
-    """The scene with points that its training views' optical flow shows."""
+def _add_flow_points(scene: Scene, out: Path) -> Scene:
+    """The scene with points triangulated from its training views' optical flow."""
     cameras = [scene.cameras[name] for name in scene.train]
     pixels = sum(camera.width * camera.height for camera in cameras)
     cell = max(2, round((pixels / MORE_POINTS / 4) ** 0.5))  # most views' points were seen by another already
@@ -244,10 +250,10 @@ def _with_flow_points(scene: Scene, out: Path) -> Scene:
     )
 
 
-def _place(params: Params, out: Path, capture: Capture) -> Capture:
-    """The capture with poses by structure from motion, of the views that it places."""
-    found = sfm.solve(capture.pictures, params.longest, out / "sfm", SEED)
+def _run_sfm(params: Params, out: Path, capture: Capture) -> Capture:
+    """The capture with poses by structure from motion, reduced to the views that were placed."""
+    found = sfm.reconstruct(capture.pictures, params.longest, out / "sfm", SEED)
     facts = found.facts()
     print(facts["summary"], flush=True)
-    save_json(out / SOLVED, facts)
+    save_json(out / SFM_FACTS, facts)
     return replace(capture, pictures={name: capture.pictures[name] for name in found.poses.lenses}, poses=found.poses)

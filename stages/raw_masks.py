@@ -1,6 +1,6 @@
-"""raw_masks: the masks that a scene brings, as its undistorted views lie; the region to change.
+"""raw_masks: the masks that a scene brings, undistorted like its views; and the region to change.
 
-They are no part of `poses`, so new masks move no camera and run no structure from motion again.
+They are not part of `poses`, so new masks rerun neither cameras nor structure from motion.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from pathlib import Path
 from reffusion import trace
 from reffusion.capture.checks.sanity import find_odd_masks
 from reffusion.capture.lenses import load_lenses
-from reffusion.capture.scene_folder import read_scene, unphotographed
+from reffusion.capture.scene_folder import is_gaussians_only, read_scene
 from reffusion.capture.undistort import save_undistorted_masks
-from reffusion.capture.views import check_outliers, known
+from reffusion.capture.views import check_outliers, resolve_view
 from reffusion.io.arrays import save_json
 from reffusion.io.images import image_size, save_mask
 from reffusion.io.scene import WARNINGS, load_raw_masks, load_scene
@@ -26,11 +26,11 @@ FACTS = "facts.json"
 
 def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
     """Write masks/ (with masks of several objects, masks/<object>/), test_masks/ and fill/, <view>.png each;
-    region.json where the scene names a region; facts.json, the size of the test masks' files; warnings.json where
-    masks are odd."""
+    region.json where the scene names a region; facts.json, the size of the test masks' files; warnings.json where masks
+    are odd."""
     placed, lenses = load_scene(poses), load_lenses(poses)[0]
     notes: tuple[str, ...] = ()
-    if not unphotographed(params, scene):
+    if not is_gaussians_only(params, scene):
         _, roles = read_scene(params, scene)
         names = sorted(lenses)
         for k in trace.progress(len(names), "masks"):
@@ -48,12 +48,12 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
 
 
 def _save_region(params: Params, out: Path, scene: Scene) -> None:
-    """Write the region as region.json, or masks of what lies outside it."""
+    """Write the region as region.json, or as masks of what lies outside it."""
     region, scale = params.region, scene.similarity.scale
     if region.view is not None:
         check_outliers("region", [region.view], scene.outliers)
         center = regions.point_on_axis(
-            scene.cameras[known(region.view, scene.cameras, "region")], region.distance * scale
+            scene.cameras[resolve_view(region.view, scene.cameras, "region")], region.distance * scale
         )
     else:
         center = scene.similarity.apply(region.center)

@@ -27,7 +27,7 @@ from small_capture import (
     write_transforms,
 )
 
-from reffusion.capture.lens import sampling_map, without_distortion
+from reffusion.capture.lens import sampling_map, undistorted_pinhole
 from reffusion.capture.scene_folder import read_scene
 from reffusion.io import colmap
 from reffusion.io.arrays import load_json
@@ -53,7 +53,7 @@ def read(folder: Path, **params) -> tuple[Scene, Path, str]:
 def assert_cameras(scene: Scene, truth: Truth, views: dict[str, str]) -> None:
     """Poses and intrinsics of `views` (ours -> the truth's)."""
     assert sorted(scene.cameras) == sorted(views)
-    similarity, at = scene.similarity, without_distortion(truth.lens)
+    similarity, at = scene.similarity, undistorted_pinhole(truth.lens)
     for view, name in views.items():
         camera, pose = scene.cameras[view], truth.world_to_camera[name]
         center = similarity.invert(camera.center[None])[0]
@@ -405,7 +405,7 @@ def test_colmaps_fisheyes_without_coefficients(tmp_path, model, params, text):
         (folder / "sparse/0/cameras.bin").unlink()
     scene, _, _ = read(folder)
     assert_cameras(scene, truth, {view: view for view in truth.world_to_camera})
-    pinhole = without_distortion(truth.lens)  # a pixel of it is read where an equidistant fisheye shows its direction
+    pinhole = undistorted_pinhole(truth.lens)  # a pixel of it is read where an equidistant fisheye shows its direction
     at = sampling_map(truth.lens, pinhole)[10, 20]
     x, y = (20.5 - pinhole.cx) / pinhole.fx, (10.5 - pinhole.cy) / pinhole.fy
     stretch = np.arctan(np.hypot(x, y)) / np.hypot(x, y)

@@ -184,7 +184,7 @@ def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
         images = {n: to_uint8(rasterizer.render(scene, c).color.clamp(0, 1).numpy()) for n, c in cameras.items()}
     box = torch.arange(count) >= len(parts[0][0])
     near, mask = all_views.neighbours(scene), voting.render_labels(scene, box, cameras["middle"]) > 0.5
-    found = all_views.labelled(scene, near, cameras, {"middle": mask}, images.__getitem__)
+    found = all_views.label_gaussians(scene, near, cameras, {"middle": mask}, images.__getitem__)
     assert (found & box).sum() > 0.95 * box.sum() and (found & ~box).sum() < 0.01 * box.sum()
 
 

@@ -279,7 +279,7 @@ def test_three_made_scenes_of_spin_nerfs_layout_by_the_real_stages(tmp_path, gen
 
     for seed, name in enumerate(("1", "2", "book")):
         generate.generate(tmp_path / "data" / name, seed, generate.KINDS["mini"])
-    assert sum("8 training and 3 test views" in line for line in spinnerf.told(tmp_path / "data")) == 3
+    assert sum("8 training and 3 test views" in line for line in spinnerf.summarize_scenes(tmp_path / "data")) == 3
     small = "fit.iterations=60 personalize.steps=4 personalize.optimizer.batch=1 distill.iterations=4"
     command = [sys.executable, "-m", "reffusion.command", "compare", "--data", str(tmp_path / "data")]
     command += [

@@ -132,7 +132,7 @@ def test_test_views_are_without_the_object(generate, mini):
         photographs.path(0, kind, target, n, label) for n, label in ((kind.train, "train"), (kind.test, "test"))
     )
     middle = np.argmin(np.linalg.norm(train[:, 13:] - train[:, 13:].mean(0), axis=1))
-    world = photographs.exposed(world, train[middle], kind)
+    world = photographs.set_exposure(world, train[middle], kind)
     for k, name in enumerate(stems(mini / "images_4")[: kind.test]):
         photo = load_image(mini / f"images_4/{name}.png")
         mask = load_mask(mini / f"images_4/test_label/out_{k:05d}.png")

@@ -28,12 +28,12 @@ def small(kind):
 
 
 def shot(generate, kind, seed: int):
-    """(solids, cameras of the training views, what `photographs.photographed` makes) of a scene."""
+    """(solids, cameras of the training views, what `photographs.take_photographs` makes) of a scene."""
     import photographs
 
     furniture, target = generate.furnish(seed, kind)
     world = generate.bake(furniture, seed, kind)
-    session = photographs.photographed(seed, kind, world, target)
+    session = photographs.take_photographs(seed, kind, world, target)
     return world.solids, session.cameras[kind.test :], session
 
 

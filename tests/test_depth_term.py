@@ -322,7 +322,7 @@ def lines(folder):
 
 
 def test_interrupted_distillation_with_the_depth_term_resumes_bit_for_bit(prior, text, tmp_path, monkeypatch):
-    monkeypatch.setattr(trace, "WORTH", 0)  # a checkpoint after every step
+    monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
     whole, _ = distilled(tmp_path / "whole", prior, text, giving(WALL))
     real = D.take_step
 

@@ -217,7 +217,7 @@ def test_any_number_of_threads_gives_the_same_bits(prior, text, tmp_path, off):
 
 
 def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp_path, monkeypatch):
-    monkeypatch.setattr(trace, "WORTH", 0)  # a checkpoint after every step
+    monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
     monkeypatch.setattr(D, "REGION_EVERY", 2)
     whole, labels = run(tmp_path / "whole", prior, text)
     assert labels.sum() > wall()[1].sum(), "densification added no masked Gaussian"

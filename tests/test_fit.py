@@ -96,7 +96,7 @@ class Killed(Exception):
 
 @pytest.mark.parametrize("gains", [None, np.linspace(0.8, 1.2, 15).reshape(5, 3)], ids=["plain", "exposure"])
 def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, gains):
-    monkeypatch.setattr(trace, "WORTH", 0)  # a checkpoint after every step
+    monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
     unbroken = run(tmp_path / "unbroken", gains=gains)
     adapt, folder = fitting.control_density, tmp_path / "resumed"
     for moment in (3, 4, 13, 18):  # before the first checkpoint of a run, twice in a row, around densifications

@@ -256,11 +256,13 @@ def test_scene_round_trip_in_full_precision(tmp_path):
 def test_quaternions_survive_half_turns():
     for axis in np.eye(3):
         half_turn = 2 * np.outer(axis, axis) - np.eye(3)
-        np.testing.assert_allclose(rotations.pose_matrix(rotations.quaternion_of(half_turn), axis)[:3, :3], half_turn)
+        np.testing.assert_allclose(
+            rotations.quaternion_to_pose(rotations.rotation_to_quaternion(half_turn), axis)[:3, :3], half_turn
+        )
     generator = np.random.default_rng(1)
     for _ in range(50):
         rotation = some_rotation(generator)
-        again = rotations.pose_matrix(rotations.quaternion_of(rotation), np.zeros(3))[:3, :3]
+        again = rotations.quaternion_to_pose(rotations.rotation_to_quaternion(rotation), np.zeros(3))[:3, :3]
         np.testing.assert_allclose(again, rotation, atol=1e-15)
 
 

@@ -91,10 +91,10 @@ def test_enlarged_pictures_are_told_from_sharp_ones(filter_):
     sharp = [np.clip(128 + 45 * field / field.std(), 0, 255).astype(np.uint8) for field in fields]
     sharp = [np.repeat(picture[..., None], 3, -1) for picture in sharp]
     twice = [cv2.resize(picture, None, fx=2, fy=2, interpolation=filter_) for picture in sharp]
-    assert not image_detail.enlarged(sharp, 0.1)
-    assert image_detail.enlarged(twice, 0.1)
-    assert not image_detail.enlarged(twice, 0.0)  # never
-    assert not image_detail.enlarged([np.full((64, 64, 3), 7, np.uint8)], 0.1)  # plain: nothing says that it was
+    assert not image_detail.is_enlarged(sharp, 0.1)
+    assert image_detail.is_enlarged(twice, 0.1)
+    assert not image_detail.is_enlarged(twice, 0.0)  # never
+    assert not image_detail.is_enlarged([np.full((64, 64, 3), 7, np.uint8)], 0.1)  # plain: nothing says that it was
 
 
 def test_no_more_harmonics_than_views():

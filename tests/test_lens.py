@@ -70,7 +70,7 @@ def test_masks_follow_the_image_through_the_lens(tmp_path):
 @pytest.mark.parametrize("model", [RADIAL, OPENCV, FISHEYE], ids=lambda m: m[0])
 def test_no_border_is_left_and_little_is_cropped(model):
     whole = lens.from_colmap(model[0], WIDTH, HEIGHT, model[1])
-    where = lens.sampling_map(whole, lens.without_distortion(whole))
+    where = lens.sampling_map(whole, lens.undistorted_pinhole(whole))
     assert where.min() >= 0 and (where <= (WIDTH, HEIGHT)).all()
     touches = (
         where[:, 0, 0].min(),
@@ -110,6 +110,6 @@ def test_lenses_agree_with_colmap(model):
 
 def test_a_lens_that_folds_over_is_refused():
     with pytest.raises(ValueError, match="cannot be undone"):
-        lens.without_distortion(lens.from_colmap("SIMPLE_RADIAL", WIDTH, HEIGHT, (40.0, 48.0, 36.0, -0.5)))
+        lens.undistorted_pinhole(lens.from_colmap("SIMPLE_RADIAL", WIDTH, HEIGHT, (40.0, 48.0, 36.0, -0.5)))
     with pytest.raises(ValueError, match="FOV"):
         lens.from_colmap("FOV", WIDTH, HEIGHT, (40.0, 40.0, 48.0, 36.0, 0.9))

@@ -71,9 +71,11 @@ def test_masks_of_a_small_object_in_a_deep_scene_agree():
     points = directions * np.geomspace(0.5, 40, 40_000)[:, None]
     colours = np.zeros((40_000, 3), np.uint8)
     scene = Scene(cameras, tuple(cameras), (), frozenset(), points, colours, Similarity(1.0, np.zeros(3)))
-    assert sanity._disagreeing(scene, masks) == []
+    assert sanity._warn_inconsistent(scene, masks) == []
     moved = masks | {"v4": np.roll(masks["v4"], 20, 0)}
-    assert sanity._disagreeing(scene, moved) == ["the mask of v4 shows something else than those of the other views do"]
+    assert sanity._warn_inconsistent(scene, moved) == [
+        "the mask of v4 shows something else than those of the other views do"
+    ]
 
 
 def test_exposure_that_jumps(brought):

@@ -275,7 +275,7 @@ def test_state_continues_bit_for_bit():
 def test_the_mean_of_what_was_remembered():
     """It loses the rows that are lost, survives a checkpoint, and ends where Gaussians are added."""
     optimizer, seen = GaussianOptimizer(random_gaussians(6)), []
-    optimizer.take_mean()  # of nothing: nothing changes
+    optimizer.apply_mean()  # of nothing: nothing changes
     for step in range(4):
         pretend_gradients(optimizer, step)
         optimizer.step(0.0)
@@ -286,13 +286,13 @@ def test_the_mean_of_what_was_remembered():
     optimizer.select(keep)
     other = GaussianOptimizer(random_gaussians(4))
     other.load_state_dict(optimizer.state_dict())
-    other.take_mean()
+    other.apply_mean()
     for name in PARAMETERS:
         mean = torch.stack([getattr(each, name).double() for each in seen]).mean(0)[keep]
         assert torch.allclose(getattr(other.gaussians, name).double(), mean, atol=1e-6), name
     last = optimizer.gaussians.means.detach().clone()
     optimizer.append(random_gaussians(2), torch.zeros(2, dtype=torch.bool))
-    optimizer.take_mean()
+    optimizer.apply_mean()
     assert torch.equal(optimizer.gaussians.means[:4], last)
 
 

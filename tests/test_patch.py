@@ -191,7 +191,7 @@ def test_a_walled_in_hole_is_in_sight_from_nowhere():
     means = np.concatenate([hole, shell])
     deleted = np.arange(len(means)) < len(hole)
     with pytest.raises(ValueError, match=r"bring cameras"):
-        ring.cameras_around(means, np.full(len(means), 0.05), np.ones(len(means), bool), deleted, 64)
+        ring.place_cameras(means, np.full(len(means), 0.05), np.ones(len(means), bool), deleted, 64)
 
 
 # ---------------------------------------------------------------------------------------------- the stage `masks`

@@ -201,7 +201,7 @@ def room(*walls: str) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("walls", [(), ("back",), ("back", "left")])
 def test_cameras_of_an_open_room_stand_in_it(walls):
     means, deleted = room(*walls)
-    found = ring.cameras_around(means, np.full(len(means), 0.02), np.ones(len(means), bool), deleted, 96)
+    found = ring.place_cameras(means, np.full(len(means), 0.02), np.ones(len(means), bool), deleted, 96)
     assert len(found.lenses) >= 3
     for pose in found.world_to_camera.values():
         place = -pose[:3, :3].T @ pose[:3, 3]

@@ -175,7 +175,7 @@ def test_photographs_are_measured_by_and_not_learnt_from(tiny, tmp_path):
 
 
 def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch):
-    monkeypatch.setattr(trace, "WORTH", 0)  # a checkpoint after every step
+    monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
 
     def trained(folder):
         prior = small_prior()

@@ -20,7 +20,7 @@ from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import load_scene
 from reffusion.params.poses import Params
-from reffusion.params.reference import Given
+from reffusion.params.reference import ReferenceSpec
 from reffusion.references.files import load_given
 from reffusion.types import Camera
 from report import check
@@ -214,10 +214,10 @@ def test_what_scene_yaml_brings_for_such_a_view_is_refused(tmp_path):
     assert str(refused.value) == f"scene.yaml: reference: {refusal}"
     out, _ = placed(folder)
     with pytest.raises(BadInput) as refused:  # named later, when `poses` is done
-        load_given(folder, placed_views(out), Given(**reference))
+        load_given(folder, placed_views(out), ReferenceSpec(**reference))
     assert str(refused.value) == f"{folder / 'reference.png'}: {refusal}"
     out, _ = placed(folder, reference=reference, keep=[BAD])
-    assert [each.view for each in load_given(folder, placed_views(out), Given(**reference))] == [BAD]
+    assert [each.view for each in load_given(folder, placed_views(out), ReferenceSpec(**reference))] == [BAD]
 
 
 def test_a_view_is_excluded_or_kept(tmp_path):

@@ -224,7 +224,7 @@ def test_spin_nerf_folders_are_told_in_a_line_each(tmp_path):
     (tmp_path / "3/poses_bounds.npy").unlink()
     (tmp_path / "book/poses_bounds.npy").unlink()
     (tmp_path / "notes").mkdir()
-    lines = dict(line.split(": ", 1) for line in spinnerf.told(tmp_path))
+    lines = dict(line.split(": ", 1) for line in spinnerf.summarize_scenes(tmp_path))
     assert lines["1"] == "4 training and 2 test views (published: 60 and 40); images_4 96x72, images 384x288 px"
     assert "lacks images_4/test_label (no test views" in lines["2"] and "images (full size" in lines["2"]
     assert lines["3"].startswith("cannot be run: lacks poses_bounds.npy") and "4 training" in lines["book"]
@@ -232,7 +232,7 @@ def test_spin_nerf_folders_are_told_in_a_line_each(tmp_path):
     run(tmp_path / "book", longest=4 * WIDTH)  # the model stands for poses_bounds.npy
     assert image_size(tmp_path / "book_out/images/v00.png")[0] == 4 * WIDTH
     with pytest.raises(ValueError, match="no scenes of SPIn-NeRF"):
-        spinnerf.told(tmp_path / "notes")
+        spinnerf.summarize_scenes(tmp_path / "notes")
 
 
 def test_splits_from_scene_yaml(tmp_path):
@@ -457,7 +457,7 @@ def real(tmp_path: Path, name: str, **params):
 def test_statue(tmp_path):
     found = load_capture(capture("statue"))
     assert (
-        len(found.pictures) == 29 and found.brought_by.name == "poses_bounds.npy" and len(found.poses.points) == 15881
+        len(found.pictures) == 29 and found.pose_source.name == "poses_bounds.npy" and len(found.poses.points) == 15881
     )
     assert next(iter(found.poses.lenses.values())).model == "PINHOLE" and not found.warnings
     names = ["IMG_2707", "IMG_2716", "IMG_2736"]

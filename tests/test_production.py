@@ -87,7 +87,7 @@ def test_a_batch_in_parts_gives_the_same_values_and_gradients(sd2):
     noisy, condition, at = draw(3, 4, 16, 16), draw(3, 5, 16, 16), torch.tensor([10, 500, 900])
     text = diffusion.embed_text(sd2, list(crops.PROMPTS)).detach()
     found = []
-    for prior in (sd2, replace(sd2, rows=1, rows_graded=2), enable_checkpointing(sd2)):
+    for prior in (sd2, replace(sd2, rows=1, rows_with_grad=2), enable_checkpointing(sd2)):
         latents = diffusion.encode(prior, images)
         (gradient,) = torch.autograd.grad((latents * draw(*latents.shape)).sum(), images)
         with torch.no_grad():
@@ -104,7 +104,7 @@ def test_a_training_step_in_parts_is_the_same_step():
         for part in (prior.unet, prior.text_encoder):  # dropout's draws depend on the parts
             for layer in part.modules():
                 layer.p = 0.0 if isinstance(layer, torch.nn.Dropout) else getattr(layer, "p", None)
-        prior = replace(prior, rows_graded=rows)
+        prior = replace(prior, rows_with_grad=rows)
         loss = train_step(prior, optimizer, [F.reference(32)], training, 0)
         after.append((loss, [p.detach().clone() for part in trained.values() for p in part]))
     assert after[0][0] == pytest.approx(after[1][0], rel=1e-5)
@@ -219,7 +219,7 @@ def test_a_budget_chooses_the_parts(sd2):
     )
     budget = (sd2.bytes + 3.5 * one) / memory.USABLE_SHARE / 1e9
     chosen = memory.fit_to_memory(sd2, budget, "distill.memory_gb", memory.encode_one_sample)
-    assert chosen.rows_graded == 3 and chosen.rows == int(3.5 * one // answer)
+    assert chosen.rows_with_grad == 3 and chosen.rows == int(3.5 * one // answer)
     with pytest.raises(ValueError, match=r"distill.memory_gb is 0.001, but the prior takes .* raise it to"):
         memory.fit_to_memory(sd2, 1e-3, "distill.memory_gb", memory.encode_one_sample)
     assert memory.peak_bytes(lambda: memory.encode_one_sample(enable_checkpointing(sd2)), "cpu") < one
@@ -228,7 +228,7 @@ def test_a_budget_chooses_the_parts(sd2):
 def test_measuring_a_training_sample_leaves_no_gradient(sd2):
     trained, _, _ = F.trainer(sd2, 1)
     row = lambda prior: denoising.backward_one_sample(prior, [F.reference(32)], 0)
-    assert memory.fit_to_memory(sd2, 1.0, "personalize.memory_gb", row).rows_graded > 1
+    assert memory.fit_to_memory(sd2, 1.0, "personalize.memory_gb", row).rows_with_grad > 1
     assert all(p.grad is None and p.requires_grad for part in trained.values() for p in part)
 
 

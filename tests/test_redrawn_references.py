@@ -16,7 +16,7 @@ from reffusion.io.arrays import load_json, save_json
 from reffusion.io.files import BadInput
 from reffusion.io.images import save_image
 from reffusion.masks import shadows
-from reffusion.params.reference import Given
+from reffusion.params.reference import ReferenceSpec
 from reffusion.references import color, registration
 from reffusion.references.files import load_given
 
@@ -70,7 +70,9 @@ def test_another_view_of_the_scene_is_refused(parallax):
         found = registration.register(picture, photo, hole)
         assert not found.fits and found.in_place < 0.55
     same = registration.register(other_view(truth, 0.0), photo, hole)
-    assert same.fits and same.shift == pytest.approx(4, abs=0.2), "displaced by 4 px everywhere, it would be accepted"
+    assert same.fits and same.max_shift == pytest.approx(4, abs=0.2), (
+        "displaced by 4 px everywhere, it would be accepted"
+    )
 
 
 def test_another_scene_and_a_plain_picture_are_refused():
@@ -93,7 +95,7 @@ def test_what_cannot_be_compared_is_accepted_and_says_so(size, kind):
     picture = pictures.get(kind, photo)
     photo = picture.copy() if kind in ("black", "plain") else photo
     found = registration.register(picture, photo, hole)
-    assert found.fits and found.moved is None and np.isfinite([*found.gain, *found.offset, found.shift]).all()
+    assert found.fits and found.moved is None and np.isfinite([*found.gain, *found.offset, found.max_shift]).all()
     assert "plain" in str(found) or kind == "equal"
 
 
@@ -172,10 +174,10 @@ def test_a_painting_is_trusted_by_a_line_that_names_it(wall, tmp_path):
     with pytest.raises(ValueError, match=line):
         completed(wall, tmp_path / "refused")
     views = placed_views(wall["poses"])
-    of_painting = Given(view="a2", image="painted/a2.png", trust=True)
+    of_painting = ReferenceSpec(view="a2", image="painted/a2.png", trust=True)
     assert [each.trust for each in load_given(wall["scene"], views, of_painting)] == [True]
     save_image(wall["scene"] / "ref.png", small.photo(small.CAMERAS["a2"]))
-    of_another = Given(view="a2", image="ref.png", trust=True)
+    of_another = ReferenceSpec(view="a2", image="ref.png", trust=True)
     assert [each.trust for each in load_given(wall["scene"], views, of_another)] == [False]
 
 

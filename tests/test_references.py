@@ -126,7 +126,7 @@ def test_a_moved_reference_is_read_once_through_the_lens(tmp_path):
     np.save(tmp_path / "depth.npy", depth)
     given = GivenReference("v", tmp_path / "whole.png", tmp_path / "depth.npy")
     straight = load_straight_depth(given, shot, False)
-    where = lens.sampling_map(shot, lens.without_distortion(shot))
+    where = lens.sampling_map(shot, lens.undistorted_pinhole(shot))
     np.testing.assert_allclose(straight, 1 + (where[..., 0] - 0.5) / (WIDTH - 1), atol=0.6 / WIDTH)
     shifted = load_straight_depth(given, shot.pinhole, False, np.array([[1.0, 0, 4], [0, 1, 0]]))
     np.testing.assert_allclose(shifted[:, :-4], depth[:, 4:], rtol=1e-6)
@@ -499,10 +499,10 @@ def test_references_that_contradict_each_other_are_told_from_those_that_agree():
         painted[view.name] = np.round(255 * small.texture(points[..., 0], points[..., 1])).astype(np.uint8)
     holes = {view.name: view_ranking.Hole(view, hole, depth) for view in views}
     alike = [Reference(view, painted[view.name], hole) for view in views]
-    assert agreement.difference(*alike, *holes.values()) < agreement.UNLIKE / 4
+    assert agreement.color_difference(*alike, *holes.values()) < agreement.CONTRADICTION / 4
     other = replace(alike[1], image=np.where(hole[..., None], 255 - alike[1].image, alike[1].image))
     ((first, second, unlike),) = agreement.contradicting([alike[0], other], holes)
-    assert (first, second) == ("a", "b") and unlike > 2 * agreement.UNLIKE
+    assert (first, second) == ("a", "b") and unlike > 2 * agreement.CONTRADICTION
 
 
 def test_what_references_draw_before_a_scene_is_compared_at_its_own_depth():

@@ -62,20 +62,20 @@ def fewer_tracks(monkeypatch):
 
 
 @cache
-def put_right(shift: float, turn: float) -> refine.Refined:
-    return refine.refined(shaken(shift, turn), PHOTOS)
+def put_right(shift: float, turn: float) -> refine.Refinement:
+    return refine.refine_cameras(shaken(shift, turn), PHOTOS)
 
 
 def test_exact_cameras_are_left_as_they_are():
-    found = refine.refined(EXACT, PHOTOS)
-    assert found.after is None and found.before < refine.ENOUGH
+    found = refine.refine_cameras(EXACT, PHOTOS)
+    assert found.after is None and found.before < refine.GOOD_RESIDUAL
     assert all(found.cameras[view.name] is view for view in EXACT)
 
 
 @pytest.mark.parametrize(("shift", "turn"), [(1.5, 0.0), (0.0, 0.2), (1.0, 0.15)])
 def test_shaken_cameras_are_put_right(shift, turn):
     given, found = shaken(shift, turn), put_right(shift, turn)
-    assert found.before > 2 * refine.ENOUGH and found.after < 0.12
+    assert found.before > 2 * refine.GOOD_RESIDUAL and found.after < 0.12
     # where the pixels of the far and the near wall's points come to lie, against the truth
     points = np.random.default_rng(6).uniform((-0.3, -0.25, 0.6), (0.3, 0.25, 4.0), (400, 3))
 
@@ -102,7 +102,7 @@ def test_the_frame_stays_where_it_was():
 
 def test_a_view_that_shares_nothing_stays_and_hinders_nothing():
     alone = replace(camera("w", 0.0, 0.0, 0.0, np.pi), width=WIDTH)
-    found = refine.refined([*shaken(1.5, 0.0), alone], PHOTOS | {"w": PHOTOS["v0"]})
+    found = refine.refine_cameras([*shaken(1.5, 0.0), alone], PHOTOS | {"w": PHOTOS["v0"]})
     assert found.after < 0.12
     moved = found.cameras["w"]
     assert (moved.cx, moved.cy) == (alone.cx, alone.cy) and np.linalg.norm(moved.center - alone.center) < 0.05
@@ -111,12 +111,12 @@ def test_a_view_that_shares_nothing_stays_and_hinders_nothing():
 def test_a_principal_point_beyond_reason_is_not_followed():
     given = shaken(0.5, 0.0)
     given[4] = replace(given[4], cx=given[4].cx + 0.1 * WIDTH)  # a crop that nobody told of
-    found = refine.refined(given, PHOTOS)
+    found = refine.refine_cameras(given, PHOTOS)
     assert abs(found.cameras["v4"].cx - given[4].cx) < 1e-9
 
 
 def test_the_same_pictures_give_the_same_cameras():
-    first, second = put_right(1.5, 0.0).cameras, refine.refined(shaken(1.5, 0.0), PHOTOS).cameras
+    first, second = put_right(1.5, 0.0).cameras, refine.refine_cameras(shaken(1.5, 0.0), PHOTOS).cameras
     for name in first:
         assert np.array_equal(first[name].world_to_camera, second[name].world_to_camera)
         assert (first[name].cx, first[name].cy) == (second[name].cx, second[name].cy)
@@ -133,6 +133,6 @@ def test_what_no_camera_explains_moves_no_camera():
                 fields[axis] = fields[axis] + 0.45 * np.sin(k[0] * x + k[1] * y + rng.uniform(0, 6.3))
         bent = cv2.remap(picture, x + fields[0].astype(np.float32), y + fields[1].astype(np.float32), cv2.INTER_CUBIC)
         pictures[name] = bent
-    found = refine.refined(EXACT, pictures)
-    assert found.before > refine.ENOUGH and found.after is None
+    found = refine.refine_cameras(EXACT, pictures)
+    assert found.before > refine.GOOD_RESIDUAL and found.after is None
     assert all(found.cameras[view.name] is view for view in EXACT)

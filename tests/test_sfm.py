@@ -107,7 +107,7 @@ def solved_by(threads: int, photographs: dict[str, Path], work: Path) -> Poses:
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        return sfm.solve(photographs, 640, work / "work", seed=0).poses
+        return sfm.reconstruct(photographs, 640, work / "work", seed=0).poses
     finally:
         torch.set_num_threads(before)
 
@@ -195,7 +195,7 @@ def test_which_views_share_a_lens(tmp_path):
 
     taken = {"a": (ACROSS, 28), "b": (ACROSS, 28), "c": (UPRIGHT, 28), "d": (ACROSS, 56), "e": (UPRIGHT, None)}
     taken |= {"f": ((150, 150), 28), "g": (ACROSS, None)}
-    groups = sfm.lens_groups({n: written(f"{n}.webp", *how) for n, how in taken.items()}, tmp_path)
+    groups = sfm.group_by_lens({n: written(f"{n}.webp", *how) for n, how in taken.items()}, tmp_path)
     assert [group for group, _ in groups] == [["f"], ["e", "g"], ["a", "b", "c"], ["d"]]
     film = 1.25 / 43.27  # of a 4:3 picture: the longer side over the diagonal, over the film's diagonal in mm
     assert [focal for _, focal in groups][1:] == [None, pytest.approx(28 * film, 1e-3), pytest.approx(56 * film, 1e-3)]
@@ -210,7 +210,7 @@ def test_focal_length_from_exif(tmp_path, ending):
         exif[0x010F], exif[0x0110] = maker, model
         exif.get_ifd(0x8769).update({int(tag[1:], 16): value for tag, value in tags.items()})
         Image.new("RGB", (360, 240)).save(path, exif=exif.tobytes())
-        return sfm.focal_of(path, tmp_path)
+        return sfm.relative_focal_length(path, tmp_path)
 
     assert focal(xA405=28) == pytest.approx(28 / 36, rel=0.01)
     # 18 mm of a camera whose sensor COLMAP knows, 23.6 mm wide; of one whose resolution is in the file

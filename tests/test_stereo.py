@@ -47,7 +47,7 @@ def test_exact_matches_give_exact_depths():
     depth, known = stereo.triangulate(matches, BY_NAME)
     assert known.all()
     np.testing.assert_allclose(depth, points[:, 2] + 1, rtol=1e-6)
-    assert np.abs(stereo.misses(matches, BY_NAME, depth)).max() < 1e-3
+    assert np.abs(stereo.flow_residuals(matches, BY_NAME, depth)).max() < 1e-3
     np.testing.assert_allclose(stereo.unproject(CAMERAS[0], matches.pixels, depth), points, atol=1e-5)
 
 

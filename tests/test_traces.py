@@ -225,7 +225,7 @@ def test_a_slow_disk_does_not_hold_a_stage_up(ready, tmp_path, monkeypatch, stag
 
 @pytest.mark.parametrize("stage", list(KILLED))
 def test_a_stage_gives_the_same_after_a_kill(ready, tmp_path, monkeypatch, stage):
-    monkeypatch.setattr(trace, "WORTH", 0)  # a checkpoint after every step
+    monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
     module, name, position = KILLED[stage]
     often = {"checkpoint_seconds": 1e-9}
     whole = run(stage, ready, tmp_path / "whole", **often)

@@ -150,7 +150,7 @@ def test_photographs_of_a_phone(tmp_path):
     picture = load_image(path)
     assert picture.shape == (64, 48, 3) and image_size(path, upright=True) == (48, 64)
     assert np.abs(picture[[2, 2, -3, -3], [2, -3, 2, -3]].astype(int).argmax(-1) - (1, 0, 2, 0)).max() == 0
-    assert sfm.focal_of(path, tmp_path) is None
+    assert sfm.relative_focal_length(path, tmp_path) is None
     path.write_bytes(base64.b64decode(PHONE)[:400])
     with pytest.raises(BadInput, match=r"IMG_1.HEIC: not a readable image"):
         load_image(path)

@@ -64,7 +64,7 @@ def personalization(bench: Bench) -> dict[str, Any]:
     values = bench.measure(lambda: {"loss": train_step(prior, optimizer, [picture], training, 0)})
     moved = sum(float(p.detach().abs().sum()) for p in trained["text"])
     bench.forget_prior()  # it has LoRA layers now
-    return values | {"batch": bench.sizes.batch, "rows": prior.rows_graded, "lora_text": moved, "weights": source}
+    return values | {"batch": bench.sizes.batch, "rows": prior.rows_with_grad, "lora_text": moved, "weights": source}
 
 
 def prior_and_prompts(bench: Bench) -> tuple[Prior, Tensor, str]:

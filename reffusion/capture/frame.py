@@ -1,4 +1,4 @@
-"""The normalised frame: which similarity brings a scene to it, and points for scenes that bring few."""
+"""The normalised frame: the similarity that brings a scene to it, and random points for scenes with few."""
 
 from __future__ import annotations
 
@@ -23,17 +23,19 @@ def depth_ranges(
 ) -> np.ndarray:
     """Near, typical and far camera depth of every view, [V, 3] float64 in the scene's units, all positive.
 
-    From the points inside the view (1st, 50th and 99th percentile) where there are at least 10; else from the
-    LLFF bounds (typical: the mean in disparity); else from where the optical axes meet (a third and four times of
-    it are near and far); where the axes are parallel or meet behind, from three times the cameras' spread.
+    The first of these that is available:
+    - the points inside the view (1st, 50th and 99th percentile), where there are at least 10;
+    - the LLFF bounds (typical: the mean in disparity);
+    - the point where the optical axes meet (near and far: a third and four times its depth);
+    - where the axes are parallel or meet behind the cameras, three times the cameras' spread.
 
     Args:
         world_to_camera: [V, 4, 4]. points: [P, 3]. bounds: [V, 2] near and far, or None.
 
     Raises:
-        BadInput: where nothing tells the depth: no points, no bounds, and all cameras at one place.
+        BadInput: there are no points, no bounds, and all cameras are at one place, so no depth can be estimated.
     """
-    guess = _depths_of_axes(world_to_camera) if bounds is None else None
+    guess = _axis_intersection_depths(world_to_camera) if bounds is None else None
     ranges = np.empty((len(lenses), 3))
     for k, (pose, lens) in enumerate(zip(world_to_camera, lenses, strict=True)):
         z = depths_in_view(points, pose, lens)
@@ -52,7 +54,7 @@ def depth_ranges(
 
 
 def depths_in_view(points: np.ndarray, world_to_camera: np.ndarray, lens: Lens) -> np.ndarray:
-    """Camera depths [Q] of the points [P, 3] that fall inside the picture (distortion ignored)."""
+    """Camera depths [Q] of those of the points [P, 3] that fall inside the picture, distortion ignored."""
     at = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
     at = at[at[:, 2] > 0]
     uv = at[:, :2] / at[:, 2:] * (lens.fx, lens.fy) + (lens.cx, lens.cy)
@@ -60,10 +62,10 @@ def depths_in_view(points: np.ndarray, world_to_camera: np.ndarray, lens: Lens) 
 
 
 def nearest_depths(cells: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """[P] for each point the depth of the nearest one in its cell.
+    """[P] for each point the depth of the nearest point in its cell.
 
     Args:
-        cells: int [P], the cell that each point falls into. depths: [P].
+        cells: int [P], the cell of each point. depths: [P].
     """
     order = np.argsort(depths)
     found, first = np.unique(cells[order], return_index=True)
@@ -71,20 +73,22 @@ def nearest_depths(cells: np.ndarray, depths: np.ndarray) -> np.ndarray:
 
 
 def camera_centers(world_to_camera: np.ndarray) -> np.ndarray:
-    """[V, 3] from [V, 4, 4]."""
+    """[V, 3] centres of world-to-camera poses [V, 4, 4]."""
     return -np.einsum("vji,vj->vi", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3])
 
 
-def _depths_of_axes(world_to_camera: np.ndarray) -> np.ndarray:
-    """[V] depth of the point nearest to all optical axes; NaN where the cameras' places do not tell it."""
+def _axis_intersection_depths(world_to_camera: np.ndarray) -> np.ndarray:
+    """[V] depth of the point nearest to all optical axes; NaN where all cameras are at one place."""
     centers, axes = camera_centers(world_to_camera), world_to_camera[:, 2, :3]
-    away = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    perpendicular = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     middle = centers.mean(axis=0)
-    matrix = away.mean(axis=0)
-    meeting = middle
+    matrix = perpendicular.mean(axis=0)
+    intersection = middle
     if np.linalg.eigvalsh(matrix)[0] > 1e-3:  # mean squared sine of about 2 degrees between the axes
-        meeting = middle + np.linalg.solve(matrix, np.einsum("vij,vj->i", away, centers - middle) / len(centers))
-    depths = np.einsum("vi,vi->v", meeting - centers, axes)
+        intersection = middle + np.linalg.solve(
+            matrix, np.einsum("vij,vj->i", perpendicular, centers - middle) / len(centers)
+        )
+    depths = np.einsum("vi,vi->v", intersection - centers, axes)
     spread = np.sqrt(((centers - middle) ** 2).sum(axis=1).mean())
     if np.median(depths) > 0.2 * spread:
         return np.maximum(depths, 0.2 * np.median(depths))
@@ -92,13 +96,14 @@ def _depths_of_axes(world_to_camera: np.ndarray) -> np.ndarray:
 
 
 def normalising(world_to_camera: np.ndarray, typical: np.ndarray) -> Similarity:
-    """The similarity into the normalised frame: the scene's middle at 0, its typical distance from the cameras 1.
+    """The similarity into the normalised frame, where the scene's middle is at 0 and its typical distance from the
+    cameras 1.
 
-    The scale is one over the median of the views' typical depths [V]; the offset is the median, axis by axis, of
-    what the views look at: the point at typical depth on each optical axis. So for photos from one side the object
-    is near the origin and the cameras about 1 away; for photos all around they stand on a ring of radius about 1.
-    Scaling or moving the scene changes nothing in the normalised frame; all of it is float64, so a geo-referenced
-    offset of a million extents still leaves ten digits. There is no rotation.
+    The scale is one over the median of the views' typical depths [V]. The offset is the median, axis by axis, of the
+    points at typical depth on the optical axes. So for photographs from one side the object is near the origin and the
+    cameras about 1 away; for photographs from all around, the cameras stand on a ring of radius about 1. Scaling or
+    moving the scene changes nothing in the normalised frame. Everything is float64, so a geo-referenced offset of a
+    million extents still leaves ten digits. There is no rotation.
     """
     from reffusion.types import Similarity
 
@@ -107,29 +112,33 @@ def normalising(world_to_camera: np.ndarray, typical: np.ndarray) -> Similarity:
 
 
 def normalise_pose(world_to_camera: np.ndarray, similarity: Similarity) -> np.ndarray:
-    """[4, 4] in the scene's own frame -> [4, 4] in the normalised frame."""
+    """World-to-camera [4, 4] of the scene's own frame -> of the normalised frame."""
     pose = world_to_camera.copy()
     pose[:3, 3] = similarity.scale * (world_to_camera[:3, :3] @ similarity.offset + world_to_camera[:3, 3])
     return pose
 
 
-def ranges_of(poses: Poses, pinholes: Mapping[str, Lens]) -> np.ndarray:
+def view_depth_ranges(poses: Poses, pinholes: Mapping[str, Lens]) -> np.ndarray:
     """`depth_ranges` [V, 3] of the views that have a pinhole, in its order, in the scene's units."""
     bounds = np.array([poses.bounds[name] for name in pinholes]) if poses.bounds else None
-    return depth_ranges(_stacked(poses, pinholes), list(pinholes.values()), poses.points, bounds)
+    return depth_ranges(_stack_poses(poses, pinholes), list(pinholes.values()), poses.points, bounds)
 
 
-def _stacked(poses: Poses, names: Mapping[str, Lens]) -> np.ndarray:
+def _stack_poses(poses: Poses, names: Mapping[str, Lens]) -> np.ndarray:
     return np.stack([poses.world_to_camera[name] for name in names])
 
 
-def normalised(
+def normalize_scene(
     poses: Poses, pinholes: Mapping[str, Lens], train: Sequence[str], test: Sequence[str], clean: frozenset[str]
 ) -> Scene:
-    """Cameras and points in the normalised frame (`normalising`). `pinholes`: view name -> undistorted lens."""
+    """The scene in the normalised frame (`normalising`): cameras, and the points that the capture brings.
+
+    Args:
+        pinholes: view name -> undistorted lens.
+    """
     from reffusion.types import Camera, Scene
 
-    similarity = normalising(_stacked(poses, pinholes), ranges_of(poses, pinholes)[:, 1])
+    similarity = normalising(_stack_poses(poses, pinholes), view_depth_ranges(poses, pinholes)[:, 1])
     cameras = {
         name: Camera(
             name,
@@ -146,17 +155,17 @@ def normalised(
     return Scene(cameras, tuple(train), tuple(test), clean, similarity.apply(poses.points), poses.colors, similarity)
 
 
-def filled_up(
+def add_random_points(
     scene: Scene, ranges: np.ndarray, count: int, generator: Generator, image_of: Callable[[str], np.ndarray]
 ) -> Scene:
-    """The scene with `count` random points more, coloured by the picture they were drawn in.
+    """The scene with `count` more random points, coloured by the pictures they were drawn in.
 
     Args:
         ranges: [V, 3] near, typical and far depths in the normalised frame.
         image_of: view name -> uint8 [H, W, 3].
     """
     names = list(scene.cameras)
-    points, views, pixels = random_points(list(scene.cameras.values()), ranges, count, generator)
+    points, views, pixels = sample_frustum_points(list(scene.cameras.values()), ranges, count, generator)
     colors = np.zeros((len(points), 3), np.uint8)
     for k in np.unique(views):
         mine = views == k
@@ -168,12 +177,12 @@ def filled_up(
     )
 
 
-def random_points(
+def sample_frustum_points(
     cameras: Sequence[Camera], ranges: np.ndarray, count: int, generator: Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`count` points in the views' frusta, uniform over pixels and in disparity between near and far.
+    """Random points in the views' frusta, uniform over pixels, and over disparity between near and far.
 
-    Four times as many are drawn and those that a second view sees too go first, so that few float before a lens.
+    Four times as many are drawn. Those that a second view sees too are preferred, so that few float in front of a lens.
 
     Returns:
         points [count, 3]; the view each was drawn in, int [count]; its pixel there, (column, row), int [count, 2].

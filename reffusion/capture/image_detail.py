@@ -1,5 +1,5 @@
-"""What a capture's views support: no finer pictures, no more spherical harmonics than they can tell apart; and what
-they show at its points."""
+"""How much detail the views of a capture support: resolution, degree of spherical harmonics; and sampling pictures at
+visible points."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from reffusion import geometry
 from reffusion.capture.frame import nearest_depths
 from reffusion.types import Camera
 
-CELLS = 40  # along a view's width, in each of which the nearest points hide those behind them
-NEARLY = 1.15  # times as far as these: what is shown too
+CELLS = 40  # cells along a view's width; the nearest point of each hides those behind it
+NEARLY = 1.15  # relative depth, over the nearest point's, up to which a point is visible too
 
 
-def enlarged(images: Iterable[np.ndarray], detail: float) -> bool:
-    """Whether the pictures show no more than pictures of half their size would.
+def is_enlarged(images: Iterable[np.ndarray], detail: float) -> bool:
+    """Do the pictures show no more than pictures of half their size would?
 
-    A picture sharp to the pixel has about as much energy between a half and the whole of its highest frequency as in
-    the octave below (0.25 to 0.8 of it in photographs tried, 0.4 to 0.7 in the demo's); enlarged twice, by whatever
-    filter, or out of focus, it has 0.01 to 0.08 of it.
+    A picture that is sharp to the pixel has about as much energy between a half and the whole of its highest frequency
+    as in the octave below (0.25 to 0.8 of it in photographs tried, 0.4 to 0.7 in the demo's). A picture enlarged twice,
+    by whatever filter, or out of focus, has 0.01 to 0.08 of it.
 
     Args:
         images: uint8 [H, W, 3], as large as they would be used; some views are enough.
-        detail: ratio of the two octaves' energies, median over the pictures, under which it is so.
+        detail: ratio of the energies of the two octaves, median over the pictures, below which the answer is yes.
     """
-    return float(np.median([_octaves(image) for image in images])) < detail
+    return float(np.median([_octave_ratio(image) for image in images])) < detail
 
 
-def _octaves(image: np.ndarray) -> float:
-    """Energy at over a half of the highest frequency, over that of the octave below; infinite for a plain picture."""
+def _octave_ratio(image: np.ndarray) -> float:
+    """Energy above half of the highest frequency, over that of the octave below; infinite for a plain picture."""
     gray = image.mean(-1)
     height, width = gray.shape
     # windowed, or the step from one border to the opposite one counts as detail
@@ -42,8 +42,9 @@ def _octaves(image: np.ndarray) -> float:
     return float(power[frequency >= 0.25].sum() / below) if below > 0 else np.inf
 
 
-def views_of(points: np.ndarray, cameras: Sequence[Camera]) -> int:
-    """In how many views a typical point is: the median over points [P, 3]; all where there are none."""
+def typical_view_count(points: np.ndarray, cameras: Sequence[Camera]) -> int:
+    """Median over points [P, 3] of the number of views that contain them; the number of cameras where there are no
+    points."""
     seen = np.zeros(len(points), int)
     for camera in cameras:
         uv, z = geometry.project(points, camera)
@@ -54,15 +55,19 @@ def views_of(points: np.ndarray, cameras: Sequence[Camera]) -> int:
 
 
 def harmonics(points: np.ndarray, cameras: Sequence[Camera], most: int) -> tuple[int, int]:
-    """The highest degree of spherical harmonics, at most `most`, whose (degree + 1)^2 coefficients a typical point's
-    views determine; and in how many views that point is (the median over points [P, 3])."""
-    views = views_of(points, cameras)
+    """The highest supported degree of spherical harmonics, at most `most`, and the `typical_view_count` behind it.
+
+    A degree has (degree + 1)^2 coefficients, as many as the views of a typical point [P, 3] must be to determine them.
+    """
+    views = typical_view_count(points, cameras)
     return min(most, max(isqrt(views) - 1, 0)), views
 
 
 def sample_visible(camera: Camera, points: np.ndarray, picture: np.ndarray, cells: int = CELLS) -> np.ndarray:
-    """[P, C] what a view's picture [H, W, C] shows at the points [P, 3]; NaN outside it, and behind nearer points:
-    the nearest of each cell, of which there are `cells` along the picture's width, hide those behind them."""
+    """[P, C] values of a view's picture [H, W, C] at the visible points among [P, 3]; NaN at the others.
+
+    A point is hidden outside the picture, and behind the nearest point of its cell; there are `cells` along the width.
+    """
     uv, depth = geometry.project(points, camera)
     values, inside = geometry.sample_nearest(picture, uv)
     cell = max(1.0, camera.width / cells)

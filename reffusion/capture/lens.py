@@ -1,4 +1,4 @@
-"""Lenses: distortion models, and the pinhole view that replaces a distorted one.
+"""Lenses: distortion models, and the pinhole that replaces a distorted lens.
 
 Directions are [..., 2] camera x/z and y/z (x right, y down); pixels as in CONVENTIONS.md.
 """
@@ -47,7 +47,7 @@ class Lens:
     model: str = "PINHOLE"
 
     def resized(self, width: int, height: int) -> Lens:
-        """The same lens before a picture of another size; distortion acts on directions and stays."""
+        """The same lens for a picture of another size. Distortion acts on directions and stays."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
@@ -59,14 +59,14 @@ class Lens:
         return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def coefficients(self) -> str:
-        """For messages: `SIMPLE_RADIAL k1=0.0124`."""
+        """The model and its coefficients for messages: `SIMPLE_RADIAL k1=0.0124`."""
         names = [(f"k{i}", k) for i, k in enumerate((*self.radial, *self.denominator), start=1)]
         names += [("p1", self.tangential[0]), ("p2", self.tangential[1])]
         return " ".join([self.model, *(f"{name}={value:.4g}" for name, value in names if value)])
 
 
 def from_colmap(model: str, width: int, height: int, params: tuple[float, ...]) -> Lens:
-    """The lens of a COLMAP camera; BadInput naming the model where it is none of those understood."""
+    """The lens of a COLMAP camera. BadInput naming the model where it is not supported."""
     if model not in _COLMAP:
         raise BadInput(f"camera model {model} is not understood; convert it to one of {', '.join(_COLMAP)}")
     single_focal, fisheye, names = _COLMAP[model]
@@ -84,7 +84,7 @@ def from_colmap(model: str, width: int, height: int, params: tuple[float, ...]) 
     )
 
 
-# One focal length for both axes?, fisheye?, what follows the principal point.
+# model: (one focal length for both axes, fisheye, parameters after the principal point)
 _COLMAP = {
     "SIMPLE_PINHOLE": (True, False, ()),
     "PINHOLE": (False, False, ()),
@@ -101,7 +101,7 @@ _COLMAP = {
 
 
 def distort(directions: np.ndarray, lens: Lens) -> np.ndarray:
-    """True directions [..., 2] -> where the lens shows them, [..., 2], float64."""
+    """Apply the lens's distortion: true directions [..., 2] -> distorted directions [..., 2], float64."""
     xy = np.asarray(directions, np.float64)
     length = np.linalg.norm(xy, axis=-1, keepdims=True)
     angle = np.arctan(length) if lens.fisheye else length
@@ -124,25 +124,25 @@ def _polynomial(coefficients: tuple[float, ...], square: np.ndarray) -> np.ndarr
     return 1.0 + value
 
 
-def undistort(shown: np.ndarray, lens: Lens) -> np.ndarray:
-    """Inverse of `distort`, by Newton's method; NaN where it does not converge (outside what the lens can show)."""
-    shown = np.asarray(shown, np.float64)
-    xy, step = shown.copy(), 1e-6
+def undistort(distorted: np.ndarray, lens: Lens) -> np.ndarray:
+    """Inverse of `distort`, by Newton's method; NaN where it does not converge, outside the range of the lens."""
+    distorted = np.asarray(distorted, np.float64)
+    xy, step = distorted.copy(), 1e-6
     if lens.fisheye:
-        radius = np.linalg.norm(shown, axis=-1, keepdims=True)
-        xy = shown * np.tan(np.minimum(radius, 1.5)) / np.maximum(radius, 1e-12)
+        radius = np.linalg.norm(distorted, axis=-1, keepdims=True)
+        xy = distorted * np.tan(np.minimum(radius, 1.5)) / np.maximum(radius, 1e-12)
     with np.errstate(all="ignore"):
         for _ in range(30):
             right, below = np.array([step, 0.0]), np.array([0.0, step])
             by_x = (distort(xy + right, lens) - distort(xy - right, lens)) / (2 * step)
             by_y = (distort(xy + below, lens) - distort(xy - below, lens)) / (2 * step)
-            error = distort(xy, lens) - shown
+            error = distort(xy, lens) - distorted
             determinant = by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0]
             dx = (error[..., 0] * by_y[..., 1] - error[..., 1] * by_y[..., 0]) / determinant
             dy = (by_x[..., 0] * error[..., 1] - by_x[..., 1] * error[..., 0]) / determinant
             xy = xy - np.stack([dx, dy], axis=-1)
-        lost = (np.abs(distort(xy, lens) - shown).max(axis=-1) > 1e-8) | ~(determinant > 0)
-    return np.where(lost[..., None], np.nan, xy)
+        diverged = (np.abs(distort(xy, lens) - distorted).max(axis=-1) > 1e-8) | ~(determinant > 0)
+    return np.where(diverged[..., None], np.nan, xy)
 
 
 def to_pixels(directions: np.ndarray, lens: Lens) -> np.ndarray:
@@ -151,7 +151,7 @@ def to_pixels(directions: np.ndarray, lens: Lens) -> np.ndarray:
 
 
 def to_directions(pixels: np.ndarray, lens: Lens) -> np.ndarray:
-    """Pixels [..., 2] of the distorted picture -> true directions [..., 2]; NaN outside what the lens can show."""
+    """Pixels [..., 2] of the distorted picture -> true directions [..., 2]; NaN outside the range of the lens."""
     return undistort((np.asarray(pixels, np.float64) - (lens.cx, lens.cy)) / (lens.fx, lens.fy), lens)
 
 
@@ -167,7 +167,8 @@ def _border(lens: Lens) -> tuple[np.ndarray, ...]:
 
 @lru_cache(maxsize=4096)
 def largest_shift(lens: Lens) -> float:
-    """Pixels by which the lens moves the border pixel that it moves furthest; 0 for a pinhole, inf off its range."""
+    """px, the largest displacement of a border pixel by the distortion; 0 for a pinhole, inf where the border is out of
+    range."""
     border = np.concatenate(_border(lens))
     seen = to_directions(border, lens)
     if not np.isfinite(seen).all():
@@ -176,15 +177,15 @@ def largest_shift(lens: Lens) -> float:
 
 
 @lru_cache(maxsize=4096)
-def without_distortion(lens: Lens) -> Lens:
-    """The pinhole that an undistorted picture of the same size gets.
+def undistorted_pinhole(lens: Lens) -> Lens:
+    """The pinhole of the undistorted picture, of the same size.
 
-    Its window is the largest that lies wholly inside the distorted picture, so that no black border remains; both
-    axes are zoomed alike, so pixels keep their shape. A lens that moves nothing by `PINHOLE_ENOUGH` px only loses
-    its coefficients.
+    It shows the largest window that lies wholly inside the distorted picture, so that no black border remains. Both
+    axes are zoomed alike, so pixels keep their shape. A lens that moves no pixel by more than `PINHOLE_ENOUGH` px only
+    loses its coefficients.
 
     Raises:
-        BadInput: where the distortion folds over, or a fisheye reaches 85 degrees, inside the picture.
+        BadInput: inside the picture the distortion folds over, or a fisheye reaches 85 degrees.
     """
     shift = largest_shift(lens)
     if shift <= PINHOLE_ENOUGH:
@@ -205,21 +206,21 @@ def without_distortion(lens: Lens) -> Lens:
 
 
 def sampling_map(lens: Lens, pinhole: Lens) -> np.ndarray:
-    """[H, W, 2] float64: for each pixel of the pinhole's picture, the pixel coordinates to read in the lens's."""
+    """[H, W, 2] float64: for each pixel of the pinhole's picture, the coordinates to read in the distorted one."""
     columns, rows = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
     directions = np.stack([(columns - pinhole.cx) / pinhole.fx, (rows - pinhole.cy) / pinhole.fy], axis=-1)
     return to_pixels(directions, lens)
 
 
 @lru_cache(maxsize=4)
-def undoing(lens: Lens) -> tuple[Lens, np.ndarray | None]:
-    """The pinhole that replaces the lens, and where to read (`sampling_map`); no map where nothing moves."""
-    pinhole = without_distortion(lens)
+def undistortion_map(lens: Lens) -> tuple[Lens, np.ndarray | None]:
+    """The pinhole that replaces the lens, and the `sampling_map`; None for the map where nothing moves."""
+    pinhole = undistorted_pinhole(lens)
     return pinhole, None if pinhole == lens.pinhole else sampling_map(lens, pinhole)
 
 
 def undistort_image(image: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """uint8 [h, w, 3] read at `where` [H, W, 2] (`sampling_map`) by Lanczos interpolation."""
+    """Resample uint8 [h, w, 3] at `where` [H, W, 2] (`sampling_map`) by Lanczos interpolation."""
     import cv2
 
     at = (where - 0.5).astype(np.float32)  # OpenCV counts from the centre of the first pixel
@@ -227,7 +228,7 @@ def undistort_image(image: np.ndarray, where: np.ndarray) -> np.ndarray:
 
 
 def undistort_mask(mask: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """bool [h, w] read at `where` [H, W, 2]: linear, then cut at one half."""
+    """Resample bool [h, w] at `where` [H, W, 2] bilinearly, with a threshold of one half."""
     import cv2
 
     at = (where - 0.5).astype(np.float32)

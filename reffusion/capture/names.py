@@ -14,7 +14,7 @@ from typing import TypeVar
 from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS
 
-MASK_FOLDERS = ("label", "test_label", "masks", "mask")  # inside a folder of pictures, folders of these names hold none
+MASK_FOLDERS = ("label", "test_label", "masks", "mask")  # folders of these names inside a folder of pictures hold none
 MASK_SUFFIXES = ("_mask", ".mask", "-mask")  # `A_mask.png` beside `A.png` is its mask
 
 K = TypeVar("K")
@@ -22,22 +22,22 @@ V = TypeVar("V")
 
 
 def normalize_path(path: str) -> str:
-    """The path in NFC, with forward slashes, without `./` and the drive or root of an absolute path."""
+    """The path in NFC, with forward slashes, without `./`, and without the drive or root of an absolute path."""
     parts = unicodedata.normalize("NFC", path).replace("\\", "/").split("/")
     return "/".join(part for part in parts if part not in ("", ".") and not part.endswith(":"))
 
 
 def strip_ending(path: str) -> str:
-    """The path without the ending of a picture; any other ending is part of the name."""
+    """The path without its ending, if that is one of pictures; any other ending is part of the name."""
     stem, dot, ending = path.rpartition(".")
     return stem if dot and PurePosixPath(stem).name and f".{ending}".lower() in ENDINGS else path
 
 
 def list_pictures(folder: Path, nested: bool = False) -> list[str]:
-    """Paths of the pictures in a folder, relative to it, sorted; no masks beside their pictures (`MASK_SUFFIXES`).
+    """Paths of the pictures in a folder, relative to it, sorted; without masks beside their pictures (`MASK_SUFFIXES`).
 
     Args:
-        nested: also those in its sub-folders, but `MASK_FOLDERS`.
+        nested: also those in sub-folders other than `MASK_FOLDERS`.
     """
     found = [path.relative_to(folder).as_posix() for path in _walk(folder, nested)]
     stems = {strip_ending(path) for path in found}
@@ -62,8 +62,8 @@ def is_mask_of_another(stem: str, stems: Collection[str]) -> bool:
 def name_views(paths: Collection[str]) -> dict[str, str]:
     """View name -> path, in the order of the paths.
 
-    A view is called by its file name without ending; where two are equal, all are called by their path, with `-` for
-    `/`: `cam0/0001.png` is the view `cam0-0001`.
+    A view has the file name of its picture without the ending. Where two of these are equal, all views have the path as
+    name, with `-` for `/`: `cam0/0001.png` is the view `cam0-0001`.
 
     Raises:
         BadInput: two paths give the same name even so.
@@ -83,14 +83,14 @@ def name_views(paths: Collection[str]) -> dict[str, str]:
 
 
 def flatten(path: str) -> str:
-    """A path as one name."""
+    """The path as a single name, with `-` for `/`."""
     return path.replace("/", "-")
 
 
 def pair_names(wanted: Mapping[K, Iterable[str]], known: Mapping[V, Iterable[str]]) -> dict[K, V]:
-    """Which of `known` each of `wanted` means; one that means none, or could mean several, is left out.
+    """Pair each of `wanted` with the one of `known` that it means; ambiguous and unknown ones are left out.
 
-    Compared are whole paths first, then paths without their first folder, and so on to the file names; then all of
+    Whole paths are compared first, then paths without their first folder, and so on down to file names; then all of
     that without regard to case. A pair needs a key that no other entry on either side has.
 
     Args:
@@ -126,7 +126,7 @@ def _index(paths: Mapping[K, Iterable[list[str]]], depth: int) -> dict[tuple[str
 
 
 def pair_pictures(wanted: Mapping[K, str], files: Collection[str]) -> dict[K, str]:
-    """Which file each path of another program means: by its name with ending, else without."""
+    """Key -> the file that another program's path means: by its name with ending, else without."""
     pairs = pair_names({key: [path] for key, path in wanted.items()}, {file: [file] for file in files})
     rest = {key: [strip_ending(normalize_path(path))] for key, path in wanted.items()}
     by_stem = pair_names(rest, {file: [strip_ending(file)] for file in files})
@@ -135,7 +135,7 @@ def pair_pictures(wanted: Mapping[K, str], files: Collection[str]) -> dict[K, st
 
 
 def pair_masks(masks: Collection[str], views: Mapping[V, Iterable[str]]) -> dict[str, V]:
-    """Mask file -> the view it belongs to, of those that belong to one.
+    """Mask file -> the view it belongs to, for masks that belong to one.
 
     A mask is called like its picture (`A.png`), like its picture with the ending (COLMAP: `A.jpg.png`), or with one of
     `MASK_SUFFIXES`.
@@ -146,7 +146,7 @@ def pair_masks(masks: Collection[str], views: Mapping[V, Iterable[str]]) -> dict
     stems = {mask: strip_ending(normalize_path(mask)) for mask in masks}
     bare = {view: [strip_ending(normalize_path(path)) for path in paths] for view, paths in views.items()}
     whole = {view: list(paths) for view, paths in views.items()}
-    trimmed = {mask: _trim(stem) for mask, stem in stems.items()}
+    trimmed = {mask: _strip_mask_suffix(stem) for mask, stem in stems.items()}
     pairs: dict[str, V] = {}
     for spelling, known in ((stems, bare), (stems, whole), (trimmed, bare)):
         for mask, view in pair_names({m: [s] for m, s in spelling.items()}, known).items():
@@ -154,7 +154,7 @@ def pair_masks(masks: Collection[str], views: Mapping[V, Iterable[str]]) -> dict
     return pairs
 
 
-def _trim(stem: str) -> str:
-    """Without the ending of COLMAP's masks and without a suffix that says mask."""
+def _strip_mask_suffix(stem: str) -> str:
+    """The stem without the ending of COLMAP's masks and without a suffix for masks."""
     stem = strip_ending(stem)
     return next((stem.removesuffix(suffix) for suffix in MASK_SUFFIXES if stem.endswith(suffix)), stem)

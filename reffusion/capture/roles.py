@@ -1,4 +1,4 @@
-"""What each view of a capture is for: training, test or clean; which mask belongs to it."""
+"""Assigns roles to the views of a capture (training, test, clean, cameras only), and masks to views."""
 
 from __future__ import annotations
 
@@ -10,28 +10,29 @@ from pathlib import Path
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.layouts.mask_files import NONE, find_masks, match_masks
 from reffusion.capture.names import list_pictures
-from reffusion.capture.views import Views, check_proportions, known
+from reffusion.capture.views import ViewTable, check_proportions, resolve_view
 from reffusion.io.files import BadInput
 from reffusion.io.images import WHITE, MaskValues, image_size
-from reffusion.params.capture import Masks
+from reffusion.params.capture import MaskSpec
 
-LEAST_TRAINING_VIEWS = 3  # but for a scene with views that are cameras only
+LEAST_TRAINING_VIEWS = 3  # for a scene without views that are cameras only
 OTHERS = "others"
 
 
 @dataclass(frozen=True)
 class Roles:
-    """Names are sorted.
+    """The role of each view. Names are sorted.
 
     Attributes:
         train, test, clean: names of views.
-        masks: object -> view -> file, where a photograph shows it: of training views, and of test views that show it
-            too. "" is the object of masks that tell none apart.
-        test_masks: where a test view shows the object, or would show it; what its box comes from.
-        warnings: what is odd.
-        blank: names of views without pixels, beside training and test views.
-        values: which pixel values of `masks` are the object.
-        fill: training view -> file, a mask of what is to be filled whatever its photograph shows there.
+        masks: object -> view -> file of the mask, for training views, and test views that show the object too. "" is
+            the object of masks that tell no objects apart.
+        test_masks: test view -> file of a mask of where it shows the object, or would show it; the test box comes from
+            it.
+        warnings: sentences for the user.
+        blank: names of views whose pixels are not used, beside training and test views.
+        values: the pixel values of `masks` that are the object.
+        fill: training view -> file of a mask of what is to be filled, whatever its photograph shows there.
         keep: names of views that stay, even where their photographs contradict their poses.
     """
 
@@ -48,15 +49,16 @@ class Roles:
 
     @property
     def mask_files(self) -> dict[str, dict[str, Path]]:
-        """Folder of the stage `raw_masks` -> view -> file: "masks/" or "masks/<object>", "test_masks", "fill"."""
+        """Folder of the stage `raw_masks` -> view -> file; folders are "masks/" or "masks/<object>", "test_masks",
+        "fill"."""
         masks = {f"masks/{thing}": files for thing, files in self.masks.items()}
         return {**masks, "test_masks": self.test_masks, "fill": self.fill}
 
-    def among(self, names: set[str]) -> Roles:
-        """Without the views that are not in `names` (those that structure from motion could not place).
+    def restrict(self, names: set[str]) -> Roles:
+        """The roles of the views in `names`, such as those that structure from motion placed.
 
         Raises:
-            BadInput: where fewer than 3 training views are left.
+            BadInput: fewer than 3 training views are left.
         """
         kept = lambda values: {name: value for name, value in values.items() if name in names}
         roles = replace(
@@ -77,7 +79,7 @@ def load_roles(
     folder: Path,
     capture: Capture,
     *,
-    masks: str | Masks | None = None,
+    masks: str | MaskSpec | None = None,
     test_masks: str | None = None,
     train: Sequence[str] | str | None = None,
     test: Sequence[str] | str | None = None,
@@ -86,24 +88,24 @@ def load_roles(
     cameras_only: Sequence[str] | str | None = None,
     remove: Sequence[str] | None = None,
 ) -> Roles:
-    """The roles of the capture's views, from scene.yaml's keys and the folder's usual places.
+    """Assign roles from scene.yaml's keys and the folder's usual places.
 
-    Test views: those named; else, where the folder has test masks (`<pictures>/test_label`), the views without a
-    mask, or where some training masks are missing the first ones in order of names; else those that the layout holds
-    out. Training views: those named, else all others. A view that is neither is left out of the scene.
+    Test views are those named; else, where the folder has test masks (`<pictures>/test_label`), the views without a
+    mask, or where some training masks are missing the first views in order of names; else those that the layout holds
+    out. Training views are those named, else all others. A view that is neither is left out of the scene.
 
     Args:
-        masks: folder of masks, and which numbers in them are the object; "none" for a scene without; None looks into
+        masks: folder of masks, and the numbers in them that are the object; "none" for a scene without. None looks into
             <pictures>/label, masks, mask, label, for `A_mask.png` beside `A.png`, and for masks that the layout names.
         test_masks: folder of the test views' masks, named like the views or in their order; "none"; None looks.
         train, test: names, or "every 8" (the first of each eight in order of names), or None.
         region: the scene names a 3D region, so it may lack masks.
-        cameras_only: views whose pixels nobody reads: names, "every 8", or "others": all not in train or test.
+        cameras_only: views whose pixels are not used: names, "every 8", or "others": all not in train or test.
         remove: objects, each a folder of masks; only checked here.
 
     Raises:
-        BadInput: naming the file and the remedy: a mask for no picture, of other proportions (over 10%), no mask
-            at all, an unknown view, a view for both training and test, fewer than 3 training views.
+        BadInput: naming the file and the remedy: a mask for no picture, of other proportions (over 10%), no mask at
+            all, an unknown view, a view for both training and test, fewer than 3 training views.
     """
     folder = Path(folder)
     found = find_masks(folder, capture, masks, optional=region or cameras_only is not None)
@@ -112,46 +114,50 @@ def load_roles(
     mask_files = {name: path for files in of_objects.values() for name, path in files.items()}
     label_folder = capture.label_folder / "test_label" if test_masks is None else folder / test_masks
     label_files = _test_mask_files(label_folder, test_masks)
-    train_named, test_named = (_chosen(value, capture, key) for key, value in (("train", train), ("test", test)))
-    labelled = None if label_files is None else _labelled(capture, mask_files, label_folder, label_files, test_named)
-    asked = None if cameras_only in (None, OTHERS) else _chosen(cameras_only, capture, "cameras_only")
-    train_named, test_views = _parted(train_named, test_named, labelled, asked or [], capture)
+    train_named, test_named = (_select_views(value, capture, key) for key, value in (("train", train), ("test", test)))
+    labelled = (
+        None if label_files is None else _test_mask_views(capture, mask_files, label_folder, label_files, test_named)
+    )
+    asked = None if cameras_only in (None, OTHERS) else _select_views(cameras_only, capture, "cameras_only")
+    train_named, test_views = _split_views(train_named, test_named, labelled, asked or [], capture)
     _check_enough(train_named, cameras_only is not None)
-    blank = _blank(cameras_only, asked, {*train_named, *test_views}, capture)
-    clean_views = _clean(clean, train_named, capture)
+    blank = _camera_only_views(cameras_only, asked, {*train_named, *test_views}, capture)
+    clean_views = _clean_views(clean, train_named, capture)
     labels = None if labelled is None else dict(zip(labelled, label_files or (), strict=True))
-    held_out, beside = _beside(test_views, mask_files, labels or {})
+    held_out, test_files = _split_masks(test_views, mask_files, labels or {})
     kept = {name: path for name, path in mask_files.items() if name in set(train_named)}
-    ours = {thing: _among(files, {*kept, *held_out}) for thing, files in of_objects.items()}
-    for name, path in (*(item for files in ours.values() for item in files.items()), *beside.items()):
+    training_masks = {thing: _restrict_files(files, {*kept, *held_out}) for thing, files in of_objects.items()}
+    for name, path in (*(item for files in training_masks.values() for item in files.items()), *test_files.items()):
         check_proportions(path, name, _size_of(name, capture), 0.10, "mask")
-    bare = [name for name in train_named if name not in kept and name not in clean_views]
-    warning = f"{len(bare)} training views have no mask: {', '.join(bare)}" if kept and bare else None
-    said = tuple(filter(None, (found.warning, warning)))
-    return Roles(tuple(train_named), tuple(test_views), clean_views, ours, beside, said, blank, found.values)
+    unmasked = [name for name in train_named if name not in kept and name not in clean_views]
+    warning = f"{len(unmasked)} training views have no mask: {', '.join(unmasked)}" if kept and unmasked else None
+    messages = tuple(filter(None, (found.warning, warning)))
+    return Roles(
+        tuple(train_named), tuple(test_views), clean_views, training_masks, test_files, messages, blank, found.values
+    )
 
 
-def _clean(clean: Sequence[str], train: list[str], capture: Capture) -> frozenset[str]:
-    """The views that the scene says are without the object."""
-    views = frozenset(known(name, capture.pictures, "clean") for name in clean)
+def _clean_views(clean: Sequence[str], train: list[str], capture: Capture) -> frozenset[str]:
+    """The views that the scene names as clean, without the object."""
+    views = frozenset(resolve_view(name, capture.pictures, "clean") for name in clean)
     if views - set(train):
         raise BadInput(f"scene.yaml: clean: {', '.join(sorted(views - set(train)))} is no training view")
     return views
 
 
-def _beside(
+def _split_masks(
     test: list[str], masks: dict[str, Path], labels: dict[str, Path]
 ) -> tuple[dict[str, Path], dict[str, Path]]:
-    """The test views that show the object, with the masks that say so, and where all would show it.
+    """The masks of test views that show the object (view -> file), and `Roles.test_masks`.
 
-    Those with masks of their own among the training masks are held out, but without a truth inside.
+    Test views with a mask among the training masks are held out, but their photographs are no ground truth inside it.
     """
     held_out = {name: path for name, path in masks.items() if name in set(test)}
     own = {name: path for name, path in labels.items() if name in set(test)}
     return {name: path for name, path in held_out.items() if name not in own}, held_out | own
 
 
-def _among(files: dict[str, Path], names: set[str]) -> dict[str, Path]:
+def _restrict_files(files: dict[str, Path], names: set[str]) -> dict[str, Path]:
     return {name: path for name, path in files.items() if name in names}
 
 
@@ -164,20 +170,20 @@ def _check_objects(remove: Sequence[str] | None, found: dict[str, dict[str, Path
         raise BadInput(f"scene.yaml: remove: there is no object '{unknown[0]}'; masks tell apart {', '.join(found)}")
 
 
-def views_of(capture: Capture, roles: Roles) -> Views:
-    """The capture's views, for what people bring for them."""
-    return Views(capture.pictures, roles.train, roles.test, lambda name: _size_of(name, capture), capture.upright)
+def capture_views(capture: Capture, roles: Roles) -> ViewTable:
+    """The views of a capture, for checking what people bring for them."""
+    return ViewTable(capture.pictures, roles.train, roles.test, lambda name: _size_of(name, capture), capture.upright)
 
 
 def _size_of(name: str, capture: Capture) -> tuple[int, int]:
     return image_size(capture.pictures[name], upright=capture.upright)
 
 
-def _parted(
+def _split_views(
     train: list[str] | None, test: list[str] | None, labelled: list[str] | None, blank: list[str], capture: Capture
 ) -> tuple[list[str], list[str]]:
-    """Training and test views from those named, None where they are not, those that test masks are of, and those that
-    the layout holds out."""
+    """Training and test views, from the named ones (None where none are named), the test masks', and the layout's test
+    views."""
     test_views = test if test is not None else (labelled or [*capture.test])
     if train is None:
         train = [name for name in capture.pictures if name not in {*test_views, *blank}]
@@ -189,10 +195,10 @@ def _parted(
     return train, test_views
 
 
-def _blank(
+def _camera_only_views(
     asked: Sequence[str] | str | None, named: Sequence[str] | None, taken: set[str], capture: Capture
 ) -> tuple[str, ...]:
-    """The views without pixels."""
+    """The views whose pixels are not used."""
     if asked is None:
         return ()
     if named is None:
@@ -211,8 +217,8 @@ def _check_enough(train: Sequence[str], sparse: bool = False) -> None:
         )
 
 
-def _chosen(value: Sequence[str] | str | None, capture: Capture, key: str) -> list[str] | None:
-    """Names in sorted order from a list or from "every N"."""
+def _select_views(value: Sequence[str] | str | None, capture: Capture, key: str) -> list[str] | None:
+    """View names, sorted, from a list of names or from "every N"."""
     if value is None:
         return None
     if isinstance(value, str):
@@ -220,7 +226,7 @@ def _chosen(value: Sequence[str] | str | None, capture: Capture, key: str) -> li
         if match is None:
             raise BadInput(f"scene.yaml: {key}: '{value}' is neither a list of views nor like 'every 8'")
         return list(capture.pictures)[:: int(match[1])]
-    names = sorted(known(name, capture.pictures, key) for name in value)
+    names = sorted(resolve_view(name, capture.pictures, key) for name in value)
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise BadInput(f"scene.yaml: {key}: {', '.join(twice)} named twice")
@@ -228,7 +234,7 @@ def _chosen(value: Sequence[str] | str | None, capture: Capture, key: str) -> li
 
 
 def _test_mask_files(found: Path, test_masks: str | None) -> list[Path] | None:
-    """The test views' masks below a folder, in order of their paths; None where the scene has none."""
+    """The test views' masks in a folder, in order of their paths; None where the scene has none."""
     if test_masks is not None and test_masks.lower() == NONE:
         return None
     files = [found / path for path in list_pictures(found, nested=True)]
@@ -237,10 +243,10 @@ def _test_mask_files(found: Path, test_masks: str | None) -> list[Path] | None:
     return files or None
 
 
-def _labelled(
+def _test_mask_views(
     capture: Capture, masks: dict[str, Path], place: Path, labels: list[Path], test_named: list[str] | None
 ) -> list[str]:
-    """The views that the test masks below a folder stand for, one for each, in their order."""
+    """The view of each test mask in a folder, in the order of the masks."""
     files = [path.relative_to(place).as_posix() for path in labels]
     named = match_masks(place, files, capture, strict=False)
     if all(view in capture.pictures for view in named.values()) and len(named) == len(labels):

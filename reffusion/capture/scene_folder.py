@@ -1,4 +1,4 @@
-"""A scene folder read as the keys of scene.yaml say."""
+"""Reads a scene folder as the keys of scene.yaml ask."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from pathlib import Path
 from reffusion.capture.click_coordinates import check_clicks
 from reffusion.capture.layouts.cameras import has_pictures
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.layouts.mask_files import objects_of_masks
-from reffusion.capture.lens import without_distortion
+from reffusion.capture.layouts.mask_files import group_by_object
+from reffusion.capture.lens import undistorted_pinhole
 from reffusion.capture.load import LONGEST, load_capture
 from reffusion.capture.names import list_pictures
 from reffusion.capture.roles import Roles, load_roles
-from reffusion.capture.views import known
-from reffusion.io.files import BadInput, there
+from reffusion.capture.views import resolve_view
+from reffusion.io.files import BadInput, is_file
 from reffusion.io.splats import load_splats, summarize
 from reffusion.params.capture import SceneKeys
 from reffusion.params.reference import reference_list
 
 
 def read_scene(params: SceneKeys, scene: Path, longest: int = LONGEST) -> tuple[Capture, Roles]:
-    """The capture and its views' roles.
+    """The capture and the roles of its views.
 
     Args:
-        longest: larger image side in px that is asked for, see `load_capture`; no role depends on it.
+        longest: requested size of the larger image side in px, see `load_capture`; no role depends on it.
 
     Raises:
         BadInput: naming the file and the remedy where one is wrong.
@@ -46,35 +46,43 @@ def read_scene(params: SceneKeys, scene: Path, longest: int = LONGEST) -> tuple[
     )
     capture, roles = _exclude(params, capture, roles)
     if params.fill is not None:
-        roles = replace(roles, fill=_to_fill(scene / params.fill, capture, roles))
+        roles = replace(roles, fill=_find_fill_masks(scene / params.fill, capture, roles))
     if params.region is not None and params.region.view is not None:
-        known(params.region.view, {*roles.train, *roles.test}, "region")
+        resolve_view(params.region.view, {*roles.train, *roles.test}, "region")
     if params.clicks:
         check_clicks(params.clicks, capture, roles)
-    check_brought(params, scene)
+    check_gaussian_files(params, scene)
     _check_lenses(capture)
     return capture, roles
 
 
 def _exclude(params: SceneKeys, capture: Capture, roles: Roles) -> tuple[Capture, Roles]:
     """The capture and its roles without the views that the scene excludes."""
-    excluded, kept = ({known(n, capture.pictures, key) for n in getattr(params, key)} for key in ("exclude", "keep"))
+    excluded, kept = (
+        {resolve_view(n, capture.pictures, key) for n in getattr(params, key)} for key in ("exclude", "keep")
+    )
     if both := sorted(excluded & kept):
         raise BadInput(f"scene.yaml: {', '.join(both)} in both exclude and keep; name a view in one of them")
     roles = replace(roles, keep=frozenset(kept))
     if not excluded:
         return capture, roles
     pictures = {name: path for name, path in capture.pictures.items() if name not in excluded}
-    return replace(capture, pictures=pictures), roles.among(set(pictures))
+    return replace(capture, pictures=pictures), roles.restrict(set(pictures))
 
 
-def check_brought(params: SceneKeys, scene: Path) -> list[str]:
-    """What reading the Gaussians that the scene brings will change in them; BadInput where they cannot be used: both as
-    far as their headers tell."""
+def check_gaussian_files(params: SceneKeys, scene: Path) -> list[str]:
+    """Check the Gaussians that the scene brings, as far as the headers of their files allow.
+
+    Returns:
+        what reading will change in them, a sentence each.
+
+    Raises:
+        BadInput: they cannot be used.
+    """
     counts, notes = {}, []
     for key, name in (("gaussians", params.gaussians), ("cleaned", params.cleaned)):
         if name is not None:
-            if not there(scene / name):
+            if not is_file(scene / name):
                 raise BadInput(f"{scene / name}: no such file; correct `{key}` in scene.yaml")
             summary = summarize(scene / name)
             counts[key], notes = summary.count, [*notes, *(f"{name}: {note}" for note in summary.notes)]
@@ -96,9 +104,12 @@ def check_brought(params: SceneKeys, scene: Path) -> list[str]:
     return notes
 
 
-def unphotographed(params: SceneKeys, scene: Path) -> bool:
-    """Are there no photographs, and a cleaned scene whose renders can stand for them? BadInput for a key that is about
-    photographs."""
+def is_gaussians_only(params: SceneKeys, scene: Path) -> bool:
+    """Has the scene no photographs, but a cleaned scene of Gaussians whose renders stand for them?
+
+    Raises:
+        BadInput: it has, and scene.yaml holds a key about photographs.
+    """
     named = [each.image for each in reference_list(params.reference)]
     if params.cleaned is None or params.images is not None or has_pictures(scene, frozenset(named)):
         return False
@@ -109,9 +120,9 @@ def unphotographed(params: SceneKeys, scene: Path) -> bool:
     return True
 
 
-def _to_fill(folder: Path, capture: Capture, roles: Roles) -> dict[str, Path]:
-    """Training view -> mask of what is to be filled; BadInput where one has none."""
-    found = objects_of_masks(folder, list_pictures(folder, nested=True), capture)
+def _find_fill_masks(folder: Path, capture: Capture, roles: Roles) -> dict[str, Path]:
+    """Training view -> mask of what is to be filled; BadInput where a view has none."""
+    found = group_by_object(folder, list_pictures(folder, nested=True), capture)
     files = {name: path for views in found.values() for name, path in views.items()}
     if lacking := [name for name in roles.train if name not in {*files, *roles.clean}]:
         raise BadInput(
@@ -122,11 +133,11 @@ def _to_fill(folder: Path, capture: Capture, roles: Roles) -> dict[str, Path]:
 
 
 def _check_lenses(capture: Capture) -> None:
-    """BadInput for a lens whose distortion cannot be undone."""
+    """BadInput for a lens whose distortion cannot be removed."""
     lenses = capture.poses.lenses.items() if capture.poses else ()
     of = {lens: name for name, lens in lenses if replace(lens.pinhole, model=lens.model) != lens}
     for lens, name in of.items():
         try:
-            without_distortion(lens)
+            undistorted_pinhole(lens)
         except BadInput as error:
-            raise BadInput(f"{capture.brought_by}: view '{name}': {error}") from None
+            raise BadInput(f"{capture.pose_source}: view '{name}': {error}") from None

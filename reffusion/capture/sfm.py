@@ -1,4 +1,4 @@
-"""Structure from motion through COLMAP: SIFT on the CPU, exhaustive matching, incremental mapping, adjustment."""
+"""Structure from motion through COLMAP: SIFT on the CPU, exhaustive matching, incremental mapping."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from PIL import Image
 
 from reffusion.capture.layouts.capture import Poses
 from reffusion.capture.lens import from_colmap
-from reffusion.capture.undistort import load_at
+from reffusion.capture.undistort import load_resized
 from reffusion.io.files import BadInput
-from reffusion.io.images import image_size, opened, save_image
+from reffusion.io.images import image_size, open_image, save_image
 from reffusion.types import Camera
 
 if TYPE_CHECKING:
     import pycolmap
 
-LEAST_VIEWS = 3
-LEAST_SIGHTINGS = 100
+LEAST_VIEWS = 3  # that must be placed
+LEAST_SIGHTINGS = 100  # observations, below which a view is not adjusted
 SAME_FOCAL = 1.01  # ratio of EXIF focal lengths up to which photographs count as taken at one zoom
 EXIF_PART, MAKER, MODEL = 0x8769, 0x010F, 0x0110  # EXIF tags: the camera's part, and what names the camera
 FOCAL_TAGS = (0x920A, 0xA405, 0xA20E, 0xA210)  # mm; mm of 35 mm film; pixels per unit of the sensor; that unit
 
 
 @dataclass(frozen=True)
-class Solution:
-    """What structure from motion found.
+class Reconstruction:
+    """The result of structure from motion.
 
     Attributes:
         poses: lenses, poses and points, in an arbitrary frame, of the views that were placed.
-        photographs: how many views there were.
-        lenses: how many different ones were solved for.
+        photographs: number of photographs.
+        lenses: number of different lenses that were estimated.
         track_length: mean number of views that show a point.
-        residual: mean reprojection error, px of the pictures that were looked at.
+        residual: mean reprojection error in px of the reduced pictures.
     """
 
     poses: Poses
@@ -49,7 +49,7 @@ class Solution:
     residual: float
 
     def facts(self) -> dict[str, float | str]:
-        """The figures by name, and one line of them for people."""
+        """The figures by name, and a line for people."""
         lenses = "1 lens" if self.lenses == 1 else f"{self.lenses} lenses"
         placed, points = len(self.poses.lenses), len(self.poses.points)
         return {
@@ -64,19 +64,20 @@ class Solution:
         }
 
 
-def solve(photographs: Mapping[str, Path], longest: int, work: Path, seed: int = 0) -> Solution:
-    """Find lenses, poses and sparse points of photographs, upright as their orientation tags say.
+def reconstruct(photographs: Mapping[str, Path], longest: int, work: Path, seed: int = 0) -> Reconstruction:
+    """Estimate lenses, poses and sparse points of photographs, which are turned as their orientation tags say.
 
-    Photographs of one size and one EXIF focal length share a SIMPLE_RADIAL lens; a portrait format is the landscape
-    one turned. The same pictures give the same poses: order, seeds and, where it matters, one thread are fixed.
+    Photographs of one size and one EXIF focal length share a SIMPLE_RADIAL lens; portrait pictures are turned to
+    landscape for this. The same pictures give the same poses: order, seeds and, where it matters, a single thread are
+    fixed.
 
     Args:
         photographs: view name -> file; sizes may differ.
         longest: px to which the longer side is reduced.
-        work: a folder for pictures and the database; made, and removed at the end.
+        work: a folder for pictures and the database; created, and removed at the end.
 
     Returns:
-        The solution at the reduced size; fewer views than `photographs` where some were not placed.
+        The reconstruction at the reduced size; with fewer views than `photographs` where some were not placed.
 
     Raises:
         BadInput: naming the views that were not placed, where fewer than 3 were.
@@ -89,9 +90,9 @@ def solve(photographs: Mapping[str, Path], longest: int, work: Path, seed: int =
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     pycolmap.set_random_seed(seed)
     turned = {name for name, path in photographs.items() if _is_portrait(image_size(path, upright=True))}
-    for group, focal in lens_groups(photographs, work):
+    for group, focal in group_by_lens(photographs, work):
         for name in group:
-            image = load_at(photographs[name], longest, upright=True)
+            image = load_resized(photographs[name], longest, upright=True)
             save_image(pictures / _file_of(name), np.rot90(image) if name in turned else image)
         _register(database, pictures, [_file_of(name) for name in group], focal)
     _match(database, pictures, seed)
@@ -108,13 +109,13 @@ def solve(photographs: Mapping[str, Path], longest: int, work: Path, seed: int =
     lenses = len({image.camera_id for image in placed.values()})
     poses = _poses_of(model, placed, turned)
     shutil.rmtree(work)
-    return Solution(
+    return Reconstruction(
         poses, len(photographs), lenses, model.compute_mean_track_length(), model.compute_mean_reprojection_error()
     )
 
 
 def _register(database: Path, folder: Path, files: Sequence[str], focal: float | None) -> None:
-    """Pictures that share a lens into the database; `focal`: over the longer side, where it is known."""
+    """Add pictures that share a lens to the database; `focal`: focal length over the longer side, where it is known."""
     import pycolmap
 
     reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
@@ -126,7 +127,7 @@ def _register(database: Path, folder: Path, files: Sequence[str], focal: float |
 
 
 def _match(database: Path, folder: Path, seed: int) -> None:
-    """SIFT of the registered pictures, and matches of all pairs; the same ones with any number of threads."""
+    """SIFT features of the registered pictures, and matches of all pairs; the same for any number of threads."""
     import pycolmap
 
     threads, cpu = torch.get_num_threads(), pycolmap.Device.cpu
@@ -139,7 +140,7 @@ def _match(database: Path, folder: Path, seed: int) -> None:
 
 
 def _reconstruct(database: Path, pictures: Path, work: Path, seed: int):
-    """COLMAP's reconstruction of most views; None where it finds none."""
+    """COLMAP's reconstruction with most views; None where it finds none."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed, min_model_size=LEAST_VIEWS)
@@ -154,7 +155,7 @@ def _is_portrait(size: tuple[int, int]) -> bool:
 
 
 def _file_of(view: str) -> str:
-    """The name of its picture in the database; a view may be called by its path."""
+    """File name of a view's picture in the database; a view may be called by its path."""
     return f"{view}.png"
 
 
@@ -185,14 +186,15 @@ def _poses_of(model, images: Mapping[str, pycolmap.Image], turned: Collection[st
     )
 
 
-def lens_groups(photographs: Mapping[str, Path], work: Path) -> list[tuple[list[str], float | None]]:
-    """Names of views that share a lens, and its focal length over the longer side where EXIF tells it.
+def group_by_lens(photographs: Mapping[str, Path], work: Path) -> list[tuple[list[str], float | None]]:
+    """Names of views that share a lens, and its focal length over the longer side where EXIF has it.
 
-    They have the same size, portrait or landscape, and EXIF focal lengths that agree within 1%. `work`: see `focal_of`.
+    They have the same size, portrait or landscape, and EXIF focal lengths that agree within 1%. `work`: see
+    `relative_focal_length`.
     """
     groups: list[tuple[list[str], float | None]] = []
     last: tuple[list[int], float] | None = None
-    found = [(sorted(image_size(path)), focal_of(path, work), name) for name, path in photographs.items()]
+    found = [(sorted(image_size(path)), relative_focal_length(path, work), name) for name, path in photographs.items()]
     for size, focal, name in sorted(found, key=lambda each: (each[0], each[1] or 0.0, each[2])):
         if last is None or size != last[0] or (focal or 0.0) > SAME_FOCAL * last[1]:
             groups.append(([], focal))
@@ -201,13 +203,13 @@ def lens_groups(photographs: Mapping[str, Path], work: Path) -> list[tuple[list[
     return groups
 
 
-def focal_of(photograph: Path, work: Path) -> float | None:
+def relative_focal_length(photograph: Path, work: Path) -> float | None:
     """Focal length over the longer side, from EXIF and COLMAP's table of sensors; None where unknown.
 
-    COLMAP does not read every kind of picture (WebP, HEIC): it sees a blank JPEG with the photograph's tags, which is
-    made in the folder `work`.
+    COLMAP does not read every kind of picture (WebP, HEIC). So it gets a blank JPEG with the photograph's tags, which
+    is written to the folder `work`.
     """
-    with opened(photograph) as image:
+    with open_image(photograph) as image:
         exif = image.getexif()
         part = exif.get_ifd(EXIF_PART)
         camera = tuple((tag, exif[tag]) for tag in (MAKER, MODEL) if exif.get(tag))
@@ -229,30 +231,30 @@ def _focal_of_tags(size: tuple[int, int], camera: tuple, focal: tuple, work: Pat
     return found.mean_focal_length() / max(found.width, found.height) if found.has_prior_focal_length else None
 
 
-def bundle_adjusted(
+def bundle_adjust(
     cameras: Mapping[str, Camera],
     sightings: Mapping[str, Sequence[np.ndarray]],
     points: Sequence[tuple[np.ndarray, Sequence[tuple[str, int]]]],
-    held: Collection[str] = (),
+    fixed: Collection[str] = (),
 ) -> dict[str, Camera]:
-    """Poses, and each view's own principal point, at the points' least robust reprojection error.
+    """Adjust poses, and the principal point of each view, to the least robust reprojection error.
 
     Args:
-        cameras: view name -> camera, to start from; a view of fewer than `LEAST_SIGHTINGS` sightings stays as it is.
+        cameras: view name -> camera, to start from; a view with fewer than `LEAST_SIGHTINGS` observations stays fixed.
         sightings: view name -> pixels [2] in it.
-        points: position [3] and track of each, (view name, index of sighting)s.
-        held: names of views whose principal points stay.
+        points: of each point the position [3] and track: pairs of view name and index of its pixel in `sightings`.
+        held: names of views whose principal points stay fixed.
 
     Returns:
-        The cameras in a frame that is near the given one's, but no more than that.
+        The cameras, in a frame that is only roughly the given one.
     """
     import pycolmap
 
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
-    numbers = {name: k + 1 for k, name in enumerate(sorted(cameras))}
+    identities = {name: k + 1 for k, name in enumerate(sorted(cameras))}
     model, config = pycolmap.Reconstruction(), pycolmap.BundleAdjustmentConfig()
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    for name, number in numbers.items():
+    for name, number in identities.items():
         c = cameras[name]
         lens = [c.fx, c.fy, c.cx, c.cy]
         model.add_camera_with_trivial_rig(
@@ -263,22 +265,22 @@ def bundle_adjusted(
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(c.world_to_camera[:3, :3]), c.world_to_camera[:3, 3])
         model.add_image_with_trivial_frame(image, pose)
         config.add_image(number)
-        lonely = len(places) < LEAST_SIGHTINGS
-        if name in held or lonely:
+        underdetermined = len(places) < LEAST_SIGHTINGS
+        if name in fixed or underdetermined:
             config.set_constant_cam_intrinsics(number)
-        if lonely:
+        if underdetermined:
             config.set_constant_rig_from_world_pose(model.images[number].frame_id)
     for point, track in points:
         elements = pycolmap.Track()
         for name, index in track:
-            elements.add_element(numbers[name], index)
+            elements.add_element(identities[name], index)
         model.add_point3D(point, elements)
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length, options.refine_principal_point, options.print_summary = False, True, False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = 1  # the order of sums, and so the result, is fixed
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-    return {name: _camera(cameras[name], model.images[k], model.cameras[k]) for name, k in numbers.items()}
+    return {name: _camera(cameras[name], model.images[k], model.cameras[k]) for name, k in identities.items()}
 
 
 def _camera(camera: Camera, image, lens) -> Camera:

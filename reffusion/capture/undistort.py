@@ -1,4 +1,4 @@
-"""From the pictures of a capture to those of the `poses` folder: resized, and without the lens's distortion."""
+"""Writes the pictures and masks of a capture for the `poses` and `raw_masks` folders: resized and undistorted."""
 
 from __future__ import annotations
 
@@ -8,53 +8,53 @@ from pathlib import Path
 import numpy as np
 
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.lens import Lens, undistort_image, undistort_mask, undoing
+from reffusion.capture.lens import Lens, undistort_image, undistort_mask, undistortion_map
 from reffusion.capture.roles import Roles
 from reffusion.io.files import BadInput
 from reffusion.io.images import WHITE, MaskValues, image_size, load_image, load_mask, resized, save_image, save_mask
 
 
 def fitting_size(width: int, height: int, longest: int) -> tuple[int, int]:
-    """(width, height) with the longer side at most `longest`, proportions kept, never enlarged."""
+    """(width, height) with the longer side at most `longest`; proportions stay, nothing is enlarged."""
     factor = min(1.0, longest / max(width, height))
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
-def load_at(path: Path, longest: int, upright: bool) -> np.ndarray:
-    """The picture, uint8 [H, W, 3], at its `fitting_size`; downscaled by area averaging."""
+def load_resized(path: Path, longest: int, upright: bool) -> np.ndarray:
+    """The picture, uint8 [H, W, 3], at its `fitting_size`, downscaled by area averaging."""
     image = load_image(path, upright)
     return resized(image, fitting_size(image.shape[1], image.shape[0], longest))
 
 
-def lens_of(name: str, capture: Capture, longest: int) -> tuple[Lens, Lens]:
-    """The lens of a view whose pixels nobody reads, and its pinhole, at the size its picture would have."""
+def resized_lens(name: str, capture: Capture, longest: int) -> tuple[Lens, Lens]:
+    """The lens of a view whose pixels are not used, and its pinhole, at the size its picture would have."""
     width, height = image_size(capture.pictures[name], upright=capture.upright)
     lens = capture.poses.lenses[name].resized(*fitting_size(width, height, longest))
-    return lens, undoing(lens)[0]
+    return lens, undistortion_map(lens)[0]
 
 
-def save_undistorted(out: Path, name: str, capture: Capture, longest: int) -> tuple[Lens, Lens]:
-    """Write the view's picture as a pinhole shows it, images/<view>.png.
+def save_undistorted_view(out: Path, name: str, capture: Capture, longest: int) -> tuple[Lens, Lens]:
+    """Write the undistorted picture of a view, images/<view>.png.
 
     Returns:
         the photograph's lens at this size, and the pinhole.
 
     Raises:
-        BadInput: naming the file, where it is unreadable, or its lens cannot be undone.
+        BadInput: naming the file, where it is unreadable, or its distortion cannot be removed.
     """
-    image = load_at(capture.pictures[name], longest, capture.upright)
+    image = load_resized(capture.pictures[name], longest, capture.upright)
     lens = capture.poses.lenses[name].resized(image.shape[1], image.shape[0])
     try:
-        pinhole, where = undoing(lens)
+        pinhole, where = undistortion_map(lens)
     except ValueError as error:
-        raise BadInput(f"{capture.brought_by or capture.pictures[name]}: view '{name}': {error}") from error
+        raise BadInput(f"{capture.pose_source or capture.pictures[name]}: view '{name}': {error}") from error
     save_image(out / "images" / f"{name}.png", image if where is None else undistort_image(image, where))
     return lens, pinhole
 
 
 def save_undistorted_masks(out: Path, name: str, roles: Roles, lens: Lens) -> None:
-    """Write the view's masks as its undistorted picture lies: masks/, test_masks/ and fill/<view>.png, those that the
-    view has; of several objects masks/<object>/<view>.png.
+    """Write the undistorted masks of a view: masks/, test_masks/ and fill/<view>.png, those that the view has; with
+    several objects masks/<object>/<view>.png.
 
     Args:
         lens: of the view's photograph, see `reffusion.capture.lenses`.
@@ -66,13 +66,12 @@ def save_undistorted_masks(out: Path, name: str, roles: Roles, lens: Lens) -> No
     for folder, files in roles.mask_files.items():
         if name in files:
             values = roles.values if files[name] in own else WHITE
-            mask, where = load_mask(files[name], (lens.height, lens.width), values), undoing(lens)[1]
+            mask, where = load_mask(files[name], (lens.height, lens.width), values), undistortion_map(lens)[1]
             save_mask(out / folder / f"{name}.png", mask if where is None else undistort_mask(mask, where))
 
 
 def check_masks(masks: Mapping[str, Path], values: MaskValues = WHITE) -> None:
-    """BadInput where masks are given and not one of them holds a masked pixel, or all hold nothing else, or one is
-    unreadable."""
+    """Check that masks are readable, and not all empty or all full; BadInput naming the folder."""
     shares = [load_mask(path, values=values).mean() for path in masks.values()]
     if shares and (max(shares) == 0 or min(shares) == 1):
         state, folder = "empty" if max(shares) == 0 else "full", next(iter(masks.values())).parent

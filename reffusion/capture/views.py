@@ -1,4 +1,4 @@
-"""The views of a scene, as far as what people bring for them is checked: their names, roles and sizes."""
+"""Looks up the views of a scene by the names that people write: in scene.yaml, for references, clicks and regions."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from reffusion.io.images import image_size
 
 
 @dataclass(frozen=True)
-class Views:
-    """Those of a capture (`reffusion.capture.roles.views_of`), or those that `poses` placed (`placed_views`).
+class ViewTable:
+    """The views of a capture (`reffusion.capture.roles.capture_views`), or those that `poses` placed.
 
     Attributes:
-        names: all of them.
-        train, test: those that are for either.
+        names: all views.
+        train, test: training and test views.
         size_of: name -> (width, height) of its picture.
-        upright: the camera's orientation tag is obeyed.
-        placed: they are what `poses` wrote, so a view that is not among them may be the capture's all the same.
+        upright: the orientation tag of pictures is obeyed.
+        placed: the views are those that `poses` wrote (`placed_views`), so the capture may have others.
         outliers: views that `poses` left out because their photographs contradict their poses.
     """
 
@@ -36,36 +36,37 @@ class Views:
     outliers: Collection[str] = ()
 
 
-def placed_views(poses_dir: Path) -> Views:
+def placed_views(poses_dir: Path) -> ViewTable:
     """The views of a finished `poses` folder, at the sizes of its undistorted pictures."""
     lenses, upright = load_lenses(poses_dir)
     roles = load_json(Path(poses_dir) / "views.json")
     size_of = lambda name: (lenses[name].width, lenses[name].height)
-    return Views(lenses, roles["train"], roles["test"], size_of, upright, True, roles.get("outliers", ()))
+    return ViewTable(lenses, roles["train"], roles["test"], size_of, upright, True, roles.get("outliers", ()))
 
 
-def known(name: str, names: Collection[str], key: str) -> str:
-    """The view of that name, or of the picture of that path; BadInput with the nearest names where there is none."""
+def resolve_view(name: str, names: Collection[str], key: str) -> str:
+    """The view of that name, or of the picture of that path; BadInput with the most similar names for none."""
     if found := find_view(name, names):
         return found
-    raise BadInput(f"scene.yaml: {key}: there is no view '{name}'; views are named like {_near(name, names)}")
+    raise BadInput(f"scene.yaml: {key}: there is no view '{name}'; views are named like {_similar_names(name, names)}")
 
 
-def known_for(path: Path, name: str, views: Views, key: str) -> str:
-    """`known`, of the view that the file at `path` is made for."""
+def resolve_file_view(path: Path, name: str, views: ViewTable, key: str) -> str:
+    """`resolve_view`, for the view that the file at `path` is made for."""
     if not views.placed:
-        return known(name, views.names, key)
+        return resolve_view(name, views.names, key)
     if found := find_view(name, views.names):
         return found
-    raise not_placed(path, name, views)
+    raise not_placed_error(path, name, views)
 
 
-def not_placed(path: Path, name: str, views: Views) -> BadInput:
+def not_placed_error(path: Path, name: str, views: ViewTable) -> BadInput:
+    """The error for a file whose view is not among those that `poses` placed."""
     if outlier := find_view(name, views.outliers):
-        return outlier_named(str(path), outlier)
+        return outlier_error(str(path), outlier)
     return BadInput(
         f"{path}: its view '{name}' could not be placed, or is neither a training nor a test view; "
-        f"make it for another view: they are named like {_near(name, views.names)}"
+        f"make it for another view: they are named like {_similar_names(name, views.names)}"
     )
 
 
@@ -73,11 +74,11 @@ def check_outliers(key: str, names: Iterable[str], outliers: Collection[str]) ->
     """BadInput where a key of scene.yaml names a view that is left out because its photograph contradicts its pose."""
     for name in names:
         if outlier := find_view(name, outliers):
-            raise outlier_named(f"scene.yaml: {key}", outlier)
+            raise outlier_error(f"scene.yaml: {key}", outlier)
 
 
-def outlier_named(where: str, name: str) -> BadInput:
-    """What is said of a file or key that stands for a view which is left out."""
+def outlier_error(where: str, name: str) -> BadInput:
+    """The error for a file or key (`where`) that stands for a view which is left out."""
     return BadInput(
         f"{where}: it is for the view '{name}', which is left out: its photograph contradicts its pose; choose another "
         f'view, or add `keep: ["{name}"]` to scene.yaml'
@@ -91,14 +92,14 @@ def find_view(name: str, names: Collection[str]) -> str | None:
     return next((candidate for candidate in spellings if candidate in names), None)
 
 
-def _near(name: str, names: Collection[str]) -> str:
+def _similar_names(name: str, names: Collection[str]) -> str:
     return ", ".join(get_close_matches(name, names, 3, 0.0))
 
 
 def check_proportions(
     path: Path, name: str, of_size: tuple[int, int], tolerance: float, what: str, upright: bool = False
 ) -> None:
-    """BadInput where a picture's sides are not in the proportion of its view's, by more than `tolerance`."""
+    """BadInput where the proportions of a picture differ from those of its view by more than `tolerance`."""
     (width, height), (of_width, of_height) = image_size(path, upright), of_size
     if abs(width * of_height - height * of_width) > tolerance * width * of_height:
         raise BadInput(

@@ -11,11 +11,11 @@ OBJECT, OTHER, UNKNOWN = 1, -1, 0
 
 @dataclass(frozen=True)
 class Clicks:
-    """Clicks on one view, a scribble being many, in the order in which they were made.
+    """Clicks on a view in the order in which they were made; a scribble is many clicks.
 
     Attributes:
-        points: [K, 2] float64, pixels of the view, as CONVENTIONS.md counts them.
-        positive: [K] bool, True = on the object, False = on what is not.
+        points: [K, 2] float64, pixels of the view, as in CONVENTIONS.md.
+        positive: [K] bool, True = on the object, False = on the background.
     """
 
     points: np.ndarray
@@ -25,9 +25,9 @@ class Clicks:
         return len(self.points)
 
 
-def marked(clicks: Clicks, shape: tuple[int, int]) -> np.ndarray:
-    """int8 [H, W], OBJECT, OTHER or UNKNOWN: the pixels that were clicked on and no others, since a click may be next
-    to the object's rim; the later click wins."""
+def mark_pixels(clicks: Clicks, shape: tuple[int, int]) -> np.ndarray:
+    """int8 [H, W], OBJECT, OTHER or UNKNOWN. Only the clicked pixels are marked, since a click may be next to the
+    object's border; the later click wins."""
     found = np.full(shape, UNKNOWN, np.int8)
     columns, rows = (clicks.points[:, axis].astype(int).clip(0, shape[1 - axis] - 1) for axis in (0, 1))
     for column, row, positive in zip(columns, rows, clicks.positive, strict=True):

@@ -1,6 +1,6 @@
-"""Clicks to a mask by a network of the SAM kind, loaded through transformers, where its weights are on this machine.
+"""Turns clicks into a mask by a SAM network, loaded through transformers, where its weights are on this machine.
 
-Its own processor would ask for torchvision; the few lines that it takes are here in plain torch.
+The network's own processor would need torchvision; the few lines of it that are needed are here in plain torch.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from reffusion.weights import local
 
 SOURCE = "facebook/sam-vit-base"
 KIND = "sam"
-MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's pixels, which the network was fed
+# mean and standard deviation of ImageNet's pixels, with which the network was trained
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 @dataclass(frozen=True)
 class Segmenter:
-    """A network, frozen, in evaluation mode; `model` is transformers' SamModel, `side` that of its square pictures."""
+    """A frozen network in evaluation mode; `model` is transformers' SamModel, `side` the side of its square input."""
 
     model: nn.Module
     side: int
@@ -32,11 +33,11 @@ class Segmenter:
 
 @dataclass(frozen=True)
 class Looked:
-    """What the network makes of a picture, whatever is clicked: what takes long.
+    """The image embedding of a picture, independent of clicks; computing it takes most of the time.
 
     Attributes:
         features: [1, C, h, w].
-        shape: (height, width) of the picture; size: the same as the network sees it.
+        shape: (height, width) of the picture; size: the same at the network's input size.
     """
 
     features: Tensor
@@ -48,7 +49,7 @@ def load_segmenter(source: str | Path = SOURCE) -> Segmenter | None:
     """The model in a local folder, or of a hub id; None where its weights are not on this machine.
 
     Raises:
-        ValueError: a folder without a model, one that is cut short, or a model of another kind.
+        ValueError: a folder without a model, an incomplete one, or a model of another kind.
     """
     from transformers import AutoConfig, SamModel
     from transformers.utils import logging as transformers_logging
@@ -78,7 +79,8 @@ def make_segmenter(model: nn.Module) -> Segmenter:
 
 @torch.no_grad()
 def look(segmenter: Segmenter, image: np.ndarray) -> Looked:
-    """A picture, uint8 [H, W, 3]: its larger side made the network's, below and to the right of it nothing."""
+    """Encode a picture, uint8 [H, W, 3]: its larger side is scaled to the network's; below and to the right it is
+    padded."""
     shape = image.shape[:2]
     size = tuple(max(1, round(side * segmenter.side / max(shape))) for side in shape)
     values = torch.as_tensor(image).permute(2, 0, 1)[None].float() / 255
@@ -90,8 +92,8 @@ def look(segmenter: Segmenter, image: np.ndarray) -> Looked:
 
 @torch.no_grad()
 def network_mask(segmenter: Segmenter, looked: Looked, clicks: Clicks) -> np.ndarray:
-    """bool [H, W], True = the object that clicks are on; empty without a click on the object. What one click is on may
-    be a part or the whole: of the network's answers the one that it is surest of is taken.
+    """bool [H, W], True = the object that clicks are on; empty without a click on the object. A single click may mean a
+    part or the whole: the network's answer with the highest score is taken.
 
     Raises:
         FloatingPointError: the answer is not finite.

@@ -1,4 +1,4 @@
-"""Clicks on one photograph to a mask of it, in about a second on one core; and masks moved to a photograph's edges."""
+"""Segments a photograph by clicks, in about a second on one core; and moves the borders of masks to its edges."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from reffusion.clicks.geodesic_cut import enclosed, grown, merit, regrown
-from reffusion.clicks.marks import OBJECT, OTHER, UNKNOWN, Clicks, marked
+from reffusion.clicks.geodesic_cut import correct_labels, grow_object, nested_candidates, object_score
+from reffusion.clicks.marks import OBJECT, OTHER, UNKNOWN, Clicks, mark_pixels
 
-LONGEST = 192  # px, the larger side of the picture that is cut
-BAND = 0.008  # of the picture's larger side: how far its edges may lie from the mask
-STEEP = 4.0, 10.0  # px of depth a pixel: a surface still, and no surface any more
-STANDS_OUT = 0.25  # share of an object's rim beyond which something lies behind, from which its relief is believed
-HEEDED = 12  # px of the picture that is cut, around each click
-RING = 0.25  # of the square root of a mask's pixels: how far around it colours are compared
-MARGIN = 3  # bands around a mask whose colours count
+LONGEST = 192  # px, the larger side of the picture that is segmented
+BAND = 0.008  # of the larger side: how far a photograph's edges may lie from the mask's border
+DEPTH_SLOPE = 4.0, 10.0  # px of depth per px: largest slope of a surface, smallest slope of an edge between surfaces
+LEAST_EDGE_SHARE = 0.25  # share of an object's border that must be an edge between surfaces, for depth to be used
+LEAST_REGION = 12  # px of the segmented picture that a region with a click must have
+RING = 0.25  # of the square root of a mask's pixels: width of the ring around it in which colours are compared
+MARGIN = 3  # bands around a mask whose colours are used
 
 
 def view_mask(image: np.ndarray, clicks: Clicks, relief: np.ndarray | None = None) -> np.ndarray:
@@ -29,85 +29,99 @@ def view_mask(image: np.ndarray, clicks: Clicks, relief: np.ndarray | None = Non
     shape = image.shape[:2]
     if not clicks.positive.any():
         return np.zeros(shape, bool)
-    lab, small, marks = _small(image, clicks)
+    lab, small, marks = _downscale(image, clicks)
     border = np.ones(small, bool)
     border[1:-1, 1:-1] = False
-    pairs, length = _grid(small)
-    torn, given = _torn(relief, small, pairs, length), (lab, pairs, length, marks.ravel(), border.ravel())
-    found = None if torn is None else _standing([*enclosed(*given, torn), grown(*given, torn)], marks, lab, pairs, torn)
-    mask = _whole(grown(*given), marks) if found is None else found
-    return refined(image, _enlarged(mask, shape), marked(clicks, shape))
+    pairs, length = _pixel_pairs(small)
+    depth_edges, given = (
+        _find_depth_edges(relief, small, pairs, length),
+        (lab, pairs, length, marks.ravel(), border.ravel()),
+    )
+    found = (
+        None
+        if depth_edges is None
+        else _select_object(
+            [*nested_candidates(*given, depth_edges), grow_object(*given, depth_edges)], marks, lab, pairs, depth_edges
+        )
+    )
+    mask = _fill_holes(grow_object(*given), marks) if found is None else found
+    return refine_edges(image, _upscale(mask, shape), mark_pixels(clicks, shape))
 
 
-def _standing(
-    some: list[np.ndarray], marks: np.ndarray, lab: np.ndarray, pairs: np.ndarray, torn: np.ndarray
+def _select_object(
+    candidates: list[np.ndarray], marks: np.ndarray, lab: np.ndarray, pairs: np.ndarray, depth_edges: np.ndarray
 ) -> np.ndarray | None:
-    """bool [h, w]: of some labels those that most stand for a thing of its own; None where the fit does not know one.
-    Arguments as in `graph`, marks [h, w]."""
-    whole = [each for each in (_whole(labels, marks) for labels in some) if _heeds(each, marks)]
+    """bool [h, w]: the labels among several that are most an object of its own; None where depth shows no edge around
+    it.
+
+    Arguments as in `geodesic_cut`; marks are [h, w].
+    """
+    whole = [each for each in (_fill_holes(labels, marks) for labels in candidates) if _has_regions(each, marks)]
     if not whole:
         return None
-    merits = [merit(each.ravel(), _ring(each).ravel(), lab, pairs, torn) for each in whole]
+    merits = [object_score(each.ravel(), _ring(each).ravel(), lab, pairs, depth_edges) for each in whole]
     best = whole[int(np.argmax(merits))]
     rim = best.ravel()[pairs[:, 0]] != best.ravel()[pairs[:, 1]]
-    return best if max(merits) > -np.inf and torn[rim].mean() >= STANDS_OUT else None
+    return best if max(merits) > -np.inf and depth_edges[rim].mean() >= LEAST_EDGE_SHARE else None
 
 
-def _heeds(mask: np.ndarray, marks: np.ndarray) -> bool:
-    """Is there more around each mark than the mark?"""
+def _has_regions(mask: np.ndarray, marks: np.ndarray) -> bool:
+    """Is the region around each mark larger than the mark itself?"""
     for side, kind in ((mask, OBJECT), (~mask, OTHER)):
         parts, _ = ndimage.label(side, np.ones((3, 3)))
-        if np.bincount(parts.ravel())[parts[(marks == kind) & side]].min(initial=HEEDED) < HEEDED:
+        if np.bincount(parts.ravel())[parts[(marks == kind) & side]].min(initial=LEAST_REGION) < LEAST_REGION:
             return False
     return True
 
 
-def _whole(labels: np.ndarray, marks: np.ndarray) -> np.ndarray:
-    """bool [h, w]: labels without the holes that no mark lies in."""
+def _fill_holes(labels: np.ndarray, marks: np.ndarray) -> np.ndarray:
+    """bool [h, w]: labels with those holes filled that no mark lies in."""
     mask = labels.reshape(marks.shape)
-    return mask | (ndimage.binary_fill_holes(mask) & ~_around(marks == OTHER, mask))
+    return mask | (ndimage.binary_fill_holes(mask) & ~_marked_holes(marks == OTHER, mask))
 
 
 def _ring(mask: np.ndarray) -> np.ndarray:
-    """bool [h, w], around a mask, as far as it is large."""
+    """bool [h, w], a ring around a mask whose width grows with its size."""
     far = max(3, round(RING * float(np.sqrt(mask.sum()))))
-    return ~shrunk(~mask, far) & shrunk(~mask, 1)
+    return ~erode(~mask, far) & erode(~mask, 1)
 
 
 def corrected(image: np.ndarray, before: np.ndarray, clicks: Clicks, relief: np.ndarray | None = None) -> np.ndarray:
-    """bool [H, W]: the mask `before` [H, W] with what clicks say against it, which reaches to where colours change, and
-    to the edges of surfaces where their relief is known."""
-    lab, small, marks = _small(image, clicks)
-    was = cv2.resize(before.astype(np.float32), small[::-1], interpolation=cv2.INTER_AREA) > 0.5
-    wrong = np.where((marks == OBJECT) & ~was | (marks == OTHER) & was, marks, UNKNOWN)
+    """bool [H, W]: the mask `before` [H, W], corrected by clicks that contradict it. A correction extends to where
+    colours change, and to the edges of surfaces where their relief is known."""
+    lab, small, marks = _downscale(image, clicks)
+    before_small = cv2.resize(before.astype(np.float32), small[::-1], interpolation=cv2.INTER_AREA) > 0.5
+    wrong = np.where((marks == OBJECT) & ~before_small | (marks == OTHER) & before_small, marks, UNKNOWN)
     if not wrong.any():
-        return refined(image, before, marked(clicks, before.shape))
-    grid = _grid(small)
-    mask = regrown(lab, *grid, marks.ravel(), was.ravel(), _torn(relief, small, *grid)).reshape(small)
-    same = _enlarged(mask == was, before.shape)
-    return refined(image, np.where(same, before, ~before), marked(clicks, before.shape))
+        return refine_edges(image, before, mark_pixels(clicks, before.shape))
+    grid = _pixel_pairs(small)
+    mask = correct_labels(
+        lab, *grid, marks.ravel(), before_small.ravel(), _find_depth_edges(relief, small, *grid)
+    ).reshape(small)
+    same = _upscale(mask == before_small, before.shape)
+    return refine_edges(image, np.where(same, before, ~before), mark_pixels(clicks, before.shape))
 
 
-def _small(image: np.ndarray, clicks: Clicks) -> tuple[np.ndarray, tuple[int, int], np.ndarray]:
-    """The picture at the size in which it is cut: colours [P, 3] in L*a*b*, (height, width), marks int8 [h, w]."""
+def _downscale(image: np.ndarray, clicks: Clicks) -> tuple[np.ndarray, tuple[int, int], np.ndarray]:
+    """The picture at the size for segmentation: colours [P, 3] in L*a*b*, (height, width), marks int8 [h, w]."""
     factor = min(1.0, LONGEST / max(image.shape[:2]))
     height, width = (max(1, round(side * factor)) for side in image.shape[:2])
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).reshape(-1, 3).astype(np.float64)
     at = Clicks(clicks.points * (width / image.shape[1], height / image.shape[0]), clicks.positive)
-    return lab, (height, width), marked(at, (height, width))
+    return lab, (height, width), mark_pixels(at, (height, width))
 
 
-def _enlarged(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _upscale(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return cv2.resize(mask.astype(np.float32), shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
 
 
-def refined(image: np.ndarray, mask: np.ndarray, marks: np.ndarray) -> np.ndarray:
-    """bool [H, W]: the mask with its rim where colours change, at most `BAND` away; marks [H, W] are kept."""
+def refine_edges(image: np.ndarray, mask: np.ndarray, marks: np.ndarray) -> np.ndarray:
+    """bool [H, W]: the mask with its border moved to where colours change, at most by `BAND`; marks [H, W] stay."""
     if not mask.any():
         return mask
     band = max(1, round(BAND * max(mask.shape)))
-    inner, outer = shrunk(mask, band), ~shrunk(~mask, band)
+    inner, outer = erode(mask, band), ~erode(~mask, band)
     reach = MARGIN * band
     window = tuple(slice(max(0, each.min() - reach), each.max() + reach + 1) for each in np.nonzero(outer))
     state = np.where(mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
@@ -123,32 +137,32 @@ def refined(image: np.ndarray, mask: np.ndarray, marks: np.ndarray) -> np.ndarra
     return found
 
 
-def shrunk(mask: np.ndarray, by: int) -> np.ndarray:
+def erode(mask: np.ndarray, by: int) -> np.ndarray:
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by + 1,) * 2)
     return cv2.erode(mask.astype(np.uint8), kernel, borderValue=1) > 0
 
 
-def _torn(
+def _find_depth_edges(
     relief: np.ndarray | None, small: tuple[int, int], pairs: np.ndarray, length: np.ndarray
 ) -> np.ndarray | None:
-    """[E] in [0, 1]: how surely neighbours lie on two surfaces, one behind the other; `view_mask` has the relief."""
+    """[E] in [0, 1]: how surely neighbours lie on two surfaces, one behind the other; relief as for `view_mask`."""
     if relief is None:
         return None
     size = small[::-1]
     seen = cv2.resize(relief.astype(np.float32), size, interpolation=cv2.INTER_AREA) * (size[0] / relief.shape[1])
     seen = cv2.medianBlur(seen, 3).ravel()
     slope = np.abs(seen[pairs[:, 0]] - seen[pairs[:, 1]]) / length
-    return ((slope - STEEP[0]) / (STEEP[1] - STEEP[0])).clip(0, 1)
+    return ((slope - DEPTH_SLOPE[0]) / (DEPTH_SLOPE[1] - DEPTH_SLOPE[0])).clip(0, 1)
 
 
-def _around(marks: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def _marked_holes(marks: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """bool [H, W]: the holes of the mask that marks lie in."""
     holes, _ = ndimage.label(~mask)
     return np.isin(holes, holes[marks & ~mask])
 
 
-def _grid(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs [E, 2] of neighbouring pixels, eight to each, and their distances [E] in pixels."""
+def _pixel_pairs(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs [E, 2] of neighbouring pixels (8-neighbourhood), and their distances [E] in pixels."""
     index, pairs, length = np.arange(shape[0] * shape[1]).reshape(shape), [], []
     for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
         width = shape[1] - abs(right)

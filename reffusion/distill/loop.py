@@ -264,7 +264,7 @@ def average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
     if not settings.densify.every and done > AVERAGED_FROM * settings.iterations:
         optimizer.remember()
     if done == settings.iterations:
-        optimizer.take_mean()
+        optimizer.apply_mean()
 
 
 def rates_of(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:

@@ -121,7 +121,7 @@ def average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
     if is_averaged(settings, done):
         optimizer.remember()
     if done == settings.iterations:
-        optimizer.take_mean()
+        optimizer.apply_mean()
 
 
 def is_averaged(settings: Params, done: int) -> bool:

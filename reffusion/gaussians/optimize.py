@@ -194,7 +194,7 @@ class GaussianOptimizer:
                 getattr(self._mean, name).lerp_(getattr(self.gaussians, name), 1 / self._meant)
 
     @torch.no_grad()
-    def take_mean(self) -> None:
+    def apply_mean(self) -> None:
         """Replace the Gaussians by their running mean, if `remember` was called.
 
         With one view per step Gaussians fluctuate around their optimum, and the mean of the iterates is closer to it

@@ -1,4 +1,4 @@
-"""JSON and label arrays."""
+"""Reads and writes JSON, text, and arrays of labels."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 
 def save_json(path: Path, value: Any) -> None:
-    """Write `value` indented, creating the folder. Floats keep every digit; NaN and infinity raise ValueError."""
+    """Write `value` as indented JSON, creating the folder. Floats keep every digit; NaN and infinity raise
+    ValueError."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n")
@@ -29,15 +30,15 @@ def save_text(path: Path, text: str) -> None:
 
 
 def load_json(path: Path) -> Any:
-    """The value in a JSON file, in UTF-8, -16 or -32; BadInput naming the file where it is absent or not JSON."""
+    """The value in a JSON file, in UTF-8, -16 or -32; BadInput naming the file where it is missing or not JSON."""
     with reading(path, "valid JSON"):
         return json.loads(Path(path).read_bytes())
 
 
 def load_array(path: Path, what: str = "a readable array") -> np.ndarray:
-    """The array in a `.npy` file. BadInput where it is something else: pickles are not read, nor archives."""
+    """The array in a `.npy` file. BadInput where it is something else: neither pickles nor archives are read."""
     with reading(path, what):
-        # Mapped first, so that what the header declares is compared with the file's length before memory is taken.
+        # Mapped first, so that the size in the header is compared with the file's length before memory is allocated.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
         if not isinstance(array, np.ndarray):
             raise BadInput(f"{path}: an archive; save a single array, as .npy")

@@ -1,4 +1,4 @@
-"""Cameras in the scene's own frame for other tools: a COLMAP model and nerfstudio's transforms.json."""
+"""Exports cameras in the scene's own frame for other tools: as a COLMAP model and as nerfstudio's transforms.json."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ GL = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's cameras look along -z, y up
 
 
 def save_cameras(folder: Path, scene: Scene, images: str) -> None:
-    """Write sparse/0/*.bin, transforms.json and sparse_pc.ply: undistorted pinholes and sparse points.
+    """Write undistorted pinholes and sparse points as sparse/0/*.bin, transforms.json and sparse_pc.ply.
 
     Args:
-        images: where the views' pictures <view>.png are, relative to `folder`.
+        images: folder of the views' pictures <view>.png, relative to `folder`.
     """
     folder = Path(folder)
     points = scene.similarity.invert(scene.points)
     cameras, registered, frames = {}, {}, []
     for identity, camera in enumerate(scene.cameras.values(), start=1):
-        pose = own_pose(camera, scene.similarity)
+        pose = scene_frame_pose(camera, scene.similarity)
         lens = (camera.fx, camera.fy, camera.cx, camera.cy)
         cameras[identity] = ModelCamera("PINHOLE", camera.width, camera.height, lens)
         registered[identity] = ModelImage(f"{camera.name}.png", identity, pose)
@@ -42,7 +42,7 @@ def save_cameras(folder: Path, scene: Scene, images: str) -> None:
     save_json(folder / "transforms.json", {"camera_model": "PINHOLE", "ply_file_path": POINTS, "frames": frames})
 
 
-def own_pose(camera: Camera, similarity: Similarity) -> np.ndarray:
+def scene_frame_pose(camera: Camera, similarity: Similarity) -> np.ndarray:
     """[4, 4] float64, world to camera in the scene's own frame and unit."""
     pose = camera.world_to_camera.copy()
     pose[:3, 3] = pose[:3, 3] / similarity.scale - pose[:3, :3] @ similarity.offset

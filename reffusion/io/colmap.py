@@ -1,4 +1,4 @@
-"""COLMAP models: a folder of cameras, images and points3D, binary or text."""
+"""Reads and writes COLMAP models: a folder of cameras, images and points3D, binary or text."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from reffusion.io.files import BadInput, Cursor, reading, shortened, there
-from reffusion.io.rotations import pose_matrix, quaternion_of
+from reffusion.io.files import BadInput, Cursor, is_file, reading, shorten
+from reffusion.io.rotations import quaternion_to_pose, rotation_to_quaternion
 
-# Order is COLMAP's numbering in binary files.
+# Model name -> number of parameters, in the order of COLMAP's model ids.
 MODELS = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -39,7 +39,7 @@ NAMES = tuple(MODELS)
 
 @dataclass(frozen=True)
 class ModelCamera:
-    """Intrinsics: COLMAP's model name, size in pixels, parameters in COLMAP's order."""
+    """Intrinsics: COLMAP's model name, size in pixels, and parameters in COLMAP's order."""
 
     model: str
     width: int
@@ -73,12 +73,12 @@ class ModelPoints:
 
 
 def model_file(folder: Path, stem: str) -> Path | None:
-    """`<folder>/<stem>.bin` or, failing that, `.txt`; None where neither is there."""
-    return next((p for p in (Path(folder) / f"{stem}{end}" for end in (".bin", ".txt")) if there(p)), None)
+    """`<folder>/<stem>.bin` or else `.txt`; None where neither exists."""
+    return next((p for p in (Path(folder) / f"{stem}{end}" for end in (".bin", ".txt")) if is_file(p)), None)
 
 
 def is_model(folder: Path) -> bool:
-    """True where cameras and images are both there (points may be missing)."""
+    """Does the folder hold both cameras and images? Points may be missing."""
     return model_file(folder, "cameras") is not None and model_file(folder, "images") is not None
 
 
@@ -86,7 +86,7 @@ def is_model(folder: Path) -> bool:
 
 
 def _lines(path: Path) -> list[str]:
-    """The lines of a text file but comments; a blank line is kept, it may be an image without points."""
+    """The lines of a text file without comments. Blank lines stay: one may be an image without points."""
     lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
     return [line.strip() for line in lines if not line.lstrip().startswith("#")]
 
@@ -95,8 +95,8 @@ def load_cameras(path: Path) -> dict[int, ModelCamera]:
     """Camera id -> intrinsics, from cameras.bin or cameras.txt.
 
     Raises:
-        BadInput: naming the file; also for a camera without pixels, or whose parameters are not finite or whose focal
-            lengths not positive.
+        BadInput: naming the file; also for a camera without pixels, with parameters that are not finite, or with focal
+            lengths that are not positive.
     """
     with reading(path, "COLMAP's cameras"):
         found = _cameras_binary(path) if path.suffix == ".bin" else _cameras_text(path)
@@ -137,7 +137,7 @@ def _cameras_binary(path: Path) -> dict[int, ModelCamera]:
 def _cameras_text(path: Path) -> dict[int, ModelCamera]:
     cameras = {}
     for line in filter(None, _lines(path)):
-        with _line(path, "camera", line):
+        with _line_errors(path, "camera", line):
             identity, model, width, height, *params = line.split()
             if len(params) != MODELS[model]:
                 raise ValueError("its number of parameters")
@@ -153,14 +153,14 @@ def _add(found: dict, identity: int, value: ModelCamera | ModelImage, path: Path
 
 
 @contextmanager
-def _line(path: Path, what: str, line: str) -> Iterator[None]:
-    """BadInput with the line for what is wrong with it."""
+def _line_errors(path: Path, what: str, line: str) -> Iterator[None]:
+    """Turn errors inside into BadInput that shows the line."""
     try:
         yield
     except BadInput:
         raise
     except (ValueError, KeyError, OverflowError) as error:
-        raise BadInput(f"{path}: cannot read the {what} '{shortened(line)}' ({shortened(str(error))})") from None
+        raise BadInput(f"{path}: cannot read the {what} '{shorten(line)}' ({shorten(str(error))})") from None
 
 
 def load_images(path: Path) -> dict[int, ModelImage]:
@@ -170,7 +170,7 @@ def load_images(path: Path) -> dict[int, ModelImage]:
     for image in found.values():
         if not np.isfinite(image.world_to_camera).all():
             raise BadInput(
-                f"{path}: the pose of {shortened(image.name)} is not finite; remove the view or solve it again"
+                f"{path}: the pose of {shorten(image.name)} is not finite; remove the view or solve it again"
             )
     return found
 
@@ -182,7 +182,12 @@ def _images_binary(path: Path) -> dict[int, ModelImage]:
         name = file.text()
         seen = file.count(24)
         file.at += 24 * seen
-        _add(images, identity, ModelImage(_named(name, path), camera_id, pose_matrix(pose[:4], pose[4:])), path)
+        _add(
+            images,
+            identity,
+            ModelImage(_check_name(name, path), camera_id, quaternion_to_pose(pose[:4], pose[4:])),
+            path,
+        )
     file.end()
     return images
 
@@ -194,17 +199,17 @@ def _images_text(path: Path) -> dict[int, ModelImage]:
     for line in lines[::2]:
         if not line:
             break
-        with _line(path, "image", line):
+        with _line_errors(path, "image", line):
             fields = line.split(maxsplit=9)
             if len(fields) != 10:
                 raise ValueError("10 fields are expected")
             pose = [float(f) for f in fields[1:8]]
-            image = ModelImage(_named(fields[9], path), int(fields[8]), pose_matrix(pose[:4], pose[4:]))
+            image = ModelImage(_check_name(fields[9], path), int(fields[8]), quaternion_to_pose(pose[:4], pose[4:]))
             _add(images, int(fields[0]), image, path)
     return images
 
 
-def _named(name: str, path: Path) -> str:
+def _check_name(name: str, path: Path) -> str:
     if not Path(name).stem or "\0" in name:
         raise BadInput(f"{path}: an image without a name")
     return name
@@ -214,7 +219,7 @@ POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", 
 
 
 def load_model_points(path: Path) -> ModelPoints:
-    """The points of points3D.bin or points3D.txt, with the images that see each."""
+    """The points of points3D.bin or points3D.txt, with the images that observe each."""
     with reading(path, "COLMAP's points"):
         points = _points_binary(path) if path.suffix == ".bin" else _points_text(path)
     if not np.isfinite(points.positions).all():
@@ -225,7 +230,7 @@ def load_model_points(path: Path) -> ModelPoints:
 def _points_binary(path: Path) -> ModelPoints:
     file = Cursor(path)
     count = file.count(POINT.itemsize)
-    # Records follow each other at distances that their track lengths tell: first the places, then all at once.
+    # Records vary in length with their tracks: first find where each starts, then read all at once.
     starts, at, track_at = np.empty(count, np.int64), file.at, POINT.itemsize - 8
     for k in range(count):
         starts[k] = at
@@ -247,7 +252,7 @@ def _points_binary(path: Path) -> ModelPoints:
 def _points_text(path: Path) -> ModelPoints:
     positions, colors, tracks = [], [], []
     for line in filter(None, _lines(path)):
-        with _line(path, "point", line):
+        with _line_errors(path, "point", line):
             row = line.split()
             x, y, z, red, green, blue, _ = row[1:8]
             positions.append((float(x), float(y), float(z)))
@@ -282,7 +287,7 @@ def save_model(
     with open(folder / "images.bin", "wb") as file:
         file.write(struct.pack("<Q", len(images)))
         for identity, image in images.items():
-            pose = (*quaternion_of(image.world_to_camera[:3, :3]), *image.world_to_camera[:3, 3])
+            pose = (*rotation_to_quaternion(image.world_to_camera[:3, :3]), *image.world_to_camera[:3, 3])
             file.write(struct.pack("<I7dI", identity, *pose, image.camera_id))
             file.write(image.name.encode() + b"\0" + struct.pack("<Q", 0))
     records = np.zeros(len(positions), POINT)

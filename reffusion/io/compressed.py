@@ -1,7 +1,7 @@
-"""Files that gsply reads and writes: PlayCanvas's compressed .ply, 256 Gaussians a chunk, quantised within its bounds;
+"""Reads and writes the formats that gsply supports: PlayCanvas's compressed .ply, quantised in chunks of 256 Gaussians,
 and Niantic's .spz.
 
-The only importer of gsply.
+The only module that imports gsply.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from reffusion.io.splat_rows import Rows
 if TYPE_CHECKING:
     from reffusion.types import Gaussians, Similarity
 
-PACKED = "packed_position"  # a property that only these files have
+PACKED = "packed_position"  # a property that only compressed files have
 SPZ_HEADER, SPZ_MAGIC = struct.Struct("<IIIBBBB"), 0x5053474E
 # Signs of the spherical harmonics under y, z -> -y, -z, in the order of 3DGS: degree 1 is y, z, x.
 TURNED_SH = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 
 def save_compressed(path: Path, gaussians: Gaussians, similarity: Similarity) -> None:
-    """Write Gaussians in the scene's own frame; neighbours next to each other, so that chunks are small and steps fine.
+    """Write Gaussians in the scene's own frame, sorted so that chunks are small and quantisation is fine.
 
     Positions keep 11, 10 and 11 bits of their chunk's extent, colours and opacity 8 bits, spherical harmonics 8.
 
     Raises:
         BadInput: gsply is not installed.
     """
-    gsply = _library(path)
-    order = np.argsort(_interleaved(gaussians.means.double().numpy()), kind="stable")
+    gsply = _import_gsply(path)
+    order = np.argsort(_morton_codes(gaussians.means.double().numpy()), kind="stable")
     arrays = {name: getattr(gaussians, name).double().numpy()[order] for name in ("means", "log_scales", "quaternions")}
     plain = lambda array: np.ascontiguousarray(array, np.float32)
     lengths = np.linalg.norm(arrays["quaternions"], axis=1, keepdims=True)
@@ -54,14 +54,14 @@ def save_compressed(path: Path, gaussians: Gaussians, similarity: Similarity) ->
 
 
 def load_compressed(path: Path) -> Rows:
-    """The splats of a compressed .ply. BadInput where it is broken, or gsply is not installed."""
-    gsply = _library(path)
+    """The splats of a compressed .ply. BadInput where it is damaged, or gsply is not installed."""
+    gsply = _import_gsply(path)
     with reading(path, "a compressed .ply"):
         return _to_rows(gsply.plyread(str(path)))
 
 
 def load_spz_header(path: Path) -> tuple[int, int, bool]:
-    """The number of splats in a .spz, its version, and whether they are meant to be drawn antialiased."""
+    """The number of splats in a .spz, its version, and whether they are meant to be rendered antialiased."""
     with reading(path, "a .spz file"), open(path, "rb") as file:
         start = file.read(4096)
         if start[:2] == b"\x1f\x8b":  # versions 1 to 3 are one gzip stream
@@ -75,15 +75,15 @@ def load_spz_header(path: Path) -> tuple[int, int, bool]:
 
 
 def load_spz(path: Path) -> Rows:
-    """The splats of a .spz, in the frame of a .ply: the format holds them turned by 180 degrees about x (y up)."""
-    gsply = _library(path)
+    """The splats of a .spz, in the frame of a .ply: the file holds them turned by 180 degrees about x (y up)."""
+    gsply = _import_gsply(path)
     with reading(path, "a .spz file"):
         return _turn_about_x(_to_rows(gsply.read_spz(str(path))))
 
 
 def save_spz(path: Path, rows: Rows) -> None:
-    """Write rows in the frame of a .ply. Positions keep 24 bits, as fine as their extent allows."""
-    gsply = _library(path)
+    """Write rows that are in the frame of a .ply. Positions keep 24 bits, as fine as their extent allows."""
+    gsply = _import_gsply(path)
     turned = _turn_about_x(rows)
     extent = float(np.abs(turned.means).max(initial=1e-6))
     lengths = np.linalg.norm(turned.quaternions, axis=1, keepdims=True)
@@ -103,32 +103,32 @@ def save_spz(path: Path, rows: Rows) -> None:
 
 
 def _to_rows(data) -> Rows:
-    """What gsply read."""
+    """Rows from gsply's arrays."""
     sh = data.sh0[:, None] if data.shN is None else np.concatenate([data.sh0[:, None], data.shN], axis=1)
     return Rows(data.means.astype(np.float64), data.quats, data.scales, data.opacities.reshape(-1), sh)
 
 
 def _turn_about_x(rows: Rows) -> Rows:
-    """Turned by 180 degrees about x: y and z change sign, and with them each odd spherical harmonic."""
+    """Rows turned by 180 degrees about x: y and z change sign, and with them each odd spherical harmonic."""
     means, quaternions = rows.means * (1, -1, -1), rows.quaternions * np.array([1, 1, -1, -1], np.float32)
     return Rows(means, quaternions, rows.log_scales, rows.opacity_logits, rows.sh * TURNED_SH[: rows.sh.shape[1], None])
 
 
-def require_library(path: Path) -> None:
-    """BadInput where gsply is not installed, without importing it."""
+def check_gsply(path: Path) -> None:
+    """BadInput where gsply is not installed; does not import it."""
     if importlib.util.find_spec("gsply") is None:
         raise BadInput(f"{path}: a quantised file takes gsply: `pip install gsply`, or save it as plain .ply")
 
 
-def _library(path: Path):
-    require_library(path)
+def _import_gsply(path: Path):
+    check_gsply(path)
     import gsply
 
     return gsply
 
 
-def _interleaved(points: np.ndarray) -> np.ndarray:
-    """uint64 [N], places [N, 3] along a curve on which neighbours are near: the bits of x, y and z in turn."""
+def _morton_codes(points: np.ndarray) -> np.ndarray:
+    """uint64 [N], Morton codes of the positions [N, 3]: the bits of x, y and z in turn, so that neighbours are near."""
     low, extent = points.min(0, initial=np.inf), np.ptp(points, axis=0).max(initial=1e-30)
     cells = ((points - low) / extent * (2**20 - 1)).astype(np.uint64)
     code = np.zeros(len(points), np.uint64)

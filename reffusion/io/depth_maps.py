@@ -1,4 +1,4 @@
-"""Depth maps in files that other tools write: 16-bit pictures, .npy, .exr."""
+"""Reads depth maps from other tools: 16-bit pictures, .npy, .exr."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from reffusion.io.arrays import load_array
 from reffusion.io.files import BadInput
-from reffusion.io.images import load_exr, opened
+from reffusion.io.images import load_exr, open_image
 
 
 def load_depth(path: Path) -> np.ndarray:
-    """float32 [h, w], a map of depth or disparity in any unit; NaN where it says nothing (not finite; 0 in a picture).
+    """float32 [h, w], a map of depth or disparity in any unit; NaN where unknown (not finite, or 0 in a picture).
 
     Raises:
         BadInput: naming the file, where it is unreadable, not of one channel, 8-bit, empty or constant.
@@ -41,7 +41,7 @@ def _values(path: Path) -> np.ndarray:
         return load_exr(path)
     if path.suffix.lower() == ".npy":
         return load_array(path, "a readable depth map")
-    with opened(path, "a readable depth map") as image:
+    with open_image(path, "a readable depth map") as image:
         mode, values = image.mode, np.array(image)
     if mode[0] not in "IF":
         raise BadInput(f"{path}: {mode} pixels of 8 bits are too coarse for depth; write 16-bit grey, .npy or .exr")

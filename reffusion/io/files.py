@@ -1,4 +1,4 @@
-"""The one place where a file that somebody hands over is opened, and where what is wrong with it becomes one line."""
+"""Opens files that a user hands over, and turns everything that is wrong with them into a message of one line."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-MOST_PIXELS = 200_000_000  # of a picture or depth map; what declares more is refused before memory is taken
+MOST_PIXELS = 200_000_000  # of a picture or depth map; larger ones are refused before memory is allocated
 LONGEST_WORD = 400  # characters of a message without a blank
 
 
 class BadInput(ValueError):
-    """What a person handed over is wrong: one line that names the file or key, and where it can what mends it."""
+    """Something that a user handed over is wrong: one line that names the file or key and, where possible, the
+    remedy."""
 
     def __init__(self, message: str):
-        # A number of two thousand digits is told by its beginning; a path is hardly ever so long.
-        super().__init__(" ".join(shortened(word, LONGEST_WORD) for word in " ".join(message.splitlines()).split(" ")))
+        # Long words, such as a number of two thousand digits, are cut; a path is hardly ever so long.
+        super().__init__(" ".join(shorten(word, LONGEST_WORD) for word in " ".join(message.splitlines()).split(" ")))
 
 
 @contextmanager
-def understood(path: Path, what: str) -> Iterator[None]:
-    """Whatever is raised inside comes out as BadInput: libraries raise dozens of kinds of errors for what they do not
-    understand, so all are caught.
+def as_bad_input(path: Path, what: str) -> Iterator[None]:
+    """Turn every error raised inside into BadInput. Libraries raise dozens of kinds of errors for input that they do
+    not understand, so all are caught.
 
     Args:
         path: the file that is read, for the message; what: what it should be, as in "a readable picture".
@@ -34,20 +35,21 @@ def understood(path: Path, what: str) -> Iterator[None]:
     except BadInput:
         raise
     except Exception as error:
-        said = shortened(" ".join(str(error).split()), 200) or "cut off"
-        raise BadInput(f"{path}: not {what} ({type(error).__name__}: {said})") from error
+        message = shorten(" ".join(str(error).split()), 200) or "cut off"
+        raise BadInput(f"{path}: not {what} ({type(error).__name__}: {message})") from error
 
 
 @contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """`understood`, of a file that is opened inside: BadInput too where it is absent, a folder, a pipe or a device."""
-    with understood(path, what):
+    """`as_bad_input` for a file that is opened inside: BadInput too where it is missing, a folder, a pipe or
+    a device."""
+    with as_bad_input(path, what):
         _check_regular(path)
         yield
 
 
 def _check_regular(path: Path) -> None:
-    """Opening a pipe would wait for its other end for ever."""
+    """BadInput where the path is no regular file: opening a pipe would wait for its other end for ever."""
     try:
         mode = Path(path).stat().st_mode
     except FileNotFoundError:
@@ -57,15 +59,16 @@ def _check_regular(path: Path) -> None:
 
 
 def check_pixels(path: Path, width: int, height: int) -> None:
-    """BadInput where a picture has no pixel, or declares more than `MOST_PIXELS`."""
+    """BadInput where a picture has no pixel, or more than `MOST_PIXELS`."""
     if width < 1 or height < 1:
         raise BadInput(f"{path}: {width}x{height} px; it has no pixel")
     if width * height > MOST_PIXELS:
         raise BadInput(f"{path}: {width}x{height} px are more than {MOST_PIXELS // 10**6} megapixels; make it smaller")
 
 
-def there(path: Path) -> bool:
-    """Is a file of this name there? BadInput where it is something else: it would be passed over without a word."""
+def is_file(path: Path) -> bool:
+    """Does a file of this name exist? BadInput where it is something else, which would otherwise be
+    ignored."""
     if path.is_file():
         return True
     if path.exists() or path.is_symlink():
@@ -73,14 +76,14 @@ def there(path: Path) -> bool:
     return False
 
 
-def shortened(value: object, most: int = 60) -> str:
-    """What was found, for a message; long texts and whole objects are cut."""
+def shorten(value: object, most: int = 60) -> str:
+    """A value as text for a message, cut after `most` characters."""
     text = value if isinstance(value, str) else reprlib.repr(value)
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
 class Cursor:
-    """A place in a binary file, little endian; BadInput where the file ends before what it declares."""
+    """A position in a little-endian binary file; BadInput where the file ends before what it declares."""
 
     def __init__(self, path: Path):
         self.path, self.data, self.at = path, Path(path).read_bytes(), 0
@@ -93,12 +96,12 @@ class Cursor:
         return values
 
     def need(self, count: int, size: int) -> None:
-        """BadInput where fewer than `count` records of `size` bytes follow: before memory is taken for them."""
+        """BadInput where fewer than `count` records of `size` bytes follow, before memory is allocated for them."""
         if self.at + count * size > len(self.data):
             raise BadInput(f"{self.path}: cut off at byte {len(self.data)}")
 
     def count(self, size: int) -> int:
-        """The number of records that follow, each of at least `size` bytes."""
+        """Read the number of records that follow, each of at least `size` bytes."""
         (count,) = self.read("Q")
         self.need(count, size)
         return count

@@ -1,4 +1,4 @@
-"""Pictures, masks and depth maps."""
+"""Reads and writes pictures, masks and depth maps."""
 
 from __future__ import annotations
 
@@ -12,38 +12,37 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
-from reffusion.io.files import BadInput, check_pixels, reading, shortened
+from reffusion.io.files import BadInput, check_pixels, reading, shorten
 
-HEIC = (".heic", ".heif")  # of phones
-ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", *HEIC)  # of pictures, in small letters
+HEIC = (".heic", ".heif")  # endings of phones' pictures
+ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", *HEIC)  # of pictures, in lower case
 
-# What is read under these names; other kinds that Pillow knows call programs, or are not for photographs.
-DARK = 8  # levels up to which a mask's background may be grey
-FLAT = 0.002  # share of a mask that a value fills where it is a number and no soft edge
+DARK = 8  # levels up to which the background of a mask may be grey
+FLAT = 0.002  # share of a mask that a value must fill to count as an area, not as part of a soft edge
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "HEIF")
 _HEIC_BRANDS = tuple(
     b"ftyp" + brand for brand in (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"hevc", b"hevx")
 )
 logging.getLogger("PIL").addHandler(logging.NullHandler())  # what it says on standard error is in our line too
-Image.MAX_IMAGE_PIXELS = None  # `opened` looks at the size itself: with one limit, and without a warning below it
+Image.MAX_IMAGE_PIXELS = None  # `open_image` looks at the size itself: with one limit, and without a warning below it
 
 
 @contextmanager
-def opened(path: Path, what: str = "a readable image") -> Iterator[Image.Image]:
-    """A picture of which the header was read; BadInput naming the file for all that is wrong with it, here or inside
-    the block, and for more than `MOST_PIXELS`."""
+def open_image(path: Path, what: str = "a readable image") -> Iterator[Image.Image]:
+    """A picture of which the header has been read. BadInput naming the file for everything that is wrong with it, here
+    or inside the block, and for more than `MOST_PIXELS`."""
     with reading(path, what):
         with open(path, "rb") as file:
             if file.read(12)[4:12] in _HEIC_BRANDS:  # whatever it is called
-                _learn_heic(path)
+                _register_heic(path)
         known = [each for each in _FORMATS if each != "HEIF" or each in Image.OPEN]
     with reading(path, what), Image.open(path, formats=known) as image:
         check_pixels(path, *image.size)
         yield image
 
 
-def _learn_heic(path: Path) -> None:
-    """Have Pillow read HEIC, always upright. pi-heif only decodes; pillow-heif's wheels bring an encoder under GPL."""
+def _register_heic(path: Path) -> None:
+    """Let Pillow read HEIC, always upright. pi-heif only decodes; pillow-heif's wheels bring an encoder under GPL."""
     try:
         import pi_heif
     except ImportError:
@@ -53,7 +52,7 @@ def _learn_heic(path: Path) -> None:
 
 def image_size(path: Path, upright: bool = False) -> tuple[int, int]:
     """(width, height) in pixels, from the file's header alone. `upright` as in `load_image`."""
-    with opened(path) as image:
+    with open_image(path) as image:
         width, height = image.size
         turned = upright and image.getexif().get(0x0112, 1) in (5, 6, 7, 8)
         return (height, width) if turned else (width, height)
@@ -66,9 +65,9 @@ def load_image(path: Path, upright: bool = False) -> np.ndarray:
     tag is ignored, because poses that come with photographs refer to the stored pixels; `upright=True` obeys it.
 
     Raises:
-        BadInput: naming the file, where it is absent, cut off, or has pixels of more than 16 bits or of floats.
+        BadInput: naming the file, where it is missing, truncated, or has pixels of more than 16 bits or of floats.
     """
-    with opened(path) as image:
+    with open_image(path) as image:
         turned = ImageOps.exif_transpose(image) if upright else image
         if image.mode[0] not in "IF":
             return np.array(turned.convert("RGB"))
@@ -79,8 +78,9 @@ def load_image(path: Path, upright: bool = False) -> np.ndarray:
 
 
 def load_thumbnail(path: Path, side: int) -> np.ndarray:
-    """The picture as uint8 [h, w, 3], its longer side at most `side` px; of the stored pixels. Imports no OpenCV."""
-    with opened(path) as image:
+    """The picture as uint8 [h, w, 3], its longer side at most `side` px; from the stored pixels. Does not import
+    OpenCV."""
+    with open_image(path) as image:
         if image.mode[0] not in "IF":
             image.draft("RGB", (2 * side, 2 * side))  # JPEGs are decoded at a fraction of their size
             image = image.convert("RGB")
@@ -111,14 +111,14 @@ def save_image(path: Path, array: np.ndarray) -> None:
 
 
 def replace_image(path: Path, array: np.ndarray) -> None:
-    """`save_image`, so that a kill leaves no half picture: `path` is all there, or as it was."""
+    """`save_image` atomically: after a kill, `path` is complete, or as it was."""
     writing = Path(path).with_name(f".{Path(path).name}")
     save_image(writing, array)
     writing.replace(path)
 
 
 def to_uint8(array: np.ndarray) -> np.ndarray:
-    """Floats, clipped to [0, 1], as levels of 255, rounded."""
+    """Floats, clipped to [0, 1], rounded to levels of 255."""
     return np.round(np.clip(array, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
@@ -128,10 +128,10 @@ def _is_png(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class MaskValues:
-    """Which pixels of a mask file are the object.
+    """Which pixel values of a mask file are the object.
 
     Attributes:
-        ids: these numbers (of palettes: these entries); empty: white, as `load_mask` understands it.
+        ids: these numbers (for palettes: these entries); empty: white, as `load_mask` understands it.
         inverted: all other pixels instead.
     """
 
@@ -145,9 +145,9 @@ WHITE = MaskValues()  # the object is white
 def load_mask(path: Path, size: tuple[int, int] | None = None, values: MaskValues = WHITE) -> np.ndarray:
     """Read a mask as bool [H, W], True = masked.
 
-    Understood are files of {0, 1}, of {0, 255} (cut at 128, so lossy and soft edges do no harm), one-bit files, and
-    palettes and colours of which black is the background. Of grey colours the brightest channel counts; alpha is
-    ignored, but not where the mask can only be there: which of its ends is the object differs from tool to tool.
+    Accepted are files of {0, 1}, of {0, 255} (threshold 128, so lossy and soft edges do no harm), one-bit files, and
+    palettes and colours of which black is the background. Of colours the brightest channel counts. Alpha is ignored,
+    but refused where only it can hold the mask: tools disagree on which of its ends is the object.
 
     Args:
         size: (height, width) to resize to, nearest neighbour; None keeps the file's.
@@ -156,16 +156,16 @@ def load_mask(path: Path, size: tuple[int, int] | None = None, values: MaskValue
     Raises:
         BadInput: naming the file, where it is unreadable, in its alpha, or a map of object numbers without `ids`.
     """
-    with opened(path, "a readable mask") as image:
+    with open_image(path, "a readable mask") as image:
         if values.ids:
-            mask = np.isin(_numbers(path, image), values.ids)
+            mask = np.isin(_object_numbers(path, image), values.ids)
         else:
-            mask = _white(path, image)
+            mask = _white_pixels(path, image)
     mask = mask ^ values.inverted
     return mask if size is None else resize_nearest(mask, size)
 
 
-def _numbers(path: Path, image: Image.Image) -> np.ndarray:
+def _object_numbers(path: Path, image: Image.Image) -> np.ndarray:
     """[H, W], the object numbers of a map: grey levels, or the entries of a palette."""
     array = np.array(image)
     if array.ndim == 3 and (array[..., :1] == array[..., : min(3, array.shape[2])]).all():
@@ -175,7 +175,7 @@ def _numbers(path: Path, image: Image.Image) -> np.ndarray:
     return array
 
 
-def _white(path: Path, image: Image.Image) -> np.ndarray:
+def _white_pixels(path: Path, image: Image.Image) -> np.ndarray:
     mode = image.mode
     array = np.array(image.convert("RGB") if mode in ("P", "PA") else image)
     if array.ndim == 3:
@@ -202,7 +202,7 @@ def _white(path: Path, image: Image.Image) -> np.ndarray:
 
 
 def _check_colors(path: Path, mode: str, colors: np.ndarray) -> None:
-    """BadInput where a picture [H, W, 3] has areas of several colours beside black: which is the object?"""
+    """BadInput where a picture [H, W, 3] has areas of several colours beside black: any of them may be the object."""
     found = [color for color in _flat_levels(colors.astype(np.int32) @ (65536, 256, 1)) if color]
     if len(found) > 1:
         numbers = ", or name the object's entries in scene.yaml: `masks: {id: ...}`" if mode in ("P", "PA") else ""
@@ -212,7 +212,7 @@ def _check_colors(path: Path, mode: str, colors: np.ndarray) -> None:
 
 
 def _flat_levels(array: np.ndarray) -> list[int]:
-    """The values that fill areas, ascending: soft edges pass through the others only."""
+    """The values that fill areas, ascending; soft edges pass through other values."""
     same = np.ones(array.shape, bool)
     same[1:] &= array[1:] == array[:-1]
     same[:, 1:] &= array[:, 1:] == array[:, :-1]
@@ -232,7 +232,7 @@ def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def resize_nearest(array: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """[H, W, ...] -> [*size, ...]: each new pixel takes the old one its centre falls into."""
+    """[H, W, ...] -> [*size, ...]: each new pixel takes the value of the old one that contains its centre."""
     rows, columns = (
         np.minimum(((np.arange(new) + 0.5) * old / new).astype(int), old - 1)
         for new, old in zip(size, array.shape[:2], strict=True)
@@ -259,7 +259,7 @@ def save_exr(path: Path, depth: np.ndarray) -> None:
     spec = oiio.ImageSpec(depth.shape[1], depth.shape[0], 1, oiio.FLOAT)
     spec.channelnames = ("Z",)
     spec.attribute("compression", "zip")
-    spec.attribute("DateTime", "1970:01:01 00:00:00")  # else that of now is written: equal depths, unequal files
+    spec.attribute("DateTime", "1970:01:01 00:00:00")  # the default, now, would make files of equal depths differ
     file = oiio.ImageOutput.create(str(path))
     if file is None or not file.open(str(path), spec) or not file.write_image(depth[..., None]) or not file.close():
         raise ValueError(f"{path}: cannot be written ({file.geterror() if file else oiio.geterror()})")
@@ -278,11 +278,11 @@ def load_exr(path: Path) -> np.ndarray:
                 raise BadInput(f"{path}: not an EXR file; give it the ending of what it is")
         file = oiio.ImageInput.open(str(path))
         if file is None:
-            raise BadInput(f"{path}: not a readable EXR file ({shortened(oiio.geterror(), 200)})")
+            raise BadInput(f"{path}: not a readable EXR file ({shorten(oiio.geterror(), 200)})")
         spec = file.spec()
         check_pixels(path, spec.width, spec.height * max(spec.depth, 1))
         pixels = file.read_image(0, 0, 0, 1, oiio.FLOAT)
         file.close()
         if pixels is None:
-            raise BadInput(f"{path}: cut off ({shortened(file.geterror(), 200)})")
+            raise BadInput(f"{path}: cut off ({shorten(file.geterror(), 200)})")
         return np.ascontiguousarray(pixels.reshape(pixels.shape[0], pixels.shape[1], -1)[..., 0])

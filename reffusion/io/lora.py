@@ -1,4 +1,4 @@
-"""LoRA weights for other tools."""
+"""Exports LoRA weights for other tools."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ FACTS = "lora_adapter_metadata"  # of diffusers: its configuration by part, as J
 
 
 def save_portable(source: Path, path: Path) -> None:
-    """Write the LoRA of `source`, as diffusers saved it, so that tools that do not read its configuration change
-    weights as much: alpha / rank is multiplied into B, and alpha is the rank. Nothing is dropped out: it is for use."""
+    """Write the LoRA of `source`, as diffusers saved it, for tools that do not read its configuration.
+
+    alpha / rank is multiplied into B, and alpha becomes the rank, so that the weights change by as much. Dropout is 0,
+    since the LoRA is for inference.
+    """
     from safetensors import safe_open
     from safetensors.torch import save_file
 

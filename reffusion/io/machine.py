@@ -1,4 +1,4 @@
-"""What this machine has for work on a CUDA card, and what it lacks: read from small files, without importing torch."""
+"""Detects what this machine has for CUDA, and what it lacks, from small files, without importing torch."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ INSTALL = "`make gpu` installs it"
 
 @dataclass(frozen=True)
 class Machine:
-    """What is there for CUDA; None where it is not there or cannot be told.
+    """What CUDA needs; None where it is missing or unknown.
 
     Attributes:
-        card: its name. gigabytes: its memory, 1e9 bytes. driver: major version.
+        card: name of the GPU. gigabytes: its memory, 1e9 bytes. driver: major version.
         torch_cuda: the CUDA version torch was built for, e.g. "13.0"; "" for a build without.
-        gsplat: is the package there? extension: its kernels, compiled with it.
-        nvcc: the CUDA version of the compiler, "" where it is there but does not say.
+        gsplat: is the package installed? extension: are its kernels compiled with it?
+        nvcc: the CUDA version of the compiler, "" where it exists but its version is unknown.
     """
 
     card: str | None = None
@@ -42,19 +42,20 @@ class Machine:
 
 @functools.cache
 def machine() -> Machine:
-    """This one: a few files are read, and nvidia-smi is asked where there is one."""
-    card, gigabytes, driver = _asked_of_driver()
+    """This machine: a few files are read, and nvidia-smi is run where it exists."""
+    card, gigabytes, driver = _query_gpu()
     package = _package("gsplat")
     extension = package is not None and any(package.glob("csrc*.so"))
     return Machine(card, gigabytes, driver or _driver(DRIVER), _torch_cuda(), package is not None, extension, _nvcc())
 
 
 def lacks(here: Machine, memory_gb: float = 0.0, splats: bool = True, memory_param: str = "") -> list[str]:
-    """What keeps this machine from a stage on CUDA, a line each, with what would mend it; a driver is there.
+    """What keeps this machine from running a stage on CUDA, a line each with the remedy; a driver is present.
 
     Args:
-        memory_gb: what the stage may take by its parameters, 0: no limit. memory_param: the parameter that says so.
-        splats: does it draw Gaussians?
+        memory_gb: limit of the stage's memory by its parameters, 0: no limit.
+        memory_param: the name of that parameter.
+        splats: does the stage render Gaussians?
     """
     found = []
     if here.torch_cuda == "":
@@ -79,7 +80,7 @@ def lacks(here: Machine, memory_gb: float = 0.0, splats: bool = True, memory_par
 
 
 def _cannot_build(here: Machine, wanted: int | None) -> list[str]:
-    """gsplat's wheel brings sources only, which nvcc compiles when they are first loaded."""
+    """Why gsplat cannot be compiled: its wheel holds sources only, which nvcc compiles when they are first loaded."""
     if here.nvcc is None:
         toolkit = f"CUDA toolkit {wanted}" if wanted else "the CUDA toolkit"
         return [
@@ -98,8 +99,8 @@ def _major(version: str | None) -> int | None:
     return int(version.split(".")[0]) if version else None
 
 
-def _asked_of_driver() -> tuple[str | None, float | None, int | None]:
-    """(name, GB, driver's major version) of the first card that can be seen, by nvidia-smi."""
+def _query_gpu() -> tuple[str | None, float | None, int | None]:
+    """(name, GB, driver's major version) of the first visible GPU, by nvidia-smi."""
     command = shutil.which("nvidia-smi") or shutil.which("nvidia-smi", path="/usr/lib/wsl/lib")
     if not command:
         return None, None, None
@@ -115,7 +116,8 @@ def _asked_of_driver() -> tuple[str | None, float | None, int | None]:
 
 
 def _driver(path: Path) -> int | None:
-    """Of a line like `NVRM version: NVIDIA UNIX x86_64 Kernel Module  580.65.06  Sun ...`, open modules' too."""
+    """Major version from a line like `NVRM version: NVIDIA UNIX x86_64 Kernel Module  580.65.06  Sun ...`, also of open
+    modules."""
     with suppress(OSError):
         if found := re.search(r"Kernel Module\D*?(?:for \S+)?\s+(\d+)\.\d", path.read_text()):
             return int(found[1])
@@ -128,7 +130,7 @@ def _package(name: str) -> Path | None:
 
 
 def _torch_cuda() -> str | None:
-    """What torch/version.py says of its build, without importing torch."""
+    """The CUDA version in torch/version.py, read without importing torch."""
     folder = _package("torch")
     with suppress(OSError):
         text = (folder / "version.py").read_text() if folder else ""
@@ -150,7 +152,7 @@ def _nvcc() -> str | None:
 
 
 def idle_seconds() -> float:
-    """How long its cores have done nothing since it was started, added up; infinite where that is not told."""
+    """Idle time since boot, summed over all cores; infinite where it is unknown."""
     try:
         ticks = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
     except (OSError, ValueError):

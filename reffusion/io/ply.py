@@ -1,4 +1,4 @@
-"""Gaussians as files, in the layout 3DGS writes and its relatives, and plain coloured points as PLY."""
+"""Reads and writes Gaussians as files, in the layout of 3DGS and related ones, and coloured points as PLY."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def save_ply(
 ) -> None:
     """Write Gaussians in the standard 3DGS layout (binary, little endian).
 
-    Properties: x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3; `f_rest` runs through the
-    coefficients of red, then green, then blue; opacity as logit, scales as logarithms, rotations wxyz.
+    Properties: x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3. `f_rest` holds the coefficients of red,
+    then green, then blue; opacity is a logit, scales are logarithms, rotations wxyz.
 
     Args:
-        similarity: with it, positions and sizes go back through it (in float64) to the scene's own frame.
-            Positions are then written as doubles only where floats would move them by more than 1e-5 of the
-            normalised extent (geo-referenced scenes); viewers that insist on floats read all others.
-        properties: another order of these, normals left out where it has none (`properties_of` a file to be like).
+        similarity: with it, positions and sizes are converted (in float64) to the scene's own frame. Positions are then
+            written as doubles only where floats would move them by more than 1e-5 of the normalised extent
+            (geo-referenced scenes); viewers that insist on floats read all others.
+        properties: another order of these, without normals where it has none (`properties_of` a file to match).
     """
     array = lambda name: getattr(gaussians, name).detach().cpu().numpy()
     means, log_scales, sh, position_type = array("means").astype(np.float64), array("log_scales"), array("sh"), "f4"
@@ -78,21 +78,21 @@ def save_ply(
 
 
 def can_save(path: Path) -> None:
-    """BadInput where `save_splats` has no format of this ending, its library is missing, or the folder is no folder."""
+    """BadInput where `save_splats` cannot write this file: unknown ending, missing library, or missing folder."""
     name = Path(path).name.lower()
     if not name.endswith(FORMATS):
         raise BadInput(f"{path}: {Path(path).suffix or 'no ending'} is not written; one of {', '.join(FORMATS)} is")
     if name.endswith((".compressed.ply", ".spz")):
-        compressed.require_library(path)
+        compressed.check_gsply(path)
     if Path(path).is_dir() or not (parent := Path(path).absolute().parent).is_dir():
         raise BadInput(f"{path}: a folder; name a file" if Path(path).is_dir() else f"{parent}: no such folder")
 
 
 def save_splats(path: Path, gaussians: Gaussians, similarity: Similarity, properties: Sequence[str] = ()) -> None:
-    """Write Gaussians in the scene's own frame, in the format that the ending names, see `splats.FORMATS`.
+    """Write Gaussians in the scene's own frame, in the format of the file's ending, see `splats.FORMATS`.
 
     Args:
-        properties: of a plain .ply, their order, as in `save_ply`.
+        properties: for a plain .ply, their order, as in `save_ply`.
     """
     name = Path(path).name.lower()
     if name.endswith((".spz", ".splat")):
@@ -114,8 +114,8 @@ def load_ply(path: Path, similarity: Similarity | None = None) -> Gaussians:
         similarity: with it, the file is in the scene's own frame and the result is in the normalised one.
 
     Raises:
-        BadInput: naming the file, where properties are missing (e.g. a plain point cloud), `f_rest` has a
-            count that belongs to no degree, or most rows are not finite.
+        BadInput: naming the file, where properties are missing (e.g. a plain point cloud), the number of `f_rest`
+            properties belongs to no degree, or most rows are not finite.
     """
     gaussians = load_splats(path).gaussians(similarity)
     if not (gaussians.means.isfinite().all() and gaussians.log_scales.isfinite().all()):
@@ -157,11 +157,11 @@ def _points(path: Path, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return points, np.full((len(points), 3), 128, np.uint8)
 
 
-def check_gaussians(path: Path) -> int:
-    """How many there are, by the header alone: BadInput where the file is cut off, or its properties are others."""
+def count_gaussians(path: Path) -> int:
+    """The number of Gaussians, from the header alone. BadInput where the file is truncated, or has other properties."""
     return summarize(path).count
 
 
 def properties_of(path: Path) -> tuple[str, ...]:
-    """The names of its vertices' properties, in order; none of a quantised file."""
+    """The names of the vertices' properties, in order; empty for a quantised file."""
     return summarize(path).properties

@@ -1,4 +1,4 @@
-"""PLY files as tables: the header, the vertices as a structured array, and writing one."""
+"""PLY files as tables: reads the header and the vertices as a structured array, and writes one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reffusion.io.files import BadInput, reading, shortened
+from reffusion.io.files import BadInput, reading, shorten
 
 TYPES: dict[str, np.dtype] = {
     **dict.fromkeys(("char", "int8"), np.dtype("i1")),
@@ -20,7 +20,7 @@ TYPES: dict[str, np.dtype] = {
     **dict.fromkeys(("float", "float32"), np.dtype("f4")),
     **dict.fromkeys(("double", "float64"), np.dtype("f8")),
 }
-LONGEST_LINE = 10_000  # of a header, in bytes
+LONGEST_LINE = 10_000  # bytes, of a header
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Header:
     """The header of a PLY file.
 
     Attributes:
-        text: the numbers are written as text.
-        elements: name, number of rows, and of each of its properties type and name; of a list ("list", name).
-        comments: the lines of comment.
-        at: where the data begins, in bytes.
+        text: numbers are written as text.
+        elements: name, number of rows, and type and name of each property; of a list ("list", name).
+        comments: the comment lines.
+        at: offset of the data in bytes.
     """
 
     text: bool
@@ -39,22 +39,24 @@ class Header:
     comments: tuple[str, ...]
     at: int
 
-    def least(self) -> int:
-        """Bytes that the data takes at least: a digit and a blank for each number of a text, one for a list's length.
+    def least_bytes(self) -> int:
+        """Smallest possible size of the data in bytes: a digit and a blank per number in text, one byte for the length
+        of a list.
 
-        An element without properties takes none, however many it is said to have: it counts as a byte each."""
+        A row without properties counts as one byte, so that an element cannot claim any number of them.
+        """
         size = lambda kind: 2 if self.text else TYPES[kind].itemsize if kind in TYPES else 1
         rows = ((count, max(sum(size(kind) for kind, _ in each), 1)) for _, count, each in self.elements)
         return sum(count * row for count, row in rows) - int(self.text)  # the last line may end without a break
 
     def vertices(self) -> tuple[int, list[str]]:
-        """The number of vertices, and the names of their properties that are numbers."""
+        """The number of vertices, and the names of their numeric properties."""
         count, properties = next((c, p) for name, c, p in self.elements if name == "vertex")
         return count, [name for kind, name in properties if kind in TYPES]
 
 
 def load_header(path: Path) -> Header:
-    """Raises BadInput, where it is none, or where the file is too short for what it declares."""
+    """Read the header. BadInput where it is none, or where the file is too short for what it declares."""
     with reading(path, "a readable PLY file with vertices"), open(path, "rb") as file:
         if file.readline(8).strip() != b"ply":
             raise BadInput(f"{path}: not a PLY file; its first line is not `ply`")
@@ -76,16 +78,17 @@ def load_header(path: Path) -> Header:
         held = tuple((name, count, tuple(properties)) for name, count, properties in elements)
         header = Header(form == "ascii", held, tuple(comments), file.tell())
         if form not in ("ascii", "binary_little_endian", "binary_big_endian"):
-            raise BadInput(f"{path}: not a readable PLY file with vertices: its format is '{shortened(form)}'")
+            raise BadInput(f"{path}: not a readable PLY file with vertices: its format is '{shorten(form)}'")
         if any(count < 0 for _, count, _ in held) or not any(name == "vertex" for name, _, _ in held):
             raise BadInput(f"{path}: not a readable PLY file with vertices")
-        if header.at + header.least() > Path(path).stat().st_size:
+        if header.at + header.least_bytes() > Path(path).stat().st_size:
             raise BadInput(f"{path}: cut off: it is too short for what its header declares")
         return header
 
 
 def load_vertices(path: Path, header: Header) -> np.ndarray:
-    """[N] structured, a property a field. Vertices of fixed size are mapped from the file, not held in memory."""
+    """[N] structured array with a field per property. Vertices of fixed size are mapped from the file, not held in
+    memory."""
     from plyfile import PlyData
 
     with reading(path, "a readable PLY file with vertices"):

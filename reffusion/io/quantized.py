@@ -1,7 +1,7 @@
-"""Files of antimatter15's viewer (.splat): 32 bytes a splat, without a header and without spherical harmonics.
+"""Reads and writes files of antimatter15's viewer (.splat): 32 bytes a splat, no header, no spherical harmonics.
 
-A record is three float32 of position, three of size (standard deviations, not logarithms), the colour and the opacity
-in four bytes, and the quaternion wxyz in four bytes. No maintained library reads it without a compiler or network.
+A record holds three float32 of position, three of size (standard deviations, not logarithms), colour and opacity in
+four bytes, and the quaternion wxyz in four bytes. No maintained library reads it without a compiler or network.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 
 
 
 def count_splat(path: Path) -> int:
-    """The number of splats, by the size of the file. BadInput where it is no whole number of records."""
+    """The number of splats, from the size of the file. BadInput where that is no multiple of a record."""
     with reading(path, "a .splat file"):
         size = Path(path).stat().st_size
     if size % RECORD.itemsize:
@@ -28,7 +28,7 @@ def count_splat(path: Path) -> int:
 
 
 def open_splat(path: Path) -> Callable[[slice], Rows]:
-    """A function from a range of rows to these rows; a record of zero bytes gives a row of zeros only."""
+    """A function that reads a range of rows; a record of zero bytes gives a row of zeros."""
     table = np.memmap(path, RECORD, mode="r") if Path(path).stat().st_size else np.empty(0, RECORD)
 
     def read(chosen: slice) -> Rows:
@@ -53,7 +53,7 @@ def open_splat(path: Path) -> Callable[[slice], Rows]:
 
 
 def save_splat(path: Path, rows: Rows) -> None:
-    """Write records; spherical harmonics above the constant one are left out."""
+    """Write the rows; spherical harmonics above the constant one are dropped."""
     table = np.empty(len(rows), RECORD)
     lengths = np.linalg.norm(rows.quaternions, axis=1, keepdims=True)
     unit = np.where(lengths > 0, rows.quaternions / np.maximum(lengths, 1e-30), [1.0, 0.0, 0.0, 0.0])

@@ -1,11 +1,11 @@
-"""Rotations as quaternions, as COLMAP's files have them."""
+"""Converts between rotations and quaternions, as in COLMAP's files."""
 
 from __future__ import annotations
 
 import numpy as np
 
 
-def pose_matrix(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
+def quaternion_to_pose(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
     """[4, 4] float64 from wxyz (any length; not finite where it is zero) and a translation."""
     with np.errstate(all="ignore"):
         w, x, y, z = np.asarray(quaternion, np.float64) / np.linalg.norm(quaternion)
@@ -19,10 +19,10 @@ def pose_matrix(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def quaternion_of(rotation: np.ndarray) -> np.ndarray:
-    """[4] wxyz of a [3, 3] rotation, w >= 0, without loss where the angle nears pi."""
+def rotation_to_quaternion(rotation: np.ndarray) -> np.ndarray:
+    """[4] wxyz of a [3, 3] rotation, w >= 0; accurate near an angle of pi too."""
     r = np.asarray(rotation, np.float64)
-    # The largest of the four components is found first, so that none is divided by a small number.
+    # The largest of the four components is computed first, to avoid a division by a small number.
     squares = np.array(
         [
             1 + r[0, 0] + r[1, 1] + r[2, 2],

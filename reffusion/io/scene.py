@@ -1,4 +1,4 @@
-"""The artifacts of the stages: scenes, views, masks and references.
+"""Reads and writes the artifacts of the stages: scenes, views, masks and references.
 
 `poses` writes images/<view>.png, sparse/0/*.bin, transform.json, views.json and lenses.json; `raw_masks` writes
 masks/<view>.png (with several objects masks/<object>/<view>.png), test_masks/<view>.png and fill/<view>.png.
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from reffusion.types import MaskSet, Reference, Scene
 
-WARNINGS = "warnings.json"  # in either folder: sentences about what is odd
+WARNINGS = "warnings.json"  # in either folder: sentences about oddities
 PIXEL_CLASSES = ("raw", "consistent", "unobserved", "invent")
 
 
@@ -43,7 +43,7 @@ def save_scene(poses_dir: Path, scene: Scene) -> None:
 
 
 def load_scene(poses_dir: Path) -> Scene:
-    """The scene that `poses` wrote, in the normalised frame. ValueError naming the file where one is wrong."""
+    """The scene that `poses` wrote, in the normalised frame. ValueError naming a file that is wrong."""
     from reffusion.types import Camera, Scene, Similarity
 
     poses_dir = Path(poses_dir)
@@ -79,12 +79,12 @@ def load_views(poses_dir: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
 
 
 def has_photograph(poses_dir: Path, name: str) -> bool:
-    """None has one in a scene without photographs, where renders of its Gaussians stand for them."""
+    """Does the view have a photograph? In a scene without photographs renders of its Gaussians stand for them."""
     return (Path(poses_dir) / "images" / f"{name}.png").exists()
 
 
 def load_warnings(folder: Path) -> list[str]:
-    """What is odd, as `poses` or `raw_masks` wrote it, a sentence each."""
+    """The oddities that `poses` or `raw_masks` found, a sentence each."""
     path = Path(folder) / WARNINGS
     return load_json(path) if path.is_file() else []
 
@@ -95,10 +95,11 @@ def objects_of(raw_masks_dir: Path) -> list[str]:
 
 
 def raw_mask_files(raw_masks_dir: Path, name: str, objects: Sequence[str] | None = None) -> list[Path]:
-    """The view's masks: one, or where objects are told apart one for each of `objects` (None: all) that has one."""
+    """The view's masks: a single one, or where objects are told apart one for each of `objects` (None: all) that has
+    one."""
     folder = Path(raw_masks_dir) / "masks"
-    told = objects_of(raw_masks_dir) if objects is None else objects
-    return [path for path in (folder / thing / f"{name}.png" for thing in told or [""]) if path.is_file()]
+    found_objects = objects_of(raw_masks_dir) if objects is None else objects
+    return [path for path in (folder / thing / f"{name}.png" for thing in found_objects or [""]) if path.is_file()]
 
 
 def load_raw_masks(
@@ -106,7 +107,7 @@ def load_raw_masks(
 ) -> dict[str, np.ndarray]:
     """View name -> bool [H, W], True = the object; only the views that have a mask.
 
-    Where objects are told apart, the union of those in `objects` (None: all), of views with a mask of each.
+    Where objects are told apart, the union of those in `objects` (None: all), for views with a mask of each.
     """
     objects = objects_of(raw_masks_dir) if objects is None else objects
     files = {name: raw_mask_files(raw_masks_dir, name, objects) for name in names}
@@ -115,12 +116,12 @@ def load_raw_masks(
 
 
 def load_test_masks(raw_masks_dir: Path) -> dict[str, np.ndarray]:
-    """Test view name -> bool [H, W], True = where the object would be seen; empty where the scene has none."""
+    """Test view name -> bool [H, W], True = where the object would be visible; empty where the scene has none."""
     return {path.stem: load_mask(path) for path in sorted((Path(raw_masks_dir) / "test_masks").glob("*.png"))}
 
 
 def load_fill(raw_masks_dir: Path) -> dict[str, np.ndarray]:
-    """Training view name -> bool [H, W], what is to be filled there; empty where the scene brings no such masks."""
+    """Training view name -> bool [H, W], what is to be filled; empty where the scene brings no such masks."""
     return {path.stem: load_mask(path) for path in sorted((Path(raw_masks_dir) / "fill").glob("*.png"))}
 
 
@@ -140,7 +141,7 @@ def load_mask_sets(masks_dir: Path, names: Iterable[str]) -> dict[str, MaskSet]:
 
 
 def shows_object(raw_masks_dir: Path, masks_dir: Path | None, name: str) -> bool:
-    """Has the view a raw mask: one that was given, or one made from clicks?"""
+    """Has the view a raw mask, given or made from clicks?"""
     if raw_mask_files(raw_masks_dir, name) or masks_dir is None:
         return bool(raw_mask_files(raw_masks_dir, name))
     made = Path(masks_dir) / "raw" / f"{name}.png"
@@ -148,7 +149,7 @@ def shows_object(raw_masks_dir: Path, masks_dir: Path | None, name: str) -> bool
 
 
 def load_object(masks_dir: Path) -> Tensor:
-    """[N] bool, of the Gaussians that `masks` removes those that are the object, and not debris."""
+    """[N] bool: of the Gaussians that `masks` removes, those that are the object, and not debris."""
     labels, debris = load_labels(masks_dir / "labels.npy"), masks_dir / "debris.npy"
     return labels & ~load_labels(debris) if debris.exists() else labels
 

@@ -1,4 +1,4 @@
-"""Rows of splat files brought to what 3DGS can draw: clamped, dropped, and Mip-Splatting's filter folded in.
+"""Cleans rows of splat files for 3DGS: clamps or drops invalid ones, and folds Mip-Splatting's filter in.
 
 Tools write infinite logits for opaque splats, scales of minus infinity for flat ones, single rows with NaN, and rows of
 zeros as padding.
@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# In float32 the sigmoid of 20 is 1, and that of -20 is far below 1/255, from which splats are drawn.
+# In float32 the sigmoid of 20 is 1, and that of -20 is far below 1/255, the least opacity that is rendered.
 MOST_LOGIT = 20.0
 # Log-scale of an axis without extent: 2e-9 units, far below a pixel, while products of three such sizes stay above 0.
 FLAT = -20.0
 MOST_SCALE = 80.0  # log-scale: in float32 the exponential of 88.7 is infinite
-BAD_SHARE = 0.5  # of the rows that may be invalid: with more it is no file of splats
-DEGREE = 3  # of spherical harmonics: the highest that is drawn
+BAD_SHARE = 0.5  # largest share of invalid rows: with more it is no file of splats
+DEGREE = 3  # highest degree of spherical harmonics that is rendered
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class Repairs:
     """How many rows were dropped or changed.
 
     Attributes:
-        invalid: dropped, with NaN or infinite values; padding: dropped, of zeros only.
-        opacities: infinite logits that were clamped; scales: scales of minus infinity that were clamped.
+        invalid: dropped, with NaN or infinite values; padding: dropped, all zeros.
+        opacities: clamped infinite logits; scales: clamped scales of minus infinity.
     """
 
     invalid: int = 0
@@ -59,7 +59,7 @@ class Repairs:
         return Repairs(*(a + b for a, b in zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def sentence(self, count: int) -> str:
-        """What was done to a file of `count` rows; empty where nothing was."""
+        """What was done to a file of `count` rows; empty if nothing."""
         dropped = [f"{self.invalid} with NaN or infinite values"] if self.invalid else []
         dropped += [f"{self.padding} of zeros only (padding)"] if self.padding else []
         clamped = [f"{self.opacities} infinite opacities"] if self.opacities else []
@@ -71,10 +71,10 @@ class Repairs:
 
 
 def drop_invalid(rows: Rows) -> tuple[Rows, Repairs]:
-    """The rows that can be drawn, clamped, and what was done.
+    """The valid rows, clamped, and what was done.
 
-    Dropped are rows that hold NaN, an infinite position, rotation, colour or size, and rows of zeros only. A zero
-    quaternion alone stays: 3DGS draws it as the identity.
+    Dropped are rows with NaN, an infinite position, rotation, colour or size, and rows of zeros. A zero quaternion
+    alone stays: 3DGS renders it as the identity.
     """
     logits, scales = rows.opacity_logits, rows.log_scales
     with np.errstate(invalid="ignore", over="ignore"):
@@ -96,20 +96,20 @@ def drop_invalid(rows: Rows) -> tuple[Rows, Repairs]:
 
 
 def fold_filter(log_scales: np.ndarray, logits: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Log-scales [N, 3] and opacity logits [N], float64, with Mip-Splatting's 3D filter of standard deviations
-    `sizes` [N] in them:
+    """Fold Mip-Splatting's 3D filter of standard deviations `sizes` [N] into log-scales [N, 3] and opacity logits [N],
+    float64:
 
         scale' = sqrt(scale^2 + f^2),  opacity' = opacity * prod(scale) / prod(scale')
 
-    in logarithms: log(scale'/scale) is half the softplus of 2 (log f - log scale), which neither overflows nor cancels,
-    and the logit of a probability p is log p - log(1 - p), with 1 - p by expm1.
+    In logarithms: log(scale'/scale) is half the softplus of 2 (log f - log scale), which neither overflows nor cancels;
+    the logit of a probability p is log p - log(1 - p), with 1 - p by expm1.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         filters = np.log(np.abs(np.asarray(sizes, np.float64)))[:, None]
         scales = np.asarray(log_scales, np.float64)
         widened = np.logaddexp(2 * scales, 2 * filters) / 2
-        grown = np.logaddexp(0.0, 2 * (filters - scales)) / 2
+        growth = np.logaddexp(0.0, 2 * (filters - scales)) / 2
         # of a filter of no size and an axis of none: inf - inf, and nothing grows
-        grown = np.where(np.isneginf(filters), 0.0, grown)
-        log_opacity = -np.logaddexp(0.0, -np.asarray(logits, np.float64)) - grown.sum(1)
+        growth = np.where(np.isneginf(filters), 0.0, growth)
+        log_opacity = -np.logaddexp(0.0, -np.asarray(logits, np.float64)) - growth.sum(1)
         return widened, log_opacity - np.log(-np.expm1(log_opacity))

@@ -1,6 +1,6 @@
-"""Files of Gaussians in any layout that is read: .ply of 3DGS and its relatives, compressed .ply, .spz and .splat.
+"""Reads files of Gaussians: .ply of 3DGS and related tools, compressed .ply, .spz and .splat.
 
-Rows are read in blocks, so that beside the result only one block is held in memory.
+Rows are read in blocks, so that only one block is held in memory beside the result.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from reffusion.io import compressed, quantized
-from reffusion.io.files import BadInput, reading, there
+from reffusion.io.files import BadInput, is_file, reading
 from reffusion.io.ply_table import load_header, load_vertices
 from reffusion.io.splat_rows import BAD_SHARE, DEGREE, FLAT, Repairs, Rows, drop_invalid, fold_filter
 from reffusion.splat.conventions import SH0
@@ -27,7 +27,7 @@ SCALES = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 RED_GREEN_BLUE = ("red", "green", "blue")
 FILTER = "filter_3D"  # Mip-Splatting's standard deviation of each splat's smoothing filter
-ANTIALIASED = "antialiased"  # a comment that says how the Gaussians are meant to be drawn
+ANTIALIASED = "antialiased"  # a comment that says how the Gaussians are meant to be rendered
 FORMATS = (".ply", ".compressed.ply", ".spz", ".splat")
 UNREAD = (".ksplat", ".sog", ".lcc", ".lcc2", ".glb", ".gltf", ".usdz", ".zip", ".json")
 BLOCK = 8192  # rows
@@ -39,8 +39,8 @@ class Splats:
     """The splats of a file, in its own frame, and what was changed when they were read.
 
     Attributes:
-        rows: those that can be drawn, in the order of the file.
-        antialiased: they are meant to be drawn with Mip-Splatting's compensation.
+        rows: the valid ones, in the order of the file.
+        antialiased: they are meant to be rendered with Mip-Splatting's compensation.
         notes: sentences without the file's name.
     """
 
@@ -69,7 +69,7 @@ class Summary:
     Attributes:
         count: the number of rows.
         notes: what reading will change, sentences without the file's name.
-        properties: names of a .ply's vertex properties, in order; none of a quantised file.
+        properties: names of a .ply's vertex properties, in order; empty for a quantised file.
         antialiased: as in `Splats`.
     """
 
@@ -80,7 +80,7 @@ class Summary:
 
 
 def summarize(path: Path) -> Summary:
-    """What the header says. BadInput where the file is cut off, or no file of Gaussians."""
+    """Read the header. BadInput where the file is truncated, or no file of Gaussians."""
     path = Path(path)
     ending = path.suffix.lower()
     if ending in UNREAD:
@@ -91,13 +91,13 @@ def summarize(path: Path) -> Summary:
     if ending == ".splat":
         return Summary(quantized.count_splat(path))
     if ending == ".spz":
-        compressed.require_library(path)
+        compressed.check_gsply(path)
         count, _, antialiased = compressed.load_spz_header(path)
         return Summary(count, antialiased=antialiased)
     header = load_header(path)
     count, names = header.vertices()
     if compressed.PACKED in names:
-        compressed.require_library(path)
+        compressed.check_gsply(path)
         return Summary(count)
     notes = _check_properties(path, names)
     smoothed = ANTIALIASED in header.comments or FILTER in names
@@ -105,13 +105,13 @@ def summarize(path: Path) -> Summary:
 
 
 def load_splats(path: Path) -> Splats:
-    """Read the splats of a file; rows that cannot be drawn are dropped, see `splat_rows.drop_invalid`.
+    """Read the splats of a file; invalid rows are dropped, see `splat_rows.drop_invalid`.
 
     Raises:
-        BadInput: naming the file, where it is none of Gaussians, or more than half of its rows are invalid.
+        BadInput: naming the file, where it holds no Gaussians, or more than half of its rows are invalid.
     """
     path = Path(path)
-    there(path)
+    is_file(path)
     summary, ending = summarize(path), path.suffix.lower()
     with reading(path, "a file of Gaussians"):
         if ending == ".splat":
@@ -123,12 +123,12 @@ def load_splats(path: Path) -> Splats:
         else:
             read = _open_ply(load_vertices(path, load_header(path)))
         rows, repairs = _gather(path, summary.count, read)
-    said = repairs.sentence(summary.count)
-    return Splats(rows, summary.antialiased, (*summary.notes, *([said] if said else [])))
+    repair_note = repairs.sentence(summary.count)
+    return Splats(rows, summary.antialiased, (*summary.notes, *([repair_note] if repair_note else [])))
 
 
 def _gather(path: Path, count: int, read: Callable[[slice], Rows]) -> tuple[Rows, Repairs]:
-    """All valid rows of a file of `count` rows, of which `read` gives a block."""
+    """All valid rows of a file of `count` rows, which `read` returns in blocks."""
     first, repairs, at = read(slice(0, 0)), Repairs(), 0
     whole = Rows(*(np.empty((count, *array.shape[1:]), array.dtype) for array in vars(first).values()))
     for start in range(0, count, BLOCK):
@@ -148,13 +148,13 @@ def _gather(path: Path, count: int, read: Callable[[slice], Rows]) -> tuple[Rows
 
 
 def _open_ply(table: np.ndarray) -> Callable[[slice], Rows]:
-    """A function from a range of rows to these rows."""
+    """A function that reads a range of rows."""
     names = table.dtype.names
     higher = sum(name.startswith("f_rest_") for name in names) // 3
     used = min(higher, (DEGREE + 1) ** 2 - 1)
     rest = [[f"f_rest_{channel * higher + k}" for channel in range(3)] for k in range(used)]
 
-    def take(block: np.ndarray, columns: Sequence[str], kind: str) -> np.ndarray:
+    def read_columns(block: np.ndarray, columns: Sequence[str], kind: str) -> np.ndarray:
         found = np.empty((len(block), len(columns)), kind)
         with np.errstate(over="ignore"):
             for column, name in enumerate(columns):
@@ -163,25 +163,25 @@ def _open_ply(table: np.ndarray) -> Callable[[slice], Rows]:
 
     def read(chosen: slice) -> Rows:
         block = np.array(table[chosen])  # mapped: from the disk once, not once for each property
-        logits = take(block, ["opacity"], "f8")[:, 0]
-        scales = take(block, [name for name in SCALES if name in names], "f8")
+        logits = read_columns(block, ["opacity"], "f8")[:, 0]
+        scales = read_columns(block, [name for name in SCALES if name in names], "f8")
         if scales.shape[1] == 2:
             scales = np.column_stack([scales, np.full(len(block), FLAT)])
         if FILTER in names:
             scales, logits = fold_filter(scales, logits, block[FILTER])
         sh = np.empty((len(block), 1 + used, 3), np.float32)
-        sh[:, 0] = take(block, DC, "f4") if DC[0] in names else _color_coefficients(block)
+        sh[:, 0] = read_columns(block, DC, "f4") if DC[0] in names else _color_coefficients(block)
         for k, columns in enumerate(rest):
-            sh[:, 1 + k] = take(block, columns, "f4")
+            sh[:, 1 + k] = read_columns(block, columns, "f4")
         with np.errstate(over="ignore"):
             narrow = scales.astype(np.float32), logits.astype(np.float32)
-        return Rows(take(block, POSITION, "f8"), take(block, ROTATION, "f4"), *narrow, sh)
+        return Rows(read_columns(block, POSITION, "f8"), read_columns(block, ROTATION, "f4"), *narrow, sh)
 
     return read
 
 
 def _color_coefficients(block: np.ndarray) -> np.ndarray:
-    """[N, 3] float32, the constant coefficient of each colour: bytes, or floats from 0 to 1."""
+    """[N, 3] float32, the constant coefficient of each colour, from bytes, or floats from 0 to 1."""
     colors = np.stack([block[name] for name in RED_GREEN_BLUE], axis=1)
     unit = colors if np.issubdtype(colors.dtype, np.floating) else colors / 255
     return ((unit - 0.5) / SH0).astype(np.float32)

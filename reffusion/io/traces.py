@@ -1,4 +1,4 @@
-"""`trace.jsonl`, error against run time: what may stand in one, and reading it (docs/traces.md)."""
+"""The schema of `trace.jsonl`, error against run time, and reading it (docs/traces.md)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ REASONS = ("finished", "converged")
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a key of a trace means.
+    """The meaning of a key in a trace.
 
     Attributes:
-        unit: "dB", "count", "1" for a ratio; "" where only the comparison within a scene means something.
+        unit: "dB", "count", "1" for a ratio; "" where values can only be compared within a scene.
         better: "more" or "less"; "" where neither is.
         label: for an axis.
     """
@@ -68,7 +68,7 @@ def load_trace(path: Path, stage: str) -> dict[str, list[dict[str, Any]]]:
     """The lines of a stage's trace by series (docs/traces.md), "" for those without a name.
 
     Raises:
-        ValueError: naming file, line and what does not follow the schema; or there is no file.
+        ValueError: naming file, line and what violates the schema; or the file does not exist.
     """
     if not path.exists():
         raise ValueError(f"{path}: no such file")
@@ -76,7 +76,7 @@ def load_trace(path: Path, stage: str) -> dict[str, list[dict[str, Any]]]:
     seconds = 0.0
     for number, line in enumerate(read_trace(path), 1):
         own = series.setdefault(str(line.get("series", "")), [])
-        if wrong := _wrong(line, own[-1] if own else None, seconds, stage):
+        if wrong := _find_violation(line, own[-1] if own else None, seconds, stage):
             raise ValueError(f"{path}: line {number}: {wrong}")
         own.append(line)
         seconds = line["seconds"]
@@ -84,15 +84,15 @@ def load_trace(path: Path, stage: str) -> dict[str, list[dict[str, Any]]]:
 
 
 def main_quantity(stage: str, lines: list[dict[str, Any]]) -> str:
-    """The name of the quantity that stands for the stage's error in these lines of one series."""
+    """The name of the quantity that stands for the stage's error in the lines of one series."""
     for name in MAIN[stage]:
         if any(name in line for line in lines):
             return name
     raise ValueError(f"a trace of {stage} has none of {', '.join(MAIN[stage])}")
 
 
-def _wrong(line: dict[str, Any], before: dict[str, Any] | None, seconds: float, stage: str) -> str | None:
-    """What does not follow the schema in a line, given the one before it in its series and the last moment."""
+def _find_violation(line: dict[str, Any], before: dict[str, Any] | None, seconds: float, stage: str) -> str | None:
+    """What violates the schema in a line, given the one before it in its series and the last time."""
     if missing := [key for key in ("seconds", "iteration") if key not in line]:
         return f"no {missing[0]!r}"
     texts = {"series", "reason"} & line.keys()

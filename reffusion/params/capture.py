@@ -1,4 +1,4 @@
-"""The keys of scene.yaml about files and views, which the stages `poses` and `raw_masks` read."""
+"""The keys of scene.yaml about files and views, read by the stages `poses` and `raw_masks`."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from pydantic import Field, model_validator
 
 from reffusion.params.base import UNKEYED, Settings
 from reffusion.params.clicks import Clicked
-from reffusion.params.reference import Given
+from reffusion.params.reference import ReferenceSpec
 
 Side = Annotated[float, Field(gt=0)]
 
 
-class Region(Settings):
-    """A place in the scene's own frame and units: a box along its axes, or a sphere."""
+class RegionSpec(Settings):
+    """A region in the scene's own frame and units: an axis-aligned box, or a sphere."""
 
     center: tuple[float, float, float] | None = Field(None, description="its middle")
     view: str | None = Field(None, description="instead of center: a view on whose optical axis the middle lies")
-    distance: Side | None = Field(None, description="with view: how far from its camera")
+    distance: Side | None = Field(None, description="with view: distance from its camera")
     size: tuple[Side, Side, Side] | None = Field(None, description="side lengths of a box")
-    radius: Side | None = Field(None, description="instead of size: of a sphere")
-    outside: bool = Field(False, description="all that lies beyond the sphere is masked in every view")
+    radius: Side | None = Field(None, description="instead of size: radius of a sphere")
+    outside: bool = Field(False, description="everything beyond the sphere is masked in every view")
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -34,12 +34,12 @@ class Region(Settings):
         return self
 
 
-class Masks(Settings):
-    """Where masks lie, and which numbers in them are the object."""
+class MaskSpec(Settings):
+    """The folder of the masks, and which numbers in them are the object."""
 
-    folder: str | None = Field(None, description="relative to the scene; None: the usual ones")
+    folder: str | None = Field(None, description="relative to the scene; None: the usual folders")
     id: int | list[int] | None = Field(
-        None, description="of maps of object numbers, and of palettes: the numbers that are the object"
+        None, description="in maps of object numbers, and in palettes: the numbers that are the object"
     )
 
     @property
@@ -51,11 +51,11 @@ class SceneKeys(Settings):
     """Keys about masks are UNKEYED: the views and mask files that follow from them are hashed instead (`scene_facts` in
     `stages.plan`)."""
 
-    layout: Literal["llff", "colmap", "transforms", "photos"] | None = Field(None, description="None: recognised")
-    images: str | None = Field(None, description="folder of pictures, relative to the scene; None: the usual ones")
-    masks: str | Masks | None = Field(
+    layout: Literal["llff", "colmap", "transforms", "photos"] | None = Field(None, description="None: detected")
+    images: str | None = Field(None, description="folder of pictures, relative to the scene; None: the usual folders")
+    masks: str | MaskSpec | None = Field(
         None,
-        description='folder of masks, or {folder, id}; "none": the scene has none; None: the usual ones',
+        description='folder of masks, or {folder, id}; "none": the scene has none; None: the usual folders',
         json_schema_extra=UNKEYED,
     )
     test_masks: str | None = Field(
@@ -67,15 +67,17 @@ class SceneKeys(Settings):
     cameras_only: list[str] | str | None = Field(
         None, description='views whose pixels are not used: names, "every N", or "others" than train and test'
     )
-    exclude: list[str] = Field([], description="views that are no part of the scene")
+    exclude: list[str] = Field([], description="views to leave out of the scene")
     keep: list[str] = Field([], description="views that stay, even where their photographs contradict their poses")
-    gaussians: str | None = Field(None, description="splats the scene brings in its own frame: .ply, .spz or .splat")
-    cleaned: str | None = Field(None, description="the same file after someone deleted splats: these are the object")
-    region: Region | None = Field(
+    gaussians: str | None = Field(
+        None, description="a fitted scene of Gaussians in its own frame: .ply, .spz or .splat"
+    )
+    cleaned: str | None = Field(None, description="the same file after splats were deleted: these are the object")
+    region: RegionSpec | None = Field(
         None, description="box or sphere that holds the object, or is to be filled", json_schema_extra=UNKEYED
     )
     fill: str | None = Field(
-        None, description="instead of a region: folder of masks, of what is to be filled", json_schema_extra=UNKEYED
+        None, description="instead of a region: folder of masks of what is to be filled", json_schema_extra=UNKEYED
     )
     clicks: Clicked | None = Field(
         None, description="read by the stage `masks`; here only checked", json_schema_extra=UNKEYED
@@ -83,7 +85,7 @@ class SceneKeys(Settings):
     remove: list[str] | None = Field(
         None, description="read by the stage `masks`; here only checked", json_schema_extra=UNKEYED
     )
-    reference: Given | list[Given] | None = Field(
+    reference: ReferenceSpec | list[ReferenceSpec] | None = Field(
         None,
         description="read by the stage `reference`; here only checked against the views",
         json_schema_extra=UNKEYED,
@@ -91,9 +93,9 @@ class SceneKeys(Settings):
 
     @property
     def has_masks(self) -> bool:
-        """Does the scene not say that it has no masks?"""
+        """False where the scene says `masks: none`."""
         return (self.mask_folder or "").lower() != "none"
 
     @property
     def mask_folder(self) -> str | None:
-        return self.masks.folder if isinstance(self.masks, Masks) else self.masks
+        return self.masks.folder if isinstance(self.masks, MaskSpec) else self.masks

@@ -1,4 +1,4 @@
-"""Clicks that a scene brings: scene.yaml's `clicks`."""
+"""The key `clicks` of scene.yaml."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-CLICKS = "clicks.json"  # in a scene's folder: what the mask page keeps of its own, and no stage reads
+CLICKS = "clicks.json"  # in a scene's folder: what the mask page keeps for itself, and no stage reads
 
 
 def _click(said: Any) -> Any:
-    """YAML reads an unquoted + or - as text, and a click without either is on the object."""
+    """Complete a click: YAML reads an unquoted + or - as text, and a click without either is on the object."""
     if not isinstance(said, list | tuple) or len(said) not in (2, 3):
         raise ValueError("a click is [x, y, +] on the object, [x, y, -] on what is not")
     return (*said, "+") if len(said) == 2 else said

@@ -8,9 +8,11 @@ from reffusion.params.capture import SceneKeys
 
 
 class Params(SceneKeys):
-    longest: int = Field(1600, ge=16, description="larger image side in px; smaller pictures stay as they are")
-    # PAPER leaves open: pictures that are blurred or were enlarged. It takes 1600 px; half of them may show as much.
+    longest: int = Field(1600, ge=16, description="larger image side in px; smaller pictures are not enlarged")
+    # PAPER leaves open: pictures that are blurred or were enlarged. It takes 1600 px; half of that may show as much.
     detail: float = Field(
-        0.0, ge=0, description="pictures of less are halved, see reffusion.capture.image_detail; 0: never"
+        0.0, ge=0, description="pictures with less detail (reffusion.capture.image_detail) are halved; 0: never"
     )
-    refine: bool = Field(False, description="adjust cameras, the principal point of each view too, that flow belies")
+    refine: bool = Field(
+        False, description="adjust poses and principal points of views to optical flow, where they disagree with it"
+    )

@@ -10,23 +10,25 @@ from pydantic import Field
 from reffusion.params.base import Device, Dtype, Sampler, Settings, memory_field, prior_field
 
 
-class Given(Settings):
+class ReferenceSpec(Settings):
     """A completed view that the scene brings."""
 
     view: str = Field(description="name of the view it completes")
     image: str = Field(description="picture, relative to the scene; of another size or cropped a little is fine")
     depth: str | None = Field(None, description="its depth or disparity, any scale: 16-bit .png, .npy or .exr")
-    undistorted: bool = Field(False, description="painted over `poses`' own undistorted image, not over the photo")
-    trust: bool = Field(False, description="take it though it does not seem to show its view")
+    undistorted: bool = Field(False, description="painted over the undistorted image of `poses`, not over the photo")
+    trust: bool = Field(False, description="use it even though it does not seem to show its view")
 
 
-def reference_list(given: Given | Sequence[Given] | None) -> list[Given]:
+def reference_list(given: ReferenceSpec | Sequence[ReferenceSpec] | None) -> list[ReferenceSpec]:
     """The values of the key `reference` as a list."""
-    return [] if given is None else [given] if isinstance(given, Given) else list(given)
+    return [] if given is None else [given] if isinstance(given, ReferenceSpec) else list(given)
 
 
 class Params(Settings):
-    reference: Given | list[Given] | None = Field(None, description="completed views that the scene brings")
+    reference: ReferenceSpec | list[ReferenceSpec] | None = Field(
+        None, description="completed views that the scene brings"
+    )
     inpainter: Literal["diffusion", "exemplar", "lama", "migan", "auto"] = Field(
         "diffusion",
         description="the prior; patches of the photographs, along surfaces: sharp, with nothing new; LaMa or MI-GAN: "
@@ -34,11 +36,11 @@ class Params(Settings):
         "LaMa, MI-GAN that is here, else patches",
     )
     prior: str = prior_field()
-    prompt: str = Field("", description="what the invented region shows, for a prior that reads")
+    prompt: str = Field("", description="what the invented region shows, for a prior with a text encoder")
     candidates: int = Field(4, ge=1, description="pictures to choose from")
-    choose: int | None = Field(None, ge=0, description="the candidate to take; None takes the one of the lowest seam")
+    choose: int | None = Field(None, ge=0, description="the candidate to take; None takes the one with the lowest seam")
     sampler: Sampler = Sampler()
-    seed: int = Field(0, description="of the first candidate; the others count up")
+    seed: int = Field(0, description="seed of the first candidate; the others count up")
     device: Device = "cpu"
     dtype: Dtype = "float32"
     memory_gb: float = memory_field()

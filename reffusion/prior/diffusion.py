@@ -49,7 +49,7 @@ def _token_ids(tokenizer: Any, encoder: nn.Module, prompts: list[str], device: t
 
 def _in_batches(prior: Prior, function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
     """`function` of the rows, in passes of at most the number of rows set in the prior."""
-    max_rows = (prior.rows_graded if torch.is_grad_enabled() else prior.rows) or len(rows[0])
+    max_rows = (prior.rows_with_grad if torch.is_grad_enabled() else prior.rows) or len(rows[0])
     if len(rows[0]) <= max_rows:
         return function(*rows)
     parts = zip(*(tensor.split(max_rows) for tensor in rows), strict=True)

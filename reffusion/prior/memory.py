@@ -102,7 +102,7 @@ def fit_to_memory(
     for network in (prior.unet, prior.vae, prior.text_encoder):
         if network is not None:
             network.zero_grad(set_to_none=True)
-    return replace(prior, rows=rows, rows_graded=rows_within(budget_gb, prior.bytes, sample_bytes, param))
+    return replace(prior, rows=rows, rows_with_grad=rows_within(budget_gb, prior.bytes, sample_bytes, param))
 
 
 @torch.no_grad()

@@ -59,7 +59,7 @@ class Prior:
     tokenizer_2: Any = None
     zero_empty: bool = False
     rows: int = 0
-    rows_graded: int = 0
+    rows_with_grad: int = 0
     fills: bool = False
 
     @property

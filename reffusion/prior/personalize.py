@@ -141,7 +141,7 @@ def train_step(
         loss = error.sum() / count
         return loss.detach(), torch.autograd.grad(loss, [detached_text, *unet_parameters], allow_unused=True)
 
-    part_size = min(prior.rows_graded or count, ceil(count / (executor.now if executor else 1)))
+    part_size = min(prior.rows_with_grad or count, ceil(count / (executor.now if executor else 1)))
     parts = torch.arange(count).chunk(ceil(count / part_size))
     losses, gradients = zip(
         *(executor.map(loss_and_gradients, parts) if executor else map(loss_and_gradients, parts)), strict=True

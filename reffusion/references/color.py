@@ -1,4 +1,4 @@
-"""The colours of a reference: matched to its photograph's, and the hole pasted into the photograph."""
+"""Colours of a reference: matched to its photograph's, and the hole pasted into the photograph."""
 
 from __future__ import annotations
 
@@ -7,16 +7,17 @@ import numpy as np
 
 from reffusion.io.images import to_uint8
 
-VISIBLE = 1.0  # levels of 255: a change of colours up to which there is none
+VISIBLE_CHANGE = 1.0  # levels of 255: smaller changes of colour are ignored
 SAMPLES = 5000  # pixels that are compared
-FEWEST = 100  # pixels that determine a gain
-LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # beyond, the pictures have nothing in common
+LEAST_PIXELS = 100  # pixels that determine a gain
+LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # beyond these bounds the pictures have nothing in common
 
 
 def match_colors(picture: np.ndarray, photo: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gain and offset [3] of each channel, colours in [0, 1]: photo = gain * picture + offset, over the known pixels.
+    """Gain and offset [3] per channel, colours in [0, 1]: photo = gain * picture + offset, by a robust fit over known
+    pixels.
 
-    Outliers are let go. 1 and 0 where they would hardly change a colour, or where no line fits.
+    1 and 0 where they would hardly change a colour, or where no line fits.
     """
     x, y = (_samples(image, known) for image in (picture, photo))
     gain, offset = np.ones(3), np.zeros(3)
@@ -25,23 +26,23 @@ def match_colors(picture: np.ndarray, photo: np.ndarray, known: np.ndarray) -> t
     low, high = np.quantile(x, (0.05, 0.95), axis=0) if len(x) else (np.zeros(3), np.ones(3))
     change = max(np.abs((gain - 1) * at + offset).max() for at in (low, high)) * 255
     sensible = gain.min() > LEAST_GAIN and gain.max() < MOST_GAIN
-    return (gain, offset) if sensible and change > VISIBLE else (np.ones(3), np.zeros(3))
+    return (gain, offset) if sensible and change > VISIBLE_CHANGE else (np.ones(3), np.zeros(3))
 
 
 def recolor(picture: np.ndarray, gain: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3] with the colours of the photograph."""
+    """uint8 [H, W, 3], the picture in the colours of the photograph."""
     return to_uint8(picture / 255.0 * gain + offset)
 
 
 def paste(
     picture: np.ndarray, photo: np.ndarray, hole: np.ndarray, inside: np.ndarray, margin: float, rim: float
 ) -> np.ndarray:
-    """The photograph with the picture in the hole, uint8 [H, W, 3].
+    """Paste the hole of the picture into the photograph, uint8 [H, W, 3].
 
     Args:
-        picture: registered and in the photograph's colours.
-        hole: bool [H, W]. inside: bool [H, W], pixels that the picture has.
-        margin: px around the hole that are taken from the picture too, rim: px beyond over which they are blended.
+        picture: aligned with the photograph, in its colours.
+        hole: bool [H, W]. inside: bool [H, W], pixels that the picture covers.
+        margin: px around the hole that are taken from the picture too; rim: px beyond, over which both are blended.
     """
     away = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5) if hole.any() else np.full(hole.shape, 1e9)
     share = np.clip(1 - (away - margin) / max(rim, 1e-6), 0, 1) * inside
@@ -58,8 +59,8 @@ def _samples(image: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Gain and offset of y ~ gain * x + offset, outliers let go; no gain where x hardly varies."""
-    if len(x) < FEWEST:
+    """Gain and offset of y ~ gain * x + offset, by reweighted least squares; gain 1 where x hardly varies."""
+    if len(x) < LEAST_PIXELS:
         return 1.0, 0.0
     gain, offset = 1.0, float(np.median(y - x))
     for _ in range(20):

@@ -1,4 +1,4 @@
-"""Completed views that a scene brings: named in its scene.yaml, or painted into its folder `painted`."""
+"""Finds the references that a scene brings: named in its scene.yaml, or painted into its folder `painted`."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from reffusion.capture.views import Views, check_proportions, known_for, not_placed
+from reffusion.capture.views import ViewTable, check_proportions, not_placed_error, resolve_file_view
 from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS, image_size
-from reffusion.params.reference import Given, reference_list
+from reffusion.params.reference import ReferenceSpec, reference_list
 
-PAINTED = "painted"  # folder of the scene: <view>.png and <view>_depth.*
-DEPTHS = (".npy", ".exr", ".png", ".tif", ".tiff")
-PROPORTIONS = 0.1  # how far a reference's may be from its view's: people crop
+PAINTED = "painted"  # folder of the scene with <view>.png and <view>_depth.*
+DEPTH_ENDINGS = (".npy", ".exr", ".png", ".tif", ".tiff")
+PROPORTION_TOLERANCE = 0.1  # relative difference of a reference's proportions from its view's: people crop
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,13 @@ class GivenReference:
     """A completed view that the scene brings.
 
     Attributes:
-        view: its name.
-        path: the picture; another size than the photograph's, and slightly other proportions, are made up for.
-        depth: its depth or disparity, over the picture; or None.
+        view: name of the view.
+        path: the picture. Another size than the photograph's, and slightly different proportions, are corrected later.
+        depth: depth or disparity map of the whole picture; or None.
         undistorted: the picture was painted over an undistorted image, not over the photograph.
-        painted: it lies in `painted`, over what `reference` wrote to be painted: the view's exposure is taken out.
-        trust: it is taken even where it does not seem to show its view.
+        painted: it lies in `painted`, over what `reference` wrote to be painted, whose exposure is the scene's common
+            one.
+        trust: it is used even where it does not seem to show its view.
     """
 
     view: str
@@ -38,36 +39,40 @@ class GivenReference:
 
     @property
     def way_to_trust(self) -> str:
-        """What to write in scene.yaml to have it taken whatever is measured, in words."""
+        """What to write in scene.yaml so that the reference is used despite a failed check, in words."""
         if not self.painted:
             return "write `trust: true` beside it in scene.yaml"
         line = f"{{view: {self.view}, image: {PAINTED}/{self.path.name}, trust: true}}"
         return f"write `reference: {line}` in scene.yaml"
 
 
-def paintings_in(folder: Path) -> list[Path]:
-    """The files of the scene's folder `painted`."""
+def list_paintings(folder: Path) -> list[Path]:
+    """The files of the scene's folder `painted`, sorted."""
     return sorted(path for path in (Path(folder) / PAINTED).glob("[!.]*") if path.is_file())
 
 
-def load_given(folder: Path, views: Views, asked: Given | Sequence[Given] | None) -> list[GivenReference]:
-    """The references that scene.yaml names (`asked`) and those in `painted`, <view>.png, with <view>_depth.* where
-    there is one; sorted by view. A painting stands for one that scene.yaml names for the same view.
+def load_given(
+    folder: Path, views: ViewTable, asked: ReferenceSpec | Sequence[ReferenceSpec] | None
+) -> list[GivenReference]:
+    """The references that scene.yaml names (`asked`) and those in `painted`, sorted by view.
+
+    A painting is called <view>.png, its depth map <view>_depth.*. It replaces one that scene.yaml names for the same
+    view.
 
     Raises:
-        BadInput: naming the file and the remedy: an unknown view, a test view, a view that is for neither, two for a
-            view, a missing file, other proportions than the view's, a depth map of another kind.
+        BadInput: naming the file and the remedy: an unknown view, a test view, a view that is for neither, two
+            references for a view, a missing file, other proportions than the view's, a depth map of an unknown kind.
     """
     folder = Path(folder)
     found: dict[str, GivenReference] = {}
     for each in reference_list(asked):
         path = folder / each.image
-        name = known_for(path, each.view, views, "reference")
+        name = resolve_file_view(path, each.view, views, "reference")
         if name in found:
             raise BadInput(f"scene.yaml: reference: two for the view '{name}'; keep one")
         depth = None if each.depth is None else folder / each.depth
         found[name] = GivenReference(name, path, depth, each.undistorted, trust=each.trust)
-    for given in _paintings(paintings_in(folder), views):
+    for given in _paintings(list_paintings(folder), views):
         named = found.get(given.view)
         found[given.view] = replace(given, trust=named is not None and named.trust and named.path == given.path)
     for given in found.values():
@@ -75,13 +80,13 @@ def load_given(folder: Path, views: Views, asked: Given | Sequence[Given] | None
     return sorted(found.values(), key=lambda given: given.view)
 
 
-def words(given: Sequence[GivenReference]) -> str:
-    """Their views for people."""
+def describe_references(given: Sequence[GivenReference]) -> str:
+    """The views of references, for people."""
     return ", ".join(each.view + (" (painted)" if each.painted else "") for each in given)
 
 
-def _paintings(files: Sequence[Path], views: Views) -> list[GivenReference]:
-    """The paintings with their depth maps; masks that were copied along are passed over."""
+def _paintings(files: Sequence[Path], views: ViewTable) -> list[GivenReference]:
+    """The paintings with their depth maps; masks copied along with them are ignored."""
     pictures, depths = {}, {}
     for path in files:
         of = {end: path.stem.removesuffix(end) for end in ("_depth", "_mask") if path.stem.endswith(end)}
@@ -94,7 +99,7 @@ def _paintings(files: Sequence[Path], views: Views) -> list[GivenReference]:
         else:
             raise BadInput(f"{path}: no picture; a painting is called <view>.png, its depth <view>_depth.png or .exr")
         if name not in views.names and views.placed:
-            raise not_placed(path, name, views)
+            raise not_placed_error(path, name, views)
         if name not in views.names:
             raise BadInput(f"{path}: no view is called '{name}'; call the painting like its view, or remove it")
         if name in kind:
@@ -105,7 +110,7 @@ def _paintings(files: Sequence[Path], views: Views) -> list[GivenReference]:
     return [GivenReference(name, path, depths.get(name), True, True) for name, path in pictures.items()]
 
 
-def _check(given: GivenReference, views: Views) -> None:
+def _check(given: GivenReference, views: ViewTable) -> None:
     where = "" if given.painted else "; correct `reference` in scene.yaml"
     for path in (given.path, given.depth):
         if path is not None and not path.is_file():
@@ -120,9 +125,11 @@ def _check(given: GivenReference, views: Views) -> None:
             f"{given.path}: '{given.view}' is neither a training nor a test view; "
             "name it in `train` in scene.yaml, or make the reference for another view"
         )
-    check_proportions(given.path, given.view, views.size_of(given.view), PROPORTIONS, "reference", views.upright)
+    check_proportions(
+        given.path, given.view, views.size_of(given.view), PROPORTION_TOLERANCE, "reference", views.upright
+    )
     if given.depth is not None:
-        if given.depth.suffix.lower() not in DEPTHS:
+        if given.depth.suffix.lower() not in DEPTH_ENDINGS:
             raise BadInput(f"{given.depth}: a depth map is a 16-bit .png, a .npy or an .exr; convert it")
         if given.depth.suffix.lower() not in (".npy", ".exr"):
             image_size(given.depth)

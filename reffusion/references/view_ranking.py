@@ -1,7 +1,8 @@
-"""For people who paint: which views to complete, by what each would cover, and what of them is known.
+"""For people who paint references: which views to complete, by how much of the hole each covers, and what is known of
+them.
 
-The surface behind the object is not known before a view is painted; here it is the surroundings' disparity drawn
-across the hole. That is enough to tell which views look at the same part of it.
+The surface behind the object is not known before a view is painted. Here the disparity of the surroundings is continued
+across the hole, which is enough to tell which views look at the same part of it.
 """
 
 from __future__ import annotations
@@ -19,19 +20,19 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
 SIDE = 160  # px, the longer side at which surfaces are compared
-NEAR = 0.1  # relative depth up to which two views speak of the same surface
-GREY = 128  # of what is to be painted
-LEAST = 0.02  # share of all pixels to be invented that a further view must cover
+SAME_SURFACE = 0.1  # relative depth within which two views show the same surface
+GREY = 128  # level of the pixels to be painted
+LEAST_GAIN = 0.02  # share of all pixels to be invented that a further view must cover
 
 
 @dataclass(frozen=True)
 class Hole:
-    """A view's pixels to be invented, at a small size.
+    """The pixels of a view to be invented, at a small size.
 
     Attributes:
         camera: the small view.
         pixels: bool [h, w].
-        depth: [h, w] of the surroundings drawn across them, camera z; 0 where nothing is known.
+        depth: [h, w] camera z, continued across the pixels from the surroundings; 0 where unknown.
     """
 
     camera: Camera
@@ -40,8 +41,8 @@ class Hole:
 
 
 @dataclass(frozen=True)
-class Ranked:
-    """A view to paint: its name, and the share of all pixels to be invented that it covers beyond those before it."""
+class RankedView:
+    """A view to paint: its name, and the share of all pixels to be invented that it adds to the views before it."""
 
     view: str
     share: float
@@ -54,11 +55,12 @@ def holes(
     hidden: Mapping[str, np.ndarray],
     invent: Mapping[str, np.ndarray],
 ) -> dict[str, Hole]:
-    """View name -> its hole, of the views that have one.
+    """View name -> its hole, for the views that have one.
 
     Args:
         remaining: the Gaussians without the object's.
-        hidden, invent: view name -> bool [H, W], where the object stood, and what is to be made up.
+        hidden: view name -> bool [H, W], the object's pixels.
+        invent: view name -> bool [H, W], the pixels to be invented.
     """
     found = {}
     for camera in cameras:
@@ -78,22 +80,27 @@ def holes(
     return found
 
 
-def ranked(holes: Mapping[str, Hole], chosen: Sequence[str], most: int) -> list[Ranked]:
-    """The views of `chosen`, then up to `most` others, each the one that covers most of what is not covered yet.
+def ranked(view_holes: Mapping[str, Hole], chosen: Sequence[str], most: int) -> list[RankedView]:
+    """Rank views greedily: those of `chosen`, then up to `most` others, each the one that covers most of what is not
+    covered yet.
 
-    Of the others those come first whose hole keeps clear of the border: one that is cut off by it hides a part.
+    Of the others, views whose hole does not touch the picture's border come first: a hole that is cut off hides a part.
 
     Args:
+        view_holes: view name -> its hole.
         chosen: views that have their picture already.
         most: how many further ones.
     """
-    covers, total = _coverage(holes)
+    covers, total = _coverage(view_holes)
     if not total:
         return []
     left, result = np.ones(total, bool), []
-    named = [name for name in chosen if name in holes]
-    cut_off = {name for name in holes if _cut_off(holes[name])}
-    groups = [([name], 1, 0.0) for name in named] + [(set(holes) - cut_off, most, LEAST), (cut_off, most, LEAST)]
+    named = [name for name in chosen if name in view_holes]
+    at_border = {name for name in view_holes if _touches_border(view_holes[name])}
+    groups = [([name], 1, 0.0) for name in named] + [
+        (set(view_holes) - at_border, most, LEAST_GAIN),
+        (at_border, most, LEAST_GAIN),
+    ]
     for group, count, least in groups:
         for _ in range(min(count, len(named) + most - len(result))):
             candidates = sorted(set(group) - {each.view for each in result})
@@ -101,35 +108,38 @@ def ranked(holes: Mapping[str, Hole], chosen: Sequence[str], most: int) -> list[
             best = max(candidates, key=gains.__getitem__, default=None)
             if best is None or gains[best] < least * total:
                 break
-            result.append(Ranked(best, gains[best] / total))
+            result.append(RankedView(best, gains[best] / total))
             left &= ~covers[best]
     return result
 
 
-def _cut_off(hole: Hole) -> bool:
+def _touches_border(hole: Hole) -> bool:
+    """Does the hole touch the border of the picture?"""
     return bool(hole.pixels[[0, -1]].any() or hole.pixels[:, [0, -1]].any())
 
 
-def _coverage(holes: Mapping[str, Hole]) -> tuple[dict[str, np.ndarray], int]:
-    """View -> bool [P]: which of all views' pixels to be invented its own hole covers; and P."""
-    points = [geometry.unproject(hole.depth, hole.camera)[hole.pixels & (hole.depth > 0)] for hole in holes.values()]
+def _coverage(view_holes: Mapping[str, Hole]) -> tuple[dict[str, np.ndarray], int]:
+    """View -> bool [P]: which of the pixels to be invented, of all views together, its own hole covers; and P."""
+    points = [
+        geometry.unproject(hole.depth, hole.camera)[hole.pixels & (hole.depth > 0)] for hole in view_holes.values()
+    ]
     everything = np.concatenate(points) if points else np.zeros((0, 3))
     covers = {}
-    for name, hole in holes.items():
+    for name, hole in view_holes.items():
         uv, z = geometry.project(everything, hole.camera)
         inside, framed = geometry.sample_nearest(hole.pixels, uv)
         depth, _ = geometry.sample_nearest(hole.depth, uv)
-        covers[name] = framed & inside & (depth > 0) & (np.abs(z - depth) < NEAR * depth)
+        covers[name] = framed & inside & (depth > 0) & (np.abs(z - depth) < SAME_SURFACE * depth)
     return covers, len(everything)
 
 
 def to_paint(known: np.ndarray, invent: np.ndarray) -> np.ndarray:
-    """The picture to paint over, uint8 [H, W, 3]: what is known of the view, grey where it is to be made up."""
+    """The picture to paint over, uint8 [H, W, 3]: the known background, grey where it has to be invented."""
     return np.where(invent[..., None], np.uint8(GREY), known)
 
 
-def words(views: Sequence[Ranked], painted: Sequence[str]) -> str:
-    """The ranked list for people, a line a view."""
+def words(views: Sequence[RankedView], painted: Sequence[str]) -> str:
+    """The ranking as text, a line per view."""
     lines = ["# what each view would cover of all that has to be invented, beyond the views above it"]
     for number, each in enumerate(views, start=1):
         lines.append(f"{number}. {each.view}  {each.share:.0%}{'  (painted)' if each.view in painted else ''}")

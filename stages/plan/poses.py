@@ -1,4 +1,4 @@
-"""What `poses` says before it runs."""
+"""What `poses` reads, checks and announces before it runs."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ from pathlib import Path
 from reffusion.capture import lens
 from reffusion.capture.layouts import cameras
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.roles import views_of
-from reffusion.capture.scene_folder import check_brought, read_scene, unphotographed
+from reffusion.capture.roles import capture_views
+from reffusion.capture.scene_folder import check_gaussian_files, is_gaussians_only, read_scene
 from reffusion.params.clicks import CLICKS
 from reffusion.params.poses import Params
-from reffusion.references.files import PAINTED, load_given, words
+from reffusion.references.files import PAINTED, describe_references, load_given
 
-# pictures count where they are photographs; depth maps belong to references
+# Endings of files that this stage reads only as photographs or depth maps of the capture; others belong to references.
 NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".npy", ".exr")
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
-    """Of the scene's files those that this stage reads, and what it reads elsewhere: the photographs, and all that is
-    neither a picture nor a depth map. So new masks and references, wherever they lie, rerun nothing here."""
+    """The scene's files that this stage reads: the photographs, and everything that is neither a picture nor a depth
+    map. So new masks and references, wherever they lie, rerun nothing here."""
     others = [path for path in files if path.parent != scene or path.name not in ("scene.yaml", CLICKS)]
     brought = {scene / name for name in (params.gaussians, params.cleaned) if name is not None}
     try:
-        if unphotographed(params, scene):
+        if is_gaussians_only(params, scene):
             return sorted({path for path in others if path.suffix.lower() not in NOT_READ} | brought)
         capture, roles = read_scene(params, scene, params.longest)
     except ValueError:  # `preview` refuses it
@@ -35,32 +35,32 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
-    """What each view is for, which may follow from the names of masks."""
-    if unphotographed(params, scene):
+    """The role of each view, which may depend on the names of masks."""
+    if is_gaussians_only(params, scene):
         return {}
     roles = read_scene(params, scene, params.longest)[1]
     return {"views": [roles.train, roles.test, sorted(roles.clean), roles.blank]}
 
 
 def preview(params: Params, scene: Path) -> list[str]:
-    """What the stage will do, from headers. ValueError where it would refuse, or where a reference that the scene
-    brings, read by a later stage, belongs to none of its views."""
-    if unphotographed(params, scene):
-        brought = check_brought(params, scene)
+    """What the stage will do, from headers. ValueError where it would fail, or where a reference of the scene, which a
+    later stage reads, belongs to none of its views."""
+    if is_gaussians_only(params, scene):
+        brought = check_gaussian_files(params, scene)
         found = cameras.read(scene)
         who = f"{len(found[0].lenses)} cameras of {found[1].relative_to(scene)}" if found else "cameras around the hole"
         return [f"no photographs: {who} look at renders of {params.gaussians} instead", *brought]
     capture, roles = read_scene(params, scene, params.longest)
-    given = load_given(scene, views_of(capture, roles), params.reference)
+    given = load_given(scene, capture_views(capture, roles), params.reference)
     notes = [f"{len(roles.train)} training and {len(roles.test)} test views"]
     notes += [f"{len(roles.blank)} views are cameras only"] if roles.blank else []
-    notes += _of_poses(capture, scene)
-    notes += [f"the scene brings a reference of {words(given)}"] if given else []
-    return [*notes, *capture.warnings, *check_brought(params, scene)]
+    notes += _describe_poses(capture, scene)
+    notes += [f"the scene brings a reference of {describe_references(given)}"] if given else []
+    return [*notes, *capture.warnings, *check_gaussian_files(params, scene)]
 
 
-def _of_poses(capture: Capture, scene: Path) -> list[str]:
-    """Where the poses come from, and what their lenses take."""
+def _describe_poses(capture: Capture, scene: Path) -> list[str]:
+    """Where the poses come from, and what their lenses need."""
     if capture.poses is None:
         return [f"SfM: {len(capture.pictures)} photos bring no poses"]
     shifts = {each: lens.largest_shift(each) for each in set(capture.poses.lenses.values())}
@@ -68,6 +68,6 @@ def _of_poses(capture: Capture, scene: Path) -> list[str]:
     moved = f"{worst.coefficients()} moves the border by up to {shifts[worst]:.1f} px"
     pinhole = shifts[worst] <= lens.PINHOLE_ENOUGH
     return [
-        f"SfM left out: {capture.brought_by.relative_to(scene)} brings poses",
+        f"SfM left out: {capture.pose_source.relative_to(scene)} brings poses",
         "undistortion left out: the lens is a pinhole" if pinhole else f"undistortion: {moved}",
     ]

@@ -1,10 +1,10 @@
-"""What `raw_masks` says before it runs."""
+"""What `raw_masks` reads, checks and announces before it runs."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from reffusion.capture.scene_folder import read_scene, unphotographed
+from reffusion.capture.scene_folder import is_gaussians_only, read_scene
 from reffusion.capture.undistort import check_masks
 from reffusion.params.raw_masks import Params
 
@@ -12,16 +12,16 @@ from reffusion.params.raw_masks import Params
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
     """The mask files that this stage reads."""
     try:
-        roles = None if unphotographed(params, scene) else read_scene(params, scene)[1]
+        roles = None if is_gaussians_only(params, scene) else read_scene(params, scene)[1]
     except ValueError:  # `preview` refuses it
         return files
     return sorted({path for views in roles.mask_files.values() for path in views.values()}) if roles else []
 
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
-    """Which file is which view's mask, and the region."""
+    """Which file is the mask of which view, and the region."""
     region = {"region": params.region.model_dump() | {"holds": params.has_masks}} if params.region else {}
-    if unphotographed(params, scene):
+    if is_gaussians_only(params, scene):
         return region
     roles = read_scene(params, scene)[1]
     named = {kind: {name: str(path) for name, path in views.items()} for kind, views in roles.mask_files.items()}
@@ -30,7 +30,7 @@ def scene_facts(params: Params, scene: Path) -> dict[str, object]:
 
 def preview(params: Params, *, scene: Path, poses: Path | None = None) -> list[str]:
     """What the stage will do. ValueError where a mask is unreadable, or all are empty or full."""
-    if unphotographed(params, scene):
+    if is_gaussians_only(params, scene):
         return []
     _, roles = read_scene(params, scene)
     for files in roles.masks.values():

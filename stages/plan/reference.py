@@ -1,4 +1,4 @@
-"""What `reference` says before it runs."""
+"""What `reference` reads, checks, needs and announces before it runs."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from reffusion.capture.views import placed_views
 from reffusion.cost import estimate
 from reffusion.io import machine
 from reffusion.params.reference import Params, reference_list
-from reffusion.references.files import PAINTED, load_given, paintings_in, words
+from reffusion.references.files import PAINTED, describe_references, list_paintings, load_given
 from reffusion.weights import local, painters
 from reffusion.weights.published import PAINTERS
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml, and its folders."""
+    """The weights that the stage needs, and what of them is missing; `brings`: the keys of scene.yaml, and its
+    folders."""
     given = params.reference is not None or PAINTED in brings
     if given or params.inpainter in (painters.EXEMPLAR, painters.AUTO):
         return []
@@ -25,26 +26,27 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
 
 
 def optional_weights(params: Params) -> list[local.Need]:
-    """What `inpainter: auto` would take."""
+    """The weights that `inpainter: auto` would use."""
     return [painters.inpainter_need(kind) for kind in PAINTERS]
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """What the result depends on beside the parameters: which inpainter, and the content of its file."""
+    """What the result depends on beside the parameters: the inpainter, and the content of its file."""
     return painters.inpainter_facts(params.inpainter, "" if params.inpainter == painters.AUTO else params.prior)
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
-    """Of the scene's files those that this stage reads, and what it reads elsewhere."""
+    """The scene's files that this stage reads, and those that it reads elsewhere."""
     named = {scene / name for each in reference_list(params.reference) for name in (each.image, each.depth) if name}
     return sorted({path for path in named if path.is_file()} | {p for p in files if p.parent == scene / PAINTED})
 
 
 def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path | None) -> list[str]:
-    """What the stage will do. ValueError where it would refuse a reference for its name, its file or its view, as far
-    as that can be told: against the views that `poses` placed (before it has run, `poses` checks the capture's)."""
-    if reference_list(params.reference) or paintings_in(scene):
-        views = words(load_given(scene, placed_views(poses), params.reference)) if poses else ""
+    """What the stage will do. ValueError where it would refuse a reference for its name, file or view, as far as that
+    can be checked: against the views that `poses` placed (before it has run, `poses` checks them against the
+    capture's)."""
+    if reference_list(params.reference) or list_paintings(scene):
+        views = describe_references(load_given(scene, placed_views(poses), params.reference)) if poses else ""
         return [f"takes over the scene's reference{views and ' ' + views}: no diffusion here"]
     if params.inpainter == "diffusion":
         return []
@@ -56,10 +58,10 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
 
 
 def lacks(params: Params) -> list[str]:
-    """What this machine has not, and the stage needs on CUDA."""
+    """What this machine lacks for the stage on CUDA."""
     return machine.lacks(machine.machine(), params.memory_gb, splats=False, memory_param="reference.memory_gb")
 
 
 def cost(params: Params, card: str) -> Mapping[str, object] | None:
-    """What it takes on a card; "": this machine's. ValueError for one that is not in the table."""
+    """The stage's cost on a card; "" is this machine's. ValueError for a card that is not in the table."""
     return estimate.format_estimate(card, params.device, estimate.reference(params))

@@ -1,8 +1,8 @@
-"""Photographs that contradict their poses: another picture under the same name, a pose that is wrong by degrees.
+"""Finds photographs that contradict their poses: another picture under the same name, a pose that is wrong by degrees.
 
-The sparse points tie the views together. Where two views see the same points, their pictures must show the same there.
-For each view we take what its nearest views show at the points, place that where the view's pose projects the points,
-and correlate it with the view's own picture at every shift of the picture. A right photograph correlates best at no
+The sparse points connect the views: where two views see the same points, their pictures must show the same there. For
+each view we take what its nearest views show at the points, place it where the view's pose projects the points, and
+correlate it with the view's own picture at every shift of the picture. A right photograph correlates best without a
 shift, by a wide margin, whatever its exposure and however few points it shares. A photograph that belongs elsewhere
 correlates best at some other shift, or nowhere.
 
@@ -25,43 +25,46 @@ from reffusion.geometry import project
 from reffusion.types import Camera, Scene
 
 LONGER_SIDE = 128  # cells along a picture's longer side, at which pictures are compared
-WINDOW = 12  # cells: what varies over more is brightness, not detail
-NOISE = 4.0  # levels of 255 of deviation in a window, well under which there is no detail
-POINTS = 5000  # at most
-DENSITY = 12  # points in a cell of the picture, on average, so that the nearest of them hide those behind them
-LEAST_SHARED = 50  # points that a view has in common with another that it is compared with
-LEAST_POINTS = 250  # that it has in common with all of these: with fewer, chance correlates too
-NEIGHBOURS = 6  # views that each is compared with
-LEAST_NEIGHBOURS = 2
-TURN = np.cos(np.radians(35))  # views whose axes differ by more see other sides of things, and are not compared
+WINDOW = 12  # cells: variation over larger distances is brightness, not detail
+NOISE = 4.0  # levels of 255: standard deviation in a window, well under which there is no detail
+POINTS = 5000  # at most, that are compared
+DENSITY = 12  # mean number of points per cell of the picture, so that the nearest hide those behind them
+LEAST_SHARED = 50  # points that two compared views have in common
+LEAST_POINTS = 250  # points that a view shares with all its neighbours together: with fewer, chance correlates too
+NEIGHBOURS = 6  # views that each view is compared with
+LEAST_NEIGHBOURS = 2  # with fewer, a view is not judged
+# cosine of 35 degrees: views whose axes differ by more see other sides of things, and are not compared
+TURN = np.cos(np.radians(35))
 LEAST_DETAIL = 0.2  # root mean square of the detail at the points, under which the pictures are too plain
 SAME, ELSEWHERE = 2, 4  # cells of shift up to which the pose is right, and from which it is wrong
 LEAST_MARGIN = 0.1  # of the correlation at the pose over that at the best other shift; right views have 0.2 to 0.7
 CLEAR = 0.6  # correlation at the pose from which another shift must be better, by this margin, to count
-LEAST_OVERLAP = 0.5  # of the points that a shift must leave in the picture
+LEAST_OVERLAP = 0.5  # share of the points that a shift must leave in the picture
 
 
 @dataclass(frozen=True)
 class PoseCheck:
-    """Attributes:
-    judged: how many views share enough with others to be judged.
-    contradicting: sorted names of the views whose photographs contradict their poses.
+    """The result of `check_poses`.
+
+    Attributes:
+        judged: number of views that share enough with others to be judged.
+        contradicting: sorted names of the views whose photographs contradict their poses.
     """
 
     judged: int
     contradicting: tuple[str, ...]
 
     @property
-    def is_general(self) -> bool:
-        """Half of the views contradict the others, or more: which of them are right cannot be told."""
+    def is_widespread(self) -> bool:
+        """Do half of the views or more contradict the others? Then it cannot be told which of them are right."""
         return 2 * len(self.contradicting) >= max(self.judged, 1)
 
 
 def check_poses(cameras: Sequence[Camera], points: np.ndarray, image_of: Callable[[str], np.ndarray]) -> PoseCheck:
     """Compare each photograph with those of the nearest views at the points that both see.
 
-    The worst view is set aside and its neighbours are compared again, until the rest agree. At last those set aside are
-    compared with the rest once more.
+    The worst view is set aside and its neighbours are compared again, until the rest agree. In the end the views set
+    aside are compared with the rest once more.
 
     Args:
         cameras: undistorted views in the normalised frame.
@@ -96,11 +99,11 @@ def _is_low(margin: float | None) -> bool:
 
 @dataclass(frozen=True)
 class _View:
-    """A view's picture in cells, and what it shows at the points.
+    """The picture of a view in cells, and what it shows at the points.
 
     Attributes:
-        places: [P, 2] int, column and row of the cell that shows each point; only where `seen`.
-        seen: [P] bool, the points that it shows.
+        places: [P, 2] int, column and row of the cell that shows each point; valid where `seen`.
+        seen: [P] bool, the visible points.
         detail: float32 [h, w], see `_detail`.
         values: float32 [P], the detail at the points; 0 where they are not seen.
     """
@@ -134,14 +137,17 @@ class _View:
         return [np.fft.rfft2(each, self.padded) for each in pictures]
 
     def distance(self, other: _View) -> float:
-        """How differently two cameras look: way between their places, and angle between their axes in radians."""
+        """How differently two cameras look: distance of their centres, plus the angle between their axes in radians."""
         cosine = float(self.camera.world_to_camera[2, :3] @ other.camera.world_to_camera[2, :3])
         return float(np.linalg.norm(self.camera.center - other.camera.center) + np.arccos(np.clip(cosine, -1, 1)))
 
 
 def _detail(image: np.ndarray) -> np.ndarray:
-    """float32 [h, w]: brightness in cells, less its mean in a window, over its deviation there: free of exposure and
-    shading, about -1 to 1, and near 0 where the picture is plain."""
+    """float32 [h, w]: local contrast of the brightness in cells, about -1 to 1.
+
+    It is the brightness less its mean in a window, over its standard deviation there. So it does not depend on exposure
+    and shading, and is near 0 where the picture is plain.
+    """
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     factor = LONGER_SIDE / max(gray.shape)
     size = max(1, round(gray.shape[1] * factor)), max(1, round(gray.shape[0] * factor))
@@ -151,7 +157,7 @@ def _detail(image: np.ndarray) -> np.ndarray:
 
 
 def _nearest(view: _View, others: Collection[_View]) -> list[str]:
-    """Names of the views that look the same way and share points with this one, the nearest first."""
+    """Names of the views that look in the same direction and share points with this one, the nearest first."""
     axis = view.camera.world_to_camera[2, :3]
     others = [each for each in others if each is not view and each.camera.world_to_camera[2, :3] @ axis > TURN]
     shared = [each for each in others if (each.seen & view.seen).sum() >= LEAST_SHARED]
@@ -160,7 +166,7 @@ def _nearest(view: _View, others: Collection[_View]) -> list[str]:
 
 def _margin(view: _View, others: Sequence[_View]) -> float | None:
     """The correlation at the view's pose less that at the best other shift, and a bonus where it is clear; None where
-    nothing can be told."""
+    nothing can be said."""
     if len(others) < LEAST_NEIGHBOURS:
         return None
     count = sum(each.seen & view.seen for each in others)
@@ -176,8 +182,8 @@ def _margin(view: _View, others: Sequence[_View]) -> float | None:
 
 
 def _correlations(view: _View, places: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The correlation of `expected` [K] with the view's detail in the places [K, 2], for every shift of these that
-    leaves enough of them in the picture; and the shifts' lengths in cells."""
+    """Correlation of `expected` [K] with the view's detail at the cells [K, 2], for every shift that keeps enough of
+    them in the picture; and the lengths of these shifts in cells."""
     templates = np.zeros((3, *view.padded))
     for template, weight in zip(templates, (expected, np.ones_like(expected), expected**2), strict=True):
         np.add.at(template, (places[:, 1], places[:, 0]), weight)
@@ -196,17 +202,19 @@ def _correlations(view: _View, places: np.ndarray, expected: np.ndarray) -> tupl
 
 @dataclass(frozen=True)
 class Verdict:
-    """Attributes:
-    outliers: training views to leave out of the scene, sorted.
-    suspects: views that contradict their poses and stay: test views, clean views, and all if too few would be left.
-    sentences: what the user should know, with the line of scene.yaml that decides otherwise.
+    """What follows from a `PoseCheck`.
+
+    Attributes:
+        outliers: training views to leave out of the scene, sorted.
+        suspects: views that contradict their poses and stay: test views, clean views, and all if too few would be left.
+        sentences: what the user should know, with the line of scene.yaml that decides otherwise.
     """
 
     outliers: tuple[str, ...] = ()
     suspects: tuple[str, ...] = ()
     sentences: tuple[str, ...] = ()
 
-    def applied_to(self, scene: Scene) -> Scene:
+    def apply(self, scene: Scene) -> Scene:
         """The scene without the outliers."""
         return replace(
             scene,
@@ -218,16 +226,16 @@ class Verdict:
 
 
 def judge(check: PoseCheck, scene: Scene, keep: Collection[str] = (), exclude: Sequence[str] = ()) -> Verdict:
-    """Which views to leave out, and what to say about them.
+    """Decide which views to leave out, and what to tell the user.
 
     Args:
         keep: views that the user wants to stay.
-        exclude: what scene.yaml excludes already, to be repeated in the line that it needs.
+        exclude: what scene.yaml excludes already, to be repeated in the line that the message suggests.
     """
     wrong = [name for name in check.contradicting if name not in keep]
     if not wrong:
         return Verdict()
-    if check.is_general:
+    if check.is_widespread:
         count = f"at least {len(check.contradicting)} of {check.judged} photographs"
         sentence = f"{count} contradict their poses; do poses and pictures belong together?"
         return Verdict((), tuple(wrong), (sentence,))
@@ -237,22 +245,22 @@ def judge(check: PoseCheck, scene: Scene, keep: Collection[str] = (), exclude: S
     least = 1 if scene.blank else LEAST_TRAINING_VIEWS
     is_enough = len(scene.train) - len(train) >= least
     fate = "are left out" if is_enough else f"are used all the same, for fewer than {least} would be left"
-    said = (
+    cases = (
         (train, "photographs", fate),
         (test, "test photographs", "are scored all the same"),
         (clean, "clean photographs", "are used all the same"),
     )
     sentences = [
         f"{kind} that contradict their poses, or show something else than the others, {fate}: {', '.join(names)}; in "
-        f"scene.yaml, {_line('exclude', exclude, names)} leaves them out for good, {_line('keep', keep, names)} uses "
-        "them without this warning"
-        for names, kind, fate in said
+        f"scene.yaml, {_yaml_line('exclude', exclude, names)} leaves them out for good, "
+        f"{_yaml_line('keep', keep, names)} uses them without this warning"
+        for names, kind, fate in cases
         if names
     ]
     outliers = tuple(train) if is_enough else ()
     return Verdict(outliers, tuple(name for name in wrong if name not in outliers), tuple(sentences))
 
 
-def _line(key: str, named: Collection[str], names: Sequence[str]) -> str:
+def _yaml_line(key: str, named: Collection[str], names: Sequence[str]) -> str:
     """The line of scene.yaml that names these views beside those that it names already."""
     return f"`{key}: {json.dumps(sorted({*named, *names}), ensure_ascii=False)}`"

@@ -1,7 +1,7 @@
-"""What is odd about a capture, in plain words: input that can be read, and is more likely a mistake than meant.
+"""Finds oddities in a capture: input that can be read, but is more likely a mistake than intended.
 
-PAPER leaves open: it takes masks, poses and photographs as given. The thresholds are loose: what is said here should be
-worth a look, and nothing is refused for it.
+PAPER leaves open: it takes masks, poses and photographs as given. The thresholds are loose: a warning should be worth a
+look, and nothing is refused.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from reffusion.capture.image_detail import sample_visible
 from reffusion.geometry import pixel_rays, project, sample_nearest
 from reffusion.types import Camera, Scene
 
-LARGE = 0.5  # of a picture: a mask that covers more is more often inverted than meant
-LOOKED_AT = 24  # masks, spread evenly, that each is compared with in 3D
-RAYS, DEPTHS = 64, 128  # pixels of a mask, and places along the ray of each: a small object is thin to a deep scene
-AGREE = 0.75  # of the other masks that must hold a place for it to be the object
-SUPPORTED = 0.3  # of a mask's pixels, under which it shows something else than the others
-BRIGHTER = 1.5  # times as bright as the others
+LARGE = 0.5  # share of a picture: a mask that covers more is more often inverted than intended
+LOOKED_AT = 24  # number of masks, spread evenly, that each is compared with in 3D
+RAYS, DEPTHS = 64, 128  # pixels of a mask, and points along the ray of each: a small object is thin in a deep scene
+AGREE = 0.75  # share of the other masks that must contain a point for it to be the object
+SUPPORTED = 0.3  # share of a mask's pixels, under which it shows something else than the others
+BRIGHTER = 1.5  # ratio of brightness to the others from which a photograph is odd
 POINTS = 5000  # at most, at which photographs are compared
-LEAST_SEEN = 50  # points in a view for anything to be said of it
+LEAST_SEEN = 50  # points in a view, for anything to be said about it
 
 
 def find_odd_exposures(scene: Scene, image_of: Callable[[str], np.ndarray]) -> list[str]:
-    """A sentence for each photograph much brighter or darker than the others.
+    """A sentence for photographs much brighter or darker than the others.
 
     Args:
-        scene: undistorted, in the normalised frame; its points are sparse ones or those of flow, none that were drawn.
+        scene: undistorted, in the normalised frame; its points are sparse ones or those of flow, no random ones.
         image_of: view name -> uint8 [H, W, 3].
     """
     cameras = [scene.cameras[name] for name in (*scene.train, *scene.test) if name not in scene.suspects]
@@ -50,29 +50,30 @@ def find_odd_exposures(scene: Scene, image_of: Callable[[str], np.ndarray]) -> l
     worst = max(jumps, key=lambda name: abs(np.log(jumps[name])))
     who = f"{len(jumps)} of {len(ratios)} photographs are" if len(jumps) > 1 else "a photograph is"
     return [
-        f"{who} exposed otherwise than the rest ({_listed(sorted(jumps))}; {worst} is {jumps[worst]:.2g} times as "
+        f"{who} exposed otherwise than the rest ({_join_names(sorted(jumps))}; {worst} is {jumps[worst]:.2g} times as "
         "bright): take them with a fixed exposure, or have each one's fitted (fit.exposure)"
     ]
 
 
 def find_odd_masks(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
-    """A sentence for masks that cover most of their pictures, and for those that contradict the others in 3D.
+    """Sentences for masks that cover most of their pictures, and for those that contradict the others in 3D.
 
     Args:
         masks: view name -> bool [H, W], True = the object.
     """
-    return [*_covering(masks), *_disagreeing(scene, masks)]
+    return [*_warn_large(masks), *_warn_inconsistent(scene, masks)]
 
 
-def _covering(masks: Mapping[str, np.ndarray]) -> list[str]:
-    """Masks that cover most of their pictures and of their borders: a thing seen from near leaves much of these."""
+def _warn_large(masks: Mapping[str, np.ndarray]) -> list[str]:
+    """Warn of masks that cover most of their pictures and of their borders; even an object seen from near leaves much
+    free."""
     shares = {name: float(mask.mean()) for name, mask in masks.items()}
     border = lambda mask: np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
     large = sorted(name for name, share in shares.items() if share > LARGE and border(masks[name]) > LARGE)
     if not large:
         return []
     middle = float(np.median(list(shares.values())))
-    who = f"the masks of {_listed(large)} cover" if len(large) > 1 else f"the mask of {large[0]} covers"
+    who = f"the masks of {_join_names(large)} cover" if len(large) > 1 else f"the mask of {large[0]} covers"
     if middle > LARGE:
         who = f"the masks cover {middle:.0%} of the pictures (median);"
     else:
@@ -83,9 +84,9 @@ def _covering(masks: Mapping[str, np.ndarray]) -> list[str]:
 # ---------------------------------------------------------------------------------------------- masks in 3D
 
 
-def _disagreeing(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
-    """Masks that show something else than the others: along none of their pixels' rays lies a place that is inside the
-    other masks too."""
+def _warn_inconsistent(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
+    """Warn of masks that show something else than the others: no point along the rays of their pixels is inside the
+    others."""
     names = [name for name in scene.train if name in masks and name not in scene.clean]
     marked = [name for name in names if masks[name].any()]
     if len(marked) < 3:
@@ -100,10 +101,10 @@ def _disagreeing(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
                 hit, within = sample_nearest(masks[camera.name], project(places, camera)[0])
                 inside += hit & within
                 framed += within
-        held = ((inside >= AGREE * framed) & (framed >= 2)).any(1)
-        told = (framed >= 2).any(1)
-        if told.sum() >= RAYS // 4:
-            share[name] = float(held[told].mean())
+        supported = ((inside >= AGREE * framed) & (framed >= 2)).any(1)
+        judged = (framed >= 2).any(1)
+        if judged.sum() >= RAYS // 4:
+            share[name] = float(supported[judged].mean())
     alone = sorted(name for name, each in share.items() if each < SUPPORTED)
     if len(alone) > len(share) / 2:
         return [
@@ -114,7 +115,8 @@ def _disagreeing(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
 
 
 def _along_rays(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """[R, D, 3]: places behind pixels of the mask, evenly in disparity from the nearest to the farthest point shown."""
+    """[R, D, 3]: points behind pixels of the mask, evenly in disparity from the nearest to the farthest scene point
+    shown."""
     rows, columns = np.nonzero(mask)
     chosen = np.unique(np.linspace(0, len(rows) - 1, RAYS).astype(int))
     at, depth = project(points, camera)
@@ -129,11 +131,11 @@ def _along_rays(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndar
 
 
 def _brightness(camera: Camera, points: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """[P] the photograph's brightness where its pose puts the points; NaN where it does not show them."""
+    """[P] the photograph's brightness where its pose projects the points; NaN where it does not show them."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     return sample_visible(camera, points, cv2.blur(gray, (max(3, camera.width // 40),) * 2)[..., None])[:, 0]
 
 
-def _listed(names: Iterable[str], most: int = 4) -> str:
+def _join_names(names: Iterable[str], most: int = 4) -> str:
     names = list(names)
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,4 +1,4 @@
-"""What every layout is read into, and what their readers share."""
+"""What every layout is read into, and what the readers share."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from reffusion.io.colmap import ModelCamera
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
 
-Brought = tuple[np.ndarray, np.ndarray]  # points: positions [P, 3] float64 and colours [P, 3] uint8
-NO_POINTS: Brought = (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+PointCloud = tuple[np.ndarray, np.ndarray]  # positions [P, 3] float64 and colours [P, 3] uint8
+NO_POINTS: PointCloud = (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
 
 @dataclass(frozen=True)
@@ -37,19 +37,19 @@ class Poses:
 
 @dataclass(frozen=True)
 class Capture:
-    """What a folder holds.
+    """The contents of a scene folder.
 
     Attributes:
         layout: llff, colmap, transforms or photos.
         pictures: view name -> picture file, in the order of the files' paths; all of them have poses, if any has.
         paths: name of a view, or of one that is left out -> the paths by which its mask may call it.
-        poses: None where they must be found by structure from motion.
-        brought_by: the file the poses come from, for messages; None without poses.
+        poses: None where structure from motion has to find them.
+        pose_source: the file the poses come from, for messages; None without poses.
         label_folder: where masks (`label`) and test masks (`test_label`) are looked for: the pictures' folder, or that
             of the same pictures at another size.
-        warnings: what the user should know, each one sentence.
+        warnings: sentences for the user.
         test: names of the views that the layout itself holds out (Blender's transforms_test.json).
-        depth_maps: files that points may be made of.
+        depth_maps: files that points may be made from.
         ignore_masks: view name -> the mask that the layout names for it, black where training ignores the picture.
     """
 
@@ -57,7 +57,7 @@ class Capture:
     pictures: dict[str, Path]
     paths: dict[str, tuple[str, ...]]
     poses: Poses | None
-    brought_by: Path | None
+    pose_source: Path | None
     label_folder: Path
     warnings: tuple[str, ...]
     test: tuple[str, ...] = ()
@@ -66,15 +66,15 @@ class Capture:
 
     @property
     def upright(self) -> bool:
-        """Whether the camera's orientation tag is obeyed: given poses refer to the stored pixels instead."""
+        """Are orientation tags obeyed? Poses that come along refer to the stored pixels instead."""
         return self.layout == "photos"
 
 
-def pictures_in(folder: Path, nested: bool = False) -> dict[str, Path]:
-    """View name -> picture, in the order of their paths (`list_pictures`); none where the folder is not there.
+def find_pictures(folder: Path, nested: bool = False) -> dict[str, Path]:
+    """View name -> picture, in the order of their paths (`list_pictures`); empty where the folder does not exist.
 
     Raises:
-        BadInput: two pictures share a name.
+        BadInput: two pictures have the same view name.
     """
     return {name: folder / path for name, path in name_views(list_pictures(folder, nested)).items()}
 
@@ -83,16 +83,16 @@ def has_pictures(folder: Path, nested: bool = False) -> bool:
     return bool(list_pictures(folder, nested))
 
 
-def paths_below(folder: Path, pictures: dict[str, Path]) -> dict[str, tuple[str, ...]]:
-    """`Capture.paths` of pictures below a folder: their paths, and their views' names with their endings."""
+def relative_paths(folder: Path, pictures: dict[str, Path]) -> dict[str, tuple[str, ...]]:
+    """`Capture.paths` of pictures in a folder: their relative paths, and their views' names with the endings."""
     below = {name: normalize_path(path.relative_to(folder).as_posix()) for name, path in pictures.items()}
     return {name: (path, name + Path(path).suffix) for name, path in below.items()}
 
 
-def image_folder_of(folder: Path, images: str | None, usual: tuple[str, ...]) -> Path:
-    """The named folder; or the first usual one that holds pictures, one with a `label` folder inside first.
+def find_image_folder(folder: Path, images: str | None, usual: tuple[str, ...]) -> Path:
+    """The named folder; else the first usual one that holds pictures, preferring one with a `label` folder inside.
 
-    Pictures may lie in its sub-folders, but not where it is the scene's own folder, which holds masks and more.
+    Pictures may lie in sub-folders, except in those of the scene's own folder, which holds masks and more.
     """
     if images is not None:
         return folder / images
@@ -102,15 +102,15 @@ def image_folder_of(folder: Path, images: str | None, usual: tuple[str, ...]) ->
     return next((path for path in there if (path / "label").is_dir()), there[0])
 
 
-def lens_of(camera: ModelCamera, source: Path) -> Lens:
-    """`from_colmap`, of a camera that the file `source` names."""
+def lens_from_model(camera: ModelCamera, source: Path) -> Lens:
+    """`from_colmap`, for a camera in the file `source`."""
     try:
         return from_colmap(camera.model, camera.width, camera.height, camera.params)
     except BadInput as error:
         raise BadInput(f"{source}: {error}") from None
 
 
-def fitted(lens: Lens, picture: Path) -> Lens:
+def resize_lens(lens: Lens, picture: Path) -> Lens:
     """The lens at the size of the picture file; BadInput where the two have different proportions."""
     width, height = image_size(picture)
     if abs(width * lens.height - height * lens.width) > 0.02 * width * lens.height:
@@ -121,8 +121,8 @@ def fitted(lens: Lens, picture: Path) -> Lens:
     return lens.resized(width, height)
 
 
-def rigid(matrix: np.ndarray, name: str, source: Path) -> np.ndarray:
-    """[4, 4] with the nearest rotation; BadInput where it is not finite, mirrored, sheared or a scaling."""
+def nearest_rigid(matrix: np.ndarray, name: str, source: Path) -> np.ndarray:
+    """[4, 4] with the nearest rotation; BadInput where the matrix is not finite, or mirrors, shears or scales."""
     if not np.isfinite(matrix).all():
         raise BadInput(f"{source}: the pose of '{name}' is not finite; remove the view or solve its pose again")
     u, stretch, v = np.linalg.svd(matrix[:3, :3])
@@ -133,12 +133,13 @@ def rigid(matrix: np.ndarray, name: str, source: Path) -> np.ndarray:
     return result
 
 
-def inverse(pose: np.ndarray) -> np.ndarray:
+def invert_pose(pose: np.ndarray) -> np.ndarray:
+    """Inverse of a rigid pose [4, 4]."""
     result = np.eye(4)
     result[:3, :3], result[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
     return result
 
 
-def counted(what: str, names: list[str]) -> str | None:
+def count_message(what: str, names: list[str]) -> str | None:
     """`17 of the ... : a, b, c`, or None for no names."""
     return f"{len(names)} {what}: {', '.join(names)}" if names else None

@@ -1,4 +1,4 @@
-"""A COLMAP model beside its pictures."""
+"""Reads a COLMAP model and its pictures."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from pathlib import Path
 
 from reffusion.capture.layouts.capture import (
     NO_POINTS,
-    Brought,
     Capture,
+    PointCloud,
     Poses,
-    counted,
-    fitted,
-    image_folder_of,
-    lens_of,
-    paths_below,
+    count_message,
+    find_image_folder,
+    lens_from_model,
+    relative_paths,
+    resize_lens,
 )
 from reffusion.capture.layouts.points import are_tracks_inside, contradicts_order, keep_points_in_frame
 from reffusion.capture.names import (
@@ -27,29 +27,29 @@ from reffusion.io.colmap import ModelImage, is_model, load_cameras, load_images,
 from reffusion.io.files import BadInput
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap", ".")
-RENAMED = re.compile(r"image\d+")  # what LLFF calls its copies of smaller size, in the order of the originals' names
+RENAMED = re.compile(r"image\d+")  # what LLFF calls its smaller copies, in the order of the originals' names
 
 
-def model_folder(folder: Path) -> Path | None:
-    """The model with most images, of equal ones the first; None where there is none."""
+def find_model(folder: Path) -> Path | None:
+    """The folder of the model with most images, of equal ones the first; None where there is no model."""
     return max(found, key=found.__getitem__) if (found := _count_images(folder)) else None
 
 
 def other_models(folder: Path, model: Path) -> str | None:
-    """A sentence about the models that are not taken, or None."""
+    """A sentence about the models that are not used, or None."""
     found = _count_images(folder)
-    others = [f"{_below(folder, path)} ({count})" for path, count in found.items() if path != model]
+    others = [f"{_relative(folder, path)} ({count})" for path, count in found.items() if path != model]
     if not others:
         return None
-    return f"{_below(folder, model)} is taken, which has most images ({found[model]}); not {', '.join(others)}"
+    return f"{_relative(folder, model)} is taken, which has most images ({found[model]}); not {', '.join(others)}"
 
 
-def _below(folder: Path, path: Path) -> str:
+def _relative(folder: Path, path: Path) -> str:
     return path.relative_to(folder).as_posix()
 
 
 def _count_images(folder: Path) -> dict[Path, int]:
-    """Model folder -> number of its images; of one model written as .bin and .txt, or found twice, once."""
+    """Model folder -> number of images. A model that is written as .bin and .txt, or found twice, counts once."""
     numbered = sorted(path for place in ("sparse", "colmap/sparse") for path in (folder / place).glob("[0-9]*"))
     places = dict.fromkeys([*(folder / name for name in MODEL_FOLDERS), *numbered])
     models = [place for place in places if is_model(place)]
@@ -59,16 +59,16 @@ def _count_images(folder: Path) -> dict[Path, int]:
 
 
 def read(folder: Path, images: str | None) -> Capture:
-    """See `load_capture`."""
-    model = model_folder(folder)
+    """Read a scene in this layout, see `load_capture`."""
+    model = find_model(folder)
     if model is None:
         raise BadInput(f"{folder}: no COLMAP model (cameras and images, .bin or .txt) in {', '.join(MODEL_FOLDERS)}")
-    image_folder = image_folder_of(folder, images, ("images", "images_2", "images_4", "."))
-    return from_model(folder, model, image_folder, "colmap", image_folder)
+    image_folder = find_image_folder(folder, images, ("images", "images_2", "images_4", "."))
+    return capture_from_model(folder, model, image_folder, "colmap", image_folder)
 
 
-def from_model(folder: Path, model: Path, image_folder: Path, layout: str, label_folder: Path) -> Capture:
-    """Pictures paired with the model's images by their paths (`pair_pictures`).
+def capture_from_model(folder: Path, model: Path, image_folder: Path, layout: str, label_folder: Path) -> Capture:
+    """Pair the pictures with the model's images by their paths (`pair_pictures`).
 
     Only LLFF's renamed copies, `image000.png` and so on, are paired by order, with a warning.
     """
@@ -80,7 +80,7 @@ def from_model(folder: Path, model: Path, image_folder: Path, layout: str, label
         pairs = dict(zip(sorted(images), files, strict=True))
         warnings.append(f"{image_folder}: renamed pictures, paired with the images of {source.name} in order of names")
     if not pairs:
-        raise BadInput(f"{source}: {_unpaired(image_folder, list(images), files)}")
+        raise BadInput(f"{source}: {_pairing_error(image_folder, list(images), files)}")
     views = name_views(pairs.values())
     of_file = {file: images[name] for name, file in pairs.items()}
     pictures = {view: image_folder / file for view, file in views.items()}
@@ -89,10 +89,10 @@ def from_model(folder: Path, model: Path, image_folder: Path, layout: str, label
         camera = cameras.get(of_file[file].camera_id)
         if camera is None:
             raise BadInput(f"{source}: the camera {of_file[file].camera_id} of '{view}' is missing in the model")
-        lenses[view] = fitted(lens_of(camera, camera_file), pictures[view])
+        lenses[view] = resize_lens(lens_from_model(camera, camera_file), pictures[view])
         poses[view] = of_file[file].world_to_camera
     found = Poses(lenses, poses, *NO_POINTS, {})
-    points, said = _points(model, found, pictures, {v: identities[of_file[f].name] for v, f in views.items()})
+    points, point_warning = _points(model, found, pictures, {v: identities[of_file[f].name] for v, f in views.items()})
     if by_order and contradicts_order([*pictures.values()], [*lenses.values()], [*poses.values()], points):
         raise BadInput(
             f"{image_folder}: its pictures are not in the order of the images of {source}: they show the model's "
@@ -100,11 +100,11 @@ def from_model(folder: Path, model: Path, image_folder: Path, layout: str, label
         )
     unplaced, lost = sorted(set(files) - set(pairs.values())), sorted(images.keys() - pairs.keys())
     warnings += [
-        counted("images of the model have no picture", [_stem(name) for name in lost]),
-        counted("pictures are not in the model and are left out", [_stem(file) for file in unplaced]),
-        said,
+        count_message("images of the model have no picture", [_stem(name) for name in lost]),
+        count_message("pictures are not in the model and are left out", [_stem(file) for file in unplaced]),
+        point_warning,
     ]
-    paths = paths_below(image_folder, pictures)
+    paths = relative_paths(image_folder, pictures)
     paths = {view: (*paths[view], of_file[file].name) for view, file in views.items()}
     rest = {path: (path,) for path in (*lost, *unplaced)}
     return Capture(
@@ -119,7 +119,7 @@ def from_model(folder: Path, model: Path, image_folder: Path, layout: str, label
 
 
 def _images_by_name(source: Path) -> tuple[dict[str, ModelImage], dict[str, int]]:
-    """Name -> image, and name -> its number; BadInput where a name comes twice."""
+    """Name -> image, and name -> image id; BadInput where a name comes twice."""
     images: dict[str, ModelImage] = {}
     identities: dict[str, int] = {}
     for identity, image in load_images(source).items():
@@ -133,7 +133,7 @@ def _stem(path: str) -> str:
     return Path(normalize_path(path)).stem
 
 
-def _unpaired(image_folder: Path, images: list[str], files: list[str]) -> str:
+def _pairing_error(image_folder: Path, images: list[str], files: list[str]) -> str:
     """Why no image of a model could be paired, and what would help."""
     if not files:
         return f"none of its images is in {image_folder}; name their folder as `images` in scene.yaml"
@@ -146,8 +146,8 @@ def _unpaired(image_folder: Path, images: list[str], files: list[str]) -> str:
 
 def _points(
     model: Path, poses: Poses, pictures: dict[str, Path], identities: dict[str, int]
-) -> tuple[Brought, str | None]:
-    """The model's points, none where they are not in the frame of its cameras; and a sentence where they are not."""
+) -> tuple[PointCloud, str | None]:
+    """The model's points, none where they are not in the frame of its cameras; and in that case a sentence about it."""
     file = model_file(model, "points3D")
     if file is None:
         return NO_POINTS, None
@@ -159,20 +159,23 @@ def _points(
 
 
 def read_cameras(model: Path) -> Poses:
-    """The lenses and poses alone, of a model whose pictures are not there."""
+    """Lenses and poses alone, of a model whose pictures are missing."""
     source, camera_file = model_file(model, "images"), model_file(model, "cameras")
     images, _ = _images_by_name(source)
     cameras = load_cameras(camera_file)
     if lost := [name for name, image in images.items() if image.camera_id not in cameras]:
         raise BadInput(f"{source}: the camera of '{lost[0]}' is missing in the model")
     views = {view: images[name] for view, name in name_views(list(images)).items()}
-    lenses = {view: lens_of(cameras[image.camera_id], camera_file) for view, image in views.items()}
+    lenses = {view: lens_from_model(cameras[image.camera_id], camera_file) for view, image in views.items()}
     return Poses(lenses, {view: image.world_to_camera for view, image in views.items()}, *NO_POINTS, {})
 
 
 def _pictures_of_model(folder: Path, image_folder: Path, names: list[str]) -> list[str]:
-    """Paths of pictures below a folder that a model may mean: in its sub-folders too where the model's names have
-    folders or it holds no pictures itself; in the scene's own folder only those that the model names exactly."""
+    """Paths of the pictures in a folder that a model may mean.
+
+    Sub-folders count where the model's names have folders, or the folder itself holds no pictures. In the scene's own
+    folder only those of their pictures count that the model names exactly.
+    """
     loose = list_pictures(image_folder)
     in_folders = any("/" in normalize_path(name) for name in names)
     if image_folder.samefile(folder):

@@ -1,4 +1,4 @@
-"""Points from the depth maps that a capture names for its frames, where it brings no points."""
+"""Makes points from the depth maps that a capture names for its frames, where it brings no points."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from reffusion.capture.layouts.capture import NO_POINTS, Brought
+from reffusion.capture.layouts.capture import NO_POINTS, PointCloud
 from reffusion.capture.lens import Lens, to_directions
 from reffusion.io.depth_maps import load_depth
 from reffusion.io.images import load_thumbnail
 
 FRAMES = 16  # depth maps that are read, spread evenly
-POINTS = 10_000  # that are made of them, at most
+POINTS = 10_000  # at most, that are made from them
 
 
 def points_from_depth(
@@ -22,12 +22,12 @@ def points_from_depth(
     pictures: Mapping[str, Path],
     lenses: Mapping[str, Lens],
     world_to_camera: Mapping[str, np.ndarray],
-) -> Brought:
-    """Pixels on a grid, unprojected and coloured by their pictures: positions [P, 3] and colours [P, 3].
+) -> PointCloud:
+    """Unproject a grid of pixels and colour them by their pictures: positions [P, 3] and colours [P, 3].
 
     Args:
         depths: view name -> depth map, depth along the camera's axis.
-        scale: units of the scene for 1 in a map of integers; maps of floats are in the scene's units.
+        scale: units of the scene per 1 in a map of integers; maps of floats are in the scene's units.
     """
     names = sorted(depths)[:: -(-len(depths) // FRAMES)] if depths else []
     positions, colors = [NO_POINTS[0]], [NO_POINTS[1]]

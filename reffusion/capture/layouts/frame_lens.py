@@ -1,4 +1,4 @@
-"""Lenses as the frames of transforms.json give them."""
+"""Lenses from the frames of transforms.json."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from reffusion.capture.layouts.capture import fitted
+from reffusion.capture.layouts.capture import resize_lens
 from reffusion.capture.lens import Lens
-from reffusion.io.files import BadInput, shortened
+from reffusion.io.files import BadInput, shorten
 from reffusion.io.images import image_size
 
 MODELS = (
@@ -29,12 +29,12 @@ MODELS = (
 
 
 def load_frame_lens(values: dict[str, Any], picture: Path, source: Path) -> Lens:
-    """The lens of a frame at the size of its picture; see `frame_lens`."""
-    return fitted(frame_lens(values, picture, source, image_size(picture)), picture)
+    """`frame_lens` at the size of the frame's picture file."""
+    return resize_lens(frame_lens(values, picture, source, image_size(picture)), picture)
 
 
 def frame_lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[int, int]) -> Lens:
-    """The lens that a frame's keys give.
+    """The lens that a frame's keys describe.
 
     Args:
         values: the frame's keys over the file's.
@@ -50,10 +50,10 @@ def frame_lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[
 
 
 def read_number(values: dict[str, Any], key: str, default: float, picture: Path, source: Path) -> float:
-    """A number of a frame; BadInput where it is none, or not finite."""
+    """A number of a frame; BadInput where it is no number, or not finite."""
     value = values.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
-        raise BadInput(f"{source}: {key} = {shortened(value)} of '{picture.name}' is no finite number")
+        raise BadInput(f"{source}: {key} = {shorten(value)} of '{picture.name}' is no finite number")
     return float(value)
 
 
@@ -65,10 +65,10 @@ def _lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[int, 
         raise BadInput(f"{source}: neither fl_x nor camera_angle_x for '{picture.name}'; one of them is needed")
     fy = _focal_length(values, "y", height, number)
     model = values.get("camera_model", "OPENCV")
-    model = model.upper() if isinstance(model, str) else shortened(model)
+    model = model.upper() if isinstance(model, str) else shorten(model)
     fisheye = "FISHEYE" in model or bool(values.get("is_fisheye", False))
     if model not in MODELS:
-        raise BadInput(f"{source}: camera_model {shortened(model)} is not understood; one of {', '.join(MODELS)}")
+        raise BadInput(f"{source}: camera_model {shorten(model)} is not understood; one of {', '.join(MODELS)}")
     k = [number(f"k{i}") for i in range(1, 7)]
     rational = model == "FULL_OPENCV"
     return Lens(
@@ -78,8 +78,8 @@ def _lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[int, 
         fx if fy is None else fy,
         number("cx", width / 2),
         number("cy", height / 2),
-        radial=_trimmed(k[:3] if rational else k[:4]),
-        denominator=_trimmed(k[3:]) if rational else (),
+        radial=_strip_zeros(k[:3] if rational else k[:4]),
+        denominator=_strip_zeros(k[3:]) if rational else (),
         tangential=(0.0, 0.0) if fisheye else (number("p1"), number("p2")),
         fisheye=fisheye,
         model=model,
@@ -87,7 +87,7 @@ def _lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[int, 
 
 
 def _focal_length(values: dict[str, Any], axis: str, extent: float, number: Callable[..., float]) -> float | None:
-    """Pixels along one axis of `extent` pixels, from the focal length or else the angle of view; None without."""
+    """Focal length in px along one axis of `extent` px, from fl_ or camera_angle_; None where both are missing."""
     if f"fl_{axis}" in values:
         return number(f"fl_{axis}")
     if f"camera_angle_{axis}" in values:
@@ -96,8 +96,8 @@ def _focal_length(values: dict[str, Any], axis: str, extent: float, number: Call
     return None
 
 
-def _trimmed(coefficients: list[float]) -> tuple[float, ...]:
-    """Without the zeros at the end."""
+def _strip_zeros(coefficients: list[float]) -> tuple[float, ...]:
+    """The coefficients without trailing zeros."""
     while coefficients and coefficients[-1] == 0.0:
         coefficients = coefficients[:-1]
     return tuple(coefficients)

@@ -1,6 +1,7 @@
-"""LLFF's poses_bounds.npy, as SPIn-NeRF's scenes have it; a COLMAP model beside it wins, or helps where incomplete.
+"""Reads LLFF's poses_bounds.npy, as in SPIn-NeRF's scenes. A COLMAP model beside it is preferred, or helps if
+incomplete.
 
-The same pictures lie there in several sizes, and the masks beside one of them, in SPIn-NeRF beside those of a quarter.
+The same pictures lie there in several sizes, and the masks beside one of them; in SPIn-NeRF beside those of a quarter.
 """
 
 from __future__ import annotations
@@ -13,39 +14,39 @@ import numpy as np
 from reffusion.capture.frame import depths_in_view
 from reffusion.capture.layouts.capture import (
     NO_POINTS,
-    Brought,
     Capture,
+    PointCloud,
     Poses,
-    fitted,
-    image_folder_of,
-    inverse,
-    lens_of,
-    paths_below,
-    pictures_in,
-    rigid,
+    find_image_folder,
+    find_pictures,
+    invert_pose,
+    lens_from_model,
+    nearest_rigid,
+    relative_paths,
+    resize_lens,
 )
-from reffusion.capture.layouts.colmap import from_model, model_folder
+from reffusion.capture.layouts.colmap import capture_from_model, find_model
 from reffusion.capture.lens import Lens
 from reffusion.io.arrays import load_array
 from reffusion.io.colmap import load_cameras, load_model_points, model_file
-from reffusion.io.files import BadInput, there
+from reffusion.io.files import BadInput, is_file
 from reffusion.io.images import image_size
 
 USUAL = ("images_4", "images_2", "images_8", "images")
 
 
 def read(folder: Path, images: str | None, longest: int, references: frozenset[Path] = frozenset()) -> Capture:
-    """See `load_capture`."""
+    """Read a scene in this layout, see `load_capture`."""
     source = folder / "poses_bounds.npy"
     label_folder = _label_folder(folder, images)
-    image_folder, warnings = (folder / images, []) if images else _large_enough(folder, label_folder, longest)
-    model = model_folder(folder)
+    image_folder, warnings = (folder / images, []) if images else _choose_image_folder(folder, label_folder, longest)
+    model = find_model(folder)
     if model is not None:  # exact poses, the lens's distortion and the points
-        found = from_model(folder, model, image_folder, "llff", label_folder)
+        found = capture_from_model(folder, model, image_folder, "llff", label_folder)
         return replace(found, warnings=(*warnings, *found.warnings))
-    if not there(source):
+    if not is_file(source):
         raise BadInput(f"{source}: missing, and there is no complete COLMAP model in {folder / 'sparse/0'}")
-    pictures, rows = pictures_in(image_folder), _poses_bounds(source)
+    pictures, rows = find_pictures(image_folder), _load_poses_bounds(source)
     if len(rows) != len(pictures):
         pictures = {name: path for name, path in pictures.items() if path not in references}
     if len(rows) != len(pictures):
@@ -59,35 +60,36 @@ def read(folder: Path, images: str | None, longest: int, references: frozenset[P
         lens = Lens(
             round(width), round(height), float(focal), float(focal), width / 2, height / 2, model="SIMPLE_PINHOLE"
         )
-        lenses[name] = fitted(lens, path)
+        lenses[name] = resize_lens(lens, path)
         camera_to_world = np.eye(4)
         # LLFF's columns are down, right, backwards.
         camera_to_world[:3] = np.stack([columns[:, 1], columns[:, 0], -columns[:, 2], columns[:, 3]], axis=1)
-        poses[name] = inverse(rigid(camera_to_world, name, source))
+        poses[name] = invert_pose(nearest_rigid(camera_to_world, name, source))
         bounds[name] = float(row[15]), float(row[16])
     partial = folder / "sparse" / "0"
     lenses = _lens_of_partial_model(partial, lenses, pictures, warnings)
     points = _points_of_partial_model(partial, lenses, poses, bounds, warnings)
-    brought = Poses(lenses, poses, *points, bounds)
-    paths = paths_below(image_folder, pictures)
-    return Capture("llff", pictures, paths, brought, source, label_folder, tuple(warnings))
+    capture_poses = Poses(lenses, poses, *points, bounds)
+    paths = relative_paths(image_folder, pictures)
+    return Capture("llff", pictures, paths, capture_poses, source, label_folder, tuple(warnings))
 
 
 def _label_folder(folder: Path, images: str | None) -> Path:
-    """The named folder of pictures where masks lie in it, else the usual one in which they do."""
+    """The named folder of pictures if it holds masks, else the usual one that does."""
     if images and (folder / images / "label").is_dir():
         return folder / images
     labelled = [folder / name for name in USUAL if (folder / name / "label").is_dir()]
-    return labelled[0] if labelled else image_folder_of(folder, images, USUAL)
+    return labelled[0] if labelled else find_image_folder(folder, images, USUAL)
 
 
-def _large_enough(folder: Path, label_folder: Path, longest: int) -> tuple[Path, list[str]]:
-    """The smallest size of the pictures that is `longest` px or more, else the largest; and what to warn of.
+def _choose_image_folder(folder: Path, label_folder: Path, longest: int) -> tuple[Path, list[str]]:
+    """The smallest size of the pictures that is `longest` px or more, else the largest; and warnings.
 
-    Only folders that hold all the pictures of the folder with the masks, under the same names, are that size."""
-    names, sizes, other = pictures_in(label_folder).keys(), {}, []
+    Only folders that hold all the pictures of the folder with the masks, under the same names, count as sizes of them.
+    """
+    names, sizes, other = find_pictures(label_folder).keys(), {}, []
     for place in dict.fromkeys([label_folder, *(folder / name for name in USUAL)]):
-        pictures = pictures_in(place) if place.is_dir() else {}
+        pictures = find_pictures(place) if place.is_dir() else {}
         if pictures and names <= pictures.keys():
             sizes[place] = max(image_size(next(iter(pictures.values()))))
         elif pictures:
@@ -100,7 +102,7 @@ def _large_enough(folder: Path, label_folder: Path, longest: int) -> tuple[Path,
     return chosen, [f"{named}: not the pictures of {label_folder.name} under the same names, so not used"]
 
 
-def _poses_bounds(source: Path) -> np.ndarray:
+def _load_poses_bounds(source: Path) -> np.ndarray:
     """[V, 17] float64, checked."""
     rows = load_array(source)
     if rows.ndim != 2 or rows.shape[1] != 17:
@@ -119,13 +121,13 @@ def _poses_bounds(source: Path) -> np.ndarray:
 def _lens_of_partial_model(
     model: Path, lenses: dict[str, Lens], pictures: dict[str, Path], warnings: list[str]
 ) -> dict[str, Lens]:
-    """The lens of a model that lacks its images, where it holds one camera that agrees with poses_bounds.npy."""
+    """The lens of a model without images, where it has a single camera that agrees with poses_bounds.npy."""
     file = model_file(model, "cameras") if model.is_dir() else None
     cameras = list(load_cameras(file).values()) if file else []
     if len(cameras) != 1:
         return lenses
-    exact = lens_of(cameras[0], file)
-    replaced = {name: fitted(exact, path) for name, path in pictures.items()}
+    model_lens = lens_from_model(cameras[0], file)
+    replaced = {name: resize_lens(model_lens, path) for name, path in pictures.items()}
     ratio = np.median([replaced[name].fx / lens.fx for name, lens in lenses.items()])
     if abs(ratio - 1) > 0.02:
         warnings.append(f"{file}: its focal length is {ratio:.3f} times that of poses_bounds.npy and is not used")
@@ -139,12 +141,12 @@ def _points_of_partial_model(
     poses: dict[str, np.ndarray],
     bounds: dict[str, tuple[float, float]],
     warnings: list[str],
-) -> Brought:
-    """Its points where they are in the frame of the poses, else none.
+) -> PointCloud:
+    """The points of a model without images, where they are in the frame of the poses; else none.
 
-    By tracks, where as many images are seen in them as there are poses: of the observations, 95% must lie in front
-    of and inside the view that made them, its views taken in order of their ids. Without: in the median view at
-    least a fifth of the points must lie inside the picture and, half of those, between near and far.
+    If as many images observe the points as there are poses, tracks decide: 95% of the observations must lie in front of
+    and inside the view that made them, with its views taken in order of their ids. Otherwise at least a fifth of the
+    points must lie inside the picture of the median view and, half of those, between near and far.
     """
     file = model_file(model, "points3D") if model.is_dir() else None
     if file is None:

@@ -1,4 +1,4 @@
-"""Masks that a scene brings: where they lie, which view each belongs to, and which of them are of one object."""
+"""Finds the masks that a scene brings: where they lie, which view each belongs to, and which are of the same object."""
 
 from __future__ import annotations
 
@@ -10,18 +10,20 @@ from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.names import is_mask_of_another, pair_masks, strip_ending
 from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS, WHITE, MaskValues
-from reffusion.params.capture import Masks
+from reffusion.params.capture import MaskSpec
 
 NONE = "none"
-USUAL = ("masks", "mask", "label")  # of the scene's folder, after `label` inside the folder of pictures
+USUAL = ("masks", "mask", "label")  # folders of the scene, tried after `label` inside the folder of pictures
 
 
 @dataclass(frozen=True)
 class FoundMasks:
-    """Attributes:
-    files: object -> view -> mask; "" is the object of masks that tell none apart. Empty without masks.
-    values: which pixel values are the object.
-    warning: what the user should know, a sentence, or None.
+    """The masks of a scene.
+
+    Attributes:
+        files: object -> view -> mask; "" is the object of masks that tell no objects apart. Empty without masks.
+        values: which pixel values are the object.
+        warning: a sentence for the user, or None.
     """
 
     files: dict[str, dict[str, Path]]
@@ -29,8 +31,8 @@ class FoundMasks:
     warning: str | None = None
 
 
-def find_masks(folder: Path, capture: Capture, asked: str | Masks | None, optional: bool) -> FoundMasks:
-    """The masks of a scene, each checked to have its picture.
+def find_masks(folder: Path, capture: Capture, asked: str | MaskSpec | None, optional: bool) -> FoundMasks:
+    """Find the masks of a scene, and check that each has its picture.
 
     Args:
         asked: the parameter `masks` (`reffusion.params.capture`).
@@ -39,28 +41,28 @@ def find_masks(folder: Path, capture: Capture, asked: str | Masks | None, option
     Raises:
         BadInput: naming the file or folder and the remedy.
     """
-    named = asked if isinstance(asked, Masks) else Masks(folder=asked)
+    named = asked if isinstance(asked, MaskSpec) else MaskSpec(folder=asked)
     if named.folder is not None and named.folder.lower() == NONE:
         return FoundMasks({})
     values = MaskValues(named.numbers)
     if named.folder is not None:
         place = folder / named.folder
-        if not (files := _files_of(place, capture)):
+        if not (files := _mask_paths(place, capture)):
             inside = any(place in path.parents for path in capture.pictures.values())
             why = (
                 "it holds photographs, and no mask beside one (A_mask.png beside A.png)" if inside else "no masks there"
             )
             raise BadInput(f"{place}: {why}; correct `masks` in scene.yaml")
-        return FoundMasks(objects_of_masks(place, files, capture), values)
+        return FoundMasks(group_by_object(place, files, capture), values)
     places = [capture.label_folder / "label", *(folder / name for name in USUAL)]
     beside = _pictures_folder(capture)
     ignored = set(capture.ignore_masks.values())
     for place in (*(p for p in places if p != capture.label_folder), *([beside] if beside else [])):
-        files = _files_of(place, capture)
+        files = _mask_paths(place, capture)
         if files and not {place / path for path in files} <= ignored:
-            return FoundMasks(objects_of_masks(place, files, capture), values)
+            return FoundMasks(group_by_object(place, files, capture), values)
     if ignored:
-        said = f"mask_path of {capture.brought_by.name}: black, which training ignores, is taken for the object"
+        said = f"mask_path of {capture.pose_source.name}: black, which training ignores, is taken for the object"
         return FoundMasks({"": capture.ignore_masks}, MaskValues(named.numbers, inverted=True), said)
     if optional:
         return FoundMasks({})
@@ -77,8 +79,8 @@ def _pictures_folder(capture: Capture) -> Path | None:
     return parents.pop() if len(parents) == 1 else None
 
 
-def _files_of(place: Path, capture: Capture) -> list[str]:
-    """Paths of the masks below a folder; where photographs lie too, only those called `A_mask.png` beside `A.png`."""
+def _mask_paths(place: Path, capture: Capture) -> list[str]:
+    """Paths of the masks in a folder. If photographs lie there too, only those called `A_mask.png` beside `A.png`."""
     if not place.is_dir():
         return []
     found = sorted(
@@ -92,17 +94,17 @@ def _files_of(place: Path, capture: Capture) -> list[str]:
     return [path for path in found if is_mask_of_another(strip_ending(path), stems)]
 
 
-def objects_of_masks(place: Path, files: Collection[str], capture: Capture) -> dict[str, dict[str, Path]]:
-    """Object -> view -> mask of the files below a folder.
+def group_by_object(place: Path, files: Collection[str], capture: Capture) -> dict[str, dict[str, Path]]:
+    """Object -> view -> mask of the files in a folder.
 
-    Sub-folders are objects where a view has masks in several of them, or where there is only one. Sub-folders of which
-    each view has a mask in one hold the masks of one object: those of pictures that lie in folders themselves.
+    Sub-folders are objects if a view has masks in several of them, or if there is only one sub-folder. If each view has
+    a mask in exactly one sub-folder, as for pictures that lie in folders themselves, all masks are of one object.
 
     Raises:
         BadInput: a mask belongs to no picture, or two to one; masks lie beside folders of masks.
     """
     folders = {PurePosixPath(path).parts[0] for path in files if "/" in path}
-    if not folders or _hold_pictures(folders, capture):
+    if not folders or _are_picture_folders(folders, capture):
         return {"": _assign_masks(place, match_masks(place, files, capture), capture)}
     if any("/" not in path for path in files):
         raise BadInput(
@@ -119,17 +121,17 @@ def objects_of_masks(place: Path, files: Collection[str], capture: Capture) -> d
     return found
 
 
-def _hold_pictures(folders: Collection[str], capture: Capture) -> bool:
-    """Are they all folders in which pictures lie?"""
+def _are_picture_folders(folders: Collection[str], capture: Capture) -> bool:
+    """Are these all folders that pictures lie in?"""
     ours = {part for paths in capture.paths.values() for path in paths for part in PurePosixPath(path).parent.parts}
     return set(folders) <= ours
 
 
 def match_masks(place: Path, files: Collection[str], capture: Capture, strict: bool = True) -> dict[str, str]:
-    """Mask -> the view, or the picture that is left out, it belongs to.
+    """Mask -> the view it belongs to, or the picture that is left out.
 
     Raises:
-        BadInput: with `strict`, where one belongs to none.
+        BadInput: with `strict`, a mask belongs to none.
     """
     everything = {name: (name, *paths) for name, paths in capture.paths.items()}
     found = pair_masks(files, everything)

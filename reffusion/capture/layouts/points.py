@@ -1,7 +1,7 @@
-"""Whether sparse points lie in the frame of the cameras, and in that of their pictures.
+"""Tests whether sparse points are in the frame of the cameras, and of their pictures.
 
-People replace the points of a model by another cloud, or the order of its pictures is lost. Where the geometry cannot
-tell (a cloud of another scale around the same middle), colours can: a point shows in its views what it is coloured.
+People replace the points of a model by another cloud, or the order of its pictures is lost. Where geometry cannot tell
+(a cloud of another scale around the same middle), colours can: the views of a point show its colour.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ from pathlib import Path
 import numpy as np
 
 from reffusion.capture.frame import camera_centers, depths_in_view, nearest_depths
-from reffusion.capture.layouts.capture import NO_POINTS, Brought, Poses
+from reffusion.capture.layouts.capture import NO_POINTS, PointCloud, Poses
 from reffusion.capture.lens import Lens, to_pixels
 from reffusion.io.colmap import ModelPoints
 from reffusion.io.images import load_thumbnail
 
 INSIDE = 0.02  # share of the points that the median view must show
-FARTHEST = 100.0  # times the cameras' distance from their middle: points farther away show no parallax
+FARTHEST = 100.0  # times the cameras' distance from their middle: points further away show no parallax
 TRACKED = 0.9  # share of the observations that must lie inside the view that made them
-VIEWS, POINTS = 8, 8000  # that colours are compared in, spread evenly
+VIEWS, POINTS = 8, 8000  # number of views and points for comparing colours, spread evenly
 SIDE = 320  # px, the longer side of the pictures that colours are read from
 LEAST_POINTS = 50  # in a view
-LEAST_CONTRAST = 6.0  # levels of 255: standard deviation, of points and picture, from which they can be compared
-CELLS, NEARLY = 40, 1.1  # along a side; times the depth of the nearest point of a cell, beyond which others are hidden
+LEAST_CONTRAST = 6.0  # levels of 255: standard deviation, of points and of picture, from which they can be compared
+CELLS, NEARLY = 40, 1.1  # cells along a side; times the nearest depth of a cell, up to which points are visible
 # Median correlation under which colours contradict the frame. Right clouds of five captures have .38 to .86; those that
 # were scaled by 2, turned, mirrored or moved have up to .31.
 CORRELATED = 0.25
@@ -33,9 +33,9 @@ BETTER = 0.02  # by how much another view's points must fit a picture better tha
 
 
 def keep_points_in_frame(
-    path: Path, points: Brought, poses: Poses, pictures: Mapping[str, Path]
-) -> tuple[Brought, str | None]:
-    """The points, none where they are not in the frame of the poses; and a sentence where they are not used."""
+    path: Path, points: PointCloud, poses: Poses, pictures: Mapping[str, Path]
+) -> tuple[PointCloud, str | None]:
+    """The points, none where they are not in the frame of the poses; and in that case a sentence about it."""
     finite = np.isfinite(points[0]).all(axis=1)
     positions, colors = points[0][finite], points[1][finite]
     refused = NO_POINTS, f"{path}: its points are not in the frame of the cameras and are not used"
@@ -58,7 +58,7 @@ def keep_points_in_frame(
 
 
 def are_tracks_inside(points: ModelPoints, poses: Mapping[int, tuple[Lens, np.ndarray]]) -> bool:
-    """Whether the points lie in front of and inside the images that their tracks name; True where none names any.
+    """Do the points lie in front of and inside the images that their tracks name? True where no tracks are known.
 
     Args:
         poses: image id -> its lens and [4, 4] world-to-camera.
@@ -72,32 +72,31 @@ def are_tracks_inside(points: ModelPoints, poses: Mapping[int, tuple[Lens, np.nd
 
 
 def contradicts_order(
-    pictures: Sequence[Path], lenses: Sequence[Lens], poses: Sequence[np.ndarray], points: Brought
+    pictures: Sequence[Path], lenses: Sequence[Lens], poses: Sequence[np.ndarray], points: PointCloud
 ) -> bool:
-    """Whether most of the pictures show the points as another view's pose puts them, rather than as their own does.
+    """Do most of the pictures show the points where another view's pose projects them, rather than their own?
 
     Args:
-        pictures, lenses, poses: the view k has pictures[k], lenses[k] and the [4, 4] world-to-camera poses[k].
+        pictures, lenses, poses: view k has pictures[k], lenses[k] and the [4, 4] world-to-camera poses[k].
     """
     if not _has_contrast(points[1] @ GREY):
         return False
     chosen = range(0, len(pictures), -(-len(pictures) // VIEWS))
-    wrong = said = 0
+    misplaced = compared = 0
     for k in chosen:
         grey = read_grey(pictures[k])
         fits = np.array([correlate_colors(grey, lens, pose, *points) for lens, pose in zip(lenses, poses, strict=True)])
         if np.isnan(fits[k]) or np.isnan(fits).sum() > len(fits) / 2:
             continue
-        said += 1
-        wrong += np.nanmax(fits) > fits[k] + BETTER
-    return bool(said) and 2 * wrong > said
+        compared += 1
+        misplaced += np.nanmax(fits) > fits[k] + BETTER
+    return bool(compared) and 2 * misplaced > compared
 
 
 def correlate_colors(
     grey: np.ndarray, lens: Lens, pose: np.ndarray, positions: np.ndarray, colors: np.ndarray
 ) -> float:
-    """Correlation of the points' brightness with a picture's, where the pose puts them; NaN where too few are seen or
-    either is plain.
+    """Correlation of the points' brightness with a picture's at their projections; NaN with too few points or contrast.
 
     Args:
         grey: [H, W] of any size. lens: of the same view at any size. pose: [4, 4] world-to-camera.
@@ -110,7 +109,7 @@ def correlate_colors(
         uv = to_pixels(at[:, :2] / at[:, 2:], lens) / (lens.width, lens.height)
         inside = ((uv > 0) & (uv < 1)).all(axis=1)
     uv, depth, own = uv[inside], at[inside, 2], own[inside]
-    front = _are_nearest(uv, depth)
+    front = _is_nearest(uv, depth)
     columns, rows = (uv[front] * grey.shape[::-1]).astype(int).T
     seen, own = grey[rows, columns], own[front]
     if len(own) < LEAST_POINTS or not (_has_contrast(seen) and _has_contrast(own)):
@@ -118,8 +117,8 @@ def correlate_colors(
     return float(np.corrcoef(seen, own)[0, 1])
 
 
-def _are_nearest(uv: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """bool [P]: points that are not behind others in the same of `CELLS` x `CELLS` cells of the picture [0, 1]^2."""
+def _is_nearest(uv: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """bool [P]: points not hidden by others in the same of `CELLS` x `CELLS` cells of the picture [0, 1]^2."""
     cells = (uv * CELLS).astype(int) @ (CELLS, 1)
     return depth < NEARLY * nearest_depths(cells, depth)
 

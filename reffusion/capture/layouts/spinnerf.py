@@ -1,18 +1,18 @@
 """SPIn-NeRF's published scenes: which are in a folder, and what each of them lacks.
 
 Sorted by name the first 40 views are test views, photographs without the object; the last 60 are training views. Poses,
-lens (SIMPLE_RADIAL) and points are those of the full size, `images`; masks lie beside the quarter, `images_4`.
+lens (SIMPLE_RADIAL) and points belong to the full size, `images`; masks lie beside the quarter size, `images_4`.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from reffusion.capture.layouts.capture import pictures_in
-from reffusion.capture.layouts.colmap import model_folder
+from reffusion.capture.layouts.capture import find_pictures
+from reffusion.capture.layouts.colmap import find_model
 from reffusion.capture.load import load_capture
 from reffusion.capture.roles import load_roles
-from reffusion.io.files import BadInput, there
+from reffusion.io.files import BadInput, is_file
 from reffusion.io.images import image_size
 
 SCENES = ("1", "2", "3", "4", "7", "9", "10", "12", "book", "trash")
@@ -24,26 +24,26 @@ PARTS = {  # what a scene holds, and what is lost without it
     "poses_bounds.npy": "near and far; the COLMAP model stands for the rest",
     "sparse/0": "the lens's distortion and the points",
     "images": "full size: the scene stays at that of images_4",
-}
+}  # what a scene holds, and what is lost without it
 
 
 def scene_folders(data: Path) -> list[Path]:
-    """The published scenes that are in a folder; where none of these is, every folder laid out like one."""
+    """The published scenes in a folder; where there is none of these, every folder with the same layout."""
     folders = sorted(p for p in data.iterdir() if p.is_dir() and p.name[0] not in "._") if data.is_dir() else []
     return [p for p in folders if p.name in SCENES] or [p for p in folders if (p / "images_4").is_dir()]
 
 
-def told(data: Path) -> list[str]:
-    """A line a scene: what it holds, what it lacks, or that it is not there. ValueError where there is none at all."""
+def summarize_scenes(data: Path) -> list[str]:
+    """A line per scene: what it holds, what it lacks, or that it is missing. ValueError where there is no scene."""
     folders = scene_folders(data)
     if not folders:
         raise ValueError(f"{data}: no scenes of SPIn-NeRF there; expected the folders {', '.join(SCENES)}")
     names = [path.name for path in folders]
     absent = [name for name in SCENES if name not in names] if set(names) & set(SCENES) else []
-    return [*(f"{path.name}: {held(path)}" for path in folders), *(f"{name}: not there" for name in absent)]
+    return [*(f"{path.name}: {summarize_scene(path)}" for path in folders), *(f"{name}: not there" for name in absent)]
 
 
-def held(folder: Path) -> str:
+def summarize_scene(folder: Path) -> str:
     """What a scene holds and lacks, in a line."""
     missing = [f"{part} ({loss})" for part, loss in PARTS.items() if not _has(folder, part)]
     lacks = f"lacks {'; '.join(missing)}" if missing else ""
@@ -60,11 +60,11 @@ def held(folder: Path) -> str:
 
 def _has(folder: Path, part: str) -> bool:
     if part == "sparse/0":
-        return model_folder(folder) is not None
+        return find_model(folder) is not None
     path = folder / part
-    return there(path) if path.suffix else path.is_dir() and bool(pictures_in(path))
+    return is_file(path) if path.suffix else path.is_dir() and bool(find_pictures(path))
 
 
 def _size(folder: Path) -> str:
-    width, height = image_size(next(iter(pictures_in(folder).values())))
+    width, height = image_size(next(iter(find_pictures(folder).values())))
     return f"{folder.name} {width}x{height}"

@@ -1,4 +1,4 @@
-"""nerfstudio's transforms.json, and Blender's transforms_train.json with _test and _val."""
+"""Reads nerfstudio's transforms.json, and Blender's transforms_train.json with _test and _val."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ import numpy as np
 
 from reffusion.capture.layouts.capture import (
     NO_POINTS,
-    Brought,
     Capture,
+    PointCloud,
     Poses,
-    counted,
-    inverse,
-    paths_below,
-    rigid,
+    count_message,
+    invert_pose,
+    nearest_rigid,
+    relative_paths,
 )
 from reffusion.capture.layouts.depth_maps import points_from_depth
 from reffusion.capture.layouts.frame_lens import frame_lens, load_frame_lens, read_number
 from reffusion.capture.layouts.points import keep_points_in_frame
 from reffusion.capture.names import list_pictures, name_views, normalize_path, pair_pictures
 from reffusion.io.arrays import load_json
-from reffusion.io.files import BadInput, shortened, there, understood
+from reffusion.io.files import BadInput, as_bad_input, is_file, shorten
 from reffusion.io.images import ENDINGS
 from reffusion.io.ply import load_points
 
@@ -39,29 +39,31 @@ class Frame:
 
     Attributes:
         values: its keys over the file's.
-        listed: its file_path.
+        file_path: its key of that name, the path of the picture.
         source: the file.
-        split: "", or of Blender's files "train", "test" or "val".
+        split: "", or for Blender's files "train", "test" or "val".
     """
 
     values: dict[str, Any]
-    listed: str
+    file_path: str
     source: Path
     split: str
 
 
 def split_files(folder: Path) -> dict[str, Path]:
-    """Split -> file: {"": transforms.json}, or Blender's transforms_train.json with _test and _val; empty without."""
-    if there(folder / "transforms.json"):
+    """Split -> file: {"": transforms.json}, or Blender's transforms_train.json with _test and _val; empty without
+    either."""
+    if is_file(folder / "transforms.json"):
         return {"": folder / "transforms.json"}
     found = {
-        split: folder / f"transforms_{split}.json" for split in SPLITS if there(folder / f"transforms_{split}.json")
+        split: folder / f"transforms_{split}.json" for split in SPLITS if is_file(folder / f"transforms_{split}.json")
     }
     return found if "train" in found else {}
 
 
 def read(folder: Path, images: str | None) -> Capture:
-    """See `load_capture`. Of Blender's splits, test views are those of _test, without it those of _val."""
+    """Read a scene in this layout, see `load_capture`. Blender's test views are those of _test, or without it those of
+    _val."""
     sources = split_files(folder)
     unread = [sources.pop("val").name] if {"test", "val"} <= sources.keys() else []
     frames = [frame for split, source in sources.items() for frame in _load_frames(source, split)]
@@ -69,7 +71,7 @@ def read(folder: Path, images: str | None) -> Capture:
     files = _find_pictures(folder, images, frames)
     if not files:
         raise BadInput(f"{source}: none of its {len(frames)} frames has a picture; name their folder as `images`")
-    missing = [frame.listed for k, frame in enumerate(frames) if k not in files]
+    missing = [frame.file_path for k, frame in enumerate(frames) if k not in files]
     root = Path(os.path.commonpath([path.parent for path in files.values()]))
     of_path = {path.relative_to(root).as_posix(): frames[k] for k, path in files.items()}
     if len(of_path) < len(files):
@@ -80,17 +82,17 @@ def read(folder: Path, images: str | None) -> Capture:
     lenses = {view: load_frame_lens(each.values, pictures[view], each.source) for view, each in placed.items()}
     poses = {view: _frame_pose(each.values, view, each.source) for view, each in placed.items()}
     found = Poses(lenses, poses, *NO_POINTS, {})
-    points, said = _points(folder, source, frames[0].values, placed, found, pictures)
-    paths = paths_below(root, pictures)
+    points, messages = _points(folder, source, frames[0].values, placed, found, pictures)
+    paths = relative_paths(root, pictures)
     warnings = (
-        counted(f"of the {len(frames)} frames in {source.name} have no picture", sorted(missing)),
-        counted("beside the test views are left out", unread),
-        *said,
+        count_message(f"of the {len(frames)} frames in {source.name} have no picture", sorted(missing)),
+        count_message("beside the test views are left out", unread),
+        *messages,
     )
     return Capture(
         "transforms",
         pictures,
-        {view: (*paths[view], each.listed) for view, each in placed.items()} | {path: (path,) for path in missing},
+        {view: (*paths[view], each.file_path) for view, each in placed.items()} | {path: (path,) for path in missing},
         replace(found, points=points[0], colors=points[1]),
         source,
         next(iter(pictures.values())).parent if len({path.parent for path in pictures.values()}) == 1 else root,
@@ -102,11 +104,11 @@ def read(folder: Path, images: str | None) -> Capture:
 
 
 def read_cameras(folder: Path) -> Poses:
-    """The lenses and poses alone, of a capture whose pictures are not there; their sizes are the file's w and h."""
+    """Lenses and poses alone, of a capture whose pictures are missing; sizes are the file's w and h."""
     frames = [each for split, source in split_files(folder).items() for each in _load_frames(source, split)]
-    listed = {normalize_path(each.listed): each for each in frames}
+    listed = {normalize_path(each.file_path): each for each in frames}
     if len(listed) < len(frames):
-        twice = next(path for path in listed if sum(normalize_path(each.listed) == path for each in frames) > 1)
+        twice = next(path for path in listed if sum(normalize_path(each.file_path) == path for each in frames) > 1)
         raise BadInput(f"{frames[0].source}: two frames are called '{Path(twice).stem}'; rename one")
     lenses, poses = {}, {}
     for view, path in name_views(list(listed)).items():
@@ -121,7 +123,7 @@ def read_cameras(folder: Path) -> Poses:
 
 
 def has_pictures(folder: Path) -> bool:
-    """Is a picture of one of its frames there?"""
+    """Does a picture of one of the frames exist?"""
     frames = [each for split, source in split_files(folder).items() for each in _load_frames(source, split)]
     return bool(_find_pictures(folder, None, frames))
 
@@ -137,7 +139,7 @@ def _frames(record: object, source: Path) -> list[dict]:
         raise BadInput(f"{source}: it has no list `frames`")
     for frame in frames:
         if not isinstance(frame, dict) or "transform_matrix" not in frame or not _is_path(frame.get("file_path")):
-            raise BadInput(f"{source}: a frame without file_path or transform_matrix: {shortened(frame)}")
+            raise BadInput(f"{source}: a frame without file_path or transform_matrix: {shorten(frame)}")
     return frames
 
 
@@ -146,41 +148,44 @@ def _is_path(value: object) -> bool:
 
 
 def _find_pictures(folder: Path, images: str | None, frames: list[Frame]) -> dict[int, Path]:
-    """Number of a frame -> its picture, of those that have one.
+    """Index of a frame -> its picture, for the frames that have one.
 
-    As listed, the ending may be missing; with `images`, or where none is as listed, the pictures of that folder or of a
-    usual one that are called like it (`pair_pictures`): paths of another machine, or of another size's folder.
+    Pictures lie where file_path says, possibly with another ending. With `images`, or where none lies there, pictures
+    are looked for in that folder, or in a usual one, by their names (`pair_pictures`): file_path may be of another
+    machine, or name the folder of another size.
     """
-    listed = {k: path for k, frame in enumerate(frames) if (path := _as_listed(folder, frame.listed)) is not None}
+    listed = {
+        k: path for k, frame in enumerate(frames) if (path := _existing_picture(folder, frame.file_path)) is not None
+    }
     if images is None and listed:
         return listed
     for place in [images] if images is not None else USUAL:
         names = list_pictures(folder / place, nested=True)
-        pairs = pair_pictures({k: frame.listed for k, frame in enumerate(frames)}, names)
+        pairs = pair_pictures({k: frame.file_path for k, frame in enumerate(frames)}, names)
         if pairs:
             return {k: folder / place / name for k, name in sorted(pairs.items())}
     return {}
 
 
-def _as_listed(folder: Path, listed: str) -> Path | None:
-    """The file of a path in the record, usual endings tried; None where it is not there."""
+def _existing_picture(folder: Path, listed: str) -> Path | None:
+    """The file that file_path names, with the usual endings tried; None where it does not exist."""
     base = folder / listed.replace("\\", "/")
     if base.suffix.lower() in ENDINGS:
-        there(base)  # a folder or a pipe of that name is no missing picture
+        is_file(base)  # a folder or a pipe of that name is no missing picture
     candidates = [base, *(base.with_name(base.name + end) for e in ENDINGS for end in (e, e.upper()))]
     return next((path for path in candidates if path.is_file()), None)
 
 
 def _named_files(folder: Path, placed: Mapping[str, Frame], key: str) -> dict[str, Path]:
-    """View name -> the file that its frame names under a key (`mask_path`, `depth_file_path`), where it is there."""
+    """View name -> the file that its frame names under a key (`mask_path`, `depth_file_path`), where it exists."""
     named = {view: each.values[key] for view, each in placed.items() if _is_path(each.values.get(key))}
     files = {view: folder / path.replace("\\", "/") for view, path in named.items()}
     return {view: path for view, path in files.items() if path.is_file()}
 
 
 def _frame_pose(frame: dict, name: str, source: Path) -> np.ndarray:
-    """OpenGL camera-to-world (y up, looking along -z) -> [4, 4] world-to-camera of ours."""
-    with understood(source, f"a number in each place of the transform_matrix of '{name}'"):
+    """OpenGL camera-to-world (y up, looking along -z) -> our world-to-camera [4, 4]."""
+    with as_bad_input(source, f"a number in each place of the transform_matrix of '{name}'"):
         matrix = np.array(frame["transform_matrix"])
         if matrix.dtype.kind not in "fiu":
             raise BadInput(f"{source}: the transform_matrix of '{name}' is no 4x4 matrix of numbers")
@@ -189,7 +194,7 @@ def _frame_pose(frame: dict, name: str, source: Path) -> np.ndarray:
         raise BadInput(f"{source}: the transform_matrix of '{name}' is no 4x4 matrix")
     camera_to_world = np.eye(4)
     camera_to_world[:3] = matrix[:3] * (1.0, -1.0, -1.0, 1.0)
-    return inverse(rigid(camera_to_world, name, source))
+    return invert_pose(nearest_rigid(camera_to_world, name, source))
 
 
 def _points(
@@ -199,28 +204,33 @@ def _points(
     placed: Mapping[str, Frame],
     poses: Poses,
     pictures: Mapping[str, Path],
-) -> tuple[Brought, list[str | None]]:
-    """The points of `ply_file_path` (or sparse_pc.ply) in the frame of the poses, else of the frames' depth maps; and
+) -> tuple[PointCloud, list[str | None]]:
+    """The points of `ply_file_path` (or sparse_pc.ply) in the frame of the poses, else those of the depth maps; and
     sentences about what is not used.
 
-    `applied_transform` and `applied_scale` say what was done to poses and points alike: there is nothing to undo.
+    `applied_transform` and `applied_scale` describe what was done to poses and points alike, so there is nothing to
+    undo.
     """
     listed = record.get("ply_file_path")
     if listed is not None and not _is_path(listed):
-        raise BadInput(f"{source}: ply_file_path = {shortened(listed)} is no file's name")
+        raise BadInput(f"{source}: ply_file_path = {shorten(listed)} is no file's name")
     path = folder / (listed.replace("\\", "/") if listed else "sparse_pc.ply")
-    said: list[str | None] = []
-    if there(path):
+    messages: list[str | None] = []
+    if is_file(path):
         points, refused = keep_points_in_frame(path, load_points(path), poses, pictures)
         if len(points[0]):
             return points, []
-        said.append(refused)
+        messages.append(refused)
     elif listed:
-        said.append(f"{path}: named by {source.name}, but missing")
+        messages.append(f"{path}: named by {source.name}, but missing")
     if depths := _named_files(folder, placed, "depth_file_path"):
         scale = read_number(record, "integer_depth_scale", 1e-3, path, source)
-        made = points_from_depth(depths, scale, pictures, poses.lenses, poses.world_to_camera)
-        kept, refused = keep_points_in_frame(next(iter(depths.values())).parent, made, poses, pictures)
-        said.append(refused or f"{len(kept[0])} points are made of the depth maps (depth_file_path) of {source.name}")
-        return kept, said
-    return NO_POINTS, said
+        depth_points = points_from_depth(depths, scale, pictures, poses.lenses, poses.world_to_camera)
+        points_in_frame, refused = keep_points_in_frame(
+            next(iter(depths.values())).parent, depth_points, poses, pictures
+        )
+        messages.append(
+            refused or f"{len(points_in_frame[0])} points are made of the depth maps (depth_file_path) of {source.name}"
+        )
+        return points_in_frame, messages
+    return NO_POINTS, messages

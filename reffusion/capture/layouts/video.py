@@ -1,4 +1,4 @@
-"""A video as photographs: its sharpest frames, evenly spaced by how far the picture moves, as a scene's folder."""
+"""Turns a video into photographs: its sharpest frames, evenly spaced by how far the picture moves."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from reffusion.io.arrays import save_json
 from reffusion.io.files import BadInput, reading
 from reffusion.io.images import resized
 
-MOST = 80  # frames: what is matched pair by pair within minutes
-FEWEST = 12
+MOST = 80  # frames at most: what can be matched pair by pair within minutes
+FEWEST = 12  # frames
 SPACING = 0.04  # of the picture's width that it moves between two frames: neighbours share most of what they show
-STILL = 0.25  # of the width: a picture that moves less in all shows everything from one place
-LOOKED_AT = 3000  # frames at most, every so many of a long video
+STILL = 0.25  # of the width: a picture that moves less in total shows everything from one place
+LOOKED_AT = 3000  # frames at most that are measured; of a longer video every few
 SHARP, FLOW = 640, 320  # px, the longer side at which sharpness and motion are measured
-ANCHOR = 0.02  # of the width, from which motion is measured anew: a hand that trembles goes nowhere
-CORNERS, KEPT = 200, 0.25  # that are followed; the share of them under which they are lost
-PATIENCE, JUMP = 3, 0.3  # frames for which they may be, before all counts as new and as so far away
-MIDDLE, ASIDE = 0.5, 0.6  # of its window; a frame outside counts as so much less sharp, so that few stand side by side
-NEAR = 4  # windows to either side with whose frames one is compared
-BLURRED = 0.4  # of the sharpness of those, under which it is left out
-NOISE = 4.0  # of the Laplacian's variance, levels of 255 squared: rounding and coding leave so much in a plain picture
+ANCHOR = 0.02  # of the width, from which motion is measured anew: the trembling of a hand does not add up
+CORNERS, KEPT = 200, 0.25  # corners that are tracked; share of them under which tracking is lost
+PATIENCE, JUMP = 3, 0.3  # frames for which tracking may be lost, before a jump of this share of the width is assumed
+MIDDLE, ASIDE = 0.5, 0.6  # central share of a window; factor for the sharpness outside, so that few frames are adjacent
+NEAR = 4  # windows to either side whose frames a frame is compared with
+BLURRED = 0.4  # of the sharpness of those, under which a frame is left out
+NOISE = 4.0  # variance of the Laplacian, levels of 255 squared, that rounding and coding leave in a plain picture
 TOO_BLURRED = 0.003  # sharpness; photographs of grass, stone and rooms have 0.5 to 0.9, blurred by 2 px 0.003 to 0.01
 QUALITY = 95  # of the JPEGs: the video lost more
 RECORD, TABLE = "frames.json", "frames.csv"
@@ -39,35 +39,37 @@ TAKEN, LESS_SHARP, SOFT = "taken", "another nearby is sharper", "blurred like al
 
 
 @dataclass(frozen=True)
-class Seen:
-    """A frame that was looked at.
+class FrameStats:
+    """Measurements of a frame.
 
     Attributes:
         number: of the frame in the file, from 0.
         seconds: its time.
         sharpness: variance of the Laplacian over that of the brightness, at `SHARP` px.
-        way: by how much of its width the picture has moved since the first frame.
+        distance: by how much of its width the picture has moved since the first frame.
     """
 
     number: int
     seconds: float
     sharpness: float
-    way: float
+    distance: float
 
 
 def take(video: Path, folder: Path, content: str) -> str:
-    """Write the video's frames to folder/images, all that was looked at to frames.csv, and frames.json, last.
+    """Write the selected frames to folder/images, all measurements to frames.csv, and frames.json last.
 
     The same file gives the same frames. Rotation that the file declares is obeyed.
 
     Args:
         content: a hash of the file, for frames.json.
+
     Returns:
         What was taken and what was not, in a sentence.
+
     Raises:
         BadInput: it is no video, too short, shows the same all the time, or is blurred throughout.
     """
-    seen = look(video)
+    seen = measure_frames(video)
     if not seen:
         raise BadInput(
             f"{video}: OpenCV opens it and decodes no frame of it (codec {_codec(video)}); convert it, as in "
@@ -75,61 +77,65 @@ def take(video: Path, folder: Path, content: str) -> str:
         )
     if len(seen) < FEWEST:
         raise BadInput(f"{video}: {len(seen)} frames; a video that walks around the scene has hundreds")
-    if seen[-1].way < STILL:
+    if seen[-1].distance < STILL:
         raise BadInput(
-            f"{video}: the picture moves by {seen[-1].way:.0%} of its width in all; walk around the object as you film"
+            f"{video}: the picture moves by {seen[-1].distance:.0%} of its width in all; walk around the object as you "
+            "film"
         )
-    chosen, soft = choose(seen)
+    chosen, blurred = select_frames(seen)
     if np.median([each.sharpness for each in chosen]) < TOO_BLURRED:
         raise BadInput(f"{video}: blurred throughout; film slower, in more light, with the focus held on the scene")
     size = _write(video, folder / "images", chosen)
-    said = f"{len(chosen)} of {len(seen)} frames of {video.name}, the sharpest of every {_spacing(seen):.0%} of the "
-    said += f"width that the picture moves; {len(soft)} places left out, blurred all along"
-    _save_table(folder / TABLE, seen, chosen, soft)
+    sentence = (
+        f"{len(chosen)} of {len(seen)} frames of {video.name}, the sharpest of every {_spacing(seen):.0%} of the "
+    )
+    sentence += f"width that the picture moves; {len(blurred)} places left out, blurred all along"
+    _save_table(folder / TABLE, seen, chosen, blurred)
     facts = {"frames": len(seen), "seconds": seen[-1].seconds, "size": list(size), "taken": len(chosen)}
-    facts |= {"blurred": len(soft), "said": said}
+    facts |= {"blurred": len(blurred), "said": sentence}
     save_json(folder / RECORD, {"video": str(video), "content": content, **facts})
-    return said
+    return sentence
 
 
-def look(video: Path) -> list[Seen]:
-    """How sharp the frames are, and how far the picture has moved; of a long video every few."""
+def measure_frames(video: Path) -> list[FrameStats]:
+    """Sharpness of the frames, and how far the picture has moved; of a long video every few frames."""
     count = _count(video)
-    every, way, seen = max(1, -(-count // LOOKED_AT)), _Way(), []
+    every, way, seen = max(1, -(-count // LOOKED_AT)), _MotionTracker(), []
     frames = _frames(video, lambda number: number % every == 0)
     for _, (number, seconds, frame) in zip(trace.progress(-(-count // every), "frames"), frames, strict=False):
         gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
         at = lambda longest, gray=gray: resized(gray, fitting_size(gray.shape[1], gray.shape[0], longest))
         sharp = sharpness(at(SHARP))
-        seen.append(Seen(number, seconds, sharp, way.moved(at(FLOW), sharp)))
+        seen.append(FrameStats(number, seconds, sharp, way.update(at(FLOW), sharp)))
     return seen
 
 
 def _count(video: Path) -> int:
-    """Its frames; where the file does not say, as browsers' recordings do not, by going through it."""
-    opened = _opened(video)
-    count = int(opened.get(cv2.CAP_PROP_FRAME_COUNT))
+    """Number of frames; counted by decoding where the file does not say, as browsers' recordings do not."""
+    video_file = _open_video(video)
+    count = int(video_file.get(cv2.CAP_PROP_FRAME_COUNT))
     if count <= 0:
-        count = sum(1 for _ in iter(opened.grab, False))
-    opened.release()
+        count = sum(1 for _ in iter(video_file.grab, False))
+    video_file.release()
     return count
 
 
 def _codec(video: Path) -> str:
-    """Four letters, as `av01`."""
-    opened = _opened(video)
-    code = int(opened.get(cv2.CAP_PROP_FOURCC))
-    opened.release()
+    """The codec's four letters, as `av01`."""
+    video_file = _open_video(video)
+    code = int(video_file.get(cv2.CAP_PROP_FOURCC))
+    video_file.release()
     return "".join(letter for k in range(4) if (letter := chr(code >> 8 * k & 255)).isalnum()) or "unknown"
 
 
 def sharpness(gray: np.ndarray) -> float:
-    """Of a grey picture, uint8 [H, W]: 0 where it is plain."""
+    """Sharpness of a grey picture, uint8 [H, W]; 0 where it is plain."""
     return max(0.0, float((cv2.Laplacian(gray, cv2.CV_32F).var() - NOISE) / (gray.var() + NOISE)))
 
 
-class _Way:
-    """How far a picture has moved: by corners followed from an anchor, which is renewed where they have moved on."""
+class _MotionTracker:
+    """Measures how far a picture has moved, by tracking corners from an anchor frame that is renewed when they have
+    moved on."""
 
     def __init__(self) -> None:
         self._anchor: np.ndarray | None = None
@@ -137,10 +143,10 @@ class _Way:
         self._sharpness = self._before = self._longest = 0.0
         self._lost = 0
 
-    def moved(self, gray: np.ndarray, sharp: float) -> float:
-        """With the next frame, grey uint8 [H, W], and its sharpness: how far up to now, in widths; never less than
-        before."""
-        step = self._since(gray)
+    def update(self, gray: np.ndarray, sharp: float) -> float:
+        """Add the next frame, grey uint8 [H, W], and its sharpness; returns the distance so far in widths, which never
+        decreases."""
+        step = self._distance_from_anchor(gray)
         if self._corners is None or self._lost > PATIENCE:
             self._renew(gray, sharp, JUMP if self._lost else 0.0)
         elif step >= (ANCHOR if sharp >= BLURRED * self._sharpness else 3 * ANCHOR):  # few corners last in a smear
@@ -155,43 +161,44 @@ class _Way:
         self._anchor, self._sharpness = gray, sharp
         self._corners = cv2.goodFeaturesToTrack(gray, CORNERS, 0.01, 8)
 
-    def _since(self, gray: np.ndarray) -> float:
-        """From the anchor; 0 where it is lost, or plain."""
+    def _distance_from_anchor(self, gray: np.ndarray) -> float:
+        """Distance from the anchor; 0 where tracking is lost, or the picture is plain."""
         if self._corners is None:
             return 0.0
-        found, there, _ = cv2.calcOpticalFlowPyrLK(self._anchor, gray, self._corners, None)
-        there = there.ravel() > 0
-        if there.sum() < max(8, KEPT * len(there)):
+        found, tracked, _ = cv2.calcOpticalFlowPyrLK(self._anchor, gray, self._corners, None)
+        tracked = tracked.ravel() > 0
+        if tracked.sum() < max(8, KEPT * len(tracked)):
             self._lost += 1
             return 0.0
         self._lost = 0
-        return float(np.median(np.linalg.norm((found - self._corners).reshape(-1, 2)[there], axis=1)) / gray.shape[1])
+        return float(np.median(np.linalg.norm((found - self._corners).reshape(-1, 2)[tracked], axis=1)) / gray.shape[1])
 
 
-def _spacing(seen: list[Seen]) -> float:
-    """The way between two frames that are taken."""
-    return seen[-1].way / min(MOST, max(FEWEST, round(seen[-1].way / SPACING)))
+def _spacing(seen: list[FrameStats]) -> float:
+    """The distance between two selected frames."""
+    return seen[-1].distance / min(MOST, max(FEWEST, round(seen[-1].distance / SPACING)))
 
 
-def choose(seen: list[Seen]) -> tuple[list[Seen], list[Seen]]:
-    """Of windows of equal way each the sharpest frame, and those of them that are blurred next to their neighbours."""
+def select_frames(seen: list[FrameStats]) -> tuple[list[FrameStats], list[FrameStats]]:
+    """The sharpest frame of each window of equal distance, and those of them that are blurred compared with their
+    neighbours."""
     spacing = _spacing(seen)
-    windows: dict[int, list[Seen]] = {}
+    windows: dict[int, list[FrameStats]] = {}
     for each in seen:
-        windows.setdefault(min(int(each.way / spacing), round(seen[-1].way / spacing) - 1), []).append(each)
+        windows.setdefault(min(int(each.distance / spacing), round(seen[-1].distance / spacing) - 1), []).append(each)
     best = []
     for number, frames in sorted(windows.items()):
-        central = lambda each, number=number: abs(each.way / spacing - number - 0.5) <= MIDDLE / 2
+        central = lambda each, number=number: abs(each.distance / spacing - number - 0.5) <= MIDDLE / 2
         best.append(max(frames, key=lambda each: each.sharpness * (1 if central(each) else ASIDE)))
-    chosen, soft = [], []
+    chosen, blurred = [], []
     for k, each in enumerate(best):
         usual = np.median([other.sharpness for other in best[max(0, k - NEAR) : k + NEAR + 1]])
-        (chosen if each.sharpness >= BLURRED * usual else soft).append(each)
-    return chosen, soft
+        (chosen if each.sharpness >= BLURRED * usual else blurred).append(each)
+    return chosen, blurred
 
 
-def _write(video: Path, folder: Path, chosen: list[Seen]) -> tuple[int, int]:
-    """Write the frames as frame_<number>.jpg; their (width, height)."""
+def _write(video: Path, folder: Path, chosen: list[FrameStats]) -> tuple[int, int]:
+    """Write the frames as frame_<number>.jpg; returns their (width, height)."""
     wanted, size = {each.number for each in chosen}, (0, 0)
     partial = folder.with_name(f".{folder.name}-{os.getpid()}")
     shutil.rmtree(partial, ignore_errors=True)
@@ -209,33 +216,33 @@ def _write(video: Path, folder: Path, chosen: list[Seen]) -> tuple[int, int]:
 
 def _frames(video: Path, wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, np.ndarray]]:
     """Number, seconds and picture, uint8 [H, W, 3] BGR, of the frames whose number is `wanted`."""
-    opened, number = _opened(video), 0
-    while opened.grab():
+    video_file, number = _open_video(video), 0
+    while video_file.grab():
         if wanted(number):
-            seconds = opened.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            whole, frame = opened.retrieve()
+            seconds = video_file.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            whole, frame = video_file.retrieve()
             if whole and frame is not None and frame.ndim == 3:
                 yield number, seconds, frame
         number += 1
-    opened.release()
+    video_file.release()
 
 
-def _opened(video: Path) -> cv2.VideoCapture:
+def _open_video(video: Path) -> cv2.VideoCapture:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what they say on standard error is in our line
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     with reading(video, "a video that OpenCV reads"):
-        opened = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
-        if not opened.isOpened():
+        video_file = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
+        if not video_file.isOpened():
             raise BadInput(f"{video}: not a video that OpenCV reads; mp4, mov, mkv and webm are")
-    opened.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
-    return opened
+    video_file.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+    return video_file
 
 
-def _save_table(path: Path, seen: list[Seen], chosen: list[Seen], soft: list[Seen]) -> None:
-    what = {each.number: TAKEN for each in chosen} | {each.number: SOFT for each in soft}
+def _save_table(path: Path, seen: list[FrameStats], chosen: list[FrameStats], blurred: list[FrameStats]) -> None:
+    what = {each.number: TAKEN for each in chosen} | {each.number: SOFT for each in blurred}
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(("frame", "seconds", "way", "sharpness", "what"))
         for each in seen:
-            numbers = (f"{each.seconds:.3f}", f"{each.way:.4f}", f"{each.sharpness:.4f}")
+            numbers = (f"{each.seconds:.3f}", f"{each.distance:.4f}", f"{each.sharpness:.4f}")
             writer.writerow((each.number, *numbers, what.get(each.number, LESS_SHARP)))
