@@ -10,7 +10,7 @@ UNIT = 1000  # capacity of a cost of 1, since capacities are integers
 HARD = 1e4  # a cost that no sum of links outweighs
 
 
-def least_cut(true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray) -> np.ndarray:
+def min_cut(true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray) -> np.ndarray:
     """bool [N], the labels with the smallest total cost, by a minimum cut.
 
     Args:
@@ -34,7 +34,7 @@ def least_cut(true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, 
     return np.isin(nodes, reached)
 
 
-def least_labels(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, start: np.ndarray) -> np.ndarray:
+def alpha_expansion(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, start: np.ndarray) -> np.ndarray:
     """int [N], labels with a low total cost, by expansion moves (Boykov et al. 2001): each move gives one label to all
     that gain from it, until no move lowers the cost.
 
@@ -52,7 +52,7 @@ def least_labels(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, star
             # Neighbours with different labels cost once unless both move: each that moves gains half of it.
             gain = np.bincount(pairs[apart].T.ravel(), np.tile(strength[apart] / 2, 2), len(labels))
             stay = np.where(labels == label, HARD, keep)  # what has the label is as if it had moved
-            moves = least_cut(cost[label] - gain, stay, pairs, np.where(apart, strength / 2, strength))
+            moves = min_cut(cost[label] - gain, stay, pairs, np.where(apart, strength / 2, strength))
             moved = np.where(moves, label, labels)
             if _total(cost, pairs, strength, moved) < _total(cost, pairs, strength, labels) - 1 / UNIT:
                 labels, changed = moved, True

@@ -21,7 +21,7 @@ def generator(seed: int, *labels: object, device: str = "cpu") -> torch.Generato
     return torch.Generator(device).manual_seed(seed_for(seed, *labels))
 
 
-def in_epochs(turn: int, count: int, seed: int, *labels: object) -> int:
+def epoch_index(turn: int, count: int, seed: int, *labels: object) -> int:
     """Index of the item, of `count`, whose turn it is: each item once per epoch, in a new order in every epoch."""
     order = torch.randperm(count, generator=generator(seed, *labels, turn // count))
     return int(order[turn % count])

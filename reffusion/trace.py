@@ -134,7 +134,7 @@ def log_spaced(iteration: int, last: int, per_octave: int = 2, first: int = 1) -
     return iteration >= first and step(iteration) != step(iteration - 1)
 
 
-def affordable(
+def steps_within_budget(
     folder: Path, asked: int, seconds: float, spent: Callable[[], float], trial: Callable[[Path, int], object]
 ) -> int:
     """The number of `asked` steps that a stage can do in its `seconds`: at least a twentieth of them.

@@ -156,7 +156,7 @@ class Gaussians:
         """`function` applied to each parameter, e.g. `g.map(lambda p: p[keep])`."""
         return Gaussians(*(function(getattr(self, name)) for name in PARAMETERS), antialiased=self.antialiased)
 
-    def zipped(self, other: Gaussians, function: Callable[[Tensor, Tensor], Tensor]) -> Gaussians:
+    def zip_map(self, other: Gaussians, function: Callable[[Tensor, Tensor], Tensor]) -> Gaussians:
         """`function` applied to each pair of parameters, e.g. concatenation; `antialiased` is that of `self`."""
         pairs = ((getattr(self, name), getattr(other, name)) for name in PARAMETERS)
         return Gaussians(*(function(*pair) for pair in pairs), antialiased=self.antialiased)

@@ -16,7 +16,7 @@ from reffusion.background.visibility import render_depth_views
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_arrays, load_json, load_labels
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_mask_sets, load_object, load_scene
+from reffusion.io.scene import load_mask_sets, load_object_labels, load_scene
 from reffusion.prior import inpaint
 from reffusion.types import Gaussians, MaskSet, Scene
 
@@ -58,7 +58,7 @@ class Workspace:
     @cached_property
     def object_labels(self) -> Tensor:
         """bool [N], the object's Gaussians, without debris."""
-        return load_object(self.masks).to(self.device)
+        return load_object_labels(self.masks).to(self.device)
 
     @cached_property
     def remaining(self) -> Gaussians:

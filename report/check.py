@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from reffusion.io.arrays import load_json
-from reffusion.io.images import load_image, load_mask, resize_nearest, resized, save_image
+from reffusion.io.images import load_image, load_mask, resize_image, resize_nearest, save_image
 from reffusion.io.scene import has_photograph, load_warnings
 from report import cli, sheet
 
@@ -51,7 +51,7 @@ def overlay_masks(poses: Path, raw_masks: Path, name: str) -> np.ndarray:
     image = load_image(poses / "images" / f"{name}.png")
     factor = min(WIDTH / image.shape[1], HEIGHT / image.shape[0])
     size = max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor))
-    small = resized(image, size)
+    small = resize_image(image, size)
     for folder, tint in (("test_masks", [255 - level for level in TINT]), ("masks", TINT)):
         if (path := raw_masks / folder / f"{name}.png").is_file():
             mask = resize_nearest(load_mask(path), size[::-1])

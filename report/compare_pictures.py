@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, save_image
-from reffusion.io.scene import shows_object
+from reffusion.io.scene import has_object_mask
 from report.results import FULL, Comparison, Run
 from report.sheet import GAP, enlarge, pick_evenly
 
@@ -54,7 +54,7 @@ def _cells(runs: list[Run], first: Run, view: str) -> list[tuple[str, np.ndarray
     cells = []
     if photo.exists() and views.exists():
         raw_masks, masks = (first.folders.get(stage) for stage in ("raw_masks", "masks"))
-        with_object = view not in load_json(views)["test"] or (raw_masks and shows_object(raw_masks, masks, view))
+        with_object = view not in load_json(views)["test"] or (raw_masks and has_object_mask(raw_masks, masks, view))
         cells.append(("ground truth" if not with_object else "photograph, with the object", load_image(photo)))
     for run in runs:
         path = run.folders["evaluate"] / "renders" / f"{view}.png"

@@ -34,7 +34,7 @@ class GaussianLayers:
         """The chosen parts of a state, as one scene."""
         parts = zip((*self.states[state], self.removed), (kept, added, removed), strict=True)
         chosen = [part if wanted else part.map(lambda p: p[:0]) for part, wanted in parts]
-        return reduce(lambda one, other: one.zipped(other, lambda a, b: torch.cat([a, b])), chosen)
+        return reduce(lambda one, other: one.zip_map(other, lambda a, b: torch.cat([a, b])), chosen)
 
 
 def load_layers(home: Path, similarity: Similarity) -> GaussianLayers:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from reffusion.io.images import resized
+from reffusion.io.images import resize_image
 
 QUALITY = 70  # WebP quality
 BYTES_PER_PIXEL = 0.2  # approximate size of a photograph at that quality
@@ -20,7 +20,7 @@ COLOURS = 64  # palette size of a chart
 def photo_address(array: np.ndarray, longest: int) -> str:
     """Data URL of a picture, uint8 [H, W, 3], reduced to at most `longest` px a side."""
     factor = min(1.0, longest / max(array.shape[:2]))
-    small = resized(array, (max(1, round(array.shape[1] * factor)), max(1, round(array.shape[0] * factor))))
+    small = resize_image(array, (max(1, round(array.shape[1] * factor)), max(1, round(array.shape[0] * factor))))
     return _address(Image.fromarray(small), "webp", quality=QUALITY)
 
 

@@ -11,19 +11,19 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from reffusion.capture.click_coordinates import as_photographed, photographed, straightened
-from reffusion.capture.lenses import load_lenses, photograph_sizes
+from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points
+from reffusion.capture.lenses import load_lenses, load_photograph_sizes
 from reffusion.capture.scene_folder import read_scene
 from reffusion.clicks import all_views
 from reffusion.clicks.marks import Clicks
-from reffusion.clicks.network import SOURCE, Looked, Segmenter, load_segmenter, look, network_mask
-from reffusion.clicks.single_view import corrected, view_mask
+from reffusion.clicks.network import SOURCE, ImageFeatures, Segmenter, encode_image, load_segmenter, predict_mask
+from reffusion.clicks.single_view import correct_mask, segment_view
 from reffusion.command import root
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.files import BadInput
 from reffusion.io.images import WHITE, replace_image, to_uint8
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_raw_masks, load_scene, load_views, objects_of
+from reffusion.io.scene import list_objects, load_raw_masks, load_scene, load_views
 from reffusion.params.clicks import CLICKS
 from reffusion.params.raw_masks import Params
 from report import sheet
@@ -59,7 +59,7 @@ def load_capture(home: Path) -> Capture:
     params = Params(**load_json(raw_masks / "receipt.json")["params"])
     if not params.has_masks:
         raise BadInput(f"{folder / 'scene.yaml'}: `masks: none` is set; remove that line to make masks")
-    if objects_of(raw_masks):
+    if list_objects(raw_masks):
         raise BadInput(f"{raw_masks / 'masks'}: the masks distinguish several objects, which clicks cannot")
     roles = read_scene(params.changed({"clicks": {}}), folder)[1]
     if roles.values != WHITE:
@@ -101,10 +101,10 @@ class Session:
     def __init__(self, capture: Capture, fitted: Callable[[], bool], segmenter: Segmenter | None = None):
         self.capture, self.scene = capture, load_scene(capture.poses)
         self.segmenter, self.unsaved = segmenter, False
-        self.embeddings: dict[str, Looked] = {}  # view that was clicked on -> the network's features
+        self.embeddings: dict[str, ImageFeatures] = {}  # view that was clicked on -> the network's features
         self.fitted = fitted  # is the fit of these poses finished? the folder may still hold a fit of earlier poses
         self.views = [name for name in self.scene.train if name not in self.scene.clean]
-        self.lenses, self.sizes = load_lenses(capture.poses)[0], photograph_sizes(capture.poses)
+        self.lenses, self.sizes = load_lenses(capture.poses)[0], load_photograph_sizes(capture.poses)
         self.images = load_views(capture.poses, self.views)
         self.clicks: dict[str, list[tuple[float, float, bool]]] = {}
         self.masks, self.versions = dict(capture.given), dict.fromkeys(self.views, 0)
@@ -115,7 +115,7 @@ class Session:
         self.lock, self.changed = threading.RLock(), threading.Event()
         for name, points in _saved_clicks(capture.folder)["clicks"].items():
             if name in self.views:
-                at = straightened(np.array([p[:2] for p in points]), self.lenses[name], self.sizes[name])
+                at = undistort_points(np.array([p[:2] for p in points]), self.lenses[name], self.sizes[name])
                 self.clicks[name] = [(*xy, p[2] == "+") for xy, p in zip(at.tolist(), points, strict=True)]
         threading.Thread(target=self._update_masks, daemon=True).start()
         for name in self.clicks:
@@ -167,7 +167,7 @@ class Session:
             if foreign:
                 raise ValueError(f"{foreign[0]}: not written by this page, so it is not overwritten; move it away")
             for name, path in paths.items():
-                replace_image(path, to_uint8(as_photographed(masks[name], self.lenses[name], self.sizes[name]) * 1.0))
+                replace_image(path, to_uint8(distort_mask(masks[name], self.lenses[name], self.sizes[name]) * 1.0))
                 written[_relative_path(path, folder)] = file_digest(path)
             save_json(folder / CLICKS, {"clicks": self._photograph_clicks(), "written": written})
             self.unsaved = False
@@ -200,7 +200,7 @@ class Session:
         """The clicks in pixels of the distorted photographs."""
         clicks = {}
         for name, points in self.clicks.items():
-            at = photographed(np.array([p[:2] for p in points]), self.lenses[name], self.sizes[name]).round(1)
+            at = distort_points(np.array([p[:2] for p in points]), self.lenses[name], self.sizes[name]).round(1)
             clicks[name] = [[*xy, "+" if p[2] else "-"] for xy, p in zip(at.tolist(), points, strict=True)]
         return clicks
 
@@ -224,12 +224,12 @@ class Session:
             return self._network_mask(name, clicks)
         if self.gaussians is not None:
             if name not in self.reliefs:
-                self.reliefs[name] = all_views.relief(self.gaussians, self.scene.cameras[name])
+                self.reliefs[name] = all_views.surface_relief(self.gaussians, self.scene.cameras[name])
             relief = self.reliefs[name]
-        alone = not self.capture.given and all_views.in_order(self._all_clicks())[0] == name
+        alone = not self.capture.given and all_views.order_views(self._all_clicks())[0] == name
         if alone or name not in self.masks:
-            return view_mask(image, clicks, relief)
-        return corrected(image, self.masks[name], clicks, relief)
+            return segment_view(image, clicks, relief)
+        return correct_mask(image, self.masks[name], clicks, relief)
 
     def _uses_network(self, clicks: Clicks) -> bool:
         """True if the network answers these clicks.
@@ -240,8 +240,8 @@ class Session:
 
     def _network_mask(self, name: str, clicks: Clicks) -> np.ndarray:
         if name not in self.embeddings:
-            self.embeddings[name] = look(self.segmenter, self.images[name])
-        return network_mask(self.segmenter, self.embeddings[name], clicks)
+            self.embeddings[name] = encode_image(self.segmenter, self.images[name])
+        return predict_mask(self.segmenter, self.embeddings[name], clicks)
 
     def _all_clicks(self) -> dict[str, Clicks]:
         return {name: self._clicks_on(name) for name in self.clicks}
@@ -255,7 +255,7 @@ class Session:
         given = given | {name: self._network_mask(name, clicks.pop(name)) for name in by_network}
         cameras = {name: self.scene.cameras[name] for name in {*self.views, *given}}
         problem = (self.gaussians, self.near, cameras, self.images.__getitem__, clicks, given)
-        return lambda: all_views.solved(*problem).labels
+        return lambda: all_views.segment_by_clicks(*problem).labels
 
     def _apply_labels(self, labels: Tensor | None, revision: int) -> None:
         """Show the labels that include the clicks up to `revision`; views with clicks are updated first."""
@@ -271,7 +271,7 @@ class Session:
 
     def _refine(self, name: str) -> None:
         camera, image, on = self.scene.cameras[name], self.images[name], self._clicks_on(name)
-        self._set_mask(name, all_views.shown(self.gaussians, self.labels, camera, image, on))
+        self._set_mask(name, all_views.object_mask(self.gaussians, self.labels, camera, image, on))
         self.pending_views = [each for each in self.pending_views if each != name]
 
     def _update_masks(self) -> None:
@@ -299,7 +299,7 @@ class Session:
     def _load_fit(self) -> None:
         if self.fitted():
             gaussians = load_ply(self.capture.fit / "gaussians.ply")
-            near = all_views.neighbours(gaussians)
+            near = all_views.find_neighbours(gaussians)
             with self.lock:
                 self.gaussians, self.near = gaussians, near
                 self.revision += bool(self.clicks)

@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from reffusion.io.arrays import load_labels
-from reffusion.io.ply import properties_of, save_ply
+from reffusion.io.ply import load_property_names, save_ply
 from reffusion.io.scene import load_scene
 from report import cli, patch_files
 from report.patch_result import load_result, require_deleted
@@ -26,7 +26,7 @@ def make(home: Path) -> str:
         ValueError: nothing was deleted, or that stage has not run.
     """
     patch = load_result(home)
-    similarity, properties = load_scene(patch.poses).similarity, properties_of(patch.poses / "gaussians.ply")
+    similarity, properties = load_scene(patch.poses).similarity, load_property_names(patch.poses / "gaussians.ply")
     result, new, out = patch.gaussians, patch.new, home / "patch"
     save_ply(out / WHOLE, result, similarity, properties)
     save_ply(out / NEW, result.map(lambda parameter: parameter[new]), similarity, properties)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from reffusion.io.arrays import save_text
 from reffusion.io.files import BadInput
-from reffusion.io.ply import can_save, properties_of, save_splats
+from reffusion.io.ply import check_can_save, load_property_names, save_splats
 from reffusion.io.scene import load_scene
 from reffusion.io.splats import summarize
 from report.patch_result import load_result
@@ -35,7 +35,7 @@ def check_arguments(arguments: argparse.Namespace) -> None:
         raise BadInput("--out: name the file to write, as --out patched.ply")
     for file in arguments.files:
         summarize(file)
-    can_save(arguments.out)
+    check_can_save(arguments.out)
     if arguments.cameras is not None and not arguments.cameras.is_dir():
         raise BadInput(f"{arguments.cameras}: no such folder; --cameras names one with transforms.json or sparse/0")
 
@@ -88,7 +88,7 @@ def make(arguments: argparse.Namespace) -> str:
     home = arguments.runs / folder.name
     result = load_result(home)
     similarity = load_scene(result.poses).similarity
-    save_splats(arguments.out, result.gaussians, similarity, properties_of(arguments.files[0]))
+    save_splats(arguments.out, result.gaussians, similarity, load_property_names(arguments.files[0]))
     return (
         f"{arguments.out}: the whole scene, {len(result.gaussians)} splats, {int(result.new.sum())} of them new\n"
         f"for another filling, paint one of {home / 'to_paint'}, save it as {folder / 'painted'}/<view>.png, and "

@@ -186,7 +186,7 @@ def frames() -> int:
     question = json.load(sys.stdin)
     video = importlib.import_module("reffusion.capture.layouts.video")
     try:
-        print(video.take(Path(question["video"]), Path(question["folder"]), question["content"]))
+        print(video.extract_frames(Path(question["video"]), Path(question["folder"]), question["content"]))
     except ValueError as error:
         print(format_error(error))
         return 1

@@ -65,7 +65,7 @@ def run(
             return distill(*inputs, params.model_copy(update={"iterations": steps}), folder, estimator, distance)
 
         elapsed = lambda: time.monotonic() - began
-        steps = trace.affordable(out, params.iterations, params.seconds, elapsed, distill_for)
+        steps = trace.steps_within_budget(out, params.iterations, params.seconds, elapsed, distill_for)
         gaussians, masked = distill_for(out, steps)
     save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     save_labels(out / "labels.npy", masked.cpu())

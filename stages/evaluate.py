@@ -18,7 +18,7 @@ from reffusion.inpaint.classical import Painter
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
-from reffusion.io.scene import load_raw_masks, load_scene, shows_object
+from reffusion.io.scene import has_object_mask, load_raw_masks, load_scene
 from reffusion.kernels.compiled import side_by_side
 from reffusion.metrics import consistency, image_metrics, lpips, rows
 from reffusion.metrics.consistency import Shown
@@ -177,7 +177,7 @@ def truth_for(work: Work, camera: Camera) -> rows.Truth:
     """
     kept = work.masks and load_json(work.masks / "facts.json").get("kept")
     picture = truth_of(camera, work.poses) if work.tested and not kept else None
-    with_object = shows_object(work.raw_masks, work.masks, camera.name)
+    with_object = has_object_mask(work.raw_masks, work.masks, camera.name)
     return rows.Truth(picture, with_object, work.unseen.get(camera.name))
 
 

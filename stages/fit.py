@@ -58,7 +58,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None
     run_fit = lambda folder, steps: fit(
         *views, with_steps(steps), folder=folder, weights=weights, rates=rates, gains=gains
     )
-    steps = trace.affordable(out, params.iterations, params.seconds, elapsed, run_fit)
+    steps = trace.steps_within_budget(out, params.iterations, params.seconds, elapsed, run_fit)
     gaussians = fit(
         *views,
         with_steps(steps),
@@ -78,7 +78,9 @@ def limit_sh_degree(params: Params, scene: Scene) -> Params:
     max_degree = params.sh.degree
     if params.few_views == "as_many":
         return params
-    degree, views = image_detail.harmonics(scene.points, [scene.cameras[name] for name in scene.train], max_degree)
+    degree, views = image_detail.supported_sh_degree(
+        scene.points, [scene.cameras[name] for name in scene.train], max_degree
+    )
     if degree == max_degree:
         return params
     print(f"spherical harmonics of degree {degree}: a typical point is in {views} views", flush=True)
@@ -141,7 +143,7 @@ def collect_points(
 
     points, colors = scene.points, scene.point_colors
     if params.init.flow_cell:
-        flow_points, flow_colors = stereo.dense_points(cameras, images, params.init.flow_cell)
+        flow_points, flow_colors = stereo.triangulate_points(cameras, images, params.init.flow_cell)
         print(f"{len(flow_points)} points by optical flow beside {len(points)}", flush=True)
         points, colors = np.concatenate([points, flow_points]), np.concatenate([colors, flow_colors])
     kept = ~voting.points_inside(points, cameras, hidden)

@@ -15,7 +15,7 @@ from reffusion.clicks.scene_masks import masks_from_clicks
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, load_labels, save_arrays, save_json, save_labels
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_fill, load_raw_masks, load_scene, objects_of, save_mask_sets
+from reffusion.io.scene import list_objects, load_fill_masks, load_raw_masks, load_scene, save_mask_sets
 from reffusion.masks import consolidation, frame_check, voting
 from reffusion.masks.debris import find_debris
 from reffusion.masks.regions import FillRequest, Region
@@ -38,7 +38,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
     ballots = {name: raw[name] for name in scene.train if name in raw}
     ballots |= {name: empty[name] for name in scene.clean} if raw else {}
-    fill = FillRequest(region, load_fill(raw_masks)) if params.invent != "unobserved" else FillRequest(None, {})
+    fill = FillRequest(region, load_fill_masks(raw_masks)) if params.invent != "unobserved" else FillRequest(None, {})
     if deleted is None and not raw and region is None and not fill.masks and not scene.blank:
         raise ValueError(f"{raw_masks}: neither masks nor a region say what is to be changed: add masks, or a region")
 
@@ -68,7 +68,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     save_mask_sets(out, sets)
     invent = {name: each.invent for name, each in sets.items()}
     facts = {
-        "kept": [name for name in objects_of(raw_masks) if params.remove is not None and name not in params.remove],
+        "kept": [name for name in list_objects(raw_masks) if params.remove is not None and name not in params.remove],
         "masked_gaussians": int(labels.sum()),
         "gaussians": len(gaussians),
         "voting_views": len(ballots),
@@ -99,7 +99,7 @@ def collect_raw_masks(
 ) -> dict[str, np.ndarray]:
     """View name -> bool [H, W]: the masks that the scene brings, and those made from clicks."""
     raw = load_raw_masks(raw_masks, scene.train, params.remove)
-    if objects_of(raw_masks) and not raw:
+    if list_objects(raw_masks) and not raw:
         raise ValueError(
             f"{raw_masks / 'masks'}: no view has a mask of each object; add empty ones where one is unseen"
         )

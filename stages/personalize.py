@@ -49,7 +49,12 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, reference: P
     backward = lambda prior: denoising.backward_one_sample(prior, references, params.seed)
     with memory.explain_oom(MEMORY_PARAM, params.memory_gb):
         prior = memory.fit_to_memory(prior, params.memory_gb, MEMORY_PARAM, backward)
-        train(out, trace.affordable(out, params.steps, params.seconds, lambda: time.monotonic() - start, try_training))
+        train(
+            out,
+            trace.steps_within_budget(
+                out, params.steps, params.seconds, lambda: time.monotonic() - start, try_training
+            ),
+        )
     lora.save(prior, out)
     trace.clear_checkpoint(out)
 

@@ -26,7 +26,7 @@ from reffusion.gaussians import matching
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
-from reffusion.io.ply import properties_of, save_ply
+from reffusion.io.ply import load_property_names, save_ply
 from reffusion.io.scene import WARNINGS, load_views, save_scene
 from reffusion.io.splats import Splats, load_splats
 from reffusion.params.poses import Params
@@ -108,7 +108,7 @@ def _load_own_splats(params: Params, scene: Path) -> OwnSplats | None:
         cleaned, messages = _load_positions(scene / params.cleaned)
         notes += [f"{params.cleaned}: {note}" for note in messages]
         deleted = _find_deleted((path, scene / params.cleaned), splats.rows.means, cleaned)
-    return OwnSplats(splats, properties_of(path), deleted, tuple(notes))
+    return OwnSplats(splats, load_property_names(path), deleted, tuple(notes))
 
 
 def _load_positions(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -238,7 +238,7 @@ def _add_flow_points(scene: Scene, out: Path) -> Scene:
     cameras = [scene.cameras[name] for name in scene.train]
     pixels = sum(camera.width * camera.height for camera in cameras)
     cell = max(2, round((pixels / MORE_POINTS / 4) ** 0.5))  # most views' points were seen by another already
-    points, colors = stereo.dense_points(cameras, load_views(out, scene.train), cell)
+    points, colors = stereo.triangulate_points(cameras, load_views(out, scene.train), cell)
     kept = np.arange(len(points))
     if len(points) > MORE_POINTS:
         draws = seeding.generator(SEED, "poses", "flow points")

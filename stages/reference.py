@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from reffusion.capture.views import placed_views
+from reffusion.capture.views import load_placed_views
 from reffusion.inpaint import exemplar, feedforward
 from reffusion.io.arrays import save_json, save_text
 from reffusion.io.images import save_image, save_mask
@@ -18,7 +18,7 @@ from reffusion.prior import inpaint, memory
 from reffusion.prior.model import load_prior
 from reffusion.references import view_ranking
 from reffusion.references.adoption import adopt_references
-from reffusion.references.files import load_given
+from reffusion.references.files import load_reference_files
 from reffusion.types import MaskSet, Reference
 from reffusion.weights import painters
 from reffusion.weights.published import PAINTERS
@@ -31,7 +31,7 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks
     """Write references/, masks/, depth/ and facts.json; to_paint/, unless scene.yaml names the references; and
     candidates.png and candidates.json, where a view is inpainted here."""
     space = Workspace(poses, fit, masks)
-    files = load_given(scene, placed_views(poses), params.reference)
+    files = load_reference_files(scene, load_placed_views(poses), params.reference)
     if files:
         references, fits = adopt_references(files, space)
     else:
@@ -49,13 +49,13 @@ def save_views_to_paint(folder: Path, painted: list[str], space: Workspace) -> N
     consistent, invent = (
         {name: getattr(space.mask_sets[name], kind) for name in train} for kind in ("consistent", "invent")
     )
-    holes = view_ranking.holes(space.remaining, [space.scene.cameras[name] for name in train], consistent, invent)
-    views = view_ranking.ranked(holes, painted, VIEWS_TO_PAINT)
+    holes = view_ranking.find_holes(space.remaining, [space.scene.cameras[name] for name in train], consistent, invent)
+    views = view_ranking.rank_views(holes, painted, VIEWS_TO_PAINT)
     for name in (each.view for each in views):
-        save_image(folder / f"{name}.png", view_ranking.to_paint(space.remove_object(name), invent[name]))
+        save_image(folder / f"{name}.png", view_ranking.painting_template(space.remove_object(name), invent[name]))
         save_mask(folder / f"{name}_mask.png", invent[name])
     if views:
-        save_text(folder / "ranked.txt", view_ranking.words(views, painted))
+        save_text(folder / "ranked.txt", view_ranking.format_ranking(views, painted))
         names = ", ".join(f"{each.view} ({each.share:.0%})" for each in views)
         print(f"to be painted by hand, and what each covers more: {names}; see {TO_PAINT}/ranked.txt", flush=True)
 

@@ -63,7 +63,7 @@ def gaussians(square_at: float):
     seen = torch.from_numpy(~hidden_everywhere(wall.means.numpy(), square_at))
     square = plane(square_at, HALF, HALF, lambda x, y: np.broadcast_to((0.9, 0.1, 0.1), (*x.shape, 3)))
     labels = torch.cat([torch.zeros(int(seen.sum()), dtype=torch.bool), torch.ones(len(square), dtype=torch.bool)])
-    return wall.map(lambda p: p[seen]).zipped(square, lambda a, b: torch.cat([a, b])), labels
+    return wall.map(lambda p: p[seen]).zip_map(square, lambda a, b: torch.cat([a, b])), labels
 
 
 def behind_square(points: np.ndarray, view: Camera, square_at: float) -> np.ndarray:

@@ -27,7 +27,7 @@ from reffusion.io.depth_maps import load_depth
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, save_exr, save_image
 from reffusion.io.ply import save_ply
-from reffusion.references.files import load_given
+from reffusion.references.files import load_reference_files
 from reffusion.references.undistort import GivenReference
 from reffusion.types import Gaussians
 from runner import Refused, worker
@@ -821,7 +821,7 @@ def test_depth_maps(captures, tmp_path, name, change):
     with pytest.raises(BadInput, match=name):
         capture, roles = read_scene(poses.Params(), folder)
         given = {"view": "v01", "image": "images/v01.png", "depth": name}
-        found = load_given(folder, capture_views(capture, roles), poses.Params(reference=given).reference)
+        found = load_reference_files(folder, capture_views(capture, roles), poses.Params(reference=given).reference)
         load_depth(found[0].depth)
     assert time.monotonic() - began < LONGEST
 
@@ -834,7 +834,7 @@ def test_paintings(captures, tmp_path, broken):
     both(picture("painted/v01.png", NOISE), broken("painted/v01.png"))(folder)
     with pytest.raises(BadInput, match="v01"):
         capture, roles = read_scene(poses.Params(), folder)
-        found = load_given(folder, capture_views(capture, roles), None)
+        found = load_reference_files(folder, capture_views(capture, roles), None)
         load_image(found[0].path if found else GivenReference("v01", folder / "painted/v01.png").path)
 
 

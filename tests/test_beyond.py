@@ -39,7 +39,7 @@ def with_more(gaussians: Gaussians, mean, sizes, color) -> Gaussians:
     sh = torch.zeros(1, gaussians.sh.shape[1], 3)
     sh[0, 0] = (torch.tensor(color) - 0.5) / 0.2820948
     rows = torch.tensor([mean]), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([sizes]).log(), torch.tensor([4.0]), sh
-    return gaussians.zipped(Gaussians(*rows), lambda a, b: torch.cat([a, b]))
+    return gaussians.zip_map(Gaussians(*rows), lambda a, b: torch.cat([a, b]))
 
 
 # --- what is shown there
@@ -122,7 +122,7 @@ def test_unseen_is_what_all_training_views_hide_behind_something_or_under_masks(
     scene, _ = small_scene.gaussians(at)
     full = small_scene.plane(small_scene.WALL, 2.0, 1.4, small_scene.texture)
     square = small_scene.plane(at, small_scene.HALF, small_scene.HALF, lambda x, y: np.full((*x.shape, 3), 0.5))
-    both = full.zipped(square, lambda a, b: torch.cat([a, b]))
+    both = full.zip_map(square, lambda a, b: torch.cat([a, b]))
     aside = small_scene.camera("aside", 0.9)
     points = small_scene.wall_points(aside)
     framed = np.any([((uv >= 0) & (uv < (c.width, c.height))).all(-1) & ~small_scene.behind_square(points, c, at)

@@ -34,7 +34,7 @@ from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_mask
 from reffusion.io.ply import save_points
-from reffusion.io.scene import load_raw_masks, load_test_masks, load_views, objects_of
+from reffusion.io.scene import list_objects, load_raw_masks, load_test_masks, load_views
 from reffusion.params.poses import Params
 from reffusion.types import Scene
 from stages.plan import poses as plan
@@ -152,7 +152,7 @@ def test_pictures_in_folders(tmp_path, flat):
     write_named_model(folder / "sparse/0", truth, {view: f"{view}.png" if flat else path[view] for view in path})
     scene, out, _ = read(folder)
     assert_cameras(scene, truth, {view: view for view in path})
-    assert objects_of(out) == [] and len(load_raw_masks(out, scene.train)) == 6
+    assert list_objects(out) == [] and len(load_raw_masks(out, scene.train)) == 6
 
 
 def test_equal_names_in_two_folders_are_called_by_their_paths(tmp_path):
@@ -180,7 +180,7 @@ def test_folders_of_masks_are_objects_where_a_view_has_several(tmp_path):
     for thing in ("box", "ball"):
         write_masks(folder / "masks" / thing, truth.world_to_camera)
     _, out, _ = read(folder)
-    assert objects_of(out) == ["ball", "box"]
+    assert list_objects(out) == ["ball", "box"]
 
 
 # ---------------------------------------------------------------------------------------------- D: Blender

@@ -11,11 +11,11 @@ import small_scene as small
 import torch
 from browser import visiting
 
-from reffusion.capture.click_coordinates import as_photographed, photographed, straightened
+from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points
 from reffusion.clicks import all_views
 from reffusion.clicks.marks import Clicks
-from reffusion.clicks.single_view import corrected, view_mask
-from reffusion.graph_cut import least_cut
+from reffusion.clicks.single_view import correct_mask, segment_view
+from reffusion.graph_cut import min_cut
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, load_mask, save_image, save_mask, to_uint8
 from reffusion.io.scene import load_mask_sets
@@ -47,7 +47,7 @@ def test_the_cut_is_the_cheapest_of_all():
         labels = np.array(list(itertools.product((False, True), repeat=8)))
         border = (labels[:, pairs[:, 0]] != labels[:, pairs[:, 1]]) @ strength
         costs = labels @ for_object + ~labels @ for_other + border
-        found = least_cut(for_object, for_other, pairs, strength)
+        found = min_cut(for_object, for_other, pairs, strength)
         cost = found @ for_object + ~found @ for_other + (found[pairs[:, 0]] != found[pairs[:, 1]]) @ strength
         assert cost == pytest.approx(costs.min())
 
@@ -67,35 +67,35 @@ def test_one_click_finds_what_is_of_one_colour_and_another_the_rest():
     picture, disk = scenery()
     rows = np.mgrid[:240, :320][0]
     red = disk & (abs(rows - 120) >= 12)
-    assert small.iou(view_mask(picture, on((150, 85), (150, 155))) & red, red) > 0.97
-    assert small.iou(view_mask(picture, on((150, 85), (150, 155), (150, 120))), disk) > 0.97
-    assert not view_mask(picture, on((10, 10, False))).any()
-    assert not view_mask(picture, Clicks(np.zeros((0, 2)), np.zeros(0, bool))).any()
+    assert small.iou(segment_view(picture, on((150, 85), (150, 155))) & red, red) > 0.97
+    assert small.iou(segment_view(picture, on((150, 85), (150, 155), (150, 120))), disk) > 0.97
+    assert not segment_view(picture, on((10, 10, False))).any()
+    assert not segment_view(picture, Clicks(np.zeros((0, 2)), np.zeros(0, bool))).any()
 
 
 def test_where_the_depth_is_known_a_click_goes_as_far_as_the_surface():
     picture, disk = scenery()
     picture[:, 180:] = picture[70:90, 140:160].mean((0, 1))  # what stands behind has the disk's colour, and touches it
     relief = np.where(disk, 0.0, 300.0)
-    alone, flat = view_mask(picture, on((150, 85))), view_mask(picture, on((150, 85)), 0 * relief)
+    alone, flat = segment_view(picture, on((150, 85))), segment_view(picture, on((150, 85)), 0 * relief)
     assert small.iou(alone, disk) < 0.9 and (alone == flat).all()
-    assert small.iou(view_mask(picture, on((150, 85)), relief), disk) > 0.95
+    assert small.iou(segment_view(picture, on((150, 85)), relief), disk) > 0.95
     half = disk & (np.mgrid[:240, :320][1] < 150)
-    assert small.iou(corrected(picture, half, on((165, 90)), relief), disk) > 0.9
+    assert small.iou(correct_mask(picture, half, on((165, 90)), relief), disk) > 0.9
 
 
 def test_a_click_takes_back_what_it_is_on():
     picture, disk = scenery()
     stripe = disk & (abs(np.mgrid[:240, :320][0] - 120) < 12)
-    without = corrected(picture, disk, on((150, 120, False)))
+    without = correct_mask(picture, disk, on((150, 120, False)))
     assert not without[115:125, 140:160].any() and small.iou(without, disk & ~stripe) > 0.9
-    again = corrected(picture, without, on((150, 120)))
+    again = correct_mask(picture, without, on((150, 120)))
     assert small.iou(again, disk) > 0.95
 
 
 def test_a_plain_picture_of_any_size_is_no_error():
     for shape in ((1, 1, 3), (2, 300, 3), (40, 40, 3)):
-        found = view_mask(np.full(shape, 7, np.uint8), on((shape[1] / 2, shape[0] / 2)))
+        found = segment_view(np.full(shape, 7, np.uint8), on((shape[1] / 2, shape[0] / 2)))
         assert found.shape == shape[:2]
 
 
@@ -148,10 +148,10 @@ def test_a_mask_in_one_view_stays_as_it_was_given(scene):
     _, placed, _ = scene
     everything, _ = small.gaussians(NEAR)
     image_of = lambda name: load_image(placed / "images" / f"{name}.png")
-    near = all_views.neighbours(everything)
-    found = all_views.solved(everything, near, small.CAMERAS, image_of, {}, {"a1": truth("a1")})
+    near = all_views.find_neighbours(everything)
+    found = all_views.segment_by_clicks(everything, near, small.CAMERAS, image_of, {}, {"a1": truth("a1")})
     assert (found.masks["a1"] == truth("a1")).all()
-    shown = all_views.shown(everything, found.labels, small.CAMERAS["a4"], image_of("a4"))
+    shown = all_views.object_mask(everything, found.labels, small.CAMERAS["a4"], image_of("a4"))
     assert small.iou(shown, truth("a4")) > 0.9
 
 
@@ -183,7 +183,7 @@ def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
     with torch.no_grad():
         images = {n: to_uint8(rasterizer.render(scene, c).color.clamp(0, 1).numpy()) for n, c in cameras.items()}
     box = torch.arange(count) >= len(parts[0][0])
-    near, mask = all_views.neighbours(scene), voting.render_labels(scene, box, cameras["middle"]) > 0.5
+    near, mask = all_views.find_neighbours(scene), voting.render_labels(scene, box, cameras["middle"]) > 0.5
     found = all_views.label_gaussians(scene, near, cameras, {"middle": mask}, images.__getitem__)
     assert (found & box).sum() > 0.95 * box.sum() and (found & ~box).sum() < 0.01 * box.sum()
 
@@ -194,12 +194,12 @@ def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
 def test_clicks_find_their_place_through_the_lens():
     lens = small_capture.some_truth(small_capture.OPENCV).lens
     points = np.array([[1.0, 2.0], [50.0, 30.0], [190.0, 140.0]])
-    there = straightened(points, lens, (192, 144))
-    assert np.abs(photographed(there, lens, (192, 144)) - points).max() < 1e-3
+    there = undistort_points(points, lens, (192, 144))
+    assert np.abs(distort_points(there, lens, (192, 144)) - points).max() < 1e-3
     mask = np.zeros((72, 96), bool)
     mask[30:40, 40:60] = True
-    photo = as_photographed(mask, lens, (192, 144))
-    corners = photographed(np.array([[40.0, 30.0], [60.0, 40.0]]), lens, (192, 144)).round().astype(int)
+    photo = distort_mask(mask, lens, (192, 144))
+    corners = distort_points(np.array([[40.0, 30.0], [60.0, 40.0]]), lens, (192, 144)).round().astype(int)
     assert photo.shape == (144, 192)
     rows, columns = np.nonzero(photo)
     assert abs(columns.min() - corners[0, 0]) <= 2 and abs(rows.max() + 1 - corners[1, 1]) <= 2

@@ -10,7 +10,7 @@ import small_scene as small
 import torch
 
 from reffusion.clicks.marks import Clicks
-from reffusion.clicks.network import load_segmenter, look, make_segmenter, network_mask
+from reffusion.clicks.network import encode_image, load_segmenter, make_segmenter, predict_mask
 from report.mask_session import Capture, Session
 
 SIDE, WIDE = 64, 16
@@ -40,9 +40,9 @@ def test_loaded_from_a_folder_it_answers_as_the_model_saved(folder):
 
     image, clicks = picture((40, 60)), Clicks(np.array([[20.0, 10.0], [50.0, 30.0]]), np.array([True, False]))
     loaded, own = load_segmenter(folder), make_segmenter(SamModel.from_pretrained(folder))
-    found = network_mask(loaded, look(loaded, image), clicks)
+    found = predict_mask(loaded, encode_image(loaded, image), clicks)
     assert found.shape == (40, 60) and found.dtype == bool
-    assert (found == network_mask(own, look(own, image), clicks)).all()
+    assert (found == predict_mask(own, encode_image(own, image), clicks)).all()
 
 
 def test_clicks_and_answers_are_in_the_pictures_pixels(folder):
@@ -58,15 +58,15 @@ def test_clicks_and_answers_are_in_the_pictures_pixels(folder):
     segmenter.model.register_forward_hook(right_of_the_click)
     for size in (1, 3):
         image, at = picture((36 * size, 48 * size)), np.array([[30.0, 9.0]]) * size
-        found = network_mask(segmenter, look(segmenter, image), Clicks(at, np.array([True])))
+        found = predict_mask(segmenter, encode_image(segmenter, image), Clicks(at, np.array([True])))
         assert np.allclose(asked[-1]["input_points"].numpy(), [40.0, 12.0])
         assert (found == (np.arange(48 * size) + 0.5 > 30 * size)).all()
 
 
 def test_no_click_on_the_object_is_no_mask(folder):
     segmenter = load_segmenter(folder)
-    looked = look(segmenter, picture((20, 20)))
-    assert not network_mask(segmenter, looked, Clicks(np.array([[3.0, 3.0]]), np.array([False]))).any()
+    looked = encode_image(segmenter, picture((20, 20)))
+    assert not predict_mask(segmenter, looked, Clicks(np.array([[3.0, 3.0]]), np.array([False]))).any()
 
 
 def test_weights_that_are_not_here_are_none_and_others_are_refused(folder, tmp_path, monkeypatch):
@@ -88,7 +88,9 @@ def test_the_page_asks_the_network_and_takes_back_without_it(folder, tmp_path):
     session = Session(Capture(tmp_path, tmp_path / "masks", placed, fit, {}), lambda: False, segmenter)
     name, at = session.views[0], (10.0, 12.0)
     session.click(name, [(*at, True)])
-    expected = network_mask(segmenter, look(segmenter, session.images[name]), Clicks(np.array([at]), np.array([True])))
+    expected = predict_mask(
+        segmenter, encode_image(segmenter, session.images[name]), Clicks(np.array([at]), np.array([True]))
+    )
     assert (session.masks[name] == expected).all()
     session.click(session.views[1], [(*at, False)])
     assert set(session.embeddings) == {name}

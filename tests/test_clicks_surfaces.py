@@ -6,7 +6,7 @@ import numpy as np
 import small_scene as small
 
 from reffusion.clicks.marks import Clicks
-from reffusion.clicks.single_view import view_mask
+from reffusion.clicks.single_view import segment_view
 
 
 def chequered_on_gravel():
@@ -22,7 +22,7 @@ def chequered_on_gravel():
 
 def test_one_click_finds_a_chequered_thing_on_rough_ground():
     picture, relief, disk = chequered_on_gravel()
-    found = view_mask(picture, Clicks(np.array([[110.5, 150.5]]), np.array([True])), relief)
+    found = segment_view(picture, Clicks(np.array([[110.5, 150.5]]), np.array([True])), relief)
     assert small.iou(found, disk) > 0.9
 
 
@@ -33,5 +33,5 @@ def test_a_further_click_never_loses_what_was_clicked_before():
     other = np.hypot(rows - 80, columns - 200) < 20
     picture[other], relief[other] = (200, 40, 40), 0
     clicks = Clicks(np.array([[110.5, 150.5], [200.5, 80.5]]), np.array([True, True]))
-    found = view_mask(picture, clicks, relief)
+    found = segment_view(picture, clicks, relief)
     assert small.iou(found & disk, disk) > 0.9 and small.iou(found & other, other) > 0.9

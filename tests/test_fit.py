@@ -324,8 +324,10 @@ def test_the_stage_starts_from_flow_points_of_the_views_it_fits(tmp_path, capsys
     from reffusion.capture import stereo
 
     write_scene(tmp_path / "poses")
-    seen, find = [], stereo.dense_points
-    monkeypatch.setattr(stereo, "dense_points", lambda cameras, *rest: seen.append(cameras) or find(cameras, *rest))
+    seen, find = [], stereo.triangulate_points
+    monkeypatch.setattr(
+        stereo, "triangulate_points", lambda cameras, *rest: seen.append(cameras) or find(cameras, *rest)
+    )
     values = {"iterations": 3, "densify.cap_max": 500, "sh.degree": 0, "init.flow_cell": 2, "holdout": 4}
     params = stage.Params(antialiased=True).changed(values)
     (tmp_path / "out").mkdir()

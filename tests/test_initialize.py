@@ -246,7 +246,7 @@ def test_a_hidden_gaussian_does_not_become_a_speck_of_another_colour():
     red = np.zeros_like(picture) + np.uint8([255, 0, 0])
     before = surface_gaussians(red, 0.9 * far, everything, view, sh_count=1, spread=0.4)
     new = surface_gaussians(picture, far, everything, view, sh_count=1, spread=0.4)
-    both = before.zipped(new, lambda a, b: torch.cat([a, b]))
+    both = before.zip_map(new, lambda a, b: torch.cat([a, b]))
     labels = torch.arange(len(both)) >= len(before)
     colors = 0.5 + SH0 * rules.match_colors(both, labels, picture, everything, view, 5).sh[labels, 0]
     assert colors.min() > 110 / 255 - 0.11 and colors.max() < 140 / 255 + 0.11
@@ -328,7 +328,7 @@ def test_the_back_of_a_thing_is_drawn_though_its_front_shows_from_behind():
     depth = np.where(drawn, near, small.WALL)
     assert (coverage.pixels_in_front(wall, depth, reference, hidden) == drawn).all()
     front = small.plane(near, small.HALF, small.HALF, small.texture)
-    both = wall.zipped(front, lambda a, b: torch.cat([a, b]))
+    both = wall.zip_map(front, lambda a, b: torch.cat([a, b]))
     assert coverage.pixels_in_front(both, depth, reference, hidden).sum() < 0.2 * drawn.sum()  # the square's soft rim
     assert not coverage.pixels_in_front(wall, depth, reference, drawn).any()
 

@@ -36,7 +36,7 @@ from small_capture import (
 )
 
 from reffusion.capture.load import load_capture
-from reffusion.io.scene import objects_of
+from reffusion.io.scene import list_objects
 
 
 def other_frame(views: int) -> Truth:
@@ -99,7 +99,7 @@ def test_B_rig_of_two_cameras_two_folders_deep(tmp_path):
     assert scene.test == ("rig1-right-002",) and scene.blank == ("rig1-left-001", "rig1-right-000")
     views = {v: path.replace("/", "-") for v, path in paths.items()}
     assert_cameras(scene, renamed(truth, views))
-    assert objects_of(out) == [] and masked_share(out, "rig1-left-002") == pytest.approx(SHARE, abs=1e-3)
+    assert list_objects(out) == [] and masked_share(out, "rig1-left-002") == pytest.approx(SHARE, abs=1e-3)
 
 
 def test_B_equal_names_in_transforms_json(tmp_path):
@@ -139,7 +139,7 @@ def test_C_masks_by_colmaps_rule_for_equal_names(tmp_path):
     write_named_model(folder / "sparse/0", truth, paths)
     scene, out, _ = attempt(folder)
     views = [path.removesuffix(".jpg").replace("/", "-") for path in paths.values()]
-    assert objects_of(out) == [] and sorted(scene.train) == sorted(views)
+    assert list_objects(out) == [] and sorted(scene.train) == sorted(views)
     assert_masked(out, views)
 
 
@@ -151,7 +151,7 @@ def test_C_masks_of_one_day_only(tmp_path):
         write_mask(folder / "segmentation" / f"{path}.png")
     write_listed(folder, truth, {v: f"images/{path}.jpg" for v, path in days.items()})
     scene, out, sentences = attempt(folder, masks="segmentation")
-    assert objects_of(out) == [] and len(scene.train) == 6
+    assert list_objects(out) == [] and len(scene.train) == 6
     assert_masked(out, ["IMG_0", "IMG_1", "IMG_2"])
     assert_sentence(sentences, "3", "no mask", "IMG_4")
 
@@ -163,7 +163,7 @@ def test_C_folders_of_objects_stay_objects(tmp_path):
         write_masks(folder / "masks" / thing, truth.world_to_camera)
     write_model(folder / "sparse/0", truth)
     _, out, _ = attempt(folder, remove=["lamp"])
-    assert objects_of(out) == ["chair", "lamp"]
+    assert list_objects(out) == ["chair", "lamp"]
 
 
 # ---------------------------------------------------------------------------------------------- D: Blender's files

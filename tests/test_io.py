@@ -176,7 +176,7 @@ def test_ply_round_trip_is_exact(tmp_path, degree):
     gaussians = some_gaussians(5, degree)
     save_ply(tmp_path / "g.ply", gaussians)
     again = load_ply(tmp_path / "g.ply")
-    again.zipped(gaussians, lambda a, b: torch.testing.assert_close(a, b, rtol=0, atol=0))
+    again.zip_map(gaussians, lambda a, b: torch.testing.assert_close(a, b, rtol=0, atol=0))
 
 
 def test_ply_is_the_layout_that_viewers_expect(tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 from reffusion.background.continuation import _surrounded
 from reffusion.depth.background_depth import Completion, Hints, ViewDepth, continue_depth, dilate
 from reffusion.depth.layers import label_surfaces, segment_surfaces
-from reffusion.graph_cut import least_labels
+from reffusion.graph_cut import alpha_expansion
 from reffusion.types import Camera
 
 
@@ -128,7 +128,7 @@ def test_labels_of_the_least_cost_are_found():
             apart = labels[pairs[:, 0]] != labels[pairs[:, 1]]
             return cost[labels, np.arange(7)].sum() + strength[apart].sum()
 
-        found = least_labels(cost, pairs, strength, cost.argmin(0))
+        found = alpha_expansion(cost, pairs, strength, cost.argmin(0))
         least = min(total(np.array(labels)) for labels in itertools.product(range(3), repeat=7))
         assert total(found) < least + 0.02  # capacities are whole thousandths
 

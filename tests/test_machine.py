@@ -14,7 +14,7 @@ import pytest
 
 from benchmarks.gpu import ready
 from reffusion.io import machine
-from reffusion.io.machine import Machine, lacks
+from reffusion.io.machine import Machine, find_missing
 from runner import worker
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -36,19 +36,21 @@ POOR = {
 @pytest.mark.parametrize("name", list(POOR))
 def test_what_is_lacking_is_one_line_that_mends_it(name):
     changes, said = POOR[name]
-    (line,) = lacks(replace(GOOD, **changes), 16.0, memory_param="distill.memory_gb")
+    (line,) = find_missing(replace(GOOD, **changes), 16.0, memory_param="distill.memory_gb")
     assert "\n" not in line
     assert re.search(said, line), line
 
 
 def test_nothing_is_lacking():
-    assert lacks(GOOD, 16.0) == []
-    assert lacks(replace(GOOD, extension=False, nvcc="13.0")) == [], "it is built when it is first needed"
-    assert lacks(replace(GOOD, extension=False, nvcc="")) == [], "nvcc does not say its version"
-    assert lacks(replace(GOOD, gsplat=False, extension=False), splats=False) == [], "the prior alone draws nothing"
-    assert lacks(replace(GOOD, driver=570, torch_cuda="12.8")) == []
-    assert lacks(Machine(gsplat=True, extension=True)) == [], "what cannot be told is not held against it"
-    assert lacks(replace(GOOD, gigabytes=8.0), 0.0) == [], "0: no limit"
+    assert find_missing(GOOD, 16.0) == []
+    assert find_missing(replace(GOOD, extension=False, nvcc="13.0")) == [], "it is built when it is first needed"
+    assert find_missing(replace(GOOD, extension=False, nvcc="")) == [], "nvcc does not say its version"
+    assert find_missing(replace(GOOD, gsplat=False, extension=False), splats=False) == [], (
+        "the prior alone draws nothing"
+    )
+    assert find_missing(replace(GOOD, driver=570, torch_cuda="12.8")) == []
+    assert find_missing(Machine(gsplat=True, extension=True)) == [], "what cannot be told is not held against it"
+    assert find_missing(replace(GOOD, gigabytes=8.0), 0.0) == [], "0: no limit"
 
 
 @pytest.mark.parametrize(
@@ -92,7 +94,7 @@ def test_a_stage_says_what_it_lacks_at_once(tmp_path, monkeypatch):
     """Asked as the plan asks, on a machine with an old driver, a small card and torch without CUDA."""
     monkeypatch.setattr(os, "environ", with_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 535.183.01"))
     monkeypatch.chdir(ROOT)
-    machine.machine.cache_clear()
+    machine.detect.cache_clear()
     asked = lambda **params: {"stage": "distill", "params": params, "takes": TAKES, "brings": []}
     began = time.perf_counter()
     said = worker._describe(asked(device="cuda", memory_gb=16))["lacks"]
@@ -100,14 +102,14 @@ def test_a_stage_says_what_it_lacks_at_once(tmp_path, monkeypatch):
     assert any("distill.memory_gb is 16, and NVIDIA GeForce GTX 1080 has 9 GB" in line for line in said)
     assert any("built without CUDA" in line or "needs 580" in line for line in said)
     assert "lacks" not in worker._describe(asked(device="cpu"))
-    machine.machine.cache_clear()
+    machine.detect.cache_clear()
 
 
 TAKES = ["poses", "fit", "masks", "reference", "initialize", "personalize", "lift"]
 
 
 def test_it_imports_nothing_heavy():
-    code = "import sys; from reffusion.io import machine; machine.machine(); print('torch' in sys.modules)"
+    code = "import sys; from reffusion.io import machine; machine.detect(); print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True).stdout == "False\n"
 
 

@@ -36,7 +36,7 @@ def ball(z, opacity=0.9, scale=0.1):
 
 def test_a_vote_is_the_blending_weight_inside_and_outside_the_mask():
     view, front, back = small.camera("v", 0.0), ball(1.0), ball(1.5)
-    both = front.zipped(back, lambda a, b: torch.cat([a, b]))
+    both = front.zip_map(back, lambda a, b: torch.cat([a, b]))
     left = np.zeros((small.HEIGHT, small.WIDTH), bool)
     left[:, : small.WIDTH // 2] = True
     votes = voting.cast_votes(both, [view], {"v": left}, mode="weight")
@@ -247,7 +247,7 @@ def test_haze_shows_mostly_where_nobody_saw():
     inside = small.true_mask(view, 1.0)
     aside = blob.map(lambda p: p.clone())
     aside.means[0, 0] = 0.4
-    both = blob.zipped(aside, lambda a, b: torch.cat([a, b]))
+    both = blob.zip_map(aside, lambda a, b: torch.cat([a, b]))
     assert voting.find_floaters(both, [view], {"v": inside}).tolist() == [True, False]
 
 

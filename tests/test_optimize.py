@@ -399,7 +399,7 @@ def test_masked_gaussians_go_at_their_own_pace():
     for name in PARAMETERS:
         getattr(optimizer.gaussians, name).grad = torch.ones_like(getattr(optimizer.gaussians, name))
     optimizer.step(0.0)
-    moved = before.zipped(optimizer.gaussians, lambda a, b: (a - b).detach())
+    moved = before.zip_map(optimizer.gaussians, lambda a, b: (a - b).detach())
     torch.testing.assert_close(moved.means / moved.means[1], torch.tensor([0.25, 1.0, 1.0])[:, None].expand(3, 3))
     torch.testing.assert_close(moved.sh[0] / moved.sh[1], torch.full_like(moved.sh[0], 0.5))
     torch.testing.assert_close(moved.sh[2], moved.sh[1])

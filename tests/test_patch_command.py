@@ -20,7 +20,7 @@ from reffusion.capture.layouts import ring
 from reffusion.gaussians import matching
 from reffusion.io.arrays import load_labels
 from reffusion.io.files import BadInput
-from reffusion.io.ply import can_save, load_ply, properties_of, save_ply, save_splats
+from reffusion.io.ply import check_can_save, load_ply, load_property_names, save_ply, save_splats
 from reffusion.io.scene import load_scene
 from reffusion.types import Similarity
 from report import export, patch_files
@@ -121,7 +121,7 @@ def test_the_ending_says_the_format(tmp_path, ending, within):
     if ending in (".spz", ".compressed.ply"):
         pytest.importorskip("gsply")
     made, path = some_gaussians(300, 1), tmp_path / f"out{ending}"
-    can_save(path)
+    check_can_save(path)
     save_splats(path, made, FRAME, ("x", "y", "z", "opacity"))
     read, means = load_ply(path), torch.from_numpy(FRAME.invert(made.means.double().numpy())).float()
     nearest = torch.cdist(means, read.means).argmin(1)
@@ -130,7 +130,7 @@ def test_the_ending_says_the_format(tmp_path, ending, within):
     sizes = made.log_scales - np.float32(np.log(FRAME.scale))
     np.testing.assert_allclose(read.log_scales[nearest], sizes, atol=0.04)
     if ending == ".ply":
-        assert properties_of(path)[:4] == ("x", "y", "z", "opacity")
+        assert load_property_names(path)[:4] == ("x", "y", "z", "opacity")
 
 
 def test_export_writes_the_scene_with_the_object_too(tmp_path):

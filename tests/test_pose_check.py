@@ -14,14 +14,14 @@ import small_capture
 from scipy.spatial.transform import Rotation
 
 from reffusion.capture.checks.pose_check import check_poses
-from reffusion.capture.views import placed_views
+from reffusion.capture.views import load_placed_views
 from reffusion.geometry import pixel_rays
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import load_scene
 from reffusion.params.poses import Params
 from reffusion.params.reference import ReferenceSpec
-from reffusion.references.files import load_given
+from reffusion.references.files import load_reference_files
 from reffusion.types import Camera
 from report import check
 from stages import poses
@@ -214,10 +214,12 @@ def test_what_scene_yaml_brings_for_such_a_view_is_refused(tmp_path):
     assert str(refused.value) == f"scene.yaml: reference: {refusal}"
     out, _ = placed(folder)
     with pytest.raises(BadInput) as refused:  # named later, when `poses` is done
-        load_given(folder, placed_views(out), ReferenceSpec(**reference))
+        load_reference_files(folder, load_placed_views(out), ReferenceSpec(**reference))
     assert str(refused.value) == f"{folder / 'reference.png'}: {refusal}"
     out, _ = placed(folder, reference=reference, keep=[BAD])
-    assert [each.view for each in load_given(folder, placed_views(out), ReferenceSpec(**reference))] == [BAD]
+    assert [each.view for each in load_reference_files(folder, load_placed_views(out), ReferenceSpec(**reference))] == [
+        BAD
+    ]
 
 
 def test_a_view_is_excluded_or_kept(tmp_path):

@@ -44,7 +44,7 @@ from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
 from reffusion.io.ply import load_ply, save_ply, save_points
-from reffusion.io.scene import load_fill, load_raw_masks, load_scene, load_test_masks, load_views, objects_of
+from reffusion.io.scene import list_objects, load_fill_masks, load_raw_masks, load_scene, load_test_masks, load_views
 from reffusion.types import Gaussians
 from stages import fit, poses, raw_masks
 from stages.plan import poses as plan
@@ -156,7 +156,7 @@ def test_objects_that_are_told_apart(tmp_path):
         path.unlink()
     (usual / "ball/v03.png").unlink()
     scene, out = run(folder)
-    assert objects_of(out) == ["ball", "box"]
+    assert list_objects(out) == ["ball", "box"]
     assert "v03" in load_raw_masks(out, scene.train, ["box"]) and "v03" not in load_raw_masks(out, scene.train)
     with pytest.raises(BadInput, match="no object 'cat'; masks tell apart ball, box"):
         plan.preview(poses.Params(remove=["cat"]), folder)
@@ -167,7 +167,7 @@ def test_masks_of_what_is_to_be_filled(tmp_path):
     (folder / "masks").rename(folder / "new")
     asked = {"fill": "new", "train": ["v00", "v01", "v02", "v03"]}
     scene, out = run(folder, **asked)
-    assert sorted(load_fill(out)) == list(scene.train) and not load_raw_masks(out, scene.train)
+    assert sorted(load_fill_masks(out)) == list(scene.train) and not load_raw_masks(out, scene.train)
     params, files = raw_masks.Params(**asked), sorted(folder.rglob("*.*"))
     assert folder / "new/v02.png" in raw_masks_plan.scene_files(params, folder, files)
     (folder / "new/v02.png").unlink()

@@ -11,14 +11,14 @@ import small_scene as small
 from small_references import completed, named, pattern, psnr, write_wall
 
 from benchmarks.studies import redrawn
-from reffusion.capture.views import placed_views
+from reffusion.capture.views import load_placed_views
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.files import BadInput
 from reffusion.io.images import save_image
 from reffusion.masks import shadows
 from reffusion.params.reference import ReferenceSpec
 from reffusion.references import color, registration
-from reffusion.references.files import load_given
+from reffusion.references.files import load_reference_files
 
 CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "data"
 SIZE = (480, 360)
@@ -49,8 +49,8 @@ def test_a_redrawn_picture_of_the_view_is_accepted(variant):
     photo, hole = with_object(truth), hole_at(truth.shape)
     picture = redrawn.fit_size(redrawn.VARIANTS[variant](redrawn.redraw(truth)), photo)
     found = registration.register(picture, photo, hole)
-    assert found.fits and found.in_place > 0.9 and not found.untouched
-    moved = registration.IDENTITY if found.moved is None else found.moved
+    assert found.fits and found.inlier_ratio > 0.9 and not found.is_identical
+    moved = registration.IDENTITY if found.affine is None else found.affine
     expected = {"shifted by 4 px": (3.3, -2.2), "8, shifted, gain, sharpened": (-2.5, 3.1)}.get(variant, (0, 0))
     np.testing.assert_allclose(moved[:, 2] + moved[:, :2] @ (240, 180) - (240, 180), expected, atol=0.2)
     image = color.recolor(registration.warp(picture, moved)[0], found.gain, found.offset)
@@ -68,7 +68,7 @@ def test_another_view_of_the_scene_is_refused(parallax):
     photo, hole = with_object(truth), hole_at(truth.shape)
     for picture in (other_view(truth, parallax), redrawn.redraw(other_view(truth, parallax))):
         found = registration.register(picture, photo, hole)
-        assert not found.fits and found.in_place < 0.55
+        assert not found.fits and found.inlier_ratio < 0.55
     same = registration.register(other_view(truth, 0.0), photo, hole)
     assert same.fits and same.max_shift == pytest.approx(4, abs=0.2), (
         "displaced by 4 px everywhere, it would be accepted"
@@ -79,7 +79,7 @@ def test_another_scene_and_a_plain_picture_are_refused():
     photo, hole = with_object(pattern(0, SIZE)), hole_at(SIZE[::-1])
     for picture in (redrawn.redraw(pattern(1, SIZE)), np.zeros_like(photo), photo[::-1, ::-1].copy()):
         found = registration.register(picture, photo, hole)
-        assert not found.fits and found.in_place < 0.1
+        assert not found.fits and found.inlier_ratio < 0.1
     plain = np.full_like(photo, 120)
     assert not registration.register(photo, plain, hole).fits, "a plain photograph shows nothing of such a picture"
 
@@ -95,7 +95,7 @@ def test_what_cannot_be_compared_is_accepted_and_says_so(size, kind):
     picture = pictures.get(kind, photo)
     photo = picture.copy() if kind in ("black", "plain") else photo
     found = registration.register(picture, photo, hole)
-    assert found.fits and found.moved is None and np.isfinite([*found.gain, *found.offset, found.max_shift]).all()
+    assert found.fits and found.affine is None and np.isfinite([*found.gain, *found.offset, found.max_shift]).all()
     assert "plain" in str(found) or kind == "equal"
 
 
@@ -105,9 +105,9 @@ def test_the_nearest_photograph_tells_views_of_a_plane_apart():
     nothing = np.zeros(views["a2"].shape[:2], bool)
     picture = redrawn.redraw(views["a3"])
     found = registration.register(picture, views["a2"], nothing)
-    assert registration.closer_view(picture, found, [("a3", views["a3"], nothing)])[0] == "a3"
+    assert registration.find_better_view(picture, found, [("a3", views["a3"], nothing)])[0] == "a3"
     own = registration.register(redrawn.redraw(views["a2"]), views["a2"], nothing)
-    assert registration.closer_view(redrawn.redraw(views["a2"]), own, [("a3", views["a3"], nothing)]) is None
+    assert registration.find_better_view(redrawn.redraw(views["a2"]), own, [("a3", views["a3"], nothing)]) is None
 
 
 # ------------------------------------------------------------------------------------------------------- the stage
@@ -173,12 +173,12 @@ def test_a_painting_is_trusted_by_a_line_that_names_it(wall, tmp_path):
     line = r"write `reference: \{view: a2, image: painted/a2\.png, trust: true\}` in scene\.yaml"
     with pytest.raises(ValueError, match=line):
         completed(wall, tmp_path / "refused")
-    views = placed_views(wall["poses"])
+    views = load_placed_views(wall["poses"])
     of_painting = ReferenceSpec(view="a2", image="painted/a2.png", trust=True)
-    assert [each.trust for each in load_given(wall["scene"], views, of_painting)] == [True]
+    assert [each.trust for each in load_reference_files(wall["scene"], views, of_painting)] == [True]
     save_image(wall["scene"] / "ref.png", small.photo(small.CAMERAS["a2"]))
     of_another = ReferenceSpec(view="a2", image="ref.png", trust=True)
-    assert [each.trust for each in load_given(wall["scene"], views, of_another)] == [False]
+    assert [each.trust for each in load_reference_files(wall["scene"], views, of_another)] == [False]
 
 
 # --------------------------------------------------------------------------------------------------- real captures
@@ -200,6 +200,6 @@ def test_real_photographs(name):
             found = registration.register(
                 redrawn.fit_size(redrawn.VARIANTS[variant](redrawn.redraw(photo)), photo), photo, hole
             )
-            assert found.in_place > 0.8, (view, variant)
+            assert found.inlier_ratio > 0.8, (view, variant)
         for picture in (*(capture.picture(other) for other in nearest), photo_of_another):
             assert not registration.register(redrawn.fit_size(picture, photo), photo, hole).fits, view

@@ -25,8 +25,8 @@ from reffusion.io.depth_maps import load_depth
 from reffusion.io.images import load_image, load_mask, save_exr, save_image, save_mask
 from reffusion.io.scene import load_references, load_scene
 from reffusion.references import agreement, color, registration, view_ranking
-from reffusion.references.files import GivenReference
-from reffusion.references.undistort import load_straight, load_straight_depth
+from reffusion.references.files import ReferenceFile
+from reffusion.references.undistort import undistort_reference, undistort_reference_depth
 from reffusion.types import Reference
 from runner.execute import run_scene
 from runner.keys import Hashes, code_fingerprints
@@ -60,11 +60,11 @@ def test_a_picture_from_another_tool_comes_back_onto_its_photograph(how):
     photo, changed = with_object(truth), from_another_tool(truth, **how)
     picture = cv2.resize(changed, size, interpolation=cv2.INTER_CUBIC)
     found = registration.register(picture, photo, object_at())
-    assert found.fits and found.in_place > 0.95
+    assert found.fits and found.inlier_ratio > 0.95
     crop, (height, width) = how.get("crop", 5), changed.shape[:2]
     scale = np.array([width + crop, height + crop]) / size * np.array(size) / (width, height)
     expected = np.stack([[scale[0], 0, -crop * size[0] / width], [0, scale[1], -crop * size[1] / height]])
-    moved = registration.IDENTITY if found.moved is None else found.moved
+    moved = registration.IDENTITY if found.affine is None else found.affine
     corners = np.array([(0, 0), (160, 0), (0, 120), (160, 120)])
     error = corners @ (moved - expected)[:, :2].T + (moved - expected)[:, 2]
     assert np.abs(error).max() < 0.25, "pixels"
@@ -77,10 +77,10 @@ def test_a_picture_from_another_tool_comes_back_onto_its_photograph(how):
 def test_an_aligned_reference_comes_through_untouched():
     truth = pattern(0)
     found = registration.register(truth, with_object(truth), object_at())
-    assert found.untouched and found.moved is None and (found.gain == 1).all() and not found.offset.any()
+    assert found.is_identical and found.affine is None and (found.gain == 1).all() and not found.offset.any()
     slightly = from_another_tool(truth, scale=1.0, crop=0, quality=70, gain=1)
     found = registration.register(slightly, with_object(truth), object_at())
-    assert found.fits and found.moved is None and not found.untouched, "not resampled, cut in only"
+    assert found.fits and found.affine is None and not found.is_identical, "not resampled, cut in only"
 
 
 def test_what_was_repainted_elsewhere_moves_nothing():
@@ -88,16 +88,16 @@ def test_what_was_repainted_elsewhere_moves_nothing():
     picture = from_another_tool(truth, scale=1.0, crop=0, quality=90, gain=0.9)
     picture[90:, :50] = pattern(1)[90:, :50]
     found = registration.register(picture, with_object(truth), object_at())
-    assert found.fits and found.moved is None and found.gain == pytest.approx(1 / 0.9, abs=0.01)
+    assert found.fits and found.affine is None and found.gain == pytest.approx(1 / 0.9, abs=0.01)
 
 
 def test_another_picture_fits_badly_and_a_plain_one_cannot_be_told():
     photo = with_object(pattern(0))
     found = registration.register(pattern(1), photo, object_at())
-    assert not found.fits and found.in_place < 0.2 and f"shows {found.in_place:.0%} of" in found.misfit
+    assert not found.fits and found.inlier_ratio < 0.2 and f"shows {found.inlier_ratio:.0%} of" in found.mismatch
     plain = np.full_like(photo, 90)
     found = registration.register(plain, with_object(plain + 20), object_at())
-    assert found.fits and np.isnan(found.in_place) and "too plain" in str(found)
+    assert found.fits and np.isnan(found.inlier_ratio) and "too plain" in str(found)
 
 
 def test_only_the_hole_and_its_rim_are_taken():
@@ -119,16 +119,16 @@ def test_a_moved_reference_is_read_once_through_the_lens(tmp_path):
     shot = lens.from_colmap(OPENCV[0], WIDTH, HEIGHT, OPENCV[1])
     image = pattern(3, (WIDTH, HEIGHT))
     save_image(tmp_path / "whole.png", image)
-    whole, inside = load_straight(GivenReference("v", tmp_path / "whole.png"), shot, False)
-    still, _ = load_straight(GivenReference("v", tmp_path / "whole.png"), shot, False, np.eye(2, 3))
+    whole, inside = undistort_reference(ReferenceFile("v", tmp_path / "whole.png"), shot, False)
+    still, _ = undistort_reference(ReferenceFile("v", tmp_path / "whole.png"), shot, False, np.eye(2, 3))
     assert inside.all() and np.abs(whole.astype(int) - still).max() <= 1
     depth = np.tile(np.linspace(1, 2, WIDTH), (HEIGHT, 1))
     np.save(tmp_path / "depth.npy", depth)
-    given = GivenReference("v", tmp_path / "whole.png", tmp_path / "depth.npy")
-    straight = load_straight_depth(given, shot, False)
+    given = ReferenceFile("v", tmp_path / "whole.png", tmp_path / "depth.npy")
+    straight = undistort_reference_depth(given, shot, False)
     where = lens.sampling_map(shot, lens.undistorted_pinhole(shot))
     np.testing.assert_allclose(straight, 1 + (where[..., 0] - 0.5) / (WIDTH - 1), atol=0.6 / WIDTH)
-    shifted = load_straight_depth(given, shot.pinhole, False, np.array([[1.0, 0, 4], [0, 1, 0]]))
+    shifted = undistort_reference_depth(given, shot.pinhole, False, np.array([[1.0, 0, 4], [0, 1, 0]]))
     np.testing.assert_allclose(shifted[:, :-4], depth[:, 4:], rtol=1e-6)
     assert np.isnan(shifted[:, -4:]).all()
 
@@ -377,10 +377,10 @@ def test_views_are_ranked_by_what_they_cover_beyond_those_before():
         return view_ranking.Hole(camera, pixels, np.full(pixels.shape, small.WALL))
 
     holes = {"a": hole("a", 0.0, slice(10, 40)), "b": hole("b", 0.0, slice(12, 36)), "c": hole("c", 2.0, slice(10, 25))}
-    found = view_ranking.ranked(holes, [], 3)
+    found = view_ranking.rank_views(holes, [], 3)
     assert [each.view for each in found] == ["a", "c"]
     assert [each.share for each in found] == pytest.approx([54 / 69, 15 / 69])
-    assert [each.view for each in view_ranking.ranked(holes, ["b"], 3)] == ["b", "c", "a"]
+    assert [each.view for each in view_ranking.rank_views(holes, ["b"], 3)] == ["b", "c", "a"]
 
 
 # ------------------------------------------------------------------------------------------ what reruns, and what stays
@@ -501,7 +501,7 @@ def test_references_that_contradict_each_other_are_told_from_those_that_agree():
     alike = [Reference(view, painted[view.name], hole) for view in views]
     assert agreement.color_difference(*alike, *holes.values()) < agreement.CONTRADICTION / 4
     other = replace(alike[1], image=np.where(hole[..., None], 255 - alike[1].image, alike[1].image))
-    ((first, second, unlike),) = agreement.contradicting([alike[0], other], holes)
+    ((first, second, unlike),) = agreement.find_contradictions([alike[0], other], holes)
     assert (first, second) == ("a", "b") and unlike > 2 * agreement.CONTRADICTION
 
 
@@ -510,7 +510,7 @@ def test_what_references_draw_before_a_scene_is_compared_at_its_own_depth():
     near, step = 1.4, 1.7
     floor = small.plane(step, 2.0, 0.25, small.texture)
     floor = replace(floor, means=floor.means + torch.tensor([0.0, 0.6, 0.0]))
-    scene = small.plane(small.WALL, 2.0, 1.4, small.texture).zipped(floor, lambda a, b: torch.cat([a, b]))
+    scene = small.plane(small.WALL, 2.0, 1.4, small.texture).zip_map(floor, lambda a, b: torch.cat([a, b]))
     references = []
     for view in (small.camera("a", -0.2), small.camera("b", 0.2)):
         drawn = small.true_mask(view, near)
@@ -522,10 +522,10 @@ def test_what_references_draw_before_a_scene_is_compared_at_its_own_depth():
         references.append(Reference(view, np.round(255 * image).astype(np.uint8), drawn, 3 * depth))
     cameras, nothing = [each.camera for each in references], np.zeros((small.HEIGHT, small.WIDTH), bool)
     hidden = {camera.name: nothing for camera in cameras}
-    holes = view_ranking.holes(scene, cameras, hidden, {each.camera.name: each.mask for each in references})
-    measured = agreement.as_drawn(holes, references, scene, hidden)
-    assert set(measured) == {"a", "b"} and not agreement.contradicting(references, measured)
-    assert agreement.contradicting(references, holes)  # at the wall's depth the stripes would not meet
-    assert agreement.as_drawn(holes, [replace(each, depth=None) for each in references], scene, hidden) == {}
+    holes = view_ranking.find_holes(scene, cameras, hidden, {each.camera.name: each.mask for each in references})
+    measured = agreement.refine_hole_depth(holes, references, scene, hidden)
+    assert set(measured) == {"a", "b"} and not agreement.find_contradictions(references, measured)
+    assert agreement.find_contradictions(references, holes)  # at the wall's depth the stripes would not meet
+    assert agreement.refine_hole_depth(holes, [replace(each, depth=None) for each in references], scene, hidden) == {}
     other = replace(references[1], image=references[1].image[..., [2, 0, 1]])
-    assert agreement.contradicting([references[0], other], measured)
+    assert agreement.find_contradictions([references[0], other], measured)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from reffusion.capture import stereo
-from reffusion.io.images import resized
+from reffusion.io.images import resize_image
 from reffusion.types import Camera
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
@@ -95,7 +95,7 @@ def pictures(slope: float) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("slope", [0.0, 0.5])
 def test_a_painted_plane_comes_back(slope):
-    points, colors = stereo.dense_points(CAMERAS, pictures(slope), 3)
+    points, colors = stereo.triangulate_points(CAMERAS, pictures(slope), 3)
     cells = WIDTH * HEIGHT / 9
     assert 0.6 * cells < len(points) < 2 * cells  # later views add what the first does not see
     assert colors.shape == points.shape and colors.dtype == np.uint8
@@ -109,10 +109,10 @@ def test_views_of_several_sizes_and_lenses_match(slope=0.3):
     for view, factor, left in zip(CAMERAS, (1.0, 0.6, 1.0, 1.5), (0, 0, 30, 0), strict=True):
         size = round((WIDTH - 2 * left) * factor), round(HEIGHT * factor)
         cut = np.ascontiguousarray(shown[view.name][:, left : WIDTH - left])
-        shown[view.name] = resized(cut, size)
+        shown[view.name] = resize_image(cut, size)
         focal, middle = FOCAL * factor, ((WIDTH / 2 - left) * factor, HEIGHT / 2 * factor)
         cameras.append(Camera(view.name, *size, focal, focal, *middle, view.world_to_camera))
-    points, _ = stereo.dense_points(cameras, shown, 3)
+    points, _ = stereo.triangulate_points(cameras, shown, 3)
     assert len(points) > 0.6 * WIDTH * HEIGHT / 9
     away = np.abs(points[:, 2] - 1 - slope * points[:, 0]) / 2
     assert np.median(away) < 0.01 and np.quantile(away, 0.95) < 0.05
@@ -120,16 +120,16 @@ def test_views_of_several_sizes_and_lenses_match(slope=0.3):
 
 def test_plain_pictures_give_nothing():
     plain = {name: np.full_like(picture, 90) for name, picture in pictures(0.0).items()}
-    assert len(stereo.dense_points(CAMERAS, plain, 3)[0]) == 0
+    assert len(stereo.triangulate_points(CAMERAS, plain, 3)[0]) == 0
 
 
 def test_lonely_views_and_opposite_ones_give_nothing():
     shown = pictures(0.0)
-    assert len(stereo.dense_points(CAMERAS[:1], shown, 3)[0]) == 0
+    assert len(stereo.triangulate_points(CAMERAS[:1], shown, 3)[0]) == 0
     opposite = [CAMERAS[0], camera("b", 0.1, turn=np.pi)]
-    assert len(stereo.dense_points(opposite, shown, 3)[0]) == 0
+    assert len(stereo.triangulate_points(opposite, shown, 3)[0]) == 0
 
 
 def test_the_same_pictures_give_the_same_points():
-    first, second = (stereo.dense_points(CAMERAS, pictures(0.2), 4) for _ in range(2))
+    first, second = (stereo.triangulate_points(CAMERAS, pictures(0.2), 4) for _ in range(2))
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))

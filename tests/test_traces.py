@@ -289,7 +289,9 @@ def test_steps_that_fit_are_counted_once(tmp_path):
         rows = [{"seconds": s, "iteration": i} for i, s in enumerate(seconds)]
         (folder / "trace.jsonl").write_text("\n".join(map(json.dumps, rows)))
 
-    count = lambda name, asked, seconds, spent: trace.affordable(tmp_path / name, asked, seconds, lambda: spent, trial)
+    count = lambda name, asked, seconds, spent: trace.steps_within_budget(
+        tmp_path / name, asked, seconds, lambda: spent, trial
+    )
     assert count("a", 100, 0, 5.0) == 100 and not tried, "no budget, nothing measured"
     assert count("b", 100, 30.0, 10.0) == 40
     assert count("b", 100, 30.0, 29.0) == 40 and len(tried) == 1, "read back on a resume"

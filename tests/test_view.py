@@ -86,7 +86,7 @@ def test_what_evaluate_adds_beyond_the_capture_counts_as_kept(tmp_path):
     """And what it leaves out is missing from either."""
     gaussians, labels = finished(tmp_path / "x", NEEDS)
     backdrop = gaussians.map(lambda p: p[:5] + 3)
-    fewer = gaussians.map(lambda p: p[1:]).zipped(backdrop, lambda a, b: torch.cat([a, b]))
+    fewer = gaussians.map(lambda p: p[1:]).zip_map(backdrop, lambda a, b: torch.cat([a, b]))
     save_ply(tmp_path / "x/evaluate/scene.ply", fewer, similarity=SIMILARITY)
     kept, added = gaussian_layers.load_layers(tmp_path / "x", SIMILARITY).states["result"]
     assert len(kept) + len(added) == len(fewer) and len(added) == int(labels[1:].sum())

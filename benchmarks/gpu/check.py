@@ -29,8 +29,8 @@ import torch
 from benchmarks.gpu import exact, steps
 from benchmarks.gpu.bench import PAPER, TOY, Bench
 from reffusion.gaussians.ssim import triton_works
-from reffusion.io.machine import lacks
-from reffusion.io.machine import machine as facts_of_machine
+from reffusion.io.machine import detect as facts_of_machine
+from reffusion.io.machine import find_missing
 from reffusion.params.distill import Params as Distill
 from reffusion.params.fit import Params as Fit
 from reffusion.params.personalize import Params as Personalize
@@ -158,7 +158,7 @@ def main() -> int:
     if options.device == "cuda" and not torch.cuda.is_available():
         print("gpu-check needs a CUDA GPU, and torch finds none on this machine.", file=sys.stderr)
         return 2
-    if options.device == "cuda" and (lacking := lacks(facts_of_machine())):
+    if options.device == "cuda" and (lacking := find_missing(facts_of_machine())):
         print(f"error: {'; '.join(lacking)}", file=sys.stderr)
         return 2
     report = check(options.device, options.out)

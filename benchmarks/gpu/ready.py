@@ -12,7 +12,7 @@ import time
 
 import psutil
 
-from reffusion.io.machine import Machine, lacks, machine
+from reffusion.io.machine import Machine, detect, find_missing
 
 COMPILER_GB = 1.0  # memory of one compiler; gsplat's largest file takes 0.85
 
@@ -21,7 +21,7 @@ def refusal_reasons(here: Machine, before: bool) -> list[str]:
     """Reasons why CUDA jobs cannot run here, one line each."""
     if here.driver is None and here.card is None:
         return ["there is no NVIDIA driver on this machine: nothing to do; profile=laptop needs no card"]
-    return lacks(here, splats=not before)
+    return find_missing(here, splats=not before)
 
 
 def compiler_jobs(cores: int, free_gb: float) -> int:
@@ -33,7 +33,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--before", action="store_true", help="check driver and torch only, load nothing")
     before = parser.parse_args().before
-    if found := refusal_reasons(machine(), before):
+    if found := refusal_reasons(detect(), before):
         print(f"error: {'; '.join(found)}", file=sys.stderr)
         return 2
     if before:

@@ -58,9 +58,9 @@ def normalized_scene(extent: float, offset: float) -> Scene:
     points = extent * true_gaussians().means.double().numpy() + place
     matrices = np.stack(list(world.values()))
     ranges = frame.depth_ranges(matrices, [lens] * VIEWS, points, None)
-    similarity = frame.normalising(matrices, ranges[:, 1])
+    similarity = frame.normalizing_similarity(matrices, ranges[:, 1])
     cameras = {
-        name: Camera(name, WIDTH, HEIGHT, lens.fx, lens.fy, lens.cx, lens.cy, frame.normalise_pose(pose, similarity))
+        name: Camera(name, WIDTH, HEIGHT, lens.fx, lens.fy, lens.cx, lens.cy, frame.normalize_pose(pose, similarity))
         for name, pose in world.items()
     }
     colors = np.full((len(points), 3), 128, np.uint8)

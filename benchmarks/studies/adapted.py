@@ -87,7 +87,7 @@ def save_sheet(models: dict[str, Prior], run: Path, count: int, steps: int, out:
     """Write the pictures and sheet.png; return the views on it."""
     views, rows = load_holes(run, count), []
     for name, (picture, hole) in views.items():
-        row = {"to paint": view_ranking.to_paint(picture, hole)}
+        row = {"to paint": view_ranking.painting_template(picture, hole)}
         for column, (when, prompt) in COLUMNS.items():
             row[column] = paint_hole(models[when], picture, hole, prompt, steps)
         for column, made in row.items():

@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from reffusion.clicks import all_views
 from reffusion.clicks.marks import Clicks
-from reffusion.clicks.single_view import view_mask
+from reffusion.clicks.single_view import segment_view
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_raw_masks, load_scene, load_views
@@ -46,7 +46,7 @@ def simulate_clicks(image: np.ndarray, true: np.ndarray, most: int, relief: np.n
         chosen.append(next_click(found, true))
         clicks = Clicks(np.array([each[:2] for each in chosen]), np.array([each[2] for each in chosen]))
         began = time.monotonic()
-        found = view_mask(image, clicks, relief)
+        found = segment_view(image, clicks, relief)
         print(f"  click {len(chosen)}: {iou(found, true):.3f}, {time.monotonic() - began:.1f} s", flush=True)
     return clicks
 
@@ -60,11 +60,11 @@ def evaluate_run(run: Path, most: int, sheet: Path | None) -> str:
     names = sorted(true)
     view, images = names[len(names) // 2], load_views(run / "poses", names)
     gaussians = load_ply(run / "fit/gaussians.ply")
-    clicks = simulate_clicks(images[view], true[view], most, all_views.relief(gaussians, scene.cameras[view]))
+    clicks = simulate_clicks(images[view], true[view], most, all_views.surface_relief(gaussians, scene.cameras[view]))
     began, cameras = time.monotonic(), {name: scene.cameras[name] for name in names}
-    near = all_views.neighbours(gaussians)
-    solved = all_views.solved(gaussians, near, cameras, images.__getitem__, {view: clicks}, {})
-    shown = lambda name: all_views.shown(gaussians, solved.labels, cameras[name], images[name])
+    near = all_views.find_neighbours(gaussians)
+    solved = all_views.segment_by_clicks(gaussians, near, cameras, images.__getitem__, {view: clicks}, {})
+    shown = lambda name: all_views.object_mask(gaussians, solved.labels, cameras[name], images[name])
     found = {name: shown(name) for name in names}
     seconds = time.monotonic() - began
     shares = {name: iou(found[name], true[name]) for name in names}

@@ -28,7 +28,7 @@ from reffusion.io.compressed import save_compressed
 from reffusion.io.images import load_image, load_mask, save_image, to_uint8
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.ply_table import load_header, load_vertices, save_vertices
-from reffusion.io.scene import load_object, load_scene
+from reffusion.io.scene import load_object_labels, load_scene
 from reffusion.metrics import image_metrics
 from reffusion.splat import rasterizer
 from reffusion.types import Scene, Similarity
@@ -55,7 +55,7 @@ def in_box(means: np.ndarray, labels: np.ndarray) -> np.ndarray:
 def write_scenes(run: Path, scene: Path, out: Path) -> None:
     """Write the three scenes' folders to `out`."""
     placed, gaussians = load_scene(run / "poses"), load_ply(run / "fit" / "gaussians.ply")
-    deleted = torch.from_numpy(in_box(gaussians.means.double().numpy(), load_object(run / "masks").numpy()))
+    deleted = torch.from_numpy(in_box(gaussians.means.double().numpy(), load_object_labels(run / "masks").numpy()))
     left = gaussians.map(lambda p: p[~deleted])
     stripped = type(left)(left.means, left.quaternions, left.log_scales, left.opacity_logits, left.sh[:, :1])
     reference = next((run / "reference" / "references").glob("*.png"))
@@ -92,7 +92,7 @@ def delete_object(run: Path, folder: Path, tool: list[str]) -> None:
     (folder / "cameras").mkdir(parents=True)
     shutil.copy(exported / "with_object.ply", folder / "before.ply")
     table = load_vertices(folder / "before.ply", load_header(folder / "before.ply"))
-    selected = in_box(load_ply(folder / "before.ply").means.double().numpy(), load_object(run / "masks").numpy())
+    selected = in_box(load_ply(folder / "before.ply").means.double().numpy(), load_object_labels(run / "masks").numpy())
     marked = np.empty(len(table), [*table.dtype.descr, ("selected", "f4")])
     for name in table.dtype.names:
         marked[name] = table[name]
@@ -167,7 +167,7 @@ def render_test_views(parts: tuple[Path, ...], placed: Scene, similarity: Simila
         most = max(first.sh.shape[1], other.sh.shape[1])
         wide = lambda g, most=most: torch.cat([g.sh, g.sh.new_zeros(len(g), most - g.sh.shape[1], 3)], 1)
         both = (type(first)(g.means, g.quaternions, g.log_scales, g.opacity_logits, wide(g)) for g in (first, other))
-        first = next(both).zipped(next(both), lambda a, b: torch.cat([a, b]))
+        first = next(both).zip_map(next(both), lambda a, b: torch.cat([a, b]))
     with torch.no_grad():
         return {n: to_uint8(rasterizer.render(first, placed.cameras[n]).color.numpy()) for n in placed.test}
 

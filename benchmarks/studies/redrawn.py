@@ -186,17 +186,17 @@ def measure(capture: Photographs, foreign: np.ndarray, every: int) -> Rates:
             image = fit_size(make(redrawn), photo)
             found = registration.register(image, photo, hole)
             compare = number == index % len(VARIANTS)  # one variant per view is compared with neighbours, to save time
-            wrong = not found.fits or (compare and registration.closer_view(image, found, others))
-            rates.own.append(found.in_place)
+            wrong = not found.fits or (compare and registration.find_better_view(image, found, others))
+            rates.own.append(found.inlier_ratio)
             rates.refused += bool(wrong)
         for number, name in enumerate(nearest[:NEAREST]):
             image = fit_size(capture.picture(name) if number else redraw(capture.picture(name)), photo)
             found = registration.register(image, photo, hole)
-            rates.other.append(found.in_place)
+            rates.other.append(found.inlier_ratio)
             rates.accepted_by_place += found.fits
-            rates.accepted += found.fits and registration.closer_view(image, found, others) is None
+            rates.accepted += found.fits and registration.find_better_view(image, found, others) is None
         found = registration.register(fit_size(foreign, photo), photo, hole)
-        rates.foreign.append(found.in_place)
+        rates.foreign.append(found.inlier_ratio)
         rates.accepted += found.fits
     return rates
 

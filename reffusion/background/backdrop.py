@@ -62,7 +62,7 @@ def completed(scenes: Sequence[Gaussians], cameras: Sequence[Camera]) -> list[Ga
         return list(scenes)
     rest = scenes[0].map(lambda p: p[~supported[0]])
     behind = backdrop(kept, cameras, joined([patches, brought(rest, cameras)]))
-    return [each.zipped(behind, lambda a, b: torch.cat([a, b.to(a)])) for each in kept]
+    return [each.zip_map(behind, lambda a, b: torch.cat([a, b.to(a)])) for each in kept]
 
 
 def support(gaussians: Gaussians, cameras: Sequence[Camera], pixels: Sequence[float]) -> torch.Tensor:

@@ -9,7 +9,7 @@ import numpy as np
 
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import Lens, to_directions, to_pixels, undistortion_map
-from reffusion.capture.lenses import load_lenses, photograph_sizes
+from reffusion.capture.lenses import load_lenses, load_photograph_sizes
 from reffusion.capture.roles import Roles
 from reffusion.capture.views import find_view, resolve_view
 from reffusion.io.files import BadInput
@@ -45,36 +45,36 @@ def check_clicks(clicks: Clicked, capture: Capture, roles: Roles) -> None:
         raise BadInput("scene.yaml: clicks: none is on the object; add one like [x, y, +]")
 
 
-def to_views(poses: Path, clicks: Clicked) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def undistort_clicks(poses: Path, clicks: Clicked) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """View -> points [K, 2] in its undistorted picture, and bool [K]: the click is on the object.
 
     Clicks that the undistorted picture does not show are left out, and views that could not be placed.
     """
     lenses, _ = load_lenses(poses)
-    sizes, found = photograph_sizes(poses), {}
+    sizes, found = load_photograph_sizes(poses), {}
     for spelling, points in clicks.items():
         if name := find_view(spelling, lenses):
-            at = straightened(np.array([point[:2] for point in points]).reshape(-1, 2), lenses[name], sizes[name])
+            at = undistort_points(np.array([point[:2] for point in points]).reshape(-1, 2), lenses[name], sizes[name])
             inside = ((at >= 0) & (at <= (lenses[name].width, lenses[name].height))).all(1)
             found[name] = at[inside], np.array([point[2] == "+" for point in points], bool)[inside]
     return found
 
 
-def straightened(points: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
+def undistort_points(points: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
     """Pixels [K, 2] of the photograph of `size` (width, height) -> pixels of its undistorted picture."""
     pinhole, _ = _undistortion(lens)
     directions = to_directions(points * (lens.width / size[0], lens.height / size[1]), lens)
     return directions * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
 
 
-def photographed(points: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
-    """Inverse of `straightened`."""
+def distort_points(points: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
+    """Inverse of `undistort_points`."""
     pinhole, _ = _undistortion(lens)
     directions = (points - (pinhole.cx, pinhole.cy)) / (pinhole.fx, pinhole.fy)
     return to_pixels(directions, lens) * (size[0] / lens.width, size[1] / lens.height)
 
 
-def as_photographed(mask: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
+def distort_mask(mask: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
     """A mask [H, W] of the undistorted picture resampled to its photograph of `size` (width, height). Where the
     undistorted picture does not reach, the mask's border is repeated."""
     import cv2

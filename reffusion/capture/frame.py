@@ -95,7 +95,7 @@ def _axis_intersection_depths(world_to_camera: np.ndarray) -> np.ndarray:
     return np.full(len(centers), 3.0 * spread if spread > 0 else np.nan)
 
 
-def normalising(world_to_camera: np.ndarray, typical: np.ndarray) -> Similarity:
+def normalizing_similarity(world_to_camera: np.ndarray, typical: np.ndarray) -> Similarity:
     """The similarity into the normalised frame, where the scene's middle is at 0 and its typical distance from the
     cameras 1.
 
@@ -111,7 +111,7 @@ def normalising(world_to_camera: np.ndarray, typical: np.ndarray) -> Similarity:
     return Similarity(float(1.0 / np.median(typical)), np.median(looked_at, axis=0))
 
 
-def normalise_pose(world_to_camera: np.ndarray, similarity: Similarity) -> np.ndarray:
+def normalize_pose(world_to_camera: np.ndarray, similarity: Similarity) -> np.ndarray:
     """World-to-camera [4, 4] of the scene's own frame -> of the normalised frame."""
     pose = world_to_camera.copy()
     pose[:3, 3] = similarity.scale * (world_to_camera[:3, :3] @ similarity.offset + world_to_camera[:3, 3])
@@ -131,14 +131,14 @@ def _stack_poses(poses: Poses, names: Mapping[str, Lens]) -> np.ndarray:
 def normalize_scene(
     poses: Poses, pinholes: Mapping[str, Lens], train: Sequence[str], test: Sequence[str], clean: frozenset[str]
 ) -> Scene:
-    """The scene in the normalised frame (`normalising`): cameras, and the points that the capture brings.
+    """The scene in the normalised frame (`normalizing_similarity`): cameras, and the points that the capture brings.
 
     Args:
         pinholes: view name -> undistorted lens.
     """
     from reffusion.types import Camera, Scene
 
-    similarity = normalising(_stack_poses(poses, pinholes), view_depth_ranges(poses, pinholes)[:, 1])
+    similarity = normalizing_similarity(_stack_poses(poses, pinholes), view_depth_ranges(poses, pinholes)[:, 1])
     cameras = {
         name: Camera(
             name,
@@ -148,7 +148,7 @@ def normalize_scene(
             pinhole.fy,
             pinhole.cx,
             pinhole.cy,
-            normalise_pose(poses.world_to_camera[name], similarity),
+            normalize_pose(poses.world_to_camera[name], similarity),
         )
         for name, pinhole in sorted(pinholes.items())
     }

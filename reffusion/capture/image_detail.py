@@ -54,7 +54,7 @@ def typical_view_count(points: np.ndarray, cameras: Sequence[Camera]) -> int:
     return int(np.median(seen)) if len(points) else len(cameras)
 
 
-def harmonics(points: np.ndarray, cameras: Sequence[Camera], most: int) -> tuple[int, int]:
+def supported_sh_degree(points: np.ndarray, cameras: Sequence[Camera], most: int) -> tuple[int, int]:
     """The highest supported degree of spherical harmonics, at most `most`, and the `typical_view_count` behind it.
 
     A degree has (degree + 1)^2 coefficients, as many as the views of a typical point [P, 3] must be to determine them.

@@ -36,6 +36,6 @@ def load_lenses(poses_dir: Path) -> tuple[dict[str, Lens], bool]:
     return views, read["upright"]
 
 
-def photograph_sizes(poses_dir: Path) -> dict[str, tuple[int, int]]:
+def load_photograph_sizes(poses_dir: Path) -> dict[str, tuple[int, int]]:
     """View name -> (width, height) of its photograph in the scene's folder."""
     return {name: tuple(size) for name, size in load_json(Path(poses_dir) / LENSES)["photographs"].items()}

@@ -47,7 +47,7 @@ class Matches:
     seen: np.ndarray
 
 
-def dense_points(
+def triangulate_points(
     cameras: Sequence[Camera], images: Mapping[str, np.ndarray], cell: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """A point per `cell` x `cell` pixels of the first view, and of every further view where there is no point yet.

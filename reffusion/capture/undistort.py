@@ -11,7 +11,16 @@ from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import Lens, undistort_image, undistort_mask, undistortion_map
 from reffusion.capture.roles import Roles
 from reffusion.io.files import BadInput
-from reffusion.io.images import WHITE, MaskValues, image_size, load_image, load_mask, resized, save_image, save_mask
+from reffusion.io.images import (
+    WHITE,
+    MaskValues,
+    image_size,
+    load_image,
+    load_mask,
+    resize_image,
+    save_image,
+    save_mask,
+)
 
 
 def fitting_size(width: int, height: int, longest: int) -> tuple[int, int]:
@@ -23,7 +32,7 @@ def fitting_size(width: int, height: int, longest: int) -> tuple[int, int]:
 def load_resized(path: Path, longest: int, upright: bool) -> np.ndarray:
     """The picture, uint8 [H, W, 3], at its `fitting_size`, downscaled by area averaging."""
     image = load_image(path, upright)
-    return resized(image, fitting_size(image.shape[1], image.shape[0], longest))
+    return resize_image(image, fitting_size(image.shape[1], image.shape[0], longest))
 
 
 def resized_lens(name: str, capture: Capture, longest: int) -> tuple[Lens, Lens]:

@@ -23,7 +23,7 @@ class ViewTable:
         train, test: training and test views.
         size_of: name -> (width, height) of its picture.
         upright: the orientation tag of pictures is obeyed.
-        placed: the views are those that `poses` wrote (`placed_views`), so the capture may have others.
+        placed: the views are those that `poses` wrote (`load_placed_views`), so the capture may have others.
         outliers: views that `poses` left out because their photographs contradict their poses.
     """
 
@@ -36,7 +36,7 @@ class ViewTable:
     outliers: Collection[str] = ()
 
 
-def placed_views(poses_dir: Path) -> ViewTable:
+def load_placed_views(poses_dir: Path) -> ViewTable:
     """The views of a finished `poses` folder, at the sizes of its undistorted pictures."""
     lenses, upright = load_lenses(poses_dir)
     roles = load_json(Path(poses_dir) / "views.json")

@@ -14,8 +14,8 @@ from torch import Tensor
 from reffusion.clicks import color_evidence
 from reffusion.clicks.geodesic_cut import keep_connected, relative_distance
 from reffusion.clicks.marks import Clicks, mark_pixels
-from reffusion.clicks.single_view import corrected, erode, refine_edges, view_mask
-from reffusion.graph_cut import least_cut
+from reffusion.clicks.single_view import correct_mask, erode, refine_edges, segment_view
+from reffusion.graph_cut import min_cut
 from reffusion.masks import voting
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
@@ -63,7 +63,7 @@ class ClickSegmentation:
     masks: dict[str, np.ndarray]
 
 
-def neighbours(gaussians: Gaussians) -> NeighbourGraph:
+def find_neighbours(gaussians: Gaussians) -> NeighbourGraph:
     """The graph of neighbouring Gaussians; likeness of colours is relative to the mean difference of neighbours."""
     means, color = (each.detach().cpu().double().numpy() for each in (gaussians.means, gaussians.sh[:, 0] * SH0))
     near = cKDTree(means).query(means, min(NEIGHBOURS + 1, len(means)))[1].reshape(len(means), -1)[:, 1:]
@@ -76,7 +76,7 @@ def neighbours(gaussians: Gaussians) -> NeighbourGraph:
     return NeighbourGraph(pairs, np.exp(-unlike / 2), apart * (1 + UNLIKE * np.sqrt(unlike)) + 1e-12)
 
 
-def solved(
+def segment_by_clicks(
     gaussians: Gaussians,
     near: NeighbourGraph,
     cameras: Mapping[str, Camera],
@@ -90,7 +90,7 @@ def solved(
     what the Gaussians labelled so far show there.
 
     Args:
-        near: `neighbours` of the Gaussians.
+        near: `find_neighbours` of the Gaussians.
         cameras: of the views whose photographs show the object.
         image_of: view -> uint8 [H, W, 3].
         clicks: view -> clicks in its undistorted pixels.
@@ -99,18 +99,18 @@ def solved(
     masks, labels = dict(given), torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     if masks:
         labels = label_gaussians(gaussians, near, cameras, masks, image_of)
-    for name in in_order(clicks):
+    for name in order_views(clicks):
         if labels.any():
             before = voting.render_labels(gaussians, labels, cameras[name]) > COVERED
-            masks[name] = corrected(image_of(name), before, clicks[name], relief(gaussians, cameras[name]))
+            masks[name] = correct_mask(image_of(name), before, clicks[name], surface_relief(gaussians, cameras[name]))
         else:
-            masks[name] = view_mask(image_of(name), clicks[name], relief(gaussians, cameras[name]))
+            masks[name] = segment_view(image_of(name), clicks[name], surface_relief(gaussians, cameras[name]))
         labels = label_gaussians(gaussians, near, cameras, masks, image_of)
     return ClickSegmentation(labels, masks)
 
 
 @torch.no_grad()
-def relief(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+def surface_relief(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """float64 [H, W] px, logarithm of the depth times the focal length, so that its slope does not depend on the
     distance of a surface. Empty pixels get the largest depth."""
     depth = rasterizer.render(gaussians, camera, sh_degree=0).depth.double().cpu().numpy()
@@ -119,7 +119,7 @@ def relief(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     return np.log(np.where(depth > 0, depth, depth.max())) * camera.fx
 
 
-def in_order(clicks: Mapping[str, Clicks]) -> list[str]:
+def order_views(clicks: Mapping[str, Clicks]) -> list[str]:
     """The views, sorted by falling number of clicks on the object."""
     return sorted(clicks, key=lambda name: (-int(clicks[name].positive.sum()), name))
 
@@ -157,13 +157,13 @@ def label_gaussians(
             np.minimum(COLOR * coverage, LARGEST_VOTE) * (log_ratio + NEARER * side) * ~(known.inside | known.outside)
         )
         before, against, for_it = labels, outside + np.maximum(-gain, 0), inside + np.maximum(gain, 0)
-        labels = keep_connected(least_cut(against, for_it, near.pairs, near.likeness), near.pairs, known.inside)
+        labels = keep_connected(min_cut(against, for_it, near.pairs, near.likeness), near.pairs, known.inside)
         if (labels == before).all():
             break
     return torch.as_tensor(labels, device=gaussians.means.device)
 
 
-def shown(
+def object_mask(
     gaussians: Gaussians, labels: Tensor, camera: Camera, image: np.ndarray, clicks: Clicks | None = None
 ) -> np.ndarray:
     """bool [H, W]: the labelled Gaussians in a view, with the border moved to the edges of its photograph."""
@@ -172,7 +172,7 @@ def shown(
     return refine_edges(image, mask, mark_pixels(clicks or no_clicks, mask.shape))
 
 
-def there(gaussians: Gaussians, camera: Camera, image: np.ndarray, mask: np.ndarray) -> bool:
+def is_visible(gaussians: Gaussians, camera: Camera, image: np.ndarray, mask: np.ndarray) -> bool:
     """Does the photograph show the object inside its mask [H, W], as the Gaussians do, or was it taken without the
     object?"""
     around = ~erode(~mask, max(2, round(RING * max(mask.shape)))) & ~mask

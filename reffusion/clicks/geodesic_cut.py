@@ -7,7 +7,7 @@ from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
 from reffusion.clicks.marks import OBJECT, OTHER
-from reffusion.graph_cut import HARD, least_cut
+from reffusion.graph_cut import HARD, min_cut
 
 BINS = 20  # of colours, along each axis of L*a*b* with 8 bits
 ROUNDS = 3  # of distances and colours, each with the labels of the one before
@@ -52,7 +52,7 @@ def grow_object(
         gain = 2 * side + np.log(like / unlike).clip(-LARGEST_LOG_RATIO, LARGEST_LOG_RATIO)
         cost_object = np.where(seeds == OTHER, HARD, np.maximum(-gain, 0) * (seeds != OBJECT))
         cost_other = np.where(seeds == OBJECT, HARD, np.maximum(gain, 0) * (seeds != OTHER))
-        labels = least_cut(cost_object, cost_other, pairs, smooth)
+        labels = min_cut(cost_object, cost_other, pairs, smooth)
         likelihood = like / (like + unlike)
         change = np.abs(likelihood[pairs[:, 0]] - likelihood[pairs[:, 1]])
         cost = COLOR_COST * step + LIKELIHOOD_COST * (change if depth_edges is None else COLOR_ON_SURFACE * change)
@@ -93,9 +93,7 @@ def _cut_within(
     inner = np.where(ends[crossing, 0], pairs[crossing, 0], pairs[crossing, 1])
     border = np.bincount(inner, strength[crossing], len(inside_of))
     found = np.zeros(len(inside_of), bool)
-    found[inside_of] = least_cut(
-        (true_cost + border)[inside_of], false_cost[inside_of], at[pairs[both]], strength[both]
-    )
+    found[inside_of] = min_cut((true_cost + border)[inside_of], false_cost[inside_of], at[pairs[both]], strength[both])
     return found
 
 
@@ -154,7 +152,7 @@ def correct_labels(
     gain = np.where(before, 1.0, -1.0) * (1 - weight_lost)
     cost_object = np.where(seeds == OTHER, HARD, np.maximum(-gain, 0) * (seeds != OBJECT))
     cost_other = np.where(seeds == OBJECT, HARD, np.maximum(gain, 0) * (seeds != OTHER))
-    return least_cut(cost_object, cost_other, pairs, smooth)
+    return min_cut(cost_object, cost_other, pairs, smooth)
 
 
 def _smoothness(step: np.ndarray, length: np.ndarray) -> np.ndarray:

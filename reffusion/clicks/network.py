@@ -32,7 +32,7 @@ class Segmenter:
 
 
 @dataclass(frozen=True)
-class Looked:
+class ImageFeatures:
     """The image embedding of a picture, independent of clicks; computing it takes most of the time.
 
     Attributes:
@@ -78,7 +78,7 @@ def make_segmenter(model: nn.Module) -> Segmenter:
 
 
 @torch.no_grad()
-def look(segmenter: Segmenter, image: np.ndarray) -> Looked:
+def encode_image(segmenter: Segmenter, image: np.ndarray) -> ImageFeatures:
     """Encode a picture, uint8 [H, W, 3]: its larger side is scaled to the network's; below and to the right it is
     padded."""
     shape = image.shape[:2]
@@ -87,11 +87,11 @@ def look(segmenter: Segmenter, image: np.ndarray) -> Looked:
     values = interpolate(values, size=size, mode="bilinear", align_corners=False, antialias=True)
     mean, deviation = (values.new_tensor(each).view(1, 3, 1, 1) for each in (MEAN, DEVIATION))
     square = pad((values - mean) / deviation, (0, segmenter.side - size[1], 0, segmenter.side - size[0]))
-    return Looked(segmenter.model.get_image_embeddings(square), shape, size)
+    return ImageFeatures(segmenter.model.get_image_embeddings(square), shape, size)
 
 
 @torch.no_grad()
-def network_mask(segmenter: Segmenter, looked: Looked, clicks: Clicks) -> np.ndarray:
+def predict_mask(segmenter: Segmenter, looked: ImageFeatures, clicks: Clicks) -> np.ndarray:
     """bool [H, W], True = the object that clicks are on; empty without a click on the object. A single click may mean a
     part or the whole: the network's answer with the highest score is taken.
 

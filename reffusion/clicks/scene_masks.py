@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from reffusion import trace
-from reffusion.capture.click_coordinates import to_views
+from reffusion.capture.click_coordinates import undistort_clicks
 from reffusion.capture.views import check_outliers
 from reffusion.clicks import all_views
 from reffusion.clicks.marks import Clicks
@@ -29,17 +29,19 @@ def masks_from_clicks(
         ValueError: the clicks lie where undistorted views show nothing, or on nothing that the Gaussians show.
     """
     check_outliers("clicks", clicks, scene.outliers)
-    points = {name: Clicks(*each) for name, each in to_views(poses, clicks).items()}
+    points = {name: Clicks(*each) for name, each in undistort_clicks(poses, clicks).items()}
     image_of = lambda name: load_views(poses, [name])[name]
     cameras = {name: scene.cameras[name] for name in scene.train if name in masks or name not in scene.clean}
-    solution = all_views.solved(gaussians, all_views.neighbours(gaussians), cameras, image_of, points, masks)
+    solution = all_views.segment_by_clicks(
+        gaussians, all_views.find_neighbours(gaussians), cameras, image_of, points, masks
+    )
     if not solution.labels.any():
         raise ValueError("scene.yaml: clicks: the views show nothing there; click in the middle of the object")
     names = [name for name in (*scene.train, *scene.test) if name not in {*masks, *scene.clean}]
     found = dict(masks)
     for k in trace.progress(len(names), "masks from clicks"):
         name, camera, image = names[k], scene.cameras[names[k]], image_of(names[k])
-        mask = all_views.shown(gaussians, solution.labels, camera, image, points.get(name))
-        if name in scene.train or all_views.there(gaussians, camera, image, mask):
+        mask = all_views.object_mask(gaussians, solution.labels, camera, image, points.get(name))
+        if name in scene.train or all_views.is_visible(gaussians, camera, image, mask):
             found[name] = mask
     return found

@@ -18,7 +18,7 @@ RING = 0.25  # of the square root of a mask's pixels: width of the ring around i
 MARGIN = 3  # bands around a mask whose colours are used
 
 
-def view_mask(image: np.ndarray, clicks: Clicks, relief: np.ndarray | None = None) -> np.ndarray:
+def segment_view(image: np.ndarray, clicks: Clicks, relief: np.ndarray | None = None) -> np.ndarray:
     """bool [H, W], True = the object that clicks are on; empty without a click on the object.
 
     Args:
@@ -86,7 +86,7 @@ def _ring(mask: np.ndarray) -> np.ndarray:
     return ~erode(~mask, far) & erode(~mask, 1)
 
 
-def corrected(image: np.ndarray, before: np.ndarray, clicks: Clicks, relief: np.ndarray | None = None) -> np.ndarray:
+def correct_mask(image: np.ndarray, before: np.ndarray, clicks: Clicks, relief: np.ndarray | None = None) -> np.ndarray:
     """bool [H, W]: the mask `before` [H, W], corrected by clicks that contradict it. A correction extends to where
     colours change, and to the edges of surfaces where their relief is known."""
     lab, small, marks = _downscale(image, clicks)
@@ -145,7 +145,7 @@ def erode(mask: np.ndarray, by: int) -> np.ndarray:
 def _find_depth_edges(
     relief: np.ndarray | None, small: tuple[int, int], pairs: np.ndarray, length: np.ndarray
 ) -> np.ndarray | None:
-    """[E] in [0, 1]: how surely neighbours lie on two surfaces, one behind the other; relief as for `view_mask`."""
+    """[E] in [0, 1]: how surely neighbours lie on two surfaces, one behind the other; relief as for `segment_view`."""
     if relief is None:
         return None
     size = small[::-1]

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from reffusion.cost.counts import COUNTS
-from reffusion.io.machine import machine
+from reffusion.io.machine import detect
 from reffusion.params.base import PRIOR, REFINED_FROM
 from reffusion.params.distill import Params as Distill
 from reffusion.params.fit import Params as Fit
@@ -73,7 +73,7 @@ def find_gpu(name: str) -> str | None:
         ValueError: `name` is not in the table.
     """
     normalize = lambda text: re.sub(r"[^a-z0-9]", "", text.lower())
-    requested = name or machine().card or ""
+    requested = name or detect().card or ""
     match = next((card for card in CARDS if requested and normalize(card) in normalize(requested)), None)
     if name and not match:
         raise ValueError(f"card {name!r} is none of {', '.join(CARDS)}")

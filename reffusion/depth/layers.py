@@ -9,7 +9,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from reffusion.depth.completion import unit_range
-from reffusion.graph_cut import HARD, least_labels
+from reffusion.graph_cut import HARD, alpha_expansion
 
 JUMP = 0.025  # relative disparity step between neighbours that separates two surfaces
 MIN_SHARE = 0.03  # of the known pixels around a hole: smaller segments are not surfaces of their own
@@ -70,7 +70,7 @@ def label_surfaces(
     pairs, strength = _weighted_edges(index, colors)
     initial = np.where(label >= 0, label, np.where(assumed_label >= 0, assumed_label, cost.argmin(0)))
     result = surfaces.copy()
-    result[domain] = least_labels(cost, pairs, strength, initial) + 1
+    result[domain] = alpha_expansion(cost, pairs, strength, initial) + 1
     return _remove_islands(result, surfaces, missing)
 
 

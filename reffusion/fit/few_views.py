@@ -68,7 +68,7 @@ def gaussians_on_surfaces(
             missing &= ~(is_covered & (rendered_depth < OCCLUSION_RATIO * depth))
         added = sheet_gaussians(images[camera.name], depth, missing, camera, (params.sh.degree + 1) ** 2, Sheets())
         added = replace(added.map(lambda p: p.to(params.device)), antialiased=params.antialiased)
-        result = added if result is None else result.zipped(added, lambda a, b: torch.cat([a, b]))
+        result = added if result is None else result.zip_map(added, lambda a, b: torch.cat([a, b]))
     return result
 
 

@@ -33,12 +33,12 @@ def iterate_views(
     """
 
     def prepare(i: int) -> tuple[Camera, Tensor, Tensor | None]:
-        camera = cameras[seeding.in_epochs(i, len(cameras), seed, "views")]
+        camera = cameras[seeding.epoch_index(i, len(cameras), seed, "views")]
         view = camera, images[camera.name], weights.get(camera.name)
         if i < coarse:
             return to_tensors(*downsample(*view), device)
         if i in sparse and camera.width * camera.height >= MIN_SPARSE_PIXELS:
-            phase = seeding.in_epochs(i // len(cameras), 4, seed, "pixels", camera.name)
+            phase = seeding.epoch_index(i // len(cameras), 4, seed, "pixels", camera.name)
             return to_tensors(*subsample(*view, phase % 2, phase // 2), device)
         return to_tensors(*view, device)
 

@@ -49,7 +49,7 @@ def densify(
     clones = gaussians.map(lambda p: p[to_clone])
     children = split(gaussians.map(lambda p: p[to_split]), generator)
     labels = torch.cat([optimizer.masked[to_clone], optimizer.masked[to_split].repeat(2)])
-    optimizer.append(clones.zipped(children, lambda a, b: torch.cat([a, b])), labels)
+    optimizer.append(clones.zip_map(children, lambda a, b: torch.cat([a, b])), labels)
     optimizer.select(torch.cat([~to_split, torch.ones_like(labels)]))
     optimizer.forget_grad2d()
     return growth

@@ -214,10 +214,10 @@ class GaussianOptimizer:
     def append(self, gaussians: Gaussians, masked: Tensor) -> None:
         """Append Gaussians with labels `masked` [M] bool and zero moments; the running mean is discarded."""
         self._mean, self._meant = None, 0
-        self.gaussians = self.gaussians.zipped(gaussians, lambda a, b: _leaf(torch.cat([a, b])))
+        self.gaussians = self.gaussians.zip_map(gaussians, lambda a, b: _leaf(torch.cat([a, b])))
         empty = gaussians.map(_zeros)
-        self._first = self._first.zipped(empty, lambda a, b: torch.cat([a, b]))
-        self._second = self._second.zipped(empty, lambda a, b: torch.cat([a, b]))
+        self._first = self._first.zip_map(empty, lambda a, b: torch.cat([a, b]))
+        self._second = self._second.zip_map(empty, lambda a, b: torch.cat([a, b]))
         for name in self._COUNTERS:
             old = getattr(self, name)
             setattr(self, name, torch.cat([old, masked if name == "masked" else old.new_zeros(len(gaussians))]))

@@ -58,4 +58,4 @@ def sheet_gaussians(
     back = surface_gaussians(
         *source, **shape, spread=settings.under_spread, opacity=settings.under_opacity, offset_px=settings.offset_px
     )
-    return front.zipped(back, lambda a, b: torch.cat([a, b]))
+    return front.zip_map(back, lambda a, b: torch.cat([a, b]))

@@ -38,5 +38,5 @@ class Draft:
 
     def add(self, added: Gaussians) -> Draft:
         """With new Gaussians at the end."""
-        together = self.gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
+        together = self.gaussians.zip_map(added, lambda a, b: torch.cat([a, b]))
         return Draft(together, torch.cat([self.is_new, self.is_new.new_ones(len(added))]))

@@ -221,7 +221,7 @@ def _flat_levels(array: np.ndarray) -> list[int]:
     return [int(level) for level, count in zip(levels, counts, strict=True) if count > FLAT * array.size]
 
 
-def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def resize_image(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """The picture, uint8 [h, w, 3], at `size` (width, height): by area averaging where it shrinks, else bicubic."""
     import cv2
 

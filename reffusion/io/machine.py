@@ -41,7 +41,7 @@ class Machine:
 
 
 @functools.cache
-def machine() -> Machine:
+def detect() -> Machine:
     """This machine: a few files are read, and nvidia-smi is run where it exists."""
     card, gigabytes, driver = _query_gpu()
     package = _package("gsplat")
@@ -49,7 +49,7 @@ def machine() -> Machine:
     return Machine(card, gigabytes, driver or _driver(DRIVER), _torch_cuda(), package is not None, extension, _nvcc())
 
 
-def lacks(here: Machine, memory_gb: float = 0.0, splats: bool = True, memory_param: str = "") -> list[str]:
+def find_missing(here: Machine, memory_gb: float = 0.0, splats: bool = True, memory_param: str = "") -> list[str]:
     """What keeps this machine from running a stage on CUDA, a line each with the remedy; a driver is present.
 
     Args:

@@ -46,7 +46,7 @@ def save_ply(
         similarity: with it, positions and sizes are converted (in float64) to the scene's own frame. Positions are then
             written as doubles only where floats would move them by more than 1e-5 of the normalised extent
             (geo-referenced scenes); viewers that insist on floats read all others.
-        properties: another order of these, without normals where it has none (`properties_of` a file to match).
+        properties: another order of these, without normals where it has none (`load_property_names` a file to match).
     """
     array = lambda name: getattr(gaussians, name).detach().cpu().numpy()
     means, log_scales, sh, position_type = array("means").astype(np.float64), array("log_scales"), array("sh"), "f4"
@@ -77,7 +77,7 @@ def save_ply(
     save_vertices(path, table, comments)
 
 
-def can_save(path: Path) -> None:
+def check_can_save(path: Path) -> None:
     """BadInput where `save_splats` cannot write this file: unknown ending, missing library, or missing folder."""
     name = Path(path).name.lower()
     if not name.endswith(FORMATS):
@@ -162,6 +162,6 @@ def count_gaussians(path: Path) -> int:
     return summarize(path).count
 
 
-def properties_of(path: Path) -> tuple[str, ...]:
+def load_property_names(path: Path) -> tuple[str, ...]:
     """The names of the vertices' properties, in order; empty for a quantised file."""
     return summarize(path).properties

@@ -89,7 +89,7 @@ def load_warnings(folder: Path) -> list[str]:
     return load_json(path) if path.is_file() else []
 
 
-def objects_of(raw_masks_dir: Path) -> list[str]:
+def list_objects(raw_masks_dir: Path) -> list[str]:
     """The objects that masks tell apart, sorted."""
     return sorted(path.name for path in (Path(raw_masks_dir) / "masks").glob("[!.]*") if path.is_dir())
 
@@ -98,7 +98,7 @@ def raw_mask_files(raw_masks_dir: Path, name: str, objects: Sequence[str] | None
     """The view's masks: a single one, or where objects are told apart one for each of `objects` (None: all) that has
     one."""
     folder = Path(raw_masks_dir) / "masks"
-    found_objects = objects_of(raw_masks_dir) if objects is None else objects
+    found_objects = list_objects(raw_masks_dir) if objects is None else objects
     return [path for path in (folder / thing / f"{name}.png" for thing in found_objects or [""]) if path.is_file()]
 
 
@@ -109,7 +109,7 @@ def load_raw_masks(
 
     Where objects are told apart, the union of those in `objects` (None: all), for views with a mask of each.
     """
-    objects = objects_of(raw_masks_dir) if objects is None else objects
+    objects = list_objects(raw_masks_dir) if objects is None else objects
     files = {name: raw_mask_files(raw_masks_dir, name, objects) for name in names}
     found = {name: paths for name, paths in files.items() if len(paths) == max(len(objects), 1)}
     return {name: np.logical_or.reduce([load_mask(path) for path in paths]) for name, paths in found.items()}
@@ -120,7 +120,7 @@ def load_test_masks(raw_masks_dir: Path) -> dict[str, np.ndarray]:
     return {path.stem: load_mask(path) for path in sorted((Path(raw_masks_dir) / "test_masks").glob("*.png"))}
 
 
-def load_fill(raw_masks_dir: Path) -> dict[str, np.ndarray]:
+def load_fill_masks(raw_masks_dir: Path) -> dict[str, np.ndarray]:
     """Training view name -> bool [H, W], what is to be filled; empty where the scene brings no such masks."""
     return {path.stem: load_mask(path) for path in sorted((Path(raw_masks_dir) / "fill").glob("*.png"))}
 
@@ -140,7 +140,7 @@ def load_mask_sets(masks_dir: Path, names: Iterable[str]) -> dict[str, MaskSet]:
     return {name: MaskSet(*(load(kind, name) for kind in PIXEL_CLASSES)) for name in names}
 
 
-def shows_object(raw_masks_dir: Path, masks_dir: Path | None, name: str) -> bool:
+def has_object_mask(raw_masks_dir: Path, masks_dir: Path | None, name: str) -> bool:
     """Has the view a raw mask, given or made from clicks?"""
     if raw_mask_files(raw_masks_dir, name) or masks_dir is None:
         return bool(raw_mask_files(raw_masks_dir, name))
@@ -148,7 +148,7 @@ def shows_object(raw_masks_dir: Path, masks_dir: Path | None, name: str) -> bool
     return made.is_file() and bool(load_mask(made).any())
 
 
-def load_object(masks_dir: Path) -> Tensor:
+def load_object_labels(masks_dir: Path) -> Tensor:
     """[N] bool: of the Gaussians that `masks` removes, those that are the object, and not debris."""
     labels, debris = load_labels(masks_dir / "labels.npy"), masks_dir / "debris.npy"
     return labels & ~load_labels(debris) if debris.exists() else labels

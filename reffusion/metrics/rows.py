@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from reffusion.background import training_coverage
-from reffusion.io.images import resize_nearest, resized
+from reffusion.io.images import resize_image, resize_nearest
 from reffusion.metrics import consistency, image_metrics
 from reffusion.metrics.consistency import Shown
 from reffusion.metrics.lpips import Lpips
@@ -72,10 +72,10 @@ def _score_reduced(
     found: dict[str, Any] = {"reduced_width": size[0], "reduced_height": size[1]}
     if (box := image_metrics.mask_box(resize_nearest(mask, size[::-1]))) is None:
         return found
-    true = box.crop(resized(truth, size))
+    true = box.crop(resize_image(truth, size))
     targets = image_metrics.lpips_targets(true, models)
     for key, picture in pictures.items():
-        scores = image_metrics.score(box.crop(resized(picture, size)), true, targets)
+        scores = image_metrics.score(box.crop(resize_image(picture, size)), true, targets)
         found |= {f"{key}reduced_{name}_box": value for name, value in scores.items()}
     return found
 

@@ -14,9 +14,9 @@ from reffusion.io.files import BadInput
 from reffusion.io.scene import has_photograph, load_views
 from reffusion.masks import shadows
 from reffusion.references import agreement, color, registration, view_ranking
-from reffusion.references.files import GivenReference
+from reffusion.references.files import ReferenceFile
 from reffusion.references.registration import Registration
-from reffusion.references.undistort import load_straight, load_straight_depth
+from reffusion.references.undistort import undistort_reference, undistort_reference_depth
 from reffusion.types import Camera, MaskSet, Reference
 from reffusion.workspace import Workspace
 
@@ -25,7 +25,7 @@ LEAST_HOLE_SHARE = 0.9  # share of the invent mask that a reference must cover a
 NEIGHBOURS = 4  # nearest views that a matching reference is compared with, in case it shows one of them better
 
 
-def adopt_references(files: Sequence[GivenReference], space: Workspace) -> tuple[list[Reference], dict[str, str]]:
+def adopt_references(files: Sequence[ReferenceFile], space: Workspace) -> tuple[list[Reference], dict[str, str]]:
     """Align the references with their views, and drop those in whose view nothing has to be invented.
 
     The mask of a reference is the invent mask of its view. In a clean view, whose photograph shows what other views
@@ -53,7 +53,7 @@ def adopt_references(files: Sequence[GivenReference], space: Workspace) -> tuple
     return references, fits
 
 
-def adopt_reference(file: GivenReference, masks: MaskSet, space: Workspace) -> tuple[Reference, str]:
+def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tuple[Reference, str]:
     """Align one reference with its photograph.
 
     A picture that equals the photograph outside the object is used as it is. Of any other picture only the hole, the
@@ -74,21 +74,21 @@ def adopt_reference(file: GivenReference, masks: MaskSet, space: Workspace) -> t
     keeps_exposure = not file.painted and has_photograph(space.poses, file.view)
     photo = load_photo(space, file.view) if keeps_exposure else space.load_photos([file.view])[file.view]
     hidden = object_pixels(masks)
-    image, inside = load_straight(file, lens, upright)
+    image, inside = undistort_reference(file, lens, upright)
     found = registration.register(image, photo, hidden)
     if not found.fits and not file.undistorted:
-        straight, _ = load_straight(replace(file, undistorted=True), lens, upright)
+        straight, _ = undistort_reference(replace(file, undistorted=True), lens, upright)
         if registration.register(straight, photo, hidden).fits:
             raise BadInput(
                 f"{file.path}: fits the undistorted picture of its view '{file.view}', not the photograph; write "
                 "`undistorted: true` beside it in scene.yaml"
             )
-    if not found.untouched:
+    if not found.is_identical:
         found = check_match(file, found, image, space)
     print(f"reference {file.view}: {found}", flush=True)
     usual = 0.0
-    if not found.untouched:
-        image, inside = load_straight(file, lens, upright, found.moved)
+    if not found.is_identical:
+        image, inside = undistort_reference(file, lens, upright, found.affine)
         image = color.recolor(image, found.gain, found.offset)
         margin, blend = (share * camera.width for share in (PASTE_MARGIN, PASTE_BLEND))
         usual = shadows.redrawn_difference(image, photo, inside & ~hidden)
@@ -98,13 +98,13 @@ def adopt_reference(file: GivenReference, masks: MaskSet, space: Workspace) -> t
         raise ValueError(f"{file.path}: shows only {share:.0%} of the hole in '{file.view}'; crop less")
     differs = masks.consistent | shadows.changed_pixels(image, photo, masks.invent, usual)
     image = image if file.painted else exposure.normalize_exposure(image, space.fit, file.view)
-    depth = load_straight_depth(file, lens, upright, found.moved)
+    depth = undistort_reference_depth(file, lens, upright, found.affine)
     if depth is not None:  # a depth map in the scene's own unit is now in that of the normalised frame
         depth = depth * space.scene.similarity.scale
     return Reference(camera, image, masks.invent & inside & differs, depth), str(found)
 
 
-def check_match(file: GivenReference, found: Registration, image: np.ndarray, space: Workspace) -> Registration:
+def check_match(file: ReferenceFile, found: Registration, image: np.ndarray, space: Workspace) -> Registration:
     """The registration, where the picture shows its view and shows no other view better.
 
     If scene.yaml trusts a picture that does not match, a warning replaces the error, and the picture is used without
@@ -122,15 +122,15 @@ def check_match(file: GivenReference, found: Registration, image: np.ndarray, sp
     others.sort(key=lambda name: view_distance(scene.cameras[name], scene.cameras[file.view]))
     others = others[:NEIGHBOURS] if found.fits else others
     loaded = ((name, load_photo(space, name), object_pixels(space.mask_sets[name])) for name in others)
-    closer = registration.closer_view(image, found, loaded)
+    closer = registration.find_better_view(image, found, loaded)
     if found.fits and closer is None:
         return found
-    problem = f"{file.path}: does not fit its view '{file.view}': {found if found.fits else found.misfit}"
+    problem = f"{file.path}: does not fit its view '{file.view}': {found if found.fits else found.mismatch}"
     problem += f"; it fits the view '{closer[0]}' better ({closer[1]:.0%})" if closer else ""
     if file.trust:
         warnings.warn(f"{problem}; taken all the same: scene.yaml says `trust: true`", stacklevel=1)
-        return found if found.fits else replace(found, moved=None, gain=np.ones(3), offset=np.zeros(3))
-    raise BadInput(f"{problem}; is it of another view, or of another scene? If it is right, {file.way_to_trust}")
+        return found if found.fits else replace(found, affine=None, gain=np.ones(3), offset=np.zeros(3))
+    raise BadInput(f"{problem}; is it of another view, or of another scene? If it is right, {file.trust_hint}")
 
 
 def check_agreement(references: Sequence[Reference], space: Workspace) -> None:
@@ -140,9 +140,11 @@ def check_agreement(references: Sequence[Reference], space: Workspace) -> None:
         return
     cameras = [each.camera for each in references]
     hidden = {camera.name: space.mask_sets[camera.name].consistent for camera in cameras}
-    holes = view_ranking.holes(space.remaining, cameras, hidden, {each.camera.name: each.mask for each in references})
-    holes = agreement.as_drawn(holes, references, space.remaining, hidden)
-    for first, second, unlike in agreement.contradicting(references, holes):
+    holes = view_ranking.find_holes(
+        space.remaining, cameras, hidden, {each.camera.name: each.mask for each in references}
+    )
+    holes = agreement.refine_hole_depth(holes, references, space.remaining, hidden)
+    for first, second, unlike in agreement.find_contradictions(references, holes):
         raise ValueError(
             f"the references of '{first}' and '{second}' contradict each other: in what both show, colours differ by "
             f"{255 * unlike:.0f} of 255; make them alike, or give one of them"

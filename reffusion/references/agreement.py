@@ -33,14 +33,14 @@ LEAST_PIXELS = 40  # pixels that both show, at `view_ranking.SIDE`, from which a
 CONTRADICTION = 0.04
 
 
-def as_drawn(
+def refine_hole_depth(
     holes: Mapping[str, Hole], references: Sequence[Reference], remaining: Gaussians, hidden: Mapping[str, np.ndarray]
 ) -> dict[str, Hole]:
     """The holes with the depth that completed views bring. Holes of unknown depth are left out: what is drawn over the
     background does not lie at the depth of the surroundings.
 
     Args:
-        holes: view name -> its hole (`view_ranking.holes`).
+        holes: view name -> its hole (`view_ranking.find_holes`).
         remaining: the Gaussians without the object's.
         hidden: view name -> bool [H, W], the object's pixels.
     """
@@ -66,11 +66,11 @@ def _align_depth(hole: Hole, reference: Reference, remaining: Gaussians, hidden:
     return replace(hole, depth=np.where(np.isfinite(aligned), aligned, 0.0))
 
 
-def contradicting(references: Sequence[Reference], holes: Mapping[str, Hole]) -> list[tuple[str, str, float]]:
+def find_contradictions(references: Sequence[Reference], holes: Mapping[str, Hole]) -> list[tuple[str, str, float]]:
     """The pairs of views that contradict each other, with their `color_difference`, the largest first.
 
     Args:
-        holes: view name -> its hole (`view_ranking.holes`).
+        holes: view name -> its hole (`view_ranking.find_holes`).
     """
     shown = [each for each in references if each.camera.name in holes]
     found = []

@@ -17,7 +17,7 @@ PROPORTION_TOLERANCE = 0.1  # relative difference of a reference's proportions f
 
 
 @dataclass(frozen=True)
-class GivenReference:
+class ReferenceFile:
     """A completed view that the scene brings.
 
     Attributes:
@@ -51,9 +51,9 @@ def list_paintings(folder: Path) -> list[Path]:
     return sorted(path for path in (Path(folder) / PAINTED).glob("[!.]*") if path.is_file())
 
 
-def load_given(
+def load_reference_files(
     folder: Path, views: ViewTable, asked: ReferenceSpec | Sequence[ReferenceSpec] | None
-) -> list[GivenReference]:
+) -> list[ReferenceFile]:
     """The references that scene.yaml names (`asked`) and those in `painted`, sorted by view.
 
     A painting is called <view>.png, its depth map <view>_depth.*. It replaces one that scene.yaml names for the same
@@ -64,14 +64,14 @@ def load_given(
             references for a view, a missing file, other proportions than the view's, a depth map of an unknown kind.
     """
     folder = Path(folder)
-    found: dict[str, GivenReference] = {}
+    found: dict[str, ReferenceFile] = {}
     for each in reference_list(asked):
         path = folder / each.image
         name = resolve_file_view(path, each.view, views, "reference")
         if name in found:
             raise BadInput(f"scene.yaml: reference: two for the view '{name}'; keep one")
         depth = None if each.depth is None else folder / each.depth
-        found[name] = GivenReference(name, path, depth, each.undistorted, trust=each.trust)
+        found[name] = ReferenceFile(name, path, depth, each.undistorted, trust=each.trust)
     for given in _paintings(list_paintings(folder), views):
         named = found.get(given.view)
         found[given.view] = replace(given, trust=named is not None and named.trust and named.path == given.path)
@@ -80,12 +80,12 @@ def load_given(
     return sorted(found.values(), key=lambda given: given.view)
 
 
-def describe_references(given: Sequence[GivenReference]) -> str:
+def describe_references(given: Sequence[ReferenceFile]) -> str:
     """The views of references, for people."""
     return ", ".join(each.view + (" (painted)" if each.painted else "") for each in given)
 
 
-def _paintings(files: Sequence[Path], views: ViewTable) -> list[GivenReference]:
+def _paintings(files: Sequence[Path], views: ViewTable) -> list[ReferenceFile]:
     """The paintings with their depth maps; masks copied along with them are ignored."""
     pictures, depths = {}, {}
     for path in files:
@@ -107,10 +107,10 @@ def _paintings(files: Sequence[Path], views: ViewTable) -> list[GivenReference]:
         kind[name] = path
     for name in depths.keys() - pictures.keys():
         raise BadInput(f"{depths[name]}: a depth map without a painting; add {name}.png, or remove it")
-    return [GivenReference(name, path, depths.get(name), True, True) for name, path in pictures.items()]
+    return [ReferenceFile(name, path, depths.get(name), True, True) for name, path in pictures.items()]
 
 
-def _check(given: GivenReference, views: ViewTable) -> None:
+def _check(given: ReferenceFile, views: ViewTable) -> None:
     where = "" if given.painted else "; correct `reference` in scene.yaml"
     for path in (given.path, given.depth):
         if path is not None and not path.is_file():

@@ -42,52 +42,52 @@ class Registration:
     """How a picture lies over its photograph.
 
     Attributes:
-        moved: [2, 3] affine map from the photograph's pixels to the picture's; None where the picture is aligned as it
+        affine: [2, 3] affine map from the photograph's pixels to the picture's; None where the picture is aligned as it
             is.
         max_shift: px, by how much the map moves the corner that it moves most.
         gain, offset: [3] each, colours in [0, 1]: photograph = gain * picture + offset; 1 and 0 where none is needed.
         point_count: number of points that were compared.
-        in_place: share in [0, 1] of the points that the picture shows where the photograph does; NaN with too few
+        inlier_ratio: share in [0, 1] of the points that the picture shows where the photograph does; NaN with too few
             points.
         median_displacement: px, of the tracked points; NaN where none was tracked.
-        untouched: the picture equals the photograph outside the hole, up to rounding.
+        is_identical: the picture equals the photograph outside the hole, up to rounding.
     """
 
-    moved: np.ndarray | None
+    affine: np.ndarray | None
     max_shift: float
     gain: np.ndarray
     offset: np.ndarray
     point_count: int
-    in_place: float
+    inlier_ratio: float
     median_displacement: float
-    untouched: bool
+    is_identical: bool
 
     @property
     def fits(self) -> bool:
         """Is it a picture of this view? True where there are too few points to tell."""
-        return not self.in_place < LEAST_INLIER_RATIO
+        return not self.inlier_ratio < LEAST_INLIER_RATIO
 
     @property
-    def misfit(self) -> str:
+    def mismatch(self) -> str:
         """How badly it fits, for an error message."""
-        moved = f"moved by up to {self.max_shift:.0f} px" if self.moved is not None else "as it lies"
+        moved = f"moved by up to {self.max_shift:.0f} px" if self.affine is not None else "as it lies"
         displaced = (
             "none of the others is found in it"
             if np.isnan(self.median_displacement)
             else f"the median displacement is {self.median_displacement:.1f} px"
         )
         return (
-            f"{moved}, it shows {self.in_place:.0%} of {self.point_count} places around the hole where the "
+            f"{moved}, it shows {self.inlier_ratio:.0%} of {self.point_count} places around the hole where the "
             f"photograph has them (at least {LEAST_INLIER_RATIO:.0%} must; {displaced})"
         )
 
     def __str__(self) -> str:
-        if np.isnan(self.in_place):
+        if np.isnan(self.inlier_ratio):
             return "what it shows around the hole is too plain to be compared"
-        moved = f"moved by up to {self.max_shift:.1f} px" if self.moved is not None else "not moved"
+        moved = f"moved by up to {self.max_shift:.1f} px" if self.affine is not None else "not moved"
         brighter = (self.gain.mean() + self.offset.mean() - 1) * 100
         colors = f"colours matched ({brighter:+.0f} %)" if (self.gain != 1).any() or self.offset.any() else "as exposed"
-        share = f"{self.in_place:.0%} of {self.point_count} places"
+        share = f"{self.inlier_ratio:.0%} of {self.point_count} places"
         return f"{moved}, {colors}; {share} around the hole lie as in the photograph"
 
 
@@ -105,16 +105,16 @@ def register(picture: np.ndarray, photo: np.ndarray, hidden: np.ndarray, working
     pair = _Pair.at(picture, photo, known, working)
     best = unmoved = pair.judge(IDENTITY)
     if untouched and best.fits:
-        return replace(best, moved=None, gain=np.ones(3), offset=np.zeros(3), untouched=True)
+        return replace(best, affine=None, gain=np.ones(3), offset=np.zeros(3), is_identical=True)
     for start in pair.starts():
         found = pair.refine(start)
         best = found if found is not None and _is_better(found, best) else best
-        if best.in_place > SURE_INLIER_RATIO:
+        if best.inlier_ratio > SURE_INLIER_RATIO:
             break
-    return best if best.max_shift > IDENTITY_SHIFT * pair.stride.max() else replace(unmoved, moved=None)
+    return best if best.max_shift > IDENTITY_SHIFT * pair.stride.max() else replace(unmoved, affine=None)
 
 
-def closer_view(
+def find_better_view(
     picture: np.ndarray, found: Registration, others: Iterable[tuple[str, np.ndarray, np.ndarray]]
 ) -> tuple[str, float] | None:
     """The name of another view that the picture shows better than its own, and the inlier ratio there; None for no such
@@ -125,17 +125,17 @@ def closer_view(
         others: of other views the name, the photograph, and bool [H, W] the object's pixels; likely ones first.
     """
     best: tuple[str, float] | None = None
-    own = 0.0 if np.isnan(found.in_place) else found.in_place
+    own = 0.0 if np.isnan(found.inlier_ratio) else found.inlier_ratio
     is_far = found.max_shift > FAR_SHIFT * max(picture.shape)
     for name, photo, hidden in others:
         size = (photo.shape[1], photo.shape[0])
         image = picture if picture.shape == photo.shape else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
         match = register(image, photo, hidden, QUICK_SIDE)
         # Other views of a plane show the same points, all displaced alike: then the view that needs no shift is right.
-        as_well = is_far and match.in_place > own - 0.05 and match.max_shift < found.max_shift / 2
-        if match.in_place >= LEAST_INLIER_RATIO and (match.in_place > own + CLEAR_MARGIN or as_well):
-            best = (name, match.in_place) if best is None or match.in_place > best[1] else best
-            if match.in_place > SURE_INLIER_RATIO:
+        as_well = is_far and match.inlier_ratio > own - 0.05 and match.max_shift < found.max_shift / 2
+        if match.inlier_ratio >= LEAST_INLIER_RATIO and (match.inlier_ratio > own + CLEAR_MARGIN or as_well):
+            best = (name, match.inlier_ratio) if best is None or match.inlier_ratio > best[1] else best
+            if match.inlier_ratio > SURE_INLIER_RATIO:
                 break
     return best
 
@@ -188,7 +188,7 @@ class _Pair:
         stride = self.stride
         full = np.concatenate([moved[:, :2] * stride[:, None] / stride, (moved[:, 2] * stride)[:, None]], 1)
         shift, displaced = (each * float(stride.max()) for each in (_shift(moved, self.known.shape), displaced))
-        return Registration(full, shift, gain, offset, places, in_place, displaced, untouched=False)
+        return Registration(full, shift, gain, offset, places, in_place, displaced, is_identical=False)
 
     @cached_property
     def unmoved(self) -> tuple[np.ndarray, np.ndarray, tracks.Tracks]:
@@ -245,9 +245,9 @@ class _Pair:
 
 def _is_better(found: Registration, best: Registration) -> bool:
     """Does `found` have a larger inlier ratio than `best`, or the same with smaller displacements?"""
-    if found.in_place > best.in_place + 0.01 or np.isnan(best.in_place):
-        return not np.isnan(found.in_place)
-    return found.in_place > best.in_place - 0.01 and found.median_displacement < best.median_displacement
+    if found.inlier_ratio > best.inlier_ratio + 0.01 or np.isnan(best.inlier_ratio):
+        return not np.isnan(found.inlier_ratio)
+    return found.inlier_ratio > best.inlier_ratio - 0.01 and found.median_displacement < best.median_displacement
 
 
 def _compose(first: np.ndarray, then: np.ndarray) -> np.ndarray:

@@ -7,14 +7,14 @@ import numpy as np
 from reffusion.capture.lens import Lens, to_pixels, undistort_image, undistortion_map
 from reffusion.io.depth_maps import load_depth
 from reffusion.io.files import BadInput
-from reffusion.io.images import image_size, load_image, resize_nearest, resized
-from reffusion.references.files import GivenReference
+from reffusion.io.images import image_size, load_image, resize_image, resize_nearest
+from reffusion.references.files import ReferenceFile
 
 DOWNSCALE_ABOVE = 1.5  # times the width of the view: larger pictures are shrunk before they are resampled
 
 
-def load_straight(
-    given: GivenReference, lens: Lens, upright: bool, affine: np.ndarray | None = None
+def undistort_reference(
+    given: ReferenceFile, lens: Lens, upright: bool, affine: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Load a reference and undistort it like its view: uint8 [H, W, 3], and bool [H, W]: pixels that the file covers.
 
@@ -28,20 +28,20 @@ def load_straight(
     image, size = load_image(given.path, upright), (lens.width, lens.height)
     pinhole, where = undistortion_map(lens)
     if affine is None:
-        image = resized(image, size)
+        image = resize_image(image, size)
         straight = image if where is None or given.undistorted else undistort_image(image, where)
         return straight, np.ones(straight.shape[:2], bool)
     if image.shape[1] > DOWNSCALE_ABOVE * size[0]:
-        image = resized(image, size)
+        image = resize_image(image, size)
     points = _sampling_points(image.shape, pinhole if given.undistorted else lens, pinhole, affine)
     inside = ((points >= 0) & (points <= (image.shape[1], image.shape[0]))).all(-1)
     return undistort_image(image, points), inside
 
 
-def load_straight_depth(
-    given: GivenReference, lens: Lens, upright: bool, affine: np.ndarray | None = None
+def undistort_reference_depth(
+    given: ReferenceFile, lens: Lens, upright: bool, affine: np.ndarray | None = None
 ) -> np.ndarray | None:
-    """Load the depth map of a reference and undistort it like `load_straight`, by the nearest pixel.
+    """Load the depth map of a reference and undistort it like `undistort_reference`, by the nearest pixel.
 
     Returns:
         float32 [H, W], NaN where unknown; None where the reference has no depth map.

@@ -49,7 +49,7 @@ class RankedView:
 
 
 @torch.no_grad()
-def holes(
+def find_holes(
     remaining: Gaussians,
     cameras: Sequence[Camera],
     hidden: Mapping[str, np.ndarray],
@@ -80,7 +80,7 @@ def holes(
     return found
 
 
-def ranked(view_holes: Mapping[str, Hole], chosen: Sequence[str], most: int) -> list[RankedView]:
+def rank_views(view_holes: Mapping[str, Hole], chosen: Sequence[str], most: int) -> list[RankedView]:
     """Rank views greedily: those of `chosen`, then up to `most` others, each the one that covers most of what is not
     covered yet.
 
@@ -133,12 +133,12 @@ def _coverage(view_holes: Mapping[str, Hole]) -> tuple[dict[str, np.ndarray], in
     return covers, len(everything)
 
 
-def to_paint(known: np.ndarray, invent: np.ndarray) -> np.ndarray:
+def painting_template(known: np.ndarray, invent: np.ndarray) -> np.ndarray:
     """The picture to paint over, uint8 [H, W, 3]: the known background, grey where it has to be invented."""
     return np.where(invent[..., None], np.uint8(GREY), known)
 
 
-def words(views: Sequence[RankedView], painted: Sequence[str]) -> str:
+def format_ranking(views: Sequence[RankedView], painted: Sequence[str]) -> str:
     """The ranking as text, a line per view."""
     lines = ["# what each view would cover of all that has to be invented, beyond the views above it"]
     for number, each in enumerate(views, start=1):

@@ -26,7 +26,7 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
 
 def lacks(params: Params) -> list[str]:
     """What the stage needs on CUDA and this machine lacks."""
-    return machine.lacks(machine.machine(), params.memory_gb, splats=True, memory_param="distill.memory_gb")
+    return machine.find_missing(machine.detect(), params.memory_gb, splats=True, memory_param="distill.memory_gb")
 
 
 def cost(params: Params, card: str) -> Mapping[str, object] | None:

@@ -29,4 +29,4 @@ def unavailable(params: Params) -> list[str]:
 
 def lacks(params: Params) -> list[str]:
     """What this machine has not, and the stage needs on CUDA."""
-    return machine.lacks(machine.machine())
+    return machine.find_missing(machine.detect())

@@ -19,7 +19,7 @@ def preview(params: Params, *, poses: Path | None) -> list[str]:
 
 def lacks(params: Params) -> list[str]:
     """What the stage needs on CUDA and this machine lacks."""
-    return machine.lacks(machine.machine())
+    return machine.find_missing(machine.detect())
 
 
 def cost(params: Params, card: str) -> Mapping[str, object] | None:

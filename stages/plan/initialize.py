@@ -40,4 +40,4 @@ def preview(params: Params, **_: Path | None) -> list[str]:
 
 def lacks(params: Params) -> list[str]:
     """What the stage needs on CUDA and this machine lacks."""
-    return machine.lacks(machine.machine())
+    return machine.find_missing(machine.detect())

@@ -22,4 +22,4 @@ def machine_facts(params: Params) -> dict[str, str]:
 
 def lacks(params: Params) -> list[str]:
     """What the stage needs on CUDA and this machine lacks."""
-    return machine.lacks(machine.machine(), splats=False)
+    return machine.find_missing(machine.detect(), splats=False)

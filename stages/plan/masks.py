@@ -8,4 +8,4 @@ __all__ = ["Params", "lacks"]
 
 def lacks(params: Params) -> list[str]:
     """What the stage needs on CUDA and this machine lacks."""
-    return machine.lacks(machine.machine())
+    return machine.find_missing(machine.detect())

@@ -11,7 +11,7 @@ from reffusion.capture.roles import capture_views
 from reffusion.capture.scene_folder import check_gaussian_files, is_gaussians_only, read_scene
 from reffusion.params.clicks import CLICKS
 from reffusion.params.poses import Params
-from reffusion.references.files import PAINTED, describe_references, load_given
+from reffusion.references.files import PAINTED, describe_references, load_reference_files
 
 # Endings of files that this stage reads only as photographs or depth maps of the capture; others belong to references.
 NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".npy", ".exr")
@@ -51,7 +51,7 @@ def preview(params: Params, scene: Path) -> list[str]:
         who = f"{len(found[0].lenses)} cameras of {found[1].relative_to(scene)}" if found else "cameras around the hole"
         return [f"no photographs: {who} look at renders of {params.gaussians} instead", *brought]
     capture, roles = read_scene(params, scene, params.longest)
-    given = load_given(scene, capture_views(capture, roles), params.reference)
+    given = load_reference_files(scene, capture_views(capture, roles), params.reference)
     notes = [f"{len(roles.train)} training and {len(roles.test)} test views"]
     notes += [f"{len(roles.blank)} views are cameras only"] if roles.blank else []
     notes += _describe_poses(capture, scene)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from reffusion.capture.views import placed_views
+from reffusion.capture.views import load_placed_views
 from reffusion.cost import estimate
 from reffusion.io import machine
 from reffusion.params.reference import Params, reference_list
-from reffusion.references.files import PAINTED, describe_references, list_paintings, load_given
+from reffusion.references.files import PAINTED, describe_references, list_paintings, load_reference_files
 from reffusion.weights import local, painters
 from reffusion.weights.published import PAINTERS
 
@@ -46,7 +46,11 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
     can be checked: against the views that `poses` placed (before it has run, `poses` checks them against the
     capture's)."""
     if reference_list(params.reference) or list_paintings(scene):
-        views = describe_references(load_given(scene, placed_views(poses), params.reference)) if poses else ""
+        views = (
+            describe_references(load_reference_files(scene, load_placed_views(poses), params.reference))
+            if poses
+            else ""
+        )
         return [f"takes over the scene's reference{views and ' ' + views}: no diffusion here"]
     if params.inpainter == "diffusion":
         return []
@@ -59,7 +63,7 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
 
 def lacks(params: Params) -> list[str]:
     """What this machine lacks for the stage on CUDA."""
-    return machine.lacks(machine.machine(), params.memory_gb, splats=False, memory_param="reference.memory_gb")
+    return machine.find_missing(machine.detect(), params.memory_gb, splats=False, memory_param="reference.memory_gb")
 
 
 def cost(params: Params, card: str) -> Mapping[str, object] | None:

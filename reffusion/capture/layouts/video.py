@@ -17,7 +17,7 @@ from reffusion import trace
 from reffusion.capture.undistort import fitting_size
 from reffusion.io.arrays import save_json
 from reffusion.io.files import BadInput, reading
-from reffusion.io.images import resized
+from reffusion.io.images import resize_image
 
 MOST = 80  # frames at most: what can be matched pair by pair within minutes
 FEWEST = 12  # frames
@@ -55,7 +55,7 @@ class FrameStats:
     distance: float
 
 
-def take(video: Path, folder: Path, content: str) -> str:
+def extract_frames(video: Path, folder: Path, content: str) -> str:
     """Write the selected frames to folder/images, all measurements to frames.csv, and frames.json last.
 
     The same file gives the same frames. Rotation that the file declares is obeyed.
@@ -104,7 +104,7 @@ def measure_frames(video: Path) -> list[FrameStats]:
     frames = _frames(video, lambda number: number % every == 0)
     for _, (number, seconds, frame) in zip(trace.progress(-(-count // every), "frames"), frames, strict=False):
         gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-        at = lambda longest, gray=gray: resized(gray, fitting_size(gray.shape[1], gray.shape[0], longest))
+        at = lambda longest, gray=gray: resize_image(gray, fitting_size(gray.shape[1], gray.shape[0], longest))
         sharp = sharpness(at(SHARP))
         seen.append(FrameStats(number, seconds, sharp, way.update(at(FLOW), sharp)))
     return seen

@@ -117,7 +117,7 @@ class TermInputs:
 
 def cycle_through(views: Sequence[TrainView], seed: int, label: str) -> Callable[[int], TrainView]:
     """Turn -> view: every view once an epoch, in a random order that `seed`, `label` and epoch determine."""
-    return lambda turn: views[seeding.in_epochs(turn, len(views), seed, "distill", label)]
+    return lambda turn: views[seeding.epoch_index(turn, len(views), seed, "distill", label)]
 
 
 def reach_hole(settings: Params, everywhere: bool = False) -> Callable[[Tensor, View], Tensor]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from reffusion.graph_cut import least_cut
+from reffusion.graph_cut import min_cut
 
 COLOR_WEIGHT = 0.7  # weight of plain colour, beside that of detail, which is 1
 GRADIENT_WEIGHT = 2.0  # weight of the detail's change to the next pixel
@@ -75,7 +75,7 @@ def expand(cost: np.ndarray, look: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         np.add.at(move, first, first_moves - seams - cut)
         np.add.at(move, second, cut - first_moves)
         shared = np.minimum(keep, move)
-        moves = least_cut(COST_SCALE * (move - shared), COST_SCALE * (keep - shared), pairs, COST_SCALE * cut)
+        moves = min_cut(COST_SCALE * (move - shared), COST_SCALE * (keep - shared), pairs, COST_SCALE * cut)
         proposal = np.where(moves, candidate, labels)
         if (proposal == labels).all():
             continue
