@@ -41,10 +41,9 @@ def run(
     """Write gaussians.ply, labels.npy (the new ones), facts.json, depth/<view>.exr, extra_views/<view>.png, and masks:
     shadows/ and invent/<view>.png."""
     space = Workspace(poses, fit, masks, params.device)
-    scene, sets = space.scene, space.mask_sets
+    draft, scene, sets = Draft.start(space.remaining), space.scene, space.mask_sets
     train = [scene.cameras[name] for name in scene.train]
     references = load_completed(params, space, reference, lift)
-    draft = Draft.start(space.remaining)
     if params.tidy and params.start != "nothing":  # where nothing takes their place, floaters are better than a hole
         unobserved = {camera.name: sets[camera.name].unobserved for camera in train}
         draft = draft.drop(voting.find_floaters(draft.gaussians, train, unobserved, FLOATER_RATIO))

@@ -12,9 +12,9 @@ from reffusion.background.model import Background
 from reffusion.depth import background_depth
 from reffusion.depth.background_depth import Completion
 from reffusion.gaussians.optimize import reconstruction_loss
-from reffusion.gaussians.sheets import Sheets
+from reffusion.gaussians.sheets import Sheets, sheet_gaussians
 from reffusion.gaussians.surfels import surface_gaussians, surface_normals
-from reffusion.initialize import coverage
+from reffusion.initialize import coverage, fill
 from reffusion.initialize import unprojection as rules
 from reffusion.initialize.draft import Draft
 from reffusion.initialize.refit import Supervision, crop_to_mask, repetitions
@@ -48,7 +48,7 @@ def references(scene, folder, *names):
 
 @pytest.mark.parametrize("how", [{}, {"planar_share": 2.0}], ids=["planes", "smooth"])
 def test_the_hidden_wall_is_rebuilt_where_it_was(scene, tmp_path, monkeypatch, how):
-    monkeypatch.setattr(initialize, "HOW", Completion(**how))
+    monkeypatch.setattr(fill, "COMPLETION", Completion(**how))
     initialize.run(initialize.Params(), tmp_path, **scene, reference=references(scene, tmp_path / "r", "a2"))
     gaussians, new = load_ply(tmp_path / "gaussians.ply"), load_labels(tmp_path / "labels.npy")
     before, removed = load_ply(scene["fit"] / "gaussians.ply"), load_labels(scene["masks"] / "labels.npy")
@@ -124,7 +124,7 @@ def test_normals_beside_a_crease_belong_to_their_own_plane():
 def test_the_new_surface_shows_no_holes_nearer_by_or_from_the_side(degrees, closer, turn):
     disparity, view, _ = slanted(degrees)
     black, whole = np.zeros((*disparity.shape, 3), np.uint8), np.ones(disparity.shape, bool)
-    surface = rules.surface(black, 1 / disparity, whole, view, 4, SHEETS)
+    surface = sheet_gaussians(black, 1 / disparity, whole, view, 4, SHEETS)
     a = np.radians(turn)
     pose = np.eye(4)
     pose[:3, :3] = [[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]]
@@ -138,7 +138,7 @@ def test_no_grid_shows_from_four_times_nearer(degrees):
     disparity, view, _ = slanted(degrees)
     white, whole = np.full((*disparity.shape, 3), 255, np.uint8), np.ones(disparity.shape, bool)
     near = view.cropped(view.width // 2 - 8, view.height // 2 - 8, 16, 16).resized(64, 64)
-    alpha = rasterizer.render(rules.surface(white, 1 / disparity, whole, view, 1, SHEETS), near).alpha
+    alpha = rasterizer.render(sheet_gaussians(white, 1 / disparity, whole, view, 1, SHEETS), near).alpha
     assert alpha.min() > 0.9 and alpha.std() < 0.02
 
 
@@ -183,7 +183,7 @@ def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side()
     reference = Reference(view, (picture * 255).round().astype(np.uint8), np.ones(depth.shape, bool))
     nothing = surface_gaussians(picture, depth, np.zeros(depth.shape, bool), view, sh_count=1)
     errors = []
-    for how in (replace(SHEETS, opacity=0.95, sunk=0.0, spread=0.4), SHEETS):
+    for how in (replace(SHEETS, opacity=0.95, offset_px=0.0, spread=0.4), SHEETS):
         background = Background([], {})
         drawn = rules.add_surface(Draft.start(nothing), reference, depth, reference.mask, background, how).gaussians
         inner = (slice(14, 26), slice(14, 34))

@@ -10,7 +10,7 @@ from reffusion.io.arrays import load_json, load_labels, save_json
 from reffusion.io.images import load_mask, save_mask
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets
-from reffusion.masks import regions, voting
+from reffusion.masks import consolidation, regions, voting
 from reffusion.types import Gaussians
 from stages import masks as stage
 from stages.masks import Params, run
@@ -130,7 +130,7 @@ def test_what_stands_inside_every_mask_is_the_object_although_it_was_outvoted(tm
         (at,), _ = geometry.project(np.array([[0.0, 0.0, NEAR]]), small.CAMERAS[name])
         spot = np.hypot(columns - at[0], rows - at[1]) < 2.5
         given[name] = small.true_mask(small.CAMERAS[name], NEAR) & ~spot
-    monkeypatch.setattr(stage, "GAP", 0.1)
+    monkeypatch.setattr(consolidation, "GAP", 0.1)
     found = {}
     for hull in (0.9, 1.0):
         (tmp_path / str(hull)).mkdir()

@@ -9,6 +9,7 @@ import pytest
 
 from reffusion import geometry
 from reffusion.background.mirrors import render_mirrors
+from reffusion.background.model import Background
 from reffusion.background.plane import CELLS, Plane
 from reffusion.background.visibility import DepthView, depth_range
 from reffusion.inpaint import exemplar, plane_frames
@@ -132,13 +133,13 @@ def hidden() -> np.ndarray:
     return (rows - 70) ** 2 + (columns - 62) ** 2 < 24**2
 
 
-def floor() -> exemplar.Around:
+def floor() -> Background:
     views = []
     for view in CAMERAS:
         depth = FLOOR.depth(view)
         depth = np.where(np.isfinite(depth) & (depth < 5), depth, 0).astype(np.float32)
-        views.append(DepthView.of(view, depth, depth_range(depth), hidden()))
-    return exemplar.Around(views, [FLOOR], {view.name: planks(view) for view in CAMERAS}, np.zeros(3), 1.0)
+        views.append(DepthView.from_range(view, depth, depth_range(depth), hidden()))
+    return Background(views, {view.name: planks(view) for view in CAMERAS}, planes=[FLOOR], radius=1.0)
 
 
 def test_planks_run_on_in_their_own_perspective():
@@ -242,7 +243,7 @@ def test_frames_are_the_derivative_of_a_planes_coordinates():
             for sign in (-1, 1):
                 moved = replace(view, cx=view.cx - sign * dx, cy=view.cy - sign * dy)
                 point = geometry.unproject(FLOOR.depth(moved), moved)[row, column]
-                coordinates.append(FLOOR.along @ (point - FLOOR.origin))
+                coordinates.append(FLOOR.axes @ (point - FLOOR.origin))
             numeric = (coordinates[1] - coordinates[0]) / (2 * h)
             assert np.allclose(frames[row, column, :, axis], numeric, rtol=1e-6, atol=1e-9)
 

@@ -187,7 +187,7 @@ def segment_surfaces(
 
 
 def segment_foreground(disparity: np.ndarray, known: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """int [H, W]: foreground objects, 1, 2, ..., nearer than everything they touch around the hole (see `segment_surfaces`).
+    """int [H, W]: foreground objects, 1, 2, ..., nearer than all they touch around the hole (see `segment_surfaces`).
 
     0 for the remaining pixels and where the depth is not known.
     """

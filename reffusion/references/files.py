@@ -38,7 +38,7 @@ class ReferenceFile:
     trust: bool = False
 
     @property
-    def way_to_trust(self) -> str:
+    def trust_hint(self) -> str:
         """What to write in scene.yaml so that the reference is used despite a failed check, in words."""
         if not self.painted:
             return "write `trust: true` beside it in scene.yaml"
