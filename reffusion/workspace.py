@@ -92,8 +92,13 @@ class Workspace:
 
     @cached_property
     def background(self) -> Background:
-        """What the photographs show around the object. Of a view without a photograph its render stands for one, and
-        what no photograph shows of it is hidden."""
+        """What the photographs show around the object, with the planes and mirrors that `masks` found."""
+        return surfaces_from_arrays(self.background_views, load_arrays(self.masks / SURFACES), self.device)
+
+    @cached_property
+    def background_views(self) -> Background:
+        """The background without planes and mirrors. A view without a photograph is rendered instead, and what no
+        photograph shows of it is hidden."""
         scene = self.scene
         names = (*scene.train, *scene.blank)
         hidden = {name: self.hidden(name) for name in names}
@@ -102,7 +107,7 @@ class Workspace:
             everything = np.ones_like(hidden[name])
             nothing = np.zeros((1, 1, 3), np.uint8)
             photos[name] = inpaint.composite_background(self.gaussians, scene.cameras[name], nothing, everything)
-        background = Background(
+        return Background(
             render_depth_views(self.gaussians, [scene.cameras[name] for name in names], hidden),
             photos,
             {name: each.consistent for name, each in self.mask_sets.items()},
@@ -110,4 +115,3 @@ class Workspace:
             unobserved={name: each.unobserved for name, each in self.mask_sets.items()},
             without_photo=frozenset(scene.blank),
         )
-        return surfaces_from_arrays(background, load_arrays(self.masks / SURFACES), self.device)

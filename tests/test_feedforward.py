@@ -283,7 +283,7 @@ def test_a_job_is_told_before_any_work_and_keyed_by_the_files_content(own_cache,
     word, reason = planned("priors/tiny")
     assert word == "missing" and "Carve/LaMa-ONNX is not on this machine" in reason and "(208 MB)" in reason
     script(file)
-    assert planned(file)[0] == "undecided", "it waits for masks"
+    assert planned(file)[0] == "pending", "it waits for masks"
     hashes = Hashes(tmp_path / "hashes.json")
     before = hashes.weights(file)
     file.write_bytes(file.read_bytes() + b"more")

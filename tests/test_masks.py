@@ -12,7 +12,6 @@ from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets
 from reffusion.masks import consolidation, regions, voting
 from reffusion.types import Gaussians
-from stages import masks as stage
 from stages.masks import Params, run
 
 NEAR, FAR = 1.7, 0.8  # a square close to the wall hides part of it from all views; a distant one next to nothing

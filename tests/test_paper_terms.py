@@ -14,6 +14,7 @@ from small_params import altered
 from small_prior import small_prior
 from test_distill import camera, train_view, wall
 
+from reffusion.background.model import Background
 from reffusion.distill import loop
 from reffusion.distill.adversary import Adversary
 from reffusion.distill.display_range import clamp_to_display
@@ -22,8 +23,10 @@ from reffusion.distill.terms.depth import _downscale
 from reffusion.fit import step
 from reffusion.gaussians.optimize import Rates
 from reffusion.geometry import cameras_extent
+from reffusion.initialize.draft import Draft
 from reffusion.io.arrays import load_labels
 from reffusion.io.scene import load_mask_sets, load_references, load_scene, save_mask_sets
+from reffusion.masks.consolidation import clean_mask
 from reffusion.params.distill import Params, Sds
 from reffusion.params.fit import LearningRates
 from reffusion.params.personalize import Samples
@@ -80,14 +83,16 @@ def test_a_view_without_invented_pixels_is_distilled_where_c_is_repainted(views_
     assert torch.equal(views["a3"].repaint, hidden) and not views["a4"].repaint.any()
 
 
-def test_settling_leaves_what_is_to_be_drawn_alone(tmp_path, monkeypatch):
-    said = {}
-    monkeypatch.setattr(initialize, "refit", lambda scene, exact, known, *_: said.update(known.hidden) or scene)
-    hidden, drawn = np.eye(4, dtype=bool), np.eye(4, dtype=bool)[::-1]
-    view = type("View", (), {"camera": camera(), "hidden": hidden})
-    around = type("Around", (), {"cameras": [camera()], "photos": {}, "views": [view]})
-    initialize.settled(initialize.Params(refit_steps=1), tmp_path, None, None, [], around, {"a": drawn})
-    assert (said["a"] == hidden | drawn).all()
+def test_the_refit_is_not_supervised_where_an_object_is_drawn(tmp_path, monkeypatch):
+    found = {}
+    monkeypatch.setattr(initialize, "refit", lambda scene, exact, known, *_: found.update(known.hidden) or scene)
+    masked, invent = np.eye(4, dtype=bool), np.eye(4, dtype=bool)[::-1]
+    background = Background([type("View", (), {"camera": camera(), "masked": masked})], {})
+    space = type("Space", (), {"scene": type("Scene", (), {"clean": (), "blank": ()})})
+    sets = {"a": MaskSet(masked, masked, invent, invent)}
+    draft = Draft(None, torch.zeros(0, dtype=torch.bool))
+    initialize.refit_draft(initialize.Params(refit_steps=1), tmp_path, space, draft, background, [], [], sets)
+    assert (found["a"] == masked | invent).all()
 
 
 def test_a_clean_view_can_be_a_reference(tmp_path):
@@ -202,7 +207,7 @@ def test_positions_step_by_the_cameras_extent_as_3dgs_has_it():
     cameras = [camera("a", -0.3), camera("b", 0.3), camera("c", 0.0)]
     assert cameras_extent(cameras) == pytest.approx(1.1 * 0.3)
     for unit, factor in (("distance", 1.0), ("cameras", 1.1 * 0.3)):
-        rates = step.rates_of(LearningRates(means_unit=unit), cameras)
+        rates = step.learning_rates(LearningRates(means_unit=unit), cameras)
         ours = loop.rates_of(Params(lr={"means_unit": unit}).lr, cameras)
         for each in (rates, ours):
             assert (each.means, each.means_last) == pytest.approx((1.6e-4 * factor, 1.6e-6 * factor))
@@ -210,10 +215,10 @@ def test_positions_step_by_the_cameras_extent_as_3dgs_has_it():
 
 
 def test_what_the_paper_does_not_do_can_be_left_out(monkeypatch):
-    monkeypatch.setattr(fit.image_detail, "harmonics", lambda *_: (0, 1.0))
+    monkeypatch.setattr(fit.image_detail, "supported_sh_degree", lambda *_: (0, 1.0))
     scene = type("Scene", (), {"points": None, "cameras": {}, "train": ()})
     degree = lambda few_views: fit.supported(fit.Params(few_views=few_views), scene).sh.degree
     assert [degree(each) for each in ("as_many", "fewer_harmonics", "surfaces")] == [3, 0, 0]
     speck = np.zeros((100, 200), bool)
     speck[50, 50] = True
-    assert not masks.tidied(masks.Params(), speck).any() and masks.tidied(masks.Params(tidy=False), speck).sum() == 1
+    assert not clean_mask(masks.Params(), speck).any() and clean_mask(masks.Params(tidy=False), speck).sum() == 1

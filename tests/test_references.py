@@ -462,7 +462,7 @@ def test_saved_masks_rerun_neither_poses_nor_the_fit(tmp_path):
     (folder / "scene.yaml").unlink()
     for path, content in masks.items():
         path.write_bytes(content)
-    assert words() == before | {"raw_masks": "run", "masks": "undecided"}
+    assert words() == before | {"raw_masks": "run", "masks": "pending"}
     run_scene(request, "raw_masks")
     last = max(masks)
     save_mask(last, np.roll(load_image(last)[..., 0] > 0, 2, 0))
