@@ -17,7 +17,7 @@ PYTHON ?= python3
 VENV ?= .venv
 PY := $(VENV)/bin/python
 RUN := $(VENV)/bin/reffusion
-STAGES := poses raw_masks fit masks reference lift initialize personalize distill evaluate
+STAGES := poses raw_masks fit masks reference lift initialize personalize distill finish evaluate
 
 of = --scene="$$scene"
 where = $(if $(variant),--variant="$$variant") $(if $(runs),--runs="$$runs")

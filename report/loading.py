@@ -12,7 +12,8 @@ from report import curves, sheet
 from report.results import load_receipts
 
 ORDER = (
-    "poses", "raw_masks", "fit", "masks", "reference", "lift", "initialize", "personalize", "distill", "evaluate",
+    "poses", "raw_masks", "fit", "masks", "reference", "lift", "initialize", "personalize", "distill", "finish",
+    "evaluate",
 )  # fmt: skip
 
 
