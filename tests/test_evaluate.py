@@ -249,7 +249,7 @@ def test_a_held_out_view_that_shows_the_object_is_scored_outside_its_mask_only(t
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[8:32, 3:37] = True  # 2 px wider, a disk at its corners
     picture, truth = (load_image(p / "view0.png") for p in (tmp_path / "out/renders", folders["poses"] / "images"))
-    nearly = image_metrics.outside(picture, truth, mask)
+    nearly = image_metrics.score_outside(picture, truth, mask)
     assert float(row["psnr_outside"]) == pytest.approx(nearly["psnr_outside"], abs=0.05)
     assert summary["protocol"]["outside_margin"] == 0.05
 

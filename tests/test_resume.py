@@ -26,16 +26,8 @@ from runner.resolve import Request, resolve
 ROOT = Path(__file__).resolve().parent.parent
 KILLS = int(os.environ.get("RESUME_KILLS", "3"))
 STAGES = ("fit", "masks", "reference", "personalize", "initialize", "distill", "finish", "evaluate")
-IN_TURN = (
-    "fit",
-    "distill",
-    "personalize",
-    "masks",
-    "evaluate",
-    "initialize",
-    "finish",
-    "reference",
-)  # those that resume first
+# Those that resume come first.
+IN_TURN = ("fit", "distill", "personalize", "masks", "evaluate", "initialize", "finish", "reference")
 SMALL = (
     "fit.iterations=120 fit.checkpoint_seconds=0.2 personalize.steps=16 personalize.optimizer.batch=2 "
     "personalize.checkpoint_seconds=0.2 distill.iterations=40 distill.checkpoint_seconds=0.2"
