@@ -71,7 +71,7 @@ def apart(folder: Path) -> tuple[Gaussians, Gaussians]:
 
 
 def added_in(result: Gaussians, folder: Path) -> Tensor:
-    """bool [N]: those of the finished scene that a stage labelled as new. `evaluate` leaves out and adds Gaussians, so
+    """bool [N]: those of the finished scene that a stage labelled as new. `finish` leaves out and adds Gaussians, so
     they are told by where they are; what it adds beyond the capture counts as kept."""
     from scipy.spatial import cKDTree
 
