@@ -42,8 +42,8 @@ def run(
         share = unseen_share(scene, gaussians["fit"], raw_masks, masks)
     has_backdrop = share is not None and share > MIN_UNSEEN_SHARE
     if share is not None:
-        verb = "closed by" if has_backdrop else "left without"
-        print(f"{share:.1%} of a training view is seen in no other one: the scene is {verb} a backdrop", flush=True)
+        which = "with a backdrop" if has_backdrop else "without a backdrop"
+        print(f"{share:.1%} of a training view's pixels show what no other training view does: {which}", flush=True)
     if has_backdrop:
         # What was invented in views without photographs counts as seen.
         views = (*scene.train, *scene.blank) if reference else scene.train
