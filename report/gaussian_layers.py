@@ -73,7 +73,7 @@ def split_new(folder: Path) -> tuple[Gaussians, Gaussians]:
 def find_added(result: Gaussians, folder: Path) -> Tensor:
     """bool [N]: Gaussians of the finished scene that a stage labelled as new.
 
-    They are matched by position, since `evaluate` removes and adds Gaussians; what it adds around the capture counts as
+    They are matched by position, since `finish` removes and adds Gaussians; what it adds around the capture counts as
     kept.
     """
     from scipy.spatial import cKDTree

@@ -12,7 +12,8 @@ from report import sheet, trace_charts
 from report.results import load_receipts
 
 STAGES = (
-    "poses", "raw_masks", "fit", "masks", "reference", "lift", "initialize", "personalize", "distill", "evaluate",
+    "poses", "raw_masks", "fit", "masks", "reference", "lift", "initialize", "personalize", "distill", "finish",
+    "evaluate",
 )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ LINE_PERIOD, LINE_WIDTH = 14, 2  # distance between the lines of the hatching, a
 WORDS = "hatched: no photograph shows it"
 
 
-def load_seen_views(home: Path, scene: Scene) -> list[training_coverage.SeenView]:
+def load_seen_views(home: Path, scene: Scene) -> list[training_coverage.CoverageView]:
     """What the training views saw, according to the fit; empty if there is no fit."""
     fit = stage_folder(home, "fit") / "gaussians.ply"
     if not fit.exists():
@@ -28,11 +28,11 @@ def load_seen_views(home: Path, scene: Scene) -> list[training_coverage.SeenView
     train = [name for name in scene.train if name not in scene.clean]
     masks = load_raw_masks(stage_folder(home, "raw_masks"), train)
     masks |= {name: load_mask(path) for name in train if (path := consistent / f"{name}.png").exists()}
-    return training_coverage.seen_views(load_ply(fit), [scene.cameras[name] for name in scene.train], masks)
+    return training_coverage.render_coverage_views(load_ply(fit), [scene.cameras[name] for name in scene.train], masks)
 
 
 def hatch_unseen(
-    picture: np.ndarray, gaussians: Gaussians, camera: Camera, seen_by: list[training_coverage.SeenView]
+    picture: np.ndarray, gaussians: Gaussians, camera: Camera, seen_by: list[training_coverage.CoverageView]
 ) -> np.ndarray:
     """uint8 [H, W, 3]: the picture with everything that no training view saw hatched, and a label.
 
@@ -41,7 +41,7 @@ def hatch_unseen(
     Args:
         camera: of any size; a small one is faster.
     """
-    unseen = resize_nearest(training_coverage.unseen(gaussians, camera, seen_by), picture.shape[:2])
+    unseen = resize_nearest(training_coverage.unseen_pixels(gaussians, camera, seen_by), picture.shape[:2])
     if unseen.mean() < MIN_SHARE:
         return picture
     rows, columns = np.indices(unseen.shape)

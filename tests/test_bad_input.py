@@ -336,7 +336,7 @@ VALUES = {  # parameter -> values that it cannot have
     "reference.candidates": ("0", "true", "2.5"),
     "reference.sampler.steps": ("0", "on", "-1"),
     "distill.sds.patches": ("-1", "true"),
-    "evaluate.beyond": ("maybe",),
+    "finish.backdrop": ("maybe",),
 }
 
 

@@ -47,7 +47,7 @@ def with_more(gaussians: Gaussians, mean, sizes, color) -> Gaussians:
 
 def test_beyond_the_capture_the_picture_goes_on_softly_and_seen_pixels_stay():
     scene = wall()
-    done = backdrop.completed([scene], TRAIN)[0]
+    done = backdrop.complete_scene([scene], TRAIN)[0]
     for camera in TRAIN:
         assert np.abs(picture(done, camera) - picture(scene, camera)).max() < 0.02
     away = turned(75)
@@ -65,7 +65,7 @@ def test_beyond_the_capture_the_picture_goes_on_softly_and_seen_pixels_stay():
 def test_each_direction_takes_the_colours_that_lie_there():
     left, right = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
     color = lambda x, y: np.where(x[..., None] < 0, left, right)
-    done = backdrop.completed([small_scene.plane(small_scene.WALL, 2.0, 1.4, color)], TRAIN)[0]
+    done = backdrop.complete_scene([small_scene.plane(small_scene.WALL, 2.0, 1.4, color)], TRAIN)[0]
     to_the_left, to_the_right = (picture(done, turned(angle)).mean((0, 1)) for angle in (-80, 80))
     assert to_the_left[0] > 2 * to_the_left[2] and to_the_right[2] > 2 * to_the_right[0]
 
@@ -74,37 +74,37 @@ def test_needles_beyond_the_capture_go():
     needle = with_more(wall(), [5.0, 0.0, 2.0], [0.8, 0.01, 0.01], [0.0, 1.0, 0.0])
     away = turned(65)
     assert (picture(needle, away)[..., 1] - picture(wall(), away)[..., 1]).max() > 0.5
-    with_it, without = (picture(backdrop.completed([scene], TRAIN)[0], away) for scene in (needle, wall()))
+    with_it, without = (picture(backdrop.complete_scene([scene], TRAIN)[0], away) for scene in (needle, wall()))
     assert np.abs(with_it - without).max() < 0.05
 
 
 def test_what_one_training_view_shows_stays():
     spot = with_more(wall(), [0.9, 0.0, 1.9], [0.02, 0.02, 0.02], [0.0, 1.0, 0.0])
     assert any(np.abs(picture(spot, camera) - picture(wall(), camera)).max() > 0.3 for camera in TRAIN)
-    done = backdrop.completed([spot], TRAIN)[0]
+    done = backdrop.complete_scene([spot], TRAIN)[0]
     assert (done.means == spot.means[-1]).all(1).any()
 
 
 def test_a_scene_without_training_views_or_gaussians_is_left_alone():
     scene = wall()
-    assert backdrop.completed([scene], [])[0] is scene
+    assert backdrop.complete_scene([scene], [])[0] is scene
     nothing = scene.map(lambda p: p[:0])
-    assert len(backdrop.completed([nothing], TRAIN)[0]) == 0
+    assert len(backdrop.complete_scene([nothing], TRAIN)[0]) == 0
     behind = Camera("b", 8, 8, 8.0, 8.0, 4.0, 4.0, np.diag([-1.0, 1.0, -1.0, 1.0]))
-    assert len(backdrop.completed([scene], [behind])[0]) == len(scene)  # it sees none: nothing to continue
+    assert len(backdrop.complete_scene([scene], [behind])[0]) == len(scene)  # it sees none: nothing to continue
 
 
 # --- what was seen
 
 
-def seen_by(scene: Gaussians, masks=None) -> list[training_coverage.SeenView]:
-    return training_coverage.seen_views(scene, TRAIN, masks or {})
+def seen_by(scene: Gaussians, masks=None) -> list[training_coverage.CoverageView]:
+    return training_coverage.render_coverage_views(scene, TRAIN, masks or {})
 
 
 def test_a_view_that_everything_saw_has_nothing_unseen():
     scene = wall()
     for name in small_scene.TEST:
-        assert not training_coverage.unseen(scene, small_scene.CAMERAS[name], seen_by(scene))[2:-2, 2:-2].any()
+        assert not training_coverage.unseen_pixels(scene, small_scene.CAMERAS[name], seen_by(scene))[2:-2, 2:-2].any()
 
 
 def test_unseen_is_what_lies_outside_all_frames():
@@ -112,7 +112,7 @@ def test_unseen_is_what_lies_outside_all_frames():
     aside = small_scene.camera("aside", 1.0)
     x = small_scene.wall_points(aside)[..., 0]
     edge = TRAIN[-1].center[0] + small_scene.WALL * small_scene.WIDTH / 2 / small_scene.FOCAL
-    found = training_coverage.unseen(scene, aside, seen_by(scene))
+    found = training_coverage.unseen_pixels(scene, aside, seen_by(scene))
     assert small_scene.iou(found, x > edge) > 0.95
     assert 0.3 < found.mean() < 0.9
 
@@ -128,9 +128,23 @@ def test_unseen_is_what_all_training_views_hide_behind_something_or_under_masks(
     framed = np.any([((uv >= 0) & (uv < (c.width, c.height))).all(-1) & ~small_scene.behind_square(points, c, at)
                      for c in TRAIN for uv in [small_scene.geometry.project(points, c)[0]]], 0)  # fmt: skip
     here = ~small_scene.behind_square(points, aside, at)  # the square itself was seen
-    assert small_scene.iou(training_coverage.unseen(both, aside, seen_by(both)) & here, ~framed & here) > 0.85
+    assert small_scene.iou(training_coverage.unseen_pixels(both, aside, seen_by(both)) & here, ~framed & here) > 0.85
     hidden = {c.name: np.ones((c.height, c.width), bool) for c in TRAIN}
-    assert training_coverage.unseen(scene, TRAIN[0], seen_by(scene, hidden)).all()
+    assert training_coverage.unseen_pixels(scene, TRAIN[0], seen_by(scene, hidden)).all()
+
+
+def test_a_view_tells_what_a_further_one_would_show_for_the_first_time():
+    """Of the outermost views an outer strip is in no other one, and of those between nothing."""
+    scene = small_scene.plane(small_scene.WALL, 4.0, 2.4, small_scene.texture)
+    views = seen_by(scene)
+    share = training_coverage.leave_one_out_unseen_share(scene, views)
+    step = np.diff(sorted(view.camera.center[0] for view in views))
+    strips = [step[k] * small_scene.FOCAL / small_scene.WALL / small_scene.WIDTH for k in (0, -1)]
+    assert share == pytest.approx(sum(strips) / len(views), rel=0.2)
+    assert training_coverage.leave_one_out_unseen_share(scene, views[:1]) == 1.0
+    hidden = {c.name: np.ones((c.height, c.width), bool) for c in TRAIN}
+    assert training_coverage.leave_one_out_unseen_share(scene, seen_by(scene, hidden)) == 0.0  # all is the object
+    assert training_coverage.leave_one_out_unseen_share(scene, []) == 0.0
 
 
 # --- what is counted
@@ -153,8 +167,8 @@ def test_scores_of_seen_pixels_only():
     assert row["psnr_outside_seen"] == row["psnr_outside"] and row["unseen_share"] == 0
 
 
-def test_evaluate_counts_the_unseen_apart_and_shows_no_black(tmp_path):
-    from stages import evaluate
+def test_evaluate_counts_the_unseen_apart_and_shows_no_black(tmp_path, monkeypatch):
+    from stages import evaluate, finish
 
     poses, fit, _ = small_scene.write(tmp_path, 1.0)
     scene = load_scene(poses)
@@ -162,15 +176,13 @@ def test_evaluate_counts_the_unseen_apart_and_shows_no_black(tmp_path):
     cameras = scene.cameras | {"t0": aside}
     save_scene(poses, type(scene)(**{**scene.__dict__, "cameras": cameras}))
     save_image(poses / "images" / "t0.png", small_scene.photo(aside))
+    given = {"poses": poses, "raw_masks": poses.with_name("raw_masks"), "fit": fit}
+    monkeypatch.setattr(finish, "MIN_UNSEEN_SHARE", 0.0)
     for name in ("on", "off"):
-        (tmp_path / name).mkdir()
-        evaluate.run(
-            evaluate.Params(beyond=name == "on"),
-            tmp_path / name,
-            poses=poses,
-            raw_masks=poses.with_name("raw_masks"),
-            fit=fit,
-        )
+        for folder in (tmp_path / name, tmp_path / f"finish-{name}"):
+            folder.mkdir()
+        finish.run(finish.Params(backdrop=name == "on"), tmp_path / f"finish-{name}", **given)
+        evaluate.run(evaluate.Params(), tmp_path / name, **given, finish=tmp_path / f"finish-{name}")
     on, off = (load_json(tmp_path / name / "metrics.json") for name in ("on", "off"))
     assert on["mean"]["unseen_share"] == off["mean"]["unseen_share"] > 0.1
     assert on["mean"]["psnr_outside_seen"] > off["mean"]["psnr_outside_seen"] - 0.05

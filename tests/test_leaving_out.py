@@ -25,15 +25,17 @@ UNUSED = ("diffusers", "transformers", "peft", "tokenizers", "pycolmap", "torchv
 STAGES = """
 import sys
 from pathlib import Path
-from stages import evaluate, initialize, masks
+from stages import evaluate, finish, initialize, masks
 home = Path(sys.argv[1])
 given, raw_masks = {"poses": home / "poses", "fit": home / "fit"}, home / "raw_masks"
-for name in ("masks", "initialize", "evaluate"):
+for name in ("masks", "initialize", "finish", "evaluate"):
     (home / name).mkdir()
 masks.run(masks.Params(negligible=0.2), home / "masks", **given, raw_masks=raw_masks)
 given["masks"] = home / "masks"
 initialize.run(initialize.Params(), home / "initialize", **given, reference=None)
-evaluate.run(evaluate.Params(), home / "evaluate", **given, raw_masks=raw_masks, initialize=home / "initialize")
+given |= {"raw_masks": raw_masks, "initialize": home / "initialize"}
+finish.run(finish.Params(), home / "finish", **given)
+evaluate.run(evaluate.Params(), home / "evaluate", **given, finish=home / "finish")
 print(sorted({name.split(".")[0] for name in sys.modules} & set(sys.argv[2].split())))
 """
 

@@ -115,21 +115,24 @@ def test_outside_a_mask_only_what_lies_outside_counts():
     image, truth = pair(40, 50)
     mask = np.zeros((40, 50), bool)
     mask[10:25, 15:35] = True
-    found = image_metrics.outside(image, truth, mask)
+    found = image_metrics.score_outside(image, truth, mask)
     assert found["psnr_outside"] == pytest.approx(-10 * np.log10(((image - truth)[~mask] ** 2).mean()))
     other = np.where(mask[..., None], np.random.default_rng(1).random((40, 50, 3)), image)
-    assert image_metrics.outside(other, truth, mask) == found
+    assert image_metrics.score_outside(other, truth, mask) == found
     right = np.where(mask[..., None], image, truth)
-    clean = image_metrics.outside(right, truth, mask)
+    clean = image_metrics.score_outside(right, truth, mask)
     assert clean["psnr_outside"] == math.inf and clean["ssim_outside"] == pytest.approx(1) and not clean["flip_outside"]
 
 
 def test_outside_nothing_is_the_whole_picture_and_outside_all_is_nothing():
     image, truth = pair(20, 30)
-    found, whole = image_metrics.outside(image, truth, np.zeros((20, 30), bool)), image_metrics.score(image, truth)
+    found, whole = (
+        image_metrics.score_outside(image, truth, np.zeros((20, 30), bool)),
+        image_metrics.score(image, truth),
+    )
     assert found == {f"{name}_outside": pytest.approx(value) for name, value in whole.items()}
-    assert set(image_metrics.outside(image, truth, np.ones((20, 30), bool)).values()) == {None}
-    small = image_metrics.outside(image[:10], truth[:10], np.zeros((10, 30), bool))
+    assert set(image_metrics.score_outside(image, truth, np.ones((20, 30), bool)).values()) == {None}
+    small = image_metrics.score_outside(image[:10], truth[:10], np.zeros((10, 30), bool))
     assert small["ssim_outside"] is None and small["flip_outside"] > 0
 
 

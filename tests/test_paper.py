@@ -98,7 +98,7 @@ ABSENT = {
     "distill.sds.keep_contrast": False,
     "distill.reference.weight": 0,
     "distill.reference.reaches": "masked",
-    "evaluate.beyond": False,
+    "finish.backdrop": False,
 }
 # What it says and the profile does not do, or says without saying how.
 OTHERWISE = {"fit.densify.cap_max", "fit.densify.prune_scale3d", "distill.densify.every"}

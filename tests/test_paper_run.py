@@ -33,7 +33,8 @@ STAGES = {
     "personalize": ("poses", "raw_masks", "reference"),
     "initialize": ("poses", "fit", "masks", "reference"),
     "distill": ("poses", "fit", "masks", "reference", "personalize", "initialize"),
-    "evaluate": ("poses", "raw_masks", "fit", "masks", "reference", "personalize", "initialize", "distill"),
+    "finish": ("poses", "raw_masks", "fit", "masks", "reference", "initialize", "distill"),
+    "evaluate": ("poses", "raw_masks", "fit", "finish", "masks", "initialize", "distill"),
 }
 # All that differs from the profile: sizes and numbers of steps; where to compute, and where the weights lie.
 SIZES = {

@@ -25,8 +25,9 @@ from runner.resolve import Request, resolve
 
 ROOT = Path(__file__).resolve().parent.parent
 KILLS = int(os.environ.get("RESUME_KILLS", "3"))
-STAGES = ("fit", "masks", "reference", "personalize", "initialize", "distill", "evaluate")
-IN_TURN = ("fit", "distill", "personalize", "masks", "evaluate", "initialize", "reference")  # those that resume first
+STAGES = ("fit", "masks", "reference", "personalize", "initialize", "distill", "finish", "evaluate")
+# Those that resume come first.
+IN_TURN = ("fit", "distill", "personalize", "masks", "evaluate", "initialize", "finish", "reference")
 SMALL = (
     "fit.iterations=120 fit.checkpoint_seconds=0.2 personalize.steps=16 personalize.optimizer.batch=2 "
     "personalize.checkpoint_seconds=0.2 distill.iterations=40 distill.checkpoint_seconds=0.2"
@@ -50,9 +51,7 @@ def finish(scene: Path, runs: Path) -> dict:
     process = start(scene, runs, "all")
     output, _ = process.communicate(timeout=900)
     assert process.returncode == 0, output
-    metrics = json.loads((runs / scene.name / "evaluate" / "metrics.json").read_text())
-    metrics.pop("seconds")
-    return metrics
+    return json.loads((runs / scene.name / "evaluate" / "metrics.json").read_text())
 
 
 def kill_during(scene: Path, runs: Path, stage: str, delay: float) -> bool:

@@ -22,6 +22,7 @@ from reffusion.distill import perceptual
 from reffusion.distill.terms.lift import evaluate_lift
 from reffusion.initialize import random_init
 from reffusion.io.arrays import load_json, load_labels
+from reffusion.io.ground_truth import load_object_mask
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_raw_masks, load_references, load_scene, save_references
@@ -31,14 +32,14 @@ from runner.artifacts import hash_contents
 from runner.pipeline import load_pipeline
 from runner.plan import Decision, decide
 from runner.resolve import Job, Request, resolve
-from stages import distill, evaluate, fit, initialize, lift, masks
+from stages import distill, evaluate, finish, fit, initialize, lift, masks
 from stages.plan import fit as plan_fit
 
 ROOT = Path(__file__).resolve().parent.parent
 NEAR = 1.7
 
 # Variant -> (stages that run, stages left out beside `lift`); all others are shared with the scene's own run.
-AFTER = ("distill", "evaluate")
+AFTER = ("distill", "finish", "evaluate")
 FILLED = ("reference", "personalize", "initialize", "distill")
 PLANS = {
     "no_personalization": (AFTER, ("personalize",)),
@@ -48,9 +49,9 @@ PLANS = {
     "no_adversarial": ((), ()),
     "no_depth": ((), ()),
     "no_sds": (AFTER, ("personalize",)),
-    "masked": (("fit", "evaluate"), ("masks", *FILLED)),
-    "remove_only": (("initialize", "evaluate"), ("reference", "personalize", "distill")),
-    "inpaint_2d": (("evaluate",), FILLED),
+    "masked": (("fit", "finish", "evaluate"), ("masks", *FILLED)),
+    "remove_only": (("initialize", "finish", "evaluate"), ("reference", "personalize", "distill")),
+    "inpaint_2d": (("finish", "evaluate"), FILLED),
     "lift_mse": (("lift", "initialize", *AFTER), ("personalize",)),
     "lift_perceptual": (("lift", "initialize", *AFTER), ("personalize",)),
     "lift_perceptual_diffusion": (("lift", "initialize", *AFTER), ("personalize",)),
@@ -340,16 +341,12 @@ def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
         assert facts["inpainter"].startswith("OpenCV") and said == perceptual_name
         assert trace.read_trace(out / "trace.jsonl")[-1]["lift"] > 0
     out = tmp_path / "evaluate"
-    out.mkdir()
-    evaluate.run(
-        evaluate.Params(),
-        out,
-        **scene,
-        raw_masks=scene["poses"].with_name("raw_masks"),
-        initialize=chain["initialize"],
-        distill=tmp_path / "mse",
-        lift=painted,
-    )
+    given = scene | {"raw_masks": scene["poses"].with_name("raw_masks")}
+    given |= {"initialize": chain["initialize"], "distill": tmp_path / "mse"}
+    for folder in (tmp_path / "finish", out):
+        folder.mkdir()
+    finish.run(finish.Params(), tmp_path / "finish", **given)
+    evaluate.run(evaluate.Params(), out, **given, finish=tmp_path / "finish")
     summary = load_json(out / "metrics.json")
     assert summary["inpainter"].startswith("OpenCV") and summary["perceptual"] is None
     assert summary["result"] == "distill" and summary["mean"]["psnr_box"] > 20
@@ -357,12 +354,12 @@ def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
 
 
 def test_rendered_views_inpainted_in_2d(scene, tmp_path):
-    (tmp_path / "fit").mkdir()
-    (tmp_path / "inpainted").mkdir()
-    evaluate.run(evaluate.Params(), tmp_path / "fit", **scene, raw_masks=scene["poses"].with_name("raw_masks"))
-    evaluate.run(
-        evaluate.Params(inpaint=True), tmp_path / "inpainted", **scene, raw_masks=scene["poses"].with_name("raw_masks")
-    )
+    for name in ("finish", "fit", "inpainted"):
+        (tmp_path / name).mkdir()
+    given = scene | {"raw_masks": scene["poses"].with_name("raw_masks")}
+    finish.run(finish.Params(), tmp_path / "finish", **given)
+    evaluate.run(evaluate.Params(), tmp_path / "fit", **given, finish=tmp_path / "finish")
+    evaluate.run(evaluate.Params(inpaint=True), tmp_path / "inpainted", **given, finish=tmp_path / "finish")
     before, after = (load_json(tmp_path / n / "metrics.json") for n in ("fit", "inpainted"))
     assert before["inpainter"] is None and after["inpainter"].startswith("OpenCV") and after["result"] == "fit"
     assert after["mean"]["psnr_box"] > before["mean"]["psnr_box"] + 5, "the red square is still there"
@@ -407,6 +404,6 @@ def test_the_box_is_the_test_masks_whatever_was_left_out(scene, tmp_path):
     view, given = small.CAMERAS["a1"], load_mask(scene["masks"] / "consistent" / "a1.png")
     raw_masks = scene["poses"].with_name("raw_masks")
     raw = load_raw_masks(raw_masks, ["a1"])["a1"]
-    assert (evaluate.mask_of(view, raw_masks, scene["masks"]) == given).all()
-    assert (evaluate.mask_of(view, raw_masks, None) == raw).all()
-    assert not evaluate.mask_of(small.CAMERAS["t0"], raw_masks, None).any()
+    assert (load_object_mask(view, raw_masks, scene["masks"]) == given).all()
+    assert (load_object_mask(view, raw_masks, None) == raw).all()
+    assert not load_object_mask(small.CAMERAS["t0"], raw_masks, None).any()

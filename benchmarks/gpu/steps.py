@@ -133,7 +133,8 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[DepthEstimator, str]:
         ))  # fmt: skip
         torch.nn.init.constant_(model.head.conv3.bias, 1e4)  # else the last ReLU would cut nearly all values to 0
         network, source = monocular.make_network(model, device), "random"
-    tries = [network_estimator(lambda image, sign=sign: sign * monocular.predict_disparity(network, image), Completion())
+    tries = [
+        network_estimator(lambda image, sign=sign: sign * monocular.predict_disparity(network, image), Completion())
              for sign in (1, -1)]  # fmt: skip
 
     def disparity(view: ViewDepth, picture: Callable[[], np.ndarray]) -> np.ndarray:

@@ -23,12 +23,12 @@ from reffusion import trace
 from reffusion.distill.loop import average, build_objective, masked_factors, take_step
 from reffusion.gaussians.optimize import GaussianOptimizer
 from reffusion.io.arrays import load_json, save_json
+from reffusion.io.ground_truth import load_ground_truth, load_object_mask
 from reffusion.io.scene import load_scene
 from reffusion.metrics import image_metrics
 from reffusion.splat import rasterizer
 from report import charts
 from stages import distill as stage
-from stages import evaluate
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -76,8 +76,8 @@ def load_test_views(run: Path) -> list[tuple]:
     scene, found = load_scene(run / "poses"), []
     for name in scene.test:
         camera = scene.cameras[name]
-        truth = evaluate.truth_of(camera, run / "poses")
-        box = image_metrics.mask_box(evaluate.mask_of(camera, run / "raw_masks", run / "masks"))
+        truth = load_ground_truth(camera, run / "poses")
+        box = image_metrics.mask_box(load_object_mask(camera, run / "raw_masks", run / "masks"))
         if truth is not None and box is not None:
             found.append((camera, truth, box))
     if not found:

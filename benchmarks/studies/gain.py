@@ -16,11 +16,11 @@ import numpy as np
 
 from benchmarks.studies.holes import gradient_energy
 from reffusion.io.arrays import load_json, save_json
+from reffusion.io.ground_truth import load_ground_truth, load_object_mask
 from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import load_scene
 from reffusion.metrics import image_metrics
 from report.sheet import compose_sheet, enlarge, pick_evenly, stage_folder
-from stages import evaluate
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -43,11 +43,11 @@ def evaluate_run(run: Path) -> dict:
         raise ValueError(f"{run}: no test view has ground truth and a mask")
     energies: dict[str, list[tuple[float, float]]] = {"truth": [], **{way: [] for way in RENDERS}}
     for name in scene.test:
-        mask = evaluate.mask_of(scene.cameras[name], stage_folder(run, "raw_masks"), stage_folder(run, "masks"))
+        mask = load_object_mask(scene.cameras[name], stage_folder(run, "raw_masks"), stage_folder(run, "masks"))
         left, top, right, bottom = image_metrics.mask_box(mask)
         box = np.zeros_like(mask)
         box[top:bottom, left:right] = True
-        pictures = {"truth": evaluate.truth_of(scene.cameras[name], stage_folder(run, "poses"))}
+        pictures = {"truth": load_ground_truth(scene.cameras[name], stage_folder(run, "poses"))}
         pictures |= {way: load_image(run / "evaluate" / folder / f"{name}.png") for way, folder in RENDERS.items()}
         for way, picture in pictures.items():
             energies[way].append((gradient_energy(picture, box), gradient_energy(picture, mask)))
@@ -92,9 +92,9 @@ def save_sheet(run: Path, path: Path) -> None:
         camera = scene.cameras[name]
         folders = ("renders_fit", *RENDERS.values())
         pictures = [load_image(run / "evaluate" / folder / f"{name}.png") for folder in folders]
-        pictures.append(evaluate.truth_of(camera, stage_folder(run, "poses")))
+        pictures.append(load_ground_truth(camera, stage_folder(run, "poses")))
         left, top, right, bottom = image_metrics.mask_box(
-            evaluate.mask_of(camera, stage_folder(run, "raw_masks"), stage_folder(run, "masks")), 0.3
+            load_object_mask(camera, stage_folder(run, "raw_masks"), stage_folder(run, "masks")), 0.3
         )
         rows.append([enlarge(picture[top:bottom, left:right], ENLARGE) for picture in pictures])
     height, width = (max(cell.shape[axis] for row in rows for cell in row) for axis in (0, 1))

@@ -23,7 +23,18 @@ from reffusion.io.arrays import load_json, save_json
 from report import charts
 
 ROOT = Path(__file__).resolve().parents[2]
-STAGES = ("poses", "raw_masks", "fit", "masks", "reference", "initialize", "personalize", "distill", "evaluate")
+STAGES = (
+    "poses",
+    "raw_masks",
+    "fit",
+    "masks",
+    "reference",
+    "initialize",
+    "personalize",
+    "distill",
+    "finish",
+    "evaluate",
+)
 VIEWS, PIXELS = (30, 60, 120, 300), (0.3, 0.6, 1.2, 2.0)  # megapixels
 WIDE, HIGH = 4, 3
 SHORT_JOB = (

@@ -43,12 +43,12 @@ from benchmarks.studies.holes import (
 )
 from reffusion import seeding, trace
 from reffusion.io.arrays import load_json, save_json
+from reffusion.io.ground_truth import load_ground_truth, load_object_mask
 from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import load_references, load_scene
 from reffusion.prior import diffusion, lora
 from reffusion.prior.model import Prior, load_prior
 from reffusion.prior.windows import window_around
-from stages import evaluate
 from stages import personalize as stage
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -120,8 +120,8 @@ def scene_cases(run: Path, size: int, pictures: dict[str, np.ndarray] | None = N
     scene = load_scene(run / "poses")
     found = {}
     for name in scene.test:
-        truth = evaluate.truth_of(scene.cameras[name], run / "poses")
-        hole = evaluate.mask_of(scene.cameras[name], run / "raw_masks", run / "masks")
+        truth = load_ground_truth(scene.cameras[name], run / "poses")
+        hole = load_object_mask(scene.cameras[name], run / "raw_masks", run / "masks")
         if truth is not None and hole.any():
             found[name] = Case(truth if pictures is None else pictures[name], hole, name)
     if not found:

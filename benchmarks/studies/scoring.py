@@ -13,13 +13,13 @@ import numpy as np
 from benchmarks.studies.holes import gradient_energy
 from reffusion.inpaint import classical
 from reffusion.io.arrays import load_json
+from reffusion.io.ground_truth import load_object_mask
 from reffusion.io.images import load_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
 from reffusion.metrics import image_metrics, lpips
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
-from stages import evaluate
 
 MIN_ALPHA = 0.9  # a pixel is uncovered below this alpha
 BLACK, LIT = 0.06, 0.15  # or if its brightest channel is below BLACK where the truth's is above LIT
@@ -63,7 +63,12 @@ class Run:
     def mask(self, name: str) -> np.ndarray:
         """bool [H, W]: pixels of the object, from the test mask of a test view, else the consistent mask."""
         masks = self.stage("masks")
-        return evaluate.mask_of(self.scene.cameras[name], self.stage("raw_masks"), masks if masks.exists() else None)
+        return load_object_mask(self.scene.cameras[name], self.stage("raw_masks"), masks if masks.exists() else None)
+
+    def seconds(self) -> float:
+        """Of all stages but evaluate, by their receipts."""
+        receipts = [load_json(path) for path in sorted(self.folder.glob("*/receipt.json"))]
+        return sum(receipt["seconds"] for receipt in receipts if receipt["stage"] != "evaluate")
 
     def gaussians(self) -> Gaussians:
         """The result's Gaussians."""
@@ -86,7 +91,7 @@ def score_place(run: Run, ceiling: Run, variants: Mapping[str, Run]) -> dict[str
             "train": _worst(run, {name: _untouched(run, ceiling, name) for name in run.scene.train}),
             "test": _worst(run, {name: run.truth(name) for name in run.scene.test}),
         },
-        "seconds": sum(run.metrics["seconds"].values()),
+        "seconds": run.seconds(),
         "variants": {name: _means(each.metrics["mean"]) for name, each in variants.items()},
     }
     return row

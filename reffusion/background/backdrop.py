@@ -1,8 +1,8 @@
-"""What no training view saw: Gaussians that none supports leave, and a backdrop closes the scene behind all others.
+"""Closes a scene where no training view looked: removes unsupported Gaussians and adds a soft backdrop behind the rest.
 
-Where views reach beyond the frames of the capture, or around a corner, a fit has nothing, or points that nothing ever
-taught. Both are seen at once, black and in blobs. A sphere around everything, in the blurred colours that lie in about
-the same direction, shows a soft continuation instead. (Tried, measured and left out: docs/beyond.md.)
+Beyond the frames of the capture and around its corners a fit has no Gaussians, or some that no photograph supervised.
+Views that look there show black holes and blobs. A sphere behind everything, in the blurred colours that lie in about
+the same direction, continues the scene softly instead. (What else was tried and measured: docs/beyond.md.)
 """
 
 from __future__ import annotations
@@ -19,22 +19,27 @@ from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
-SUPPORT = 0.1  # pixels of all training views together that a Gaussian must be worth to stay
-LONGEST = 256  # px a side at which the training views are looked at
-BLOCK = 16  # px a side of the patches whose mean colours the backdrop continues
-DISKS = 2000  # that make the sphere: 4.5 degrees from one to the next
-APART = math.sqrt(4 * math.pi / DISKS)  # radians
-CLEAR = 1.5  # its radius over the farthest that it must lie behind: less, and disks at a frame's edge stand before it
-SEEN_BLUR = 0.06  # radians around a patch of a view in which its colour is hardly mixed
-BROUGHT_BLUR = 0.2  # around a point that no view shows: a single stray one must not colour what is around it
+# Leave-one-out share of unseen pixels (`training_coverage`) from which a scene gets its backdrop. It is about twice the
+# share in held-out views: 0.0006 on `demo`, where a backdrop gains nothing; 0.007 to 0.05 on captures of real scenes.
+MIN_UNSEEN_SHARE = 0.01
+SUPPORT = 0.1  # px, blending weight over all training views that a Gaussian needs to stay
+LONGEST = 256  # px, larger side at which training views are rendered
+BLOCK = 16  # px, side of the blocks of a training view whose mean colours the backdrop continues
+DISKS = 2000  # Gaussians of the sphere: 4.5 degrees from one to the next
+SPACING = math.sqrt(4 * math.pi / DISKS)  # radians between neighbouring disks
+# Radius of the sphere over the distance of the farthest Gaussian or camera. Closer, disks at a frame's edge would stand
+# in front of what they must lie behind.
+CLEARANCE = 1.5
+VIEW_BLUR = 0.06  # radians around a block of a view in which its colour is hardly mixed with others
+POINT_BLUR = 0.2  # the same around a point that no view shows: a single stray one must not colour its neighbourhood
 
 
 class Patches(NamedTuple):
-    """S patches of colour, float64.
+    """Coloured rays: S patches, each seen from an origin along a direction; float64.
 
     Attributes:
-        origins, directions, colors: [S, 3], where they are seen from, along which way, and what.
-        blur: [S] radians in which the colour is hardly mixed with others.
+        origins, directions, colors: [S, 3].
+        blur: [S] radians around the ray in which the colour is hardly mixed with others.
     """
 
     origins: np.ndarray
@@ -43,30 +48,36 @@ class Patches(NamedTuple):
     blur: np.ndarray
 
 
-def completed(scenes: Sequence[Gaussians], cameras: Sequence[Camera]) -> list[Gaussians]:
-    """The supported Gaussians of each scene, in their order, and behind them the backdrop of the first.
+def complete_scene(scenes: Sequence[Gaussians], cameras: Sequence[Camera]) -> list[Gaussians]:
+    """The supported Gaussians of each scene, in their order, followed by the backdrop of the first scene.
 
-    Pixels that the training views see keep their colours: what leaves is not seen there, and what comes lies behind.
+    Pixels that the training views see keep their colours: what is removed does not show there, and what is added lies
+    behind everything.
 
     Args:
-        scenes: states of one scene, the finished one first. cameras: its training views; without any, nothing changes.
+        scenes: states of one scene, the final one first.
+        cameras: its training views; without any, the scenes come back unchanged.
     """
     if not cameras:
         return list(scenes)
-    small = [reduced(camera, LONGEST) for camera in cameras]
-    pixels = [of.width * of.height / (at.width * at.height) for of, at in zip(cameras, small, strict=True)]
-    supported = [support(gaussians, small, pixels) > SUPPORT for gaussians in scenes]
+    small = [shrink_camera(camera, LONGEST) for camera in cameras]
+    pixels = [full.width * full.height / (s.width * s.height) for full, s in zip(cameras, small, strict=True)]
+    supported = [blending_weights(gaussians, small, pixels) > SUPPORT for gaussians in scenes]
     kept = [gaussians.map(lambda p, stays=stays: p[stays]) for gaussians, stays in zip(scenes, supported, strict=True)]
-    patches = look(scenes[0], small)
+    patches = patches_of_views(scenes[0], small)
     if not len(kept[0]) or not len(patches.colors):
         return list(scenes)
-    rest = scenes[0].map(lambda p: p[~supported[0]])
-    behind = backdrop(kept, cameras, joined([patches, brought(rest, cameras)]))
+    removed = scenes[0].map(lambda p: p[~supported[0]])
+    behind = build_backdrop(kept, cameras, concatenate([patches, patches_outside_views(removed, cameras)]))
     return [each.zip_map(behind, lambda a, b: torch.cat([a, b.to(a)])) for each in kept]
 
 
-def support(gaussians: Gaussians, cameras: Sequence[Camera], pixels: Sequence[float]) -> torch.Tensor:
-    """[N] the blending weight of each Gaussian, summed over the views; `pixels`: for how many one of a view stands."""
+def blending_weights(gaussians: Gaussians, cameras: Sequence[Camera], pixels: Sequence[float]) -> torch.Tensor:
+    """[N] the blending weight of each Gaussian, summed over the pixels of all views.
+
+    Args:
+        pixels: for each camera, how many pixels of the full view one of its pixels stands for.
+    """
     total = gaussians.means.new_zeros(len(gaussians))
     for camera, share in zip(cameras, pixels, strict=True):
         ones = total.new_ones(camera.height, camera.width, 1)
@@ -75,18 +86,18 @@ def support(gaussians: Gaussians, cameras: Sequence[Camera], pixels: Sequence[fl
 
 
 @torch.no_grad()
-def look(gaussians: Gaussians, cameras: Sequence[Camera]) -> Patches:
-    """What one sees in these views."""
-    drawings = ((camera, rasterizer.render(gaussians, camera)) for camera in cameras)
-    seen = [_patches(c, d.color.double().cpu().numpy(), d.alpha.double().cpu().numpy()) for c, d in drawings]
-    return joined(seen)
+def patches_of_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> Patches:
+    """The blocks of all rendered views."""
+    renders = ((camera, rasterizer.render(gaussians, camera)) for camera in cameras)
+    return concatenate([_blocks(c, r.color.double().cpu().numpy(), r.alpha.double().cpu().numpy()) for c, r in renders])
 
 
-def brought(gaussians: Gaussians, cameras: Sequence[Camera]) -> Patches:
-    """What unsupported Gaussians tell that no frame holds: points of the scene's own, coloured by other photographs.
+def patches_outside_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> Patches:
+    """The unsupported Gaussians that lie in no view's frame, as seen from the middle of the cameras.
 
-    As Gaussians they are blobs, since nothing made a surface of them; their colours are true. Those within a frame lie
-    behind or in something, and say nothing.
+    These are points that the scene brought, coloured by photographs that are not among the training views. As Gaussians
+    they show as blobs, since nothing formed a surface of them, but their colours are true. Unsupported Gaussians within
+    a frame lie behind or inside something and tell nothing.
     """
     means = gaussians.means.double().cpu().numpy()
     outside = np.ones(len(means), bool)
@@ -94,77 +105,82 @@ def brought(gaussians: Gaussians, cameras: Sequence[Camera]) -> Patches:
         uv, _ = geometry.project(means, camera)
         outside &= ~((uv >= 0) & (uv < (camera.width, camera.height))).all(1)
     colors = 0.5 + SH0 * gaussians.sh[:, 0].double().cpu().numpy()[outside]
-    middle, blur = np.mean([camera.center for camera in cameras], axis=0), np.full(len(colors), BROUGHT_BLUR)
+    middle, blur = np.mean([camera.center for camera in cameras], axis=0), np.full(len(colors), POINT_BLUR)
     return Patches(np.broadcast_to(middle, colors.shape), means[outside] - middle, colors.clip(0, 1), blur)
 
 
-def joined(patches: Sequence[Patches]) -> Patches:
+def concatenate(patches: Sequence[Patches]) -> Patches:
+    """All patches in one."""
     return Patches(*(np.concatenate(column) for column in zip(*patches, strict=True)))
 
 
-def reduced(camera: Camera, longest: int) -> Camera:
-    """The same view, no side longer than this many pixels."""
+def shrink_camera(camera: Camera, longest: int) -> Camera:
+    """The same view with no side longer than `longest` px."""
     share = min(1.0, longest / max(camera.width, camera.height))
     return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
 
 
-def _patches(camera: Camera, color: np.ndarray, alpha: np.ndarray) -> Patches:
-    """A view's blocks of which at least a half is covered."""
+def _blocks(camera: Camera, color: np.ndarray, alpha: np.ndarray) -> Patches:
+    """The blocks of a view, `BLOCK` px a side, at least half of which is covered."""
     rows, columns = (np.arange(0, size, BLOCK) for size in color.shape[:2])
     total = lambda values: np.add.reduceat(np.add.reduceat(values, rows, 0), columns, 1)
     covered, size = total(alpha), total(np.ones_like(alpha))
     chosen = covered > 0.5 * size
     colors = total(color)[chosen] / covered[chosen][:, None]
     rays = (total(geometry.pixel_rays(camera)) / size[..., None])[chosen] @ camera.world_to_camera[:3, :3]
-    blur = np.full(len(colors), SEEN_BLUR)
+    blur = np.full(len(colors), VIEW_BLUR)
     return Patches(np.broadcast_to(camera.center, colors.shape), rays, colors.clip(0, 1), blur)
 
 
-def backdrop(scenes: Sequence[Gaussians], cameras: Sequence[Camera], patches: Patches) -> Gaussians:
-    """`DISKS` soft disks, float32 on the CPU, on a sphere that lies behind all the Gaussians and all the cameras.
+def build_backdrop(scenes: Sequence[Gaussians], cameras: Sequence[Camera], patches: Patches) -> Gaussians:
+    """`DISKS` soft disks, float32 on the CPU, on a sphere behind all Gaussians of the scenes and all cameras.
 
-    A disk's colour is the mean of the patches' colours, each where its ray meets the sphere, by nearness on it.
+    A disk's colour is a mean of the patches' colours, weighted by how near a patch's ray meets the sphere.
     """
     centers = np.stack([camera.center for camera in cameras])
     middle = centers.mean(0)
     means = [gaussians.means.double().cpu().numpy() for gaussians in scenes if len(gaussians)]
-    radius = CLEAR * max(np.linalg.norm(points - middle, axis=1).max() for points in (*means, centers))
-    towards = _spread_directions(DISKS)
-    places = _met((patches.origins - middle) / radius, patches.directions)
-    colors = _continued(towards, places, patches.colors, patches.blur)
+    radius = CLEARANCE * max(np.linalg.norm(points - middle, axis=1).max() for points in (*means, centers))
+    disks = _fibonacci_sphere(DISKS)
+    hits = _intersect_unit_sphere((patches.origins - middle) / radius, patches.directions)
+    colors = _interpolate_colors(disks, hits, patches.colors, patches.blur)
     sh = np.zeros((DISKS, scenes[0].sh.shape[1], 3))
     sh[:, 0] = (colors - 0.5) / SH0
-    sizes = radius * APART * np.array([0.8, 0.8, 0.05])
-    # The shortest turn from z to the direction; straight backwards any half turn will do.
-    turns = np.concatenate([1 + towards[:, 2:], np.cross([0.0, 0.0, 1.0], towards)], 1)
+    sizes = radius * SPACING * np.array([0.8, 0.8, 0.05])
+    # The shortest rotation from z to the direction of the disk; for -z any half turn will do.
+    quaternions = np.concatenate([1 + disks[:, 2:], np.cross([0.0, 0.0, 1.0], disks)], 1)
     logits = np.full(DISKS, math.log(0.98 / 0.02))
-    arrays = (middle + radius * towards, turns, np.log(np.tile(sizes, (DISKS, 1))), logits, sh)
+    arrays = (middle + radius * disks, quaternions, np.log(np.tile(sizes, (DISKS, 1))), logits, sh)
     return Gaussians(*(torch.from_numpy(array).float() for array in arrays), antialiased=scenes[0].antialiased)
 
 
-def _spread_directions(count: int) -> np.ndarray:
-    """[count, 3] unit vectors, about equally far apart: a spiral of the golden ratio."""
+def _fibonacci_sphere(count: int) -> np.ndarray:
+    """[count, 3] unit vectors about equally far apart, on a spiral of the golden ratio."""
     index = np.arange(count) + 0.5
     height, turn = 1 - 2 * index / count, math.pi * (1 + math.sqrt(5)) * index
     level = np.sqrt(1 - height**2)
     return np.stack([level * np.cos(turn), level * np.sin(turn), height], 1)
 
 
-def _met(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """[S, 3] unit vectors: where rays from within the unit sphere, [S, 3] both, leave it."""
+def _intersect_unit_sphere(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """[S, 3] unit vectors: where rays that start inside the unit sphere leave it.
+
+    Args:
+        origins, directions: [S, 3]; a ray without length gives its origin.
+    """
     length = np.linalg.norm(directions, axis=1, keepdims=True)
-    directions = directions / np.maximum(length, np.finfo(np.float64).tiny)  # of no length: stays where it is
+    directions = directions / np.maximum(length, np.finfo(np.float64).tiny)
     along = (origins * directions).sum(1)
     far = np.sqrt(along**2 + 1 - (origins**2).sum(1)) - along
     return origins + far[:, None] * directions
 
 
-def _continued(towards: np.ndarray, places: np.ndarray, colors: np.ndarray, blur: np.ndarray) -> np.ndarray:
-    """[D, 3] colours at unit vectors `towards`: the mean of those at `places` [S, 3], by distance to the power -6,
-    and equal within `blur` [S]."""
-    mixed = np.empty_like(towards)
-    for part in np.array_split(np.arange(len(towards)), 10):  # all at once would take gigabytes
-        square = 2 - 2 * towards[part] @ places.T
-        weight = 1 / (square + blur**2) ** 3
+def _interpolate_colors(disks: np.ndarray, hits: np.ndarray, colors: np.ndarray, blur: np.ndarray) -> np.ndarray:
+    """[D, 3] colours at the unit vectors `disks` [D, 3]: means of `colors` [S, 3], weighted by distance to the power -6
+    from `hits` [S, 3], and equally within `blur` [S] radians."""
+    mixed = np.empty_like(disks)
+    for part in np.array_split(np.arange(len(disks)), 10):  # all at once would take gigabytes
+        squared_distance = 2 - 2 * disks[part] @ hits.T
+        weight = 1 / (squared_distance + blur**2) ** 3
         mixed[part] = weight @ colors / weight.sum(1, keepdims=True)
     return mixed

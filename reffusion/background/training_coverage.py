@@ -1,4 +1,4 @@
-"""Which pixels of a view show what some training view saw: those can be held to account, the others are guesses."""
+"""Which pixels of a view show what some training view saw: those can be checked, the others are guesses."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ import torch
 from scipy import ndimage
 
 from reffusion import geometry
-from reffusion.background.backdrop import reduced
+from reffusion.background.backdrop import shrink_camera
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
-TOLERANCE = 0.1  # relative depth by which a point may lie behind what a training view shows, and still be seen there
-COVERED = 0.8  # alpha under which a fit shows nothing that it learnt anywhere
-SPECKS = 5  # px a side of the median filter that removes what single pixels claim
-LONGEST = 256  # px a side at which training views are looked at
+TOLERANCE = 0.1  # relative depth by which a point may lie behind a training view's surface and still count as seen
+COVERED = 0.8  # alpha below which the fit learned nothing at a pixel
+SPECKS = 5  # px, side of the median filter that removes single wrong pixels
+LONGEST = 256  # px, larger side at which training views are rendered
+MOST_LEFT_OUT = 32  # training views that are compared with all others; more hardly change the mean
 
 PROTOCOL = (
     "a pixel is seen where the fit to the photographs covers it (alpha of at least "
@@ -28,13 +29,13 @@ PROTOCOL = (
 )
 
 
-class SeenView(NamedTuple):
-    """A training view, small.
+class CoverageView(NamedTuple):
+    """What a training view saw, at small size.
 
     Attributes:
         camera: of the size of the other two.
-        depth: [H, W] camera z of what it shows, 0 where nothing is.
-        hidden: bool [H, W], where it shows the object that is to go.
+        depth: [H, W] camera z of the rendered surface, 0 where nothing is rendered.
+        hidden: bool [H, W], pixels that show the object to be removed.
     """
 
     camera: Camera
@@ -42,50 +43,67 @@ class SeenView(NamedTuple):
     hidden: np.ndarray
 
 
-def seen_views(gaussians: Gaussians, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray]) -> list[SeenView]:
-    """The training views as a fit shows them.
+def render_coverage_views(
+    gaussians: Gaussians, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray]
+) -> list[CoverageView]:
+    """The training views as a fit renders them.
 
     Args:
-        gaussians: the fit, object included, for that is what stood before the rest.
-        masks: view name -> bool [H, W], the object; none where a view has no entry.
+        gaussians: the fit, the object included: it hid what is behind it.
+        masks: view name -> bool [H, W], the object; a view without an entry shows none.
     """
-    found = []
+    views = []
     for camera in cameras:
-        small = reduced(camera, LONGEST)
+        small = shrink_camera(camera, LONGEST)
         hidden = np.zeros((small.height, small.width), bool)
         if camera.name in masks:
             centers = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in (small.width, small.height))), -1)
             scale = np.array([camera.width / small.width, camera.height / small.height])
             hidden, _ = geometry.sample_nearest(masks[camera.name], centers * scale)
-        found.append(SeenView(small, _depth(gaussians, small)[0], hidden))
-    return found
+        views.append(CoverageView(small, _render_depth(gaussians, small)[0], hidden))
+    return views
 
 
-def unseen(gaussians: Gaussians, camera: Camera, seen_by: Sequence[SeenView]) -> np.ndarray:
-    """bool [H, W]: the pixels of a view at which it shows what none of the training views saw; see `PROTOCOL`.
+def unseen_pixels(gaussians: Gaussians, camera: Camera, seen_by: Sequence[CoverageView]) -> np.ndarray:
+    """bool [H, W]: the pixels of a view that show what none of the training views saw; see `PROTOCOL`.
 
     Args:
-        gaussians: the fit that the training views were drawn of.
+        gaussians: the fit from which the training views were rendered.
     """
-    depth, alpha = _depth(gaussians, camera)
-    places = np.flatnonzero(depth > 0)
-    points = geometry.unproject(np.where(depth > 0, depth, 1.0), camera).reshape(-1, 3)[places]
+    depth, alpha = _render_depth(gaussians, camera)
+    pixels = np.flatnonzero(depth > 0)
+    points = geometry.unproject(np.where(depth > 0, depth, 1.0), camera).reshape(-1, 3)[pixels]
     missed = np.ones(depth.shape, bool)
-    # From the nearest on: it has seen most, and only the rest is looked for in the others.
+    # The nearest view comes first: it saw most of the points, and the other views are asked for the rest only.
     for view in sorted(seen_by, key=lambda v: float(np.linalg.norm(v.camera.center - camera.center))):
-        if not len(places):
+        if not len(pixels):
             break
         uv, z = geometry.project(points, view.camera)
         surface, framed = geometry.sample_nearest(view.depth, uv)
         hidden, _ = geometry.sample_nearest(view.hidden, uv)
-        found = framed & ~hidden & (z < (1 + TOLERANCE) * surface)
-        missed.flat[places[found]] = False
-        places, points = places[~found], points[~found]
+        is_seen = framed & ~hidden & (z < (1 + TOLERANCE) * surface)
+        missed.flat[pixels[is_seen]] = False
+        pixels, points = pixels[~is_seen], points[~is_seen]
     return ndimage.median_filter(missed | (alpha < COVERED), SPECKS)
 
 
+def leave_one_out_unseen_share(gaussians: Gaussians, views: Sequence[CoverageView]) -> float:
+    """Mean share in [0, 1] of a training view's pixels that show what no other training view saw; 0 without views.
+
+    Estimates from the training views alone what a further view of the same capture would show for the first time.
+    Pixels of the object do not count: what is behind it is the task of the other stages. Of many views
+    `MOST_LEFT_OUT` are left out in turn, evenly spaced in their order.
+    """
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_LEFT_OUT)).round().astype(int))
+    shares = []
+    for index in chosen:
+        others = [*views[:index], *views[index + 1 :]]
+        shares.append((unseen_pixels(gaussians, views[index].camera, others) & ~views[index].hidden).mean())
+    return float(np.mean(shares)) if shares else 0.0
+
+
 @torch.no_grad()
-def _depth(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Camera z, 0 where nothing is, and alpha, [H, W] both."""
-    drawn = rasterizer.render(gaussians, camera, sh_degree=0)
-    return drawn.depth.double().cpu().numpy(), drawn.alpha.cpu().numpy()
+def _render_depth(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Camera z, 0 where nothing is rendered, and alpha, both [H, W]."""
+    rendered = rasterizer.render(gaussians, camera, sh_degree=0)
+    return rendered.depth.double().cpu().numpy(), rendered.alpha.cpu().numpy()

@@ -101,10 +101,10 @@ def add_uncaptured_pixels(
     unobserved, and invented."""
     if not scene.blank:
         return {}
-    seen_by = training_coverage.seen_views(gaussians, [scene.cameras[name] for name in scene.train], hidden)
+    seen_by = training_coverage.render_coverage_views(gaussians, [scene.cameras[name] for name in scene.train], hidden)
     found = {}
     for name in scene.blank:
-        unseen = clean_mask(params, training_coverage.unseen(gaussians, scene.cameras[name], seen_by))
+        unseen = clean_mask(params, training_coverage.unseen_pixels(gaussians, scene.cameras[name], seen_by))
         each = sets[name]
         found[name] = MaskSet(each.raw, each.consistent | unseen, each.unobserved | unseen, each.invent | unseen)
     return found

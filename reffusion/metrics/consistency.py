@@ -1,4 +1,4 @@
-"""Multi-view consistency: does a view show what its neighbour shows of the same surface?"""
+"""Multi-view consistency: whether a rendered view shows the same colours of a surface as the next view."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from reffusion.depth.completion import complete
 from reffusion.fit.exposure import undo_exposure
 from reffusion.types import Camera
 
-TOLERANCE = 0.02  # relative depth by which a point may lie behind the neighbour's surface and still be visible
-SOLID = 0.5  # alpha from which a rendered depth means anything
+TOLERANCE = 0.02  # relative depth by which a point may lie behind the other view's surface and still be visible
+SOLID = 0.5  # alpha above which a rendered depth is used
 
 PROTOCOL = (
     "each rendered view and the next by name (the last has none): the mask's pixels, unprojected by rendered depth "
@@ -24,56 +24,62 @@ PROTOCOL = (
 )
 
 
-class Shown(NamedTuple):
+class RenderedView(NamedTuple):
     """A rendered view.
 
     Attributes:
         camera: the view.
         picture: uint8 [H, W, 3].
-        depth: [H, W] camera z; 0 where nothing is, or too little to have a depth.
+        depth: [H, W] camera z; 0 where alpha is too low for a depth.
         mask: bool [H, W], the pixels to compare.
-        exposed: [3, 4], the exposure that it was drawn with, see `fit.exposure`; None: the Gaussians' own.
+        exposure: [3, 4], the exposure of the picture, see `fit.exposure`; None: that of the Gaussians.
     """
 
     camera: Camera
     picture: np.ndarray
     depth: np.ndarray
     mask: np.ndarray
-    exposed: np.ndarray | None = None
+    exposure: np.ndarray | None = None
 
     @property
-    def color(self) -> np.ndarray:
-        """[H, W, 3] in [0, 1] as the Gaussians are exposed, so that views of other exposures can be compared."""
-        return undo_exposure(self.picture / 255.0, self.exposed)
+    def unexposed_color(self) -> np.ndarray:
+        """[H, W, 3] in [0, 1] with the exposure removed, so that views of different exposures can be compared."""
+        return undo_exposure(self.picture / 255.0, self.exposure)
 
 
-def difference(first: Shown, second: Shown, tolerance: float = TOLERANCE) -> tuple[float | None, float | None]:
-    """Mean absolute difference in [0, 1] of `first` in its mask and `second` where it shows the same points, and the
-    share of the mask that could be compared; None for an empty mask, the difference also where nothing is comparable.
+def color_difference(
+    first: RenderedView, second: RenderedView, tolerance: float = TOLERANCE
+) -> tuple[float | None, float | None]:
+    """Mean absolute colour difference in [0, 1] between the masked pixels of `first` and the same points in `second`,
+    and the share of the mask's pixels that could be compared.
 
-    A point is hidden from the second view where it lies more than `tolerance` (relative) behind the surface seen there.
+    Both are None for an empty mask; the difference is None too where no pixel can be compared.
+
+    Args:
+        tolerance: relative depth behind the surface of `second` from which a point counts as occluded there.
     """
-    asked = int(first.mask.sum())
-    if not asked:
+    mask_pixels = int(first.mask.sum())
+    if not mask_pixels:
         return None, None
     chosen = first.mask & (first.depth > 0)
     points = geometry.unproject(np.where(chosen, first.depth, 1.0), first.camera)[chosen]
     uv, z = geometry.project(points, second.camera)
     surface, _ = geometry.sample_nearest(second.depth, uv)
-    with np.errstate(invalid="ignore"):  # a point behind the camera has no place in its picture
+    with np.errstate(invalid="ignore"):  # points behind the camera have no pixel
         framed = ((uv >= 0.5) & (uv <= np.array([second.camera.width, second.camera.height]) - 0.5)).all(-1)
-    seen = framed & ((surface == 0) | (z <= (1 + tolerance) * surface))
-    if not seen.any():
+    visible = framed & ((surface == 0) | (z <= (1 + tolerance) * surface))
+    if not visible.any():
         return None, 0.0
-    (column, row), color = uv[seen].T - 0.5, second.color
-    there = np.stack([map_coordinates(color[..., c], (row, column), order=1) for c in range(3)], -1)
-    here = first.color[chosen][seen]
-    return float(np.abs(here - there).mean()), float(seen.sum() / asked)
+    (column, row), color = uv[visible].T - 0.5, second.unexposed_color
+    in_second = np.stack([map_coordinates(color[..., c], (row, column), order=1) for c in range(3)], -1)
+    in_first = first.unexposed_color[chosen][visible]
+    return float(np.abs(in_first - in_second).mean()), float(visible.sum() / mask_pixels)
 
 
-def depth_through(depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Depth [H, W] with that in the mask replaced: the surroundings' disparity continued smoothly; 0 where too little
-    is known around it. For pictures inpainted in 2D, which have no depth of their own.
+def interpolate_depth(depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Depth [H, W] whose masked pixels continue the surrounding disparity smoothly; 0 where too little is known.
+
+    For pictures that were inpainted in 2D, which have no depth of their own.
     """
     known = (depth > 0) & ~mask
     if not known.any():
@@ -83,5 +89,5 @@ def depth_through(depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
         disparity = complete(disparity, ~mask)
     except ValueError:
         return np.where(mask, 0.0, depth)
-    usable = disparity > 0.1 * disparity[known].min()  # beyond ten times the farthest depth it is none
+    usable = disparity > 0.1 * disparity[known].min()  # none beyond ten times the farthest known depth
     return np.where(mask, np.divide(1.0, disparity, out=np.zeros(depth.shape), where=usable), depth)

@@ -1,6 +1,6 @@
 """PSNR, SSIM, FLIP and LPIPS on the mask's box, outside the mask and on the full image.
 
-Images are [H, W, 3] sRGB, uint8 or float in [0, 1]. A box is cut out first and scored as an image of its own: nothing
+Images are [H, W, 3] sRGB, uint8 or float in [0, 1]. A box is cut out first and scored as an image of its own: no pixel
 outside it enters, and nothing is resized. Every function raises ValueError on unequal or empty images.
 """
 
@@ -14,14 +14,15 @@ import cv2
 import numpy as np
 import torch
 
-from reffusion.metrics.flip import PIXELS_PER_DEGREE, difference
+from reffusion.metrics import flip as ldr_flip
+from reffusion.metrics.flip import PIXELS_PER_DEGREE
 from reffusion.metrics.lpips import NAMES, SMALLEST, Lpips
 
 SSIM_WINDOW = 11  # px
 SSIM_SIGMA = 1.5  # px
-SSIM_CONSTANTS = 0.01**2, 0.03**2  # of the paper, at data range 1
-BOX_DILATION = 0.1  # each side of the mask's box moves outwards by this share of the box's extent
-PSNR_CAP = 100.0  # dB, what an identical image counts in a mean
+SSIM_CONSTANTS = 0.01**2, 0.03**2  # C1 and C2 of the paper for a data range of 1
+BOX_DILATION = 0.1  # share of the box's extent by which each side of the mask's box moves outwards
+PSNR_CAP = 100.0  # dB, value of an identical image in a mean
 
 BOX_COLUMNS = (*(f"{name}_box" for name in NAMES.values()), "psnr_box", "ssim_box", "flip_box")
 COLUMNS = (
@@ -69,32 +70,33 @@ class Box(NamedTuple):
     bottom: int
 
     def crop(self, array: Pixels) -> Pixels:
-        """[H, W, ...] -> the part inside."""
+        """The part of an array [H, W, ...] inside the box."""
         return array[self.top : self.bottom, self.left : self.right]
 
 
 def mask_box(mask: np.ndarray, dilation: float = BOX_DILATION) -> Box | None:
-    """The bounding box of a bool mask [H, W], each side moved outwards by `dilation` of the box's extent.
+    """The bounding box of a bool mask [H, W], each side moved outwards by the share `dilation` of the box's extent.
 
-    Rounded outwards and clipped to the image. None for an empty mask.
+    The box is rounded outwards and clipped to the image. None for an empty mask.
     """
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if len(rows) == 0:
         return None
     height, width = mask.shape
-    top, bottom = _dilated(int(rows[0]), int(rows[-1]) + 1, dilation, height)
-    left, right = _dilated(int(columns[0]), int(columns[-1]) + 1, dilation, width)
+    top, bottom = _dilate_interval(int(rows[0]), int(rows[-1]) + 1, dilation, height)
+    left, right = _dilate_interval(int(columns[0]), int(columns[-1]) + 1, dilation, width)
     return Box(left, top, right, bottom)
 
 
-def _dilated(low: int, high: int, dilation: float, size: int) -> tuple[int, int]:
+def _dilate_interval(low: int, high: int, dilation: float, size: int) -> tuple[int, int]:
+    """The interval low..high-1 widened by the share `dilation` of its length, within 0..size-1."""
     margin = round(dilation * (high - low), 9)  # 0.1 * 30 is a hair above 3: rounding outwards must not make it 4
     return max(0, floor(low - margin)), min(size, ceil(high + margin))
 
 
 def psnr(image: np.ndarray, truth: np.ndarray) -> float:
     """Peak signal-to-noise ratio in dB, inf for identical images."""
-    image, truth = _pair(image, truth)
+    image, truth = _as_unit_pair(image, truth)
     error = float(np.mean((image - truth) ** 2))
     return -10.0 * log10(error) if error > 0 else inf
 
@@ -106,7 +108,7 @@ def ssim(image: np.ndarray, truth: np.ndarray) -> float:
 
 def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """[H - 10, W - 10, 3]: SSIM of the windows that lie inside the image. Raises ValueError under 11 px a side."""
-    image, truth = _pair(image, truth)
+    image, truth = _as_unit_pair(image, truth)
     if min(image.shape[:2]) < SSIM_WINDOW:
         raise ValueError(f"SSIM needs {SSIM_WINDOW} px a side; the image is {image.shape[1]}x{image.shape[0]} px")
     edge, window = SSIM_WINDOW // 2, cv2.getGaussianKernel(SSIM_WINDOW, SSIM_SIGMA, cv2.CV_64F)
@@ -126,32 +128,32 @@ def flip(image: np.ndarray, truth: np.ndarray) -> float:
 
 def flip_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """[H, W] float32 in [0, 1]: LDR-FLIP at each pixel."""
-    return difference(*_pair(image, truth))
+    return ldr_flip.flip_map(*_as_unit_pair(image, truth))
 
 
 @dataclass(frozen=True)
 class LpipsTarget:
-    """A truth as an LPIPS network sees it, computed once for all images that are compared with it."""
+    """A ground truth's activations in an LPIPS network, computed once for all images that are compared with it."""
 
     model: Lpips
     activations: list[torch.Tensor]
 
     @torch.no_grad()
     def distance(self, image: np.ndarray) -> float:
-        """LPIPS of an image of the truth's size. Raises ValueError for an image that is none."""
-        return float(self.model.distance(_signed(image), self.activations))
+        """LPIPS of an image of the truth's size. Raises ValueError for an array that is no image."""
+        return float(self.model.distance(_as_lpips_input(image), self.activations))
 
 
 @torch.no_grad()
 def lpips_targets(truth: np.ndarray, models: dict[str, Lpips]) -> dict[str, LpipsTarget | None]:
     """Network -> target; None where the truth is too small for it."""
     fits = {net: min(truth.shape[:2]) >= SMALLEST[net] for net in models}
-    return {n: LpipsTarget(m, m.activations(_signed(truth))) if fits[n] else None for n, m in models.items()}
+    return {n: LpipsTarget(m, m.activations(_as_lpips_input(truth))) if fits[n] else None for n, m in models.items()}
 
 
-def _signed(image: np.ndarray) -> torch.Tensor:
-    """[1, 3, H, W] float32 in [-1, 1]."""
-    return torch.from_numpy(2.0 * _unit(image) - 1.0).permute(2, 0, 1)[None].float()
+def _as_lpips_input(image: np.ndarray) -> torch.Tensor:
+    """The image as [1, 3, H, W] float32 in [-1, 1]."""
+    return torch.from_numpy(2.0 * _as_unit(image) - 1.0).permute(2, 0, 1)[None].float()
 
 
 def score(
@@ -178,19 +180,20 @@ def score_view(
     shows_object: bool = False,
     unseen: np.ndarray | None = None,
 ) -> dict[str, float | None]:
-    """A value for each of `COLUMNS`: `score` on the box (None without one), `outside` of the mask (bool [H, W]; None:
-    no pixel is masked), and `score` on the full image without LPIPS.
+    """A value for each of `COLUMNS`: `score` on the box (None without one), `score_outside` of the mask, and `score` on
+    the full image without LPIPS.
 
     Args:
         targets: `lpips_targets` of the truth in the box.
-        shows_object: the truth has the object in it, so that only what lies outside its mask is true.
-        unseen: bool [H, W], pixels that no training view saw; None where that is not known: then what is said of them
-            has no value.
+        mask: bool [H, W], the object; None: no pixel is masked.
+        shows_object: the truth shows the object, so that only pixels outside the mask are scored.
+        unseen: bool [H, W], pixels that no training view saw; None where that is not known: the columns about them
+            are then None.
     """
     mask = np.zeros(truth.shape[:2], bool) if mask is None else mask
-    values = outside(image, truth, mask)
+    values = score_outside(image, truth, mask)
     if unseen is not None:
-        values |= outside_seen(image, truth, mask, unseen)
+        values |= score_outside_seen(image, truth, mask, unseen)
     if not shows_object:
         inside = score(box.crop(image), box.crop(truth), targets) if box is not None else {}
         values |= {f"{name}_box": value for name, value in inside.items()}
@@ -198,56 +201,58 @@ def score_view(
     return {column: values.get(column) for column in COLUMNS}
 
 
-def outside(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict[str, float | None]:
+def score_outside(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict[str, float | None]:
     """{"psnr", "ssim", "flip"}_outside: over the pixels where the bool mask [H, W] is False; None where there are none.
 
-    SSIM, and FLIP's filters, look at surroundings: inside the mask the truth stands in both pictures, so that nothing
-    painted there counts, and no difference at its border is one of the object's.
+    The windows of SSIM and the filters of FLIP reach into the mask. There the truth replaces both images, so that
+    nothing painted inside the mask changes a score outside it.
     """
     kept = ~mask
     if not kept.any():
         return dict.fromkeys(("psnr_outside", "ssim_outside", "flip_outside"))
-    image, truth = _pair(image, truth)
-    shown, edge = np.where(kept[..., None], image, truth), SSIM_WINDOW // 2
+    image, truth = _as_unit_pair(image, truth)
+    outside_only, edge = np.where(kept[..., None], image, truth), SSIM_WINDOW // 2
     windows = kept[edge:-edge, edge:-edge]  # empty where the image is smaller than a window
     return {
-        "psnr_outside": _psnr_at(image, truth, kept),
-        "ssim_outside": float(ssim_map(shown, truth)[windows].mean()) if windows.any() else None,
-        "flip_outside": float(flip_map(shown, truth)[kept].mean(dtype=np.float64)),
+        "psnr_outside": _masked_psnr(image, truth, kept),
+        "ssim_outside": float(ssim_map(outside_only, truth)[windows].mean()) if windows.any() else None,
+        "flip_outside": float(flip_map(outside_only, truth)[kept].mean(dtype=np.float64)),
     }
 
 
-def outside_seen(image: np.ndarray, truth: np.ndarray, mask: np.ndarray, unseen: np.ndarray) -> dict[str, float | None]:
+def score_outside_seen(
+    image: np.ndarray, truth: np.ndarray, mask: np.ndarray, unseen: np.ndarray
+) -> dict[str, float | None]:
     """{"psnr_outside_seen", "unseen_share"}: PSNR over the pixels outside the bool mask [H, W] that some training view
-    saw, and the share of those outside it that none saw; None where there are no such pixels."""
+    saw, and the share of the pixels outside the mask that none saw; None where there are no such pixels."""
     kept = ~mask
     return {
-        "psnr_outside_seen": _psnr_at(image, truth, kept & ~unseen),
+        "psnr_outside_seen": _masked_psnr(image, truth, kept & ~unseen),
         "unseen_share": float(unseen[kept].mean()) if kept.any() else None,
     }
 
 
-def _psnr_at(image: np.ndarray, truth: np.ndarray, pixels: np.ndarray) -> float | None:
+def _masked_psnr(image: np.ndarray, truth: np.ndarray, pixels: np.ndarray) -> float | None:
     """PSNR over the chosen pixels, bool [H, W]; None where there are none."""
     if not pixels.any():
         return None
-    image, truth = _pair(image, truth)
+    image, truth = _as_unit_pair(image, truth)
     error = float(np.mean((image - truth)[pixels] ** 2))
     return -10.0 * log10(error) if error > 0 else inf
 
 
 def mean(values: list[float | None]) -> float | None:
-    """Mean of what is there, each counting at most `PSNR_CAP`; None of nothing.
+    """Mean of the values that are not None, each capped at `PSNR_CAP`; None if there are none.
 
-    The cap only ever reaches PSNR: it keeps one identical view from making a mean infinite, and unlike leaving that
-    view out it never makes a better result score worse.
+    Only PSNR reaches the cap. It keeps one identical view from making the mean infinite, and unlike leaving that view
+    out it never makes a better result score worse.
     """
     present = [min(value, PSNR_CAP) for value in values if value is not None]
     return float(np.mean(present)) if present else None
 
 
 def side_by_side(panels: list[np.ndarray], box: Box | None) -> np.ndarray:
-    """uint8 [H, W', 3]: the panels from left to right, 4 px of white between them, each with the box in yellow."""
+    """uint8 [H, W', 3]: the panels from left to right with 4 px of white between them, the box drawn in yellow."""
     gap = np.full((panels[0].shape[0], 4, 3), 255, np.uint8)
     strip = []
     for panel in panels:
@@ -260,16 +265,17 @@ def side_by_side(panels: list[np.ndarray], box: Box | None) -> np.ndarray:
     return np.concatenate(strip[:-1], axis=1)
 
 
-def _pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both as float64 in [0, 1]."""
+def _as_unit_pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both images as float64 in [0, 1]. Raises ValueError where they are no images of one size, or empty."""
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"a metric compares two [H, W, 3] of one size; got {image.shape} and {truth.shape}")
     if image.size == 0:
         raise ValueError("a metric needs at least one pixel")
-    return _unit(image), _unit(truth)
+    return _as_unit(image), _as_unit(truth)
 
 
-def _unit(image: np.ndarray) -> np.ndarray:
+def _as_unit(image: np.ndarray) -> np.ndarray:
+    """float64 in [0, 1] of a uint8 or float image. Raises ValueError for other types and ranges."""
     if image.dtype == np.uint8:
         return image / 255.0
     if not np.issubdtype(image.dtype, np.floating):

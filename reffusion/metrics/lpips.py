@@ -1,7 +1,7 @@
-"""LPIPS (Zhang et al., 2018), version 0.1, from weights that lie on this machine; nothing is downloaded or made up.
+"""LPIPS (Zhang et al., 2018), version 0.1, from weights on this machine; nothing is downloaded.
 
 The weights of a network are one file `<net>.safetensors` (`reffusion.weights.lpips_package`), or two: the backbone as
-torchvision saves it, and the published linear weights. Without them the metric is unavailable, with a reason.
+torchvision saves it, and the published linear weights. Without them the metric is unavailable and says why.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from reffusion.weights.published import LPIPS
 
 Net = Literal["vgg", "alex"]
 
-NAMES = {"vgg": "lpips_vgg", "alex": "lpips_alex"}  # of the scores
-# px a side: anything smaller leaves the deepest layer without a single cell
+NAMES = {"vgg": "lpips_vgg", "alex": "lpips_alex"}  # names of the scores
+# Smallest image in px a side: in a smaller one the deepest layer has no cell.
 SMALLEST = {"alex": 31, "vgg": 16}
 
-# Layers of torchvision's `features`: (channels, kernel, stride, padding) a convolution with its ReLU, "pool" a maximum.
+# Layers of torchvision's `features`: (channels, kernel, stride, padding) of a convolution and its ReLU, or "pool".
 _ALEX = [(64, 11, 4, 2), "pool", (192, 5, 1, 2), "pool", (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)]
 _VGG = [
     *[(64, 3, 1, 1)] * 2,
@@ -38,21 +38,21 @@ _VGG = [
     *[(512, 3, 1, 1)] * 3,
 ]
 _LAYERS: dict[str, list[Any]] = {"alex": _ALEX, "vgg": _VGG}
-_POOL = {"alex": (3, 2), "vgg": (2, 2)}  # side and step of a maximum
-# Indices in `features` of the ReLUs compared.
+_POOL = {"alex": (3, 2), "vgg": (2, 2)}  # kernel size and stride of max pooling
+# Indices in `features` of the ReLUs whose activations are compared.
 TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
 WIDTHS = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
-EPSILON = 1e-10  # of the published code, added to the length of a cell's features
+EPSILON = 1e-10  # added to the norm of a cell's features, as in the published code
 
 
 class Lpips(nn.Module):
-    """The distance of one network. Build it with `from_states` or `load`.
+    """The LPIPS distance by one network. Build it with `from_states` or `load`.
 
     Attributes:
         net: "alex" or "vgg" (16 layers).
         features: the backbone under torchvision's indices.
         linear: five non-negative weights, [C_l] each.
-        files: what was read: file name -> digest (empty when built from states).
+        files: name -> digest of each file that was read; empty if built from state dicts.
     """
 
     def __init__(self, net: Net):
@@ -68,28 +68,28 @@ class Lpips(nn.Module):
                 channels = width
         self.features = nn.Sequential(*layers)
         self.linear = nn.ParameterList(torch.zeros(width) for width in WIDTHS[net])
-        # ImageNet's mean and deviation, seen from [-1, 1].
+        # ImageNet's mean and standard deviation, for inputs in [-1, 1].
         self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1))
         self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1))
         self.requires_grad_(False).eval()
 
     def forward(self, first: Tensor, second: Tensor) -> Tensor:
-        """Distance [B] of two batches [B, 3, H, W] in [-1, 1]: sum over layers of the mean over cells of
-        w_l · (f_l(first) - f_l(second))², features of unit length over channels.
+        """Distance [B] of two batches [B, 3, H, W] in [-1, 1]: the sum over layers of the mean over cells of
+        w_l · (f_l(first) - f_l(second))², with features normalised over channels.
 
-        Raises ValueError when the shapes differ or an image is smaller than `SMALLEST[net]` a side.
+        Raises ValueError if the shapes differ or an image is smaller than `SMALLEST[net]` a side.
         """
         if first.shape != second.shape:
             raise ValueError(f"LPIPS compares two [B, 3, H, W]; got {tuple(first.shape)} and {tuple(second.shape)}")
         return self.distance(first, self.activations(second))
 
     def distance(self, images: Tensor, target: list[Tensor]) -> Tensor:
-        """The same, [B], of images [B, 3, H, W] from one whose `activations` are known."""
+        """Distance [B] of images [B, 3, H, W] from targets whose `activations` are known."""
         pairs = zip(self.activations(images), target, self.linear, strict=True)
         return sum(((a - b).square() * w.float().view(1, -1, 1, 1)).sum(1).mean((1, 2)) for a, b, w in pairs)
 
     def activations(self, images: Tensor) -> list[Tensor]:
-        """The five tapped layers, float32, each cell's channels at unit length."""
+        """The activations of the five tapped layers, float32, normalised over channels in each cell."""
         if images.dim() != 4 or images.shape[1] != 3:
             raise ValueError(f"LPIPS compares two [B, 3, H, W]; got {tuple(images.shape)}")
         height, width = images.shape[2:]
@@ -101,16 +101,16 @@ class Lpips(nn.Module):
         for index, layer in enumerate(self.features):
             x = layer(x)
             if index in TAPS[self.net]:
-                # In half precision squares overflow and EPSILON is 0. The length's gradient is 0 where all are 0.
+                # In half precision squares overflow and EPSILON is 0. The norm's gradient is 0 where all are 0.
                 wide = x.float()
                 tapped.append(wide / (torch.linalg.vector_norm(wide, dim=1, keepdim=True) + EPSILON))
         return tapped
 
 
 def from_states(net: Net, backbone: dict[str, Tensor], linear: dict[str, Tensor]) -> Lpips:
-    """The metric from two state dicts: torchvision's (its classifier is ignored) and the linear weights'.
+    """The metric from two state dicts: torchvision's (its classifier is ignored) and that of the linear weights.
 
-    Raises ValueError naming the first key that is missing or of another shape.
+    Raises ValueError naming the first key that is missing or has another shape.
     """
     model = Lpips(net)
     wanted = {f"features.{key}": value for key, value in model.features.state_dict(keep_vars=True).items()}
@@ -131,15 +131,15 @@ def from_states(net: Net, backbone: dict[str, Tensor], linear: dict[str, Tensor]
 
 
 def load(net: Net, folder: str | Path | None = None) -> tuple[Lpips | None, str | None]:
-    """(metric, None), or (None, why it is unavailable).
+    """(metric, None), or (None, the reason why it is unavailable).
 
-    Raises ValueError for a file that is there but broken: wrong keys or shapes, or other content than published. A
-    damaged file is an error to mend, not an unavailable metric.
+    Raises ValueError for a broken file: wrong keys or shapes, or other content than published. A damaged file is an
+    error to fix, not an unavailable metric.
     """
     files = lpips_files(net, folder)
     if not files:
-        looked = ", ".join(abbreviate_home(place) for place in lpips_folders(folder))
-        return None, f"no weights of LPIPS ({net}): run `make weights`, or put {net}.safetensors into one of {looked}"
+        searched = ", ".join(abbreviate_home(place) for place in lpips_folders(folder))
+        return None, f"no weights of LPIPS ({net}): run `make weights`, or put {net}.safetensors into one of {searched}"
     try:
         if len(files) == 1:
             return _load_whole(net, files[0]), None
@@ -153,19 +153,20 @@ def load(net: Net, folder: str | Path | None = None) -> tuple[Lpips | None, str 
 
 
 def _load_whole(net: Net, path: Path) -> Lpips:
+    """The metric from one file with all weights. Raises ValueError if it is damaged."""
     from safetensors.torch import load_file
 
     state = load_file(path)
-    found = digest({name: value.numpy() for name, value in state.items()})
-    if found != LPIPS.nets[net].digest:
+    content = digest({name: value.numpy() for name, value in state.items()})
+    if content != LPIPS.nets[net].digest:
         raise ValueError("it is damaged: remove it, and run `make weights`")
     model = from_states(net, state, state)
-    model.files = {path.name: found}
+    model.files = {path.name: content}
     return model
 
 
 def _check_name(path: Path) -> None:
-    """ValueError where the name ends in a hash, as torchvision's do, and the file has another."""
+    """Raise ValueError if the name ends in a hash, as torchvision's names do, and the file has another hash."""
     stated = path.stem.rpartition("-")[2]
     if re.fullmatch("[0-9a-f]{8}", stated) and not _sha256(path).startswith(stated):
         raise ValueError(f"{path.name} is not the file its name says: download it again")

@@ -1,4 +1,4 @@
-"""The scores of a test run: a line for each view, and what all the numbers depend on."""
+"""The scores of a test run: a row for each view, their means, and the protocol that all numbers depend on."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ import numpy as np
 from reffusion.background import training_coverage
 from reffusion.io.images import resize_image, resize_nearest
 from reffusion.metrics import consistency, image_metrics
-from reffusion.metrics.consistency import Shown
+from reffusion.metrics.consistency import RenderedView
 from reffusion.metrics.lpips import Lpips
 from reffusion.morphology import dilate
 
 LIBRARIES = ("torch", "numpy", "opencv-contrib-python-headless")
-OUTSIDE_MARGIN = 0.01  # how much wider than the mask is left out of the scores outside it, / image width
-CONSISTENCY = ("consistency", "consistency_share")
+# Margin around the mask that the scores outside it leave out, as a share of the image's width.
+OUTSIDE_MARGIN = 0.01
+CONSISTENCY_COLUMNS = ("consistency", "consistency_share")
 
 
-class Truth(NamedTuple):
+class GroundTruth(NamedTuple):
     """What a view is compared with.
 
     Attributes:
-        picture: uint8 [H, W, 3], its own; None where the scene has none.
-        shows_object: the picture has the object in it.
+        picture: uint8 [H, W, 3], the view's own picture; None where the scene has none.
+        shows_object: the picture shows the object.
         unseen: bool [H, W], pixels that no training view saw; None where that is not known.
     """
 
@@ -35,57 +36,66 @@ class Truth(NamedTuple):
     unseen: np.ndarray | None
 
 
-def row_of(
-    shown: Shown, initial: np.ndarray | None, truth: Truth, models: dict[str, Lpips], longest: int = 0
+def score_row(
+    view: RenderedView, initial: np.ndarray | None, truth: GroundTruth, models: dict[str, Lpips], longest: int = 0
 ) -> dict[str, Any]:
-    """A view's line of per_view.csv: its box, and its scores and those of the initialization, uint8 [H, W, 3], where
-    there is a truth.
+    """A view's row of per_view.csv: its size, its box and, where there is a truth, its scores.
 
     Args:
-        longest: the box is also scored with pictures reduced to this larger side in px, where theirs is larger.
+        initial: uint8 [H, W, 3], the render of the initialization, which is scored too; None: there is none.
+        longest: px; where the pictures are larger, the box is scored once more with all pictures reduced to this
+            larger side. 0: never.
     """
-    camera, box = shown.camera, image_metrics.mask_box(shown.mask)
-    row = {"view": camera.name, "width": camera.width, "height": camera.height} | dict.fromkeys(CONSISTENCY)
+    camera, box = view.camera, image_metrics.mask_box(view.mask)
+    row = {"view": camera.name, "width": camera.width, "height": camera.height} | dict.fromkeys(CONSISTENCY_COLUMNS)
     row |= dict(zip(("left", "top", "right", "bottom"), box or (None,) * 4, strict=True))
     if truth.picture is not None:
-        margin = dilate(shown.mask, OUTSIDE_MARGIN)
+        margin = dilate(view.mask, OUTSIDE_MARGIN)
         scored = box is not None and not truth.shows_object
         targets = image_metrics.lpips_targets(box.crop(truth.picture), models) if scored else {}
-        given = truth.picture, box, targets, margin, truth.shows_object, truth.unseen
-        row |= image_metrics.score_view(shown.picture, *given)
+        compared_with = truth.picture, box, targets, margin, truth.shows_object, truth.unseen
+        row |= image_metrics.score_view(view.picture, *compared_with)
         if initial is not None:
-            scores = image_metrics.score_view(initial, *given)
+            scores = image_metrics.score_view(initial, *compared_with)
             row |= {f"initialize_{column}": value for column, value in scores.items()}
         if 0 < longest < max(camera.width, camera.height) and not truth.shows_object:
-            pictures = {"": shown.picture} | ({"initialize_": initial} if initial is not None else {})
-            row |= _score_reduced(pictures, truth.picture, shown.mask, models, longest)
+            pictures = {"": view.picture} | ({"initialize_": initial} if initial is not None else {})
+            row |= _score_reduced(pictures, truth.picture, view.mask, models, longest)
     return row
 
 
 def _score_reduced(
     pictures: dict[str, np.ndarray], truth: np.ndarray, mask: np.ndarray, models: dict[str, Lpips], longest: int
 ) -> dict[str, Any]:
-    """`REDUCED` of each picture, its key before it, and the size of all."""
+    """{prefix + "reduced_<score>_box"} for each prefix and picture, and the reduced size of all.
+
+    Args:
+        pictures: prefix of the columns -> uint8 [H, W, 3].
+        truth: uint8 [H, W, 3].
+        mask: bool [H, W].
+        longest: px, the larger side to which all are reduced.
+    """
     height, width = mask.shape
     factor = longest / max(width, height)
     size = max(1, round(width * factor)), max(1, round(height * factor))
-    found: dict[str, Any] = {"reduced_width": size[0], "reduced_height": size[1]}
+    columns: dict[str, Any] = {"reduced_width": size[0], "reduced_height": size[1]}
     if (box := image_metrics.mask_box(resize_nearest(mask, size[::-1]))) is None:
-        return found
+        return columns
     true = box.crop(resize_image(truth, size))
     targets = image_metrics.lpips_targets(true, models)
-    for key, picture in pictures.items():
+    for prefix, picture in pictures.items():
         scores = image_metrics.score(box.crop(resize_image(picture, size)), true, targets)
-        found |= {f"{key}reduced_{name}_box": value for name, value in scores.items()}
-    return found
+        columns |= {f"{prefix}reduced_{name}_box": value for name, value in scores.items()}
+    return columns
 
 
 def summarize_reduced(rows: list[dict[str, Any]], longest: int) -> dict[str, Any] | None:
-    """{"mean", "initialize", "views"} of `metrics.BOX_COLUMNS` at the reduced size, and {"protocol"}; None without."""
+    """{"mean", "initialize", "views"} of `image_metrics.BOX_COLUMNS` at the reduced size, and {"protocol"}; None where
+    no view was reduced."""
     sizes = sorted({f"{row['reduced_width']}x{row['reduced_height']}" for row in rows if "reduced_width" in row})
     if not sizes:
         return None
-    values = lambda key, name: [row.get(f"{key}reduced_{name}") for row in rows]
+    values = lambda prefix, name: [row.get(f"{prefix}reduced_{name}") for row in rows]
     return {
         "mean": {name: image_metrics.mean(values("", name)) for name in image_metrics.BOX_COLUMNS},
         "initialize": {name: image_metrics.mean(values("initialize_", name)) for name in image_metrics.BOX_COLUMNS},
@@ -95,9 +105,9 @@ def summarize_reduced(rows: list[dict[str, Any]], longest: int) -> dict[str, Any
     }
 
 
-def summary(rows: list[dict[str, Any]]) -> dict[str, dict[str, float | int | None]]:
-    """{"mean", "initialize", "views"}, each with `COLUMNS`: the means of the columns, of the columns that start with
-    `initialize_`, and how many views have a value."""
+def summarize(rows: list[dict[str, Any]]) -> dict[str, dict[str, float | int | None]]:
+    """{"mean", "initialize", "views"}, each with `image_metrics.COLUMNS`: the means of the columns, the means of the
+    columns prefixed with `initialize_`, and how many views have a value."""
     values = {
         prefix + name: [row.get(prefix + name) for row in rows]
         for prefix in ("", "initialize_")
@@ -110,8 +120,8 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, dict[str, float | int | Non
     }
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """CSV, a line a view; a value that does not exist is empty, an identical image's PSNR is inf."""
+def to_csv(rows: list[dict[str, Any]]) -> str:
+    """CSV with a line for each view. A missing value is an empty cell; the PSNR of an identical image is inf."""
     text = StringIO()
     columns = dict.fromkeys(column for row in rows for column in row)
     writer = csv.DictWriter(text, list(columns), lineterminator="\n")
@@ -120,28 +130,28 @@ def table(rows: list[dict[str, Any]]) -> str:
     return text.getvalue()
 
 
-def versions() -> dict[str, str]:
-    """The libraries that the numbers depend on."""
-    import reffusion
-
-    return {"reffusion": reffusion.__version__} | {name: version(name) for name in LIBRARIES}
+def add_consistency(row: dict[str, Any], view: RenderedView, following: RenderedView) -> None:
+    """Fill `CONSISTENCY_COLUMNS` of a view's row by comparing the view with the next one."""
+    row |= dict(zip(CONSISTENCY_COLUMNS, consistency.color_difference(view, following), strict=True))
 
 
-def add_consistency(row: dict[str, Any], shown: Shown, following: Shown) -> None:
-    """Into the line of a view, how far it agrees with the next."""
-    row |= dict(zip(CONSISTENCY, consistency.difference(shown, following), strict=True))
-
-
-def consistency_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """{"consistency", "consistency_share"}: means over the pairs of neighbours; {"pairs"}: how many could be compared;
-    {"protocol"}."""
-    difference, share = ([row[name] for row in rows] for name in CONSISTENCY)
+def summarize_consistency(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """{"consistency", "consistency_share"}: means over the pairs of consecutive views; {"pairs"}: how many could be
+    compared; {"protocol"}."""
+    difference, share = ([row[name] for row in rows] for name in CONSISTENCY_COLUMNS)
     return {
         "consistency": image_metrics.mean(difference),
         "consistency_share": image_metrics.mean(share),
         "pairs": sum(value is not None for value in difference),
         "protocol": consistency.PROTOCOL,
     }
+
+
+def library_versions() -> dict[str, str]:
+    """Library -> version, of those that the numbers depend on."""
+    import reffusion
+
+    return {"reffusion": reffusion.__version__} | {name: version(name) for name in LIBRARIES}
 
 
 def protocol(rows: list[dict[str, Any]], models: dict[str, Lpips]) -> dict[str, Any]:
@@ -153,5 +163,5 @@ def protocol(rows: list[dict[str, Any]], models: dict[str, Lpips]) -> dict[str, 
         "outside_margin": OUTSIDE_MARGIN,
         "resolution": sorted({f"{row['width']}x{row['height']}" for row in rows}),
         "lpips_weights": {name: digest for model in models.values() for name, digest in model.files.items()},
-        "versions": versions(),
+        "versions": library_versions(),
     }

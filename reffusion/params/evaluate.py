@@ -20,5 +20,4 @@ class Params(Settings):
     )
     inpaint: bool = Field(False, description="a baseline: each rendered view is inpainted in 2D inside its mask")
     inpainter: Literal["fsr", "lama", "migan"] = inpainter_field()
-    beyond: bool = Field(True, description="what no training view saw is closed by a soft backdrop, scene.ply's too")
     device: Device = Field("cpu", description="where the views are rendered")

@@ -1,4 +1,4 @@
-"""What `evaluate` says before it runs."""
+"""What can be told of `evaluate` before it runs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ from reffusion.weights.published import PAINTERS
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
+    """The weights that the stage works with, and which of them are missing on this machine.
+
+    Args:
+        brings: the keys of scene.yaml.
+    """
     painted = params.inpaint and params.inpainter in PAINTERS
     return [
         local.lpips_need(),
@@ -23,10 +27,10 @@ def machine_facts(params: Params) -> dict[str, str]:
 
 
 def unavailable(params: Params) -> list[str]:
-    """What scores are missing here; where it comes later, they are made anew."""
+    """The scores that cannot be computed on this machine; once they can, the stage runs again."""
     return ["LPIPS"] if local.lpips_need().problem else []
 
 
 def lacks(params: Params) -> list[str]:
-    """What this machine has not, and the stage needs on CUDA."""
+    """What this machine lacks and the stage needs on CUDA."""
     return machine.find_missing(machine.detect())
