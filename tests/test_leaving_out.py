@@ -112,4 +112,4 @@ def test_no_more_harmonics_than_views():
 def test_fit_takes_the_degree_that_the_views_support(tmp_path):
     poses, _, _ = small.write(tmp_path, 0.8)  # five training views
     scene = load_scene(poses)
-    assert fit.supported(fit.Params(), scene).sh.degree == 1
+    assert fit.limit_sh_degree(fit.Params(), scene).sh.degree == 1

@@ -217,7 +217,7 @@ def test_positions_step_by_the_cameras_extent_as_3dgs_has_it():
 def test_what_the_paper_does_not_do_can_be_left_out(monkeypatch):
     monkeypatch.setattr(fit.image_detail, "supported_sh_degree", lambda *_: (0, 1.0))
     scene = type("Scene", (), {"points": None, "cameras": {}, "train": ()})
-    degree = lambda few_views: fit.supported(fit.Params(few_views=few_views), scene).sh.degree
+    degree = lambda few_views: fit.limit_sh_degree(fit.Params(few_views=few_views), scene).sh.degree
     assert [degree(each) for each in ("as_many", "fewer_harmonics", "surfaces")] == [3, 0, 0]
     speck = np.zeros((100, 200), bool)
     speck[50, 50] = True
