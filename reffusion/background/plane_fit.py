@@ -8,7 +8,7 @@ import numpy as np
 
 from reffusion import geometry, seeding
 from reffusion.background.visibility import DepthView
-from reffusion.depth.background_depth import dilate
+from reffusion.morphology import dilate_by_distance
 
 RING = 0.12  # of the image's width: how far around the masks surfaces are sampled
 VIEWS = 12  # views that are sampled
@@ -25,7 +25,7 @@ def sample_surfaces(center: np.ndarray, radius: float, views: Sequence[DepthView
     """[S, 3] points of the surfaces that views show around their masks, within `radius` of `center`."""
     generator, found = np.random.default_rng(seeding.seed_for(seed, "surfaces around")), [np.zeros((0, 3))]
     for view in views[:: max(1, len(views) // VIEWS)]:
-        rows, columns = np.nonzero(dilate(view.masked, RING) & ~view.masked & (view.depth > 0))
+        rows, columns = np.nonzero(dilate_by_distance(view.masked, RING) & ~view.masked & (view.depth > 0))
         if len(rows):
             chosen = generator.choice(len(rows), min(SAMPLES, len(rows)), replace=False)
             found.append(geometry.unproject(view.depth, view.camera)[rows[chosen], columns[chosen]])

@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from reffusion.clicks.geodesic_cut import correct_labels, grow_object, nested_candidates, object_score
 from reffusion.clicks.marks import OBJECT, OTHER, UNKNOWN, Clicks, mark_pixels
+from reffusion.morphology import disk
 
 LONGEST = 192  # px, the larger side of the picture that is segmented
 BAND = 0.008  # of the larger side: how far a photograph's edges may lie from the mask's border
@@ -138,7 +139,7 @@ def refine_edges(image: np.ndarray, mask: np.ndarray, marks: np.ndarray) -> np.n
 
 
 def erode(mask: np.ndarray, by: int) -> np.ndarray:
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by + 1,) * 2)
+    kernel = disk(by)
     return cv2.erode(mask.astype(np.uint8), kernel, borderValue=1) > 0
 
 

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy import ndimage
 
-from reffusion import geometry, seeding
+from reffusion import geometry, morphology, seeding
 from reffusion.depth import bilateral, planes
 from reffusion.depth.completion import Plate, complete
 from reffusion.depth.layers import label_surfaces, plane_labels
@@ -143,7 +142,7 @@ def extract_depth(
     plane_depth, outer = hints.plane_depth, hints.outer
     if outer is not None:
         depth, alpha = np.where(outer > 0, outer, depth), np.where(outer > 0, 1.0, alpha)
-    known = (alpha > settings.explained) & (depth > 0) & ~dilate(hole, settings.margin)
+    known = (alpha > settings.explained) & (depth > 0) & ~morphology.dilate_by_distance(hole, settings.margin)
     if hints.observed is not None:
         known |= hole & hints.observed
     anchored = hole & ~known & np.isfinite(plane_depth) if plane_depth is not None else np.zeros_like(hole)
@@ -185,7 +184,8 @@ def continue_depth(
     guide = guide() if callable(guide) else guide
     plate = Plate(settings.ring, settings.stiffness, settings.edge, settings.unknowns)
     usable = view.known | view.anchored
-    surroundings, hole = usable & dilate(view.hole, settings.ring), dilate(view.hole, settings.margin)
+    near = lambda fraction: morphology.dilate_by_distance(view.hole, fraction)
+    surroundings, hole = usable & near(settings.ring), near(settings.margin)
     planes = () if farthest else view.hints.planes
     label = partial(label_surfaces, view.disparity, surroundings, hole, guide, planes, view.anchored)
     surfaces = label()
@@ -274,7 +274,7 @@ def points_around(view: ViewDepth, points: np.ndarray, settings: Completion) -> 
 
 def _surroundings(view: ViewDepth, settings: Completion) -> np.ndarray:
     excluded = view.hidden | view.hole
-    return dilate(excluded, settings.ring) & ~excluded
+    return morphology.dilate_by_distance(excluded, settings.ring) & ~excluded
 
 
 def _fit_planar_model(view: ViewDepth, points: np.ndarray, settings: Completion) -> tuple[planes.PlanarModel, str]:
@@ -314,10 +314,3 @@ def visible_points(
     rendered, _ = geometry.sample_nearest(disparity, uv)
     visible = on_pixels & inside & (z > 0) & (z * rendered < OCCLUSION_RATIO)
     return uv[visible], 1.0 / z[visible]
-
-
-def dilate(mask: np.ndarray, fraction: float) -> np.ndarray:
-    """bool [H, W]: the mask and all pixels within `fraction` of the image's width of it, by Euclidean distance."""
-    if not mask.any():
-        return mask
-    return ndimage.distance_transform_edt(~mask) <= fraction * mask.shape[1]

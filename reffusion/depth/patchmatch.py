@@ -14,6 +14,7 @@ import numpy as np
 
 from reffusion import geometry
 from reffusion.depth.sparse_to_dense import REFERENCE_WIDTH
+from reffusion.io.images import to_gray
 from reffusion.kernels.compiled import kernel, parallel_for
 from reffusion.kernels.vectors import take_ticket
 from reffusion.types import Camera
@@ -60,8 +61,17 @@ def estimate_planes(
     initial_disparity = 1 / np.asarray(initial, np.float64)
     homographies = [_homography(camera, other) for other, _ in others]
     rotations, translations = (np.stack(each) for each in zip(*homographies, strict=True))
-    pictures, sizes = _stack_padded([_grey(each) for _, each in others])
-    views = (image.astype(np.float32), _grey(image), rays, initial_disparity, rotations, translations, pictures, sizes)
+    pictures, sizes = _stack_padded([to_gray(each) for _, each in others])
+    views = (
+        image.astype(np.float32),
+        to_gray(image),
+        rays,
+        initial_disparity,
+        rotations,
+        translations,
+        pictures,
+        sizes,
+    )
     planes, cost = tangent_planes(initial_disparity, rays), np.full(initial_disparity.shape, np.inf)
     spacing = max(1, round(camera.width / REFERENCE_WIDTH))
     for k in range(ITERATIONS):
@@ -92,10 +102,6 @@ def _homography(camera: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:
     inner = np.array([[other.fx, 0, other.cx], [0, other.fy, other.cy], [0, 0, 1]])
     relative = other.world_to_camera @ np.linalg.inv(camera.world_to_camera)
     return inner @ relative[:3, :3], inner @ relative[:3, 3]
-
-
-def _grey(image: np.ndarray) -> np.ndarray:
-    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
 
 
 def _stack_padded(pictures: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

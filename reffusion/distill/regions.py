@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class Region:
+class VoxelRegion:
     """The part of space the masked Gaussians belong to, as voxels of a grid around them.
 
     Attributes:
@@ -26,7 +26,7 @@ class Region:
     foreign: Tensor
 
 
-def build_region(means: Tensor, masked: Tensor, resolution: int = 32, reach: int = 2) -> Region:
+def build_region(means: Tensor, masked: Tensor, resolution: int = 32, reach: int = 2) -> VoxelRegion:
     """The region of an initialization.
 
     PAPER leaves open: the region whose border Gaussians must not cross. The masked Gaussians of the initialization lie
@@ -52,10 +52,10 @@ def build_region(means: Tensor, masked: Tensor, resolution: int = 32, reach: int
         return F.max_pool3d(grid.float()[None], 2 * cells + 1, stride=1, padding=cells)[0] > 0
 
     core, others = voxelize(masked_means), voxelize(means[~masked])
-    return Region(origin, voxel, dilate(core, reach), core & ~dilate(others, 1))
+    return VoxelRegion(origin, voxel, dilate(core, reach), core & ~dilate(others, 1))
 
 
-def has_changed_region(region: Region, means: Tensor, masked: Tensor) -> Tensor:
+def has_changed_region(region: VoxelRegion, means: Tensor, masked: Tensor) -> Tensor:
     """[N] bool: masked Gaussians that have left the region and unmasked ones that have entered it. Both are pruned."""
     cells, is_inside = _grid_cells(means, region.origin, region.voxel, region.home.shape)
     home, foreign = torch.zeros_like(masked), torch.zeros_like(masked)

@@ -10,7 +10,7 @@ import torch
 
 from reffusion.background.model import Background
 from reffusion.background.unobserved import find_unobserved
-from reffusion.depth import background_depth, billboard, monocular
+from reffusion.depth import billboard, monocular
 from reffusion.depth.background_depth import Completion, Hints
 from reffusion.depth.monocular import DepthNetwork
 from reffusion.gaussians.sheets import Sheets
@@ -18,6 +18,7 @@ from reffusion.initialize import coverage, unprojection
 from reffusion.initialize.draft import Draft
 from reffusion.initialize.sharing import Share, share_surfaces
 from reffusion.initialize.sweep import refine_background
+from reffusion.morphology import dilate_by_distance
 from reffusion.params.initialize import Params
 from reffusion.splat import rasterizer
 from reffusion.trace import Trace
@@ -122,7 +123,7 @@ def fill_reference(
             inserted, depth = inserted & ~ceded | back, np.where(back, estimate, depth)
         drawn_over = inserted & ~coverage.beside_depth_edges(depth, behind)
     print(f"depth of reference {camera.name}: {words}")
-    pixels = background_depth.dilate(hole & ~inserted & ~ceded, OVERLAP) & ~ceded | drawn_over
+    pixels = dilate_by_distance(hole & ~inserted & ~ceded, OVERLAP) & ~ceded | drawn_over
     draft = unprojection.add_surface(draft, reference, depth, pixels, background, sheets)
     if farthest or not params.tidy:  # what is still open is completed view by view, or left
         return Filled(draft, depth)

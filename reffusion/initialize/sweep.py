@@ -17,6 +17,7 @@ from reffusion import geometry, morphology
 from reffusion.background.continuation import align_plane
 from reffusion.background.model import Background
 from reffusion.background.visibility import DepthView
+from reffusion.io.images import to_gray
 from reffusion.types import Camera
 
 NEIGHBORS = 6
@@ -70,7 +71,7 @@ def sweep_depth(
     neighbors = _select_neighbors(camera, camera.center + rays[known].mean(0) * np.median(base[known]), views)
     if len(neighbors) < 2:
         return found
-    gray = _to_gray(photo)[rows, columns]
+    gray = to_gray(photo)[rows, columns]
     factors = np.linspace(1 - RANGE, 1 + RANGE, STEPS)
     surfaces = (camera.center + rays * (base / factor)[..., None] for factor in factors)
     scores = np.stack([_correlation(gray, points, known, neighbors, photos, side) for points in surfaces])
@@ -120,7 +121,7 @@ def _correlation(
     for view in neighbors:
         uv, z = geometry.project(points.reshape(-1, 3), view.camera)
         at = uv.reshape(*gray.shape, 2).astype(np.float32) - np.float32(0.5)
-        other = cv2.remap(_to_gray(photos[view.camera.name]), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        other = cv2.remap(to_gray(photos[view.camera.name]), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
         masked, inside = geometry.sample_nearest(view.masked, uv)
         visible = (inside & ~masked & (z > 0)).reshape(gray.shape) & known
         weight = visible.astype(np.float32)
@@ -132,7 +133,3 @@ def _correlation(
         tells = visible & (total > 0.3) & (var_a > MIN_CONTRAST**2) & (var_b > MIN_CONTRAST**2)
         scores.append(np.where(tells, covariance / np.sqrt(np.maximum(var_a * var_b, 1e-6)), -1.0))
     return np.sort(scores, axis=0)[-((len(scores) + 1) // 2) :].mean(0)
-
-
-def _to_gray(image: np.ndarray) -> np.ndarray:
-    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)

@@ -29,7 +29,7 @@ from reffusion.inpaint.shift_map.photo_offsets import fill_from_photo
 from reffusion.inpaint.shift_map.plane_motions import fill_plane
 from reffusion.inpaint.shift_map.plane_symmetry import MIN_CELLS, PlanePixels, PlaneSymmetry, find_symmetry
 from reffusion.inpaint.source_image import SourceImage
-from reffusion.morphology import convex_hull, dilate, to_pixels
+from reffusion.morphology import convex_hull, dilate, disk, to_pixels
 from reffusion.types import Camera
 
 OTHER_PHOTOS = 3  # photographs beside the view's own that patches are taken from
@@ -51,9 +51,8 @@ def mask_to_paint(hidden: np.ndarray, unknown: np.ndarray) -> np.ndarray:
     (`hidden`, bool [H, W]) between them, and the rim."""
     observed = hidden & ~unknown
     reach = to_pixels(MIN_KEPT_RADIUS, hidden.shape[1])
-    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     free = np.pad((~hidden | observed).astype(np.uint8), reach, constant_values=1)
-    broad = cv2.morphologyEx(free, cv2.MORPH_OPEN, disk)[reach:-reach, reach:-reach] > 0
+    broad = cv2.morphologyEx(free, cv2.MORPH_OPEN, disk(reach))[reach:-reach, reach:-reach] > 0
     return add_rim(hidden & ~(broad & observed), hidden)
 
 

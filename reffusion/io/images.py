@@ -122,6 +122,13 @@ def to_uint8(array: np.ndarray) -> np.ndarray:
     return np.round(np.clip(array, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
+def to_gray(image: np.ndarray) -> np.ndarray:
+    """Luma of an RGB picture, uint8 [H, W, 3], as float32 [H, W] in levels of 255."""
+    import cv2
+
+    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+
+
 def _is_png(path: Path) -> bool:
     return Path(path).suffix.lower() == ".png"
 

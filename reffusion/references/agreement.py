@@ -18,6 +18,7 @@ import numpy as np
 from reffusion import geometry
 from reffusion.depth.alignment import Degenerate, align_either
 from reffusion.gaussians.surfels import surface_normals
+from reffusion.morphology import square
 from reffusion.references.view_ranking import Hole
 from reffusion.splat import rasterizer
 from reffusion.types import Gaussians, Reference
@@ -105,7 +106,7 @@ def _one_way_difference(a: Reference, b: Reference, hole_a: Hole, hole_b: Hole) 
     if both.sum() < LEAST_PIXELS:
         return None
     other, reach = _smooth_colors(b, hole_b), max(1, round(REACH * hole_b.camera.width))
-    around = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    around = square(reach)
     darkest, lightest = (geometry.sample_nearest(of(other, around), uv)[0] for of in (cv2.erode, cv2.dilate))
     beyond = np.maximum(0, np.maximum(darkest - colors, colors - lightest)).max(-1)
     return float(beyond[both].mean())

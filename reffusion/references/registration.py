@@ -14,6 +14,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from reffusion.io.images import to_gray
+from reffusion.morphology import square
 from reffusion.references import tracks
 from reffusion.references.color import match_colors, recolor
 
@@ -204,7 +206,7 @@ class _Pair:
 
     def _compare(self, read: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, tracks.Tracks]:
         gain, offset = match_colors(read, self.photo, known)
-        in_photo, in_picture = (tracks.low_pass(_gray(image)) for image in (self.photo, recolor(read, gain, offset)))
+        in_photo, in_picture = (tracks.low_pass(to_gray(image)) for image in (self.photo, recolor(read, gain, offset)))
         in_picture = np.where(known, in_picture, in_photo)  # no displacement in the hole and outside the picture
         points = tracks.find_points(in_photo, known)
         if len(points) >= LEAST_POINTS:
@@ -280,10 +282,6 @@ def _by_features(picture: np.ndarray, photo: np.ndarray, known: np.ndarray) -> n
     return tracks.estimate_affine(source, target, 2.0)
 
 
-def _gray(image: np.ndarray) -> np.ndarray:
-    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-
-
 def _dilate(mask: np.ndarray, fraction: float) -> np.ndarray:
     reach = max(1, round(fraction * mask.shape[1]))
-    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+    return cv2.dilate(mask.astype(np.uint8), square(reach)) > 0

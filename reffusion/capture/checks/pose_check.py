@@ -22,6 +22,7 @@ import numpy as np
 from reffusion.capture.image_detail import sample_visible
 from reffusion.capture.roles import LEAST_TRAINING_VIEWS
 from reffusion.geometry import project
+from reffusion.io.images import to_gray
 from reffusion.types import Camera, Scene
 
 LONGER_SIDE = 128  # cells along a picture's longer side, at which pictures are compared
@@ -148,7 +149,7 @@ def _detail(image: np.ndarray) -> np.ndarray:
     It is the brightness less its mean in a window, over its standard deviation there. So it does not depend on exposure
     and shading, and is near 0 where the picture is plain.
     """
-    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    gray = to_gray(image)
     factor = LONGER_SIDE / max(gray.shape)
     size = max(1, round(gray.shape[1] * factor)), max(1, round(gray.shape[0] * factor))
     gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)

@@ -13,6 +13,7 @@ import numpy as np
 
 from reffusion.capture.image_detail import sample_visible
 from reffusion.geometry import pixel_rays, project, sample_nearest
+from reffusion.io.images import to_gray
 from reffusion.types import Camera, Scene
 
 LARGE = 0.5  # share of a picture: a mask that covers more is more often inverted than intended
@@ -132,7 +133,7 @@ def _along_rays(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndar
 
 def _brightness(camera: Camera, points: np.ndarray, image: np.ndarray) -> np.ndarray:
     """[P] the photograph's brightness where its pose projects the points; NaN where it does not show them."""
-    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    gray = to_gray(image)
     return sample_visible(camera, points, cv2.blur(gray, (max(3, camera.width // 40),) * 2)[..., None])[:, 0]
 
 

@@ -22,6 +22,7 @@ from reffusion.inpaint.patchmatch.matches import NO_MATCH, PATCH_RADIUS, Hole, L
 from reffusion.inpaint.plane_frames import invert_2x2
 from reffusion.inpaint.poisson import blend
 from reffusion.inpaint.source_image import SourceImage
+from reffusion.io.images import to_gray
 
 COARSEST_WIDTH = 40.0  # px, width of the hole at the coarsest level, where its parts are laid out
 SINGLE_LEVEL_WIDTH = 16.0  # px: a wider hole has at least two levels
@@ -139,7 +140,7 @@ def _color_features(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
     if masked.any() and not masked.all():
         nearest = ndimage.distance_transform_edt(masked, return_distances=False, return_indices=True)
         image = image[tuple(nearest)]
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    grey = to_gray(image)
     known = cv2.erode((~masked).astype(np.float32), np.ones((3, 3)))
     window = (ROUGHNESS_WINDOW, ROUGHNESS_WINDOW)
     mass = np.maximum(cv2.blur(known, window), 1e-3)
