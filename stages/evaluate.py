@@ -49,7 +49,7 @@ def run(
     scene, facts = load_scene(poses), load_json(finish / "facts.json")
     names, kind = views_to_render(scene)
     gaussians = load_stages(finish, {"fit": fit, "initialize": initialize, "distill": distill}, params.device)
-    painter = feedforward.load_by_name(params.inpainter, params.device) if params.inpaint else None
+    painter = feedforward.load_inpainter(params.inpainter, params.device) if params.inpaint else None
     exposures = exposure.view_exposures(fit, list(scene.cameras.values()))
     renderer = ViewRenderer(gaussians, facts["result"], painter, exposures)
     loaded = {net: lpips.load(net) for net in ("vgg", "alex")}

@@ -27,8 +27,6 @@ from reffusion.masks import regions, voting
 from reffusion.params.initialize import Params
 from reffusion.trace import Trace
 from reffusion.types import MaskSet, Reference
-from reffusion.weights import painters
-from reffusion.weights.published import PAINTERS
 from reffusion.workspace import Workspace
 
 WARN_SHARE = 0.01  # uncovered share of C from which a view is named
@@ -65,8 +63,7 @@ def run(
             for name, mask in shadows.items():
                 save_mask(out / "shadows" / f"{name}.png", mask)
         if params.extra_views:
-            kind = painters.resolve_inpainter(params.inpainter)
-            painter = feedforward.load(kind, "", params.device) if kind in PAINTERS else None
+            painter = feedforward.load_inpainter(params.inpainter, params.device)
             draft, extra, depths = complete_extra_views(params, draft, background, trusted, painter)
             save_depths(out, depths)
             for each in extra:

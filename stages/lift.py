@@ -54,8 +54,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> No
 
 def load_painter(params: Params) -> tuple[str, Callable[[np.ndarray, np.ndarray, str], np.ndarray]]:
     """The inpainter's name, and a function (image uint8 [H, W, 3], hole bool [H, W], view name) -> uint8 [H, W, 3]."""
-    if params.inpainter != "diffusion":
-        painter = feedforward.load_by_name(params.inpainter, params.device)
+    if painter := feedforward.load_inpainter(params.inpainter, params.device):
         return painter.name, lambda image, hole, _: painter.paint(image, hole)
     prior = load_prior(params.prior, device=params.device, dtype=DTYPE)
 

@@ -20,8 +20,6 @@ from reffusion.references import view_ranking
 from reffusion.references.adoption import adopt_references
 from reffusion.references.files import load_reference_files
 from reffusion.types import MaskSet, Reference
-from reffusion.weights import painters
-from reffusion.weights.published import PAINTERS
 from reffusion.workspace import Workspace
 
 TO_PAINT, VIEWS_TO_PAINT = "to_paint", 4
@@ -68,16 +66,14 @@ def inpaint_reference(params: Params, out: Path, space: Workspace) -> Reference:
         raise ValueError(f"reference.choose is {params.choose}, but candidates are counted 0..{params.candidates - 1}")
     camera, masks = space.scene.cameras[name], space.mask_sets[name]
     base = space.remove_object(name)
-    kind = painters.resolve_inpainter(params.inpainter)
-    if kind == "exemplar":
-        return Reference(camera, inpaint_by_patches(params, out, base, name, space), masks.invent)
-    if kind in PAINTERS:
-        source = "" if params.inpainter == painters.AUTO else params.prior
-        painter = feedforward.load(kind, source, params.device)
+    if params.inpainter.kind == "diffusion":
+        image = inpaint_by_prior(params, out, base, name, masks)
+    elif painter := feedforward.load_inpainter(params.inpainter, params.device):
         image = painter.paint(base, exemplar.mask_to_paint(masks.consistent, masks.invent))
         save_candidates(out, [image], {"view": name, "painter": painter.name, "chosen": 0})
-        return Reference(camera, image, masks.invent)
-    return Reference(camera, inpaint_by_prior(params, out, base, name, masks), masks.invent)
+    else:
+        image = inpaint_by_patches(params, out, base, name, space)
+    return Reference(camera, image, masks.invent)
 
 
 def inpaint_by_patches(params: Params, out: Path, base: np.ndarray, name: str, space: Workspace) -> np.ndarray:

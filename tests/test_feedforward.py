@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 from test_paint2d import Mean
 from test_references import ROOT, capture, wall  # noqa: F401 (a fixture)
 
@@ -19,6 +20,8 @@ from reffusion.inpaint import exemplar, feedforward
 from reffusion.inpaint.onnx_model import Network
 from reffusion.io.images import load_image
 from reffusion.io.scene import load_mask_sets, load_references, load_scene
+from reffusion.params import evaluate, lift
+from reffusion.params.inpainter import Inpainter
 from reffusion.params.reference import Params
 from reffusion.weights import painters
 from reffusion.weights.published import PAINTERS
@@ -99,13 +102,21 @@ def script(path):
     return path
 
 
+def setting(kind, weights=None) -> dict:
+    return {"kind": kind, "weights": weights and str(weights)}
+
+
+def load(kind, weights=None):
+    return feedforward.load_inpainter(Inpainter(**setting(kind, weights)))
+
+
 # ----------------------------------------------------------------------------------------- what is shown, what is taken
 
 
 @pytest.mark.parametrize("kind", ["lama", "migan"])
 @pytest.mark.parametrize("side", [None, SIDE, 512])
 def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path, kind, side):
-    painter = feedforward.load(kind, model(tmp_path / "net.onnx", kind, side))
+    painter = load(kind, model(tmp_path / "net.onnx", kind, side))
     assert painter.name == {"lama": "LaMa (net.onnx)", "migan": "MI-GAN (net.onnx)"}[kind]
     image, inner = picture(), hole()
     painted = painter.paint(image, inner)
@@ -121,7 +132,7 @@ def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path, kind, si
 
 
 def test_a_torchscript_lama_is_read_as_by_the_baselines(tmp_path):
-    painter = feedforward.load("lama", script(tmp_path / "big.pt").parent)
+    painter = load("lama", script(tmp_path / "big.pt").parent)
     painted = painter.paint(picture(), hole())
     assert painter.name == "LaMa (big.pt)" and (painted[hole()] == painted[hole()][0]).all()
 
@@ -163,7 +174,7 @@ def test_a_fixed_size_sees_a_square_around_the_hole_with_as_much_again():
 def test_other_models_are_refused_in_one_line(tmp_path):
     def refusal(kind, path):
         with pytest.raises(ValueError) as told:
-            feedforward.load(kind, path)
+            load(kind, path)
         assert "\n" not in str(told.value) and path.name in str(told.value)
         return str(told.value)
 
@@ -178,10 +189,10 @@ def test_other_models_are_refused_in_one_line(tmp_path):
     assert "one float32 picture" in refusal("lama", model(file, outputs=["result", "mean"]))
     file.write_text("<html>")
     assert "is no ONNX model that onnxruntime reads" in refusal("lama", file)
-    fraction = feedforward.load("lama", model(file, answer=1.0))
+    fraction = load("lama", model(file, answer=1.0))
     with pytest.raises(ValueError, match=r"net\.onnx: answers in \[0, 1\]; expected 0\.\.255"):
         fraction.paint(picture(), hole())
-    poisoned = feedforward.load("lama", model(file, answer=float("inf")))
+    poisoned = load("lama", model(file, answer=float("inf")))
     with pytest.raises(ValueError, match="not finite"):
         poisoned.paint(picture(), hole())
 
@@ -190,16 +201,16 @@ def test_without_onnxruntime_one_line_says_what_to_install(tmp_path, monkeypatch
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     (tmp_path / "lama_fp32.onnx").write_bytes(b"x")
     with pytest.raises(ValueError, match=r"lama_fp32.onnx needs onnxruntime: `pip install onnxruntime`"):
-        feedforward.load("lama", tmp_path)
-    (need,) = needs(inpainter="lama", prior=str(tmp_path))
+        load("lama", tmp_path)
+    (need,) = needs("lama", tmp_path)
     assert "pip install onnxruntime" in need.problem and not need.fetched
 
 
 # --------------------------------------------------------------------------------------------- the parameter, the stage
 
 
-def needs(**params):
-    return plan_reference.needed_weights(Params(**params), frozenset())
+def needs(kind, weights=None):
+    return plan_reference.needed_weights(Params(inpainter=setting(kind, weights)), frozenset())
 
 
 @pytest.fixture
@@ -219,19 +230,44 @@ def publish(own_cache, kind):
 
 
 def test_auto_takes_the_best_that_is_here(own_cache):
-    assert painters.resolve_inpainter("auto") == "exemplar" and painters.inpainter_facts("auto") == {
-        "inpainter": "exemplar"
-    }
+    auto, exemplar, diffusion = (Inpainter(kind=kind) for kind in ("auto", "exemplar", "diffusion"))
+    assert painters.resolve_inpainter(auto) == exemplar and load("auto") is None
+    assert painters.inpainter_facts(auto) == {"inpainter": "exemplar"}
     publish(own_cache, "migan")
-    assert painters.resolve_inpainter("auto") == "migan" and painters.resolve_inpainter("exemplar") == "exemplar"
-    before = painters.inpainter_facts("auto")
+    assert painters.resolve_inpainter(auto).kind == "migan" and painters.resolve_inpainter(exemplar) == exemplar
+    before = painters.inpainter_facts(auto)
     file = publish(own_cache, "lama")
-    assert painters.resolve_inpainter("auto") == "lama" and painters.inpainter_facts("auto") != before
-    assert feedforward.load("lama").name == "LaMa (lama_fp32.onnx)" and painters.inpainter_file("lama") == file
-    assert painters.inpainter_facts("exemplar") == painters.inpainter_facts("diffusion") == {}, (
+    assert painters.resolve_inpainter(auto).kind == "lama" and painters.inpainter_facts(auto) != before
+    assert load("lama").name == load("auto").name == "LaMa (lama_fp32.onnx)"
+    assert painters.find_file(Inpainter(kind="lama")) == file
+    assert painters.inpainter_facts(exemplar) == painters.inpainter_facts(diffusion) == {}, (
         "the default depends on no cache"
     )
-    assert not needs(inpainter="auto")
+    assert not needs("auto") and load("exemplar") is None and load("diffusion") is None
+
+
+@pytest.mark.parametrize(
+    ("params", "value", "said"),
+    [
+        (Params, {"kind": "exemplar", "weights": "a.pt"}, "kind exemplar takes no `weights`, lama and migan do"),
+        (Params, {"kind": "diffusion", "weights": "a/model"}, "`prior` names a diffusion model"),
+        (Params, {"weights": "a.pt"}, "write a kind, such as lama, or {kind: lama, weights: FILE}"),
+        (Params, ["lama"], "write a kind, such as lama, or {kind: lama, weights: FILE}"),
+        (Params, "fsr", "Input should be 'exemplar', 'diffusion', 'lama', 'migan' or 'auto'"),
+        (lift.Params, "auto", "Input should be 'fsr', 'lama', 'migan' or 'diffusion'"),
+        (evaluate.Params, {"kind": "diffusion"}, "Input should be 'fsr', 'lama' or 'migan'"),
+    ],
+)
+def test_the_setting_refuses_what_a_stage_cannot_do(params, value, said):
+    with pytest.raises(ValidationError) as refused:
+        params(inpainter=value)
+    (error,) = refused.value.errors()
+    assert said in error["msg"]
+
+
+def test_a_plain_string_is_the_kind():
+    assert Params(inpainter="lama") == Params(inpainter={"kind": "lama"}) != Params()
+    assert Params().changed({"inpainter": "auto"}).inpainter.kind == "auto"
 
 
 def test_the_key_of_scene_yaml_reaches_references_and_further_views(own_cache, tmp_path):
@@ -240,7 +276,7 @@ def test_the_key_of_scene_yaml_reaches_references_and_further_views(own_cache, t
 
     def machine():
         job = prepare_job(Request(ROOT, tmp_path / "runs", str(scene), profile="laptop"))
-        assert {job.params[stage]["inpainter"] for stage in ("reference", "initialize")} == {"auto"}
+        assert all(job.params[stage]["inpainter"] == setting("auto") for stage in ("reference", "initialize"))
         return [job.stages[stage].machine for stage in ("reference", "initialize")]
 
     assert machine() == [{"inpainter": "exemplar"}] * 2
@@ -250,20 +286,20 @@ def test_the_key_of_scene_yaml_reaches_references_and_further_views(own_cache, t
 
 
 def test_the_file_is_found_or_the_plan_says_where_people_get_it(own_cache, tmp_path):
-    (need,) = needs(inpainter="lama")  # the diffusion prior is none of its files: the published one is meant
+    (need,) = needs("lama")
     assert (need.name, need.file, need.fetched) == ("Carve/LaMa-ONNX", "lama_fp32.onnx", True)
     assert "Carve/LaMa-ONNX is not on this machine" in need.problem and "make weights" in need.problem
-    (need,) = needs(inpainter="lama", prior=str(tmp_path / "nowhere.onnx"))
+    (need,) = needs("lama", tmp_path / "nowhere.onnx")
     assert not need.fetched and "is not on this machine; get lama_fp32.onnx (208 MB" in need.problem
-    (need,) = needs(inpainter="migan", prior=str(script(tmp_path / "big.pt")))
+    (need,) = needs("migan", script(tmp_path / "big.pt"))
     assert "is no .onnx file; get migan_pipeline_v2.onnx" in need.problem
-    (need,) = needs(inpainter="lama", prior=str(tmp_path))
+    (need,) = needs("lama", tmp_path)
     assert need.problem is None and need.name == str(tmp_path / "big.pt") and need.bytes > 0
-    assert painters.inpainter_file("lama", tmp_path) == tmp_path / "big.pt"
+    assert painters.find_file(Inpainter(**setting("lama", tmp_path))) == tmp_path / "big.pt"
     shutil.copy(tmp_path / "big.pt", tmp_path / "other.pt")
-    (need,) = needs(inpainter="lama", prior=str(tmp_path))
+    (need,) = needs("lama", tmp_path)
     assert r"holds 2 .pt or .onnx files (big.pt, other.pt); name one" in need.problem
-    params = Params(inpainter="lama", prior=str(tmp_path), prompt="a vase")
+    params = Params(inpainter=setting("lama", tmp_path), prompt="a vase")
     (note,) = plan_reference.preview(params, scene=tmp_path)
     assert "by LaMa, one picture" in note and "'a vase' is not read" in note
     assert not plan_reference.needed_weights(params, frozenset({"painted"}))
@@ -272,18 +308,19 @@ def test_the_file_is_found_or_the_plan_says_where_people_get_it(own_cache, tmp_p
 def test_a_job_is_told_before_any_work_and_keyed_by_the_files_content(own_cache, tmp_path):
     scene, file = capture(tmp_path / "wall"), tmp_path / "big.pt"
 
-    def planned(prior):
-        job = prepare_job(Request(ROOT, tmp_path / "runs", str(scene), profile="laptop",
-                                  set=f"reference.inpainter=lama reference.prior={prior}"))  # fmt: skip
+    def planned(inpainter):
+        asked = f"'reference.inpainter={inpainter}'"
+        job = prepare_job(Request(ROOT, tmp_path / "runs", str(scene), profile="laptop", set=asked))
+        assert job.params["initialize"]["inpainter"] == job.params["reference"]["inpainter"]
         found = plan(job, job.pipeline.closure("reference"))["reference"]
         return found.status, found.reason
 
-    word, reason = planned(file)
-    assert word == "missing" and f"reference.prior: no weights at {file}; name a folder, a file" in reason
-    word, reason = planned("priors/tiny")
+    word, reason = planned(f"{{kind: lama, weights: {file}}}")
+    assert word == "missing" and f"reference.inpainter.weights: no weights at {file}; name a folder, a file" in reason
+    word, reason = planned("lama")
     assert word == "missing" and "Carve/LaMa-ONNX is not on this machine" in reason and "(208 MB)" in reason
     script(file)
-    assert planned(file)[0] == "pending", "it waits for masks"
+    assert planned(f"{{kind: lama, weights: {file}}}")[0] == "pending", "it waits for masks"
     hashes = Hashes(tmp_path / "hashes.json")
     before = hashes.weights(file)
     file.write_bytes(file.read_bytes() + b"more")
@@ -295,7 +332,7 @@ def test_the_stage_paints_the_hole_in_one_pass(wall, tmp_path, kind):  # noqa: F
     file = script(tmp_path / "big.pt") if kind == "lama" else model(tmp_path / "pipeline.onnx", "migan")
     out = tmp_path / "out"
     out.mkdir()
-    reference.run(Params(inpainter=kind, prior=str(file)), out, **wall)
+    reference.run(Params(inpainter=setting(kind, file)), out, **wall)
     (found,) = load_references(out, load_scene(wall["poses"]))
     pixels = load_mask_sets(wall["masks"], ["a2"])["a2"]
     inner = exemplar.mask_to_paint(pixels.consistent, pixels.invent)

@@ -45,7 +45,7 @@ FIXED = {
     "masks.tau": 1,
     "masks.tau_rendered": 0.3,
     "masks.invent": "consistent",
-    "reference.inpainter": "diffusion",
+    "reference.inpainter.kind": "diffusion",
     "reference.prior": SDXL,
     "personalize.prior": SD2,
     "personalize.steps": 2000,

@@ -133,7 +133,7 @@ def fit(params: Fit) -> tuple[Work, float]:
 
 
 def reference(params: Reference) -> tuple[Work, float] | None:
-    if params.prior not in PRIORS or params.inpainter != "diffusion":
+    if params.prior not in PRIORS or params.inpainter.kind != "diffusion":
         return None
     prior, size = PRIORS[params.prior]
     finer, side = 0.0, 2 * size

@@ -1,4 +1,4 @@
-"""Feed-forward 2D inpainters from a file on this machine: LaMa and MI-GAN.
+"""Loads 2D inpainters, and runs the feed-forward ones from a file on this machine: LaMa and MI-GAN.
 
 A network of fixed input size gets a crop around the hole, resized; any other the whole image. (MI-GAN's published
 pipeline takes any size, and crops and resizes itself.)
@@ -6,39 +6,39 @@ pipeline takes any size, and crops and resizes itself.)
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 
 from reffusion.inpaint import classical, onnx_model
 from reffusion.inpaint.classical import Painter
 from reffusion.inpaint.onnx_model import Network
+from reffusion.params.inpainter import Inpainter
 from reffusion.weights import painters
 from reffusion.weights.published import PAINTERS
 
 DTYPES = {"lama": "float32", "migan": "uint8"}  # of the ONNX models' images
 
 
-def load(inpainter: str, source: str | Path = "", device: str = "cpu") -> Painter:
-    """Loads the inpainter "lama" or "migan".
+def load_inpainter(inpainter: Inpainter, device: str = "cpu") -> Painter | None:
+    """Loads the inpainter of kind "lama", "migan" or "fsr" (OpenCV), or the one that "auto" stands for.
 
-    Args:
-        source: a file, or a folder with one; empty: the published file. TorchScript (.pt, LaMa only) runs on `device`,
-            ONNX (.onnx) on the CPU.
+    TorchScript (.pt, LaMa only) runs on `device`, ONNX (.onnx) on the CPU.
+
+    Returns:
+        None for the kinds that need more than an image and a hole: "exemplar" the scene, "diffusion" the prior.
     Raises:
         ValueError: no such file or several, no onnxruntime, or a file of another kind.
     """
-    file = painters.inpainter_file(inpainter, source)
+    inpainter = painters.resolve_inpainter(inpainter)
+    if inpainter.kind == "fsr":
+        return classical.load_classical()
+    if inpainter.kind not in PAINTERS:
+        return None
+    file = painters.find_file(inpainter)
     if file.suffix == ".pt":
         return classical.load_lama(file, device)
-    network = onnx_model.load(file, DTYPES[inpainter])
-    return Painter(f"{PAINTERS[inpainter].name} ({file.name})", lambda image, hole: run_network(network, image, hole))
-
-
-def load_by_name(inpainter: str, device: str = "cpu") -> Painter:
-    """Loads "fsr" (OpenCV), or the published "lama" or "migan". ValueError as of `load`."""
-    return classical.load_classical() if inpainter == "fsr" else load(inpainter, "", device)
+    network, name = onnx_model.load(file, DTYPES[inpainter.kind]), f"{PAINTERS[inpainter.kind].name} ({file.name})"
+    return Painter(name, lambda image, hole: run_network(network, image, hole))
 
 
 def run_network(network: Network, image: np.ndarray, hole: np.ndarray) -> np.ndarray:

@@ -7,7 +7,9 @@ from typing import Literal
 from pydantic import Field
 
 from reffusion.params.base import Device, Settings
-from reffusion.params.lift import inpainter_field
+from reffusion.params.inpainter import Inpainter
+
+Kind = Literal["fsr", "lama", "migan"]
 
 
 class Params(Settings):
@@ -19,5 +21,5 @@ class Params(Settings):
         "masks' files; 0: not",
     )
     inpaint: bool = Field(False, description="a baseline: each rendered view is inpainted in 2D inside its mask")
-    inpainter: Literal["fsr", "lama", "migan"] = inpainter_field()
+    inpainter: Inpainter[Kind] = Inpainter[Kind](kind="fsr")
     device: Device = Field("cpu", description="where the views are rendered")

@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from reffusion.params.base import Device, Settings, depth_model_field
+from reffusion.params.inpainter import Inpainter, WithGeometry
 
 
 class Depth(Settings):
@@ -35,9 +36,9 @@ class Params(Settings):
     )
     # PAPER leaves open: what the reference's camera does not see of the hole.
     extra_views: int = Field(0, ge=0, description="maximum number of views completed besides the references")
-    inpainter: Literal["exemplar", "diffusion", "lama", "migan", "auto"] = Field(
-        "exemplar",
-        description="inpainter for these, as `reference.inpainter`; diffusion: also patches of photographs",
+    inpainter: Inpainter[WithGeometry] = Field(
+        Inpainter[WithGeometry](kind="exemplar"),
+        description="inpainter of the extra views",
     )
     refit_steps: int = Field(0, ge=0, description="reconstruction steps after filling; 0: none")
     device: Device = Field("cpu", description="device for rendering and the depth model")

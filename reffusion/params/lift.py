@@ -7,14 +7,13 @@ from typing import Literal
 from pydantic import Field
 
 from reffusion.params.base import Device, Settings, prior_field
+from reffusion.params.inpainter import Inpainter
 
-
-def inpainter_field() -> str:
-    return Field("fsr", description="OpenCV's FSR, else Telea; or LaMa or MI-GAN fetched by `make weights`")
+Kind = Literal["fsr", "lama", "migan", "diffusion"]
 
 
 class Params(Settings):
-    inpainter: Literal["fsr", "lama", "migan", "diffusion"] = inpainter_field()
+    inpainter: Inpainter[Kind] = Inpainter[Kind](kind="fsr")
     prior: str = prior_field()
     prompt: str = Field("", description="prompt for the inpainted region, for text-conditioned priors")
     steps: int = Field(50, ge=1, description="sampler steps from pure noise")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 from pydantic import Field
 
 from reffusion.params.base import Device, Dtype, Sampler, Settings, memory_field, prior_field
+from reffusion.params.inpainter import Inpainter, WithGeometry
 
 
 class ReferenceSpec(Settings):
@@ -29,12 +29,7 @@ class Params(Settings):
     reference: ReferenceSpec | list[ReferenceSpec] | None = Field(
         None, description="completed views that the scene brings"
     )
-    inpainter: Literal["diffusion", "exemplar", "lama", "migan", "auto"] = Field(
-        "diffusion",
-        description="the prior; patches of the photographs, along surfaces: sharp, with nothing new; LaMa or MI-GAN: "
-        "what `make weights` fetched, or the file (.pt or .onnx) or folder that `prior` names; auto: the first of "
-        "LaMa, MI-GAN that is here, else patches",
-    )
+    inpainter: Inpainter[WithGeometry] = Inpainter[WithGeometry](kind="diffusion")
     prior: str = prior_field()
     prompt: str = Field("", description="what the invented region shows, for a prior with a text encoder")
     candidates: int = Field(4, ge=1, description="pictures to choose from")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from reffusion.io import machine
 from reffusion.params.evaluate import Params
 from reffusion.weights import local, painters
-from reffusion.weights.published import PAINTERS
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
@@ -14,11 +13,8 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     Args:
         brings: the keys of scene.yaml.
     """
-    painted = params.inpaint and params.inpainter in PAINTERS
-    return [
-        local.lpips_need(),
-        *([painters.inpainter_need(params.inpainter, param="evaluate.inpainter")] if painted else []),
-    ]
+    painting = painters.weights_needs(params.inpainter, "evaluate.inpainter") if params.inpaint else []
+    return [local.lpips_need(), *painting]
 
 
 def machine_facts(params: Params) -> dict[str, str]:

@@ -15,8 +15,7 @@ __all__ = ["Params", "lacks", "needed_weights", "preview"]
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """Weights that the stage needs, and whether they are here; `brings`: the keys of scene.yaml."""
     needs = [local.model_need(params.depth.model, "float32")] if params.depth.model else []
-    uses_inpainter = params.extra_views and params.inpainter in PAINTERS
-    return needs + ([painters.inpainter_need(params.inpainter, param="initialize.inpainter")] if uses_inpainter else [])
+    return needs + (painters.weights_needs(params.inpainter, "initialize.inpainter") if params.extra_views else [])
 
 
 def optional_weights(params: Params) -> list[local.Need]:
@@ -33,7 +32,7 @@ def preview(params: Params, **_: Path | None) -> list[str]:
     """What the stage will do, as far as it is known in advance."""
     if not (params.extra_views and params.start == "reference"):
         return []
-    kind = painters.resolve_inpainter(params.inpainter)
+    kind = painters.resolve_inpainter(params.inpainter).kind
     how = f"by {PAINTERS[kind].name}" if kind in PAINTERS else "from patches of the photographs"
     return [f"completes up to {params.extra_views} extra views {how}: what no reference shows"]
 

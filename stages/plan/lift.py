@@ -5,14 +5,13 @@ from __future__ import annotations
 from reffusion.io import machine
 from reffusion.params.lift import Params
 from reffusion.weights import local, painters
-from reffusion.weights.published import PAINTERS
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """Weights that the stage needs, and whether they are here; `brings`: the keys of scene.yaml."""
-    if params.inpainter == "diffusion":
+    if params.inpainter.kind == "diffusion":
         return [local.model_need(params.prior, "float32")]
-    return [painters.inpainter_need(params.inpainter, param="lift.inpainter")] if params.inpainter in PAINTERS else []
+    return painters.weights_needs(params.inpainter, "lift.inpainter")
 
 
 def machine_facts(params: Params) -> dict[str, str]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from reffusion.capture.views import load_placed_views
 from reffusion.cost import estimate
 from reffusion.io import machine
+from reffusion.params.inpainter import Inpainter
 from reffusion.params.reference import Params, reference_list
 from reffusion.references.files import PAINTED, describe_references, list_paintings, load_reference_files
 from reffusion.weights import local, painters
@@ -18,21 +19,21 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """The weights that the stage needs, and what of them is missing; `brings`: the keys of scene.yaml, and its
     folders."""
     given = params.reference is not None or PAINTED in brings
-    if given or params.inpainter in (painters.EXEMPLAR, painters.AUTO):
+    if given:
         return []
-    if params.inpainter in PAINTERS:
-        return [painters.inpainter_need(params.inpainter, params.prior, "reference.prior")]
-    return [local.model_need(params.prior, params.dtype)]
+    if params.inpainter.kind == "diffusion":
+        return [local.model_need(params.prior, params.dtype)]
+    return painters.weights_needs(params.inpainter, "reference.inpainter")
 
 
 def optional_weights(params: Params) -> list[local.Need]:
     """The weights that `inpainter: auto` would use."""
-    return [painters.inpainter_need(kind) for kind in PAINTERS]
+    return [need for kind in PAINTERS for need in painters.weights_needs(Inpainter(kind=kind))]
 
 
 def machine_facts(params: Params) -> dict[str, str]:
     """What the result depends on beside the parameters: the inpainter, and the content of its file."""
-    return painters.inpainter_facts(params.inpainter, "" if params.inpainter == painters.AUTO else params.prior)
+    return painters.inpainter_facts(params.inpainter)
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
@@ -52,12 +53,12 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
             else ""
         )
         return [f"takes over the scene's reference{views and ' ' + views}: no diffusion here"]
-    if params.inpainter == "diffusion":
+    if params.inpainter.kind == "diffusion":
         return []
     unread = f"; the prompt '{params.prompt}' is not read, reference.inpainter=diffusion would" if params.prompt else ""
     how = "puts the reference together from patches of the photographs"
-    if (inpainter := painters.resolve_inpainter(params.inpainter)) in PAINTERS:
-        how = f"completes the reference by {PAINTERS[inpainter].name}, one picture"
+    if (kind := painters.resolve_inpainter(params.inpainter).kind) in PAINTERS:
+        how = f"completes the reference by {PAINTERS[kind].name}, one picture"
     return [f"{how}: no diffusion here{unread}"]
 
 

@@ -1,0 +1,49 @@
+"""The setting `inpainter` of the stages `reference`, `initialize`, `lift` and `evaluate`."""
+
+from __future__ import annotations
+
+from typing import Any, Generic, Literal, TypeVar
+
+from pydantic import Field, model_validator
+
+from reffusion.params.base import WEIGHTS, Settings
+
+Kind = TypeVar("Kind", bound=str)
+WithGeometry = Literal["exemplar", "diffusion", "lama", "migan", "auto"]  # of stages that know the scene's surfaces
+FEED_FORWARD = ("lama", "migan")  # the kinds that read a file
+
+
+class Inpainter(Settings, Generic[Kind]):
+    """What inpaints in 2D. A stage allows some kinds: `Inpainter[Literal["fsr", "lama"]]`; a plain string is the kind.
+
+    A diffusion model is none of its weights: it is the parameter `prior` of `reference` and `lift`, beside its sampler
+    and prompt. The kind is chosen by a scene or a variant, the model by a profile, for the machine.
+    """
+
+    kind: Kind = Field(
+        description="exemplar: patches of the photographs, along surfaces: sharp, with nothing new; diffusion: the "
+        "model `prior` (for the extra views of `initialize` patches, too); lama, migan: a feed-forward network; fsr: "
+        "OpenCV's FSR, else Telea; auto: the first of LaMa, MI-GAN that is on this machine, else exemplar",
+    )
+    weights: str | None = Field(
+        None,
+        description="of lama (.pt or .onnx) and migan (.onnx): a file, or a folder with one; none: the file that "
+        "`make weights` fetches",
+        json_schema_extra=WEIGHTS,
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_kind(cls, value: Any) -> Any:
+        value = {"kind": value} if isinstance(value, str) else value
+        if isinstance(value, Inpainter) or (isinstance(value, dict) and "kind" in value):
+            return value
+        raise ValueError("write a kind, such as lama, or {kind: lama, weights: FILE}")
+
+    @model_validator(mode="after")
+    def _has_weights(self) -> Inpainter[Kind]:
+        if self.weights and self.kind not in FEED_FORWARD:
+            raise ValueError(
+                f"kind {self.kind} takes no `weights`, {' and '.join(FEED_FORWARD)} do; `prior` names a diffusion model"
+            )
+        return self
