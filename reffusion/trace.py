@@ -81,7 +81,7 @@ class Checkpoints:
 
 
 class Trace:
-    """Writes `trace.jsonl`, one line per measurement; docs/traces.md describes the lines.
+    """Writes `trace.jsonl`, one line per measurement; docs/development.md#traces describes the lines.
 
     The clock counts work only: it stops inside `with trace.paused():`, and continues from `start_seconds` after a
     resume, which drops the lines from `start_iteration` on.

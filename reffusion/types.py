@@ -1,6 +1,6 @@
 """The data that moves between the parts of the method: frozen, without inheritance, without IO.
 
-Axes, units and names are those of CONVENTIONS.md.
+Axes, units and names are those of docs/architecture.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Merges the layers of parameters, and splits a time budget over stages (docs/traces.md)."""
+"""Merges the layers of parameters, and splits a time budget over stages (docs/development.md#traces)."""
 
 import re
 import shlex

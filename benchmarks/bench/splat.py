@@ -96,7 +96,7 @@ def cutoff_diagram() -> Diagram:
         for cutoff in CUTOFFS:
             reference.MIN_ALPHA = cutoff
             drawn, slopes = draw()
-            per_pair = 4.2e-9  # seconds, docs/splatting.md: the oracle's own time does not depend on the cut-off
+            per_pair = 4.2e-9  # seconds, docs/method.md#splatting: the oracle's own time does not depend on the cut-off
             seconds, name = per_pair * pairs(), f"1/{1 / cutoff:.0f}"
             worst = max(relative(a, b) for a, b in zip(slopes, gradients, strict=True))
             points.append(Point("image", name, cutoff, relative(drawn, color), seconds))

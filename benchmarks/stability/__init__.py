@@ -1,4 +1,4 @@
-"""Stiff and extreme cases, each with a bound that is derived beside it (docs/stability.md)."""
+"""Stiff and extreme cases, each with a bound that is derived beside it (docs/development.md#measuring)."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Beyond the frames of the capture and around its corners a fit has no Gaussians, or some that no photograph supervised.
 Views that look there show black holes and blobs. A sphere behind everything, in the blurred colours that lie in about
-the same direction, continues the scene softly instead. (What else was tried and measured: docs/beyond.md.)
+the same direction, continues the scene softly instead. (What else was measured: docs/results.md#backdrop.)
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Lenses: distortion models, and the pinhole that replaces a distorted lens.
 
-Directions are [..., 2] camera x/z and y/z (x right, y down); pixels as in CONVENTIONS.md.
+Directions are [..., 2] camera x/z and y/z (x right, y down); pixels as in docs/architecture.md.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from reffusion.types import Camera
 GOOD_RESIDUAL = 0.15
 # Largest ratio of the residuals after and before adjustment. Where stabilisers moved principal points (`statue`) a
 # fifth remains. Where more than half remains (`fox`, `bear`, `garden`, `dinosaur`: 0.7 to 0.85) something else moves in
-# the pictures; adjustment bends the cameras to it, and held-out views get worse (docs/flow.md).
+# the pictures; adjustment bends the cameras to it, and held-out views get worse (docs/method.md#cameras-and-fit).
 LARGEST_RATIO = 0.5
 TRACKS = 10_000  # number of points for bundle adjustment
 ROUNDS = 2  # of bundle adjustment; the second uses the matches that agree with the cameras of the first

@@ -143,7 +143,7 @@ def _follow_resampled(
     """`_follow_flow` for a neighbour of another size or lens: its picture is resampled as this view's lens would have
     shown it."""
     scale = np.array([camera.fx / other.fx, camera.fy / other.fy])
-    # pixel coordinates as in CONVENTIONS.md; OpenCV counts from the centre of the first pixel
+    # pixel coordinates as in docs/architecture.md; OpenCV counts from the centre of the first pixel
     shift = np.array([camera.cx, camera.cy]) - scale * (other.cx, other.cy)
     if scale.min() < 1:
         picture = cv2.GaussianBlur(picture, (0, 0), 0.5 / scale.min())

@@ -14,7 +14,7 @@ class Clicks:
     """Clicks on a view in the order in which they were made; a scribble is many clicks.
 
     Attributes:
-        points: [K, 2] float64, pixels of the view, as in CONVENTIONS.md.
+        points: [K, 2] float64, pixels of the view, as in docs/architecture.md.
         positive: [K] bool, True = on the object, False = on the background.
     """
 

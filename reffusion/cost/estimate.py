@@ -1,7 +1,7 @@
 """Estimates the cost of a stage on a GPU: operations and bytes counted at full size (counts.py), over its peak rates.
 
 Two fifths of each peak are assumed, without overlap of computation and memory traffic. On the only kind of GPU that was
-timed, an H200, this is within a tenth to a fifth (docs/production.md). `BASIS` states the assumed scene, which a plan
+timed, an H200, this is within a tenth to a fifth (docs/gpu.md). `BASIS` states the assumed scene, which a plan
 cannot know yet. The CPU time of a stage is not included.
 """
 

@@ -1,4 +1,4 @@
-"""Traces of the solvers that complete depth (docs/traces.md)."""
+"""Traces of the solvers that complete depth (docs/development.md#traces)."""
 
 from __future__ import annotations
 

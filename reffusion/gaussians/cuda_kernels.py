@@ -1,7 +1,7 @@
 """D-SSIM and Adam on CUDA as Triton kernels, each in a few passes over memory (Triton comes with torch's CUDA builds).
 
 In plain torch the windows of SSIM and the gathering of visible rows for Adam take three quarters of a step of `fit` on
-a GPU (docs/production.md). The formulas are those of `gaussians.ssim` and `gaussians.adam`.
+a GPU (docs/gpu.md). The formulas are those of `gaussians.ssim` and `gaussians.adam`.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ class Sheets:
     Opaque neighbouring Gaussians cannot show a sharp picture from all sides: each occludes part of the next one, so
     that only its far side is visible. The texture appears shifted away from the camera by a third of their spacing, and
     by twice that between opposite views. Fainter Gaussians reduce the shift; the second sheet keeps the surface closed.
-    Figures are in docs/initialization.md.
+    Figures are in docs/method.md#initialization.
 
     PAPER leaves open: scale and opacity of the initial Gaussians.
 

@@ -52,7 +52,7 @@ def estimate_depth(
         points: [P, 3] sparse points of the scene.
         completion: settings.
         disparity: [H, W], a depth model's answer to the reference, up to scale and offset; None without a model.
-        log: receives a series for each solver (docs/traces.md).
+        log: receives a series for each solver (docs/development.md#traces).
         hints: what else is known of the depth. farthest: see `background_depth.continue_depth`.
 
     Returns:

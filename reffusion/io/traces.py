@@ -1,4 +1,4 @@
-"""The schema of `trace.jsonl`, error against run time, and reading it (docs/traces.md)."""
+"""The schema of `trace.jsonl`, error against run time, and reading it (docs/development.md#traces)."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def read_trace(path: Path) -> list[dict[str, Any]]:
 
 
 def load_trace(path: Path, stage: str) -> dict[str, list[dict[str, Any]]]:
-    """The lines of a stage's trace by series (docs/traces.md), "" for those without a name.
+    """The lines of a stage's trace by series (docs/development.md#traces), "" for those without a name.
 
     Raises:
         ValueError: naming file, line and what violates the schema; or the file does not exist.

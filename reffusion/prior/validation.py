@@ -65,7 +65,7 @@ def make_held_out(
 def measure_errors(
     prior: Prior, held: HeldOut, seed: int, map_parts: Callable[..., Iterable] = map
 ) -> dict[str, float]:
-    """The errors listed in docs/traces.md, with fixed noise, so that they are comparable during training.
+    """The errors listed in docs/development.md#traces, with fixed noise, so that they are comparable during training.
 
     With a small model this takes about as long as one training step.
 

@@ -1,4 +1,4 @@
-"""Gradients of blending, per tile, front to back with the arithmetic of `forward` (docs/splatting.md).
+"""Gradients of blending, per tile, front to back with the arithmetic of `forward` (docs/method.md#splatting).
 
 Each footprint-tile pair writes one record. The records of a footprint are then added in a fixed order, so that results
 do not depend on the number of threads.

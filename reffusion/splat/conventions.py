@@ -1,4 +1,4 @@
-"""The constants of the splatting model, shared by its implementations (docs/splatting.md)."""
+"""The constants of the splatting model, shared by its implementations (docs/method.md#splatting)."""
 
 NEAR = 0.01  # camera z below which a Gaussian is culled, in units of the normalised frame
 LOW_PASS = 0.3  # px^2 added to the diagonal of the 2D covariance; in a subsampled view, px of the full view

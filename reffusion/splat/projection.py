@@ -1,7 +1,7 @@
 """Geometry of LANES Gaussians: from parameters to footprints, and the backward pass.
 
 Computed in float64, so that scales of any size stay finite and needles keep their gradients. Results for pixels are
-rounded to float32. Derivation of the backward pass: docs/splatting.md.
+rounded to float32. Derivation of the backward pass: docs/method.md#splatting.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""3D Gaussian splatting: one interface, three implementations of the same conventions (docs/splatting.md).
+"""3D Gaussian splatting: one interface, three implementations of the same conventions (docs/method.md#splatting).
 
 `reference` is plain torch in any dtype (the oracle of the tests), `cpu` is compiled by numba, and `cuda` is gsplat.
 Each is imported at its first use.
@@ -29,7 +29,7 @@ def render(
     """Render Gaussians: colour, depth, alpha and blended features in one pass, all differentiable.
 
     Args:
-        gaussians: N Gaussians, N = 0 allowed. Culled ones (docs/splatting.md) get zero gradients.
+        gaussians: N Gaussians, N = 0 allowed. Culled ones (docs/method.md#splatting) get zero gradients.
         camera: the view, of size 1 x 1 or larger.
         features: [N, C] values to blend like colours, over a background of zeros; differentiable.
         background: [3] colour behind everything, black if None; differentiable.
