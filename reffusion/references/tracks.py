@@ -1,8 +1,8 @@
 """Sparse optical flow between a photograph and a picture of the same view, and the affine map that explains most of it.
 
 Both are low-passed first, so that texture redrawn by an autoencoder does not count; structure stays where it was.
-Pictures are float32 [H, W], grey, in levels of 255. An affine map [2, 3] takes a pixel (docs/architecture.md#conventions) of the
-photograph to the pixel that shows the same in the picture.
+Pictures are float32 [H, W], grey, in levels of 255. An affine map [2, 3] takes a pixel of the photograph
+(docs/architecture.md#conventions) to the pixel that shows the same in the picture.
 """
 
 from __future__ import annotations
