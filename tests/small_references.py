@@ -8,12 +8,10 @@ import numpy as np
 import small_scene as small
 from PIL import Image
 
-from reffusion.background.model import surfaces_to_arrays
-from reffusion.io.arrays import save_arrays, save_json, save_labels
+from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.images import save_image
 from reffusion.io.scene import load_references, load_scene, save_mask_sets
 from reffusion.types import MaskSet, Reference
-from reffusion.workspace import SURFACES, Workspace
 from stages import reference
 
 SIZE = (160, 120)
@@ -59,9 +57,7 @@ def write_wall(folder: Path) -> dict[str, Path]:
     save_mask_sets(folder / "masks", sets)
     save_labels(folder / "masks" / "labels.npy", labels)
     save_json(folder / "masks" / "facts.json", {"best_reference": "a2"})
-    space = Workspace(made_poses, fitted, folder / "masks")
-    background = space.background_views.with_planes(space.gaussians, space.labels).with_mirrors(space.remaining)
-    save_arrays(folder / "masks" / SURFACES, surfaces_to_arrays(background))
+    small.write_background(made_poses, fitted, folder / "masks")
     return {"scene": folder / "scene", "poses": made_poses, "fit": fitted, "masks": folder / "masks"}
 
 

@@ -4,13 +4,16 @@ import numpy as np
 import torch
 
 from reffusion import geometry
+from reffusion.background.model import surfaces_to_arrays
 from reffusion.capture.lens import Lens
 from reffusion.capture.lenses import save_lenses
 from reffusion.gaussians.surfels import surface_gaussians
+from reffusion.io.arrays import save_arrays
 from reffusion.io.images import load_image, save_image, save_mask
 from reffusion.io.ply import save_ply
 from reffusion.io.scene import save_scene
 from reffusion.types import Camera, Scene, Similarity
+from reffusion.workspace import SURFACES, Workspace
 
 WALL, HALF, RIM = 2.0, 0.17, 0.015  # depth of the wall; half the side of the square, and its soft rim; scene units
 WIDTH, HEIGHT, FOCAL = 96, 72, 90.0
@@ -127,3 +130,10 @@ def write_photos(scene, poses, cameras) -> None:
 def iou(a: np.ndarray, b: np.ndarray) -> float:
     union = (a | b).sum()
     return float((a & b).sum() / union) if union else 1.0
+
+
+def write_background(poses: Path, fit: Path, masks: Path) -> None:
+    """Write the planes and mirrors of a scene whose masks are written by hand, as the stage `masks` does."""
+    space = Workspace(poses, fit, masks)
+    background = space.background_views.with_planes(space.gaussians, space.labels).with_mirrors(space.remaining)
+    save_arrays(masks / SURFACES, surfaces_to_arrays(background))

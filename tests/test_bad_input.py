@@ -27,8 +27,7 @@ from reffusion.io.depth_maps import load_depth
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, save_exr, save_image
 from reffusion.io.ply import save_ply
-from reffusion.references.files import load_reference_files
-from reffusion.references.undistort import GivenReference
+from reffusion.references.files import ReferenceFile, load_reference_files
 from reffusion.types import Gaussians
 from runner import Refused, worker
 from runner.parameters import parse_duration, parse_set, stack_layers
@@ -835,7 +834,7 @@ def test_paintings(captures, tmp_path, broken):
     with pytest.raises(BadInput, match="v01"):
         capture, roles = read_scene(poses.Params(), folder)
         found = load_reference_files(folder, capture_views(capture, roles), None)
-        load_image(found[0].path if found else GivenReference("v01", folder / "painted/v01.png").path)
+        load_image(found[0].path if found else ReferenceFile("v01", folder / "painted/v01.png").path)
 
 
 # ---------------------------------------------------------------------------------------------- what is meant, works

@@ -359,6 +359,7 @@ def test_an_estimate_that_is_not_finite_names_step_and_view(prior, text, tmp_pat
 
 
 def test_both_stages_find_depth_alike():
-    from stages import distill, initialize
+    from reffusion.initialize import fill
+    from stages import distill
 
-    assert initialize.HOW == Completion() == distill.build_depth_estimator(Params(), NO_POINTS).how
+    assert fill.COMPLETION == Completion() == distill.build_depth_estimator(Params(), NO_POINTS).how

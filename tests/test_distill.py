@@ -450,6 +450,7 @@ def folders(tmp_path):
     save_labels(paths["initialize"] / "labels.npy", masked)
     for stage in ("fit", "initialize"):
         save_ply(paths[stage] / "gaussians.ply", gaussians)
+    small_scene.write_background(paths["poses"], paths["fit"], paths["masks"])
     save_small_prior(tmp_path / "prior")
     return paths | {"prior": str(tmp_path / "prior")}
 

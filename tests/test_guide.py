@@ -60,7 +60,7 @@ def test_the_mask_page(mine):
     with subprocess.Popen([*as_typed(command, mine), "port=18390"], cwd=ROOT, **group) as serving:
         try:
             address = next(found[0] for line in serving.stdout if (found := re.findall(r"http://127\S+", line)))
-            assert "What shall go?" in urllib.request.urlopen(address, timeout=20).read().decode()
+            assert "What should be removed?" in urllib.request.urlopen(address, timeout=20).read().decode()
         finally:
             os.killpg(serving.pid, signal.SIGTERM)  # who runs the tests may have it ignore SIGINT
 

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from reffusion.background.continuation import _surrounded
+from reffusion.background.continuation import _enclosed_patches
 from reffusion.depth.background_depth import Completion, Hints, ViewDepth, continue_depth, dilate
 from reffusion.depth.layers import label_surfaces, segment_surfaces
 from reffusion.graph_cut import alpha_expansion
@@ -148,6 +148,6 @@ def test_a_mirror_is_surrounded_and_a_recess_is_not():
     rows, columns = np.mgrid[:100, :100]
     round_plate = np.hypot(rows - 50, columns - 50) < 20
     hidden = (rows > 60) & (columns < 40)
-    assert _surrounded(~round_plate & ~hidden, round_plate).sum() > 0.95 * round_plate.sum()
+    assert _enclosed_patches(~round_plate & ~hidden, round_plate).sum() > 0.95 * round_plate.sum()
     recess = (columns < 50) & (columns > 10) & (rows > 20) & (rows < 80)
-    assert not _surrounded((columns >= 50) | (rows >= 80), recess).any()
+    assert not _enclosed_patches((columns >= 50) | (rows >= 80), recess).any()

@@ -115,10 +115,10 @@ def test_it_imports_nothing_heavy():
 
 def test_make_gpu_ends_with_one_line_where_there_is_no_card(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["ready", "--before"])
-    monkeypatch.setattr(ready, "machine", lambda: Machine(torch_cuda="13.0", nvcc="13.0"))
+    monkeypatch.setattr(ready, "detect", lambda: Machine(torch_cuda="13.0", nvcc="13.0"))
     assert ready.main() == 2
     assert capsys.readouterr().err.count("\n") == 1
-    monkeypatch.setattr(ready, "machine", lambda: replace(GOOD, gsplat=False, extension=False))
+    monkeypatch.setattr(ready, "detect", lambda: replace(GOOD, gsplat=False, extension=False))
     assert ready.main() == 0, "gsplat is installed next"
 
 

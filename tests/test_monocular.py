@@ -127,13 +127,13 @@ def test_the_references_depth_is_the_estimate_aligned():
 
 
 def test_the_stage_shows_the_model_the_reference(network):
-    from stages.initialize import estimate_of
+    from reffusion.initialize.fill import _predict_disparity
 
     view = small.CAMERAS["a2"]
     reference = Reference(view, small.photo(view), np.zeros((small.HEIGHT, small.WIDTH), bool))
     image = torch.from_numpy(reference.image).permute(2, 0, 1) / 255
-    assert (estimate_of(network, reference) == monocular.predict_disparity(network, image).numpy()).all()
-    assert estimate_of(None, reference) is None
+    assert (_predict_disparity(network, reference) == monocular.predict_disparity(network, image).numpy()).all()
+    assert _predict_disparity(None, reference) is None
 
 
 def test_the_depth_term_asks_the_model_of_its_parameter(folder, network):

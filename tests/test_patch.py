@@ -17,7 +17,7 @@ from reffusion.gaussians import matching
 from reffusion.io.arrays import load_json, load_labels, save_labels
 from reffusion.io.cameras import save_cameras
 from reffusion.io.compressed import save_compressed
-from reffusion.io.ply import load_ply, save_ply
+from reffusion.io.ply import load_ply, load_property_names, save_ply
 from reffusion.io.scene import load_mask_sets, load_scene
 from reffusion.splat import rasterizer
 from reffusion.types import Gaussians, Similarity
@@ -105,7 +105,7 @@ def test_poses_says_which_splats_were_deleted(tmp_path, compressed, capsys):
     np.testing.assert_allclose(
         load_scene(out).similarity.invert(brought.means.double().numpy()), whole.means, atol=1e-4
     )
-    assert patch.properties_of(out / "gaussians.ply")[: len(EDITOR)] == EDITOR
+    assert load_property_names(out / "gaussians.ply")[: len(EDITOR)] == EDITOR
 
 
 def refused(folder, message, **params):

@@ -117,7 +117,7 @@ def test_one_byte_flipped_in_each_kind_of_file_is_noticed_and_named(scene, unbro
         path.write_bytes(data)
         os.utime(path, ns=(then, then))
     capsys.readouterr()
-    assert maintenance.verify(request) == len({stage for stage, _ in kinds}) == 8
+    assert maintenance.verify(request) == len({stage for stage, _ in kinds}) == 9
     said = {line.split(": ")[0].rpartition("/")[2]: line for line in capsys.readouterr().out.splitlines()}
     for (stage, _), path in kinds.items():
         assert path.relative_to(home / stage).as_posix() in said[stage] or " more changed" in said[stage]

@@ -19,6 +19,7 @@ from reffusion import trace
 from reffusion.depth.background_depth import Completion
 from reffusion.distill import loop as distilling
 from reffusion.fit import reconstruction as fitting
+from reffusion.initialize import fill
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, save_references
 from reffusion.io.traces import MAIN, load_trace, main_quantity
@@ -54,7 +55,7 @@ def ready(tmp_path_factory):
         [Reference(view, small.photo(view), load_mask_sets(home / "masks", ["a2"])["a2"].invent)],
     )
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(initialize, "HOW", Completion(planar_share=2.0))  # no planes: both solvers
+        patched.setattr(fill, "COMPLETION", Completion(planar_share=2.0))  # no planes: both solvers
         initialize.run(initialize.Params(), home / "initialize", **folders)
     save_small_prior(home / "prior")
     return SimpleNamespace(home=home, prior=str(home / "prior"), **folders)

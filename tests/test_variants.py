@@ -297,7 +297,7 @@ def test_random_gaussians_fill_the_region_of_the_hole_by_their_seed(scene, tmp_p
     gaussians, new = initialized(scene, tmp_path / "random", "random")
     removed = load_json(tmp_path / "random" / "facts.json")["removed_gaussians"]
     debris = int(load_labels(scene["masks"] / "debris.npy").sum())
-    assert int(new.sum()) == max(removed - debris, random_init.FEWEST)
+    assert int(new.sum()) == max(removed - debris, random_init.MIN_GAUSSIANS)
     at = gaussians.means[new]
     # Removed were the square and what of the wall it hides from all views.
     assert (at[:, :2].abs() < 1.3 * small.HALF).all()
