@@ -23,8 +23,8 @@ def square(radius: int) -> np.ndarray:
 
 
 def dilate(mask: np.ndarray, fraction: float) -> np.ndarray:
-    """The mask, bool [H, W], dilated by a disk whose radius is `fraction` of the image's width, at least one pixel unless
-    it is 0."""
+    """The mask, bool [H, W], dilated by a disk whose radius is `fraction` of the image's width: at least one pixel,
+    unless it is 0."""
     if not fraction:
         return mask
     return cv2.dilate(mask.astype(np.uint8), disk(to_pixels(fraction, mask.shape[1]))) > 0

@@ -1,5 +1,7 @@
 """A wall of Gaussians with a square of other Gaussians before it, seen by cameras side by side: truth by hand."""
 
+from pathlib import Path
+
 import numpy as np
 import torch
 

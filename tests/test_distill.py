@@ -8,7 +8,7 @@ import pytest
 import torch
 from small_params import altered
 from small_prior import save_small_prior
-from small_scene import write_photos
+from small_scene import write_background, write_photos
 
 from reffusion import trace
 from reffusion.distill import densification
@@ -450,7 +450,7 @@ def folders(tmp_path):
     save_labels(paths["initialize"] / "labels.npy", masked)
     for stage in ("fit", "initialize"):
         save_ply(paths[stage] / "gaussians.ply", gaussians)
-    small_scene.write_background(paths["poses"], paths["fit"], paths["masks"])
+    write_background(paths["poses"], paths["fit"], paths["masks"])
     save_small_prior(tmp_path / "prior")
     return paths | {"prior": str(tmp_path / "prior")}
 

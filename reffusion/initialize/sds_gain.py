@@ -2,8 +2,8 @@
 
 The embedded prior, adapted to the reference, improves pictures of up to `PRIOR_PSNR`, at its own size of `SIDE_PX` for
 a whole view, and degrades better ones (docs/method.md#the-embedded-prior). The truth inside the hole is unknown. Beside
-the hole there are photographs, and renders inside the hole are about `HOLE_LOSS` worse. This says nothing of pixels that
-no reference shows and that patches of photographs filled.
+the hole there are photographs, and renders inside the hole are about `HOLE_LOSS` worse. This says nothing of pixels
+that no reference shows and that patches of photographs filled.
 """
 
 from __future__ import annotations
