@@ -6,7 +6,7 @@ Axes, units and names are those of docs/architecture.md.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -143,7 +143,7 @@ class Gaussians:
     log_scales: Tensor
     opacity_logits: Tensor
     sh: Tensor
-    antialiased: bool = False
+    antialiased: bool = field(default=False, kw_only=True)
 
     def __len__(self) -> int:
         return self.means.shape[0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -54,7 +54,7 @@ def annotate(axes: Axes, text: str, at, offset=(0, 0), colour: str = INK, ha: st
     axes.annotate(text, at, offset, textcoords="offset points", **look)
 
 
-def needs_log_axis(values: Sequence[float], factor: float = 12) -> bool:
+def needs_log_axis(values: Iterable[float], factor: float = 12) -> bool:
     """True if the positive values span more than `factor`, so that a logarithmic axis serves them better."""
     positive = [value for value in values if value > 0]
     return len(positive) > 1 and max(positive) > factor * min(positive)

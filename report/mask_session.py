@@ -108,7 +108,9 @@ class Session:
         self.images = load_views(capture.poses, self.views)
         self.clicks: dict[str, list[tuple[float, float, bool]]] = {}
         self.masks, self.versions = dict(capture.given), dict.fromkeys(self.views, 0)
-        self.gaussians = self.near = self.labels = None
+        self.gaussians: all_views.Gaussians | None = None
+        self.near: all_views.NeighbourGraph | None = None
+        self.labels: Tensor | None = None
         self.pending_views: list[str] = []  # views whose masks do not follow the latest labels yet
         self.reliefs: dict[str, np.ndarray] = {}
         self.revision, self.solved_revision = 0, 0  # of the clicks, and of the clicks that the labels include
@@ -206,7 +208,9 @@ class Session:
 
     def _clicks_on(self, name: str) -> Clicks | None:
         points = self.clicks.get(name)
-        return points and Clicks(np.array([p[:2] for p in points], float), np.array([p[2] for p in points], bool))
+        if not points:
+            return None
+        return Clicks(np.array([p[:2] for p in points], float), np.array([p[2] for p in points], bool))
 
     def _set_mask(self, name: str, mask: np.ndarray | None) -> None:
         if mask is None:
@@ -239,12 +243,13 @@ class Session:
         return self.segmenter is not None and bool(clicks.positive.any())
 
     def _network_mask(self, name: str, clicks: Clicks) -> np.ndarray:
+        assert self.segmenter is not None  # `_uses_network`
         if name not in self.embeddings:
             self.embeddings[name] = encode_image(self.segmenter, self.images[name])
         return predict_mask(self.segmenter, self.embeddings[name], clicks)
 
     def _all_clicks(self) -> dict[str, Clicks]:
-        return {name: self._clicks_on(name) for name in self.clicks}
+        return {name: on for name in self.clicks if (on := self._clicks_on(name)) is not None}
 
     def _solver(self) -> Callable[[], Tensor | None]:
         """Function that labels the object from all present clicks, bool [N]; it returns None if nothing marks it."""
@@ -254,6 +259,7 @@ class Session:
         by_network = [name for name, on in clicks.items() if self._uses_network(on)]
         given = given | {name: self._network_mask(name, clicks.pop(name)) for name in by_network}
         cameras = {name: self.scene.cameras[name] for name in {*self.views, *given}}
+        assert self.gaussians is not None and self.near is not None
         problem = (self.gaussians, self.near, cameras, self.images.__getitem__, clicks, given)
         return lambda: all_views.segment_by_clicks(*problem).labels
 
@@ -270,6 +276,7 @@ class Session:
         self.pending_views = [name for name in self.views if name not in self.clicks and name not in self.capture.given]
 
     def _refine(self, name: str) -> None:
+        assert self.gaussians is not None and self.labels is not None
         camera, image, on = self.scene.cameras[name], self.images[name], self._clicks_on(name)
         self._set_mask(name, all_views.object_mask(self.gaussians, self.labels, camera, image, on))
         self.pending_views = [each for each in self.pending_views if each != name]

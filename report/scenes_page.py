@@ -103,7 +103,8 @@ def summarize_stages(jobs: list[Job]) -> list[tuple]:
 
 def quartiles(values: list[float]) -> tuple[int, float, float, float]:
     """Number of values and their three quartiles."""
-    return (len(values), *(float(v) for v in np.percentile(values, [25, 50, 75])))
+    low, middle, high = (float(v) for v in np.percentile(values, [25, 50, 75]))
+    return len(values), low, middle, high
 
 
 def scene_table(jobs: list[Job], out: Path) -> str:

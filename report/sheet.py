@@ -6,6 +6,7 @@ python -m report.sheet runs/demo --views 3 --out docs/images/demo.png
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ def make(scene_dir: Path, out: Path, *, views: list[str] | int = 3, scale: int |
     columns = [key for key in TITLES if any(key in row for row in rows)]
     width = max(picture.shape[1] for row in rows for picture in row.values())
     scale = scale or max(1, round(480 / width))
-    cells = [[enlarge(row.get(key), scale) for key in columns] for row in rows]
+    cells = [[enlarge(row[key], scale) if key in row else None for key in columns] for row in rows]
     save_image(out, compose_sheet(cells, [TITLES[key] for key in columns], names))
     return out
 
@@ -73,12 +74,12 @@ def load_view_pictures(evaluate: Path, poses: Path | None, name: str) -> dict[st
     return {key: load_image(path) for key, path in paths.items() if path.exists()}
 
 
-def enlarge(picture: np.ndarray | None, scale: int) -> np.ndarray | None:
+def enlarge(picture: np.ndarray, scale: int) -> np.ndarray:
     """Repeat each pixel `scale` times in both directions, which blurs nothing."""
-    return None if picture is None else picture.repeat(scale, 0).repeat(scale, 1)
+    return picture.repeat(scale, 0).repeat(scale, 1)
 
 
-def compose_sheet(cells: list[list[np.ndarray | None]], titles: list[str], names: list[str]) -> np.ndarray:
+def compose_sheet(cells: Sequence[Sequence[np.ndarray | None]], titles: list[str], names: list[str]) -> np.ndarray:
     """uint8 [H, W, 3]: the cells on white, column titles above, each view's name on its first picture."""
     heights = [max(cell.shape[0] for cell in row if cell is not None) for row in cells]
     width = max(cell.shape[1] for row in cells for cell in row if cell is not None)

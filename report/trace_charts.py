@@ -49,7 +49,7 @@ def axis_title(name: str) -> str:
     return quantity.label[0].upper() + quantity.label[1:] + unit + {"more": " ↑", "less": " ↓", "": ""}[quantity.better]
 
 
-def best_index(name: str, values: Sequence[float]) -> int:
+def best_index(name: str, values: Sequence[float] | np.ndarray) -> int:
     """Index of the best value."""
     more = name in QUANTITIES and QUANTITIES[name].better == "more"
     return int((np.argmax if more else np.argmin)(values))

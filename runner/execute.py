@@ -78,8 +78,8 @@ def _run_stage(
     for message in export_folders(partial, place, job.home, job.pipeline.stages[stage].export):
         say(message)
     replace_artifact(partial, place, job.hashes)
-    for other in job.home.glob(f".partial-{stage}-*"):
-        delete_folder(other)
+    for abandoned in job.home.glob(f".partial-{stage}-*"):
+        delete_folder(abandoned)
     job.hashes.save()
     return replace(decision, status="cached", reason="made now", path=place, is_final=True)
 

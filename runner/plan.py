@@ -157,7 +157,7 @@ def _weights(job: Job, stage: str) -> Iterator[tuple[str, str, Path | None]]:
 def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str, str]) -> Inputs:
     """What the stage's artifact depends on, with its needs at these paths."""
     own = job.stages[stage]
-    hashes = {need: path and job.hashes.folder(path) for need, path in needs.items()}
+    hashes = {need: job.hashes.folder(path) if path else None for need, path in needs.items()}
     hashes |= {f"{SCENE}: {name}": digest(json.dumps(fact)) for name, fact in own.facts.items()}
     hashes |= {f"machine: {name}": fact for name, fact in own.machine.items()}
     if own.reads is not None:

@@ -89,7 +89,8 @@ class Progress:
             failed = [row for row in ended if row.state.startswith("failed")]
             busy = [row for row in self._rows if row.stage]
             lefts = [self._seconds_left(row) for row in self._rows if row not in ended]
-            about = "" if None in lefts else f", {format_seconds(sum(map(float, lefts)) / self._at_once)} left"
+            known = [left for left in lefts if left is not None]
+            about = f", {format_seconds(sum(known) / self._at_once)} left" if len(known) == len(lefts) else ""
             head = f"{len(ended) - len(failed)} of {len(self._rows)} done, {len(failed)} failed{about}"
             width_name = max(map(len, (row.name for row in self._rows)), default=0)
             lines = [f"{row.name:<{width_name}}  {row.stage:<12} {self._describe(row)}" for row in busy]

@@ -125,7 +125,7 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> Job:
     base = runs / (scene_name(source) if source else "")
     folder = base / FRAMES if source and source.is_file() else source
     check_unique_name(base, folder, root)
-    if folder != source:
+    if source and folder and folder != source:
         extract_frames(source, folder, root, hashes)
     found = load_scene_file(folder, pipeline) if folder else SceneFile(root / "scene.yaml", None, {}, {})
     if variant and variant not in pipeline.variants:

@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, TextIO, get_args
+from typing import Any, TextIO, TypeGuard, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -59,7 +59,8 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
 
     A question with `scene` adds what the stage reads of it; with `brings` the weights that are "needed" and what this
     machine "lacks" for CUDA; with `card` its "cost" on that GPU; with `needs` the preview's "notes" or "refusal"."""
-    stage, needs, brings, scene = (question.get(name) for name in ("stage", "needs", "brings", "scene"))
+    stage = question["stage"]
+    needs, brings, scene = (question.get(name) for name in ("needs", "brings", "scene"))
     path = _description_file(stage)
     try:
         planned = _import_file(path)
@@ -130,7 +131,7 @@ def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any
             yield from _fields(info.annotation, f"{prefix}{name}.")
 
 
-def _is_group(annotation: Any) -> bool:
+def _is_group(annotation: Any) -> TypeGuard[type[BaseModel]]:
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
@@ -271,5 +272,5 @@ if __name__ == "__main__":
         # All results are in files: skip the teardown of large libraries, which takes most of a second.
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(code)
+        os._exit(code or 0)
     sys.exit(code)

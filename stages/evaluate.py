@@ -88,7 +88,7 @@ def run(
         "backdrop": facts["backdrop"],
         "suspects": [name for name in names if name in scene.suspects] or None,  # their photographs contradict poses
         "consistency": rows.summarize_consistency(scored),
-        **networks_used(painter and painter.name, distill),
+        **networks_used(painter.name if painter else None, distill),
         "exposure": exposure.PROTOCOL if exposures else None,
         "lpips_unavailable": "; ".join(reason for _, reason in loaded.values() if reason) or None,
         "gaussians": facts["gaussians"],

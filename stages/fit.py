@@ -38,7 +38,10 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None
     held_out_names = scene.train[params.holdout // 2 :: params.holdout] if params.holdout else ()
     cameras = [scene.cameras[name] for name in scene.train if name not in held_out_names]
     images = load_views(poses, scene.train)
-    hidden = load_hidden_pixels(raw_masks, scene) if params.pixels == "unmasked" else {}
+    hidden: dict[str, np.ndarray] = {}
+    if params.pixels == "unmasked":
+        assert raw_masks is not None
+        hidden = load_hidden_pixels(raw_masks, scene)
     images |= {
         name: classical.telea(images[name], mask) for name, mask in hidden.items()
     }  # optical flow reads these pixels, too

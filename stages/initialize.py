@@ -57,6 +57,7 @@ def run(
         save_depths(out, depths)
     if is_method:
         sets = restrict_invent_masks(out, draft, sets, background)
+        assert reference is not None
         trusted = trusted_references(reference, references, background)
         if params.refit_steps:
             trusted, background, shadows = remove_shadows(trusted, draft.gaussians, background)

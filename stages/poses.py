@@ -45,6 +45,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     gaussians.ply and deleted.npy where the scene brings them; warnings.json where something is odd."""
     own_splats = _load_own_splats(params, scene)  # before the work, not after it
     if is_gaussians_only(params, scene):
+        assert own_splats is not None  # such a scene has `cleaned`, and `gaussians` with it
         _save_gaussians_only(params, out, scene, own_splats)
         return
     capture, roles = read_scene(params, scene, params.longest)
@@ -61,6 +62,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         lenses[views[k]], pinholes[views[k]] = save_undistorted_view(out, views[k], capture, longest)
     for name in roles.blank:
         lenses[name], pinholes[name] = resized_lens(name, capture, longest)
+    assert capture.poses is not None
     normalized = frame.normalize_scene(capture.poses, pinholes, roles.train, roles.test, roles.clean)
     normalized, contradictions = _drop_outliers(params, roles, replace(normalized, blank=roles.blank), out)
     views = [name for name in views if name in normalized.cameras]
@@ -145,6 +147,7 @@ def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: Own
     """The stage for a scene without photographs: cameras that a capture left, or some around the hole; nothing in
     images/."""
     rows, found = own_splats.splats.rows, cameras.read(scene)
+    assert own_splats.deleted is not None
     means, opaque, sizes = rows.means, rows.opacity_logits > 0, np.exp(np.median(rows.log_scales, axis=1))
     poses, source = found or (ring.place_cameras(means, sizes, opaque, own_splats.deleted, params.longest), None)
     some = np.flatnonzero(opaque)

@@ -8,6 +8,8 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 
+import numpy as np
+
 from reffusion import trace
 from reffusion.capture.checks.sanity import find_odd_masks
 from reffusion.capture.lenses import load_lenses
@@ -56,7 +58,7 @@ def _save_region(params: Params, out: Path, scene: Scene) -> None:
             scene.cameras[resolve_view(region.view, scene.cameras, "region")], region.distance * scale
         )
     else:
-        center = scene.similarity.apply(region.center)
+        center = scene.similarity.apply(np.asarray(region.center))
     if region.outside:
         given = load_raw_masks(out, scene.train)
         for name in scene.train:

@@ -201,7 +201,8 @@ def _cell_visibility(
     normals = np.broadcast_to(facing, (CELLS * CELLS, 3))
     visibility = count_views(plane.cell_centers.reshape(-1, 3), views, normals)
     seen = (visibility.seen >= 1) & (visibility.seen >= visibility.free)
-    return tuple(each.reshape(CELLS, CELLS) for each in (seen, visibility.is_empty, visibility.masked > 0))
+    seen, empty, hidden = (each.reshape(CELLS, CELLS) for each in (seen, visibility.is_empty, visibility.masked > 0))
+    return seen, empty, hidden
 
 
 def _enclosed_patches(seen: np.ndarray, free: np.ndarray) -> np.ndarray:

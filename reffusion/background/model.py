@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -100,7 +101,7 @@ def robust_extent(means: Tensor) -> tuple[np.ndarray, float]:
 
 def surfaces_to_arrays(background: Background) -> dict[str, np.ndarray]:
     """The planes and mirrors as arrays, which `surfaces_from_arrays` reads: finding them takes seconds."""
-    arrays = {"center": background.center, "radius": np.float64(background.radius)}
+    arrays: dict[str, Any] = {"center": background.center, "radius": np.float64(background.radius)}
     for name in _PLANE_ARRAYS if background.planes else ():
         arrays[f"plane_{name}"] = np.stack([np.asarray(getattr(plane, name)) for plane in background.planes])
     for k, mirror in enumerate(background.mirrors):
@@ -113,10 +114,11 @@ def surfaces_to_arrays(background: Background) -> dict[str, np.ndarray]:
 def surfaces_from_arrays(background: Background, arrays: Mapping[str, np.ndarray], device: str) -> Background:
     """The background with the planes and mirrors of `surfaces_to_arrays`."""
     columns = [arrays[f"plane_{name}"] for name in _PLANE_ARRAYS] if "plane_normal" in arrays else []
-    planes = [
-        Plane(**{name: float(each) if each.ndim == 0 else each for name, each in zip(_PLANE_ARRAYS, row, strict=True)})
+    fields: list[dict[str, Any]] = [
+        {name: float(each) if each.ndim == 0 else each for name, each in zip(_PLANE_ARRAYS, row, strict=True)}
         for row in zip(*columns, strict=True)
     ]
+    planes = [Plane(**each) for each in fields]
     mirrors, k = [], 0
     while f"mirror{k}_normal" in arrays:
         tensors = {name: torch.from_numpy(arrays[f"mirror{k}_{name}"]).to(device) for name in PARAMETERS}

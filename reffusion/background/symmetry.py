@@ -68,8 +68,9 @@ def find_mirrors(
         ]
         own = torch.from_numpy(np.isfinite(distance)).to(gaussians.means.device)
         mirrors = _select_mirrors(points, up, cell, views, photos)
-        thing = _with_mean_colors(gaussians.map(lambda p, own=own: p[own]), views) if mirrors else None
-        found += [Mirror(thing, *mirror) for mirror in mirrors]
+        if mirrors:
+            thing = _with_mean_colors(gaussians.map(lambda p, own=own: p[own]), views)
+            found += [Mirror(thing, *mirror) for mirror in mirrors]
     return found
 
 

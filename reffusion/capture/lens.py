@@ -70,12 +70,15 @@ def from_colmap(model: str, width: int, height: int, params: tuple[float, ...]) 
     if model not in _COLMAP:
         raise BadInput(f"camera model {model} is not understood; convert it to one of {', '.join(_COLMAP)}")
     single_focal, fisheye, names = _COLMAP[model]
-    head = (params[0], *params[:3]) if single_focal else params[:4]
+    fx, fy, cx, cy = (params[0], *params[:3]) if single_focal else params[:4]
     k = dict(zip(names, params[3 if single_focal else 4 :], strict=True))
     return Lens(
         width,
         height,
-        *head,
+        fx,
+        fy,
+        cx,
+        cy,
         radial=tuple(k[n] for n in ("k1", "k2", "k3", "k4") if n in k and (fisheye or n != "k4")),
         denominator=tuple(k[n] for n in ("k4", "k5", "k6") if n in k and not fisheye),
         tangential=(k.get("p1", 0.0), k.get("p2", 0.0)),

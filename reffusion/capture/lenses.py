@@ -28,9 +28,9 @@ def load_lenses(poses_dir: Path) -> tuple[dict[str, Lens], bool]:
     if not path.is_file():
         raise BadInput(f"{path}: missing; {poses_dir} is no finished `poses` folder")
     read = load_json(path)
-    tuples = ("radial", "denominator", "tangential")
+    tuples = {"radial", "denominator", "tangential"}
     views = {
-        name: Lens(**{key: tuple(value) if key in tuples else value for key, value in fields.items()})
+        name: Lens(**(fields | {key: tuple(fields[key]) for key in fields.keys() & tuples}))
         for name, fields in read["views"].items()
     }
     return views, read["upright"]

@@ -7,7 +7,7 @@ decomposes accents. Names are compared in Unicode's NFC form with forward slashe
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
@@ -99,10 +99,7 @@ def pair_names(wanted: Mapping[K, Iterable[str]], known: Mapping[V, Iterable[str
     pairs: dict[K, V] = {}
     taken: set[V] = set()
     for fold in (str, str.casefold):
-        mine, theirs = (
-            {identity: [fold(normalize_path(p)).split("/") for p in paths] for identity, paths in side.items()}
-            for side in (wanted, known)
-        )
+        mine, theirs = _split(wanted, fold), _split(known, fold)
         deepest = max((len(parts) for side in (mine, theirs) for paths in side.values() for parts in paths), default=0)
         for depth in range(deepest, 0, -1):
             owners = _index(theirs, depth)
@@ -114,6 +111,11 @@ def pair_names(wanted: Mapping[K, Iterable[str]], known: Mapping[V, Iterable[str
                         pairs[identity] = candidate
                         taken.add(candidate)
     return pairs
+
+
+def _split(paths: Mapping[K, Iterable[str]], fold: Callable[[str], str]) -> dict[K, list[list[str]]]:
+    """The parts of each path, as `fold` writes them."""
+    return {identity: [fold(normalize_path(p)).split("/") for p in spellings] for identity, spellings in paths.items()}
 
 
 def _index(paths: Mapping[K, Iterable[list[str]]], depth: int) -> dict[tuple[str, ...], set[K]]:

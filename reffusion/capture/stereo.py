@@ -88,8 +88,8 @@ def match_views(
     found = {}
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         by_name = {camera.name: camera for camera in cameras}
-        sides = lambda pair: [(by_name[name], gray[name]) for name in pair]
-        both_ways = pool.map(lambda pair: _flow_both_ways(*sides(pair), cell), pairs)
+        side = lambda name: (by_name[name], gray[name])
+        both_ways = pool.map(lambda pair: _flow_both_ways(side(pair[0]), side(pair[1]), cell), pairs)
         for (one, other), (there, back) in zip(pairs, both_ways, strict=True):
             found[one, other], found[other, one] = there, back
     for camera in chosen:

@@ -56,6 +56,7 @@ def grow_object(
         likelihood = like / (like + unlike)
         change = np.abs(likelihood[pairs[:, 0]] - likelihood[pairs[:, 1]])
         cost = COLOR_COST * step + LIKELIHOOD_COST * (change if depth_edges is None else COLOR_ON_SURFACE * change)
+    assert labels is not None
     return keep_connected(labels, pairs, seeds == OBJECT)
 
 

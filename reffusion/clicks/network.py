@@ -8,6 +8,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -74,7 +75,8 @@ def load_segmenter(source: str | Path = SOURCE) -> Segmenter | None:
 
 def make_segmenter(model: nn.Module) -> Segmenter:
     """A Segmenter from a SamModel in memory."""
-    return Segmenter(model.requires_grad_(False).eval(), model.config.vision_config.image_size)
+    config: Any = model.config
+    return Segmenter(model.requires_grad_(False).eval(), config.vision_config.image_size)
 
 
 @torch.no_grad()

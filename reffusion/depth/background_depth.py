@@ -146,7 +146,7 @@ def extract_depth(
     if hints.observed is not None:
         known |= hole & hints.observed
     anchored = hole & ~known & np.isfinite(plane_depth) if plane_depth is not None else np.zeros_like(hole)
-    depth = np.where(anchored, plane_depth, depth) if anchored.any() else depth
+    depth = np.where(anchored, plane_depth, depth) if plane_depth is not None and anchored.any() else depth
     return ViewDepth(camera, depth, known, hole, hidden, anchored, hints)
 
 

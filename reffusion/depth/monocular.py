@@ -86,11 +86,11 @@ def _check_kind(config, name: str) -> None:
 
 def make_network(model: nn.Module, device: str = "cpu") -> DepthNetwork:
     """Build a DepthNetwork from a model in memory."""
-    _check_kind(model.config, model.config.name_or_path)
-    backbone = model.config.backbone_config
+    config: Any = model.config
+    _check_kind(config, config.name_or_path)
     model.requires_grad_(False).eval().to(device)
-    metric = model.config.depth_estimation_type == "metric"
-    return DepthNetwork(model, model.config.patch_size, backbone.image_size, metric)
+    metric = config.depth_estimation_type == "metric"
+    return DepthNetwork(model, config.patch_size, config.backbone_config.image_size, metric)
 
 
 @torch.no_grad()

@@ -64,8 +64,9 @@ def estimate_multiview_depth(
     """
     samples = {camera.name: visible_samples(points, camera, images[camera.name]) for camera in cameras}
     interpolate = lambda camera: interpolate_depth(samples[camera.name], camera, images[camera.name])
-    initial = dict(zip(samples, side_by_side(interpolate, cameras), strict=True))
-    views = [camera for camera in cameras if initial[camera.name] is not None]
+    found = zip(samples, side_by_side(interpolate, cameras), strict=True)
+    initial = {name: depth for name, depth in found if depth is not None}
+    views = [camera for camera in cameras if camera.name in initial]
     planes = {view.name: _refine_planes(view, views, images, initial[view.name], seed) for view in views}
     depth = {view.name: _depth_of_planes(planes[view.name], view) for view in views}
     confirmed = {

@@ -217,6 +217,7 @@ def _add_gradient(term: Term, step: int, gaussians: Gaussians, masked: Tensor) -
         norms = _gradient_norms(gaussians, masked)
         log |= {f"{label}_gradient_mean": float(norms.mean()), f"{label}_gradient_max": float(norms.max())}
     if value.probe is not None:
+        assert value.probe.grad is not None
         observed = value.probe.grad, radii * masked, view.camera.width, view.camera.height
     return _Contribution(reached & (radii > 0), log, value.latest, screen_gradient=observed)
 

@@ -52,7 +52,7 @@ def multi_scale_dssim(render: Tensor, target: Tensor) -> Tensor:
         render, target = (_downsample(image) for image in (render, target))
         if min(target.shape[:2]) < MIN_SIDE:
             break
-    return sum(values) / len(values)
+    return sum(values[1:], values[0]) / len(values)
 
 
 def _downsample(image: Tensor) -> Tensor:

@@ -32,7 +32,7 @@ def estimate_gains(points: np.ndarray, cameras: Sequence[Camera], photos: Mappin
     if not len(points):
         return result
     sampled = np.stack([sample_visible(camera, points, _blur(photos[camera.name])) for camera in cameras])  # [V, P, 3]
-    usable = (sampled > DARK).all(-1) & (sampled < BRIGHT).all(-1)  # NaN fails both
+    usable = np.all(sampled > DARK, -1) & np.all(sampled < BRIGHT, -1)  # NaN fails both
     for channel in range(3):
         result[:, channel] = np.exp(_view_offsets(np.log(np.where(usable, sampled[..., channel], 1.0)), usable))
     return result

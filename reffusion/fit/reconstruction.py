@@ -26,7 +26,7 @@ from reffusion.fit.step import (
 from reffusion.fit.view_loader import check_sizes, iterate_views, to_tensors
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.params.fit import Params
-from reffusion.splat.rasterizer import render
+from reffusion.splat.rasterizer import Implementation, render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 PLACED_RATE_FACTOR = 0.1  # on the learning rate of positions, for Gaussians whose positions are known
@@ -46,7 +46,7 @@ def fit(
     gains: np.ndarray | None = None,
     placed: Tensor | None = None,
     spent: float = 0.0,
-    impl: str = "auto",
+    impl: Implementation = "auto",
 ) -> Gaussians:
     """Optimise `initial` so that its renderings match the views; resumes bit for bit from the checkpoint in `folder`.
 
@@ -183,7 +183,7 @@ def _write_line(
     held_out: Sequence[Camera],
     images: Mapping[str, np.ndarray],
     settings: Params,
-    impl: str,
+    impl: Implementation,
 ) -> None:
     """Write a line of the trace, with the clock stopped."""
     with log.paused():
@@ -193,7 +193,7 @@ def _write_line(
 
 
 def _trace_values(
-    run: _Run, held_out: Sequence[Camera], images: Mapping[str, np.ndarray], settings: Params, impl: str
+    run: _Run, held_out: Sequence[Camera], images: Mapping[str, np.ndarray], settings: Params, impl: Implementation
 ) -> dict[str, Any]:
     """Values of a line of the trace; loss and training PSNR only if there were steps since the last line."""
     line: dict[str, Any] = {"gaussians": len(run.optimizer.gaussians)}

@@ -15,7 +15,7 @@ from reffusion.gaussians.optimize import GaussianOptimizer, Rates, reconstructio
 from reffusion.geometry import cameras_extent
 from reffusion.kernels.compiled import torch_on_one_thread
 from reffusion.params.fit import LearningRates, Params
-from reffusion.splat.rasterizer import render
+from reffusion.splat.rasterizer import Implementation, render
 from reffusion.types import Camera
 
 PRUNE_OPA = 0.005  # opacity below which Gaussians are pruned, as in 3DGS
@@ -58,7 +58,7 @@ def step(
     counts: Tensor | None,
     settings: Params,
     i: int,
-    impl: str,
+    impl: Implementation,
 ) -> tuple[float, float]:
     """Render a view, compute the loss and update; returns the loss and the mean squared error of weighted pixels."""
     location = f"step {i}, view '{camera.name}'"
@@ -77,6 +77,7 @@ def step(
         raise FloatingPointError(f"fit, {location}: the reconstruction loss is {loss_value}")
     loss.backward()
     if probe is not None:
+        assert probe.grad is not None
         optimizer.observe(probe.grad, rendering.radii, camera.width, camera.height)
     try:
         optimizer.step(i / settings.iterations, visible=rendering.radii > 0, sh_degree=degree)

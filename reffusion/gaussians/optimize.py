@@ -169,9 +169,10 @@ class GaussianOptimizer:
         updates = []
         for name, gradient in gradients.items():
             if gradient is not None:
-                rows = (_rows(t) for t in (*(getattr(g, name) for g in self._states()), gradient))
+                parameter, first, second = (_rows(getattr(each, name)) for each in self._states())
                 moving = rates[name] if name != "sh" or sh_degree is None else rates[name][: 3 * (sh_degree + 1) ** 2]
-                updates.append(adam.Update(*rows, moving, self.masked_factors.get(name, 1.0)))
+                factor = self.masked_factors.get(name, 1.0)
+                updates.append(adam.Update(parameter, first, second, _rows(gradient), moving, factor))
         adam.fastest(self.masked.device)(updates, self._steps, visible, self.masked, *unbias, *self.betas, self.epsilon)
         self.forget_gradients()
 

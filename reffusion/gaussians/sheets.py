@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -50,12 +51,10 @@ def sheet_gaussians(
     image: np.ndarray, depth: np.ndarray, pixels: np.ndarray, camera: Camera, sh_count: int, settings: Sheets
 ) -> Gaussians:
     """Gaussians of both sheets for the chosen `pixels`; arguments as `surface_gaussians`."""
-    source = (image, depth, pixels, camera)
-    shape = {"sh_count": sh_count, "thickness": settings.thickness, "grazing": settings.grazing}
-    front = surface_gaussians(*source, **shape, spread=settings.spread, opacity=settings.opacity)
+    shape = partial(surface_gaussians, sh_count=sh_count, thickness=settings.thickness, grazing=settings.grazing)
+    sheet = partial(shape, image, depth, pixels, camera)
+    front = sheet(spread=settings.spread, opacity=settings.opacity)
     if not settings.offset_px:
         return front
-    back = surface_gaussians(
-        *source, **shape, spread=settings.under_spread, opacity=settings.under_opacity, offset_px=settings.offset_px
-    )
+    back = sheet(spread=settings.under_spread, opacity=settings.under_opacity, offset_px=settings.offset_px)
     return front.zip_map(back, lambda a, b: torch.cat([a, b]))

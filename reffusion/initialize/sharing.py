@@ -101,6 +101,7 @@ def align_reference_depth(
     remaining: Gaussians, reference: Reference, background: Background, completion: Completion
 ) -> np.ndarray:
     """[H, W] the depth map of a reference in world units; 0 where unknown."""
+    assert reference.depth is not None
     camera, rendering = reference.camera, rasterizer.render(remaining, reference.camera, sh_degree=0)
     hints = Hints(outer=background.photographed_depth(camera))
     mask = background.masks[camera.name]

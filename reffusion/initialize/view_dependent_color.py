@@ -119,8 +119,8 @@ def _fit_harmonics(batch: Gaussians, camera: Camera, change: ColorChange, views:
     """[N, K, 3], the harmonics of `transfer_sh`."""
     degree, means, constant = batch.sh_degree, batch.means.double(), batch.sh[:, 0].double()
     own, _ = geometry.sample_nearest(change.material, geometry.project(means.numpy(), camera)[0])
-    target, known = _neighbor_change(means.numpy(), own, change)
-    target, weight = _fill_unknown_views(target, known, change.points.mean(0), views)
+    mean, known = _neighbor_change(means.numpy(), own, change)
+    target, weight = _fill_unknown_views(mean, known, change.points.mean(0), views)
     base = harmonics(means - torch.from_numpy(camera.center), degree)[..., 1:]
     size = base.shape[-1]
     normal = RIDGE * len(views) * torch.eye(size, dtype=torch.float64).expand(len(means), size, size).clone()

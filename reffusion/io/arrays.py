@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -69,7 +69,8 @@ def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write named arrays as a compressed `.npz`, creating the folder; equal arrays give equal bytes."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with open(path, "wb") as file:
-        np.savez_compressed(file, **arrays)
+        # Any: an array may be called like the parameter allow_pickle, as the stub of numpy sees it.
+        np.savez_compressed(file, **cast(Mapping[str, Any], arrays))
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:

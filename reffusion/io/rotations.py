@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 
-def quaternion_to_pose(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
+def quaternion_to_pose(
+    quaternion: np.ndarray | Sequence[float], translation: np.ndarray | Sequence[float]
+) -> np.ndarray:
     """[4, 4] float64 from wxyz (any length; not finite where it is zero) and a translation."""
     with np.errstate(all="ignore"):
         w, x, y, z = np.asarray(quaternion, np.float64) / np.linalg.norm(quaternion)

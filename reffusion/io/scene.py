@@ -56,7 +56,8 @@ def load_scene(poses_dir: Path) -> Scene:
         name, shared = image.name.rsplit(".", 1)[0], intrinsics[image.camera_id]
         if shared.model != "PINHOLE":
             raise ValueError(f"{model / 'cameras.bin'}: {shared.model}; `poses` writes PINHOLE cameras only")
-        cameras[name] = Camera(name, shared.width, shared.height, *shared.params, image.world_to_camera)
+        fx, fy, cx, cy = shared.params
+        cameras[name] = Camera(name, shared.width, shared.height, fx, fy, cx, cy, image.world_to_camera)
     points = load_model_points(model / "points3D.bin")
     views, similarity = load_json(poses_dir / "views.json"), load_json(poses_dir / "transform.json")
     return Scene(

@@ -80,7 +80,7 @@ def empty_aligned(*shape: int) -> np.ndarray:
         others = [other for other in blocks if other is not block]
         blocks[:] = [*others[1 - _MAX_BLOCKS :], block]
         # through a memoryview, so that views refer to this array and not to the block
-        array = np.frombuffer(memoryview(block.memory), np.float32, size)
+        array = np.frombuffer(block.memory.data, np.float32, size)
         block.tenant = weakref.ref(array)
         return array.reshape(shape)
 

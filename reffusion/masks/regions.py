@@ -25,8 +25,8 @@ class Region:
         holds: it holds the object, and the Gaussians in it are removed; else it is only filled.
     """
 
-    center: Sequence[float]
-    size: Sequence[float]
+    center: Sequence[float] | np.ndarray
+    size: Sequence[float] | np.ndarray
     round: bool = False
     holds: bool = True
 

@@ -135,4 +135,5 @@ def _sample_of_reference(
 
 
 def _window_anywhere(mask: Tensor, size: int, generator: torch.Generator) -> tuple[int, int]:
-    return tuple(int(torch.randint(extent - size + 1, (), generator=generator)) for extent in mask.shape)
+    top, left = (int(torch.randint(extent - size + 1, (), generator=generator)) for extent in mask.shape)
+    return top, left

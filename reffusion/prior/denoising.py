@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,7 +24,8 @@ def spread_timesteps(count: int, steps: int, generator: torch.Generator) -> Tens
 def latent_shape(prior: Prior, size: int) -> tuple[int, int, int]:
     """(C, h, w) of the latents of a size x size image."""
     side = size // prior.factor
-    return prior.vae.config.latent_channels, side, side
+    config: Any = prior.vae.config
+    return config.latent_channels, side, side
 
 
 def denoising_error(

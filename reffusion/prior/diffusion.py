@@ -179,7 +179,7 @@ def guided(
     """
     if guidance and empty is None:
         raise ValueError("guidance needs the empty prompt's embedding")
-    if guidance == 0 or torch.equal(text, empty):
+    if guidance == 0 or empty is None or torch.equal(text, empty):
         return predict(prior, noisy, t, condition, text)
     both = [torch.cat([x, x]) for x in (noisy, t, condition)]
     eps, clean = predict(prior, *both, torch.cat([text, empty]))

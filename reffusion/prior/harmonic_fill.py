@@ -27,7 +27,8 @@ def harmonic_extension(images: Tensor, hidden: Tensor) -> Tensor:
     known = 1 - hidden
     grids = [(torch.where(hidden > 0.5, 0, images), known)]
     while max(grids[-1][0].shape[-2:]) > 1:
-        grids.append(tuple(_downsample(part) for part in grids[-1]))
+        values, share = grids[-1]
+        grids.append((_downsample(values), _downsample(share)))
     masked_values, known_share = grids.pop()
     filled = masked_values / known_share.clamp(min=torch.finfo(images.dtype).tiny)
     for masked_values, known_share in reversed(grids):

@@ -14,7 +14,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import MethodType
-from typing import Any
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
@@ -62,6 +62,7 @@ def attach(
         raise ValueError("SDXL cannot be adapted here: it paints references (reference.prior); adapt an SD2-type prior")
     if layers not in ("attention", "qkv", "attention+conv"):
         raise ValueError(f"layers must be 'attention', 'qkv' or 'attention+conv', not {layers!r}")
+    assert prior.text_encoder is not None
     targets, text_targets = ATTENTION, TEXT_ATTENTION
     if layers == "qkv":
         targets, text_targets = ATTENTION[:-1], TEXT_ATTENTION[:-1]
@@ -70,7 +71,9 @@ def attach(
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         for part, names in ((prior.unet, targets), (prior.text_encoder, text_targets)):
-            part.add_adapter(LoraConfig(r=rank, lora_alpha=alpha, lora_dropout=dropout, target_modules=list(names)))
+            # peft annotates lora_alpha as int, and only divides it by the rank.
+            adapter = LoraConfig(r=rank, lora_alpha=cast(int, alpha), lora_dropout=dropout, target_modules=list(names))
+            part.add_adapter(adapter)
     set_dropout(prior, False)
     parameters = {"unet": _lora_parameters(prior.unet), "text": _lora_parameters(prior.text_encoder)}
     if dropout == 0 and prior.dtype == torch.float32:
@@ -144,6 +147,7 @@ def save(prior: Prior, folder: Path) -> None:
     """Write `pytorch_lora_weights.safetensors` for `load_lora_weights` of diffusers, with rank and alpha."""
     from peft import get_peft_model_state_dict
 
+    assert prior.text_encoder is not None
     text = get_peft_model_state_dict(prior.text_encoder, save_embedding_layers=False)
     pipeline_class().save_lora_weights(
         folder,

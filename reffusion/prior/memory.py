@@ -108,11 +108,12 @@ def fit_to_memory(
 @torch.no_grad()
 def inpaint_one_sample(prior: Prior) -> None:
     """Run the passes of inpainting for one sample: encode, UNet, decode."""
-    size, text_width = prior.native_size, prior.unet.config.cross_attention_dim
+    size = prior.native_size
+    config: Any = prior.unet.config
     latents = diffusion.encode(prior, torch.zeros(1, 3, size, size, device=prior.device))
     condition = torch.cat([latents[:, :1], latents], 1)
     timestep = torch.zeros(1, dtype=torch.long, device=prior.device)
-    diffusion.raw_prediction(prior, latents, timestep, condition, latents.new_zeros(1, 78, text_width))
+    diffusion.raw_prediction(prior, latents, timestep, condition, latents.new_zeros(1, 78, config.cross_attention_dim))
     diffusion.decode(prior, latents)
 
 

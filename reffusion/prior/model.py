@@ -74,12 +74,14 @@ class Prior:
     @property
     def factor(self) -> int:
         """Pixels per latent along a side."""
-        return 2 ** (len(self.vae.config.block_out_channels) - 1)
+        config: Any = self.vae.config
+        return 2 ** (len(config.block_out_channels) - 1)
 
     @property
     def native_size(self) -> int:
         """Side of the training images in pixels."""
-        size = self.unet.config.sample_size
+        config: Any = self.unet.config
+        size = config.sample_size
         return self.factor * (size if isinstance(size, int) else min(size))
 
     @property
@@ -194,7 +196,8 @@ def make_prior(
     Raises:
         ValueError: as `load_prior`.
     """
-    configs = {"unet": dict(unet.config), "vae": dict(vae.config), "scheduler": dict(scheduler.config)}
+    of_part: dict[str, Any] = {"unet": unet.config, "vae": vae.config, "scheduler": scheduler.config}
+    configs = {name: dict(config) for name, config in of_part.items()}
     configs["text_encoder"] = text.config.to_dict()
     if text_2 is not None:
         configs["text_encoder_2"] = text_2.config.to_dict()

@@ -151,7 +151,7 @@ def warp(picture: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray
                           borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).astype(np.float32)
     at = pixels @ linear.T.astype(np.float32) + moved[:, 2].astype(np.float32)
-    return read, ((at >= 0) & (at <= (width, height))).all(-1)
+    return read, np.all((at >= 0) & (at <= (width, height)), -1)
 
 
 # ------------------------------------------------------------------------------------------------------- the parts

@@ -34,7 +34,7 @@ def undistort_reference(
     if image.shape[1] > DOWNSCALE_ABOVE * size[0]:
         image = resize_image(image, size)
     points = _sampling_points(image.shape, pinhole if given.undistorted else lens, pinhole, affine)
-    inside = ((points >= 0) & (points <= (image.shape[1], image.shape[0]))).all(-1)
+    inside = np.all((points >= 0) & (points <= (image.shape[1], image.shape[0])), -1)
     return undistort_image(image, points), inside
 
 

@@ -88,7 +88,9 @@ def project_and_bin(
 
 
 def _flat(parameters: list[np.ndarray], degree: int) -> footprints.Parameters:
-    return footprints.Parameters(*(array.reshape(-1) for array in parameters), 3 * parameters[4].shape[1], degree)
+    means, quaternions, log_scales, logits, sh = (array.reshape(-1) for array in parameters)
+    width = 3 * parameters[4].shape[1]
+    return footprints.Parameters(means, quaternions, log_scales, logits, sh, width, degree)
 
 
 class _Splat(torch.autograd.Function):

@@ -90,6 +90,7 @@ def accumulate(gaussians: Gaussians, camera: Camera, values: Tensor, count: bool
         with torch.enable_grad():
             features = values.new_zeros(size).requires_grad_()
             blended = render(gaussians, camera, features, values.new_zeros(3), 0, None).features
+            assert blended is not None
             return torch.autograd.grad(blended, features, values)[0]
     import gsplat
 

@@ -53,7 +53,7 @@ _SUMS = 6  # vectors per step before its features: transmittance, red, green, bl
 AT_CUT, AT_ROUND, _AT_SERIES, AT_MAX_ALPHA, _AT_MIN_TRANSMITTANCE, AT_ROW = 0, 1, 2, 8, 9, 10
 _CONSTANTS = np.concatenate(
     [
-        np.repeat(np.float32([CUT, ROUND, *EXP2[::-1], MAX_ALPHA, MIN_TRANSMITTANCE]), LANES),
+        np.repeat(np.array([CUT, ROUND, *EXP2[::-1], MAX_ALPHA, MIN_TRANSMITTANCE], np.float32), LANES),
         (np.arange(TILE_HEIGHT * TILE_WIDTH) // TILE_WIDTH).astype(np.float32),
     ]
 )

@@ -67,7 +67,7 @@ def model_need(source: str | Path, dtype: str) -> Need:
     """
     half, problem = dtype != "float32", None
     known = PUBLISHED.get(str(source))
-    size = known and known.parameters * (2 if half else 4)
+    size = known.parameters * (2 if half else 4) if known else None
     try:
         folder = locate(source)
         if folder is not None:

@@ -20,7 +20,9 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
     """Which file is the mask of which view, and the region."""
-    region = {"region": params.region.model_dump() | {"holds": params.has_masks}} if params.region else {}
+    region: dict[str, object] = {}
+    if params.region:
+        region["region"] = params.region.model_dump() | {"holds": params.has_masks}
     if is_gaussians_only(params, scene):
         return region
     roles = read_scene(params, scene)[1]

@@ -55,7 +55,14 @@ def _count_images(folder: Path) -> dict[Path, int]:
     models = [place for place in places if is_model(place)]
     if len(models) < 2:
         return dict.fromkeys(models, 0)
-    return {model: len(load_images(model_file(model, "images"))) for model in models}
+    return {model: len(load_images(_files(model)[0])) for model in models}
+
+
+def _files(model: Path) -> tuple[Path, Path]:
+    """The files of a model's images and cameras; it is one (`is_model`), so both exist."""
+    images, cameras = model_file(model, "images"), model_file(model, "cameras")
+    assert images is not None and cameras is not None
+    return images, cameras
 
 
 def read(folder: Path, images: str | None) -> Capture:
@@ -72,7 +79,7 @@ def capture_from_model(folder: Path, model: Path, image_folder: Path, layout: st
 
     Only LLFF's renamed copies, `image000.png` and so on, are paired by order, with a warning.
     """
-    source, camera_file = model_file(model, "images"), model_file(model, "cameras")
+    source, camera_file = _files(model)
     images, identities = _images_by_name(source)
     files = _pictures_of_model(folder, image_folder, list(images))
     pairs, warnings = pair_pictures({name: name for name in images}, files), [other_models(folder, model)]
@@ -160,7 +167,7 @@ def _points(
 
 def read_cameras(model: Path) -> Poses:
     """Lenses and poses alone, of a model whose pictures are missing."""
-    source, camera_file = model_file(model, "images"), model_file(model, "cameras")
+    source, camera_file = _files(model)
     images, _ = _images_by_name(source)
     cameras = load_cameras(camera_file)
     if lost := [name for name, image in images.items() if image.camera_id not in cameras]:

@@ -124,7 +124,7 @@ def _lens_of_partial_model(
     """The lens of a model without images, where it has a single camera that agrees with poses_bounds.npy."""
     file = model_file(model, "cameras") if model.is_dir() else None
     cameras = list(load_cameras(file).values()) if file else []
-    if len(cameras) != 1:
+    if file is None or len(cameras) != 1:
         return lenses
     model_lens = lens_from_model(cameras[0], file)
     replaced = {name: resize_lens(model_lens, path) for name, path in pictures.items()}

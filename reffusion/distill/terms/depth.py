@@ -42,18 +42,17 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
     depth = settings.depth
     if depth.weight == 0 or not inputs.hole_views:
         return None
-    if inputs.prior is None or inputs.text is None:
+    prior, text, estimator = inputs.prior, inputs.text, inputs.estimator
+    if prior is None or text is None:
         raise ValueError("the depth term needs a prior and its prompts' embeddings")
-    if inputs.estimator is None:
+    if estimator is None:
         raise ValueError("the depth term needs an estimator of depth")
 
     def loss(gaussians: Gaussians, reached: Tensor, view: TrainView, step: int) -> TermValue:
         draws = seeding.generator(settings.seed, "distill", "depth", step)
         # PAPER leaves open: the guidance with which the view is repainted; SDS's.
         guidance = settings.sds.guidance
-        value, rendering = evaluate_depth(
-            gaussians, reached, view, inputs.prior, inputs.text, depth, guidance, draws, inputs.estimator
-        )
+        value, rendering = evaluate_depth(gaussians, reached, view, prior, text, depth, guidance, draws, estimator)
         return TermValue(value, rendering, latest={"depth": float(value.detach())})
 
     return Term(

@@ -36,7 +36,8 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
     sds, views = settings.sds, inputs.hole_views
     if not sds.is_on or not views:
         return None
-    if inputs.prior is None or inputs.text is None:
+    prior, text = inputs.prior, inputs.text
+    if prior is None or text is None:
         raise ValueError("distillation with sds.weight > 0 needs a prior and its prompts' embeddings")
     cameras = [reference.camera for reference in inputs.references]
     near = views_near_references(views, cameras, inputs.masked_means, sds.max_angle)
@@ -51,7 +52,7 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
     def loss(gaussians: Gaussians, reached: Tensor, view: TrainView, step: int) -> TermValue:
         probe = torch.zeros(len(reached), 2, device=reached.device, requires_grad=True)
         draws = seeding.generator(settings.seed, "distill", "sds", step)
-        value, rendering = evaluate_sds(gaussians, reached, view, inputs.prior, inputs.text, sds, draws, probe)
+        value, rendering = evaluate_sds(gaussians, reached, view, prior, text, sds, draws, probe)
         return TermValue(value, rendering, probe=probe)
 
     return Term(

@@ -73,13 +73,14 @@ def complete(
     if not pyramid:
         return Completion(telea(target.image, hole), float(NO_MATCH))
     state = np.array([seeding.seed_for(seed, "texture") | 1], np.uint64)
-    matches = coarser = None
+    matches: Matches | None = None
+    coarser: Hole | None = None
     for k, (current, mask, level_sources) in enumerate(pyramid):
         first, last = k == 0, k == len(pyramid) - 1
         hole_pixels = _gather_hole(target, mask, 2 ** (len(pyramid) - 1 - k), smooth, level_sources)
         level = Level(hole_pixels, level_sources, current, _trust(mask))
         positions = _patch_positions(level_sources, int(hole_pixels.plane.max()))
-        if first:
+        if matches is None or coarser is None:  # the first
             matches = _first_layout(level, mask, positions, state)
         else:
             matches = _from_coarser(matches, coarser, level)
@@ -90,6 +91,7 @@ def complete(
             if not last or turn < rounds - 1:
                 _vote(level, matches, level.weight, max(float(np.median(matches.misfit)), 1.0))
         coarser = hole_pixels
+    assert matches is not None
     weight = level.weight[hole_pixels.row, hole_pixels.column] * (matches.misfit < NO_MATCH)
     misfit = float((matches.misfit * weight).sum() / max(weight.sum(), 1e-6))
     return Completion(_blend_patches(target.image, hole, level, matches), misfit)
