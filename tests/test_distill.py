@@ -21,10 +21,12 @@ from reffusion.distill.terms.reference import evaluate_reference
 from reffusion.distill.terms.sds import evaluate_sds, views_near_references
 from reffusion.distill.train_view import TrainView
 from reffusion.gaussians.optimize import Rates, reconstruction_loss
+from reffusion.inpaint.exemplar import RIM_WIDTH
 from reffusion.io.arrays import load_labels, save_json, save_labels
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_references, load_scene, save_mask_sets, save_scene
+from reffusion.morphology import dilate
 from reffusion.params.distill import Adversarial, Params, Sds
 from reffusion.prior import inpaint
 from reffusion.seeding import generator
@@ -512,7 +514,7 @@ def test_a_reference_made_of_pieces_of_itself_needs_no_prior(folders, tmp_path):
     reference.run(params, folders["reference"], **pick(folders, "scene", "poses", "fit", "masks"))
     (found,) = load_references(folders["reference"], load_scene(folders["poses"]))
     photo = load_image(folders["poses"] / "images" / "b.png")
-    rim = load_mask_sets(folders["masks"], ["b"])["b"].consistent
+    rim = dilate(load_mask_sets(folders["masks"], ["b"])["b"].consistent, RIM_WIDTH)
     assert found.mask.any() and (found.image[~found.mask & ~rim] == photo[~found.mask & ~rim]).all()
 
 

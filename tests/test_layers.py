@@ -5,9 +5,10 @@ import itertools
 import numpy as np
 
 from reffusion.background.continuation import _enclosed_patches
-from reffusion.depth.background_depth import Completion, Hints, ViewDepth, continue_depth, dilate
+from reffusion.depth.background_depth import Completion, Hints, ViewDepth, continue_depth
 from reffusion.depth.layers import label_surfaces, segment_surfaces
 from reffusion.graph_cut import alpha_expansion
+from reffusion.morphology import dilate_by_distance
 from reffusion.types import Camera
 
 
@@ -52,7 +53,7 @@ def test_where_other_views_look_past_a_surface_its_colours_are_another_ones():
         seen = ViewDepth(
             view,
             1 / disparity,
-            ~dilate(hole, how.margin),
+            ~dilate_by_distance(hole, how.margin),
             hole,
             hole,
             np.zeros_like(hole),
@@ -83,7 +84,7 @@ def test_what_stands_on_a_plane_that_goes_on_keeps_its_hidden_rim():
     table, depth, vase, picture, hole = vase_on_a_table()
     view = Camera("v", 120, 100, 100.0, 100.0, 60.0, 50.0, np.eye(4))
     how = Completion(planar_share=2.0, ring=0.2, margin=0.03)
-    known, hints = ~dilate(hole, how.margin), Hints(np.where(hole, table, np.inf), (table,))
+    known, hints = ~dilate_by_distance(hole, how.margin), Hints(np.where(hole, table, np.inf), (table,))
     seen = ViewDepth(view, np.where(hole, table, depth), known, hole, hole, hole, hints)
     found, said = continue_depth(seen, picture, np.zeros((0, 3)), how)
     assert "2 surfaces" in said
@@ -94,8 +95,8 @@ def test_what_stands_on_a_plane_that_goes_on_keeps_its_hidden_rim():
 def test_a_tuft_of_the_grounds_own_colours_takes_nothing_of_the_ground():
     table, depth, vase, _, hole = vase_on_a_table()
     grass = np.random.default_rng(0).uniform(0.2, 0.6, (100, 120, 3))
-    known = ~dilate(hole, 0.03)
-    surfaces = label_surfaces(1 / depth, known, dilate(hole, 0.03), grass, (table,), np.zeros_like(hole))
+    known = ~dilate_by_distance(hole, 0.03)
+    surfaces = label_surfaces(1 / depth, known, dilate_by_distance(hole, 0.03), grass, (table,), np.zeros_like(hole))
     assert (surfaces[hole & ~vase] == surfaces[95, 5]).mean() > 0.95
 
 
