@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from reffusion.params.base import Device, Settings, depth_model_field
-from reffusion.params.inpainter import Inpainter, WithGeometry
+from reffusion.params.inpainter import Inpainter, ReferenceKind
 
 
 class Depth(Settings):
@@ -36,8 +36,8 @@ class Params(Settings):
     )
     # PAPER leaves open: what the reference's camera does not see of the hole.
     extra_views: int = Field(0, ge=0, description="maximum number of views completed besides the references")
-    inpainter: Inpainter[WithGeometry] = Field(
-        Inpainter[WithGeometry](kind="exemplar"),
+    inpainter: Inpainter[ReferenceKind] = Field(
+        Inpainter[ReferenceKind](kind="exemplar"),
         description="inpainter of the extra views",
     )
     refit_steps: int = Field(0, ge=0, description="reconstruction steps after filling; 0: none")

@@ -8,19 +8,19 @@ from pydantic import Field, model_validator
 
 from reffusion.params.base import WEIGHTS, Settings
 
-Kind = TypeVar("Kind", bound=str)
-WithGeometry = Literal["exemplar", "diffusion", "lama", "migan", "auto"]  # of stages that know the scene's surfaces
+KindT = TypeVar("KindT", bound=str)
+ReferenceKind = Literal["exemplar", "diffusion", "lama", "migan", "auto"]  # of `reference` and `initialize`
 FEED_FORWARD = ("lama", "migan")  # the kinds that read a file
 
 
-class Inpainter(Settings, Generic[Kind]):
+class Inpainter(Settings, Generic[KindT]):
     """What inpaints in 2D. A stage allows some kinds: `Inpainter[Literal["fsr", "lama"]]`; a plain string is the kind.
 
-    A diffusion model is none of its weights: it is the parameter `prior` of `reference` and `lift`, beside its sampler
-    and prompt. The kind is chosen by a scene or a variant, the model by a profile, for the machine.
+    `weights` names no diffusion model: that is the parameter `prior` of `reference` and `lift`, beside its sampler and
+    prompt. A profile sets the model, which has to suit the machine; a scene or a variant sets the kind.
     """
 
-    kind: Kind = Field(
+    kind: KindT = Field(
         description="exemplar: patches of the photographs, along surfaces: sharp, with nothing new; diffusion: the "
         "model `prior` (for the extra views of `initialize` patches, too); lama, migan: a feed-forward network; fsr: "
         "OpenCV's FSR, else Telea; auto: the first of LaMa, MI-GAN that is on this machine, else exemplar",
@@ -41,7 +41,7 @@ class Inpainter(Settings, Generic[Kind]):
         raise ValueError("write a kind, such as lama, or {kind: lama, weights: FILE}")
 
     @model_validator(mode="after")
-    def _has_weights(self) -> Inpainter[Kind]:
+    def _has_weights(self) -> Inpainter[KindT]:
         if self.weights and self.kind not in FEED_FORWARD:
             raise ValueError(
                 f"kind {self.kind} takes no `weights`, {' and '.join(FEED_FORWARD)} do; `prior` names a diffusion model"

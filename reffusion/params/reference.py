@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pydantic import Field
 
 from reffusion.params.base import Device, Dtype, Sampler, Settings, memory_field, prior_field
-from reffusion.params.inpainter import Inpainter, WithGeometry
+from reffusion.params.inpainter import Inpainter, ReferenceKind
 
 
 class ReferenceSpec(Settings):
@@ -29,7 +29,7 @@ class Params(Settings):
     reference: ReferenceSpec | list[ReferenceSpec] | None = Field(
         None, description="completed views that the scene brings"
     )
-    inpainter: Inpainter[WithGeometry] = Inpainter[WithGeometry](kind="diffusion")
+    inpainter: Inpainter[ReferenceKind] = Inpainter[ReferenceKind](kind="diffusion")
     prior: str = prior_field()
     prompt: str = Field("", description="what the invented region shows, for a prior with a text encoder")
     candidates: int = Field(4, ge=1, description="pictures to choose from")
