@@ -210,11 +210,11 @@ def _save_warnings(out: Path, messages: list[str]) -> None:
 
 def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
     """The larger image side that the training views' pictures support, at most `longest`."""
-    if params.detail == 0:
+    if params.min_detail == 0:
         return params.longest
     chosen = roles.train[:: max(1, len(roles.train) // 8)]
     images = [load_resized(capture.pictures[name], params.longest, capture.upright) for name in chosen]
-    if not image_detail.is_enlarged(images, params.detail):
+    if not image_detail.is_enlarged(images, params.min_detail):
         return params.longest
     side = max(max(image.shape[:2]) for image in images)
     print(f"pictures of {side} px show no more than {side // 2} px would: taken at that size", flush=True)

@@ -328,7 +328,7 @@ VALUES = {  # parameter -> values that it cannot have
     "fit.lr.means": ("true", "-1", ".nan", ".inf", "fast"),
     "fit.pixels": ("some", "1", "true"),
     "poses.longest": ("0", "8", "-5", "false", "wide", "2022-08-19"),
-    "poses.detail": ("-1", ".nan", "yes"),
+    "poses.min_detail": ("-1", ".nan", "yes"),
     "poses.refine": ("perhaps", "2", "[]"),
     "masks.tau": ("much", ".inf"),
     "reference.prompt": ("1984", "true", "[a]"),

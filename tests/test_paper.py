@@ -76,7 +76,7 @@ FIXED = {
 }
 # What it has not, each at the value that leaves it out.
 ABSENT = {
-    "poses.detail": 0,
+    "poses.min_detail": 0,
     "poses.refine": False,
     "fit.exposure": "never",
     "fit.few_views": "as_many",

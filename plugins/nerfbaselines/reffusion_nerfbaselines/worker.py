@@ -76,7 +76,7 @@ def _undistorted(scene: Path, out: Path) -> Path:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
         stage, params = (importlib.import_module(name) for name in ("stages.poses", "reffusion.params.poses"))
-        stage.run(params.Params(detail=0, refine=False), out, scene=scene)
+        stage.run(params.Params(min_detail=0, refine=False), out, scene=scene)
         stage, params = (importlib.import_module(name) for name in ("stages.raw_masks", "reffusion.params.raw_masks"))
         stage.run(params.Params(), raw_masks, scene=scene, poses=out)
         (out / "made").touch()
