@@ -1,6 +1,6 @@
 ## make scene=demo all            the whole job; a second call finds everything cached
 ## make scene=X STAGE             one stage and what it needs: the stages of pipeline.yaml
-## make scene=X plan              what would run, and why; card=rtx-4090: time and memory of each stage on that GPU
+## make scene=X plan              what would run, and why; gpu=rtx-4090: time and memory of each stage on that GPU
 ## make scene=X mask              make masks from clicks, in a browser; port=8090
 ## make scene=X check             look for problems of photographs, masks and poses; draw each mask over its photograph
 ## make scene=X compare           the full method, ablations and baselines: runs/X/compare.html
@@ -44,7 +44,7 @@
 
 # The options. They are set here so that variables of the environment are ignored. Recipes read them as shell variables
 # in double quotes, so that neither the shell nor make expands what was typed.
-given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port card \
+given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port gpu \
 	device dtype engine address cores yes
 $(foreach each,$(given),$(eval $(each) :=))
 data := data
@@ -133,7 +133,7 @@ all $(STAGES): ready
 	@$(RUN) run $@ $(call flags,$(options) $(cluster))
 
 plan: ready
-	@$(RUN) plan $(call flags,$(options) card)
+	@$(RUN) plan $(call flags,$(options) gpu)
 
 check: ready
 	@$(RUN) run raw_masks $(call flags,$(options))

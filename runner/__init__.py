@@ -7,7 +7,7 @@
   - frames.py: a video as a scene.
 - plan.py: gives each stage a status and a reason, from what is on disk.
   - keys.py: hashes of what an artifact depends on: contents of folders, code, parameters.
-  - card_costs.py: expected time and memory of stages on a GPU.
+  - gpu_costs.py: expected time and memory of stages on a GPU.
 - execute.py: runs stages, each in a fresh process; writes receipts; renames folders into place.
   - engine.py: where that process runs: on this machine, or on a cluster (ray_engine.py, slurm_engine.py, retry.py).
   - artifacts.py: compares artifacts with their receipts, and replaces them so that a kill loses nothing.

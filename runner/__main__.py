@@ -10,11 +10,11 @@ from pathlib import Path
 
 from reffusion.command import workplace
 from runner import Failed, Refused
-from runner.card_costs import cost_table
 from runner.compare import batch, compare
 from runner.engine import ENGINES, make_engine
 from runner.execute import Execution, run_scene
 from runner.files import write_json
+from runner.gpu_costs import cost_table
 from runner.maintenance import clean, verify
 from runner.plan import plan, plan_record, plan_table
 from runner.resolve import Request, resolve
@@ -55,7 +55,7 @@ def _plan(request: Request, arguments: argparse.Namespace) -> int:
         unset = resolve(replace(request, set="", budget=None), job.hashes)
         write_json(job.home / "plan.json", plan_record(job, decisions, unset))
     else:
-        parts = [plan_table(job, decisions), cost_table(job, decisions, arguments.card)]
+        parts = [plan_table(job, decisions), cost_table(job, decisions, arguments.gpu)]
         print("\n".join(filter(None, parts)))
     return 0
 
@@ -126,7 +126,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--variants", default="", help="compare: only these, separated by commas")
     parser.add_argument("--seeds", type=int, default=1, help="compare: number of scenes: X, X-1, X-2 ...")
     parser.add_argument("--record", action="store_true", help="plan: write it to runs/<scene>/plan.json")
-    parser.add_argument("--card", help="plan: seconds and GB of each stage on this GPU, such as rtx-4090, a100, h100")
+    parser.add_argument("--gpu", help="plan: seconds and GB of each stage on this GPU, such as rtx-4090, a100, h100")
     parser.add_argument("--trust", action="store_true", help="accept artifacts made by older code")
     parser.add_argument("--keep", action="store_true", help="accept artifacts that people changed, from now on")
     parser.add_argument("--budget", help="time for the whole job, such as 5m: sets the number of steps")

@@ -208,7 +208,7 @@ def _check_device(job: Job, stage: str, decision: Decision) -> Decision:
     if has_cuda() if job.cuda is None else job.cuda:
         return decision
     cure = f'profile=laptop, or set="{stage}.device=cpu"'
-    where = "this machine has no CUDA driver" if job.cuda is None else "no machine of the cluster has a card"
+    where = "this machine has no CUDA driver" if job.cuda is None else "no machine of the cluster has a GPU"
     return Decision("missing", f"{stage}.device is cuda, and {where}: {cure}")
 
 

@@ -170,7 +170,7 @@ def choose_profile(
         if record := next((path for path in pinned if read_text(path)), None):
             origin, profile, why = str(record), read_text(record), "this scene was run with it"
         elif cuda:
-            profile, why = "paper", "the cluster has cards"
+            profile, why = "paper", "the cluster has GPUs"
         elif cuda is None and has_cuda():
             profile, why = "paper", "this machine has a CUDA driver"
     if profile not in pipeline.profiles:

@@ -58,7 +58,7 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
     """The fields of `resolve.StageInfo`, or {"broken": why}, or {"errors": in params, "known": names of parameters}.
 
     A question with `scene` adds what the stage reads of it; with `brings` the weights that are "needed" and what this
-    machine "lacks" for CUDA; with `card` its "cost" on that GPU; with `needs` the preview's "notes" or "refusal"."""
+    machine "lacks" for CUDA; with `gpu` its "cost" on that GPU; with `needs` the preview's "notes" or "refusal"."""
     stage = question["stage"]
     needs, brings, scene = (question.get(name) for name in ("needs", "brings", "scene"))
     path = _description_file(stage)
@@ -89,11 +89,11 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
         answer["needed"] = [asdict(need) for need in planned.needed_weights(resolved, frozenset(brings))]
     if brings is not None and hasattr(planned, "lacks") and answer["params"].get("device") == "cuda":
         answer["lacks"] = planned.lacks(resolved)
-    if "card" in question and hasattr(planned, "cost"):
+    if "gpu" in question and hasattr(planned, "cost"):
         try:
-            answer["cost"] = planned.cost(resolved, question["card"])
+            answer["cost"] = planned.cost(resolved, question["gpu"])
         except ValueError as error:
-            answer["unknown card"] = format_error(error)
+            answer["unknown gpu"] = format_error(error)
     if scene is not None and hasattr(planned, "scene_files"):
         files = planned.scene_files(resolved, Path(scene), list(list_files(Path(scene))))
         answer["reads"] = sorted(str(path) for path in files)

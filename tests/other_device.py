@@ -1,8 +1,8 @@
-"""A card that is not there: tensors that say they are on `cuda:0` and refuse to be mixed with the CPU's.
+"""A GPU that is not there: tensors that say they are on `cuda:0` and refuse to be mixed with the CPU's.
 
-Inside `card()` whatever is made on, or moved to, the device `cuda` is an ordinary tensor in disguise. An operation on
+Inside `gpu()` whatever is made on, or moved to, the device `cuda` is an ordinary tensor in disguise. An operation on
 it and on a tensor of the CPU is refused, as CUDA refuses it; so is to take it for an array of numpy. gsplat's part is
-played by the CPU's rasterizer. Where there is a card, and gsplat for it, nothing is disguised: the card itself answers.
+played by the CPU's rasterizer. Where there is a GPU, and gsplat for it, nothing is disguised: the GPU itself answers.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ ONLY_ON_CPU = (torch.Tensor.numpy, torch.Tensor.__array__)
 INDEXING = (torch.Tensor.__getitem__, torch.Tensor.__setitem__)
 
 
-class OnCard(torch.Tensor):
+class OnGpu(torch.Tensor):
     """In disguise."""
 
 
 def disguised(tensor: torch.Tensor) -> torch.Tensor:
-    return tensor if isinstance(tensor, OnCard) else tensor.as_subclass(OnCard)
+    return tensor if isinstance(tensor, OnGpu) else tensor.as_subclass(OnGpu)
 
 
 def plain(tensor: torch.Tensor) -> torch.Tensor:
@@ -42,15 +42,15 @@ def plain(tensor: torch.Tensor) -> torch.Tensor:
         return tensor.as_subclass(torch.Tensor)
 
 
-def _is_card(device: Any) -> bool:
+def _is_gpu(device: Any) -> bool:
     return isinstance(device, (str, torch.device)) and torch.device(device).type == "cuda"
 
 
-class Card(TorchFunctionMode):
+class Gpu(TorchFunctionMode):
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
         tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
-        here = bool(args) and isinstance(args[0], OnCard)
+        here = bool(args) and isinstance(args[0], OnGpu)
         if func in SAID and here:
             return SAID[func]
         with torch._C.DisableTorchFunctionSubclass():
@@ -58,14 +58,14 @@ class Card(TorchFunctionMode):
                 return self._moved(func, args, kwargs)
             if func in ONLY_ON_CPU and here:
                 raise TypeError("can't convert cuda:0 device type tensor to numpy")
-            wanted = _is_card(kwargs.get("device"))
+            wanted = _is_gpu(kwargs.get("device"))
             leaf = wanted and kwargs.pop("requires_grad", False)  # the disguised one, not what it hides
             if wanted:
                 kwargs.pop("device")
-            on_card = any(isinstance(t, OnCard) for t in tensors)
+            on_gpu = any(isinstance(t, OnGpu) for t in tensors)
             self._refuse_mixed(func, args, tensors)
             result = func(*args, **kwargs)
-        if not (wanted or on_card) or func is torch.Tensor.as_subclass:
+        if not (wanted or on_gpu) or func is torch.Tensor.as_subclass:
             return result
         shown = tree_map(lambda each: disguised(each) if isinstance(each, torch.Tensor) else each, result)
         return shown.requires_grad_() if leaf else shown
@@ -77,25 +77,25 @@ class Card(TorchFunctionMode):
         if rest and (isinstance(rest[0], (str, torch.device))):
             device = given.pop(0)
         elif rest and isinstance(rest[0], torch.Tensor):  # to(other): its type and its place
-            device, given = (CARD if isinstance(rest[0], OnCard) else "cpu"), [rest[0].dtype, *rest[1:]]
+            device, given = (CARD if isinstance(rest[0], OnGpu) else "cpu"), [rest[0].dtype, *rest[1:]]
         if func is not torch.Tensor.to:
             device, given, kwargs = ("cpu" if func is torch.Tensor.cpu else CARD), [], {}
-        on_card = isinstance(tensor, OnCard) if device is None else _is_card(device)
+        on_gpu = isinstance(tensor, OnGpu) if device is None else _is_gpu(device)
         moved = tensor.to(*given, **kwargs) if given or kwargs else tensor
-        return disguised(moved) if on_card else moved.as_subclass(torch.Tensor)
+        return disguised(moved) if on_gpu else moved.as_subclass(torch.Tensor)
 
     def _refuse_mixed(self, func: Any, args: Any, tensors: list[torch.Tensor]) -> None:
         if func is torch.Tensor.copy_:
             return
-        if func in INDEXING and isinstance(args[0], OnCard):  # CUDA takes indices from the CPU
+        if func in INDEXING and isinstance(args[0], OnGpu):  # CUDA takes indices from the CPU
             tensors = [args[0], *(leaf for leaf in tree_leaves(args[2:]) if isinstance(leaf, torch.Tensor))]
-        kinds = {isinstance(t, OnCard) for t in tensors if t.ndim or isinstance(t, OnCard)}
+        kinds = {isinstance(t, OnGpu) for t in tensors if t.ndim or isinstance(t, OnGpu)}
         if len(kinds) > 1:
             raise RuntimeError(f"{getattr(func, '__name__', func)}: expected all tensors to be on the same device")
 
 
 def there_is_one() -> bool:
-    """A card, and gsplat with its extension: without gsplat a machine with a card passes the tests all the same."""
+    """A GPU, and gsplat with its extension: without gsplat a machine with a GPU passes the tests all the same."""
     try:
         cuda.require_gpu(torch.zeros(1, device="cuda" if torch.cuda.is_available() else "cpu"))
     except ValueError:
@@ -104,8 +104,8 @@ def there_is_one() -> bool:
 
 
 @contextmanager
-def card() -> Iterator[None]:
-    """The block's machine has a card."""
+def gpu() -> Iterator[None]:
+    """The block's machine has a GPU."""
     if there_is_one():
         yield
         return
@@ -120,11 +120,11 @@ def card() -> Iterator[None]:
     def accumulate(gaussians, camera, values, count):
         return enter(cpu.accumulate(gaussians.map(leave), camera, leave(values), count))
 
-    with pytest.MonkeyPatch.context() as patched, Card():
+    with pytest.MonkeyPatch.context() as patched, Gpu():
         patched.setattr(cuda, "require_gpu", lambda means: None)
         patched.setattr(cuda, "render", render)
         patched.setattr(cuda, "accumulate", accumulate)
         patched.setattr(ssim, "triton_works", lambda: False)
         patched.setattr(adam, "triton_works", lambda: False)
-        patched.setattr(view_loader, "ThreadPoolExecutor", partial(ThreadPoolExecutor, initializer=Card().__enter__))
+        patched.setattr(view_loader, "ThreadPoolExecutor", partial(ThreadPoolExecutor, initializer=Gpu().__enter__))
         yield

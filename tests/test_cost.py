@@ -1,4 +1,4 @@
-"""What a plan says that a stage takes on a card: from counted operations; longer for more work, less on a faster card;
+"""What a plan says that a stage takes on a GPU: from counted operations; longer for more work, less on a faster GPU;
 and what that rests on."""
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from reffusion.cost import estimate
 from reffusion.cost.counts import COUNTS
 from reffusion.params import distill, fit, personalize, reference
 from runner import Refused
-from runner.card_costs import cost_table
+from runner.gpu_costs import cost_table
 from runner.plan import plan, plan_table
 from runner.resolve import Request, resolve
 from runner.text import format_seconds
@@ -33,7 +33,7 @@ WORK = {
 def test_more_work_takes_longer_and_a_faster_card_less(stage):
     function, params, more = WORK[stage]
     work, gigabytes = function(params)
-    seconds = {name: work.seconds(card) for name, card in estimate.CARDS.items()}
+    seconds = {name: work.seconds(gpu) for name, gpu in estimate.GPUS.items()}
     assert seconds["rtx-3090"] > seconds["rtx-4090"] > seconds["h100"] > 0 and seconds["a100"] > seconds["h100"]
     assert 0 < gigabytes < 20
     for name in more:
@@ -41,15 +41,15 @@ def test_more_work_takes_longer_and_a_faster_card_less(stage):
         for part in name.split("."):
             value = getattr(value, part)
         longer, _ = function(params.changed({name: 2 * value}))
-        assert longer.seconds(estimate.CARDS["a100"]) > work.seconds(estimate.CARDS["a100"]), name
+        assert longer.seconds(estimate.GPUS["a100"]) > work.seconds(estimate.GPUS["a100"]), name
 
 
 def test_each_term_of_distillation_costs():
-    card, params = estimate.CARDS["rtx-4090"], WORK["distill"][1]
-    whole = estimate.distill(params)[0].seconds(card)
-    without = lambda name: estimate.distill(params.changed({f"{name}.weight": 0}))[0].seconds(card)
+    gpu, params = estimate.GPUS["rtx-4090"], WORK["distill"][1]
+    whole = estimate.distill(params)[0].seconds(gpu)
+    without = lambda name: estimate.distill(params.changed({f"{name}.weight": 0}))[0].seconds(gpu)
     assert all(without(name) < whole for name in ("sds", "depth", "adversarial"))
-    narrow = [estimate.distill(params.changed({"adversarial.width": w}))[0].seconds(card) for w in (64, 256, 512)]
+    narrow = [estimate.distill(params.changed({"adversarial.width": w}))[0].seconds(gpu) for w in (64, 256, 512)]
     assert narrow == sorted(narrow) and narrow[1] == pytest.approx(whole)
 
 
@@ -70,12 +70,12 @@ def test_the_table_is_what_is_counted_today():
 
 def test_cards_by_any_name():
     assert estimate.find_gpu("NVIDIA GeForce RTX 4090") == "rtx-4090" and estimate.find_gpu("A100") == "a100"
-    with pytest.raises(ValueError, match=r"card 'voodoo' is none of rtx-3090, .*h100"):
+    with pytest.raises(ValueError, match=r"GPU 'voodoo' is none of rtx-3090, .*h100"):
         estimate.find_gpu("voodoo")
 
 
 def test_what_a_plan_prints(tmp_path, monkeypatch):
-    """On a machine with a small card, an old driver and, as it may be, no gsplat and a torch without CUDA."""
+    """On a machine with a small GPU, an old driver and, as it may be, no gsplat and a torch without CUDA."""
     write_capture(tmp_path / "row")
     monkeypatch.setattr(os, "environ", with_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 440.10"))
     monkeypatch.setattr("runner.plan.has_cuda", lambda: True)
@@ -92,8 +92,8 @@ def test_what_a_plan_prints(tmp_path, monkeypatch):
     shape = r"    (fit|reference|personalize|distill) +[\d.]+ (s|min|h) +\d+\.\d GB"
     assert len(lines) == 5 and all(re.fullmatch(shape, line) for line in lines[:-1]), lines
     assert re.fullmatch(r"    together +[\d.]+ (s|min|h)", lines[-1])
-    with pytest.raises(Refused, match="card 'voodoo' is none of"):
+    with pytest.raises(Refused, match="GPU 'voodoo' is none of"):
         cost_table(job, decisions, "voodoo")
-    monkeypatch.setattr("runner.card_costs.has_cuda", lambda: False)
-    assert cost_table(job, decisions, None) == "", "nothing is asked where there is no card"
+    monkeypatch.setattr("runner.gpu_costs.has_cuda", lambda: False)
+    assert cost_table(job, decisions, None) == "", "nothing is asked where there is no GPU"
     assert [format_seconds(s) for s in (12.3, 600, 7200)] == ["12 s", "10 min", "2.0 h"]

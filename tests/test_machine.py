@@ -91,7 +91,7 @@ def with_nvidia_smi(folder: Path, said: str) -> dict[str, str]:
 
 
 def test_a_stage_says_what_it_lacks_at_once(tmp_path, monkeypatch):
-    """Asked as the plan asks, on a machine with an old driver, a small card and torch without CUDA."""
+    """Asked as the plan asks, on a machine with an old driver, a small GPU and torch without CUDA."""
     monkeypatch.setattr(os, "environ", with_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 535.183.01"))
     monkeypatch.chdir(ROOT)
     machine.detect.cache_clear()

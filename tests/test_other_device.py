@@ -1,4 +1,4 @@
-"""Stages on a card give what they give on the CPU; a stand-in for one, which refuses to mix tensors of two devices
+"""Stages on a GPU give what they give on the CPU; a stand-in for one, which refuses to mix tensors of two devices
 (tests/other_device.py)."""
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 import small_scene as small
 import torch
-from other_device import card, there_is_one
+from other_device import gpu, there_is_one
 
 from reffusion.io.arrays import load_labels
 from reffusion.io.ply import load_ply, save_ply
@@ -37,18 +37,18 @@ def ready(tmp_path_factory):
 
 
 def both(tmp_path, work) -> list:
-    """The folders that `work(device, folder)` fills on the CPU and on the card."""
+    """The folders that `work(device, folder)` fills on the CPU and on the GPU."""
     folders = [tmp_path / "cpu", tmp_path / "cuda"]
     for folder in folders:
         folder.mkdir()
     work("cpu", folders[0])
-    with card():
+    with gpu():
         work("cuda", folders[1])
     return folders
 
 
 def test_the_stand_in_refuses_what_cuda_refuses():
-    with card():
+    with gpu():
         here, there = torch.ones(3), torch.ones(3, device="cuda")
         assert there.device.type == "cuda" and not here.is_cuda and (there + 1).is_cuda and there[here > 0].is_cuda
         for mixed in (lambda: here + there, lambda: torch.where(here > 0, there, 0.0), lambda: here[there > 0]):
@@ -74,13 +74,13 @@ def test_masks_on_a_card(ready, tmp_path, vote):
     for name in small.TRAIN:
         for kind in ("consistent", "unobserved", "invent"):
             differs = getattr(before[name], kind) != getattr(after[name], kind)
-            assert differs.mean() <= (0.01 if there_is_one() else 0), (name, kind)  # a card rounds otherwise
+            assert differs.mean() <= (0.01 if there_is_one() else 0), (name, kind)  # a GPU rounds otherwise
 
 
 def test_a_box_on_a_card():
     gaussians, _ = small.gaussians(NEAR)
     box = regions.Region((0, 0, NEAR), (0.5, 0.5, 0.1))
-    with card():
+    with gpu():
         there = regions.inside_region(gaussians.map(lambda p: p.to("cuda")), box)
         assert there.is_cuda and there.any() and torch.equal(there.cpu(), regions.inside_region(gaussians, box))
 

@@ -56,7 +56,7 @@ WEIGHTS = {
     "distill": {"prior": "sd2", "depth.model": "depth"},
 }
 STANDS_FOR = {"sd2": published.SD2, "sdxl": published.SDXL, "depth": "depth-anything/Depth-Anything-V2-Small-hf"}
-# On a card nothing differs: bfloat16 is trained, float16 paints and distils.
+# On a GPU nothing differs: bfloat16 is trained, float16 paints and distils.
 HERE = {} if there_is_one() else {"device": "cpu", "dtype": "float32"}
 
 

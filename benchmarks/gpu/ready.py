@@ -19,8 +19,8 @@ COMPILER_GB = 1.0  # memory of one compiler; gsplat's largest file takes 0.85
 
 def refusal_reasons(here: Machine, before: bool) -> list[str]:
     """Reasons why CUDA jobs cannot run here, one line each."""
-    if here.driver is None and here.card is None:
-        return ["there is no NVIDIA driver on this machine: nothing to do; profile=laptop needs no card"]
+    if here.driver is None and here.gpu is None:
+        return ["there is no NVIDIA driver on this machine: nothing to do; profile=laptop needs no GPU"]
     return find_missing(here, splats=not before)
 
 
@@ -43,7 +43,7 @@ def main() -> int:
     import torch
 
     if not torch.cuda.is_available():
-        print("error: torch finds no card, though there is a driver: look at CUDA_VISIBLE_DEVICES", file=sys.stderr)
+        print("error: torch finds no GPU, though there is a driver: look at CUDA_VISIBLE_DEVICES", file=sys.stderr)
         return 2
     import gsplat
     from gsplat.cuda import _backend

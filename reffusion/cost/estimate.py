@@ -24,7 +24,7 @@ VIEWS, WIDTH, HEIGHT, GAUSSIANS = 60, 1600, 1200, 1_000_000
 MEAN_SHARE = 0.6  # mean number of Gaussians during a fit / final number
 HOLE_SHARE = 0.2  # of a view is inpainted
 BASIS = (
-    f"counted operations, {PEAK_SHARE:.0%} of the card's peak as timed on an H200; {VIEWS} views of {WIDTH} x "
+    f"counted operations, {PEAK_SHARE:.0%} of the GPU's peak as timed on an H200; {VIEWS} views of {WIDTH} x "
     f"{HEIGHT} px, {GAUSSIANS:,} Gaussians"
 )
 # Floats of a Gaussian of degree 3; and copies in memory: parameters, gradient, two moments of Adam.
@@ -39,7 +39,7 @@ PRIORS = {PRIOR: ("SD2", 512), SDXL: ("SDXL", 1024)}  # hub id: name in the coun
 
 
 @dataclass(frozen=True)
-class Card:
+class Gpu:
     """Peak rates of a GPU, as stated by its manufacturer.
 
     Attributes:
@@ -57,12 +57,12 @@ class Card:
     gigabytes: float
 
 
-CARDS = {
-    "rtx-3090": Card(71, 35.6, 35.6, 0.936, 24),
-    "rtx-4090": Card(165, 82.6, 82.6, 1.008, 24),
-    "a100": Card(312, 156, 19.5, 2.0, 80),
-    "h100": Card(989, 494, 67, 3.35, 80),
-    "h200": Card(989, 494, 67, 4.8, 141),
+GPUS = {
+    "rtx-3090": Gpu(71, 35.6, 35.6, 0.936, 24),
+    "rtx-4090": Gpu(165, 82.6, 82.6, 1.008, 24),
+    "a100": Gpu(312, 156, 19.5, 2.0, 80),
+    "h100": Gpu(989, 494, 67, 3.35, 80),
+    "h200": Gpu(989, 494, 67, 4.8, 141),
 }
 
 
@@ -73,10 +73,10 @@ def find_gpu(name: str) -> str | None:
         ValueError: `name` is not in the table.
     """
     normalize = lambda text: re.sub(r"[^a-z0-9]", "", text.lower())
-    requested = name or detect().card or ""
-    match = next((card for card in CARDS if requested and normalize(card) in normalize(requested)), None)
+    requested = name or detect().gpu or ""
+    match = next((gpu for gpu in GPUS if requested and normalize(gpu) in normalize(requested)), None)
     if name and not match:
-        raise ValueError(f"card {name!r} is none of {', '.join(CARDS)}")
+        raise ValueError(f"GPU {name!r} is none of {', '.join(GPUS)}")
     return match
 
 
@@ -95,9 +95,9 @@ class Work:
     def times(self, count: float) -> Work:
         return Work(*(getattr(self, name) * count for name in self.__dataclass_fields__))
 
-    def seconds(self, card: Card) -> float:
-        computing = self.half / card.half + self.single / card.single + self.plain / card.plain
-        return (computing + self.moved / card.bandwidth) / PEAK_SHARE
+    def seconds(self, gpu: Gpu) -> float:
+        computing = self.half / gpu.half + self.single / gpu.single + self.plain / gpu.plain
+        return (computing + self.moved / gpu.bandwidth) / PEAK_SHARE
 
 
 def network(name: str, half: bool = False) -> Work:
@@ -202,8 +202,8 @@ def _samples_per_pass(memory_gb: float, sample: float, most: int) -> int:
 
 def format_estimate(name: str, device: str, found: tuple[Work, float] | None) -> Mapping[str, object] | None:
     """What a plan prints: seconds, gigabytes, the GPU and the assumptions; None if the stage does not run on a GPU."""
-    card = find_gpu(name)
-    if card is None or device != "cuda" or found is None:
+    gpu = find_gpu(name)
+    if gpu is None or device != "cuda" or found is None:
         return None
     work, gigabytes = found
-    return {"card": card, "seconds": work.seconds(CARDS[card]), "gb": gigabytes, "basis": BASIS}
+    return {"gpu": gpu, "seconds": work.seconds(GPUS[gpu]), "gb": gigabytes, "basis": BASIS}

@@ -25,13 +25,13 @@ class Machine:
     """What CUDA needs; None where it is missing or unknown.
 
     Attributes:
-        card: name of the GPU. gigabytes: its memory, 1e9 bytes. driver: major version.
+        gpu: name of the GPU. gigabytes: its memory, 1e9 bytes. driver: major version.
         torch_cuda: the CUDA version torch was built for, e.g. "13.0"; "" for a build without.
         gsplat: is the package installed? extension: are its kernels compiled with it?
         nvcc: the CUDA version of the compiler, "" where it exists but its version is unknown.
     """
 
-    card: str | None = None
+    gpu: str | None = None
     gigabytes: float | None = None
     driver: int | None = None
     torch_cuda: str | None = None
@@ -43,10 +43,10 @@ class Machine:
 @functools.cache
 def detect() -> Machine:
     """This machine: a few files are read, and nvidia-smi is run where it exists."""
-    card, gigabytes, driver = _query_gpu()
+    gpu, gigabytes, driver = _query_gpu()
     package = _package("gsplat")
     extension = package is not None and any(package.glob("csrc*.so"))
-    return Machine(card, gigabytes, driver or _driver(DRIVER), _torch_cuda(), package is not None, extension, _nvcc())
+    return Machine(gpu, gigabytes, driver or _driver(DRIVER), _torch_cuda(), package is not None, extension, _nvcc())
 
 
 def find_missing(here: Machine, memory_gb: float = 0.0, splats: bool = True, memory_param: str = "") -> list[str]:
@@ -73,7 +73,7 @@ def find_missing(here: Machine, memory_gb: float = 0.0, splats: bool = True, mem
         found += _cannot_build(here, wanted)
     if memory_gb and here.gigabytes is not None and memory_gb > here.gigabytes:
         found.append(
-            f"{memory_param} is {memory_gb:g}, and {here.card or 'this card'} has {here.gigabytes:.0f} GB: "
+            f"{memory_param} is {memory_gb:g}, and {here.gpu or 'this GPU'} has {here.gigabytes:.0f} GB: "
             f'set="{memory_param}={int(0.8 * here.gigabytes)}"'
         )
     return found

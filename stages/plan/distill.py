@@ -29,6 +29,6 @@ def lacks(params: Params) -> list[str]:
     return machine.find_missing(machine.detect(), params.memory_gb, splats=True, memory_param="distill.memory_gb")
 
 
-def cost(params: Params, card: str) -> Mapping[str, object] | None:
+def cost(params: Params, gpu: str) -> Mapping[str, object] | None:
     """The estimated cost on a GPU, by name; "" is this machine's. ValueError if the name is not in the table."""
-    return estimate.format_estimate(card, params.device, estimate.distill(params))
+    return estimate.format_estimate(gpu, params.device, estimate.distill(params))

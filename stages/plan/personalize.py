@@ -22,6 +22,6 @@ def lacks(params: Params) -> list[str]:
     return machine.find_missing(machine.detect(), params.memory_gb, splats=False, memory_param="personalize.memory_gb")
 
 
-def cost(params: Params, card: str) -> Mapping[str, object] | None:
+def cost(params: Params, gpu: str) -> Mapping[str, object] | None:
     """Estimated cost on a GPU ("": that of this machine). Raises ValueError for a GPU that is not in the table."""
-    return estimate.format_estimate(card, params.device, estimate.personalize(params))
+    return estimate.format_estimate(gpu, params.device, estimate.personalize(params))

@@ -67,6 +67,6 @@ def lacks(params: Params) -> list[str]:
     return machine.find_missing(machine.detect(), params.memory_gb, splats=False, memory_param="reference.memory_gb")
 
 
-def cost(params: Params, card: str) -> Mapping[str, object] | None:
-    """The stage's cost on a card; "" is this machine's. ValueError for a card that is not in the table."""
-    return estimate.format_estimate(card, params.device, estimate.reference(params))
+def cost(params: Params, gpu: str) -> Mapping[str, object] | None:
+    """The stage's cost on a GPU; "" is this machine's. ValueError for a GPU that is not in the table."""
+    return estimate.format_estimate(gpu, params.device, estimate.reference(params))

@@ -1,4 +1,4 @@
-"""Triton's kernels give what the formulas give; on a card, or without one by its interpreter (TRITON_INTERPRET=1)."""
+"""Triton's kernels give what the formulas give; on a GPU, or without one by its interpreter (TRITON_INTERPRET=1)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from reffusion.gaussians import cuda_kernels  # noqa: E402
 @pytest.mark.parametrize("size", [(4, 4, 1), (23, 31, 3), (61, 1030, 3)])
 @pytest.mark.parametrize("masked", [None, "soft", "hard"])
 def test_ssim_and_its_gradient(size, masked):
-    rand = lambda *shape: torch.rand(*shape, generator=generator(0, "card", *map(str, shape)), dtype=torch.float64)
+    rand = lambda *shape: torch.rand(*shape, generator=generator(0, "gpu", *map(str, shape)), dtype=torch.float64)
     image, weights = rand(*size), None
     target = (image + 0.2 * rand(*size).flip(0)).clamp(0, 1)
     if masked:
