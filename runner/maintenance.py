@@ -66,7 +66,7 @@ def clean(request: Request) -> None:
             recover_swap(home, hashes)
             say(f"removing {display_path(home)}: {', '.join(sorted(p.parent.name for p in home.glob(f'*/{RECEIPT}')))}")
         for home in homes:
-            for path in list(_made_files(home, pipeline, hashes)):
+            for path in list(_find_artifact_files(home, pipeline, hashes)):
                 path.unlink(missing_ok=True)
             for folder in (path for pattern in TEMPORARY for path in home.glob(pattern)):
                 delete_folder(folder)
@@ -111,7 +111,7 @@ def is_home(folder: Path) -> bool:
     return own and ((folder / "source").is_file() or any(folder.glob(f"*/{RECEIPT}")))
 
 
-def _made_files(home: Path, pipeline: Pipeline, hashes: Hashes) -> Iterator[Path]:
+def _find_artifact_files(home: Path, pipeline: Pipeline, hashes: Hashes) -> Iterator[Path]:
     """The files of a scene's results that the runner or report/ wrote and nobody changed; receipts come last."""
     yield from (home / name for name in RECORDS)
     yield from (home / f"{stage}.log" for stage in pipeline.stages)

@@ -97,14 +97,14 @@ def test_a_scene_without_training_views_or_gaussians_is_left_alone():
 # --- what was seen
 
 
-def seen_by(scene: Gaussians, masks=None) -> list[training_coverage.CoverageView]:
+def views_of(scene: Gaussians, masks=None) -> list[training_coverage.CoverageView]:
     return training_coverage.render_coverage_views(scene, TRAIN, masks or {})
 
 
 def test_a_view_that_everything_saw_has_nothing_unseen():
     scene = wall()
     for name in small_scene.TEST:
-        assert not training_coverage.unseen_pixels(scene, small_scene.CAMERAS[name], seen_by(scene))[2:-2, 2:-2].any()
+        assert not training_coverage.unseen_pixels(scene, small_scene.CAMERAS[name], views_of(scene))[2:-2, 2:-2].any()
 
 
 def test_unseen_is_what_lies_outside_all_frames():
@@ -112,7 +112,7 @@ def test_unseen_is_what_lies_outside_all_frames():
     aside = small_scene.camera("aside", 1.0)
     x = small_scene.wall_points(aside)[..., 0]
     edge = TRAIN[-1].center[0] + small_scene.WALL * small_scene.WIDTH / 2 / small_scene.FOCAL
-    found = training_coverage.unseen_pixels(scene, aside, seen_by(scene))
+    found = training_coverage.unseen_pixels(scene, aside, views_of(scene))
     assert small_scene.iou(found, x > edge) > 0.95
     assert 0.3 < found.mean() < 0.9
 
@@ -128,22 +128,22 @@ def test_unseen_is_what_all_training_views_hide_behind_something_or_under_masks(
     framed = np.any([((uv >= 0) & (uv < (c.width, c.height))).all(-1) & ~small_scene.behind_square(points, c, at)
                      for c in TRAIN for uv in [small_scene.geometry.project(points, c)[0]]], 0)  # fmt: skip
     here = ~small_scene.behind_square(points, aside, at)  # the square itself was seen
-    assert small_scene.iou(training_coverage.unseen_pixels(both, aside, seen_by(both)) & here, ~framed & here) > 0.85
+    assert small_scene.iou(training_coverage.unseen_pixels(both, aside, views_of(both)) & here, ~framed & here) > 0.85
     hidden = {c.name: np.ones((c.height, c.width), bool) for c in TRAIN}
-    assert training_coverage.unseen_pixels(scene, TRAIN[0], seen_by(scene, hidden)).all()
+    assert training_coverage.unseen_pixels(scene, TRAIN[0], views_of(scene, hidden)).all()
 
 
 def test_a_view_tells_what_a_further_one_would_show_for_the_first_time():
     """Of the outermost views an outer strip is in no other one, and of those between nothing."""
     scene = small_scene.plane(small_scene.WALL, 4.0, 2.4, small_scene.texture)
-    views = seen_by(scene)
+    views = views_of(scene)
     share = training_coverage.leave_one_out_unseen_share(scene, views)
     step = np.diff(sorted(view.camera.center[0] for view in views))
     strips = [step[k] * small_scene.FOCAL / small_scene.WALL / small_scene.WIDTH for k in (0, -1)]
     assert share == pytest.approx(sum(strips) / len(views), rel=0.2)
     assert training_coverage.leave_one_out_unseen_share(scene, views[:1]) == 1.0
     hidden = {c.name: np.ones((c.height, c.width), bool) for c in TRAIN}
-    assert training_coverage.leave_one_out_unseen_share(scene, seen_by(scene, hidden)) == 0.0  # all is the object
+    assert training_coverage.leave_one_out_unseen_share(scene, views_of(scene, hidden)) == 0.0  # all is the object
     assert training_coverage.leave_one_out_unseen_share(scene, []) == 0.0
 
 

@@ -137,7 +137,7 @@ def test_a_torchscript_lama_is_read_as_by_the_baselines(tmp_path):
     assert painter.name == "LaMa (big.pt)" and (painted[hole()] == painted[hole()][0]).all()
 
 
-def seen_by(side, inner):
+def recording_network(side, inner):
     """What a network of this size is shown: (picture, hole)."""
     shown = []
 
@@ -161,10 +161,10 @@ def test_a_fixed_size_sees_a_square_around_the_hole_with_as_much_again():
     inner[10, :] = True
     assert feedforward.crop_around(inner, 64) == (slice(0, 300), slice(0, 400)), "longer than the picture is high"
     for side in (64, 512):
-        image, mask = seen_by(side, inner)
+        image, mask = recording_network(side, inner)
         assert image.shape == (side, side, 3) and mask.shape == (side, side) and (abs(image.astype(int) - 77) < 5).all()
         assert mask[int(10.5 * side / 400)].all(), "a line of one pixel is not lost"
-    image, mask = seen_by(None, inner[:, :397])
+    image, mask = recording_network(None, inner[:, :397])
     assert image.shape == (304, 400, 3) and mask.shape == (304, 400), "any size: multiples of 8"
 
 

@@ -84,17 +84,17 @@ def test_samples_masked_by_the_hole_show_it_where_it_is(local_share, size, monke
 def test_local_samples_show_the_hole_in_full_resolution_and_prompts_follow(monkeypatch):
     view = striped()
 
-    def drawn(count, size, share, empty):
+    def draw_samples(count, size, share, empty):
         monkeypatch.setattr(crops, "EMPTY_SHARE", empty)
         return crops.draw_samples([view], NATIVE, size, count, Samples(local_share=share), generator(3))
 
-    local = drawn(10, SIZE, 1.0, 0.0)
+    local = draw_samples(10, SIZE, 1.0, 0.0)
     windows = view.image.unfold(1, SIZE, 1).unfold(2, SIZE, 1).permute(1, 2, 0, 3, 4).flatten(0, 1)
     for image in local.images:
         assert (windows == image).all((1, 2, 3)).any(), "not a crop of the reference"
-    whole = drawn(10, NATIVE, 0.0, 0.0)
+    whole = draw_samples(10, NATIVE, 0.0, 0.0)
     assert (local.prompts == crops.LOCAL).all() and (whole.prompts == crops.GLOBAL).all()
-    mixed = drawn(300, SIZE, 0.5, 0.2).prompts
+    mixed = draw_samples(300, SIZE, 0.5, 0.2).prompts
     shares = torch.bincount(mixed, minlength=3) / 300
     torch.testing.assert_close(shares, torch.tensor([0.4, 0.4, 0.2]), atol=0.09, rtol=0)
 

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @pytest.fixture(scope="module")
 def cases():
-    return holes.held_out_cases(16)
+    return holes.make_cases(16)
 
 
 def test_a_perfect_picture_a_blurred_one_and_a_flat_one_are_told_apart(cases):
@@ -49,7 +49,7 @@ def test_only_the_hole_counts(cases):
 
 
 def test_the_held_out_set_is_fixed_and_shares_no_picture_with_training(cases):
-    again = holes.held_out_cases(3)
+    again = holes.make_cases(3)
     assert all(np.array_equal(a.truth, b.truth) and np.array_equal(a.hole, b.hole) for a, b in zip(again, cases))  # noqa: B905
     kinds = [case.kind for case in cases]
     assert 0 < kinds.count("photograph") < len(kinds)

@@ -49,7 +49,7 @@ def on_vase(rays: np.ndarray, center: np.ndarray, cut: bool) -> np.ndarray:
     return np.minimum(side, lid)
 
 
-def drawn(view: Camera, cut: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def render_vase(view: Camera, cut: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Depth [H, W] without the box, where the box hides it, where the vase is shown without it."""
     rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
     ground = np.where(rays[..., 2] < 0, -view.center[2] / np.minimum(rays[..., 2], -1e-9), 50.0).clip(0, 50)
@@ -61,7 +61,7 @@ def drawn(view: Camera, cut: bool = False) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def witness(view: Camera, cut: bool = False) -> DepthView:
-    depth, hidden, _ = drawn(view, cut)
+    depth, hidden, _ = render_vase(view, cut)
     kernel = np.ones((3, 3))
     wide = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     return DepthView.from_range(view, depth, (cv2.erode(depth, kernel), cv2.dilate(depth, kernel)), wide)
@@ -118,7 +118,7 @@ def test_a_vase_is_its_own_mirror_image(whole):
 def test_the_half_that_the_box_hides_stands_where_it_is(whole):
     views, _, _, mirrors = whole
     for view in views[::3]:
-        true, hidden, vase = drawn(view.camera)
+        true, hidden, vase = render_vase(view.camera)
         found = render_mirrors(mirrors, view.camera, hidden, views).plausible_depth
         behind_box = cv2.erode((hidden & vase).astype(np.uint8), np.ones((7, 7))) > 0
         if behind_box.sum() < 100:
@@ -133,7 +133,7 @@ def test_the_half_that_the_box_hides_stands_where_it_is(whole):
 def test_its_pixels_are_undecided_and_have_its_depth(whole):
     views, gaussians, planes, mirrors = whole
     view = views[5]
-    true, hidden, vase = drawn(view.camera)
+    true, hidden, vase = render_vase(view.camera)
     supposed = np.isfinite(render_mirrors(mirrors, view.camera, hidden, views).plausible_depth) & vase
     inside = cv2.erode(supposed.astype(np.uint8), np.ones((9, 9))) > 0
     found = find_unobserved(gaussians, view.camera, hidden, views, planes, mirrors)

@@ -154,7 +154,7 @@ def test_planks_run_on_in_their_own_perspective():
     assert carried < 0.9 * shifted and carried < 0.6 * plain
 
 
-def seen_plane(picture: np.ndarray, view: Camera) -> PlanePixels:
+def plane_pixels(picture: np.ndarray, view: Camera) -> PlanePixels:
     """The floor within 1.2 of its middle, as a picture shows it."""
     places = plane_frames.plane_coordinates(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
     rows, columns = np.nonzero((np.linalg.norm(places, axis=-1) < 1.2) & np.isfinite(FLOOR.depth(view)))
@@ -162,7 +162,7 @@ def seen_plane(picture: np.ndarray, view: Camera) -> PlanePixels:
 
 
 def test_a_floor_of_planks_repeats_itself_by_their_width():
-    found = find_symmetry(seen_plane(planks(CAMERAS[0]), CAMERAS[0]))
+    found = find_symmetry(plane_pixels(planks(CAMERAS[0]), CAMERAS[0]))
     across = (found.motions @ (1.0, 0.3)) / 0.12  # planks' widths that each shift goes across them
     assert found.centre is None and len(found.motions) > 5 and np.abs(across - across.round()).max() < 0.25
     assert np.abs(across).max() > 2
@@ -178,7 +178,7 @@ def tabletop(view: Camera) -> np.ndarray:
 
 
 def test_planks_that_meet_in_a_point_are_turned_about_it():
-    found = find_symmetry(seen_plane(tabletop(CAMERAS[0]), CAMERAS[0]))
+    found = find_symmetry(plane_pixels(tabletop(CAMERAS[0]), CAMERAS[0]))
     turns = found.motions[:, 0] / (np.pi / 10)
     assert np.linalg.norm(found.centre - (0.1, 0.4)) < 0.03
     assert np.abs(turns - turns.round()).max() < 0.15 and np.abs(turns).min() > 0.5 and np.abs(turns).max() > 4
@@ -190,7 +190,7 @@ def test_planks_that_meet_in_a_point_are_turned_about_it():
 
 
 def test_the_centre_is_found_from_afar_though_a_part_of_the_top_is_seen():
-    whole = seen_plane(tabletop(CAMERAS[0]), CAMERAS[0])
+    whole = plane_pixels(tabletop(CAMERAS[0]), CAMERAS[0])
     right = whole.coordinates[:, 0] > -0.1
     seen, cell = PlanePixels(whole.pixels[right], whole.coordinates[right], whole.image), 2.4 / plane_symmetry.SIDE
     for away in ((6, -5), (-4, 6)):
@@ -200,10 +200,10 @@ def test_the_centre_is_found_from_afar_though_a_part_of_the_top_is_seen():
 
 def test_what_does_not_repeat_itself_is_not_said_to():
     noise = np.random.default_rng(0).integers(0, 256, (SIDE, SIDE, 3), np.uint8)
-    some = seen_plane(noise, CAMERAS[0])
+    some = plane_pixels(noise, CAMERAS[0])
     assert find_symmetry(some) is None
     smooth = np.repeat(np.linspace(0, 255, SIDE)[None, :, None], SIDE, 0).repeat(3, 2).astype(np.uint8)
-    assert find_symmetry(seen_plane(smooth, CAMERAS[0])) is None
+    assert find_symmetry(plane_pixels(smooth, CAMERAS[0])) is None
     assert find_symmetry(PlanePixels(some.pixels[:MIN_CELLS], some.coordinates[:MIN_CELLS], some.image)) is None
 
 

@@ -36,7 +36,7 @@ def camera(name: str, azimuth: float, height: float, away: float = 3.5) -> Camer
     return small_scene.looking(name, azimuth, height, away, np.zeros(3), SIZE, FOCAL)
 
 
-def drawn(view: Camera, notched: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def render_scene(view: Camera, notched: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Depth [H, W] of table and floor, whether the ray meets the box first, whether the table shows without it; one
     that is notched lacks a quarter, up to the middle of the box."""
     rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
@@ -54,7 +54,7 @@ def drawn(view: Camera, notched: bool = False) -> tuple[np.ndarray, np.ndarray, 
 
 
 def witness(view: Camera, notched: bool = False) -> DepthView:
-    depth, hidden, _ = drawn(view, notched)
+    depth, hidden, _ = render_scene(view, notched)
     kernel = np.ones((3, 3))
     wide = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     return DepthView.from_range(view, depth, (cv2.erode(depth, kernel), cv2.dilate(depth, kernel)), wide)
@@ -89,7 +89,7 @@ def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(views):
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.offset))
     assert abs(table.normal[2]) > 0.999 and abs(table.offset) < 0.01
     view = camera("new", 15.0, 1.6)
-    depth, _, on_table = drawn(view)
+    depth, _, on_table = render_scene(view)
     at = table.depth(view)
     goes_on = table.pixels_on(table.continued, at, view, np.ones_like(on_table))
     place = geometry.unproject(np.where(np.isfinite(at), at, 1.0), view)
@@ -173,7 +173,7 @@ def test_what_lies_beneath_the_table_in_all_views_but_one_is_not_what_is_behind_
     beneath = np.clip((-0.2 - camera.center[2]) / np.minimum(rays[..., 2], -1e-3), 0, 20)
     grey = np.full((SIZE, SIZE, 3), 128, np.uint8)
     left = surface_gaussians(grey, beneath, np.ones((SIZE, SIZE), bool), camera, sh_count=1, spread=0.6)
-    hidden = drawn(camera)[1] & drawn(camera)[2]
+    hidden = render_scene(camera)[1] & render_scene(camera)[2]
 
     def shows_it(view):
         rays = geometry.pixel_rays(view.camera) @ view.camera.world_to_camera[:3, :3]
@@ -230,13 +230,13 @@ def drawn_with_the_box(view: Camera) -> np.ndarray:
     rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
     low, high = np.array([-BOX, -BOX, 0.0]), np.array([BOX, BOX, HIGH])
     enter = np.stack([(low - view.center) / rays, (high - view.center) / rays]).min(0).max(-1)
-    depth, hidden, _ = drawn(view)
+    depth, hidden, _ = render_scene(view)
     return np.where(hidden, enter, depth)
 
 
 def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(views):
     view, other = views[0], views[1]
-    depth, hidden, on_table = drawn(view.camera)
+    depth, hidden, on_table = render_scene(view.camera)
     place = geometry.unproject(depth, view.camera)
     shadow = on_table & ~hidden & (np.hypot(place[..., 0] - 0.5, place[..., 1] - 0.5) < 0.3)
     grain = np.random.default_rng(0).integers(-12, 13, (SIZE, SIZE, 1))
@@ -246,12 +246,12 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(views):
     found = shadows.detect_shadows(truth, photo, hidden)
     assert (found & shadow).sum() > 0.9 * (shadow & ~view.masked).sum() and not found[5:25, 5:25].any()
     assert not shadows.detect_shadows(truth, truth, hidden).any()
-    there = geometry.unproject(drawn(other.camera)[0], other.camera)
-    same = drawn(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.25) & ~other.masked
+    there = geometry.unproject(render_scene(other.camera)[0], other.camera)
+    same = render_scene(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.25) & ~other.masked
     carried, light = shadows.project_shadow(found, shadows.log_light(truth, photo), depth, view.camera, [other])["a1"]
-    assert carried[same].mean() > 0.9 and not carried[~drawn(other.camera)[2]].mean() > 0.02
+    assert carried[same].mean() > 0.9 and not carried[~render_scene(other.camera)[2]].mean() > 0.02
     lit = np.clip(np.full((SIZE, SIZE, 3), 140) + np.random.default_rng(1).integers(-12, 13, (SIZE, SIZE, 1)), 0, 255)
-    core = drawn(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.2) & ~other.masked
+    core = render_scene(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.2) & ~other.masked
     again = shadows.relight((lit * 0.6).astype(np.uint8), light)
     assert np.abs(again[core].astype(float) - lit[core]).mean() < 4 and np.abs(lit[core] * 0.4).mean() > 50
     outside = ~cv2.dilate(carried.astype(np.uint8), np.ones((9, 9))).astype(bool)
@@ -261,7 +261,7 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(views):
 def test_what_has_other_colours_than_gravel_is_debris():
     """Before rough ground nearly everything counts as seen; a teal splinter of the object does not belong there."""
     view = camera("v", 0, 2.0)
-    depth, _, _ = drawn(view)
+    depth, _, _ = render_scene(view)
     rough = (depth * (1 + 0.1 * np.random.default_rng(0).random(depth.shape))).astype(np.float32)
     witness = DepthView.from_range(view, rough, depth_range(rough), np.zeros_like(rough, bool))
     photo = np.random.default_rng(1).integers(90, 160, (*rough.shape, 3)).astype(np.uint8)

@@ -39,7 +39,7 @@ class Case:
     kind: str
 
 
-def held_out_cases(count: int, seed: int = SEED) -> list[Case]:
+def make_cases(count: int, seed: int = SEED) -> list[Case]:
     """`count` pictures that no training has seen, each with a silhouette that covers `COVER` of it."""
     cases = []
     for index in range(count):

@@ -35,8 +35,8 @@ from benchmarks.studies.holes import (
     SEED,
     Case,
     fill_holes,
-    held_out_cases,
     hole_scores,
+    make_cases,
     mean_scores,
     save_row,
     to_tensors,
@@ -320,7 +320,7 @@ def main() -> None:
     first = given.priors[0]
     result: dict = {"prior": first}
     if given.pictures:
-        cases = held_out_cases(given.pictures)
+        cases = make_cases(given.pictures)
         result["inpainting"] = measure_inpainting(given.priors, cases, given.out)
         for name, kinds in result["inpainting"]["scores"].items():
             print(name, {column: round(kinds["all"][column], 3) for column in (*COLUMNS, "seconds")}, flush=True)
