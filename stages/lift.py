@@ -12,17 +12,16 @@ import numpy as np
 import torch
 
 from reffusion import seeding, trace
-from reffusion.fit import exposure
 from reffusion.inpaint import feedforward
-from reffusion.io.arrays import load_json, load_labels, save_json
+from reffusion.io.arrays import save_json
 from reffusion.io.images import load_image, replace_image
-from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_mask_sets, load_scene, save_references
+from reffusion.io.scene import save_references
 from reffusion.params.base import REFINED_FROM
 from reffusion.params.lift import Params
 from reffusion.prior import inpaint
 from reffusion.prior.model import load_prior
 from reffusion.types import Reference
+from reffusion.workspace import Workspace
 
 GUIDANCE, SEED = 0.0, 0  # GUIDANCE is a of the paper
 DTYPE = torch.float32
@@ -33,21 +32,17 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> No
 
     Views finished by an earlier run are not painted again.
     """
-    scene, facts = load_scene(poses), load_json(masks / "facts.json")
-    best_view = facts["best_reference"]
-    names = sorted({best_view, *facts["invent_views"]} - scene.clean)
-    gaussians, labels = load_ply(fit / "gaussians.ply"), load_labels(masks / "labels.npy")
-    remaining = gaussians.map(lambda p: p[~labels])
+    space = Workspace(poses, fit, masks)
+    scene, sets, best_view = space.scene, space.mask_sets, space.facts["best_reference"]
+    names = sorted({best_view, *space.facts["invent_views"]} - scene.clean)
     painter, paint = load_painter(params)
     print(f"2D inpainter: {painter}", flush=True)
     for k in trace.progress(len(names), "lift"):
         name, path = names[k], out / "images" / f"{names[k]}.png"
         if path.exists():
             continue
-        photo, masks_of_view = exposure.load_views(poses, fit, [name])[name], load_mask_sets(masks, [name])[name]
-        picture = inpaint.composite_background(remaining, scene.cameras[name], photo, masks_of_view.consistent)
-        replace_image(path, paint(picture, masks_of_view.invent, name))
-    image, mask = load_image(out / "images" / f"{best_view}.png"), load_mask_sets(masks, [best_view])[best_view].invent
+        replace_image(path, paint(space.remove_object(name), sets[name].invent, name))
+    image, mask = load_image(out / "images" / f"{best_view}.png"), sets[best_view].invent
     save_references(out, [Reference(scene.cameras[best_view], image, mask)])
     save_json(out / "facts.json", {"inpainter": painter, "views": len(names)})
 
