@@ -50,11 +50,7 @@ class Outcome:
 
 
 def run_all(
-    runs: Sequence[Run],
-    execution: Execution,
-    hashes: Hashes,
-    stages: list[str],
-    on_end: Callable[[int, Outcome], None],
+    runs: Sequence[Run], execution: Execution, hashes: Hashes, stages: list[str], on_end: Callable[[int, Outcome], None]
 ) -> None:
     """Bring each run up to date; one that fails stops no other.
 

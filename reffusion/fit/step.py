@@ -22,13 +22,7 @@ PRUNE_OPA = 0.005  # opacity below which Gaussians are pruned, as in 3DGS
 # For refining an existing scene: between the rates at the start and at the end of a fit, so that Gaussians which
 # contradict the views can still move.
 REFIT_RATES = Rates(
-    means=4e-4,
-    means_last=2e-5,
-    quaternions=2e-3,
-    log_scales=5e-3,
-    opacity_logits=0.05,
-    sh_dc=5e-3,
-    sh_rest=5e-4,
+    means=4e-4, means_last=2e-5, quaternions=2e-3, log_scales=5e-3, opacity_logits=0.05, sh_dc=5e-3, sh_rest=5e-4
 )
 COARSE_SHARE = 0.3  # of the steps, at the start, that use views of half the size
 SPARSE_UNTIL = 0.9  # of the steps, up to which every second pixel is used

@@ -56,11 +56,7 @@ class Settings(BaseModel):
 
 
 def prior_field() -> Any:
-    return Field(
-        PRIOR,
-        description="inpainting prior: a diffusers folder or a hub id",
-        json_schema_extra=WEIGHTS,
-    )
+    return Field(PRIOR, description="inpainting prior: a diffusers folder or a hub id", json_schema_extra=WEIGHTS)
 
 
 def depth_model_field() -> Any:

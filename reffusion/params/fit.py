@@ -10,15 +10,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from reffusion.params.base import (
-    Decay,
-    Device,
-    MeansUnit,
-    Settings,
-    checkpoint_field,
-    means_unit_field,
-    seconds_field,
-)
+from reffusion.params.base import Decay, Device, MeansUnit, Settings, checkpoint_field, means_unit_field, seconds_field
 
 
 class SphericalHarmonics(Settings):

@@ -37,8 +37,7 @@ class Params(Settings):
     # PAPER leaves open: what the reference's camera does not see of the hole.
     extra_views: int = Field(0, ge=0, description="maximum number of views completed besides the references")
     inpainter: Inpainter[ReferenceKind] = Field(
-        Inpainter[ReferenceKind](kind="exemplar"),
-        description="inpainter of the extra views",
+        Inpainter[ReferenceKind](kind="exemplar"), description="inpainter of the extra views"
     )
     refit_steps: int = Field(0, ge=0, description="reconstruction steps after filling; 0: none")
     device: Device = Field("cpu", description="device for rendering and the depth model")

@@ -23,7 +23,7 @@ class Inpainter(Settings, Generic[KindT]):
     kind: KindT = Field(
         description="exemplar: patches of the photographs, along surfaces: sharp, with nothing new; diffusion: the "
         "model `prior` (for the extra views of `initialize` patches, too); lama, migan: a feed-forward network; fsr: "
-        "OpenCV's FSR, else Telea; auto: the first of LaMa, MI-GAN that is on this machine, else exemplar",
+        "OpenCV's FSR, else Telea; auto: the first of LaMa, MI-GAN that is on this machine, else exemplar"
     )
     weights: str | None = Field(
         None,

@@ -92,12 +92,7 @@ def crop_border(source: Picture, max_border: float, generator: torch.Generator) 
 
 
 def draw_samples(
-    references: Sequence[Picture],
-    native: int,
-    size: int,
-    count: int,
-    samples: Samples,
-    generator: torch.Generator,
+    references: Sequence[Picture], native: int, size: int, count: int, samples: Samples, generator: torch.Generator
 ) -> Batch:
     """`count` random training samples of side `size`, determined by `generator`.
 

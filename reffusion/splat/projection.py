@@ -284,10 +284,7 @@ def _compensation_backward(a, b, sharp, determinant, low, grad, grad_a, grad_b):
     sharpness = grad * (1.0 / maximum(sharp, 1e-300) - 1.0 / determinant)
     width = grad * (low / determinant)
     by_a, by_b = _cross(b, m), _cross(m, a)
-    return (
-        _moved_row(grad_a, by_a, sharpness, a, width),
-        _moved_row(grad_b, by_b, sharpness, b, width),
-    )
+    return (_moved_row(grad_a, by_a, sharpness, a, width), _moved_row(grad_b, by_b, sharpness, b, width))
 
 
 @inlined
