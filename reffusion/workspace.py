@@ -44,7 +44,7 @@ class Workspace:
     @cached_property
     def gaussians(self) -> Gaussians:
         """N Gaussians of the whole scene, with the object."""
-        return load_ply(self.fit / "gaussians.ply").map(lambda p: p.to(self.device))
+        return load_ply(self.fit / "gaussians.ply", device=self.device)
 
     @cached_property
     def labels(self) -> Tensor:

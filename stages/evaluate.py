@@ -112,7 +112,7 @@ def load_stages(finish: Path, folders: dict[str, Path | None], device: str) -> d
         if folder:
             completed = finish / "completed" / f"{stage}.ply"
             path = completed if completed.exists() else folder / "gaussians.ply"
-            gaussians[stage] = load_ply(path).map(lambda p: p.to(device))
+            gaussians[stage] = load_ply(path, device=device)
     return gaussians
 
 
@@ -122,7 +122,7 @@ def unseen_by_training(
     """Test view -> bool [H, W], pixels that show what no training view saw."""
     if not scene.test:
         return {}
-    gaussians = load_ply(fit / "gaussians.ply").map(lambda p: p.to(device))
+    gaussians = load_ply(fit / "gaussians.ply", device=device)
     cameras = [scene.cameras[name] for name in scene.train]
     views = training_coverage.render_coverage_views(
         gaussians, cameras, load_training_object_masks(scene, raw_masks, masks)

@@ -33,7 +33,7 @@ def run(
     """
     scene = load_scene(poses)
     folders = {"fit": fit, "initialize": initialize, "distill": distill}
-    gaussians = {s: load_ply(f / "gaussians.ply").map(lambda p: p.to(params.device)) for s, f in folders.items() if f}
+    gaussians = {s: load_ply(f / "gaussians.ply", device=params.device) for s, f in folders.items() if f}
     result = list(gaussians)[-1]
     counts = {stage: len(each) for stage, each in gaussians.items()}
     share = None

@@ -29,7 +29,7 @@ CHECKED_VIEWS = 8  # views in which Gaussians that the scene brings are compared
 def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -> None:
     """Write labels.npy, debris.npy, background.npz, facts.json, and raw/, consistent/, unobserved/ and
     invent/<view>.png."""
-    scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply").map(lambda p: p.to(params.device))
+    scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply", device=params.device)
     train = [scene.cameras[name] for name in scene.train]
     check_frame(poses, fit, gaussians, train)
     region = load_region(raw_masks)

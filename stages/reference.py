@@ -90,7 +90,7 @@ def inpaint_by_patches(params: Params, out: Path, base: np.ndarray, name: str, s
 
 def inpaint_by_prior(params: Params, out: Path, base: np.ndarray, name: str, masks: MaskSet) -> np.ndarray:
     """uint8 [H, W, 3]: the view with I inpainted by the diffusion prior."""
-    prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
+    prior = load_prior(params.prior, params.device, params.dtype)
     prior = memory.fit_to_memory(prior, params.memory_gb, "reference.memory_gb")
     hole = torch.from_numpy(masks.invent)
     with memory.explain_oom("reference.memory_gb", params.memory_gb):

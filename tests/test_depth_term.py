@@ -13,7 +13,7 @@ from reffusion.depth.alignment import align
 from reffusion.depth.background_depth import Completion
 from reffusion.distill import depth_estimator
 from reffusion.distill import loop as D
-from reffusion.distill.depth_estimator import DepthEstimator
+from reffusion.distill.depth_estimator import DepthEstimator, build_estimator
 from reffusion.distill.terms import depth as depth_term
 from reffusion.distill.train_view import TrainView
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
@@ -360,6 +360,5 @@ def test_an_estimate_that_is_not_finite_names_step_and_view(prior, text, tmp_pat
 
 def test_both_stages_find_depth_alike():
     from reffusion.initialize import fill
-    from stages import distill
 
-    assert fill.COMPLETION == Completion() == distill.build_depth_estimator(Params(), NO_POINTS).how
+    assert fill.COMPLETION == Completion() == build_estimator(Params(), NO_POINTS).how

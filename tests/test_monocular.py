@@ -138,11 +138,12 @@ def test_the_stage_shows_the_model_the_reference(network):
 
 def test_the_depth_term_asks_the_model_of_its_parameter(folder, network):
     """A scene whose disparity is the model's own answer, scaled and moved: that is what it finds in the hole."""
-    from stages import distill
+    from reffusion.distill.depth_estimator import build_estimator
+    from reffusion.params.distill import Params
 
     view, image = small.CAMERAS["a2"], picture(small.HEIGHT, small.WIDTH)
     true = 2.0 + 0.3 * monocular.predict_disparity(network, image).double().numpy()
     hole = small.true_mask(view, 1.7)
     seen = ViewDepth(view, np.where(hole, 0.0, 1 / true), ~hole, hole, hole, np.zeros_like(hole))
-    estimator = distill.build_depth_estimator(distill.Params(depth={"model": str(folder)}), np.zeros((0, 3)))
+    estimator = build_estimator(Params(depth={"model": str(folder)}), np.zeros((0, 3)))
     np.testing.assert_allclose(estimator.disparity(seen, lambda: image.permute(1, 2, 0).numpy()), true, rtol=1e-6)

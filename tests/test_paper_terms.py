@@ -15,7 +15,7 @@ from small_prior import small_prior
 from test_distill import camera, train_view, wall
 
 from reffusion.background.model import Background
-from reffusion.distill import loop
+from reffusion.distill import inputs, loop
 from reffusion.distill.adversary import Adversary
 from reffusion.distill.display_range import clamp_to_display
 from reffusion.distill.terms import adversarial, sds
@@ -33,9 +33,10 @@ from reffusion.params.personalize import Samples
 from reffusion.prior import crops, diffusion, lora
 from reffusion.seeding import generator
 from reffusion.types import MaskSet
+from reffusion.workspace import Workspace
 from runner.keys import HASHES, Hashes
 from runner.resolve import Request, resolve_all
-from stages import distill, fit, initialize, masks, reference
+from stages import fit, initialize, masks, reference
 
 ROOT = Path(__file__).resolve().parent.parent
 NEAR = 1.6
@@ -58,10 +59,10 @@ def views_of(tmp_path_factory):
     hidden[20:40, 10:30], drawn[20:40, 50:70] = True, True
     sets = {name: MaskSet(none, hidden, none, none if name == "a3" else drawn) for name in small.CAMERAS}
     save_mask_sets(home / "masks", sets)
-    scene = load_scene(poses)
+    space = Workspace(poses, fitted, home / "masks")
 
     def made(**changes):
-        views = distill.load_train_views(altered(Params(), **changes), scene, poses, fitted, home / "masks")
+        views = inputs.load_train_views(altered(Params(), **changes), space)
         return {view.camera.name: view for view in views}
 
     return made, torch.from_numpy(hidden), torch.from_numpy(drawn)
@@ -132,9 +133,9 @@ def test_an_unadapted_prior_is_not_prompted_unless_asked():
 
 
 def test_what_the_prior_is_told(prior, monkeypatch):
-    monkeypatch.setattr(distill, "load_prior", lambda *_, **__: prior)
-    _, told = distill.load_adapted_prior(Params(), None)
-    _, nothing = distill.load_adapted_prior(Params(prompts="empty"), None)
+    monkeypatch.setattr(inputs, "load_prior", lambda *_, **__: prior)
+    _, told = inputs.load_adapted_prior(Params(), None)
+    _, nothing = inputs.load_adapted_prior(Params(prompts="empty"), None)
     assert torch.equal(told, diffusion.embed_text(prior, list(crops.PROMPTS)))
     assert torch.equal(nothing, diffusion.embed_text(prior, [""] * 3)) and not torch.equal(told[0], nothing[0])
 

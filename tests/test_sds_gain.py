@@ -8,12 +8,12 @@ import torch
 from small_params import altered
 from small_scene import CAMERAS, TRAIN, gaussians, true_mask
 
+from reffusion.distill.inputs import resolve_sds
 from reffusion.initialize.sds_gain import GUESSED_SHARE, HOLE_LOSS, MAX_VIEWS, PRIOR_PSNR, predict_gain
 from reffusion.io.arrays import save_json
 from reffusion.params.distill import Params
 from reffusion.splat import rasterizer
 from reffusion.types import MaskSet
-from stages import distill
 from stages.plan import distill as told
 
 AT, TRAINED = 0.8, [CAMERAS[name] for name in TRAIN]
@@ -85,7 +85,7 @@ def test_a_few_views_are_looked_at_and_without_any_it_may_gain(given):
 def test_distillation_reads_what_the_initialization_says(tmp_path, run, may, weight):
     save_json(tmp_path / "facts.json", {"sds_may_gain": may, "sds_reason": "too good at 40.0 dB"})
     asked = altered(Params(), sds={"run": run, "weight": 1})
-    params, said = distill.resolve_sds(asked, tmp_path)
+    params, said = resolve_sds(asked, tmp_path)
     assert params == altered(asked, sds={"weight": weight})
     assert ("40.0 dB" in said) == (run == "auto") and ("left out" in said) == (weight == 0)
 

@@ -20,15 +20,17 @@ import torch
 import yaml
 
 from reffusion import trace
+from reffusion.distill.inputs import load_adapted_prior, load_initialization, load_train_views
 from reffusion.distill.loop import average, build_objective, masked_factors, take_step
 from reffusion.gaussians.optimize import GaussianOptimizer
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.ground_truth import load_ground_truth, load_object_mask
 from reffusion.io.scene import load_scene
 from reffusion.metrics import image_metrics
+from reffusion.params.distill import Params
 from reffusion.splat import rasterizer
+from reffusion.workspace import Workspace
 from report import charts
-from stages import distill as stage
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -58,13 +60,13 @@ ATTEMPTS: dict[str, dict] = {
 }
 
 
-def profile_params(overrides: dict) -> stage.Params:
+def profile_params(overrides: dict) -> Params:
     """The laptop profile's parameters of `distill` with overrides."""
     values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["distill"]
     for name, value in overrides.items():
         if name != BASE:
             values[name] = values.get(name, {}) | value if isinstance(value, dict) else value
-    return stage.Params(**values)
+    return Params(**values)
 
 
 def load_test_views(run: Path) -> list[tuple]:
@@ -98,11 +100,11 @@ def score_views(gaussians, views: list[tuple]) -> dict[str, float]:
 def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[dict[str, float]]:
     """Lines {"seconds", "iteration", scores} of one setting."""
     params = profile_params(overrides)
-    scene = load_scene(run / "poses")
-    initial, masked, holes = stage.load_initialization(params, scene, run / "reference", start)
+    space = Workspace(run / "poses", run / "fit", run / "masks")
+    initial, masked, holes = load_initialization(params, space.scene, run / "reference", start)
     adapted = run / "personalize" if overrides.get(BASE, True) else None
-    prior, text = stage.load_adapted_prior(params, adapted)
-    seen = stage.load_train_views(params, scene, run / "poses", run / "fit", run / "masks")
+    prior, text = load_adapted_prior(params, adapted)
+    seen = load_train_views(params, space)
     objective = build_objective(initial, masked, seen, holes, prior, text, params)
     optimizer = GaussianOptimizer(initial, masked, None, masked_factors(params.lr), epsilon=params.lr.epsilon)
     rasterizer.render(

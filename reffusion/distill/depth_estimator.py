@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion.depth import background_depth, estimates
+from reffusion.depth import background_depth, estimates, monocular
 from reffusion.depth.background_depth import Completion, ViewDepth
+from reffusion.params.distill import Params
 
 
 class DepthEstimator(NamedTuple):
@@ -25,6 +27,20 @@ class DepthEstimator(NamedTuple):
 
     how: Completion
     disparity: Callable[[ViewDepth, Callable[[], np.ndarray]], np.ndarray]
+
+
+def build_estimator(params: Params, points: np.ndarray) -> DepthEstimator:
+    """The depth term's estimator: with a network if one is named, else the scene's own depth continued.
+
+    Args:
+        points: [P, 3] sparse points of the scene.
+    """
+    # PAPER leaves open: whether an estimate is aligned by least squares or robustly on known pixels; least squares.
+    how = Completion(robust=False, seed=params.seed)
+    if not params.depth.model:
+        return continuation_estimator(points, how)
+    network = monocular.load_network(params.depth.model, params.device)
+    return network_estimator(partial(monocular.predict_disparity, network), how)
 
 
 def continuation_estimator(points: np.ndarray, how: Completion) -> DepthEstimator:

@@ -107,8 +107,8 @@ def save_splats(path: Path, gaussians: Gaussians, similarity: Similarity, proper
         save_ply(path, gaussians, similarity, properties)
 
 
-def load_ply(path: Path, similarity: Similarity | None = None) -> Gaussians:
-    """Read the Gaussians of a .ply, compressed .ply, .spz or .splat (see `splats.load_splats`), float32 on the CPU.
+def load_ply(path: Path, similarity: Similarity | None = None, device: str = "cpu") -> Gaussians:
+    """Read the Gaussians of a .ply, compressed .ply, .spz or .splat (see `splats.load_splats`), float32 on `device`.
 
     Args:
         similarity: with it, the file is in the scene's own frame and the result is in the normalised one.
@@ -120,7 +120,7 @@ def load_ply(path: Path, similarity: Similarity | None = None) -> Gaussians:
     gaussians = load_splats(path).gaussians(similarity)
     if not (gaussians.means.isfinite().all() and gaussians.log_scales.isfinite().all()):
         raise BadInput(f"{path}: positions or sizes are too large for 32 bits")
-    return gaussians
+    return gaussians.map(lambda p: p.to(device))
 
 
 def save_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:

@@ -96,10 +96,10 @@ class Prior:
         return sum(p.numel() * p.element_size() for part in parts for p in part.parameters())
 
 
-def load_prior(source: str | Path, device: str = "cpu", dtype: torch.dtype = torch.float32) -> Prior:
+def load_prior(source: str | Path, device: str = "cpu", dtype: torch.dtype | str = torch.float32) -> Prior:
     """Load the model from a local diffusers folder, or by a hub id whose weights are on this machine (`local.locate`).
 
-    Nothing is downloaded. `dtype` is that of UNet and text encoders.
+    Nothing is downloaded. `dtype` is that of UNet and text encoders; a string is the name of one of torch.
 
     Raises:
         ValueError: weights are missing or damaged, parts or shapes do not fit, it is no inpainting model, or it
@@ -115,6 +115,7 @@ def load_prior(source: str | Path, device: str = "cpu", dtype: torch.dtype = tor
         local.check(folder)
     except ValueError as error:
         raise ValueError(f"prior {error}") from None
+    dtype = getattr(torch, dtype) if isinstance(dtype, str) else dtype
     has_second = (folder / "text_encoder_2").is_dir()
     unet = _load_network(UNet2DConditionModel, folder, "unet", torch_dtype=dtype)
     vae = _load_network(AutoencoderKL, folder, "vae", torch_dtype=torch.float32)

@@ -18,6 +18,7 @@ from reffusion.seeding import generator as seeded
 from reffusion.trace import decibels
 
 NOISE_LEVELS = (0.2, 0.55, 0.9)  # timesteps, as fractions of the schedule, at which errors are measured
+PHOTOS = 4  # number of photographs used for validation
 SHIFTS_PER_SIDE = 4  # positions per side at which the hole of the reference is tried in a photograph
 
 
@@ -36,6 +37,12 @@ class HeldOut:
     pictures: Tensor
     repaint: Tensor
     holes: Tensor
+
+
+def choose_photos(names: Sequence[str], references: Sequence[str]) -> list[str]:
+    """Up to `PHOTOS` of the views, evenly spread, that are no references."""
+    others = [name for name in names if name not in references]
+    return others[:: max(1, len(others) // PHOTOS)][:PHOTOS]
 
 
 def make_held_out(

@@ -11,7 +11,7 @@ from reffusion import seeding
 from reffusion.distill.display_range import clamp_to_display
 from reffusion.distill.sds import draw_timesteps, sds_gradient, sds_loss
 from reffusion.distill.terms.term import Term, TermInputs, TermValue, cycle_through, reach_hole
-from reffusion.distill.train_view import TrainView
+from reffusion.distill.train_view import ReferenceHole, TrainView
 from reffusion.gaussians.optimize import confine
 from reffusion.geometry import angle_between_views
 from reffusion.params.distill import Params, Sds
@@ -77,6 +77,14 @@ def views_near_references(
     middle = means.detach().median(0).values.double().cpu().numpy()
     angles = {view.camera.name: angle_between_views(middle, view.camera, references) for view in views}
     return frozenset(name for name, angle in angles.items() if angle <= max_angle)
+
+
+def describe_sds_views(sds: Sds, means: Tensor, views: Sequence[TrainView], references: Sequence[ReferenceHole]) -> str:
+    """A sentence that says how many of the views with a hole are distilled. `means`: [M, 3] of masked Gaussians."""
+    with_hole = [view for view in views if view.repaint.any()]
+    near = views_near_references(with_hole, [each.camera for each in references], means, sds.max_angle)
+    degrees = f"{sds.max_angle:g} degrees"
+    return f"SDS in {len(near)} of {len(with_hole)} views: those within {degrees} of a reference"
 
 
 def evaluate_sds(
