@@ -77,7 +77,7 @@ class Workspace:
 
     def load_photos(self, names: Iterable[str]) -> dict[str, np.ndarray]:
         """View name -> uint8 [H, W, 3], in the exposure of the Gaussians; without photographs their renders."""
-        return exposure.load_views(self.poses, self.fit, list(names))
+        return exposure.load_normalized_views(self.poses, self.fit, list(names))
 
     def hidden(self, name: str) -> np.ndarray:
         """bool [H, W], where a view's photograph shows the object: C, and nothing in a clean view."""

@@ -18,7 +18,7 @@ from reffusion.io.arrays import save_text
 from reffusion.io.files import BadInput
 from reffusion.io.ply import check_can_save, load_property_names, save_splats
 from reffusion.io.scene import load_scene
-from reffusion.io.splats import summarize
+from reffusion.io.splats import summarize_splats
 from report.patch_result import load_result
 
 BEFORE, AFTER, PATCHES = "before", "after", "patches"
@@ -34,7 +34,7 @@ def check_arguments(arguments: argparse.Namespace) -> None:
     if arguments.out is None:
         raise BadInput("--out: name the file to write, as --out patched.ply")
     for file in arguments.files:
-        summarize(file)
+        summarize_splats(file)
     check_can_save(arguments.out)
     if arguments.cameras is not None and not arguments.cameras.is_dir():
         raise BadInput(f"{arguments.cameras}: no such folder; --cameras names one with transforms.json or sparse/0")

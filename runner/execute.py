@@ -32,7 +32,7 @@ from runner.files import (
 from runner.keys import Hashes, Inputs
 from runner.pipeline import SCENE
 from runner.plan import Decision, decide, expected_seconds, partial_folder, plan, plan_table, used_needs
-from runner.resolve import Job, Request, resolve
+from runner.resolve import Request, ResolvedJob, resolve
 from runner.retry import take_over
 from runner.text import REMEDIES, display_path
 
@@ -58,7 +58,7 @@ class Execution:
 
 
 def _run_stage(
-    job: Job, stage: str, decision: Decision, earlier: dict[str, Decision], lock: int, execution: Execution
+    job: ResolvedJob, stage: str, decision: Decision, earlier: dict[str, Decision], lock: int, execution: Execution
 ) -> Decision:
     """Run a stage in `.partial-<stage>-<key>`, which may hold the state of an earlier try, and move it into place."""
     assert decision.inputs
@@ -84,7 +84,7 @@ def _run_stage(
     return replace(decision, status="cached", reason="made now", path=place, is_final=True)
 
 
-def _copy_from_variant(job: Job, stage: str, key: str, to: Path) -> str | None:
+def _copy_from_variant(job: ResolvedJob, stage: str, key: str, to: Path) -> str | None:
     """Copy the artifact with this key from another variant of the scene; returns that variant's folder, or None."""
     for home in sorted(job.runs.glob(f"{job.base.name}@*")):
         if home != job.home and (read_receipt(home / stage) or {}).get("key") == key:
@@ -99,7 +99,7 @@ def _copy_from_variant(job: Job, stage: str, key: str, to: Path) -> str | None:
 
 
 def _run_in_engine(
-    execution: Execution, job: Job, stage: str, partial: Path, earlier: dict[str, Decision], lock: int
+    execution: Execution, job: ResolvedJob, stage: str, partial: Path, earlier: dict[str, Decision], lock: int
 ) -> dict[str, Any]:
     """Run the stage's process; returns its answer, see `worker.run`.
 
@@ -128,7 +128,7 @@ def _run_in_engine(
     raise Failed(f"{stage}: {error} (all of it in {display_path(log)})")
 
 
-def expected_memory_mb(job: Job, stage: str, needs: dict[str, Path | None]) -> int:
+def expected_memory_mb(job: ResolvedJob, stage: str, needs: dict[str, Path | None]) -> int:
     """MB of CPU memory to reserve for a stage.
 
     10% above its last peak on this scene or a variant of it; before its first run by `memory` of pipeline.yaml, from
@@ -142,7 +142,7 @@ def expected_memory_mb(job: Job, stage: str, needs: dict[str, Path | None]) -> i
     return round(each.mb + each.each * sum(path.stat().st_size for path in read) / 2**20) if each else 0
 
 
-def _receipt(job: Job, stage: str, inputs: Inputs, folder: Path, result: dict[str, Any]) -> dict[str, Any]:
+def _receipt(job: ResolvedJob, stage: str, inputs: Inputs, folder: Path, result: dict[str, Any]) -> dict[str, Any]:
     return {
         "stage": stage,
         "scene": job.base.name,
@@ -214,7 +214,7 @@ def run_scene(
     return {stage: decision.path for stage, decision in done.items()}
 
 
-def _refuse_missing(job: Job, planned: dict[str, Decision]) -> None:
+def _refuse_missing(job: ResolvedJob, planned: dict[str, Decision]) -> None:
     """Raise Refused where something is missing for a stage."""
     for stage, decision in planned.items():
         if decision.status == "missing":

@@ -14,7 +14,7 @@ FRAMES = "frames"  # folder in runs/<video>/
 FRAME_FILES = ("frames.json", "frames.csv")  # what extraction writes there beside images/
 
 
-def extract_frames(video: Path, folder: Path, root: Path, hashes: Hashes) -> None:
+def update_frames(video: Path, folder: Path, root: Path, hashes: Hashes) -> None:
     """Extract a video's frames into the folder of a scene, unless they are there.
 
     Raises:

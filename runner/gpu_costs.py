@@ -5,11 +5,11 @@ from __future__ import annotations
 from runner import Refused
 from runner.plan import FINAL, Decision
 from runner.process import ask_stages
-from runner.resolve import Job, has_cuda
+from runner.resolve import ResolvedJob, has_cuda
 from runner.text import format_seconds
 
 
-def cost_table(job: Job, decisions: dict[str, Decision], gpu: str | None) -> str:
+def cost_table(job: ResolvedJob, decisions: dict[str, Decision], gpu: str | None) -> str:
     """A line for each stage that would run on CUDA, for the named GPU or else this machine's; "" where none is known.
 
     Raises:

@@ -22,7 +22,7 @@ MAX_SCENES = 256  # scenes at once, at most, on a cluster
 
 
 @dataclass(frozen=True)
-class Run:
+class ScheduledRun:
     """One scene, or a variant of it, to be run.
 
     Attributes:
@@ -50,7 +50,11 @@ class Outcome:
 
 
 def run_all(
-    runs: Sequence[Run], execution: Execution, hashes: Hashes, stages: list[str], on_end: Callable[[int, Outcome], None]
+    runs: Sequence[ScheduledRun],
+    execution: Execution,
+    hashes: Hashes,
+    stages: list[str],
+    on_end: Callable[[int, Outcome], None],
 ) -> None:
     """Bring each run up to date; one that fails stops no other.
 
@@ -78,10 +82,10 @@ def run_all(
 
 
 def _run_in_threads(
-    runs: Sequence[Run],
+    runs: Sequence[ScheduledRun],
     groups: list[list[int]],
     at_once: int,
-    run_one: Callable[[int, Run], Outcome],
+    run_one: Callable[[int, ScheduledRun], Outcome],
     on_end: Callable[[int, Outcome], None],
     engine: Engine,
 ) -> None:
@@ -122,7 +126,9 @@ def _collect_errors(function: Callable[[], None], errors: list[BaseException]) -
         errors.append(error)
 
 
-def _run_with_progress(progress: Progress, hashes: Hashes, execution: Execution, place: int, run: Run) -> Outcome:
+def _run_with_progress(
+    progress: Progress, hashes: Hashes, execution: Execution, place: int, run: ScheduledRun
+) -> Outcome:
     """Run one with its output in a file, and report its progress."""
     run.home.mkdir(parents=True, exist_ok=True)
     output = run.home / OUTPUT
@@ -133,7 +139,7 @@ def _run_with_progress(progress: Progress, hashes: Hashes, execution: Execution,
     return outcome
 
 
-def _run(run: Run, hashes: Hashes, execution: Execution) -> Outcome:
+def _run(run: ScheduledRun, hashes: Hashes, execution: Execution) -> Outcome:
     """Run one; an error of any kind is part of the outcome, as other runs go on."""
     started = time.monotonic()
     try:

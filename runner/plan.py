@@ -24,7 +24,7 @@ from runner.keys import (
 )
 from runner.pipeline import SCENE, Condition
 from runner.process import ask_stages
-from runner.resolve import Job, has_cuda
+from runner.resolve import ResolvedJob, has_cuda
 from runner.text import format_bytes, join_names
 
 TO_DO, FINAL = ("run", "stale", "pending"), ("cached", "provided", "skip")  # statuses
@@ -49,7 +49,7 @@ class Decision:
     lacks: tuple[str, ...] = ()  # what this machine lacks for CUDA: a line each, with a remedy
 
 
-def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
+def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decision:
     """The decision for `stage`, given those of the stages before it."""
     spec = job.pipeline.stages[stage]
     if stage in job.broken:
@@ -91,14 +91,14 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
     return _compare_receipts(job, stage, _inputs(job, stage, {need: d.path for need, d in needs.items()}, code))
 
 
-def used_needs(job: Job, stage: str) -> list[str]:
+def used_needs(job: ResolvedJob, stage: str) -> list[str]:
     """The needs of a stage, without one that it ignores with these parameters."""
     spec = job.pipeline.stages[stage]
     ignored = spec.ignore and _has_value(job, spec.ignore.param, spec.ignore.equals) and spec.ignore.need
     return [need for need in spec.all_needs if need != ignored]
 
 
-def _is_true(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool | None:
+def _is_true(job: ResolvedJob, condition: Condition, earlier: dict[str, Decision]) -> bool | None:
     """Whether a condition holds; None where this is not known yet."""
     stage, name = condition.names
     if job.brings.intersection(condition.unless):
@@ -132,7 +132,7 @@ def _format_reason(condition: Condition, earlier: dict[str, Decision]) -> str:
     return condition.reason.format(**{name: _fact(folder, name) for name in names}) if folder else condition.reason
 
 
-def _has_value(job: Job, param: str, value: Any) -> bool:
+def _has_value(job: ResolvedJob, param: str, value: Any) -> bool:
     """Whether the parameter `<stage>.<name>` has this value."""
     params = flatten_params(job.params)
     if param not in params:
@@ -140,12 +140,12 @@ def _has_value(job: Job, param: str, value: Any) -> bool:
     return params[param] == value
 
 
-def _existing_artifact(job: Job, stage: str) -> Path | None:
+def _existing_artifact(job: ResolvedJob, stage: str) -> Path | None:
     """The stage's artifact of this run, else of the scene's own run, up to date or not."""
     return next((home / stage for home in (job.home, job.base) if (home / stage / RECEIPT).is_file()), None)
 
 
-def _weights(job: Job, stage: str) -> Iterator[tuple[str, str, Path | None]]:
+def _weights(job: ResolvedJob, stage: str) -> Iterator[tuple[str, str, Path | None]]:
     """For each parameter that names weights: its name, its value, and the local path, None for a published id."""
     for param in job.stages[stage].weights:
         if name := flatten_params(job.params[stage])[param]:
@@ -154,7 +154,7 @@ def _weights(job: Job, stage: str) -> Iterator[tuple[str, str, Path | None]]:
             yield param, name, path if local or (job.root / name.split("/")[0]).is_dir() else None
 
 
-def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str, str]) -> Inputs:
+def _inputs(job: ResolvedJob, stage: str, needs: dict[str, Path | None], code: dict[str, str]) -> Inputs:
     """What the stage's artifact depends on, with its needs at these paths."""
     own = job.stages[stage]
     hashes = {need: job.hashes.folder(path) if path else None for need, path in needs.items()}
@@ -172,7 +172,7 @@ def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str,
     return Inputs(own.params, hashes, weights, code, own.unkeyed, own.unavailable)
 
 
-def _compare_receipts(job: Job, stage: str, inputs: Inputs) -> Decision:
+def _compare_receipts(job: ResolvedJob, stage: str, inputs: Inputs) -> Decision:
     """Cached where a receipt (the variant's own, else the scene's) agrees with the inputs and with its artifact.
 
     Else run, with the differences as reason."""
@@ -194,14 +194,14 @@ def _compare_receipts(job: Job, stage: str, inputs: Inputs) -> Decision:
     return Decision("run", why + resumes, receipts[0][0] if receipts else None, False, inputs)
 
 
-def _damage(job: Job, diff: ArtifactDiff) -> list[str]:
+def _damage(job: ResolvedJob, diff: ArtifactDiff) -> list[str]:
     """Why an artifact cannot be used, a phrase each: files are missing or changed."""
     missing = [f"{join_names(diff.missing)} missing"] if diff.missing else []
     changed = [f"{join_names(diff.changed)} changed since (keep=1 keeps it)"] if diff.changed and not job.keep else []
     return missing + changed
 
 
-def _check_device(job: Job, stage: str, decision: Decision) -> Decision:
+def _check_device(job: ResolvedJob, stage: str, decision: Decision) -> Decision:
     """The decision, or `missing` for a stage on CUDA without a GPU; cached artifacts are valid on any machine."""
     if decision.status not in TO_DO or job.params[stage].get("device") != "cuda":
         return decision
@@ -212,12 +212,12 @@ def _check_device(job: Job, stage: str, decision: Decision) -> Decision:
     return Decision("missing", f"{stage}.device is cuda, and {where}: {cure}")
 
 
-def partial_folder(job: Job, stage: str, key: str) -> Path:
+def partial_folder(job: ResolvedJob, stage: str, key: str) -> Path:
     """The folder in which the stage works; the same key resumes there."""
     return job.home / f".partial-{stage}-{key}"
 
 
-def plan(job: Job, stages: list[str], done: dict[str, Decision] | None = None) -> dict[str, Decision]:
+def plan(job: ResolvedJob, stages: list[str], done: dict[str, Decision] | None = None) -> dict[str, Decision]:
     """The decisions for `stages`, in order; `done` has those already made.
 
     Asks each stage that may run for its notes and the weights that it needs; these answers are not cached."""
@@ -234,7 +234,7 @@ def plan(job: Job, stages: list[str], done: dict[str, Decision] | None = None) -
     return {stage: decisions[stage] for stage in stages}
 
 
-def _stage_question(job: Job, stage: str, decisions: dict[str, Decision]) -> dict[str, Any]:
+def _stage_question(job: ResolvedJob, stage: str, decisions: dict[str, Decision]) -> dict[str, Any]:
     """The question to a stage, see `worker.describe`. A stage that may run gets the paths of its needs, for a preview.
     One that reads the scene is asked, and may refuse, before its other needs are made; it gets only those of them that
     are final."""
@@ -247,7 +247,7 @@ def _stage_question(job: Job, stage: str, decisions: dict[str, Decision]) -> dic
     return question
 
 
-def _apply_answer(job: Job, question: dict[str, Any], decision: Decision, answer: dict[str, Any]) -> Decision:
+def _apply_answer(job: ResolvedJob, question: dict[str, Any], decision: Decision, answer: dict[str, Any]) -> Decision:
     """The decision with the stage's notes; `missing` where the stage refuses or something is not there."""
     needed, notes = (tuple(answer.get(name, ())) for name in ("needed", "notes"))
     if decision.status not in TO_DO:
@@ -266,7 +266,7 @@ def _apply_answer(job: Job, question: dict[str, Any], decision: Decision, answer
     return replace(decision, notes=notes, needed=needed)
 
 
-def plan_table(job: Job, decisions: dict[str, Decision]) -> str:
+def plan_table(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
     """The plan as text: the profile and its reason; a line per stage with status, expected time, reason and notes; the
     weights to fetch; files that are read outside the scene's folder."""
     lines = [f"{job.home.name} (profile {job.profile}: {job.why})"]
@@ -287,7 +287,7 @@ def plan_table(job: Job, decisions: dict[str, Decision]) -> str:
     return "\n".join(lines)
 
 
-def _paths_outside_scene(job: Job, stages: list[str]) -> list[Path]:
+def _paths_outside_scene(job: ResolvedJob, stages: list[str]) -> list[Path]:
     """Paths outside the scene's folder that the stages read, as scene.yaml or the capture's own files name them."""
     readers = [stage for stage in stages if stage in job.stages and SCENE in job.pipeline.stages[stage].all_needs]
     reads = [path for stage in readers for path in files_outside(job.stages[stage].reads or (), job.folder)]
@@ -300,7 +300,7 @@ def _paths_outside_scene(job: Job, stages: list[str]) -> list[Path]:
     return sorted({*reads, *named})
 
 
-def plan_record(job: Job, decisions: dict[str, Decision], unset: Job) -> dict[str, Any]:
+def plan_record(job: ResolvedJob, decisions: dict[str, Decision], unset: ResolvedJob) -> dict[str, Any]:
     """The plan for plan.json, which the report reads: for each stage its status, reason, notes and folder below runs/;
     and the parameters of `unset`, the same job without `set=` and `budget=`."""
     folder = lambda path: path and os.path.relpath(path, job.runs)
@@ -309,7 +309,7 @@ def plan_record(job: Job, decisions: dict[str, Decision], unset: Job) -> dict[st
     return {"profile": job.profile, "stages": stages, "params": unset.params}
 
 
-def expected_seconds(job: Job, stage: str) -> float | None:
+def expected_seconds(job: ResolvedJob, stage: str) -> float | None:
     """Seconds of the stage's last run on this scene or a variant of it, on this machine with this profile."""
     places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
     found = [r for place in places if (r := read_receipt(place / stage))]

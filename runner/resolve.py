@@ -9,7 +9,7 @@ from typing import Any
 
 from runner import Refused
 from runner.files import list_files, read_text
-from runner.frames import FRAMES, extract_frames
+from runner.frames import FRAMES, update_frames
 from runner.keys import HASHES, Hashes, code_fingerprints, digest, files_outside, paths_outside
 from runner.parameters import Layers, parse_duration, parse_set, split_budget, stack_layers
 from runner.pipeline import (
@@ -60,7 +60,7 @@ class StageInfo:
 
 
 @dataclass(frozen=True)
-class Job:
+class ResolvedJob:
     """One scene with all its settings, resolved and checked."""
 
     root: Path
@@ -93,7 +93,7 @@ class Job:
         return question | {"brings": sorted({*self.brings, *folders})}
 
 
-def resolve(request: Request, hashes: Hashes | None = None, scene: bool = True) -> Job:
+def resolve(request: Request, hashes: Hashes | None = None, scene: bool = True) -> ResolvedJob:
     """Read and check everything that a request names; with `scene=False` for no scene in particular.
 
     Raises:
@@ -102,7 +102,7 @@ def resolve(request: Request, hashes: Hashes | None = None, scene: bool = True) 
     return resolve_all([request], hashes or Hashes(request.runs / HASHES), scene)[0]
 
 
-def resolve_all(requests: list[Request], hashes: Hashes, scene: bool = True) -> list[Job]:
+def resolve_all(requests: list[Request], hashes: Hashes, scene: bool = True) -> list[ResolvedJob]:
     """Resolve several requests with one root. Asks all stages at once, and only what is not in the cache."""
     drafts = [_draft(request, hashes, scene) for request in requests]
     questions = [_questions(job) for job in drafts]
@@ -118,7 +118,7 @@ def resolve_all(requests: list[Request], hashes: Hashes, scene: bool = True) -> 
     return [_add_descriptions(job, each, hashes.known | answers) for job, each in zip(drafts, questions, strict=True)]
 
 
-def _draft(request: Request, hashes: Hashes, scene: bool) -> Job:
+def _draft(request: Request, hashes: Hashes, scene: bool) -> ResolvedJob:
     """A job without the descriptions of its stages."""
     root, runs, variant, pipeline = request.root, request.runs, request.variant, load_pipeline(request.root)
     source = find_scene(request.scene, root) if scene else None
@@ -126,7 +126,7 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> Job:
     folder = base / FRAMES if source and source.is_file() else source
     check_unique_name(base, folder, root)
     if source and folder and folder != source:
-        extract_frames(source, folder, root, hashes)
+        update_frames(source, folder, root, hashes)
     found = load_scene_file(folder, pipeline) if folder else SceneFile(root / "scene.yaml", None, {}, {})
     if variant and variant not in pipeline.variants:
         raise Refused(f"{root / 'pipeline.yaml'}: {unknown_name('variant', variant, pipeline.variants)}")
@@ -140,7 +140,7 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> Job:
         origin, text = ("budget", request.budget) if request.budget else (str(found.path), found.budget)
         layers = stack_layers(*layer, split_budget(pipeline, layers.values, parse_duration(text, origin)))
     keys = frozenset(found.brings)
-    return Job(
+    return ResolvedJob(
         root,
         runs,
         folder or root,
@@ -195,7 +195,7 @@ def check_unique_name(base: Path, folder: Path | None, root: Path) -> None:
         )
 
 
-def _questions(job: Job) -> dict[str, dict[str, Any]]:
+def _questions(job: ResolvedJob) -> dict[str, dict[str, Any]]:
     """Key of the answer -> question, for each stage that has a file; see `worker.describe`."""
     questions = {}
     for stage, spec in job.pipeline.stages.items():
@@ -207,7 +207,7 @@ def _questions(job: Job) -> dict[str, dict[str, Any]]:
     return questions
 
 
-def _answer_key(job: Job, question: dict[str, Any]) -> str:
+def _answer_key(job: ResolvedJob, question: dict[str, Any]) -> str:
     """A key that changes with everything that the answer depends on; answers under a CACHED key are cached.
 
     A process that imports stages takes half a second to start, and so may listing the files that a stage reads."""
@@ -224,7 +224,7 @@ def _answer_key(job: Job, question: dict[str, Any]) -> str:
     return CACHED + digest(json.dumps([question, code, job.hashes.file(WORKER), files]))
 
 
-def _add_descriptions(job: Job, questions: dict[str, dict[str, Any]], answers: dict[str, Any]) -> Job:
+def _add_descriptions(job: ResolvedJob, questions: dict[str, dict[str, Any]], answers: dict[str, Any]) -> ResolvedJob:
     """The job with the descriptions of its stages. Raises Refused for the first parameter that is wrong."""
     broken = {name: f"stages/{name}.py: no such file, and pipeline.yaml names it" for name in job.pipeline.stages}
     stages = {}

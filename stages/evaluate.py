@@ -136,7 +136,7 @@ def save_renders(out: Path, renders: ViewRenders, truth: np.ndarray | None) -> N
     file = f"{view.camera.name}.png"
     pictures = {FOLDERS[stage]: picture for stage, picture in renders.by_stage.items()} | {"renders": view.picture}
     panels = [panel for panel in (renders.by_stage["fit"], truth, view.picture) if panel is not None]
-    pictures["side_by_side"] = image_metrics.side_by_side(panels, image_metrics.mask_box(view.mask))
+    pictures["side_by_side"] = image_metrics.join_side_by_side(panels, image_metrics.mask_box(view.mask))
     for folder, picture in pictures.items():
         save_image(out / folder / file, picture)
 

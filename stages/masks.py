@@ -50,7 +50,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
     views = render_depth_views(gaussians, train, hidden)
     background = Background(views, {}, points=scene.points).with_planes(gaussians, labels)
-    photos = exposure.load_views(poses, fit, scene.train) if background.planes or params.debris else {}
+    photos = exposure.load_normalized_views(poses, fit, scene.train) if background.planes or params.debris else {}
     background = replace(background, photos=photos)
     if params.debris and (raw or deleted is not None):
         debris = find_debris(gaussians, labels, views, hidden, photos)
@@ -111,6 +111,6 @@ def check_frame(poses: Path, fit: Path, gaussians: Gaussians, train: list[Camera
     if not (poses / "gaussians.ply").exists():
         return
     some = train[:: max(1, len(train) // CHECKED_VIEWS)]
-    photos = exposure.load_views(poses, fit, [camera.name for camera in some])
+    photos = exposure.load_normalized_views(poses, fit, [camera.name for camera in some])
     if problem := frame_check.explain_misplacement(gaussians, some, photos):
         raise ValueError(f"{poses / 'gaussians.ply'}: `gaussians` of scene.yaml: {problem}")

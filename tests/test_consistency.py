@@ -45,7 +45,7 @@ def middle():
 def test_views_of_one_plane_agree_to_the_rounding_of_their_pictures():
     for other in (camera("b", 0.2), camera("b", -0.1, 0.05)):
         for slope in (0.0, 0.3):
-            value, share = consistency.color_difference(
+            value, share = consistency.reprojected_color_difference(
                 rendered(camera("a"), middle(), slope=slope), rendered(other, slope=slope)
             )
             assert value < 1.2 / 255 and share == 1.0
@@ -53,14 +53,14 @@ def test_views_of_one_plane_agree_to_the_rounding_of_their_pictures():
 
 def test_a_colour_that_changes_from_view_to_view_is_the_difference():
     a, b = rendered(camera("a"), middle()), rendered(camera("b", 0.2), shift=0.2)
-    value, share = consistency.color_difference(a, b)
+    value, share = consistency.reprojected_color_difference(a, b)
     assert value == pytest.approx(0.2, abs=1.2 / 255) and share == 1.0
 
 
 def test_a_wrong_depth_shows_as_the_slope_of_the_picture_times_the_shift():
     """At half its depth a point lands 6 px off in a view 0.2 to the side; a pixel is worth 0.2 * 2 / 60 of red."""
     a, b = rendered(camera("a"), middle()), rendered(camera("b", 0.2))
-    value, _ = consistency.color_difference(a._replace(depth=a.depth / 2), b._replace(depth=b.depth / 2))
+    value, _ = consistency.reprojected_color_difference(a._replace(depth=a.depth / 2), b._replace(depth=b.depth / 2))
     assert value == pytest.approx(6 * 0.2 * 2 / 60 / 3, abs=1.2 / 255)
 
 
@@ -68,23 +68,23 @@ def test_what_the_neighbour_does_not_see_is_not_compared():
     a, b = rendered(camera("a"), middle()), rendered(camera("b", 0.2))
     half = np.where(np.arange(WIDTH) < WIDTH // 2, 0.5, b.depth)  # something nearer before its left half
     poisoned = np.where((half < 1)[..., None], np.uint8(255), b.picture)
-    value, share = consistency.color_difference(a, b._replace(depth=half, picture=poisoned))
+    value, share = consistency.reprojected_color_difference(a, b._replace(depth=half, picture=poisoned))
     # The plane's pixels land 6 px to the left: those of columns 38 to 43 stay in the right half.
     assert share == pytest.approx(6 / 24) and value < 1.2 / 255 + 1 / 255
-    assert consistency.color_difference(a, rendered(camera("b", 50.0))) == (None, 0.0)
-    assert consistency.color_difference(a._replace(mask=np.zeros_like(a.mask)), b) == (None, None)
-    assert consistency.color_difference(a._replace(depth=np.zeros_like(a.depth)), b) == (None, 0.0)
+    assert consistency.reprojected_color_difference(a, rendered(camera("b", 50.0))) == (None, 0.0)
+    assert consistency.reprojected_color_difference(a._replace(mask=np.zeros_like(a.mask)), b) == (None, None)
+    assert consistency.reprojected_color_difference(a._replace(depth=np.zeros_like(a.depth)), b) == (None, 0.0)
 
 
 def test_where_the_neighbour_shows_nothing_at_all_it_disagrees():
     a, b = rendered(camera("a"), middle()), rendered(camera("b", 0.2))
     empty = b._replace(depth=np.zeros_like(b.depth), picture=np.zeros_like(b.picture))
-    value, share = consistency.color_difference(a, empty)
+    value, share = consistency.reprojected_color_difference(a, empty)
     assert share == 1.0 and value == pytest.approx(a.picture[a.mask].mean() / 255, abs=1e-9)
 
 
 def test_depth_is_continued_through_a_mask():
     depth, _ = plane(camera("a"), slope=0.3)
     broken = np.where(middle(), 0.7, depth)
-    assert np.abs(consistency.interpolate_depth(broken, middle()) / depth - 1).max() < 1e-6
-    assert (consistency.interpolate_depth(broken, np.ones_like(middle())) == 0).all()
+    assert np.abs(consistency.continue_surrounding_depth(broken, middle()) / depth - 1).max() < 1e-6
+    assert (consistency.continue_surrounding_depth(broken, np.ones_like(middle())) == 0).all()

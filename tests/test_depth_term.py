@@ -19,7 +19,7 @@ from reffusion.distill.train_view import TrainView
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.gaussians.surfels import surface_gaussians
 from reffusion.geometry import Degenerate
-from reffusion.params.distill import Depth, Params
+from reffusion.params.distill import DepthTerm, Params
 from reffusion.prior import inpaint
 from reffusion.seeding import generator
 from reffusion.splat.rasterizer import render
@@ -33,7 +33,7 @@ WALL = 0.5 + 0.004 * (COLUMNS + 0.5 - WIDTH / 2) - 0.002 * (ROWS + 0.5 - HEIGHT 
 HOLE = (np.abs(COLUMNS + 0.5 - WIDTH / 2) < 7) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 6)
 NO_POINTS = np.zeros((0, 3))
 HOW = Completion(ring=0.2)
-DEPTH = Depth(steps=2)
+DEPTH = DepthTerm(steps=2)
 
 
 def wall(moved: float = 1.0):

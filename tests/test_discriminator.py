@@ -16,11 +16,11 @@ from reffusion.distill.discriminator import (
     gradient_penalty,
 )
 from reffusion.distill.terms.adversarial import draw_patches
-from reffusion.params.distill import Adversarial
+from reffusion.params.distill import AdversarialTerm
 from reffusion.prior.windows import window_around, windows_around
 from reffusion.seeding import generator
 
-SMALL, RATE = Adversarial(patches=16, size=8, width=8), 3e-3
+SMALL, RATE = AdversarialTerm(patches=16, size=8, width=8), 3e-3
 
 
 def noise(*shape, label=0, dtype=torch.float32):

@@ -27,7 +27,7 @@ from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_references, load_scene, save_mask_sets, save_scene
 from reffusion.morphology import dilate
-from reffusion.params.distill import Adversarial, Params, Sds
+from reffusion.params.distill import AdversarialTerm, Params, SdsTerm
 from reffusion.prior import inpaint
 from reffusion.seeding import generator
 from reffusion.splat import rasterizer
@@ -36,8 +36,8 @@ from reffusion.trace import load_checkpoint, read_trace
 from reffusion.types import PARAMETERS, Camera, Gaussians, MaskSet, Scene, Similarity
 
 WIDTH, HEIGHT = 36, 28
-SDS = Sds(weighting="x0", guidance=0.0)
-ADVERSARIAL = Adversarial(patches=4, size=8, width=4)
+SDS = SdsTerm(weighting="x0", guidance=0.0)
+ADVERSARIAL = AdversarialTerm(patches=4, size=8, width=4)
 
 
 def camera(name="a", shift=0.0):

@@ -223,9 +223,9 @@ def test_score_view_leaves_out_what_is_too_small():
 
 def test_side_by_side_draws_the_box_and_leaves_the_pictures_alone():
     first, second = (np.full((6, 8, 3), v, np.uint8) for v in (10, 200))
-    strip = image_metrics.side_by_side([first, second], Box(2, 1, 6, 5))
+    strip = image_metrics.join_side_by_side([first, second], Box(2, 1, 6, 5))
     assert strip.shape == (6, 20, 3) and (strip[:, 8:12] == 255).all()
     assert (strip[1, 2] == (255, 220, 0)).all() and (strip[4, 17] == (255, 220, 0)).all()
     assert (strip[2, 3] == 10).all() and (strip[0, 0] == 10).all() and (strip[2, 15] == 200).all()
     assert (first == 10).all()
-    assert image_metrics.side_by_side([np.zeros((1, 1, 3), np.uint8)], Box(0, 0, 1, 1)).shape == (1, 1, 3)
+    assert image_metrics.join_side_by_side([np.zeros((1, 1, 3), np.uint8)], Box(0, 0, 1, 1)).shape == (1, 1, 3)

@@ -27,9 +27,9 @@ from reffusion.initialize.draft import Draft
 from reffusion.io.arrays import load_labels
 from reffusion.io.scene import load_mask_sets, load_references, load_scene, save_mask_sets
 from reffusion.masks.consolidation import clean_mask
-from reffusion.params.distill import Params, Sds
+from reffusion.params.distill import Params, SdsTerm
 from reffusion.params.fit import LearningRates
-from reffusion.params.personalize import Samples
+from reffusion.params.personalize import TrainingSamples
 from reffusion.prior import crops, diffusion, lora
 from reffusion.seeding import generator
 from reffusion.types import MaskSet
@@ -171,7 +171,7 @@ def test_no_term_shows_a_prior_or_a_critic_colours_above_1(prior, monkeypatch):
     monkeypatch.setattr(adversarial, "draw_patches", watched)
     with torch.no_grad():
         text = diffusion.embed_text(prior, list(crops.PROMPTS))
-    sds.evaluate_sds(bright, masked, train_view(), prior, text, Sds(guidance=0), generator(0, "bright"))
+    sds.evaluate_sds(bright, masked, train_view(), prior, text, SdsTerm(guidance=0), generator(0, "bright"))
     critic = Params(adversarial={"patches": 4, "size": 8, "width": 4}).adversarial
     adversary = Adversary(critic, 0)
     view = train_view()
@@ -186,7 +186,7 @@ def test_a_tenth_of_realfills_masks_repaints_all():
     whole = {}
     for kind in ("rectangles", "realfill"):
         draws = generator(0, "masks")
-        drawn = [crops.random_mask(Samples(masks=kind), 32, draws) for _ in range(600)]
+        drawn = [crops.random_mask(TrainingSamples(masks=kind), 32, draws) for _ in range(600)]
         assert all(((mask == 0) | (mask == 1)).all() for mask in drawn)
         whole[kind] = np.mean([bool(mask.all()) for mask in drawn])
     assert whole["rectangles"] < 0.01 and whole["realfill"] == pytest.approx(0.1, abs=0.03)

@@ -155,7 +155,7 @@ def test_cameras_of_a_capture_look_at_renders(tmp_path):
         center = scene.similarity.apply(-pose[:3, :3].T @ pose[:3, 3])
         np.testing.assert_allclose(scene.cameras[name].center, center, atol=1e-9)
         np.testing.assert_allclose(mine[:3, :3], pose[:3, :3], atol=1e-9)
-    seen = exposure.load_views(out, out, ["v02"])["v02"]
+    seen = exposure.load_normalized_views(out, out, ["v02"])["v02"]
     drawn = rasterizer.render(load_ply(out / "gaussians.ply"), scene.cameras["v02"]).color.numpy()
     np.testing.assert_allclose(seen / 255, drawn.clip(0, 1), atol=0.5 / 255 + 1e-6)
     refused(folder, "scene.yaml: test: the scene has no photographs", test="every 8")

@@ -8,7 +8,7 @@ from small_params import altered
 from small_prior import small_prior
 
 from reffusion import trace
-from reffusion.params.personalize import Params, Samples
+from reffusion.params.personalize import Params, TrainingSamples
 from reffusion.prior import crops, denoising, diffusion, lora, validation
 from reffusion.prior import personalize as P
 from reffusion.prior.windows import two_scale_masks
@@ -71,7 +71,7 @@ def test_samples_masked_by_the_hole_show_it_where_it_is(local_share, size, monke
     """The striped picture with its hole painted white: mask and white pixels must be the same."""
     source = striped()
     source = crops.Picture(torch.where(source.region, 1.0, source.image.clamp(max=0)), source.region)
-    chosen = Samples(local_share=local_share, hole_share=1.0)
+    chosen = TrainingSamples(local_share=local_share, hole_share=1.0)
     monkeypatch.setattr(crops, "EMPTY_SHARE", 0.0)
     samples = crops.draw_samples([source], NATIVE, size, 40, chosen, generator(5))
     white = samples.images[:, :1]
@@ -86,7 +86,7 @@ def test_local_samples_show_the_hole_in_full_resolution_and_prompts_follow(monke
 
     def draw_samples(count, size, share, empty):
         monkeypatch.setattr(crops, "EMPTY_SHARE", empty)
-        return crops.draw_samples([view], NATIVE, size, count, Samples(local_share=share), generator(3))
+        return crops.draw_samples([view], NATIVE, size, count, TrainingSamples(local_share=share), generator(3))
 
     local = draw_samples(10, SIZE, 1.0, 0.0)
     windows = view.image.unfold(1, SIZE, 1).unfold(2, SIZE, 1).permute(1, 2, 0, 3, 4).flatten(0, 1)
@@ -102,7 +102,7 @@ def test_local_samples_show_the_hole_in_full_resolution_and_prompts_follow(monke
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction"])
 def test_loss_is_the_priors_own_and_its_clean_latent_error_is_predicts(tiny, kind):
     prior, draw = replace(tiny, prediction_type=kind), generator(4)
-    samples = crops.draw_samples([striped()], NATIVE, SIZE, 3, Samples(), draw)
+    samples = crops.draw_samples([striped()], NATIVE, SIZE, 3, TrainingSamples(), draw)
     t, noise = torch.tensor([10, 500, 950]), torch.randn(3, 4, SIZE, SIZE, generator=draw)
     with torch.no_grad():
         words = diffusion.embed_text(prior, list(crops.PROMPTS))
@@ -118,7 +118,7 @@ def test_loss_is_the_priors_own_and_its_clean_latent_error_is_predicts(tiny, kin
 
 def test_what_a_mask_leaves_to_be_seen_counts_by_its_weight(tiny):
     draw = generator(5)
-    samples = crops.draw_samples([striped()], NATIVE, SIZE, 3, Samples(), draw)
+    samples = crops.draw_samples([striped()], NATIVE, SIZE, 3, TrainingSamples(), draw)
     t, noise = torch.tensor([10, 500, 950]), torch.randn(3, 4, SIZE, SIZE, generator=draw)
     with torch.no_grad():
         latents = diffusion.encode(tiny, samples.images)

@@ -26,12 +26,12 @@ from reffusion.io.ground_truth import load_object_mask
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_raw_masks, load_references, load_scene, save_references
-from reffusion.params.distill import Lift
+from reffusion.params.distill import LiftTerm
 from reffusion.types import PARAMETERS, Reference
 from runner.artifacts import hash_contents
 from runner.pipeline import load_pipeline
 from runner.plan import Decision, decide
-from runner.resolve import Job, Request, resolve
+from runner.resolve import Request, ResolvedJob, resolve
 from stages import distill, evaluate, finish, fit, initialize, lift, masks
 from stages.plan import fit as plan_fit
 
@@ -63,7 +63,7 @@ PLANS = {
 # ------------------------------------------------------------------------------------------------------- the plans
 
 
-def decisions(job: Job) -> dict[str, Decision]:
+def decisions(job: ResolvedJob) -> dict[str, Decision]:
     said: dict[str, Decision] = {}
     for stage in job.pipeline.stages:
         said[stage] = decide(job, stage, said)
@@ -145,7 +145,7 @@ def test_the_papers_profile_takes_every_variant(capture):
 
 # ------------------------------------------------------------------------------------------ what the terms may reach
 
-MSE, PATCHES = Lift(weight=1), Lift(weight=1, loss="perceptual", patch=20)
+MSE, PATCHES = LiftTerm(weight=1), LiftTerm(weight=1, loss="perceptual", patch=20)
 
 
 def lifted(name="a", shift=0.0):

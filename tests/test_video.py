@@ -17,7 +17,7 @@ from reffusion.capture.layouts import video
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, load_image
 from runner import Refused
-from runner.frames import extract_frames
+from runner.frames import update_frames
 from runner.maintenance import clean
 from runner.resolve import Request, resolve
 
@@ -124,7 +124,7 @@ def test_a_video_is_a_scene(walk, tmp_path, capfd):
     frames = runs / "walk" / "frames"
     job = resolve(Request(ROOT, runs, str(walk), "laptop"))
     assert job.folder == frames and job.home == runs / "walk"
-    again = lambda path=walk: extract_frames(path, frames, ROOT, job.hashes)
+    again = lambda path=walk: update_frames(path, frames, ROOT, job.hashes)
     again()
     assert capfd.readouterr().out.count("frames of walk.mp4, the sharpest of every") == 1, "taken once"
     other = film(tmp_path / "other" / "walk.mp4", photographs(2))

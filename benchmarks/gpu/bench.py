@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.gpu import full_size
-from reffusion.params.distill import Adversarial
+from reffusion.params.distill import AdversarialTerm
 from reffusion.prior import memory
 from reffusion.prior.model import Prior, load_prior
 from reffusion.seeding import generator
@@ -32,13 +32,15 @@ class Sizes:
     fit_steps: int
     views: int
     repeats: int
-    critic: Adversarial
+    critic: AdversarialTerm
     shape: full_size.Shape
     oracle: tuple[int, int] = (400, 200)  # Gaussians and image width of the comparison with the oracle
 
 
-PAPER = Sizes(1280, 500_000, 16, 400, 12, 3, Adversarial(), full_size.SD2)  # 1600 x 1280 px
-TOY = Sizes(40, 300, 2, 4, 3, 1, Adversarial(patches=8, size=8, width=8), full_size.shrink(full_size.SD2), (100, 70))
+PAPER = Sizes(1280, 500_000, 16, 400, 12, 3, AdversarialTerm(), full_size.SD2)  # 1600 x 1280 px
+TOY = Sizes(
+    40, 300, 2, 4, 3, 1, AdversarialTerm(patches=8, size=8, width=8), full_size.shrink(full_size.SD2), (100, 70)
+)
 
 
 @dataclass

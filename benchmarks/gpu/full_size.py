@@ -22,7 +22,7 @@ import torch
 
 from reffusion.distill.terms.sds import evaluate_sds
 from reffusion.distill.train_view import TrainView
-from reffusion.params.distill import Sds
+from reffusion.params.distill import SdsTerm
 from reffusion.params.personalize import Optimizer, Params
 from reffusion.prior import crops, denoising, diffusion, lora, memory
 from reffusion.prior.model import Prior, drop_text_encoders, enable_checkpointing, make_prior
@@ -252,7 +252,7 @@ def gaussians(number: int, device: str, degree: int = 3) -> Gaussians:
 
 
 def sds_step(
-    prior: Prior, text: torch.Tensor, view: TrainView, scene: Gaussians, sds: Sds, step: int = 0
+    prior: Prior, text: torch.Tensor, view: TrainView, scene: Gaussians, sds: SdsTerm, step: int = 0
 ) -> dict[str, float]:
     """One SDS term of the library, and its backward pass into the Gaussians."""
     masked = torch.ones(len(scene), dtype=torch.bool, device=scene.means.device)
@@ -309,7 +309,7 @@ def run(shape: Shape, dtype: torch.dtype, options: argparse.Namespace) -> dict[s
         text = record_time(report, "embed prompts", lambda: diffusion.embed_text(prior, list(crops.PROMPTS)))
     prior = drop_text_encoders(prior)
     gc.collect()
-    sds, scene = Sds(patches=options.patches), gaussians(options.gaussians, "cpu")
+    sds, scene = SdsTerm(patches=options.patches), gaussians(options.gaussians, "cpu")
     record_time(report, "SDS step", lambda: sds_step(prior, text, train_view(size, "cpu"), scene, sds))
     return report
 

@@ -23,7 +23,7 @@ from reffusion.distill.terms.reconstruction import evaluate_reconstruction
 from reffusion.distill.terms.reference import evaluate_reference
 from reffusion.fit.reconstruction import fit
 from reffusion.geometry import Degenerate
-from reffusion.params.distill import Depth, Sds
+from reffusion.params.distill import DepthTerm, SdsTerm
 from reffusion.params.fit import Densify, Params, SphericalHarmonics
 from reffusion.prior import crops, denoising, diffusion, memory
 from reffusion.prior.model import Prior, drop_text_encoders
@@ -79,7 +79,7 @@ def distillation(bench: Bench) -> dict[str, Any]:
     (scene, _), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
 
     def step() -> dict[str, float]:
-        values = full_size.sds_step(prior, text, view, scene, Sds())
+        values = full_size.sds_step(prior, text, view, scene, SdsTerm())
         for name in PARAMETERS:
             getattr(scene, name).grad = None
         return values
@@ -94,7 +94,7 @@ def depth(bench: Bench) -> dict[str, Any]:
 
     def step() -> dict[str, float]:
         draw = generator(0, "depth")
-        loss, _ = evaluate_depth(scene, masked, view, prior, text, Depth(), Sds().guidance, draw, estimator)
+        loss, _ = evaluate_depth(scene, masked, view, prior, text, DepthTerm(), SdsTerm().guidance, draw, estimator)
         backpropagate(scene, loss)
         return {"loss": float(loss.detach())}
 

@@ -14,7 +14,7 @@ from reffusion import seeding
 from reffusion.distill import discriminator, sds
 from reffusion.distill.terms.sds import evaluate_sds
 from reffusion.distill.train_view import TrainView
-from reffusion.params.distill import Sds
+from reffusion.params.distill import SdsTerm
 from reffusion.prior import diffusion, windows
 from reffusion.prior.model import Prior, load_prior
 from reffusion.types import PARAMETERS
@@ -158,7 +158,7 @@ def count_bad_gradients(low: float, high: float, guidance: float) -> float:
     view, gaussians = camera(24, 18), cloud().map(lambda p: p.clone().requires_grad_())
     everything = torch.ones(18, 24, dtype=torch.bool)
     whole = TrainView(view, torch.rand(18, 24, 3, generator=seeding.generator(0)), ~everything, everything, clean=False)
-    chosen = Sds(patches=1, t_high=high, guidance=guidance)
+    chosen = SdsTerm(patches=1, t_high=high, guidance=guidance)
     masked = torch.ones(len(gaussians), dtype=torch.bool)
     loss, _ = evaluate_sds(gaussians, masked, whole, model(), prompts(), chosen, seeding.generator(1), t_low=low)
     loss.backward()

@@ -15,7 +15,7 @@ from reffusion.capture.names import list_pictures
 from reffusion.capture.roles import Roles, load_roles
 from reffusion.capture.views import resolve_view
 from reffusion.io.files import BadInput, is_file
-from reffusion.io.splats import load_splats, summarize
+from reffusion.io.splats import load_splats, summarize_splats
 from reffusion.params.capture import SceneKeys
 from reffusion.params.reference import reference_list
 
@@ -84,7 +84,7 @@ def check_gaussian_files(params: SceneKeys, scene: Path) -> list[str]:
         if name is not None:
             if not is_file(scene / name):
                 raise BadInput(f"{scene / name}: no such file; correct `{key}` in scene.yaml")
-            summary = summarize(scene / name)
+            summary = summarize_splats(scene / name)
             counts[key], notes = summary.count, [*notes, *(f"{name}: {note}" for note in summary.notes)]
             if not counts[key]:
                 why = ": everything was deleted; delete the object only" if key == "cleaned" else ""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from reffusion import seeding
 from reffusion.distill.discriminator import Critic, critic_loss, generator_loss, gradient_penalty
-from reffusion.params.distill import Adversarial
+from reffusion.params.distill import AdversarialTerm
 
 LEARNING_RATE = 1e-3  # PAPER leaves open: the critic's step size; GANeRF's, of RMSprop
 
@@ -23,7 +23,7 @@ class Adversary:
     """
 
     def __init__(
-        self, choices: Adversarial, seed: int, device: torch.device | str = "cpu", rate: float = LEARNING_RATE
+        self, choices: AdversarialTerm, seed: int, device: torch.device | str = "cpu", rate: float = LEARNING_RATE
     ):
         self.choices = choices
         self.critic = Critic(choices.size, choices.width, seeding.generator(seed, "adversary")).to(device)

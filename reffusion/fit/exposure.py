@@ -180,7 +180,7 @@ def _fit_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     return float(gain), float(offset)
 
 
-def load_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
+def load_normalized_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
     """View name -> uint8 [H, W, 3]: the photographs, `normalize_exposure`.
 
     Views without a photograph are rendered from the Gaussians in the folder `fit`, object included.

@@ -25,7 +25,7 @@ from reffusion.io.splats import (
     ROTATION,
     SCALES,
     load_splats,
-    summarize,
+    summarize_splats,
 )
 
 if TYPE_CHECKING:
@@ -159,9 +159,9 @@ def _points(path: Path, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def count_gaussians(path: Path) -> int:
     """The number of Gaussians, from the header alone. BadInput where the file is truncated, or has other properties."""
-    return summarize(path).count
+    return summarize_splats(path).count
 
 
 def load_property_names(path: Path) -> tuple[str, ...]:
     """The names of the vertices' properties, in order; empty for a quantised file."""
-    return summarize(path).properties
+    return summarize_splats(path).properties

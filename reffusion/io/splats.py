@@ -79,7 +79,7 @@ class Summary:
     antialiased: bool = False
 
 
-def summarize(path: Path) -> Summary:
+def summarize_splats(path: Path) -> Summary:
     """Read the header. BadInput where the file is truncated, or no file of Gaussians."""
     path = Path(path)
     ending = path.suffix.lower()
@@ -112,7 +112,7 @@ def load_splats(path: Path) -> Splats:
     """
     path = Path(path)
     is_file(path)
-    summary, ending = summarize(path), path.suffix.lower()
+    summary, ending = summarize_splats(path), path.suffix.lower()
     with reading(path, "a file of Gaussians"):
         if ending == ".splat":
             read = quantized.open_splat(path)

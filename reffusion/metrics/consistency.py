@@ -47,7 +47,7 @@ class RenderedView(NamedTuple):
         return undo_exposure(self.picture / 255.0, self.exposure)
 
 
-def color_difference(
+def reprojected_color_difference(
     first: RenderedView, second: RenderedView, tolerance: float = TOLERANCE
 ) -> tuple[float | None, float | None]:
     """Mean absolute colour difference in [0, 1] between the masked pixels of `first` and the same points in `second`,
@@ -76,7 +76,7 @@ def color_difference(
     return float(np.abs(in_first - in_second).mean()), float(visible.sum() / mask_pixels)
 
 
-def interpolate_depth(depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def continue_surrounding_depth(depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Depth [H, W] whose masked pixels continue the surrounding disparity smoothly; 0 where too little is known.
 
     For pictures that were inpainted in 2D, which have no depth of their own.

@@ -251,7 +251,7 @@ def mean(values: list[float | None]) -> float | None:
     return float(np.mean(present)) if present else None
 
 
-def side_by_side(panels: list[np.ndarray], box: Box | None) -> np.ndarray:
+def join_side_by_side(panels: list[np.ndarray], box: Box | None) -> np.ndarray:
     """uint8 [H, W', 3]: the panels from left to right with 4 px of white between them, the box drawn in yellow."""
     gap = np.full((panels[0].shape[0], 4, 3), 255, np.uint8)
     strip = []

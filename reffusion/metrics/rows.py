@@ -132,7 +132,7 @@ def to_csv(rows: list[dict[str, Any]]) -> str:
 
 def add_consistency(row: dict[str, Any], view: RenderedView, following: RenderedView) -> None:
     """Fill `CONSISTENCY_COLUMNS` of a view's row by comparing the view with the next one."""
-    row |= dict(zip(CONSISTENCY_COLUMNS, consistency.color_difference(view, following), strict=True))
+    row |= dict(zip(CONSISTENCY_COLUMNS, consistency.reprojected_color_difference(view, following), strict=True))
 
 
 def summarize_consistency(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -62,7 +62,7 @@ class ViewRenderer:
         renders = {stage: _render(each, camera, matrix) for stage, each in self.gaussians.items()}
         picture, depth = renders[self.result]
         if self.painter:
-            picture, depth = self.painter.paint(picture, mask), consistency.interpolate_depth(depth, mask)
+            picture, depth = self.painter.paint(picture, mask), consistency.continue_surrounding_depth(depth, mask)
         by_stage = {stage: color for stage, (color, _) in renders.items()}
         return ViewRenders(by_stage, RenderedView(camera, picture, depth, mask, matrix))
 

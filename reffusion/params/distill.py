@@ -20,7 +20,7 @@ from reffusion.params.base import (
 )
 
 
-class Sds(Settings):
+class SdsTerm(Settings):
     """Multi-scale score distillation (section 4.2)."""
 
     weight: float = Field(1e-3, ge=0, description="lambda of the SDS term; 0 leaves it out")
@@ -53,7 +53,7 @@ class Sds(Settings):
         return self.weight > 0 and self.run != "never"
 
 
-class Depth(Settings):
+class DepthTerm(Settings):
     """Depth regularization."""
 
     weight: float = Field(0.0625, ge=0, description="lambda of the depth term; 0 leaves it out")
@@ -63,7 +63,7 @@ class Depth(Settings):
     steps: int = Field(20, ge=1, description="sampler steps from pure noise; a later start takes proportionally fewer")
 
 
-class Adversarial(Settings):
+class AdversarialTerm(Settings):
     """The critic, and the term that makes rendered patches pass for real ones (section 4.3, GANeRF)."""
 
     weight: float = Field(0.03, ge=0, description="lambda of the adversarial term; 0 leaves it out")
@@ -89,7 +89,7 @@ class Adversarial(Settings):
     penalized: Literal["real", "fake"] = Field("fake", description="the patches at which that gradient is taken")
 
 
-class Reconstruction(Settings):
+class ReconstructionTerm(Settings):
     """Photometric loss against the photographs, outside the mask."""
 
     every: int = Field(1, ge=0, description="steps between two evaluations of the reconstruction term; 0: never")
@@ -100,7 +100,7 @@ class Reconstruction(Settings):
     )
 
 
-class Reference(Settings):
+class ReferenceTerm(Settings):
     """The reference's own pixels in its hole. Not in the paper."""
 
     weight: float = Field(0.0, ge=0, description="weight of the reference's pixels in its hole (paper: 0)")
@@ -109,7 +109,7 @@ class Reference(Settings):
     )
 
 
-class Lift(Settings):
+class LiftTerm(Settings):
     """Supervision by images inpainted in 2D, for baselines. Not in the paper's method."""
 
     weight: float = Field(0.0, ge=0, description="weight of the images of the stage lift; 0 leaves the term out")
@@ -144,12 +144,12 @@ class Params(Settings):
     prior: str = prior_field()
     # PAPER leaves open: the number of iterations; 3DGS's own, less the fit's, is of this size.
     iterations: int = Field(5000, ge=1, description="optimisation steps")
-    sds: Sds = Sds()
-    depth: Depth = Depth()
-    adversarial: Adversarial = Adversarial()
-    reconstruction: Reconstruction = Reconstruction()
-    reference: Reference = Reference()
-    lift: Lift = Lift()
+    sds: SdsTerm = SdsTerm()
+    depth: DepthTerm = DepthTerm()
+    adversarial: AdversarialTerm = AdversarialTerm()
+    reconstruction: ReconstructionTerm = ReconstructionTerm()
+    reference: ReferenceTerm = ReferenceTerm()
+    lift: LiftTerm = LiftTerm()
     lr: LearningRates = LearningRates()
     densify: Densify = Densify()
     # PAPER leaves open: which mask m is. Its text repaints the consistent mask. The invent mask keeps background that

@@ -41,7 +41,7 @@ class Optimizer(Settings):
     schedule: Literal["constant", "cosine"] = Field("constant", description="learning rate after the warm-up")
 
 
-class Samples(Settings):
+class TrainingSamples(Settings):
     """Sampling of training images from the reference.
 
     PAPER leaves open: everything except that there are local and global samples; see `reffusion.prior.crops`.
@@ -66,7 +66,7 @@ class Params(Settings):
     steps: int = Field(2000, ge=0, description="optimiser steps; 0 skips the stage: the prior is not adapted")
     lora: Lora = Lora()
     optimizer: Optimizer = Optimizer()
-    samples: Samples = Samples()
+    samples: TrainingSamples = TrainingSamples()
     seed: int = 0
     device: Device = "cpu"
     dtype: Dtype = Field("float32", description="precision of the frozen weights")

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from reffusion.params.personalize import Samples
+from reffusion.params.personalize import TrainingSamples
 from reffusion.prior.windows import enlarge_to_fit, two_scale_masks, two_scales, window_around
 
 PROMPTS = ("A photo of sks", "A photo of sks, cropped", "")
@@ -75,7 +75,7 @@ def rectangle_mask(size: int, generator: torch.Generator) -> Tensor:
     return 1 - mask if _uniform(0, 1, generator) < INVERTED_SHARE else mask
 
 
-def random_mask(samples: Samples, size: int, generator: torch.Generator) -> Tensor:
+def random_mask(samples: TrainingSamples, size: int, generator: torch.Generator) -> Tensor:
     """[1, size, size] float, 1 = repaint: a random mask of the kind `samples.masks`."""
     if samples.masks == "realfill" and _uniform(0, 1, generator) < WHOLE_SHARE:
         return torch.ones(1, size, size)
@@ -92,7 +92,12 @@ def crop_border(source: Picture, max_border: float, generator: torch.Generator) 
 
 
 def draw_samples(
-    references: Sequence[Picture], native: int, size: int, count: int, samples: Samples, generator: torch.Generator
+    references: Sequence[Picture],
+    native: int,
+    size: int,
+    count: int,
+    samples: TrainingSamples,
+    generator: torch.Generator,
 ) -> Batch:
     """`count` random training samples of side `size`, determined by `generator`.
 

@@ -16,7 +16,7 @@ from reffusion.splat.projection import view_numbers
 from reffusion.types import Camera, Gaussians, Rendering
 
 
-class View(NamedTuple):
+class ProjectedView(NamedTuple):
     """The Gaussians projected into one view.
 
     Attributes:
@@ -67,7 +67,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 def project_and_bin(
     parameters: list[np.ndarray], antialiased: bool, probe: np.ndarray, camera: Camera, degree: int
-) -> View:
+) -> ProjectedView:
     """Project, sort and bin the Gaussians; `parameters` are in the order of `types.PARAMETERS`."""
     count, rows = len(parameters[0]), footprints.padded(len(parameters[0]))
     footprint_array, radii = empty_aligned(rows * FOOTPRINT), np.zeros(rows, np.int32)
@@ -82,7 +82,7 @@ def project_and_bin(
         gaussians=count,
     )
     order = binning.depth_order(radii[:count], footprint_array)
-    return View(
+    return ProjectedView(
         footprint_array, radii, binning.bin_footprints(footprint_array, order, count, camera.width, camera.height)
     )
 

@@ -81,7 +81,7 @@ class Gradients(NamedTuple):
     probe: np.ndarray
 
 
-class Workspace(NamedTuple):
+class ScratchArrays(NamedTuple):
     """Temporary arrays, LANES numbers per column.
 
     The basis of the harmonics and its gradient, a row of sh, and the sums over a footprint's pixels by Gaussian and by
@@ -245,7 +245,7 @@ def project_gaussians_backward(
         parameters: `Parameters`.
         gradients: `Gradients`, output.
     """
-    workspace = Workspace(
+    workspace = ScratchArrays(
         np.zeros(16 * LANES, np.float32),
         np.zeros(16 * LANES, np.float32),
         np.zeros(parameters.width * LANES, np.float32),

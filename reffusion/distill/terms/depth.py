@@ -16,7 +16,7 @@ from reffusion.distill.terms.term import Term, TermInputs, TermValue, cycle_thro
 from reffusion.distill.train_view import TrainView
 from reffusion.gaussians.optimize import confine
 from reffusion.geometry import Degenerate
-from reffusion.params.distill import Depth, Params
+from reffusion.params.distill import DepthTerm, Params
 from reffusion.prior.inpaint import repaint
 from reffusion.prior.model import Prior
 from reffusion.splat.rasterizer import render
@@ -71,7 +71,7 @@ def evaluate_depth(
     view: TrainView,
     prior: Prior,
     text: Tensor,
-    depth: Depth,
+    depth: DepthTerm,
     guidance: float,
     generator: torch.Generator,
     estimator: DepthEstimator,

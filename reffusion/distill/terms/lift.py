@@ -10,7 +10,7 @@ from reffusion.distill.perceptual import Distance
 from reffusion.distill.terms.term import Term, TermInputs, TermValue, cycle_through, reach_hole
 from reffusion.distill.train_view import TrainView
 from reffusion.gaussians.optimize import confine
-from reffusion.params.distill import Lift, Params
+from reffusion.params.distill import LiftTerm, Params
 from reffusion.prior.windows import enlarge_to_fit, window_around
 from reffusion.splat.rasterizer import render
 from reffusion.types import Gaussians, Rendering
@@ -52,7 +52,7 @@ def evaluate_lift(
     gaussians: Gaussians,
     reached: Tensor,
     view: TrainView,
-    lift: Lift,
+    lift: LiftTerm,
     distance: Distance | None,
     generator: torch.Generator,
 ) -> tuple[Tensor, Rendering]:

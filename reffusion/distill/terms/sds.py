@@ -14,7 +14,7 @@ from reffusion.distill.terms.term import Term, TermInputs, TermValue, cycle_thro
 from reffusion.distill.train_view import ReferenceHole, TrainView
 from reffusion.gaussians.optimize import confine
 from reffusion.geometry import angle_between_views
-from reffusion.params.distill import Params, Sds
+from reffusion.params.distill import Params, SdsTerm
 from reffusion.prior import diffusion
 from reffusion.prior.model import Prior
 from reffusion.prior.windows import enlarge_to_fit, two_scale_masks, two_scales, window_around
@@ -79,7 +79,9 @@ def views_near_references(
     return frozenset(name for name, angle in angles.items() if angle <= max_angle)
 
 
-def describe_sds_views(sds: Sds, means: Tensor, views: Sequence[TrainView], references: Sequence[ReferenceHole]) -> str:
+def describe_sds_views(
+    sds: SdsTerm, means: Tensor, views: Sequence[TrainView], references: Sequence[ReferenceHole]
+) -> str:
     """A sentence that says how many of the views with a hole are distilled. `means`: [M, 3] of masked Gaussians."""
     with_hole = [view for view in views if view.repaint.any()]
     near = views_near_references(with_hole, [each.camera for each in references], means, sds.max_angle)
@@ -93,7 +95,7 @@ def evaluate_sds(
     view: TrainView,
     prior: Prior,
     text: Tensor,
-    sds: Sds,
+    sds: SdsTerm,
     generator: torch.Generator,
     probe: Tensor | None = None,
     t_low: float = T_LOW,

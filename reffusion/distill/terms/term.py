@@ -19,7 +19,7 @@ from reffusion.prior.model import Prior
 from reffusion.types import Camera, Gaussians, Rendering
 
 
-class View(Protocol):
+class TermView(Protocol):
     """What a term is computed on in one step: a `TrainView` or a `ReferenceHole`."""
 
     @property
@@ -77,7 +77,7 @@ class Term:
 
     name: str
     weight: float
-    select_view: Callable[[int], View | None]
+    select_view: Callable[[int], TermView | None]
     reaches: Callable[[Tensor, Any], Tensor]
     loss: Callable[[Gaussians, Tensor, Any, int], TermValue]
     every: int = 1
@@ -120,7 +120,7 @@ def cycle_through(views: Sequence[TrainView], seed: int, label: str) -> Callable
     return lambda turn: views[seeding.epoch_index(turn, len(views), seed, "distill", label)]
 
 
-def reach_hole(settings: Params, everywhere: bool = False) -> Callable[[Tensor, View], Tensor]:
+def reach_hole(settings: Params, everywhere: bool = False) -> Callable[[Tensor, TermView], Tensor]:
     """The Gaussians that a term which fills the hole reaches: the masked ones; all if `everywhere` or unconfined."""
     reaches_all = everywhere or not settings.confined
     return lambda masked, view: torch.ones_like(masked) if reaches_all else masked
