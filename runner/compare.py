@@ -11,7 +11,7 @@ from runner.engine import LocalEngine
 from runner.execute import Execution
 from runner.files import write_json
 from runner.keys import HASHES, Hashes
-from runner.parallel import Outcome, ScheduledRun, run_all
+from runner.parallel import Outcome, SceneRun, run_all
 from runner.pipeline import Pipeline, find_scene, load_pipeline, scene_name, unknown_name
 from runner.resolve import Request, resolve_all
 from runner.results import mean_scores, write_table
@@ -74,7 +74,7 @@ def compare(
     for number, ((scene, method), each) in enumerate(requests.items(), 1):
         place = request.runs / (names[scene] if method == own else f"{names[scene]}@{method}")
         announcement = f"\ncompare: {method} on {names[scene]}, {number} of {len(runs)}"
-        todo.append(ScheduledRun(place.name, names[scene], place, each, announcement))
+        todo.append(SceneRun(place.name, names[scene], place, each, announcement))
     run_all(todo, execution, hashes, list(pipeline.stages), on_end)
     failed = [run for run in runs if run["state"] == FAILED]
     say("")
@@ -156,7 +156,7 @@ def batch(request: Request, folder: Path, execution: Execution | None = None) ->
 
     homes = [request.runs / f"{scene.name}{suffix}" for scene in scenes]
     todo = [
-        ScheduledRun(scene.name, scene.name, home, replace(request, scene=str(scene)))
+        SceneRun(scene.name, scene.name, home, replace(request, scene=str(scene)))
         for scene, home in zip(scenes, homes, strict=True)
     ]
     run_all(todo, execution, hashes, list(load_pipeline(request.root).stages), on_end)

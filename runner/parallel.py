@@ -22,7 +22,7 @@ MAX_SCENES = 256  # scenes at once, at most, on a cluster
 
 
 @dataclass(frozen=True)
-class ScheduledRun:
+class SceneRun:
     """One scene, or a variant of it, to be run.
 
     Attributes:
@@ -50,7 +50,7 @@ class Outcome:
 
 
 def run_all(
-    runs: Sequence[ScheduledRun],
+    runs: Sequence[SceneRun],
     execution: Execution,
     hashes: Hashes,
     stages: list[str],
@@ -82,10 +82,10 @@ def run_all(
 
 
 def _run_in_threads(
-    runs: Sequence[ScheduledRun],
+    runs: Sequence[SceneRun],
     groups: list[list[int]],
     at_once: int,
-    run_one: Callable[[int, ScheduledRun], Outcome],
+    run_one: Callable[[int, SceneRun], Outcome],
     on_end: Callable[[int, Outcome], None],
     engine: Engine,
 ) -> None:
@@ -126,9 +126,7 @@ def _collect_errors(function: Callable[[], None], errors: list[BaseException]) -
         errors.append(error)
 
 
-def _run_with_progress(
-    progress: Progress, hashes: Hashes, execution: Execution, place: int, run: ScheduledRun
-) -> Outcome:
+def _run_with_progress(progress: Progress, hashes: Hashes, execution: Execution, place: int, run: SceneRun) -> Outcome:
     """Run one with its output in a file, and report its progress."""
     run.home.mkdir(parents=True, exist_ok=True)
     output = run.home / OUTPUT
@@ -139,7 +137,7 @@ def _run_with_progress(
     return outcome
 
 
-def _run(run: ScheduledRun, hashes: Hashes, execution: Execution) -> Outcome:
+def _run(run: SceneRun, hashes: Hashes, execution: Execution) -> Outcome:
     """Run one; an error of any kind is part of the outcome, as other runs go on."""
     started = time.monotonic()
     try:

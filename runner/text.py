@@ -36,11 +36,10 @@ def format_seconds(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def join_names(names: Iterable[str], limit: int = 3) -> str:
-    """The first names with commas between, and how many more there are."""
+def join_names(names: Iterable[str]) -> str:
+    """The first three names with commas between, and how many more there are."""
     names = list(names)
-    rest = f" and {len(names) - limit} more" if len(names) > limit else ""
-    return ", ".join(names[:limit]) + rest
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def display_path(path: Path) -> str:

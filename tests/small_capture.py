@@ -11,7 +11,7 @@ from PIL import Image
 
 from reffusion.capture import lens
 from reffusion.io import colmap
-from reffusion.io.images import save_image
+from reffusion.io.images import load_mask, save_image
 from reffusion.io.scene import load_scene
 from stages import poses, raw_masks
 from stages.plan import poses as poses_plan
@@ -35,6 +35,11 @@ class Truth:
     @property
     def lens(self) -> lens.Lens:
         return lens.from_colmap(self.model[0], WIDTH, HEIGHT, self.model[1])
+
+
+def load_test_masks(folder: Path) -> dict[str, np.ndarray]:
+    """Test view name -> bool [H, W], where the object would be visible."""
+    return {path.stem: load_mask(path) for path in sorted((folder / "test_masks").glob("*.png"))}
 
 
 def some_truth(model=PINHOLE, views=6, scale=1.0, offset=(0.0, 0.0, 0.0)) -> Truth:

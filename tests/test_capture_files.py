@@ -17,6 +17,7 @@ from small_capture import (
     PINHOLE,
     WIDTH,
     Truth,
+    load_test_masks,
     prepare,
     run,
     some_truth,
@@ -34,7 +35,7 @@ from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_mask
 from reffusion.io.ply import save_points
-from reffusion.io.scene import list_objects, load_raw_masks, load_test_masks, load_views
+from reffusion.io.scene import list_objects, load_raw_masks, load_views
 from reffusion.params.poses import Params
 from reffusion.types import Scene
 from stages.plan import poses as plan

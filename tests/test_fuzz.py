@@ -31,9 +31,9 @@ from reffusion.io.compressed import save_spz
 from reffusion.io.depth_maps import load_depth
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, load_exr, load_image, load_mask, save_exr
-from reffusion.io.ply import count_gaussians, load_ply, load_points, save_ply, save_points
+from reffusion.io.ply import load_ply, load_points, save_ply, save_points
 from reffusion.io.quantized import save_splat
-from reffusion.io.splats import load_splats
+from reffusion.io.splats import load_splats, summarize_splats
 from reffusion.types import Gaussians
 from runner import Refused
 from runner.user_yaml import read_user_yaml
@@ -154,11 +154,11 @@ def readers() -> list[Reader]:
     pictures = of("p.png", "p.jpg", "p.bmp", "p.webp", "p.tif", "p.gif", "alpha.png", "bit.png")
 
     def any_ply(path: Path) -> None:
-        for read in (count_gaussians, load_points, load_ply):
+        for read in (summarize_splats, load_points, load_ply):
             _tried(read, path)
 
     def any_splats(path: Path) -> None:
-        for read in (count_gaussians, load_ply):
+        for read in (summarize_splats, load_ply):
             _tried(read, path)
 
     def any_picture(path: Path) -> None:

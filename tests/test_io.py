@@ -12,6 +12,7 @@ import pytest
 import torch
 from PIL import Image
 from plyfile import PlyData
+from small_capture import load_test_masks
 
 from reffusion.io import rotations
 from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
@@ -22,7 +23,6 @@ from reffusion.io.scene import (
     load_raw_masks,
     load_references,
     load_scene,
-    load_test_masks,
     load_views,
     save_mask_sets,
     save_references,

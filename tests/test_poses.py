@@ -22,6 +22,7 @@ from small_capture import (
     RADIAL,
     WIDTH,
     Truth,
+    load_test_masks,
     prepare,
     reprojection_error,
     run,
@@ -44,7 +45,7 @@ from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
 from reffusion.io.ply import load_ply, save_ply, save_points
-from reffusion.io.scene import list_objects, load_fill_masks, load_raw_masks, load_scene, load_test_masks, load_views
+from reffusion.io.scene import list_objects, load_fill_masks, load_raw_masks, load_scene, load_views
 from reffusion.types import Gaussians
 from stages import fit, poses, raw_masks
 from stages.plan import poses as plan

@@ -20,9 +20,9 @@ from test_patch import edited
 from reffusion.io.arrays import load_labels
 from reffusion.io.compressed import load_spz, save_spz
 from reffusion.io.files import BadInput
-from reffusion.io.ply import count_gaussians, load_ply, load_points, save_ply
+from reffusion.io.ply import load_ply, load_points, save_ply
 from reffusion.io.quantized import save_splat
-from reffusion.io.splats import load_splats
+from reffusion.io.splats import load_splats, summarize_splats
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 from stages import poses
@@ -182,7 +182,7 @@ def test_higher_harmonics_are_cut_to_degree_3(file, degree):
     np.testing.assert_array_equal(found.rows.sh[:, 1:], expected)
     save_table(path, with_columns(table, {"f_rest_70": draws[70]}))
     with pytest.raises(BadInput, match="25 f_rest properties; 0, 9, 24, 45 or 72 belong to degrees 0 to 4"):
-        count_gaussians(path)
+        summarize_splats(path)
 
 
 def test_colours_in_bytes_stand_for_the_constant_harmonic(file):
@@ -195,7 +195,7 @@ def test_colours_in_bytes_stand_for_the_constant_harmonic(file):
     np.testing.assert_allclose(0.5 + SH0 * made.sh[:, 0], colors.T / 255, atol=1e-6)
     save_table(path, with_columns(table, {}, ("f_dc_1",)))
     with pytest.raises(BadInput, match="not a file of Gaussians, it lacks f_dc_1"):
-        count_gaussians(path)
+        summarize_splats(path)
 
 
 # ---------------------------------------------------------------------------------------------- quantised files
@@ -209,7 +209,7 @@ def test_records_of_32_bytes_are_read(tmp_path):
         + record(0, 0, 0, 1, 1, 1, 128, 128, 128, 51, 128, 128, 128, 255)
         + bytes(32)
     )
-    assert count_gaussians(path) == 3
+    assert summarize_splats(path).count == 3
     found = load_splats(path)
     assert found.notes == ("1 of 3 splats are dropped: 1 of zeros only (padding); 1 infinite opacities and 1 scales of "
                            "minus infinity are clamped to finite values that look the same",)  # fmt: skip
@@ -221,7 +221,7 @@ def test_records_of_32_bytes_are_read(tmp_path):
     np.testing.assert_allclose(0.5 + SH0 * made.sh[0, 0], [1, 0, 0.2], atol=1e-6)
     path.write_bytes(path.read_bytes()[:-5])
     with pytest.raises(BadInput, match=r"s\.splat: cut off, or no \.splat file: 91 bytes are no multiple of 32"):
-        count_gaussians(path)
+        summarize_splats(path)
 
 
 @pytest.mark.parametrize("version", [3, 4])
@@ -234,7 +234,7 @@ def test_spz_is_read_in_the_frame_of_a_ply(tmp_path, version):
     np.testing.assert_allclose(raw.means, made.means.numpy() * (1, -1, -1), atol=1e-5)
     if version == 4:
         gsply.write_spz(str(path), raw, version=4)
-    assert count_gaussians(path) == 300
+    assert summarize_splats(path).count == 300
     again = load_ply(path)
     np.testing.assert_allclose(again.means, made.means, atol=3e-4)
     np.testing.assert_allclose(again.log_scales, made.log_scales, atol=1 / 32 + 1e-4)
@@ -246,7 +246,7 @@ def test_spz_is_read_in_the_frame_of_a_ply(tmp_path, version):
         load_spz(path)
     path.write_bytes(b"NGSP")
     with pytest.raises(BadInput, match=r"s\.spz: not a \.spz file"):
-        count_gaussians(path)
+        summarize_splats(path)
 
 
 def load_rows(folder, gaussians):
@@ -271,7 +271,7 @@ def test_other_formats_are_refused_with_what_converts_them(tmp_path, ending):
     path.write_bytes(bytes(4096))
     with pytest.raises(BadInput, match=rf"\.{ending} is not read; convert it to \.ply, as with `npx "
                        rf"@playcanvas/splat-transform scene\.{ending} scene\.ply`"):  # fmt: skip
-        count_gaussians(path)
+        summarize_splats(path)
 
 
 # ---------------------------------------------------------------------------------------------- the stage `poses`

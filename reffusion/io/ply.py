@@ -157,11 +157,6 @@ def _points(path: Path, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return points, np.full((len(points), 3), 128, np.uint8)
 
 
-def count_gaussians(path: Path) -> int:
-    """The number of Gaussians, from the header alone. BadInput where the file is truncated, or has other properties."""
-    return summarize_splats(path).count
-
-
 def load_property_names(path: Path) -> tuple[str, ...]:
     """The names of the vertices' properties, in order; empty for a quantised file."""
     return summarize_splats(path).properties

@@ -116,11 +116,6 @@ def load_raw_masks(
     return {name: np.logical_or.reduce([load_mask(path) for path in paths]) for name, paths in found.items()}
 
 
-def load_test_masks(raw_masks_dir: Path) -> dict[str, np.ndarray]:
-    """Test view name -> bool [H, W], True = where the object would be visible; empty where the scene has none."""
-    return {path.stem: load_mask(path) for path in sorted((Path(raw_masks_dir) / "test_masks").glob("*.png"))}
-
-
 def load_fill_masks(raw_masks_dir: Path) -> dict[str, np.ndarray]:
     """Training view name -> bool [H, W], what is to be filled; empty where the scene brings no such masks."""
     return {path.stem: load_mask(path) for path in sorted((Path(raw_masks_dir) / "fill").glob("*.png"))}

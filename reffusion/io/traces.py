@@ -83,14 +83,6 @@ def load_trace(path: Path, stage: str) -> dict[str, list[dict[str, Any]]]:
     return series
 
 
-def main_quantity(stage: str, lines: list[dict[str, Any]]) -> str:
-    """The name of the quantity that stands for the stage's error in the lines of one series."""
-    for name in MAIN[stage]:
-        if any(name in line for line in lines):
-            return name
-    raise ValueError(f"a trace of {stage} has none of {', '.join(MAIN[stage])}")
-
-
 def _find_violation(line: dict[str, Any], before: dict[str, Any] | None, seconds: float, stage: str) -> str | None:
     """What violates the schema in a line, given the one before it in its series and the last time."""
     if missing := [key for key in ("seconds", "iteration") if key not in line]:

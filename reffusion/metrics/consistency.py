@@ -47,16 +47,12 @@ class RenderedView(NamedTuple):
         return undo_exposure(self.picture / 255.0, self.exposure)
 
 
-def reprojected_color_difference(
-    first: RenderedView, second: RenderedView, tolerance: float = TOLERANCE
-) -> tuple[float | None, float | None]:
+def reprojected_color_difference(first: RenderedView, second: RenderedView) -> tuple[float | None, float | None]:
     """Mean absolute colour difference in [0, 1] between the masked pixels of `first` and the same points in `second`,
     and the share of the mask's pixels that could be compared.
 
-    Both are None for an empty mask; the difference is None too where no pixel can be compared.
-
-    Args:
-        tolerance: relative depth behind the surface of `second` from which a point counts as occluded there.
+    Both are None for an empty mask; the difference is None too where no pixel can be compared. A point farther behind
+    the surface of `second` than the relative depth `TOLERANCE` counts as occluded there.
     """
     mask_pixels = int(first.mask.sum())
     if not mask_pixels:
@@ -67,7 +63,7 @@ def reprojected_color_difference(
     surface, _ = geometry.sample_nearest(second.depth, uv)
     with np.errstate(invalid="ignore"):  # points behind the camera have no pixel
         framed = ((uv >= 0.5) & (uv <= np.array([second.camera.width, second.camera.height]) - 0.5)).all(-1)
-    visible = framed & ((surface == 0) | (z <= (1 + tolerance) * surface))
+    visible = framed & ((surface == 0) | (z <= (1 + TOLERANCE) * surface))
     if not visible.any():
         return None, 0.0
     (column, row), color = uv[visible].T - 0.5, second.unexposed_color

@@ -44,14 +44,11 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
     )
 
 
-def evaluate_reconstruction(
-    gaussians: Gaussians, reached: Tensor, view: TrainView, probe: Tensor | None = None
-) -> tuple[Tensor, Rendering]:
+def evaluate_reconstruction(gaussians: Gaussians, reached: Tensor, view: TrainView) -> tuple[Tensor, Rendering]:
     """(1 - 0.2) L1 + 0.2 D-SSIM over the pixels whose photo may supervise, and the rendering.
 
     Args:
         reached: [N] bool, the Gaussians that the gradient reaches.
-        probe: [N, 2], see `splat.render`.
     """
-    rendering = render(confine(gaussians, reached), view.camera, probe=probe)
+    rendering = render(confine(gaussians, reached), view.camera)
     return reconstruction_loss(rendering.color, view.picture, view.supervises), rendering
