@@ -31,7 +31,16 @@ from runner.files import (
 )
 from runner.keys import Hashes, Inputs
 from runner.pipeline import SCENE
-from runner.plan import Decision, decide, expected_seconds, partial_folder, plan, plan_table, used_needs
+from runner.plan import (
+    Decision,
+    decide,
+    earlier_receipts,
+    expected_seconds,
+    partial_folder,
+    plan,
+    plan_table,
+    used_needs,
+)
 from runner.resolve import Request, ResolvedJob, resolve
 from runner.retry import take_over
 from runner.text import REMEDIES, display_path
@@ -133,9 +142,7 @@ def expected_memory_mb(job: ResolvedJob, stage: str, needs: dict[str, Path | Non
 
     10% above its last peak on this scene or a variant of it; before its first run by `memory` of pipeline.yaml, from
     the size of the files that it reads."""
-    places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
-    peaks = [r["peak_memory_mb"] for place in places if (r := read_receipt(place / stage)) and r.get("peak_memory_mb")]
-    if peaks:
+    if peaks := [r["peak_memory_mb"] for r in earlier_receipts(job, stage) if r.get("peak_memory_mb")]:
         return round(1.1 * max(peaks))
     each = job.pipeline.memory.get(stage)
     read = (path for folder in needs.values() if folder for path in list_files(folder))

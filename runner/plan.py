@@ -309,9 +309,13 @@ def plan_record(job: ResolvedJob, decisions: dict[str, Decision], unset: Resolve
     return {"profile": job.profile, "stages": stages, "params": unset.params}
 
 
+def earlier_receipts(job: ResolvedJob, stage: str) -> list[dict[str, Any]]:
+    """Receipts of the stage on this scene and on its variants."""
+    places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
+    return [receipt for place in places if (receipt := read_receipt(place / stage))]
+
+
 def expected_seconds(job: ResolvedJob, stage: str) -> float | None:
     """Seconds of the stage's last run on this scene or a variant of it, on this machine with this profile."""
-    places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
-    found = [r for place in places if (r := read_receipt(place / stage))]
-    here = [r for r in found if r.get("machine") == MACHINE and r.get("profile") == job.profile]
+    here = [r for r in earlier_receipts(job, stage) if r.get("machine") == MACHINE and r.get("profile") == job.profile]
     return max(here, key=lambda r: r["date"])["seconds"] if here else None

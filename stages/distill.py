@@ -5,19 +5,17 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from torch import Tensor
-
 from reffusion import trace
 from reffusion.distill import depth_estimator, perceptual
 from reffusion.distill.inputs import load_adapted_prior, load_initialization, load_train_views, resolve_sds
 from reffusion.distill.loop import distill
 from reffusion.distill.terms.sds import describe_sds_views
+from reffusion.distill.terms.term import TermInputs
 from reffusion.io.arrays import load_json, save_json, save_labels
 from reffusion.io.ply import save_ply
 from reffusion.params.distill import Params
 from reffusion.prior import memory
 from reffusion.splat import rasterizer
-from reffusion.types import Gaussians
 from reffusion.workspace import Workspace
 
 MEMORY_PARAM = "distill.memory_gb"  # the parameter that out-of-memory errors name
@@ -53,11 +51,10 @@ def run(
     with memory.explain_oom(MEMORY_PARAM, params.memory_gb):
         if prior is not None:
             prior = memory.fit_to_memory(prior, params.memory_gb, MEMORY_PARAM, memory.encode_one_sample)
-        inputs = initial, masked, views, references, prior, text
-
-        def distill_for(folder: Path, steps: int) -> tuple[Gaussians, Tensor]:
-            return distill(*inputs, params.changed({"iterations": steps}), folder, estimator, distance)
-
+        inputs = TermInputs(views, references, initial.means[masked], prior, text, estimator, distance)
+        distill_for = lambda folder, steps: distill(
+            initial, masked, inputs, params.changed({"iterations": steps}), folder
+        )
         elapsed = lambda: time.monotonic() - began
         steps = trace.steps_within_budget(out, params.iterations, params.seconds, elapsed, distill_for)
         gaussians, masked = distill_for(out, steps)

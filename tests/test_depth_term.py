@@ -15,7 +15,8 @@ from reffusion.distill import depth_estimator
 from reffusion.distill import loop as D
 from reffusion.distill.depth_estimator import DepthEstimator, build_estimator
 from reffusion.distill.terms import depth as depth_term
-from reffusion.distill.train_view import TrainView
+from reffusion.distill.terms.term import TermInputs
+from reffusion.distill.train_view import ReferenceHole, TrainView
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.gaussians.surfels import surface_gaussians
 from reffusion.geometry import Degenerate
@@ -313,8 +314,9 @@ def distilled(folder, prior, text, estimator, settings=RUN):
     gaussians, masked = wall(0.95)
     with torch.no_grad():
         image = render(gaussians, VIEW).color.clamp(0, 1)
-    holes = [(VIEW, image, torch.from_numpy(HOLE))]
-    return D.distill(gaussians, masked, [train_view()], holes, prior, text, settings, folder, estimator)
+    holes = [ReferenceHole(VIEW, image, torch.from_numpy(HOLE))]
+    inputs = TermInputs([train_view()], holes, gaussians.means[masked], prior, text, estimator)
+    return D.distill(gaussians, masked, inputs, settings, folder)
 
 
 def lines(folder):

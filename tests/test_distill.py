@@ -19,7 +19,8 @@ from reffusion.distill.terms.adversarial import evaluate_adversarial
 from reffusion.distill.terms.reconstruction import evaluate_reconstruction
 from reffusion.distill.terms.reference import evaluate_reference
 from reffusion.distill.terms.sds import evaluate_sds, views_near_references
-from reffusion.distill.train_view import TrainView
+from reffusion.distill.terms.term import TermInputs
+from reffusion.distill.train_view import ReferenceHole, TrainView
 from reffusion.gaussians.optimize import Rates, reconstruction_loss
 from reffusion.inpaint.exemplar import RIM_WIDTH
 from reffusion.io.arrays import load_labels, save_json, save_labels
@@ -200,8 +201,9 @@ def run(folder, prior, text, settings=SETTINGS, views=None, gaussians=None):
     folder.mkdir(exist_ok=True)
     start, masked = wall()
     views = views or [train_view("a"), train_view("b", 0.1), train_view("c", -0.1, clean=True)]
-    holes = [(camera(), train_view().photo, hole())]
-    return D.distill(gaussians or start, masked, views, holes, prior, text, settings, folder)
+    initial, holes = gaussians or start, [ReferenceHole(camera(), train_view().photo, hole())]
+    inputs = TermInputs(views, holes, initial.means[masked], prior, text)
+    return D.distill(initial, masked, inputs, settings, folder)
 
 
 @pytest.mark.parametrize("off", [{"adversarial": OFF}, {"sds": OFF}], ids=["SDS beside the other terms", "a critic"])
@@ -335,8 +337,8 @@ def test_the_reference_term_draws_the_reference(prior, text, tmp_path):
     target, _ = wall()
     with torch.no_grad():
         image = render(replace(target, sh=target.sh + 0.5), camera()).color.clamp(0, 1)
-    given = views, [(camera(), image, hole())], None, None, settings, tmp_path
-    ended, _ = D.distill(start, masked, *given, rates=Rates(sh_dc=0.03))
+    inputs = TermInputs(views, [ReferenceHole(camera(), image, hole())], start.means[masked])
+    ended, _ = D.distill(start, masked, inputs, settings, tmp_path, Rates(sh_dc=0.03))
     records = read_trace(tmp_path / "trace.jsonl")
     assert records[-1]["reference_psnr"] > records[0]["reference_psnr"] + 1
     assert len(ended) == len(start)
@@ -370,11 +372,13 @@ def test_a_number_that_is_none_names_step_term_and_view(prior, text, tmp_path):
     beside = torch.where(
         hole()[..., None], train_view().photo, float("nan")
     )  # the patches of the critic reach that far
-    views, empty = [(camera(), beside, hole())], [(camera(), beside, torch.zeros_like(hole()))]
+    start, masked = wall()
+    holes = [ReferenceHole(camera(), beside, each) for each in (hole(), torch.zeros_like(hole()))]
+    full, empty = (TermInputs([train_view()], [each], start.means[masked]) for each in holes)
     with pytest.raises(FloatingPointError, match=r"step 0, adversarial, view 'a': the critic's loss"):
-        D.distill(*wall(), [train_view()], views, None, None, alone, tmp_path / "z")
+        D.distill(start, masked, full, alone, tmp_path / "z")
     with pytest.raises(ValueError, match="reference's hole"):
-        D.distill(*wall(), [train_view()], empty, None, None, alone, tmp_path / "z")
+        D.distill(start, masked, empty, alone, tmp_path / "z")
     with pytest.raises(ValueError, match="prior"):
         run(tmp_path / "z", None, None)
 

@@ -20,6 +20,8 @@ from reffusion import seeding, trace
 from reffusion.distill import loop as D
 from reffusion.distill import perceptual
 from reffusion.distill.terms.lift import evaluate_lift
+from reffusion.distill.terms.term import TermInputs
+from reffusion.distill.train_view import ReferenceHole
 from reffusion.initialize import random_init
 from reffusion.io.arrays import load_json, load_labels
 from reffusion.io.ground_truth import load_object_mask
@@ -189,8 +191,8 @@ def every_step(monkeypatch):
 def run_distill(folder, views, **changes):
     folder.mkdir()
     settings = altered(PLAIN, **{"iterations": 3, "sds": OFF, "checkpoint_seconds": 10, **changes})
-    (start, masked), holes = wall(), [(train_view().camera, train_view().photo, hole())]
-    ended, labels = D.distill(start, masked, views, holes, None, None, settings, folder)
+    (start, masked), holes = wall(), [ReferenceHole(train_view().camera, train_view().photo, hole())]
+    ended, labels = D.distill(start, masked, TermInputs(views, holes, start.means[masked]), settings, folder)
     return start, ended, masked, labels
 
 

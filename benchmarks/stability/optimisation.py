@@ -17,7 +17,8 @@ from benchmarks.stability.cases import EPS32, EXACT, Case, nan_safe_max
 from benchmarks.stability.splatting import camera, cloud
 from reffusion import seeding, trace
 from reffusion.distill.loop import distill
-from reffusion.distill.train_view import TrainView
+from reffusion.distill.terms.term import TermInputs
+from reffusion.distill.train_view import ReferenceHole, TrainView
 from reffusion.fit.reconstruction import fit
 from reffusion.fit.start import initial_gaussians
 from reffusion.gaussians.densify import densify, prune
@@ -80,11 +81,12 @@ def fast_distillation_fails(factor: float) -> float:
     settings = distilling.Params(
         iterations=40, sds=off, depth=off, adversarial=off, reference={"weight": 1}, lr={"epsilon": 1e-6}
     )
-    holes = [(scene.cameras["v2"], pictures["v2"], whole)]
+    holes = [ReferenceHole(scene.cameras["v2"], pictures["v2"], whole)]
+    inputs = TermInputs(views, holes, start.means[masked])
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         try:
-            found, _ = distill(start, masked, views, holes, None, None, settings, folder, rates=rates)
+            found, _ = distill(start, masked, inputs, settings, folder, rates)
         except FloatingPointError as error:
             return float(not (names_step_and_term(error, "re") and is_trace_finite(folder)))
         finite = all(torch.isfinite(getattr(found, n)).all() for n in PARAMETERS)

@@ -22,6 +22,7 @@ import yaml
 from reffusion import trace
 from reffusion.distill.inputs import load_adapted_prior, load_initialization, load_train_views
 from reffusion.distill.loop import average, build_objective, masked_factors, take_step
+from reffusion.distill.terms.term import TermInputs
 from reffusion.gaussians.optimize import GaussianOptimizer
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.ground_truth import load_ground_truth, load_object_mask
@@ -105,7 +106,7 @@ def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> 
     adapted = run / "personalize" if overrides.get(BASE, True) else None
     prior, text = load_adapted_prior(params, adapted)
     seen = load_train_views(params, space)
-    objective = build_objective(initial, masked, seen, holes, prior, text, params)
+    objective = build_objective(TermInputs(seen, holes, initial.means[masked], prior, text), params)
     optimizer = GaussianOptimizer(initial, masked, None, masked_factors(params.lr), epsilon=params.lr.epsilon)
     rasterizer.render(
         optimizer.gaussians, holes[0][0]

@@ -24,19 +24,16 @@ from torch import Tensor
 
 from reffusion import seeding, trace
 from reffusion.distill.densification import densify_masked
-from reffusion.distill.depth_estimator import DepthEstimator
 from reffusion.distill.overlap_worker import OverlapWorker
-from reffusion.distill.perceptual import Distance
 from reffusion.distill.regions import build_region, has_changed_region
 from reffusion.distill.terms import adversarial, depth, lift, reconstruction, reference, sds
 from reffusion.distill.terms.term import Term, TermInputs
-from reffusion.distill.train_view import ReferenceHole, TrainView
+from reffusion.distill.train_view import ReferenceHole
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.geometry import Degenerate, cameras_extent
 from reffusion.io.ply import save_ply
 from reffusion.kernels.compiled import torch_on_one_thread
 from reffusion.params.distill import LearningRates, Params
-from reffusion.prior.model import Prior
 from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
@@ -64,59 +61,37 @@ class Objective:
     worker: OverlapWorker
 
 
-def build_objective(
-    initial: Gaussians,
-    masked: Tensor,
-    views: Sequence[TrainView],
-    references: Sequence[tuple[Camera, Tensor, Tensor]],
-    prior: Prior | None,
-    text: Tensor | None,
-    settings: Params,
-    estimator: DepthEstimator | None = None,
-    distance: Distance | None = None,
-) -> Objective:
-    """The objective of a distillation; arguments as of `distill`.
+def build_objective(inputs: TermInputs, settings: Params) -> Objective:
+    """The objective of a distillation.
 
     Raises:
         ValueError: a term lacks what it needs.
     """
-    holes = [ReferenceHole(*each) for each in references]
-    inputs = TermInputs(views, holes, initial.means[masked], prior, text, estimator, distance)
     terms = [term for module in TERMS if (term := module.build(inputs, settings)) is not None]
     # A GPU does one thing after another.
-    overlaps = not initial.means.is_cuda and all(term.is_background or term.allows_overlap for term in terms)
+    overlaps = not inputs.masked_means.is_cuda and all(term.is_background or term.allows_overlap for term in terms)
     overlaps = overlaps and any(term.is_background for term in terms)
-    return Objective(terms, holes, settings, {}, OverlapWorker(torch.get_num_threads() if overlaps else 1))
+    return Objective(terms, inputs.references, settings, {}, OverlapWorker(torch.get_num_threads() if overlaps else 1))
 
 
 def distill(
     initial: Gaussians,
     masked: Tensor,
-    views: Sequence[TrainView],
-    references: Sequence[tuple[Camera, Tensor, Tensor]],
-    prior: Prior | None,
-    text: Tensor | None,
+    inputs: TermInputs,
     settings: Params,
     folder: Path,
-    estimator: DepthEstimator | None = None,
-    distance: Distance | None = None,
     rates: Rates | None = None,
 ) -> tuple[Gaussians, Tensor]:
     """Optimises an initialization. Resumes from the checkpoint in `folder`, bit for bit on the CPU.
 
     Args:
         initial, masked: the Gaussians and their labels [N] bool; everything else is on their device.
-        views: the training views. Terms that fill the hole use only those with pixels to repaint.
-        references: `ReferenceHole`s.
-        prior: adapted to the reference; None if there is neither SDS nor the depth term.
-        text: [3, L, D], hidden states of the global, the local and the empty prompt.
+        inputs: what the terms are built from.
         folder: gets trace.jsonl, checkpoints, and snapshots/ of the masked Gaussians. A line of the trace:
             reconstruction and lift (those terms' values), reference_psnr (in the references' holes),
             sds_gradient_mean and _max (norm of the weighted SDS gradient per masked Gaussian; none if the view is too
             far from every reference), depth (the last depth term's value), depth_skipped_<reason> (how often so far),
             adversarial (the generator's loss), critic_loss, critic_slope (R1 unweighted), gaussians, masked_gaussians.
-        estimator: of the depth term; None if there is none.
-        distance: of patches, for the perceptual loss of lifted pictures.
         rates: Adam's step sizes; None: 3DGS's, by `settings.lr.means_unit`.
     Returns:
         The Gaussians, detached, and their labels.
@@ -124,8 +99,8 @@ def distill(
         FloatingPointError: a value or gradient is not finite; names step, term and view.
         ValueError: a term lacks what it needs: a prior, an estimator, a hole in a reference.
     """
-    objective = build_objective(initial, masked, views, references, prior, text, settings, estimator, distance)
-    rates = rates or rates_of(settings.lr, [view.camera for view in views])
+    objective = build_objective(inputs, settings)
+    rates = rates or rates_of(settings.lr, [view.camera for view in inputs.views])
     optimizer = GaussianOptimizer(initial, masked, rates, masked_factors(settings.lr), epsilon=settings.lr.epsilon)
     region = build_region(initial.means, masked) if settings.confined and masked.any() else None
     run = _Run.start_or_resume(optimizer, objective, trace.load_checkpoint(folder))

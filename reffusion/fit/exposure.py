@@ -16,7 +16,10 @@ import torch
 from torch import Tensor
 
 from reffusion.fit.gains import BRIGHT, DARK
+from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import to_uint8
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import has_photograph, load_scene, load_views
 from reffusion.splat import rasterizer
 from reffusion.types import Camera
 
@@ -84,8 +87,6 @@ class Exposures:
         self._adam.load_state_dict(state["adam"])
 
     def save(self, folder: Path) -> None:
-        from reffusion.io.arrays import save_json
-
         save_json(folder / FILE, {name: matrix.detach().cpu().tolist() for name, matrix in self._matrices.items()})
 
 
@@ -97,17 +98,13 @@ def view_exposures(fit: Path, cameras: Sequence[Camera]) -> dict[str, np.ndarray
     Args:
         cameras: of all views, including the fitted ones.
     """
-    from reffusion.io.arrays import load_json
-
     path = Path(fit) / FILE
     fitted = {name: np.array(matrix) for name, matrix in load_json(path).items()} if path.exists() else {}
     fitted_cameras = [camera for camera in cameras if camera.name in fitted]
     if not fitted_cameras:
         return {}
-    distances, matrices = (
-        _pose_distances(fitted_cameras, fitted_cameras),
-        np.stack([fitted[camera.name] for camera in fitted_cameras]),
-    )
+    distances = _pose_distances(fitted_cameras, fitted_cameras)
+    matrices = np.stack([fitted[camera.name] for camera in fitted_cameras])
     np.fill_diagonal(distances, np.inf)
     mean_spacing = float(np.mean(distances.min(1))) if len(fitted_cameras) > 1 else 1.0
     interpolate = lambda distances, bandwidth: np.einsum(
@@ -185,13 +182,9 @@ def load_normalized_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[
 
     Views without a photograph are rendered from the Gaussians in the folder `fit`, object included.
     """
-    from reffusion.io import scene
-
     names = list(names)
-    photographed = [name for name in names if scene.has_photograph(poses, name)]
-    photos = {
-        name: normalize_exposure(image, fit, name) for name, image in scene.load_views(poses, photographed).items()
-    }
+    photographed = [name for name in names if has_photograph(poses, name)]
+    photos = {name: normalize_exposure(image, fit, name) for name, image in load_views(poses, photographed).items()}
     renderings = render_views(poses, fit, [name for name in names if name not in photos])
     return {name: (photos | renderings)[name] for name in names}
 
@@ -199,9 +192,6 @@ def load_normalized_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[
 @torch.no_grad()
 def render_views(poses: Path, fit: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
     """View name -> uint8 [H, W, 3], rendered from the Gaussians in the folder `fit`."""
-    from reffusion.io.ply import load_ply
-    from reffusion.io.scene import load_scene
-
     if not names:
         return {}
     gaussians, cameras = load_ply(fit / "gaussians.ply"), load_scene(poses).cameras
@@ -216,8 +206,6 @@ def normalize_exposure(image: np.ndarray, fit: Path, name: str) -> np.ndarray:
     Raises:
         ValueError: the exposure cannot be inverted.
     """
-    from reffusion.io.arrays import load_json
-
     path = Path(fit) / FILE
     matrices = load_json(path) if path.exists() else {}
     if name not in matrices:

@@ -50,10 +50,8 @@ def gaussians_on_surfaces(
     """
     if len(points) <= NORMAL_NEIGHBORS:
         return None
-    view_depths, result = (
-        estimate_multiview_depth(SparsePoints.of(points, colors), cameras, images, hidden, params.seed),
-        None,
-    )
+    view_depths = estimate_multiview_depth(SparsePoints.of(points, colors), cameras, images, hidden, params.seed)
+    result = None
     usable_cameras = [camera for camera in cameras if camera.name in view_depths]
     passes = [(camera, view_depths[camera.name].confirmed) for camera in usable_cameras]
     passes += [

@@ -78,10 +78,8 @@ def fit(
     optimizer = run.optimizer
     log = trace.Trace(folder, run.seconds, run.iteration + 1 if run.iteration else 0)
     centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
-    checkpoints, trace_inputs = (
-        trace.Checkpoints(folder, settings.checkpoint_seconds),
-        (held_out, images, settings, impl),
-    )
+    checkpoints = trace.Checkpoints(folder, settings.checkpoint_seconds)
+    trace_inputs = (held_out, images, settings, impl)
     if run.iteration == 0:
         _write_line(log, run, *trace_inputs)
     steps, view_schedule = range(run.iteration, settings.iterations), (coarse_steps(settings), sparse_steps(settings))

@@ -145,10 +145,8 @@ def control_density(
     if not schedule.start <= progress < schedule.stop:
         return
     if done % schedule.every == 0:
-        generator, max_gaussians = (
-            seeding.generator(settings.seed, "densify", done),
-            _max_gaussians(started_with, settings, done),
-        )
+        generator = seeding.generator(settings.seed, "densify", done)
+        max_gaussians = _max_gaussians(started_with, settings, done)
         distance = viewing_distance(optimizer.gaussians.means, centers)
         densify(optimizer, schedule.grow_grad2d, GROW_SCALE3D * distance, max_gaussians, generator)
         distance = viewing_distance(optimizer.gaussians.means, centers)

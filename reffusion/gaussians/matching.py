@@ -130,10 +130,8 @@ def _find_candidates(index: _NearIndex, points: np.ndarray) -> tuple[np.ndarray,
         near_distances, splats = (
             each.reshape(-1, count) for each in index.tree.query(points[block], count, workers=-1)
         )
-        distances[block], candidates[block] = (
-            np.where(near_distances <= index.radius(splats), near_distances, np.inf),
-            splats,
-        )
+        distances[block] = np.where(near_distances <= index.radius(splats), near_distances, np.inf)
+        candidates[block] = splats
     return distances, candidates
 
 

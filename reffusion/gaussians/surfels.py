@@ -22,6 +22,7 @@ def surface_gaussians(
     thickness: float = 0.1,
     grazing: float = 0.15,
     opacity: float = 0.95,
+    offset_px: float = 0.0,
 ) -> Gaussians:
     """One Gaussian for each chosen pixel: a disk on the surface that the depth map describes.
 
@@ -40,6 +41,7 @@ def surface_gaussians(
         thickness: standard deviation along the normal, relative to the smaller one within the surface.
         grazing: cosine between normal and view below which disks are not stretched further.
         opacity: in (0, 1).
+        offset_px: distance behind the surface, along its normal, in pixels.
 
     Returns:
         Gaussians, one for each chosen pixel in row-major order, float32 on the CPU.
@@ -57,6 +59,7 @@ def surface_gaussians(
     axes = _axes(normals, view_directions, camera)
     tangent_scale = spread * depth[pixels] / np.sqrt(camera.fx * camera.fy)
     scales = np.stack([tangent_scale, tangent_scale / cosine, thickness * tangent_scale], -1)
+    points = points - offset_px / spread * tangent_scale[:, None] * normals
     colors = (image[pixels] / 255.0 if image.dtype == np.uint8 else image[pixels]).astype(np.float64)
     sh = np.zeros((len(points), sh_count, 3))
     sh[:, 0] = (colors - 0.5) / SH0

@@ -92,11 +92,9 @@ def _blend_backward(
     written,
 ):
     channels = blended.shape[2]
-    state, sums, constants = (
-        allocate_vectors(STEPS * (_UPSTREAM + channels)),
-        allocate_vectors(channels),
-        load_constants(),
-    )
+    state = allocate_vectors(STEPS * (_UPSTREAM + channels))
+    sums = allocate_vectors(channels)
+    constants = load_constants()
     flat = records.reshape(-1)
     images = color, depth, alpha, blended, transmittance
     gradients = grad_color, grad_depth, grad_alpha, grad_blended

@@ -145,11 +145,9 @@ def _mean(footprints, base):
 def _column_rows(footprints, base, column, width, height, tops, bottoms):
     """First and one past the last pixel row of the image that the ellipse can touch, for LANES tile columns."""
     mean_x, mean_y = _mean(footprints, base)
-    half_width, half_height, tilt = (
-        footprints[base + HALF_WIDTH],
-        footprints[base + HALF_HEIGHT],
-        footprints[base + TILT],
-    )
+    half_width = footprints[base + HALF_WIDTH]
+    half_height = footprints[base + HALF_HEIGHT]
+    tilt = footprints[base + TILT]
     squared, inverse = footprints[base + COLUMN], _F(1.0) / (half_width * half_width)
     peak = footprints[base + SLANT] * half_height  # dx where the ellipse is highest
     left = (ramp() + _F(column)) * _F(TILE_WIDTH)

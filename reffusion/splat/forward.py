@@ -70,11 +70,9 @@ def blend(footprints, features, background, bins, width, height):
         [tiles] int64: number of entries of a tile's list that were processed before all its pixels were finished.
     """
     color, blended = empty_aligned(height, width, 3), empty_aligned(height, width, features.shape[1])
-    depth, alpha, transmittance = (
-        empty_aligned(height, width),
-        empty_aligned(height, width),
-        empty_aligned(height, width),
-    )
+    depth = empty_aligned(height, width)
+    alpha = empty_aligned(height, width)
+    transmittance = empty_aligned(height, width)
     used = np.empty(len(bins.starts) - 1, np.int64)
     outputs = color, depth, alpha, blended, transmittance, used
     parallel_for(_blend, footprints, or_none(features), background, bins, *outputs)

@@ -93,12 +93,13 @@ class TermInputs:
     """What the scene provides for the terms.
 
     Attributes:
-        views: the training views.
+        views: the training views. Terms that fill the hole use only those with pixels to repaint.
         references: the reference images with their holes.
         masked_means: [M, 3], centres of the initialization's masked Gaussians; on the device of everything else.
-        prior: adapted to the reference. text: [3, L, D], hidden states of the global, the local and the empty prompt.
-        estimator: of depth.
-        distance: perceptual, of patches.
+        prior: adapted to the reference; None if there is neither SDS nor the depth term.
+        text: [3, L, D], hidden states of the global, the local and the empty prompt.
+        estimator: of depth, for the depth term.
+        distance: of patches, for the perceptual loss of lifted images.
     """
 
     views: Sequence[TrainView]
