@@ -140,22 +140,8 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> ResolvedJob:
         origin, text = ("budget", request.budget) if request.budget else (str(found.path), found.budget)
         layers = stack_layers(*layer, split_budget(pipeline, layers.values, parse_duration(text, origin)))
     keys = frozenset(found.brings)
-    return ResolvedJob(
-        root,
-        runs,
-        folder or root,
-        home,
-        base,
-        pipeline,
-        layers,
-        profile,
-        why,
-        request.trust,
-        keys,
-        hashes,
-        request.keep,
-        request.cuda,
-    )
+    folders, options = (root, runs, folder or root, home, base), (request.keep, request.cuda)
+    return ResolvedJob(*folders, pipeline, layers, profile, why, request.trust, keys, hashes, *options)
 
 
 def choose_profile(

@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from reffusion import seeding
 from reffusion.background.model import Background
 from reffusion.depth import monocular
-from reffusion.initialize import coverage, random_init
+from reffusion.initialize import coverage
 from reffusion.initialize.draft import Draft
+from reffusion.initialize.draft_steps import add_random, refit_draft, restrict_invent_masks
 from reffusion.initialize.extra_views import FLOATER_RATIO, complete_extra_views
 from reffusion.initialize.fill import fill_references
-from reffusion.initialize.refit import Supervision, refit
 from reffusion.initialize.relighting import remove_shadows
 from reffusion.initialize.sds_gain import GainPrediction, predict_gain
 from reffusion.inpaint import feedforward
@@ -23,14 +22,13 @@ from reffusion.io.arrays import load_json, save_json, save_labels
 from reffusion.io.images import save_exr, save_image, save_mask
 from reffusion.io.ply import save_ply
 from reffusion.io.scene import load_references
-from reffusion.masks import regions, voting
+from reffusion.masks import voting
 from reffusion.params.initialize import Params
 from reffusion.trace import Trace
-from reffusion.types import MaskSet, Reference
+from reffusion.types import Reference
 from reffusion.workspace import Workspace
 
 WARN_SHARE = 0.01  # uncovered share of C from which a view is named
-SEED = 0  # of the refit, and of random Gaussians
 
 
 def run(
@@ -56,7 +54,10 @@ def run(
         draft, depths = fill_references(params, draft, references, best, background, network, Trace(out))
         save_depths(out, depths)
     if is_method:
-        sets = restrict_invent_masks(out, draft, sets, background)
+        restricted = restrict_invent_masks(draft, sets, background)
+        sets = sets | restricted
+        for name, each in restricted.items():
+            save_mask(out / "invent" / f"{name}.png", each.invent)
         assert reference is not None
         trusted = trusted_references(reference, references, background)
         if params.refit_steps:
@@ -71,9 +72,13 @@ def run(
                 save_image(out / "extra_views" / f"{each.camera.name}.png", each.image)
             trusted = [*trusted, *extra]
     if params.start == "random" and any(each.invent.any() for each in sets.values()):
-        draft = add_random(space, draft)
+        draft = add_random(draft, space)
     if is_method and params.refit_steps:
-        draft = refit_draft(params, out, space, draft, background, references, trusted, sets)
+        work = out / ".refit"  # hidden: its trace holds seconds, which are no part of the artifact's content
+        work.mkdir(exist_ok=True)
+        has_exact_depth = all(each.depth is not None for each in references)
+        draft = refit_draft(draft, params.refit_steps, scene, background, trusted, sets, has_exact_depth, work)
+        shutil.rmtree(work)
 
     save_ply(out / "gaussians.ply", draft.gaussians)
     save_labels(out / "labels.npy", draft.is_new.cpu())
@@ -119,67 +124,6 @@ def trusted_references(reference: Path, references: list[Reference], background:
     given = load_json(facts)["given"] if facts.exists() else []
     extend = lambda each: replace(each, mask=each.mask | background.masks[each.camera.name])
     return [extend(each) if each.camera.name in given else each for each in references]
-
-
-def restrict_invent_masks(
-    out: Path, draft: Draft, sets: dict[str, MaskSet], background: Background
-) -> dict[str, MaskSet]:
-    """The masks with I where the references drew something. Writes invent/<view>.png where it differs."""
-    restricted = {}
-    for camera in background.cameras:
-        each = sets[camera.name]
-        if (each.invent & ~each.consistent).any():
-            share = voting.render_labels(draft.gaussians, draft.is_new, camera)
-            invent = regions.restrict_to_new(each.invent, each.consistent, share)
-            restricted[camera.name] = replace(each, invent=invent)
-            save_mask(out / "invent" / f"{camera.name}.png", invent)
-    return sets | restricted
-
-
-def add_random(space: Workspace, draft: Draft) -> Draft:
-    """The draft with random Gaussians in the region of the hole: around the removed ones, or in the box that the scene
-    names."""
-    scene, region = space.scene, space.facts.get("region")
-    removed = space.gaussians.map(lambda p: p[space.object_labels])
-    if region:
-        box = random_init.box_at(region["center"], region["size"])
-    elif len(removed):
-        box = random_init.bounding_box(removed.means.double().cpu().numpy())
-    else:
-        raise ValueError("initialize.start is 'random', but no Gaussian was removed: nothing says where the hole is")
-    train = [scene.cameras[name] for name in scene.train]
-    holes = {name: space.mask_sets[name].invent for name in scene.train if space.mask_sets[name].invent.any()}
-    count = max(len(removed), random_init.MIN_GAUSSIANS)
-    places = seeding.generator(SEED, "initialize", "random")
-    points = random_init.sample_points(box, count, train, holes, places)
-    colors = seeding.generator(SEED, "initialize", "random colours")
-    added = random_init.random_gaussians(points, draft.gaussians.sh.shape[1], draft.gaussians.antialiased, colors)
-    return draft.add(added.map(lambda p: p.to(draft.gaussians.means)))
-
-
-def refit_draft(
-    params: Params,
-    out: Path,
-    space: Workspace,
-    draft: Draft,
-    background: Background,
-    references: list[Reference],
-    trusted: list[Reference],
-    sets: dict[str, MaskSet],
-) -> Draft:
-    """The draft after `params.refit_steps` steps of reconstruction."""
-    scene = space.scene
-    invented = lambda name: sets[name].invent & (name not in scene.clean)  # drawn where no photograph shows it
-    views = [view for view in background.views if view.camera.name not in scene.blank]
-    hidden = {view.camera.name: view.masked | invented(view.camera.name) for view in views}
-    completed = [each for each in trusted if each.mask.any()]
-    supervision = Supervision([view.camera for view in views], background.photos, hidden, completed)
-    has_exact_depth = draft.is_new & all(each.depth is not None for each in references)
-    work = out / ".refit"  # hidden: its trace holds seconds, which are no part of the artifact's content
-    work.mkdir(exist_ok=True)
-    gaussians = refit(draft.gaussians, has_exact_depth, supervision, params.refit_steps, SEED, work)
-    shutil.rmtree(work)
-    return Draft(gaussians, draft.is_new)
 
 
 def save_depths(out: Path, depths: dict[str, np.ndarray]) -> None:

@@ -23,6 +23,7 @@ from reffusion.distill.terms.depth import _downscale
 from reffusion.fit import step
 from reffusion.gaussians.optimize import Rates
 from reffusion.geometry import cameras_extent
+from reffusion.initialize import draft_steps
 from reffusion.initialize.draft import Draft
 from reffusion.io.arrays import load_labels
 from reffusion.io.scene import load_mask_sets, load_references, load_scene, save_mask_sets
@@ -86,13 +87,13 @@ def test_a_view_without_invented_pixels_is_distilled_where_c_is_repainted(views_
 
 def test_the_refit_is_not_supervised_where_an_object_is_drawn(tmp_path, monkeypatch):
     found = {}
-    monkeypatch.setattr(initialize, "refit", lambda scene, exact, known, *_: found.update(known.hidden) or scene)
+    monkeypatch.setattr(draft_steps, "refit", lambda scene, exact, known, *_: found.update(known.hidden) or scene)
     masked, invent = np.eye(4, dtype=bool), np.eye(4, dtype=bool)[::-1]
     background = Background([type("View", (), {"camera": camera(), "masked": masked})], {})
-    space = type("Space", (), {"scene": type("Scene", (), {"clean": (), "blank": ()})})
+    scene = type("Scene", (), {"clean": (), "blank": ()})
     sets = {"a": MaskSet(masked, masked, invent, invent)}
     draft = Draft(None, torch.zeros(0, dtype=torch.bool))
-    initialize.refit_draft(initialize.Params(refit_steps=1), tmp_path, space, draft, background, [], [], sets)
+    draft_steps.refit_draft(draft, 1, scene, background, [], sets, True, tmp_path)
     assert (found["a"] == masked | invent).all()
 
 

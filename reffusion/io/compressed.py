@@ -86,13 +86,11 @@ def save_spz(path: Path, rows: Rows) -> None:
     gsply = _import_gsply(path)
     turned = _turn_about_x(rows)
     extent = float(np.abs(turned.means).max(initial=1e-6))
-    lengths = np.linalg.norm(turned.quaternions, axis=1, keepdims=True)
-    unit = np.where(lengths > 0, turned.quaternions / np.maximum(lengths, 1e-30), [1.0, 0.0, 0.0, 0.0])
     plain = lambda array: np.ascontiguousarray(array, np.float32)
     data = gsply.GSData.from_arrays(
         means=plain(turned.means),
         scales=turned.log_scales,
-        quats=plain(unit),
+        quats=plain(turned.unit_quaternions),
         opacities=turned.opacity_logits,
         sh0=plain(turned.sh[:, 0]),
         shN=plain(turned.sh[:, 1:]) if turned.sh.shape[1] > 1 else None,

@@ -55,12 +55,10 @@ def open_splat(path: Path) -> Callable[[slice], Rows]:
 def save_splat(path: Path, rows: Rows) -> None:
     """Write the rows; spherical harmonics above the constant one are dropped."""
     table = np.empty(len(rows), RECORD)
-    lengths = np.linalg.norm(rows.quaternions, axis=1, keepdims=True)
-    unit = np.where(lengths > 0, rows.quaternions / np.maximum(lengths, 1e-30), [1.0, 0.0, 0.0, 0.0])
     in_bytes = lambda values, most: np.clip(np.round(values), 0, most).astype(np.uint8)
     opacities = 1 / (1 + np.exp(-rows.opacity_logits.astype(np.float64)))
     table["position"], table["scale"] = rows.means, np.exp(rows.log_scales)
     table["color"] = in_bytes(255 * np.column_stack([0.5 + SH0 * rows.sh[:, 0], opacities]), 255)
-    table["rotation"] = in_bytes(128 * unit + 128, 255)
+    table["rotation"] = in_bytes(128 * rows.unit_quaternions + 128, 255)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     Path(path).write_bytes(table.tobytes())

@@ -37,6 +37,12 @@ class Rows:
     def __len__(self) -> int:
         return len(self.means)
 
+    @property
+    def unit_quaternions(self) -> np.ndarray:
+        """[N, 4]: the quaternions normalised; that of no rotation for those that are zero."""
+        lengths = np.linalg.norm(self.quaternions, axis=1, keepdims=True)
+        return np.where(lengths > 0, self.quaternions / np.maximum(lengths, 1e-30), [1.0, 0.0, 0.0, 0.0])
+
     def take(self, chosen: np.ndarray | slice) -> Rows:
         return Rows(*(array[chosen] for array in vars(self).values()))
 

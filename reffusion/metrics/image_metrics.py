@@ -26,16 +26,9 @@ PSNR_CAP = 100.0  # dB, value of an identical image in a mean
 
 BOX_COLUMNS = (*(f"{name}_box" for name in NAMES.values()), "psnr_box", "ssim_box", "flip_box")
 COLUMNS = (
-    *BOX_COLUMNS,
-    "psnr_outside",
-    "ssim_outside",
-    "flip_outside",
-    "psnr_outside_seen",
-    "unseen_share",
-    "psnr_full",
-    "ssim_full",
-    "flip_full",
-)
+    *BOX_COLUMNS, "psnr_outside", "ssim_outside", "flip_outside", "psnr_outside_seen", "unseen_share",
+    "psnr_full", "ssim_full", "flip_full",
+)  # fmt: skip
 
 PROTOCOL = {
     "images": "8-bit sRGB as saved in renders/, against the ground truth at the same size; nothing is resized",

@@ -27,16 +27,9 @@ SMALLEST = {"alex": 31, "vgg": 16}
 # Layers of torchvision's `features`: (channels, kernel, stride, padding) of a convolution and its ReLU, or "pool".
 _ALEX = [(64, 11, 4, 2), "pool", (192, 5, 1, 2), "pool", (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)]
 _VGG = [
-    *[(64, 3, 1, 1)] * 2,
-    "pool",
-    *[(128, 3, 1, 1)] * 2,
-    "pool",
-    *[(256, 3, 1, 1)] * 3,
-    "pool",
-    *[(512, 3, 1, 1)] * 3,
-    "pool",
-    *[(512, 3, 1, 1)] * 3,
-]
+    *[(64, 3, 1, 1)] * 2, "pool", *[(128, 3, 1, 1)] * 2, "pool", *[(256, 3, 1, 1)] * 3, "pool",
+    *[(512, 3, 1, 1)] * 3, "pool", *[(512, 3, 1, 1)] * 3,
+]  # fmt: skip
 _LAYERS: dict[str, list[Any]] = {"alex": _ALEX, "vgg": _VGG}
 _POOL = {"alex": (3, 2), "vgg": (2, 2)}  # kernel size and stride of max pooling
 # Indices in `features` of the ReLUs whose activations are compared.

@@ -89,34 +89,28 @@ def _score_reduced(
     return columns
 
 
+def summarize(
+    rows: list[dict[str, Any]], columns: tuple[str, ...] = image_metrics.COLUMNS, infix: str = ""
+) -> dict[str, Any]:
+    """{"mean", "initialize", "views"}, each with `columns`: the means of the columns, the means of the columns prefixed
+    with `initialize_`, and how many views have a value. `infix`: what stands before a column's name in the rows."""
+    values = lambda prefix, name: [row.get(f"{prefix}{infix}{name}") for row in rows]
+    return {
+        "mean": {name: image_metrics.mean(values("", name)) for name in columns},
+        "initialize": {name: image_metrics.mean(values("initialize_", name)) for name in columns},
+        "views": {name: sum(value is not None for value in values("", name)) for name in columns},
+    }
+
+
 def summarize_reduced(rows: list[dict[str, Any]], longest: int) -> dict[str, Any] | None:
     """{"mean", "initialize", "views"} of `image_metrics.BOX_COLUMNS` at the reduced size, and {"protocol"}; None where
     no view was reduced."""
     sizes = sorted({f"{row['reduced_width']}x{row['reduced_height']}" for row in rows if "reduced_width" in row})
     if not sizes:
         return None
-    values = lambda prefix, name: [row.get(f"{prefix}reduced_{name}") for row in rows]
-    return {
-        "mean": {name: image_metrics.mean(values("", name)) for name in image_metrics.BOX_COLUMNS},
-        "initialize": {name: image_metrics.mean(values("initialize_", name)) for name in image_metrics.BOX_COLUMNS},
-        "views": {name: sum(value is not None for value in values("", name)) for name in image_metrics.BOX_COLUMNS},
+    return summarize(rows, image_metrics.BOX_COLUMNS, "reduced_") | {
         "protocol": f"renders and truth reduced to {', '.join(sizes)} px (larger side at most {longest} px) by area "
-        "averaging, masks by their nearest pixel, before the box is found; all else as at full size",
-    }
-
-
-def summarize(rows: list[dict[str, Any]]) -> dict[str, dict[str, float | int | None]]:
-    """{"mean", "initialize", "views"}, each with `image_metrics.COLUMNS`: the means of the columns, the means of the
-    columns prefixed with `initialize_`, and how many views have a value."""
-    values = {
-        prefix + name: [row.get(prefix + name) for row in rows]
-        for prefix in ("", "initialize_")
-        for name in image_metrics.COLUMNS
-    }
-    return {
-        "mean": {name: image_metrics.mean(values[name]) for name in image_metrics.COLUMNS},
-        "initialize": {name: image_metrics.mean(values[f"initialize_{name}"]) for name in image_metrics.COLUMNS},
-        "views": {name: sum(value is not None for value in values[name]) for name in image_metrics.COLUMNS},
+        "averaging, masks by their nearest pixel, before the box is found; all else as at full size"
     }
 
 

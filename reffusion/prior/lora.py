@@ -27,16 +27,9 @@ LORA_FILE = "pytorch_lora_weights.safetensors"
 ATTENTION = ("to_q", "to_k", "to_v", "to_out.0")
 TEXT_ATTENTION = ("q_proj", "k_proj", "v_proj", "out_proj")
 CONVOLUTIONS = (
-    "conv_in",
-    "conv1",
-    "conv2",
-    "conv_shortcut",
-    "conv_out",
-    "proj_in",
-    "proj_out",
-    "ff.net.0.proj",
+    "conv_in", "conv1", "conv2", "conv_shortcut", "conv_out", "proj_in", "proj_out", "ff.net.0.proj",
     "ff.net.2",
-)
+)  # fmt: skip
 
 
 def attach(

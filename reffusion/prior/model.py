@@ -229,27 +229,13 @@ def enable_checkpointing(prior: Prior) -> Prior:
 
 def pipeline(prior: Prior) -> Any:
     """The inpainting pipeline of diffusers with the same parts."""
-    if prior.text_encoder_2 is not None:
-        return pipeline_class("StableDiffusionXLInpaintPipeline")(
-            vae=prior.vae,
-            text_encoder=prior.text_encoder,
-            text_encoder_2=prior.text_encoder_2,
-            tokenizer=prior.tokenizer,
-            tokenizer_2=prior.tokenizer_2,
-            unet=prior.unet,
-            scheduler=prior.scheduler,
-            force_zeros_for_empty_prompt=prior.zero_empty,
-        )
-    return pipeline_class()(
-        vae=prior.vae,
-        text_encoder=prior.text_encoder,
-        tokenizer=prior.tokenizer,
-        unet=prior.unet,
-        scheduler=prior.scheduler,
-        safety_checker=None,
-        feature_extractor=None,
-        requires_safety_checker=False,
-    )
+    parts = {name: getattr(prior, name) for name in ("vae", "text_encoder", "tokenizer", "unet", "scheduler")}
+    if prior.text_encoder_2 is None:
+        unused = {"safety_checker": None, "feature_extractor": None, "requires_safety_checker": False}
+        return pipeline_class()(**parts, **unused)
+    parts |= {"text_encoder_2": prior.text_encoder_2, "tokenizer_2": prior.tokenizer_2}
+    kind = pipeline_class("StableDiffusionXLInpaintPipeline")
+    return kind(**parts, force_zeros_for_empty_prompt=prior.zero_empty)
 
 
 def pipeline_class(name: str = "StableDiffusionInpaintPipeline") -> Any:
