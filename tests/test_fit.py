@@ -12,6 +12,7 @@ import torch
 from reffusion import seeding, trace
 from reffusion.fit import exposure, step, view_loader
 from reffusion.fit import reconstruction as fitting
+from reffusion.fit.preparation import limit_gaussians
 from reffusion.fit.reconstruction import PLACED_RATE_FACTOR, fit
 from reffusion.fit.start import initial_gaussians
 from reffusion.io.arrays import load_json
@@ -342,7 +343,7 @@ def test_larger_pictures_have_room_for_more_gaussians():
     cameras = ring_of_cameras()
     pixels = cameras[0].width * cameras[0].height
     budget = lambda cameras, **densify: (
-        stage.limit_gaussians(stage.Params(densify=Densify(**densify)), cameras).densify.cap_max
+        limit_gaussians(stage.Params(densify=Densify(**densify)), cameras).densify.cap_max
     )
     assert budget(cameras, per_pixel=0.25) == round(0.25 * pixels)
     doubled = [camera.resized(2 * camera.width, 2 * camera.height) for camera in cameras]

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from reffusion.fit import preparation
 from reffusion.fit.gains import brightness_deviation, estimate_gains
 from reffusion.io.scene import load_scene, load_views
 from reffusion.params.fit import Params
-from stages import fit as stage
 from tests import small_scene
 
 
@@ -44,7 +44,7 @@ def test_where_nothing_is_known_all_are_alike(shown):
 
 def test_the_stage_fits_exposures_where_photographs_differ(shown, capsys):
     scene, cameras, photos = shown
-    asked = lambda how, images: stage.estimate_exposures(Params(exposure=how), scene, cameras, images)
+    asked = lambda how, images: preparation.estimate_exposures(Params(exposure=how), scene, cameras, images)
     bright = np.where(np.arange(len(cameras)) % 2, 0.6, 0.9)[:, None]
     uneven_ones = dimmed({camera.name: photos[camera.name] for camera in cameras}, bright)
     assert asked("auto", photos) is None and asked("never", uneven_ones) is None
@@ -52,5 +52,5 @@ def test_the_stage_fits_exposures_where_photographs_differ(shown, capsys):
     found = asked("auto", uneven_ones)
     assert brightness_deviation(found) == pytest.approx(np.log(bright).std(), abs=0.01)
     assert "exposures are fitted: the brightness of the same points differs by" in capsys.readouterr().out
-    even = stage.equalize_exposure(uneven_ones, cameras, found)
+    even = preparation.equalize_exposure(uneven_ones, cameras, found)
     assert brightness_deviation(estimate_gains(scene.points, cameras, even)) < 0.02

@@ -13,6 +13,7 @@ import small_scene as small
 import yaml
 
 from reffusion.capture import image_detail
+from reffusion.fit.preparation import limit_sh_degree
 from reffusion.io.arrays import load_json
 from reffusion.io.scene import load_mask_sets, load_scene
 from stages import fit, masks
@@ -112,4 +113,4 @@ def test_no_more_harmonics_than_views():
 def test_fit_takes_the_degree_that_the_views_support(tmp_path):
     poses, _, _ = small.write(tmp_path, 0.8)  # five training views
     scene = load_scene(poses)
-    assert fit.limit_sh_degree(fit.Params(), scene).sh.degree == 1
+    assert limit_sh_degree(fit.Params(), scene).sh.degree == 1

@@ -15,12 +15,14 @@ from small_prior import small_prior
 from test_distill import camera, train_view, wall
 
 from reffusion.background.model import Background
+from reffusion.capture import image_detail
 from reffusion.distill import inputs, loop
 from reffusion.distill.adversary import Adversary
 from reffusion.distill.display_range import clamp_to_display
 from reffusion.distill.terms import adversarial, sds
 from reffusion.distill.terms.depth import _downscale
 from reffusion.fit import step
+from reffusion.fit.preparation import limit_sh_degree
 from reffusion.gaussians.optimize import Rates
 from reffusion.geometry import cameras_extent
 from reffusion.initialize import draft_steps
@@ -217,9 +219,9 @@ def test_positions_step_by_the_cameras_extent_as_3dgs_has_it():
 
 
 def test_what_the_paper_does_not_do_can_be_left_out(monkeypatch):
-    monkeypatch.setattr(fit.image_detail, "supported_sh_degree", lambda *_: (0, 1.0))
+    monkeypatch.setattr(image_detail, "supported_sh_degree", lambda *_: (0, 1.0))
     scene = type("Scene", (), {"points": None, "cameras": {}, "train": ()})
-    degree = lambda few_views: fit.limit_sh_degree(fit.Params(few_views=few_views), scene).sh.degree
+    degree = lambda few_views: limit_sh_degree(fit.Params(few_views=few_views), scene).sh.degree
     assert [degree(each) for each in ("as_many", "fewer_harmonics", "surfaces")] == [3, 0, 0]
     speck = np.zeros((100, 200), bool)
     speck[50, 50] = True
