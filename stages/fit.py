@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -58,7 +59,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None
     views = (cameras, images, initial)
     weights = {name: ~mask for name, mask in hidden.items()}
     elapsed, with_steps = lambda: time.monotonic() - began, lambda steps: params.changed({"iterations": steps})
-    same = {"weights": weights, "rates": rates, "gains": gains}
+    same: dict[str, Any] = {"weights": weights, "rates": rates, "gains": gains}
     run_fit = lambda folder, steps: fit(*views, with_steps(steps), folder=folder, **same)
     steps = trace.steps_within_budget(out, params.iterations, params.seconds, elapsed, run_fit)
     held_out = [scene.cameras[name] for name in held_out_names]

@@ -56,8 +56,8 @@ def run(
     if is_method:
         restricted = restrict_invent_masks(draft, sets, background)
         sets = sets | restricted
-        for name, each in restricted.items():
-            save_mask(out / "invent" / f"{name}.png", each.invent)
+        for name, pixels in restricted.items():
+            save_mask(out / "invent" / f"{name}.png", pixels.invent)
         assert reference is not None
         trusted = trusted_references(reference, references, background)
         if params.refit_steps:
