@@ -41,9 +41,11 @@ def main() -> None:
     parser.add_argument("--kind", choices=KINDS, required=True)
     parser.add_argument("--view", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    given = parser.parse_args()
-    view = np.load(given.view)
-    np.save(given.out, background_depth(given.seed, KINDS[given.kind], view["world_to_camera"], view["rays"]))
+    arguments = parser.parse_args()
+    view = np.load(arguments.view)
+    np.save(
+        arguments.out, background_depth(arguments.seed, KINDS[arguments.kind], view["world_to_camera"], view["rays"])
+    )
 
 
 if __name__ == "__main__":

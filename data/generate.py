@@ -218,10 +218,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder to write")
     parser.add_argument("--seed", type=int, default=None, help="default 0; 7 for photos")
     parser.add_argument("--kind", choices=KINDS, default="demo")
-    given = parser.parse_args()
-    seed = given.seed if given.seed is not None else (7 if given.kind == "photos" else 0)
-    facts = generate(given.out, seed, KINDS[given.kind])
-    print(f"{given.out}: " + json.dumps(facts))
+    arguments = parser.parse_args()
+    seed = arguments.seed if arguments.seed is not None else (7 if arguments.kind == "photos" else 0)
+    facts = generate(arguments.out, seed, KINDS[arguments.kind])
+    print(f"{arguments.out}: " + json.dumps(facts))
 
 
 if __name__ == "__main__":

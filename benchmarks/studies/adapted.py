@@ -103,12 +103,12 @@ def main() -> None:
     parser = scene_priors.study_parser(__doc__, "the stages up to personalize", "adapted")
     parser.add_argument("--views", type=int, default=VIEWS)
     parser.add_argument("--steps", type=int, default=Sampler().steps, help="sampler steps from pure noise")
-    given = parser.parse_args()
-    models, base = scene_priors.load_priors(given)
-    out = given.out or given.run / "adapted"
-    views = save_sheet(models, given.run, given.views, given.steps, out)
+    arguments = parser.parse_args()
+    models, base = scene_priors.load_priors(arguments)
+    out = arguments.out or arguments.run / "adapted"
+    views = save_sheet(models, arguments.run, arguments.views, arguments.steps, out)
     scene_priors.save_results(
-        given, out, "adapted.json", {"prior": base, "seed": SEED, "steps": given.steps, "views": views}
+        arguments, out, "adapted.json", {"prior": base, "seed": SEED, "steps": arguments.steps, "views": views}
     )
     print(out / "sheet.png")
 

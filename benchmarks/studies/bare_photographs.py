@@ -107,15 +107,15 @@ def main() -> None:
     parser.add_argument("--images", help="folder of pictures inside the capture")
     parser.add_argument("--longest", type=int, default=640, help="px of the longer side, as poses.longest")
     parser.add_argument("--out", type=Path, default=Path("runs/bare_photographs"))
-    given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
     table = []
-    for folder in given.captures:
-        for row in evaluate_capture(folder, given.images, given.every, given.longest):
+    for folder in arguments.captures:
+        for row in evaluate_capture(folder, arguments.images, arguments.every, arguments.longest):
             table.append(row)
             print(format_row(row), flush=True)
-    (given.out / "bare_photographs.json").write_text(json.dumps(table, indent=1))
+    (arguments.out / "bare_photographs.json").write_text(json.dumps(table, indent=1))
 
 
 if __name__ == "__main__":

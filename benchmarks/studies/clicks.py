@@ -86,9 +86,12 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, nargs="+", required=True)
     parser.add_argument("--clicks", type=int, default=5, help="largest number of clicks")
     parser.add_argument("--sheets", type=Path, help="folder for pictures")
-    given = parser.parse_args()
-    for run in given.runs:
-        print(evaluate_run(run, given.clicks, given.sheets / f"{run.name}.png" if given.sheets else None), flush=True)
+    arguments = parser.parse_args()
+    for run in arguments.runs:
+        print(
+            evaluate_run(run, arguments.clicks, arguments.sheets / f"{run.name}.png" if arguments.sheets else None),
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -136,10 +136,10 @@ def draw(lines, systems, number, maps, path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/conditioning.png"))
-    given = parser.parse_args()
-    given.out.parent.mkdir(parents=True, exist_ok=True)
-    draw(*measure(print), given.out)
-    print(given.out)
+    arguments = parser.parse_args()
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    draw(*measure(print), arguments.out)
+    print(arguments.out)
 
 
 if __name__ == "__main__":

@@ -150,15 +150,15 @@ def main() -> int:
     parser.add_argument("--run", type=Path, help="default: runs/<scene's name>")
     parser.add_argument("--out", type=Path, help="default: runs/depth/<scene's name>")
     parser.add_argument("--kind", choices=("demo", *KINDS), help="kind of the scene; default: taken from its name")
-    given = parser.parse_args()
-    name = given.scene.resolve().name
-    run, out = given.run or Path("runs") / name, given.out or Path("runs/depth") / name
-    for path in (given.scene / "truth/facts.json", run / "initialize/facts.json"):
+    arguments = parser.parse_args()
+    name = arguments.scene.resolve().name
+    run, out = arguments.run or Path("runs") / name, arguments.out or Path("runs/depth") / name
+    for path in (arguments.scene / "truth/facts.json", run / "initialize/facts.json"):
         if not path.exists():
             raise ValueError(
                 f"{path} is missing: make the scene with data/generate.py, and run `make scene=... initialize`"
             )
-    results = measure(given.scene, run, out, given.kind or scene_kind(name))
+    results = measure(arguments.scene, run, out, arguments.kind or scene_kind(name))
     (out / "depth.json").write_text(json.dumps(results, indent=1))
     for view, parts in results.items():
         for part, found in parts.items():

@@ -145,16 +145,16 @@ def main() -> None:
     parser.add_argument("--prior", default="priors/tiny", help="a diffusers folder")
     parser.add_argument("--run", type=Path, required=True, help="runs/<scene>, finished, with ground truth")
     parser.add_argument("--out", type=Path, default=Path("runs/distillation"))
-    given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
     models = {
-        "unadapted": load_prior(given.prior),
-        "personalized": lora.merge(load_prior(given.prior), given.run / "personalize"),
+        "unadapted": load_prior(arguments.prior),
+        "personalized": lora.merge(load_prior(arguments.prior), arguments.run / "personalize"),
     }
-    rows = measure(models, given.run)
-    save_json(given.out / "distillation.json", rows)
-    draw(rows, given.out / "distillation.png")
-    print(given.out / "distillation.png")
+    rows = measure(models, arguments.run)
+    save_json(arguments.out / "distillation.json", rows)
+    draw(rows, arguments.out / "distillation.png")
+    print(arguments.out / "distillation.png")
 
 
 if __name__ == "__main__":

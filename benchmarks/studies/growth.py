@@ -115,18 +115,20 @@ def main() -> None:
     parser.add_argument("--last", choices=STAGES, default=STAGES[-1], help="last stage to run")
     parser.add_argument("--largest", action="store_true", help="also run the most views with the most pixels")
     parser.add_argument("--out", type=Path, default=ROOT / "runs/growth")
-    given = parser.parse_args()
-    out = given.out.resolve()
+    arguments = parser.parse_args()
+    out = arguments.out.resolve()
     os.makedirs(out / "runs", exist_ok=True)
     asked = {
-        f"training views of {given.pixels[0]} megapixels": [(views, given.pixels[0]) for views in given.views],
-        f"megapixels of {given.views[0]} views": [(given.views[0], each) for each in given.pixels],
+        f"training views of {arguments.pixels[0]} megapixels": [
+            (views, arguments.pixels[0]) for views in arguments.views
+        ],
+        f"megapixels of {arguments.views[0]} views": [(arguments.views[0], each) for each in arguments.pixels],
     }
     found: dict[str, dict[str, dict[str, list[float]]]] = {}
     for axis, (of, scenes) in enumerate(asked.items()):
         stages = found.setdefault(of, {})
         for size in scenes:
-            taken = run_stages(make_room(*size, out / "scenes"), out / "runs", given.profile, given.last)
+            taken = run_stages(make_room(*size, out / "scenes"), out / "runs", arguments.profile, arguments.last)
             for stage, told in taken.items():
                 row = stages.setdefault(stage, {"size": [], "cpu": [], "seconds": [], "mb": []})
                 row["size"].append(size[axis])
@@ -137,9 +139,9 @@ def main() -> None:
             print(f"{of}, {stage}: CPU {cpu:.2f}, memory {mb:.2f}")
     save_json(out / "growth.json", found)
     draw(found, out / "growth.png")
-    if given.largest:
-        scene = make_room(given.views[-1], given.pixels[-1], out / "scenes")
-        print(json.dumps(run_stages(scene, out / "runs", given.profile, given.last), indent=1))
+    if arguments.largest:
+        scene = make_room(arguments.views[-1], arguments.pixels[-1], out / "scenes")
+        print(json.dumps(run_stages(scene, out / "runs", arguments.profile, arguments.last), indent=1))
 
 
 if __name__ == "__main__":

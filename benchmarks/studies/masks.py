@@ -116,13 +116,13 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="default: runs/masks/<scene's name>")
     parser.add_argument("--seed", type=int, default=0, help="of the perturbations")
     parser.add_argument("--check", action="store_true", help="exit with 1 if a required IoU is missed")
-    given = parser.parse_args()
-    name = given.scene.resolve().name
-    run, out = given.run or Path("runs") / name, given.out or Path("runs/masks") / name
-    for path in (given.scene / "truth/cameras.json", run / "masks/receipt.json"):
+    arguments = parser.parse_args()
+    name = arguments.scene.resolve().name
+    run, out = arguments.run or Path("runs") / name, arguments.out or Path("runs/masks") / name
+    for path in (arguments.scene / "truth/cameras.json", run / "masks/receipt.json"):
         if not path.exists():
             raise ValueError(f"{path} is missing: make the scene with data/generate.py, and run `make scene=... masks`")
-    results = measure(given.scene, run, out, given.seed)
+    results = measure(arguments.scene, run, out, arguments.seed)
     (out / "masks.json").write_text(json.dumps(results, indent=1))
     missed = 0
     for kind, required in REQUIRED_IOU.items():
@@ -132,7 +132,7 @@ def main() -> int:
             numbers = f"{found['together']:.3f}, median view {found['median']:.3f}, worst {found['worst']:.3f}"
             print(f"{kind:9} {mask:10} IoU {numbers} (required: {least})")
     print(f"the perturbed masks themselves: {results['perturbed']['input']['together']:.3f}")
-    return int(given.check and missed > 0)
+    return int(arguments.check and missed > 0)
 
 
 if __name__ == "__main__":

@@ -111,18 +111,22 @@ def main() -> None:
     parser.add_argument("--goal", default="bear-rock")
     parser.add_argument("--profile", default="laptop")
     parser.add_argument("--out", type=Path, default=composites.ROOT / "runs/moving")
-    given = parser.parse_args()
-    (start,), (goal,) = (composites.select_places(name, False) for name in (given.start, given.goal))
+    arguments = parser.parse_args()
+    (start,), (goal,) = (composites.select_places(name, False) for name in (arguments.start, arguments.goal))
     if start.capture != goal.capture:
         parser.error(
             f"{start.name} is a place of {start.capture}, {goal.name} of {goal.capture}; take two of one capture"
         )
-    scene = write_scenes(start, goal, placement.load_photographs(given.captures / start.capture), given.out / "scenes")
+    scene = write_scenes(
+        start, goal, placement.load_photographs(arguments.captures / start.capture), arguments.out / "scenes"
+    )
     folders = (scene, scene.with_name(f"{scene.name}-untouched"))
-    run, ceiling = (scoring.Run.load(composites.run_job(each, given.out / "runs", given.profile)) for each in folders)
-    save_image(given.out / f"{scene.name}.png", scoring.comparison_sheet(run, ceiling))
+    run, ceiling = (
+        scoring.Run.load(composites.run_job(each, arguments.out / "runs", arguments.profile)) for each in folders
+    )
+    save_image(arguments.out / f"{scene.name}.png", scoring.comparison_sheet(run, ceiling))
     scores = scoring.score_place(run, ceiling, {})
-    save_json(given.out / "moving.json", {"place": scene.name, **scores})
+    save_json(arguments.out / "moving.json", {"place": scene.name, **scores})
     print(scores)
 
 

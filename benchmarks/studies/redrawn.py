@@ -228,14 +228,14 @@ def main() -> int:
     )
     parser.add_argument("--every", type=int, default=1, help="take every n-th view")
     parser.add_argument("--seconds", action="store_true", help="only measure the time of a registration")
-    given = parser.parse_args()
-    folders = [given.captures / name for name in given.names.split(",") if (given.captures / name).is_dir()]
+    arguments = parser.parse_args()
+    folders = [arguments.captures / name for name in arguments.names.split(",") if (arguments.captures / name).is_dir()]
     if len(folders) < 2:
-        print(f"skipped: fewer than two captures in {given.captures}")
+        print(f"skipped: fewer than two captures in {arguments.captures}")
         return 0
     captures = {folder.name: load_photographs(folder) for folder in folders}
     first = {name: capture.picture(next(iter(capture.files))) for name, capture in captures.items()}
-    if given.seconds:
+    if arguments.seconds:
         print(measure_seconds(next(iter(first.values()))))
         return 0
     print(HEADER)
@@ -243,7 +243,7 @@ def main() -> int:
     for name, capture in captures.items():
         foreign = first[names[names.index(name) - 1]]
         chosen = ", chosen on" if name in CHOSEN_ON else ""
-        print(measure(capture, foreign, given.every).row(name + chosen), flush=True)
+        print(measure(capture, foreign, arguments.every).row(name + chosen), flush=True)
     return 0
 
 

@@ -131,12 +131,12 @@ def _pair(before: float, after: float) -> str:
 
 
 def main() -> None:
-    given = scene_priors.study_parser(__doc__, "initialize and personalize", "sds-variance").parse_args()
-    models, base = scene_priors.load_priors(given)
-    found, out = measure(models, given.run), given.out or given.run / "sds-variance"
+    arguments = scene_priors.study_parser(__doc__, "initialize and personalize", "sds-variance").parse_args()
+    models, base = scene_priors.load_priors(arguments)
+    found, out = measure(models, arguments.run), arguments.out or arguments.run / "sds-variance"
     out.mkdir(parents=True, exist_ok=True)
     print(table(found))
-    scene_priors.save_results(given, out, "sds_variance.json", {"prior": base, "timesteps": TIMESTEPS} | found)
+    scene_priors.save_results(arguments, out, "sds_variance.json", {"prior": base, "timesteps": TIMESTEPS} | found)
     print(out / "sds_variance.json")
 
 

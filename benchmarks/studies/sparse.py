@@ -92,14 +92,14 @@ def main() -> None:
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS)
     parser.add_argument("--ways", choices=METHODS, nargs="+", default=list(METHODS))
     parser.add_argument("--out", type=Path, default=ROOT / "runs/sparse")
-    given = parser.parse_args()
-    found: dict[str, dict[str, list[dict[str, float]]]] = {way: {} for way in given.ways}
-    for count in given.counts:
-        for way in given.ways:
-            scenes = [make_scene(scene, count, given.out / "scenes") for scene in given.scenes]
-            found[way][str(count)] = [run_method(scene, way, given.out) for scene in scenes]
-            save_json(given.out / "sparse.json", found)
-    draw(found, given.out / "sparse.png")
+    arguments = parser.parse_args()
+    found: dict[str, dict[str, list[dict[str, float]]]] = {way: {} for way in arguments.ways}
+    for count in arguments.counts:
+        for way in arguments.ways:
+            scenes = [make_scene(scene, count, arguments.out / "scenes") for scene in arguments.scenes]
+            found[way][str(count)] = [run_method(scene, way, arguments.out) for scene in scenes]
+            save_json(arguments.out / "sparse.json", found)
+    draw(found, arguments.out / "sparse.png")
     for way, counts in found.items():
         for count, each in counts.items():
             print(f"{way:16} {count:>2} views", *(f"{s} {np.mean([e[s] for e in each]):.3f}" for s in SCORES))

@@ -68,12 +68,12 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--only", nargs="+", choices=list(STAGES))
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     over = 0
     print(f"{'stage':<12} {'without':>9} {'with':>9} {'moments':>8} {'a moment':>9} {'a step':>8} {'full length':>12}")
-    for name in given.only or STAGES:
-        steps = 8 * given.steps if name == "fit" else given.steps
-        plain, traced, moments, step = measure_pairs(name, given.run, steps, given.repeats)
+    for name in arguments.only or STAGES:
+        steps = 8 * arguments.steps if name == "fit" else arguments.steps
+        plain, traced, moments, step = measure_pairs(name, arguments.run, steps, arguments.repeats)
         profile = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
         full = profile[STAGES[name][1]]
         moment = (traced - plain) / moments
