@@ -73,16 +73,16 @@ def load_test_views(run: Path) -> list[tuple]:
     Raises:
         ValueError: no test view has ground truth and a mask.
     """
-    scene, found = load_scene(run / "poses"), []
+    scene, views = load_scene(run / "poses"), []
     for name in scene.test:
         camera = scene.cameras[name]
         truth = load_ground_truth(camera, run / "poses")
         box = image_metrics.mask_box(load_object_mask(camera, run / "raw_masks", run / "masks"))
         if truth is not None and box is not None:
-            found.append((camera, truth, box))
-    if not found:
+            views.append((camera, truth, box))
+    if not views:
         raise ValueError(f"{run / 'poses'}: no test view shows the scene without the object; take another scene")
-    return [found[place] for place in np.linspace(0, len(found) - 1, min(VIEWS, len(found))).round().astype(int)]
+    return [views[place] for place in np.linspace(0, len(views) - 1, min(VIEWS, len(views))).round().astype(int)]
 
 
 @torch.no_grad()

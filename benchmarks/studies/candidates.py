@@ -37,9 +37,9 @@ def score_candidates(run: Path, untouched: Path, out: Path, seed: int, models: d
         return None
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    given = load_json(run / "reference/receipt.json")["params"] | {"seed": seed, "reference": None}
+    params = load_json(run / "reference/receipt.json")["params"] | {"seed": seed, "reference": None}
     needs = {name: run / name for name in ("poses", "fit", "masks")}
-    reference.run(Params(**given), out, scene=out, **needs)
+    reference.run(Params(**params), out, scene=out, **needs)
     facts = load_json(out / "candidates.json")
     view, taken = facts["view"], facts["chosen"]
     pixels = load_mask_sets(run / "masks", [view])[view]

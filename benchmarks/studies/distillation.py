@@ -41,16 +41,16 @@ SCALES = {"whole": "A photo of sks", "window": "A photo of sks, cropped"}
 
 def degraded_pictures(run: Path, cases: dict[str, list[Case]], renders: dict[str, dict[str, list[Case]]]):
     """Name -> scale -> [B, 3, H, W] in [-1, 1]: the mixes, then the run's renders."""
-    made: dict[str, dict[str, Tensor]] = {}
+    pictures: dict[str, dict[str, Tensor]] = {}
     for scale in SCALES:
         truth, hole = to_tensors(cases[scale])
         filled = [cv2.inpaint(c.truth, c.hole.astype(np.uint8), 5, cv2.INPAINT_TELEA) for c in cases[scale]]
         telea = to_tensors([replace(c, truth=f) for c, f in zip(cases[scale], filled, strict=True)])[0]
         for mix in MIXES:
-            made.setdefault(f"{mix:g} Telea", {})[scale] = truth + mix * hole * (telea - truth)
+            pictures.setdefault(f"{mix:g} Telea", {})[scale] = truth + mix * hole * (telea - truth)
         for name, crops in renders.items():
-            made.setdefault(name, {})[scale] = truth + hole * (to_tensors(crops[scale])[0] - truth)
-    return made
+            pictures.setdefault(name, {})[scale] = truth + hole * (to_tensors(crops[scale])[0] - truth)
+    return pictures
 
 
 @torch.no_grad()
@@ -105,11 +105,11 @@ def measure(models: dict[str, Prior], run: Path) -> list[dict]:
 def rendered_cases(run: Path, folder: str, size: int) -> dict[str, list[Case]]:
     """`scene_cases` with evaluate's renders instead of the truth."""
     scene = load_scene(run / "poses")
-    found = run / "evaluate" / folder
-    if not found.is_dir():
-        raise ValueError(f"{found} is missing: run `make scene={run.name} all` first")
-    shown = {name: load_image(found / f"{name}.png") for name in scene.test}
-    return scene_cases(run, size, shown)
+    source = run / "evaluate" / folder
+    if not source.is_dir():
+        raise ValueError(f"{source} is missing: run `make scene={run.name} all` first")
+    renders = {name: load_image(source / f"{name}.png") for name in scene.test}
+    return scene_cases(run, size, renders)
 
 
 def draw(rows: list[dict], path: Path) -> None:

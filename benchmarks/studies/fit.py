@@ -37,8 +37,8 @@ VARIANTS = {
 
 def fit_params(profile: str, overrides: dict[str, object], every: int) -> fit.Params:
     """The profile's parameters of `fit` with overrides. ValueError names an unknown one."""
-    given = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"][profile].get("fit", {})
-    return fit.Params(**given).changed({**overrides, "holdout": every})
+    params = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"][profile].get("fit", {})
+    return fit.Params(**params).changed({**overrides, "holdout": every})
 
 
 def run_fit(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]]:

@@ -114,11 +114,11 @@ class Photographs:
         """The other views by distance: between centres, relative to the median, plus twice the radians between axes."""
         centre = {name: -pose[:3, :3].T @ pose[:3, 3] for name, pose in self.world_to_camera.items()}
         others = [name for name in self.files if name != view]
-        away = {name: float(np.linalg.norm(centre[name] - centre[view])) for name in others}
+        distance = {name: float(np.linalg.norm(centre[name] - centre[view])) for name in others}
         axis = self.world_to_camera[view][2, :3]
         cosine = {name: np.clip(self.world_to_camera[name][2, :3] @ axis, -1, 1) for name in others}
-        usual = float(np.median(list(away.values())))
-        return sorted(others, key=lambda name: away[name] / usual + 2 * np.arccos(cosine[name]))
+        usual = float(np.median(list(distance.values())))
+        return sorted(others, key=lambda name: distance[name] / usual + 2 * np.arccos(cosine[name]))
 
 
 def load_photographs(folder: Path) -> Photographs:
@@ -184,20 +184,20 @@ def measure(capture: Photographs, foreign: np.ndarray, every: int) -> Rates:
         redrawn = redraw(photo)
         for number, make in enumerate(VARIANTS.values()):
             image = fit_size(make(redrawn), photo)
-            found = registration.register(image, photo, hole)
+            registered = registration.register(image, photo, hole)
             compare = number == index % len(VARIANTS)  # one variant per view is compared with neighbours, to save time
-            wrong = not found.fits or (compare and registration.find_better_view(image, found, others))
-            rates.own.append(found.inlier_ratio)
+            wrong = not registered.fits or (compare and registration.find_better_view(image, registered, others))
+            rates.own.append(registered.inlier_ratio)
             rates.refused += bool(wrong)
         for number, name in enumerate(nearest[:NEAREST]):
             image = fit_size(capture.picture(name) if number else redraw(capture.picture(name)), photo)
-            found = registration.register(image, photo, hole)
-            rates.other.append(found.inlier_ratio)
-            rates.accepted_by_place += found.fits
-            rates.accepted += found.fits and registration.find_better_view(image, found, others) is None
-        found = registration.register(fit_size(foreign, photo), photo, hole)
-        rates.foreign.append(found.inlier_ratio)
-        rates.accepted += found.fits
+            registered = registration.register(image, photo, hole)
+            rates.other.append(registered.inlier_ratio)
+            rates.accepted_by_place += registered.fits
+            rates.accepted += registered.fits and registration.find_better_view(image, registered, others) is None
+        registered = registration.register(fit_size(foreign, photo), photo, hole)
+        rates.foreign.append(registered.inlier_ratio)
+        rates.accepted += registered.fits
     return rates
 
 

@@ -69,8 +69,8 @@ def peak_mb(device: str) -> int:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6)
 
 
-def save_results(arguments: argparse.Namespace, folder: Path, name: str, found: dict[str, Any]) -> None:
+def save_results(arguments: argparse.Namespace, folder: Path, name: str, results: dict[str, Any]) -> None:
     """Save the study's results with the device and peak memory, which are also printed."""
     peak = peak_mb(arguments.device)
-    save_json(folder / name, found | {"device": arguments.device, "dtype": arguments.dtype, "peak_mb": peak})
+    save_json(folder / name, results | {"device": arguments.device, "dtype": arguments.dtype, "peak_mb": peak})
     print(f"on {arguments.device} in {arguments.dtype}, both priors loaded: at most {peak:,} MB")

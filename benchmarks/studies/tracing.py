@@ -42,23 +42,23 @@ def cpu_seconds(stage: ModuleType, params: object, needs: dict[str, Path | None]
 def measure_pairs(name: str, run: Path, steps: int, repeats: int) -> tuple[float, float, int, float]:
     """Median seconds without and with a trace, the additional moments, and seconds per step without a trace."""
     stage, count, needs, _ = STAGES[name]
-    given = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
-    given |= {count: steps, "checkpoint_seconds": 1e9} | ({"holdout": 8} if name == "fit" else {})
+    settings = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
+    settings |= {count: steps, "checkpoint_seconds": 1e9} | ({"holdout": 8} if name == "fit" else {})
     folders = {need: run / need if (run / need).exists() else None for need in needs}
-    params, every = stage.Params(**given), trace.log_spaced
-    taken: dict[bool, list[float]] = {False: [], True: []}
+    params, every = stage.Params(**settings), trace.log_spaced
+    times: dict[bool, list[float]] = {False: [], True: []}
     lines = {}
-    cpu_seconds(stage, stage.Params(**given | {count: 2}), folders)  # compiles, fills caches
+    cpu_seconds(stage, stage.Params(**settings | {count: 2}), folders)  # compiles, fills caches
     try:
         for _ in range(repeats):
             for traced in (False, True):
                 trace.log_spaced = every if traced else (lambda i, last, per_octave=2, first=1: i == last)
                 seconds, lines[traced] = cpu_seconds(stage, params, folders)
-                taken[traced].append(seconds)
+                times[traced].append(seconds)
     finally:
         trace.log_spaced = every
-    plain, traced = (sorted(taken[which])[repeats // 2] for which in (False, True))
-    short = cpu_seconds(stage, stage.Params(**given | {count: 2}), folders)[0]
+    plain, traced = (sorted(times[which])[repeats // 2] for which in (False, True))
+    short = cpu_seconds(stage, stage.Params(**settings | {count: 2}), folders)[0]
     return plain, traced, lines[True] - lines[False], (plain - short) / (steps - 2)
 
 
