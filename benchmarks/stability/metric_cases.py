@@ -123,9 +123,9 @@ def loss_of_one_pixel() -> float:
 # -------------------------------------------------------------------------------------------------- masks
 
 
-def count_labelled(given: dict[str, np.ndarray]) -> float:
+def count_labelled(masks: dict[str, np.ndarray]) -> float:
     """Number of visible Gaussians that are labelled as the object."""
-    return float(voting.label_gaussians(voting.cast_votes(cloud(), NAMED, given)).sum())
+    return float(voting.label_gaussians(voting.cast_votes(cloud(), NAMED, masks)).sum())
 
 
 def count_seen() -> int:

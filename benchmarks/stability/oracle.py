@@ -125,7 +125,7 @@ def errors(gaussians: Gaussians, camera: Camera, relative: float, seed: int = 0)
 
 def _scale_quaternions(fast: Rendered, exact: Rendered, lengths: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Both gradients, with those of quaternions multiplied by their lengths."""
-    turn = lambda found: {**found, "quaternions": found["quaternions"].double() * lengths}
+    turn = lambda blocks: {**blocks, "quaternions": blocks["quaternions"].double() * lengths}
     return turn(fast.gradients), turn(exact.gradients)
 
 
