@@ -15,8 +15,10 @@ _CACHE = "kernels-"  # folders of machine code in __pycache__, one per state of 
 
 @functools.cache
 def _folder() -> Path:
-    """Machine code is kept by the content of all files here: numba itself looks only at the one file of a function,
-    and would go on using a constant or a callee that has changed in another."""
+    """Cache folder of machine code, named by the content of all files here.
+
+    numba checks only the file of a function, and would keep code whose constants or callees changed in another file.
+    """
     here = Path(__file__).parent
     state = hashlib.blake2b(b"".join(path.read_bytes() for path in sorted(here.glob("*.py"))), digest_size=8)
     folder = here / "__pycache__" / (_CACHE + state.hexdigest())
@@ -27,8 +29,10 @@ def _folder() -> Path:
 
 
 def kernel(parallel: bool = False, inline: str = "never") -> Callable:
-    """Compile a function at its first call; later processes load it from disk. Where this folder cannot be written
-    to, numba keeps it in the user's own cache."""
+    """Compile a function at its first call; later processes load it from disk.
+
+    If this folder is not writable, numba uses the user's cache.
+    """
 
     def compiled(function: Callable) -> Callable:
         before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(_folder())

@@ -1,8 +1,8 @@
 """Depth of a made scene without its object: `python data/depths.py --seed 0 --kind table --view in.npz --out z.npy`.
 
-For `benchmarks/studies/depth.py`, which asks for it in a process of its own. `in.npz` holds a view of the scene frame:
+`benchmarks/studies/depth.py` runs it in a process of its own. `in.npz` holds a view of the scene frame:
 `world_to_camera` [4, 4] and `rays` [H, W, 2], where its pixels lie at camera z = 1; `z.npy` is camera z [H, W] in the
-unit of the scene frame. No lens is involved, and no light: neither texture is painted nor radiance computed.
+unit of the scene frame. Lens, textures and light are ignored.
 """
 
 from __future__ import annotations
@@ -41,9 +41,11 @@ def main() -> None:
     parser.add_argument("--kind", choices=KINDS, required=True)
     parser.add_argument("--view", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    given = parser.parse_args()
-    view = np.load(given.view)
-    np.save(given.out, background_depth(given.seed, KINDS[given.kind], view["world_to_camera"], view["rays"]))
+    arguments = parser.parse_args()
+    view = np.load(arguments.view)
+    np.save(
+        arguments.out, background_depth(arguments.seed, KINDS[arguments.kind], view["world_to_camera"], view["rays"])
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Furniture: solids with materials on their faces, put together to pieces."""
+"""Furniture: pieces composed of solids with materials on their faces."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Furniture:
 
     @property
     def objects(self) -> dict[str, np.ndarray]:
-        """Name -> bool [n], the solids of each object that is named apart."""
+        """Name -> bool [n], the solids of each object with a name of its own."""
         of = [removable for *_, removable in self.solids]
         return {name: np.array([each == name for each in of]) for name in sorted({n for n in of if isinstance(n, str)})}
 
@@ -53,13 +53,13 @@ class Furniture:
         half = (radius, high / 2, radius)
         self._add(CYLINDER, (x, bottom + high / 2, z), half, 0.0, [side, top or side, side], removable)
 
-    def thicket(self, x, bottom, z, size, cell, leaf, material, drawn_from, yaw=0.0):
+    def thicket(self, x, bottom, z, size, cell, leaf, material, seed, yaw=0.0):
         """A box of size (wide, high, deep) full of leaves, one in each cell of about the size `cell`, metres; `leaf`:
-        its width, length, thickness in metres, and by how many degrees it leans at most; drawn_from: an integer."""
+        its width, length, thickness in metres, and by how many degrees it leans at most; seed: of their places."""
         half = np.array(size) / 2
         cells = np.maximum(np.round(np.array(size) / cell), 1).astype(int)
         *extents, lean = leaf
-        self.leaves[len(self.solids)] = (*cells, *np.array(extents) / 2, np.radians(lean), drawn_from)
+        self.leaves[len(self.solids)] = (*cells, *np.array(extents) / 2, np.radians(lean), seed)
         self._add(THICKET, (x, bottom + half[1], z), half, yaw, [material], False)
 
     def arrays(self, index: dict[str, int], node: float) -> tuple[Solids, Faces]:
@@ -87,7 +87,7 @@ class Furniture:
         mapping = np.zeros((len(sizes), 4))
         for face, (size, material) in enumerate(zip(sizes, self.materials, strict=True)):
             if material.tile:
-                # No two faces show the same stretch.
+                # Each face shows another part of the texture.
                 mapping[face] = 1 / material.tile, 1 / material.tile, face * 0.377 % 1, face * 0.619 % 1
             else:
                 mapping[face, :2] = 1 / (size[::-1] if material.turned else size)
@@ -211,17 +211,17 @@ def hedge(f: Furniture, draw, z: float, wide: float, high: float) -> None:
     f.box(0, 0, z - 0.4, (wide, high - 0.06, 0.2), Material("leaves", 0.6, (0.5, 0.6, 0.4)))
     for cell, back, tint in ((0.065, 0.05, 1.4), (0.08, 0.02, 2.0), (0.1, 0.0, 2.6)):
         leaf, material = (0.8 * cell, 1.1 * cell, 0.008, 80), Material("foliage", 0.8, (tint,) * 3)
-        drawn_from, yaw = int(draw.integers(1 << 20)), draw.uniform(-1.2, 1.2)
-        f.thicket(0, 0, z - 0.15 - back, (wide, high - back, 0.3), cell, leaf, material, drawn_from, yaw)
+        seed, yaw = int(draw.integers(1 << 20)), draw.uniform(-1.2, 1.2)
+        f.thicket(0, 0, z - 0.15 - back, (wide, high - back, 0.3), cell, leaf, material, seed, yaw)
 
 
 def lawn(f: Furniture, draw, z: float, wide: float) -> None:
     """Two layers of grass that do not lie in the same rows, a low dark one and a high light one."""
     for high, tint in ((0.07, 1.2), (0.12, 2.4)):
         blade, material = (0.014, high + 0.01, 0.006, 14), Material("foliage", 0.8, (tint,) * 3)
-        drawn_from, yaw = int(draw.integers(1 << 20)), draw.uniform(0, 90)
+        seed, yaw = int(draw.integers(1 << 20)), draw.uniform(0, 90)
         cell = (0.04, high + 0.02, 0.04)
-        f.thicket(0, -0.02, z, (wide, high + 0.02, wide), cell, blade, material, drawn_from, yaw)
+        f.thicket(0, -0.02, z, (wide, high + 0.02, wide), cell, blade, material, seed, yaw)
 
 
 def daybed(f: Furniture, draw, x: float, z: float) -> None:

@@ -66,12 +66,12 @@ def generate(out: Path, seed: int, kind: Kind) -> dict:
     return facts
 
 
-def _changed_by_hand(out: Path, made: Path) -> list[Path]:
-    """Files of `out` that a new scene would not have, or that are younger than the stamp of its generation."""
+def _changed_by_hand(out: Path, new_scene: Path) -> list[Path]:
+    """Files of `out` that are not in the new scene, or that are younger than the stamp of their generation."""
     sign = out / ".generated"
     files = [path for path in out.rglob("*") if path.is_file() and path != sign] if sign.exists() else []
     young = lambda path: path.stat().st_mtime > sign.stat().st_mtime
-    return sorted(path for path in files if young(path) or not (made / path.relative_to(out)).exists())
+    return sorted(path for path in files if young(path) or not (new_scene / path.relative_to(out)).exists())
 
 
 def _write_scene(out: Path, seed: int, kind: Kind) -> dict:
@@ -79,11 +79,11 @@ def _write_scene(out: Path, seed: int, kind: Kind) -> dict:
     world = bake(furniture, seed, kind)
     session = take_photographs(seed, kind, world, target)
     facts = _facts(seed, session)
-    shares, asked = [s for s in facts["never_seen_share"].values() if s is not None], f"{kind.least} or more"
+    shares, request = [s for s in facts["never_seen_share"].values() if s is not None], f"{kind.least} or more"
     if kind.hangs:
-        asked = f"{MOST_NEVER_SEEN} or less"
+        request = f"{MOST_NEVER_SEEN} or less"
     if kind.task == "remove" and (max(shares) > MOST_NEVER_SEEN if kind.hangs else min(shares) < kind.least):
-        raise ValueError(f"seed {seed}: {facts['never_seen_share']} of the masks was never seen; it must be {asked}")
+        raise ValueError(f"seed {seed}: {facts['never_seen_share']} of the masks was never seen; it must be {request}")
     frame = scene_frame(seed)
     write_truth_cameras(out / "truth/cameras.json", kind, session.names, session.cameras, frame)
     (out / "truth/facts.json").write_text(json.dumps(facts, indent=1))
@@ -145,33 +145,33 @@ def _write_removal(out: Path, session: Session, kind: Kind, world: World, frame:
         write_image(out / f"truth/never_seen/{name}.png", session.hidden[k] * np.uint8(255))
         if k < session.test:
             continue
-        for own, of in session.apart.items():
+        for own, of in session.object_masks.items():
             write_image(out / f"masks/{own}/{name}.png", of[k] * np.uint8(255))
-        if not session.apart:
+        if not session.object_masks:
             write_image(out / f"images_4/label/{name}.png", session.masks[k] * np.uint8(1))
     (out / "scene.yaml").write_text(("" if kind.hangs else _write_references(out, session)) + PROFILE)
 
 
 def _write_references(out: Path, session: Session) -> str:
     """Write the completed views; returns the lines of scene.yaml that name them."""
-    files = ["reference.png", *(f"reference_{session.names[k]}.png" for k in list(session.completed)[1:])]
-    said = []
-    for (k, picture), file in zip(session.completed.items(), files, strict=True):
+    files = ["reference.png", *(f"reference_{session.names[k]}.png" for k in list(session.completions)[1:])]
+    entries = []
+    for (k, picture), file in zip(session.completions.items(), files, strict=True):
         write_image(out / file, picture)
-        said.append(f"{{view: {session.names[k]}, image: {file}}}")
-    if len(said) == 1:
-        return f"reference: {said[0]}\n"
-    return "reference:\n" + "".join(f"- {each}\n" for each in said)
+        entries.append(f"{{view: {session.names[k]}, image: {file}}}")
+    if len(entries) == 1:
+        return f"reference: {entries[0]}\n"
+    return "reference:\n" + "".join(f"- {each}\n" for each in entries)
 
 
 def _write_sparse_views(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
     """Name a few photographs as training views and references; the other training views are cameras only."""
     shown = [session.names[k] for k in session.spread[: kind.shown]]
-    given = "".join(f"- {{view: {name}, image: images_4/{name}.png}}\n" for name in shown)
+    references = "".join(f"- {{view: {name}, image: images_4/{name}.png}}\n" for name in shown)
     listed = lambda names: f"[{', '.join(names)}]\n"
     (out / "scene.yaml").write_text(
         f"train: {listed(shown)}clean: {listed(shown)}test: {listed(session.names[: session.test])}"
-        f"cameras_only: others\nmasks: none\nreference:\n{given}{PROFILE}"
+        f"cameras_only: others\nmasks: none\nreference:\n{references}{PROFILE}"
     )
 
 
@@ -180,7 +180,7 @@ def _write_insertion(out: Path, session: Session, kind: Kind, world: World, fram
     _write_test_masks(out, session, session.masks[: session.test])
     center, radius = bounding_region(world.solids)
     region = {"center": frame.points(center).tolist(), "radius": frame.scale * radius}
-    _write_region(out, region, _write_measured(out, session, session.completed, kind, world, frame))
+    _write_region(out, region, _write_measured(out, session, session.completions, kind, world, frame))
 
 
 def _write_outpainting(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
@@ -200,13 +200,13 @@ def _write_measured(
     out: Path, session: Session, pictures: dict[int, np.ndarray], kind: Kind, world: World, frame: Frame
 ) -> str:
     """Write pictures of views and their depth; returns the lines of scene.yaml that name them."""
-    said = ["reference:\n"]
+    entries = ["reference:\n"]
     for k, picture in pictures.items():
         name = session.names[k]
         write_image(out / f"references/{name}.png", picture)
         np.save(out / f"references/{name}.npy", depth(session.cameras[k], kind, world, frame))
-        said.append(f"- {{view: {name}, image: references/{name}.png, depth: references/{name}.npy}}\n")
-    return "".join(said)
+        entries.append(f"- {{view: {name}, image: references/{name}.png, depth: references/{name}.npy}}\n")
+    return "".join(entries)
 
 
 def _write_region(out: Path, region: dict, references: str) -> None:
@@ -218,10 +218,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder to write")
     parser.add_argument("--seed", type=int, default=None, help="default 0; 7 for photos")
     parser.add_argument("--kind", choices=KINDS, default="demo")
-    given = parser.parse_args()
-    seed = given.seed if given.seed is not None else (7 if given.kind == "photos" else 0)
-    facts = generate(given.out, seed, KINDS[given.kind])
-    print(f"{given.out}: " + json.dumps(facts))
+    arguments = parser.parse_args()
+    seed = arguments.seed if arguments.seed is not None else (7 if arguments.kind == "photos" else 0)
+    facts = generate(arguments.out, seed, KINDS[arguments.kind])
+    print(f"{arguments.out}: " + json.dumps(facts))
 
 
 if __name__ == "__main__":

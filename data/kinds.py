@@ -52,7 +52,7 @@ class Kind:
     shown: int = 0
 
     @property
-    def around(self) -> bool:
+    def is_circle(self) -> bool:
         """Do the cameras circle the object?"""
         return self.spread >= 180
 

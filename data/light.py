@@ -1,4 +1,4 @@
-"""Bakes light into a map: nodes on every face, lamps that reach them, bounces between them."""
+"""Bakes a light map: nodes on every face, direct light of lamps, bounces between faces."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 from compiled import kernel
 from numba import prange
-from solids import blocked, nearest, on_face, surface
+from solids import is_blocked, nearest, on_face, surface
 
 
 @kernel()
@@ -37,7 +37,7 @@ def light_nodes(solids, faces):
             start, columns, rows = faces.grid[f, 0], faces.grid[f, 1], faces.grid[f, 2]
             for j in range(rows):
                 for k in range(columns):
-                    # Nodes on an edge are drawn inwards a little, or they would sit inside the neighbouring face.
+                    # Nodes on an edge move inwards a little, else they would lie inside the neighbouring face.
                     a = 0.004 + 0.992 * k / (columns - 1)
                     b = 0.004 + 0.992 * j / (rows - 1)
                     px, py, pz, nx, ny, nz = on_face(
@@ -63,15 +63,15 @@ def direct_light(solids, points, normals, owner, lamps, side):
         for lamp in lamps:
             area = 4.0 * math.sqrt(lamp[3] ** 2 + lamp[4] ** 2 + lamp[5] ** 2)
             area *= math.sqrt(lamp[6] ** 2 + lamp[7] ** 2 + lamp[8] ** 2)
-            total = _received(solids, with_object, points[n], normals[n], lamp, side)
+            total = _lamp_sum(solids, with_object, points[n], normals[n], lamp, side)
             for ch in range(3):
                 light[n, ch] += total / (side * side) * area / math.pi * lamp[12 + ch]
     return light
 
 
 @kernel()
-def _received(solids, with_object, point, normal, lamp, side):
-    """Sum over side x side points of the lamp of both cosines over the squared distance; 0 for hidden points."""
+def _lamp_sum(solids, with_object, point, normal, lamp, side):
+    """Sum of both cosines over the squared distance, over side x side points of the lamp; hidden points add 0."""
     total = 0.0
     for s in range(side * side):
         a, b = 2.0 * (s % side + 0.5) / side - 1.0, 2.0 * (s // side + 0.5) / side - 1.0
@@ -80,12 +80,12 @@ def _received(solids, with_object, point, normal, lamp, side):
         dz = lamp[2] + a * lamp[5] + b * lamp[8] - point[2]
         far = math.sqrt(dx * dx + dy * dy + dz * dz)
         dx, dy, dz = dx / far, dy / far, dz / far
-        here = dx * normal[0] + dy * normal[1] + dz * normal[2]
-        there = -(dx * lamp[9] + dy * lamp[10] + dz * lamp[11])
-        if here <= 0.0 or there <= 0.0:
+        cosine_surface = dx * normal[0] + dy * normal[1] + dz * normal[2]
+        cosine_lamp = -(dx * lamp[9] + dy * lamp[10] + dz * lamp[11])
+        if cosine_surface <= 0.0 or cosine_lamp <= 0.0:
             continue
-        if not blocked(solids, with_object, point[0], point[1], point[2], dx, dy, dz, far):
-            total += here * there / max(far * far, 0.04)
+        if not is_blocked(solids, with_object, point[0], point[1], point[2], dx, dy, dz, far):
+            total += cosine_surface * cosine_lamp / max(far * far, 0.04)
     return total
 
 

@@ -1,4 +1,4 @@
-"""What textures are made of: tileable noise, coordinates, colour ramps. Pictures are [N, N] or [N, N, 3] float32."""
+"""Components of textures: tileable noise, coordinates, colour ramps. Pictures are [N, N] or [N, N, 3] float32."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def blend(a, b, t):
     return a + (b - a) * t[..., None]
 
 
-def shifted(image, x, y):
+def shift(image, x, y):
     """A tileable picture [N, N] read at (x, y) in tiles."""
     size = np.float32(image.shape[0])
     return cv2.remap(

@@ -22,9 +22,9 @@ class Session:
         photos: [V, H, W, 3] uint8; masks: bool [V, H, W], pixels that the object touches or would touch.
         hidden: bool [V, H, W], masked pixels whose background no training view shows.
         middle: the view from the middle of the training views' walk.
-        completed: view -> uint8 [H, W, 3], the desired picture, of the middle view and those farthest from it.
+        completions: view -> uint8 [H, W, 3], the desired picture, of the middle view and those farthest from it.
         spread: training views, each the one farthest from those before it, the middle one first.
-        apart: object -> bool [V, H, W], its mask, for objects with masks of their own.
+        object_masks: object -> bool [V, H, W], its mask, for objects with masks of their own.
     """
 
     names: list[str]
@@ -34,9 +34,9 @@ class Session:
     masks: np.ndarray
     hidden: np.ndarray
     middle: int
-    completed: dict[int, np.ndarray]
+    completions: dict[int, np.ndarray]
     spread: list[int]
-    apart: dict[str, np.ndarray]
+    object_masks: dict[str, np.ndarray]
 
 
 def take_photographs(seed: int, kind: Kind, world: World, target: np.ndarray) -> Session:
@@ -52,18 +52,18 @@ def take_photographs(seed: int, kind: Kind, world: World, target: np.ndarray) ->
     hidden = [never_seen(world, camera, mask, *in_training) for camera, mask in zip(cameras, masks, strict=True)]
     spread = [kind.test + k for k in _spread(train, middle - kind.test, min(SPREAD, kind.train))]
     whole = {k: shoot(world, cameras[k], kind, kind.task != "remove")[0] for k in spread[: kind.references]}
-    apart = {
+    object_masks = {
         name: np.stack([_object_mask(world, c, kind, own) for c in cameras]) for name, own in world.objects.items()
     }
-    return Session(names, cameras, kind.test, photos, masks, np.stack(hidden), middle, whole, spread, apart)
+    return Session(names, cameras, kind.test, photos, masks, np.stack(hidden), middle, whole, spread, object_masks)
 
 
 def _spread(cameras: np.ndarray, first: int, count: int) -> list[int]:
     """`count` cameras, each the one farthest from those before it."""
-    chosen, away = [first], np.full(len(cameras), np.inf)
+    chosen, distance = [first], np.full(len(cameras), np.inf)
     while len(chosen) < count:
-        away = np.minimum(away, np.linalg.norm(cameras[:, 13:] - cameras[chosen[-1], 13:], axis=1))
-        chosen.append(int(np.argmax(away)))
+        distance = np.minimum(distance, np.linalg.norm(cameras[:, 13:] - cameras[chosen[-1], 13:], axis=1))
+        chosen.append(int(np.argmax(distance)))
     return chosen
 
 
@@ -87,7 +87,7 @@ def path(seed: int, kind: Kind, target: np.ndarray, count: int, label: str) -> n
     center += draw.normal(0, 0.015, (count, 3))
     aim = target + draw.normal(0, 0.04, (count, 3))
     roll = np.radians(draw.normal(0, 1.2, count))
-    focal = kind.width * (0.82 if kind.around else 0.85)
+    focal = kind.width * (0.82 if kind.is_circle else 0.85)
     bend = kind.bend * randomness(seed, "lens").uniform(0.7, 1.0)
     cameras = np.empty((count, 16))
     for k in range(count):
@@ -98,17 +98,17 @@ def path(seed: int, kind: Kind, target: np.ndarray, count: int, label: str) -> n
 
 def _middle(cameras: np.ndarray, kind: Kind) -> int:
     """The camera nearest to the mean of all; if some are low, to the mean at the height of the highest."""
-    wanted = cameras[:, 13:].mean(0)
+    mean_position = cameras[:, 13:].mean(0)
     if kind.low is not None:
-        wanted[1] = cameras[:, 14].max()
-    return int(np.argmin(np.linalg.norm(cameras[:, 13:] - wanted, axis=1)))
+        mean_position[1] = cameras[:, 14].max()
+    return int(np.argmin(np.linalg.norm(cameras[:, 13:] - mean_position, axis=1)))
 
 
 def _walk(kind: Kind, count: int, reach: float, draw: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Azimuth [count] in degrees, height and horizontal distance from the target in metres."""
     s = (np.arange(count) + 0.5) / max(count, 1)
     phase = draw.random(4) * 6.28
-    if kind.around:
+    if kind.is_circle:
         azimuth = 360 * (2 * s + draw.random())
         height = 1.15 + 0.12 * np.sin(6.28 * 3 * s + phase[1]) + np.where(s < 0.5, 0.2, -0.1)
         return azimuth, height, 2.25 + 0.1 * np.sin(6.28 * 5 * s + phase[2])

@@ -14,7 +14,7 @@ from compiled import kernel
 from light import irradiance
 from mipmaps import albedo
 from numba import prange
-from solids import EPSILON, THICKET, blocked, distance, nearest, surface
+from solids import EPSILON, THICKET, distance, is_blocked, nearest, surface
 from thicket import leaf_light
 
 TILE = 16  # pixels
@@ -148,7 +148,7 @@ def surface_points(solids, camera, pixels, with_object):
 def _reaches(solids, camera, with_object, px, py, pz):
     ax, ay, az = px - camera[13], py - camera[14], pz - camera[15]
     far = math.sqrt(ax * ax + ay * ay + az * az)
-    return not blocked(
+    return not is_blocked(
         solids, with_object, camera[13], camera[14], camera[15], ax / far, ay / far, az / far, far - 10 * EPSILON
     )
 
@@ -156,15 +156,15 @@ def _reaches(solids, camera, with_object, px, py, pz):
 @kernel(parallel=True)
 def observations(solids, cameras, width, height, points):
     """Image points [P, V, 2] of room points in V views with the object, NaN where hidden or outside the frame."""
-    found = np.full((points.shape[0], cameras.shape[0], 2), np.nan)
+    pixels = np.full((points.shape[0], cameras.shape[0], 2), np.nan)
     for n in prange(points.shape[0]):
         for v in range(cameras.shape[0]):
             x, y, z = project(cameras[v], points[n, 0], points[n, 1], points[n, 2])
             if z <= 0.0 or x < 0.0 or y < 0.0 or x >= width or y >= height:
                 continue
             if _reaches(solids, cameras[v], True, points[n, 0], points[n, 1], points[n, 2]):
-                found[n, v, 0], found[n, v, 1] = x, y
-    return found
+                pixels[n, v, 0], pixels[n, v, 1] = x, y
+    return pixels
 
 
 @kernel(parallel=True)

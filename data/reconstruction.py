@@ -47,7 +47,7 @@ class SparsePoints:
 
 
 def sparse_points(seed: int, kind: Kind, world: World, cameras: np.ndarray, photos: np.ndarray) -> SparsePoints:
-    """Points on textured surfaces that at least 3 training views see, with errors as of SfM."""
+    """Points on textured surfaces that at least 3 training views see, with errors like those of SfM."""
     draw = randomness(seed, "points")
     per_view = -(-kind.points * 3 // (2 * len(cameras)))
     positions, colors = [], []
@@ -58,7 +58,7 @@ def sparse_points(seed: int, kind: Kind, world: World, cameras: np.ndarray, phot
         colors.append(photo[row, column])
     positions, colors = np.concatenate(positions), np.concatenate(colors)
     tracks = raycast.observations(world.solids, cameras, kind.width, kind.height, positions) * FULL
-    # A feature is matched in some of the views that show it only.
+    # A feature is matched in only some of the views that show it.
     tracks[draw.random(tracks.shape[:2]) > max(0.2, 4 / len(cameras))] = np.nan
     good = np.flatnonzero(np.isfinite(tracks[..., 0]).sum(1) >= 3)
     good = np.sort(draw.permutation(good)[: kind.points])

@@ -13,13 +13,13 @@ def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
     """The furnished room, and the point that the cameras look at."""
     f, draw = Furniture(), randomness(seed, "layout")
     planks = Material("floor", 3.0, turned=bool(draw.integers(2)))
-    if kind.around:
+    if kind.is_circle:
         return f, _round_room(f, draw, planks)
     others = {"table": table_room, "corner": wall_corner, "grass": garden}
     if kind.place in others:
         return f, others[kind.place](f, draw, planks)
     side = draw.choice((-1, 1))  # where the corner is
-    # The corner stands clear of the outermost camera.
+    # The corner does not reach the outermost camera.
     corner = 1.45 + max(0.0, 2.6 * np.sin(np.radians(kind.spread)) - 0.97)
     shell(f, draw, planks, side, corner)
     if kind.place == "floor":

@@ -1,4 +1,4 @@
-"""Boxes, spheres, cylinders and foliage in an enclosed room: where rays meet them, and where on their faces that is.
+"""Boxes, spheres, cylinders and foliage in an enclosed room: intersections with rays, and coordinates on faces.
 
 Room frame: metres, x right, y up, z towards the cameras; the back wall is z = 0.
 """
@@ -96,7 +96,7 @@ def _in_cylinder(ox, oy, oz, dx, dy, dz, radius, half):
 @kernel(inline="always")
 def distance(solids, i, ox, oy, oz, dx, dy, dz):
     """Distance along the ray to solid i, 1e30 if missed. From inside a solid: to its far side."""
-    if solids.kind[i] == THICKET:  # apart from the others: in one function with it they would take twice the time
+    if solids.kind[i] == THICKET:  # a function of its own: in one function all solids would take twice the time
         return _to_thicket(solids, i, ox, oy, oz, dx, dy, dz)
     return _to_solid(solids, i, ox, oy, oz, dx, dy, dz)
 
@@ -149,7 +149,7 @@ def nearest(solids, with_object, ox, oy, oz, dx, dy, dz):
 
 
 @kernel()
-def blocked(solids, with_object, ox, oy, oz, dx, dy, dz, limit):
+def is_blocked(solids, with_object, ox, oy, oz, dx, dy, dz, limit):
     """Is a solid nearer than `limit`? The room itself hides nothing inside it."""
     for i in range(1, solids.kind.shape[0]):
         if solids.removable[i] and not with_object:

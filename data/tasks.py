@@ -34,8 +34,8 @@ def rays(camera: np.ndarray, kind: Kind, world: World) -> tuple[np.ndarray, np.n
     rows, columns = np.mgrid[: kind.height, : kind.width]
     centers = np.stack([columns, rows], -1).reshape(-1, 2) + 0.5
     points, _ = raycast.surface_points(world.solids, camera, centers, True)
-    away = (points - camera[13:]).reshape(kind.height, kind.width, 3)
-    return points.reshape(away.shape), away / np.linalg.norm(away, axis=-1, keepdims=True)
+    offsets = (points - camera[13:]).reshape(kind.height, kind.width, 3)
+    return points.reshape(offsets.shape), offsets / np.linalg.norm(offsets, axis=-1, keepdims=True)
 
 
 def depth(camera: np.ndarray, kind: Kind, world: World, frame: Frame) -> np.ndarray:
@@ -59,10 +59,10 @@ def choose_covering_views(cameras: np.ndarray, kind: Kind, world: World, center:
         depths.append((points - camera[13:]) @ camera[4:13].reshape(3, 3)[:, 2])
         pooled.append(points[outside_sphere(camera, kind, world, center, SPHERE)][::GRID])
     points = np.concatenate(pooled)
-    shown = np.stack([_is_visible(points, *each, kind) for each in zip(cameras, depths, strict=True)])
+    visible = np.stack([_is_visible(points, *each, kind) for each in zip(cameras, depths, strict=True)])
     chosen = [first]
-    while shown[chosen].any(0).mean() < COVERED * shown.any(0).mean():
-        chosen.append(int((shown & ~shown[chosen].any(0)).sum(1).argmax()))
+    while visible[chosen].any(0).mean() < COVERED * visible.any(0).mean():
+        chosen.append(int((visible & ~visible[chosen].any(0)).sum(1).argmax()))
     return chosen
 
 
@@ -72,9 +72,9 @@ def _is_visible(points: np.ndarray, camera: np.ndarray, depth: np.ndarray, kind:
     z = np.maximum(at[:, 2], 1e-6)
     column, row = (np.floor(camera[0] * at[:, k] / z + camera[1 + k]).astype(int) for k in (0, 1))
     framed = (at[:, 2] > 0) & (column >= 0) & (column < kind.width) & (row >= 0) & (row < kind.height)
-    found = np.zeros(len(points), bool)
-    found[framed] = np.abs(at[framed, 2] - depth[row[framed], column[framed]]) < NEAR * at[framed, 2]
-    return found
+    visible = np.zeros(len(points), bool)
+    visible[framed] = np.abs(at[framed, 2] - depth[row[framed], column[framed]]) < NEAR * at[framed, 2]
+    return visible
 
 
 def point_on_axis(camera: np.ndarray, distance: float) -> np.ndarray:

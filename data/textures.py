@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from patterns import blend, cell, fbm, grid, noise, ramp, random_per_cell, rim, shifted, srgb, step
+from patterns import blend, cell, fbm, grid, noise, ramp, random_per_cell, rim, shift, srgb, step
 
 WOODS = (
     ((96, 58, 32), (150, 98, 56), (196, 146, 94)),  # oak
@@ -24,9 +24,9 @@ def wood_planks(rng, size, rows=24, pieces=3, palette=None):
     row, across = cell(y * rows)
     piece, along = cell((x + rng.random(rows)[row]) % 1 * pieces)
     tone, dx, dy = random_per_cell(rng, rows, pieces, row, piece)
-    warp = shifted(noise(rng, size, 4, 4), x + dx, y + dy)
-    grain = shifted(fbm(rng, size, min(128, size // 4), 4, 4), x * 2 + dx, y + dy)
-    fine = shifted(fbm(rng, size, size // 4, 16, 2), x + dy, y + dx)
+    warp = shift(noise(rng, size, 4, 4), x + dx, y + dy)
+    grain = shift(fbm(rng, size, min(128, size // 4), 4, 4), x * 2 + dx, y + dy)
+    fine = shift(fbm(rng, size, size // 4, 16, 2), x + dy, y + dx)
     rings = np.sin(6.28 * ((across - 0.5 + 0.5 * dx) * (2 + 3 * dy) + 1.1 * warp + 0.25 * grain))
     color = ramp(0.5 + 0.55 * (tone - 0.5) + 0.15 * grain + 0.09 * rings + 0.05 * fine, *palette)
     edge = np.minimum(rim(across), rim(along) * (rows / pieces))
@@ -45,7 +45,7 @@ def herringbone(rng, size, cells=32, long=4):
     top = np.where(flat, j, j - (2 * long - 1 - phase))
     along, across = np.where(flat, a - left, b - top) / long, np.where(flat, b - top, a - left)
     tone, dx, dy = random_per_cell(rng, cells, cells, top % cells, left % cells)
-    grain = shifted(fbm(rng, size, min(128, size // 4), 8, 4), along * 0.25 + dx, across * 0.06 + dy)
+    grain = shift(fbm(rng, size, min(128, size // 4), 8, 4), along * 0.25 + dx, across * 0.06 + dy)
     color = ramp(0.5 + 0.5 * (tone - 0.5) + 0.12 * (flat - 0.5) + 0.16 * grain, *palette)
     edge = np.minimum(rim(across), long * rim(along))
     return color * (0.35 + 0.65 * step(0.01, 0.07, edge))[..., None]
@@ -64,8 +64,8 @@ def stone_tiles(rng, size, cells=8):
     x, y = grid(size)
     (i, fx), (j, fy) = cell(x * cells), cell(y * cells)
     tone, dx, dy = random_per_cell(rng, cells, cells, j, i)
-    cloud = shifted(fbm(rng, size, 8, 8, 6), x + dx, y + dy)
-    vein = np.exp(-((shifted(fbm(rng, size, 4, 4, 6), x + dy, y + dx) / 0.09) ** 2))
+    cloud = shift(fbm(rng, size, 8, 8, 6), x + dx, y + dy)
+    vein = np.exp(-((shift(fbm(rng, size, 4, 4, 6), x + dy, y + dx) / 0.09) ** 2))
     color = ramp(0.5 + 0.5 * (tone - 0.5) + 0.17 * cloud - 0.3 * vein, *palette)
     edge = np.minimum(rim(fx), rim(fy))
     joint = srgb(grout) * (0.9 + 0.05 * fbm(rng, size, 64, 64, 3))[..., None]
@@ -89,7 +89,7 @@ def bricks(rng, size, rows=24, columns=8):
     row, fy = cell(y * rows)
     column, fx = cell(x * columns + 0.5 * (row % 2))
     tone, dx, dy = random_per_cell(rng, rows, columns, row, column % columns)
-    rough = shifted(fbm(rng, size, 32, 32, 5), x + dx, y + dy)
+    rough = shift(fbm(rng, size, 32, 32, 5), x + dx, y + dy)
     color = ramp(0.5 + 0.75 * (tone - 0.5) + 0.13 * rough + 0.06 * fbm(rng, size, 4, 4, 3), *palette)
     aspect = rows / columns
     edge = np.minimum(rim(fy), aspect * rim(fx)) + wobble
@@ -231,7 +231,7 @@ def wicker(rng, size, cells=16):
     return ramp(straw, (140, 96, 52), (196, 150, 92), (226, 190, 132)) * (0.3 + 0.7 * shade)[..., None]
 
 
-def painted_front(rng, size, color=(30, 120, 120)):
+def plain_paint_front(rng, size, color=(30, 120, 120)):
     """A cabinet's front, fitted to its face: two doors with sunk panels and brass knobs, a drawer above each."""
     x, y = grid(size)
     base = srgb(color) * (1 + 0.05 * fbm(rng, size, 16, 128, 4))[..., None]
@@ -254,7 +254,7 @@ def painted_front(rng, size, color=(30, 120, 120)):
     return blend(base * light[..., None], brass, knob)
 
 
-def painted(rng, size, color=(30, 120, 120)):
+def plain_paint(rng, size, color=(30, 120, 120)):
     """Brushed paint."""
     relief = 1 + 0.05 * fbm(rng, size, 16, 128, 4) + 0.03 * fbm(rng, size, 4, 4, 3)
     return srgb(color) * relief[..., None]
@@ -291,7 +291,7 @@ def quilt(rng, size, first=(214, 66, 48), second=(240, 226, 196), cells=8):
     return color * (puffed * (1 + 0.06 * fbm(rng, size, 128, 128, 3)))[..., None]
 
 
-def glazed(rng, size, color=(40, 70, 130), bands=(236, 230, 214)):
+def glaze(rng, size, color=(40, 70, 130), bands=(236, 230, 214)):
     """Pottery: a wash with rings, fitted to its face."""
     x, y = grid(size)
     wash = srgb(color) * (1 + 0.1 * fbm(rng, size, 4, 4, 5))[..., None]

@@ -1,7 +1,7 @@
-"""Grass and foliage: a box cut into cells, in each cell a leaf, found by walking along the ray from cell to cell.
+"""Grass and foliage: a box divided into cells with a leaf each. A ray walks from cell to cell.
 
-No leaf is stored: all that it is follows from its cell's number, so a lawn of a hundred thousand blades costs what its
-box costs and a few steps a ray. A leaf never sticks out of its cell, so the first one hit on the walk is the nearest.
+No leaf is stored: its shape follows from the number of its cell, so a lawn of a hundred thousand blades costs as much as
+its box and a few steps per ray. A leaf never sticks out of its cell, so the first one that a ray hits is the nearest.
 Coordinates are those of the box: its centre is the origin, its edges lie along the axes.
 """
 
@@ -13,13 +13,13 @@ import numpy as np
 from compiled import kernel
 
 BARE = 0.12  # share of the cells that hold no leaf
-SKY = (0.36, 0.8, 0.48)  # where most of the light comes from
-SHADE = 0.3  # what a leaf gets of the light that stands edgeways to it
+SKY = (0.36, 0.8, 0.48)  # unit direction of most of the light
+SHADE = 0.3  # share of the light on a leaf that is edge-on to it
 
 
 @kernel(inline="always")
-def _mixed(state):
-    """The next of a sequence of 32-bit numbers without visible order (a xorshift and a multiplication)."""
+def _mix_bits(state):
+    """The next of a sequence of pseudo-random 32-bit numbers (xorshift and multiplication)."""
     state = ((state >> 16) ^ state) * 0x45D9F3B & 0xFFFFFFFF
     state = ((state >> 15) ^ state) * 0x2C1B3C6D & 0xFFFFFFFF
     return (state >> 16) ^ state
@@ -30,18 +30,18 @@ def _leaf(solids, n, i, j, k, leaf):
     """Write cell (i, j, k)'s leaf of solid n to `leaf` [4, 3]: its centre, and the three axes of its ellipsoid, wide,
     long and thin, each of the length 1 / half extent. False for a bare cell."""
     columns, layers = int(solids.leaves[n, 0]), int(solids.leaves[n, 1])
-    state = _mixed(((k * layers + j) * columns + i + 1) * 7919 + int(solids.leaves[n, 7]))
+    state = _mix_bits(((k * layers + j) * columns + i + 1) * 7919 + int(solids.leaves[n, 7]))
     if state < BARE * 4294967296.0:
         return False
-    state = _mixed(state + 1)
+    state = _mix_bits(state + 1)
     turn = 2.0 * math.pi * state / 4294967296.0
-    state = _mixed(state + 2)
+    state = _mix_bits(state + 2)
     lean = solids.leaves[n, 6] * (2.0 * state / 4294967296.0 - 1.0)
     c, s, up, down = math.cos(turn), math.sin(turn), math.cos(lean), math.sin(lean)
     leaf[1, 0], leaf[1, 1], leaf[1, 2] = c, 0.0, -s
     leaf[2, 0], leaf[2, 1], leaf[2, 2] = down * s, up, down * c
     leaf[3, 0], leaf[3, 1], leaf[3, 2] = up * s, -down, up * c
-    # It is shrunk where it would stick out of its cell, and moved about in what room is left.
+    # A leaf that would stick out of its cell shrinks; its place in the cell is random.
     smaller = 1.0
     for axis in range(3):
         half = solids.half[n, axis] / solids.leaves[n, axis]
@@ -49,7 +49,7 @@ def _leaf(solids, n, i, j, k, leaf):
         smaller = min(smaller, half / leaf[0, axis])
     for axis, cell in enumerate((i, j, k)):
         half = solids.half[n, axis] / solids.leaves[n, axis]
-        state = _mixed(state + 3)
+        state = _mix_bits(state + 3)
         room = half - smaller * leaf[0, axis]
         leaf[0, axis] = (2 * cell + 1) * half - solids.half[n, axis] + room * (2.0 * state / 4294967296.0 - 1.0)
     for side in range(3):
@@ -101,9 +101,9 @@ def _crossings(solids, n, axis, cell, wide, o, d):
 
 
 @kernel()
-def first_leaf(solids, n, ox, oy, oz, dx, dy, dz, near, far, least):
-    """Distance along the ray to the first leaf of solid n that is more than `least` away, 1e30 where it meets none;
-    the ray is within the box from `near` to `far`."""
+def first_leaf(solids, n, ox, oy, oz, dx, dy, dz, near, far, min_distance):
+    """Distance along the ray to the first leaf of solid n that is more than `min_distance` away, 1e30 if it meets
+    none; the ray is within the box from `near` to `far`."""
     near = max(near, 0.0)
     i, wide_x = _cell(solids, n, 0, ox + near * dx)
     j, wide_y = _cell(solids, n, 1, oy + near * dy)
@@ -115,14 +115,14 @@ def first_leaf(solids, n, ox, oy, oz, dx, dy, dz, near, far, least):
     while True:
         if _leaf(solids, n, i, j, k, leaf):
             enters, leaves = _in_leaf(leaf, ox, oy, oz, dx, dy, dz)
-            if enters <= leaves and leaves > least:
-                return enters if enters > least else leaves
-        here = min(to_x, to_y, to_z)
-        if here >= far:
+            if enters <= leaves and leaves > min_distance:
+                return enters if enters > min_distance else leaves
+        wall_distance = min(to_x, to_y, to_z)
+        if wall_distance >= far:
             return 1e30
-        if here == to_x:
+        if wall_distance == to_x:
             i, to_x = i + step_x, to_x + every_x
-        elif here == to_y:
+        elif wall_distance == to_y:
             j, to_y = j + step_y, to_y + every_y
         else:
             k, to_z = k + step_z, to_z + every_z
@@ -132,7 +132,7 @@ def first_leaf(solids, n, ox, oy, oz, dx, dy, dz, near, far, least):
 
 @kernel(inline="always")
 def leaf_light(nx, ny, nz):
-    """Share of the light that reaches a leaf by its normal; light shines through leaves, so either side will do."""
+    """Share of the light on a leaf with this normal; light shines through leaves, so the side does not matter."""
     return SHADE + (1.0 - SHADE) * abs(nx * SKY[0] + ny * SKY[1] + nz * SKY[2])
 
 

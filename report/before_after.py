@@ -85,17 +85,18 @@ addEventListener('beforeprint', () => document.querySelectorAll('details').forEa
 
 def before_after_section(job: Job) -> list[str]:
     """Heading and slider, or a sentence that says which stage is missing."""
-    views = {name: found for name in rendered_views(job) if (found := find_pictures(job, name))}
+    views = {name: pictures for name in rendered_views(job) if (pictures := find_pictures(job, name))}
     top = page.heading("Before and after")
     if not views:
         return [top, page.paragraph("None yet: the stage `evaluate` renders the views.")]
     width, height = image_size(next(iter(next(iter(views.values())).values())))
-    count = sum(len(found) for found in views.values())
+    count = sum(len(pictures) for pictures in views.values())
     longest = inline_images.affordable_side(count, MEGABYTES, MIN_SIDE, MAX_SIDE, width / height)
-    kinds = [kind for kind in TITLES if any(kind in found for found in views.values())]
+    kinds = [kind for kind in TITLES if any(kind in pictures for pictures in views.values())]
     rows = load_views(job.folders["evaluate"] / "per_view.csv")
     pairs = [
-        _pair(name, found, rows.get(name, {}), longest, first=k == 0) for k, (name, found) in enumerate(views.items())
+        _pair(name, pictures, rows.get(name, {}), longest, first=k == 0)
+        for k, (name, pictures) in enumerate(views.items())
     ]
     choice = '<p class="choose"><label>view ' + _select(dict.fromkeys(views)) + "</label>"
     choice += '<span><button type="button" aria-label="previous view">‹</button> '
@@ -116,12 +117,12 @@ def find_pictures(job: Job, name: str) -> dict[str, Path]:
     """Kind of picture (`TITLES`) -> file, for the pictures of a view that exist."""
     evaluate = job.folders["evaluate"]
     poses, raw_masks = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))
-    found = {kind: evaluate / kind / f"{name}.png" for kind in TITLES}
+    paths = {kind: evaluate / kind / f"{name}.png" for kind in TITLES}
     views = poses / "views.json"
     if views.is_file():
         clean = name in load_json(views)["test"] and not raw_mask_files(raw_masks, name)
-        found["truth" if clean else "photograph"] = poses / "images" / f"{name}.png"
-    return {kind: path for kind, path in found.items() if path.is_file()}
+        paths["truth" if clean else "photograph"] = poses / "images" / f"{name}.png"
+    return {kind: path for kind, path in paths.items() if path.is_file()}
 
 
 def _left(kinds: list[str]) -> str:
@@ -137,12 +138,12 @@ def _select(options: dict[str, str | None], chosen: str = "") -> str:
     return "<select>" + "".join(lines) + "</select>"
 
 
-def _pair(name: str, found: dict[str, Path], row: dict[str, float], longest: int, first: bool) -> str:
+def _pair(name: str, pictures: dict[str, Path], row: dict[str, float], longest: int, first: bool) -> str:
     """The pictures of a view, stacked. Without JavaScript only the first view is visible."""
-    kinds, images = list(found), []
-    width, height = image_size(found[kinds[0]])
+    kinds, images = list(pictures), []
+    width, height = image_size(pictures[kinds[0]])
     sides = {_left(kinds): "left", kinds[-1]: "right"}
-    for kind, path in found.items():
+    for kind, path in pictures.items():
         side = f' class="{sides[kind]}"' if kind in sides else ""
         source = inline_images.photo_address(load_image(path), longest)
         images.append(f'<img{side} data-kind="{kind}" src="{source}" alt="{TITLES[kind]}">')

@@ -31,15 +31,15 @@ def ellipse_path(cameras: Sequence[Camera], points: np.ndarray, frames: int) -> 
     _, sizes, axes = np.linalg.svd(centers - middle, full_matrices=False)
     radii = np.sqrt(2 / len(centers)) * sizes  # a circle has root mean square radius / sqrt 2 along each axis
     down = np.mean([camera.world_to_camera[1, :3] for camera in cameras], 0)
-    lens, made = cameras[len(cameras) // 2], []
+    lens, path = cameras[len(cameras) // 2], []
     for k in range(frames):
         turn = 2 * np.pi * k / frames
         offset = sum(f(turn) * radius * axis for f, radius, axis in zip((np.cos, np.sin), radii, axes, strict=False))
         pose = look_at(middle + offset, target, down)
-        made.append(
+        path.append(
             Camera(f"flight{k:04d}", lens.width, lens.height, lens.fx, lens.fy, lens.width / 2, lens.height / 2, pose)
         )
-    return made
+    return path
 
 
 def focus_point(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:

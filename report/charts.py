@@ -144,12 +144,12 @@ def _box(point: np.ndarray, place: tuple[float, float], wide: float, high: float
     return np.array([left, y - high / 2, left + wide, y + high / 2])
 
 
-def _cost(box: np.ndarray, place: tuple[float, float], taken: list[np.ndarray], inside) -> float:
+def _cost(box: np.ndarray, place: tuple[float, float], boxes: list[np.ndarray], inside) -> float:
     """Overlap with other boxes in px^2, plus penalties for leaving the axes (largest) and for distance to the point."""
     box = box + np.array([-LABEL_GAP, 0, LABEL_GAP, 0])
     covered = sum(
         max(0, min(box[2], other[2]) - max(box[0], other[0])) * max(0, min(box[3], other[3]) - max(box[1], other[1]))
-        for other in taken
+        for other in boxes
     )
     outside = max(0, inside.x0 - box[0], box[2] - inside.x1) + max(0, inside.y0 - box[1], box[3] - inside.y1)
     return covered + 1000 * outside + 2 * float(np.hypot(*place))

@@ -101,14 +101,14 @@ def save_tradeoff(table: list[dict[str, Any]], path: Path) -> Path | None:
 
 def save_forest(comparison: Comparison, path: Path) -> Path | None:
     """Chart method minus full: in the box, or outside the masks if there is no ground truth inside."""
-    found = {metric: by_method for metric in BOX_SCORES if (by_method := differences_to_full(comparison, metric))}
-    found = found or {
+    differences = {metric: by_method for metric in BOX_SCORES if (by_method := differences_to_full(comparison, metric))}
+    differences = differences or {
         metric: by_method for metric in OUTSIDE_SCORES if (by_method := differences_to_full(comparison, metric))
     }
-    if not found:
+    if not differences:
         return None
     more = {metric for metric, better in SCORES.items() if better == "more"}
-    charts.draw_forest(found, {metric: f"{SHORT[metric]}, minus full" for metric in found}, more, path)
+    charts.draw_forest(differences, {metric: f"{SHORT[metric]}, minus full" for metric in differences}, more, path)
     return path
 
 
@@ -120,10 +120,8 @@ def method_table(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]
     names = [name for name in TITLES if name not in OPTIONAL_COLUMNS or any(row[name] is not None for row in table)]
     best = {}
     most = max(row["scenes"] for row in table)
-    for (
-        name,
-        better,
-    ) in SCORES.items():  # `consistency` has no best (blur is consistent), nor has a mean over fewer scenes
+    # `consistency` has no best (blur is consistent), nor has a mean over fewer scenes.
+    for name, better in SCORES.items():
         values = [round(row[name], DIGITS[name]) for row in table if row[name] is not None and row["scenes"] == most]
         best[name] = (max if better == "more" else min)(values, default=None) if len(values) > 1 else None
     texts, bold = [], []
@@ -143,10 +141,10 @@ def _cell(row: dict[str, Any], name: str) -> str:
 
 def difference_table(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]] | None:
     """Method minus full: the mean, half its interval over views, and over scenes if there are several."""
-    found = [metric for metric in SCORES if any(row[f"{metric}_minus_full"] is not None for row in table)]
+    metrics = [metric for metric in SCORES if any(row[f"{metric}_minus_full"] is not None for row in table)]
     others = [row for row in table if row["method"] != FULL and not row["same_as"]]
-    lines = [[row["method"], *(_signed(row, metric) for metric in found)] for row in others]
-    return (["method", *(SHORT[metric] for metric in found)], lines) if found else None
+    lines = [[row["method"], *(_signed(row, metric) for metric in metrics)] for row in others]
+    return (["method", *(SHORT[metric] for metric in metrics)], lines) if metrics else None
 
 
 def _signed(row: dict[str, Any], metric: str) -> str:
@@ -164,15 +162,15 @@ def extra_tables(comparison: Comparison, table: list[dict[str, Any]]) -> dict[st
     Raises:
         ValueError: FOLDER/published.csv is malformed.
     """
-    found: dict[str, compare_tables.Table] = {}
+    tables: dict[str, compare_tables.Table] = {}
     if len(comparison.scenes) > 1:
         each = {metric: compare_tables.scene_table(comparison, table, metric, DIGITS[metric]) for metric in BOX_SCORES}
-        found |= {f"{SHORT[metric]} in each scene": found_table for metric, found_table in each.items() if found_table}
-    if given := compare_tables.load_published(comparison.data):
+        tables |= {f"{SHORT[metric]} in each scene": scene_table for metric, scene_table in each.items() if scene_table}
+    if published := compare_tables.load_published(comparison.data):
         done = [run for method in comparison.methods for run in comparison.finished_runs(method)]
-        here = " ".join(compare_tables.describe_protocol(done))
-        found["Published, and here"] = compare_tables.published_table(given, table, SHORT, DIGITS, here)
-    return found
+        protocol = " ".join(compare_tables.describe_protocol(done))
+        tables["Published, and here"] = compare_tables.published_table(published, table, SHORT, DIGITS, protocol)
+    return tables
 
 
 # ---------------------------------------------------------------------------------------------------------- words
@@ -232,8 +230,8 @@ def method_facts(run: Run) -> list[str]:
     """Inpainter and perceptual distance of a run in words, from metrics.json or facts.json of its stages."""
     paths = [folder / "facts.json" for folder in run.folders.values()]
     records = [run.metrics, *(load_json(path) for path in paths if path.is_file())]
-    found = {words: facts[key] for facts in records for key, words in FACTS.items() if facts.get(key)}
-    return [f"{run.method}: " + ", ".join(f"{words} {name}" for words, name in found.items()) + "."] if found else []
+    named = {words: facts[key] for facts in records for key, words in FACTS.items() if facts.get(key)}
+    return [f"{run.method}: " + ", ".join(f"{words} {name}" for words, name in named.items()) + "."] if named else []
 
 
 def explain_intervals(comparison: Comparison) -> str:
@@ -247,29 +245,31 @@ def explain_intervals(comparison: Comparison) -> str:
     )
 
 
-def markdown(comparison: Comparison, table: list[dict], drawn: dict[str, Path | None], views: dict[str, Path]) -> str:
+def markdown(
+    comparison: Comparison, table: list[dict], chart_paths: dict[str, Path | None], views: dict[str, Path]
+) -> str:
     header, texts, bold = method_table(table)
     strong = [[f"**{c}**" if b else c for c, b in zip(*line, strict=True)] for line in zip(texts, bold, strict=True)]
     lines = [f"# {comparison.name}: methods compared", "", summary(comparison, table), ""]
     lines += [page.markdown_table(header, strong)]
     for title, further in extra_tables(comparison, table).items():
         lines += [f"## {title}", "", page.markdown_table(*further)]
-    if found := difference_table(table):
+    if differences := difference_table(table):
         lines += [
             "## Difference to the full method",
             "",
             explain_intervals(comparison),
             "",
-            page.markdown_table(*found),
+            page.markdown_table(*differences),
         ]
-    for title, path in drawn.items():
+    for title, path in chart_paths.items():
         lines += [f"![{title}](compare/{path.name})", ""] if path else []
     for view, path in views.items():
         lines += [f"## {view}", "", f"![{view} by every method](compare/{path.name})", ""]
     return "\n".join([*lines, "## Notes", "", *(f"- {note}" for note in table_notes(comparison, table)), ""])
 
 
-def html(comparison: Comparison, table: list[dict], drawn: dict[str, Path | None], views: dict[str, Path]) -> str:
+def html(comparison: Comparison, table: list[dict], chart_paths: dict[str, Path | None], views: dict[str, Path]) -> str:
     header, texts, bold = method_table(table)
     title = f"{comparison.name}: methods compared"
     full = next((number for number, row in enumerate(table) if row["method"] == FULL), None)
@@ -277,11 +277,11 @@ def html(comparison: Comparison, table: list[dict], drawn: dict[str, Path | None
     body += [page.table(header, texts, bold=bold, marked=full)]
     for heading, further in extra_tables(comparison, table).items():
         body += [page.heading(heading), page.table(*further)]
-    for heading, path in drawn.items():
+    for heading, path in chart_paths.items():
         body += [page.heading(heading), page.picture(path, heading, embed=True)] if path else []
-    if found := difference_table(table):
+    if differences := difference_table(table):
         dots = " Orange and blue dots: the interval over views excludes zero. An arrow: beyond the axis."
-        body += [page.paragraph(explain_intervals(comparison) + dots, quiet=True), page.table(*found)]
+        body += [page.paragraph(explain_intervals(comparison) + dots, quiet=True), page.table(*differences)]
     if views:
         body += [page.heading("The same views"), page.paragraph("Crops of the box with a margin.", quiet=True)]
     for view, path in views.items():
@@ -298,11 +298,11 @@ def main() -> None:
     arguments = parser.parse_args()
     try:
         name = arguments.scene.expanduser().resolve().name if arguments.scene else FOLDER_COMPARISON
-        made = make(arguments.runs / name)
+        paths = make(arguments.runs / name)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
-    text = made["md"].read_text(encoding="utf-8")
-    print(text[: text.find("\n\n![")].split("## ")[0].strip(), "", *made.values(), sep="\n")
+    text = paths["md"].read_text(encoding="utf-8")
+    print(text[: text.find("\n\n![")].split("## ")[0].strip(), "", *paths.values(), sep="\n")
 
 
 if __name__ == "__main__":

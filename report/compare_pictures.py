@@ -25,10 +25,10 @@ def save_sheets(comparison: Comparison, out: Path, count: int = 3) -> dict[str, 
     """
     if len(comparison.scenes) == 1:
         return _sheets_of(comparison, comparison.scenes[0], out, "", count)
-    made: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for scene in pick_evenly(list(comparison.scenes), count):
-        made |= _sheets_of(comparison, scene, out, f"{scene}-", 1)
-    return made
+        paths |= _sheets_of(comparison, scene, out, f"{scene}-", 1)
+    return paths
 
 
 def _sheets_of(comparison: Comparison, scene: str, out: Path, prefix: str, count: int) -> dict[str, Path]:
@@ -39,13 +39,13 @@ def _sheets_of(comparison: Comparison, scene: str, out: Path, prefix: str, count
         return {}
     first = next((run for run in runs if run.method == FULL), runs[0])
     boxed = [view for view, row in first.views.items() if all(side in row for side in BOX)]
-    made = {}
+    paths = {}
     for view in pick_evenly(boxed or list(first.views), count):
         cells = _cells(runs, first, view)
         if cells:
-            path = made[f"{prefix}{view}"] = out / f"{prefix}{view}.png"
+            path = paths[f"{prefix}{view}"] = out / f"{prefix}{view}.png"
             save_image(path, arrange_crops([picture for _, picture in cells], [title for title, _ in cells]))
-    return made
+    return paths
 
 
 def _cells(runs: list[Run], first: Run, view: str) -> list[tuple[str, np.ndarray]]:

@@ -62,7 +62,7 @@ def load_published(data: Path | None) -> list[dict[str, str]]:
 
 
 def published_table(
-    rows: list[dict[str, str]], table: list[dict], short: dict[str, str], digits: dict[str, int], here: str
+    rows: list[dict[str, str]], table: list[dict], short: dict[str, str], digits: dict[str, int], protocol: str
 ) -> Table:
     """Header and rows: per metric the published values, then ours with intervals over scenes.
 
@@ -77,7 +77,7 @@ def published_table(
         ]
         ours = [row for row in table if row[metric] is not None]
         lines += [
-            [row["method"], "here", short[metric], format_spread(row, metric, digits[metric]), here] for row in ours
+            [row["method"], "here", short[metric], format_spread(row, metric, digits[metric]), protocol] for row in ours
         ]
     return ["method", "from", "metric", "mean over scenes", "protocol"], lines
 

@@ -26,8 +26,10 @@ def coverage_section(job: Job) -> list[str]:
         f"{_mean([made for _, made, _ in shares.values()]):.0%} of the removed region is made up, averaged over views"
     )
     if covered:
-        bare = [name for name, (_, _, open_) in shares.items() if (open_ or 0) > MIN_UNCOVERED]
-        text += f"; uncovered places: in {len(bare)} views" + (f", {', '.join(bare[:8])}" if bare else "")
+        uncovered = [name for name, (_, _, open_) in shares.items() if (open_ or 0) > MIN_UNCOVERED]
+        text += f"; uncovered places: in {len(uncovered)} views" + (
+            f", {', '.join(uncovered[:8])}" if uncovered else ""
+        )
     else:
         text += "; what stays uncovered is known after the stage `initialize`"
     rows = sorted(shares.items(), key=lambda each: (-(each[1][2] or 0), -each[1][1]))
@@ -44,12 +46,12 @@ def view_shares(job: Job) -> dict[str, tuple[float, float, float | None]]:
     masks, folder = job.folders.get("masks", Path()), job.folders.get("initialize", Path())
     facts = folder / "facts.json"
     open_ = load_json(facts).get("uncovered", {}) if "initialize" in job.folders and facts.is_file() else {}
-    found = {}
+    shares = {}
     for path in sorted((masks / "consistent").glob("*.png")) if "masks" in job.folders else ():
         hidden, invent = load_mask(path), load_mask(masks / "invent" / path.name)
         if hidden.any():
-            found[path.stem] = (hidden.mean(), (invent & hidden).sum() / hidden.sum(), open_.get(path.stem))
-    return found
+            shares[path.stem] = (hidden.mean(), (invent & hidden).sum() / hidden.sum(), open_.get(path.stem))
+    return shares
 
 
 def _mean(values: list[float]) -> float:

@@ -25,17 +25,17 @@ def make(home: Path) -> list[str]:
     Raises:
         ValueError: the stage `evaluate` has not run, or gsply is not installed.
     """
-    finished, out = home / "evaluate" / PLY, home / "export"
-    if not finished.exists():
-        raise ValueError(f"{finished} is missing; `make scene={home.name.split('@')[0]} export` makes it")
+    result, out = home / "evaluate" / PLY, home / "export"
+    if not result.exists():
+        raise ValueError(f"{result} is missing; `make scene={home.name.split('@')[0]} export` makes it")
     poses = stage_folder(home, "poses")
     scene = load_scene(poses)
-    gaussians = load_ply(finished, scene.similarity)
+    gaussians = load_ply(result, scene.similarity)
     save_compressed(out / COMPRESSED, gaussians, scene.similarity)
-    shutil.copyfile(finished, out / PLY)
+    shutil.copyfile(result, out / PLY)
     lines = [f"{out / PLY}: {len(gaussians)} Gaussians of degree {gaussians.sh_degree}, in the scene's own frame"]
-    lines[0] += viewer_caveats(finished, gaussians.antialiased)
-    smaller = finished.stat().st_size / (out / COMPRESSED).stat().st_size
+    lines[0] += viewer_caveats(result, gaussians.antialiased)
+    smaller = result.stat().st_size / (out / COMPRESSED).stat().st_size
     lines.append(f"{out / COMPRESSED}: the same, quantised, {smaller:.1f} times smaller, in PlayCanvas's format")
     save_cameras(out / CAMERAS, scene, IMAGES)
     pictured = [name for name in scene.cameras if has_photograph(poses, name)]

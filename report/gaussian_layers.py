@@ -49,12 +49,12 @@ def load_layers(home: Path, similarity: Similarity) -> GaussianLayers:
     used = {stage for stage, key in load_json(finished / "receipt.json")["needs"].items() if key}
     result = load_ply(finished / "scene.ply", similarity)
     none, states = result.map(lambda p: p[:0]), {}
-    made = [stage_folder(home, stage) for stage in ("initialize", "distill") if stage in used]
-    added = find_added(result, made[-1]) if made else torch.zeros(len(result), dtype=torch.bool)
+    stages = [stage_folder(home, stage) for stage in ("initialize", "distill") if stage in used]
+    added = find_added(result, stages[-1]) if stages else torch.zeros(len(result), dtype=torch.bool)
     kept, new = result.map(lambda p: p[~added]), result.map(lambda p: p[added])
     if "distill" in used:
-        states["initialization"] = split_new(made[0]) if "initialize" in used else (kept, none)
-        states |= {f"step {path.stem}": (kept, load_ply(path)) for path in list_snapshots(made[-1])}
+        states["initialization"] = split_new(stages[0]) if "initialize" in used else (kept, none)
+        states |= {f"step {path.stem}": (kept, load_ply(path)) for path in list_snapshots(stages[-1])}
     states["result"] = kept, new
     return GaussianLayers(states, load_removed(home, used, none))
 

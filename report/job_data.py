@@ -47,9 +47,9 @@ def load_job(home: Path) -> Job:
     plan = load_plan(home)
     names = list(plan or STAGES)
     planned = {s: home.parent / plan[s]["folder"] if plan and plan[s]["folder"] else None for s in plan}
-    found = {stage: planned.get(stage) or sheet.stage_folder(home, stage) for stage in names}
+    stage_folders = {stage: planned.get(stage) or sheet.stage_folder(home, stage) for stage in names}
     skipped = {stage for stage, entry in plan.items() if entry["word"] == "skip"}
-    folders = {s: f for s, f in found.items() if s not in skipped and (f / "receipt.json").exists()}
+    folders = {s: f for s, f in stage_folders.items() if s not in skipped and (f / "receipt.json").exists()}
     if not folders:
         raise ValueError(f"{home}: no stage has been done; run `make scene={home.name} all` first")
     traces, unread = {}, []

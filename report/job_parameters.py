@@ -25,10 +25,10 @@ def flatten_parameters(values: dict[str, Any], prefix: str = "") -> Iterator[tup
 def default_parameters(stage: str) -> dict[str, Any]:
     """Dotted name -> default value; empty for a stage that this code does not know."""
     try:
-        found = import_module(f"reffusion.params.{stage}").Params()
+        params = import_module(f"reffusion.params.{stage}").Params()
     except ModuleNotFoundError:
         return {}
-    return dict(flatten_parameters(found.model_dump(mode="json")))
+    return dict(flatten_parameters(params.model_dump(mode="json")))
 
 
 def command_line_parameters(job: Job) -> dict[str, Any]:
@@ -44,19 +44,23 @@ def command_line_parameters(job: Job) -> dict[str, Any]:
 
 def parameters_section(job: Job) -> list[str]:
     """Table of parameters that differ from the defaults, those set on the command line first."""
-    typed, own, rows = command_line_parameters(job), [], []
+    overrides, override_rows, rows = command_line_parameters(job), [], []
     for stage, receipt in job.receipts.items():
-        usual = default_parameters(stage)
+        defaults = default_parameters(stage)
         for name, value in flatten_parameters(receipt.get("params", {})):
-            if name not in usual or usual[name] != value:
-                rows.append([f"{stage}.{name}", _short(value), _short(usual.get(name))])
-            if f"{stage}.{name}" in typed:
+            if name not in defaults or defaults[name] != value:
+                rows.append([f"{stage}.{name}", _short(value), _short(defaults.get(name))])
+            if f"{stage}.{name}" in overrides:
                 instead = dict(flatten_parameters(job.unset[stage])).get(name)
-                own.append([f"{stage}.{name}", _short(value), _short(instead), _short(usual.get(name))])
+                override_rows.append([f"{stage}.{name}", _short(value), _short(instead), _short(defaults.get(name))])
     top = page.heading("Parameters other than their defaults")
     if not rows:
         return [top, page.paragraph("None.")]
-    parts = [page.table(["set by hand", "value", "instead of", "default"], own, text=(1, 2, 3))] if own else []
+    parts = (
+        [page.table(["set by hand", "value", "instead of", "default"], override_rows, text=(1, 2, 3))]
+        if override_rows
+        else []
+    )
     table = page.table(["", "value", "default"], rows, text=(1, 2))
     who = "by profile, scene.yaml, variant or hand"
     return [top, *parts, f"<details><summary>all {len(rows)}, {who}</summary>{table}</details>"]
@@ -74,8 +78,8 @@ def reproduce_section(job: Job) -> list[str]:
     scene = load_scene_argument(source, name)
     profile = next((receipt["profile"] for receipt in job.receipts.values()), "")
     words = [f"scene={shlex.quote(scene)}", f"profile={profile}", *([f"variant={variant}"] if variant else [])]
-    if typed := command_line_parameters(job):
-        text = " ".join(shlex.quote(f"{key}={json.dumps(value)}") for key, value in typed.items())
+    if overrides := command_line_parameters(job):
+        text = " ".join(shlex.quote(f"{key}={json.dumps(value)}") for key, value in overrides.items())
         words.append(f"set={shlex.quote(text)}")
     line = " ".join(["make", *words, "all"])
     return [page.heading("To do it again"), page.code(line)]

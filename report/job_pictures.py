@@ -170,10 +170,10 @@ def color_disparity(depths: list[np.ndarray]) -> list[np.ndarray]:
     near = [np.where(depth > 0, 1 / np.where(depth > 0, depth, 1.0), np.nan) for depth in depths]
     known = near[0][np.isfinite(near[0])]
     low, high = np.percentile(known, (1, 99)) if len(known) else (0.0, 1.0)
-    made = []
+    pictures = []
     for disparity in near:
         level = np.clip((disparity - low) / max(high - low, 1e-9), 0, 1)
         picture = (colormaps["inferno"](np.nan_to_num(level))[..., :3] * 255).round().astype(np.uint8)
         picture[~np.isfinite(disparity)] = 128
-        made.append(picture)
-    return made
+        pictures.append(picture)
+    return pictures

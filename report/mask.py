@@ -139,8 +139,8 @@ def _mask_png(mask: np.ndarray) -> bytes:
 def stage_command(stage: str, arguments) -> list[str]:
     """Command that runs a stage of a scene that may have no masks yet."""
     options = {"--profile": arguments.profile, "--budget": arguments.budget}
-    typed = [word for name, value in options.items() if value for word in (name, value)]
-    words = ["run", stage, "--scene", str(arguments.scene), "--runs", str(arguments.runs), *typed]
+    flags = [word for name, value in options.items() if value for word in (name, value)]
+    words = ["run", stage, "--scene", str(arguments.scene), "--runs", str(arguments.runs), *flags]
     return [sys.executable, "-m", "reffusion.command", *words, "--set", f"{arguments.set} poses.clicks={{}}"]
 
 

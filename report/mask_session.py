@@ -73,9 +73,9 @@ def load_capture(home: Path) -> Capture:
 
 def load_local_segmenter() -> Segmenter | None:
     """The segmentation network whose weights are on this machine, or None. ValueError if the weights are incomplete."""
-    if (found := load_segmenter()) is not None:
+    if (segmenter := load_segmenter()) is not None:
         print(f"clicks are segmented by {SOURCE}", flush=True)
-    return found
+    return segmenter
 
 
 def file_digest(path: Path) -> str:

@@ -99,8 +99,8 @@ def make(arguments: argparse.Namespace) -> str:
 def run_stages(folder: Path, arguments: argparse.Namespace) -> None:
     """Run all stages. SystemExit with the runner's code if it fails; the runner has printed the reason."""
     options = {"--profile": arguments.profile, "--budget": arguments.budget, "--set": arguments.set}
-    typed = [word for name, value in options.items() if value for word in (name, value)]
-    words = ["run", "all", "--scene", str(folder), "--runs", str(arguments.runs.resolve()), *typed]
+    flags = [word for name, value in options.items() if value for word in (name, value)]
+    words = ["run", "all", "--scene", str(folder), "--runs", str(arguments.runs.resolve()), *flags]
     process = subprocess.Popen([sys.executable, "-m", "reffusion.command", *words])
     try:
         status = process.wait()

@@ -36,11 +36,11 @@ class PatchResult:
 def load_result(home: Path) -> PatchResult:
     """Load runs/<scene> or runs/<scene>@<variant>. ValueError if nothing was deleted, or `evaluate` has not run."""
     require_deleted(home)
-    poses, finished = stage_folder(home, "poses"), home / "evaluate" / "scene.ply"
-    if not finished.exists():
-        raise ValueError(f"{finished} is missing; `make scene={home.name.split('@')[0]} patch` makes it")
+    poses, result = stage_folder(home, "poses"), home / "evaluate" / "scene.ply"
+    if not result.exists():
+        raise ValueError(f"{result} is missing; `make scene={home.name.split('@')[0]} patch` makes it")
     return PatchResult(
-        load_ply(finished, load_scene(poses).similarity), load_labels(result_stage_folder(home) / "labels.npy"), poses
+        load_ply(result, load_scene(poses).similarity), load_labels(result_stage_folder(home) / "labels.npy"), poses
     )
 
 

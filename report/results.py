@@ -27,11 +27,8 @@ OUTSIDE_SCORES = {"psnr_outside": "more", "ssim_outside": "more", "flip_outside"
 SCORES = BOX_SCORES | OUTSIDE_SCORES
 PSNR_CAP = 100.0  # dB, for a view that equals the truth; as in metrics.json
 MEASURED = ("consistency", "seconds", "own_seconds", "peak_memory_mb", "gaussians", "scenes")
-DIFFERENCE_COLUMNS = (  # half intervals; see report.paired_statistics.Difference
-    "minus_full",
-    "interval_views",
-    "interval_scenes",
-)  # see report.paired_statistics.Difference; halves of intervals
+# Mean difference, and half intervals; see report.paired_statistics.Difference.
+DIFFERENCE_COLUMNS = ("minus_full", "interval_views", "interval_scenes")
 COLUMNS = (
     "method",
     "state",
@@ -121,12 +118,12 @@ def _find_same_jobs(
 ) -> dict[str, str]:
     """Method -> an earlier one whose last stage had the same inputs in every scene."""
     first: dict[tuple[str, ...], str] = {}
-    found = {}
+    same_as = {}
     for method in methods:
         keys = tuple(runs[method, scene].receipts.get("evaluate", {}).get("key", "") for scene in scenes)
         if all(keys) and first.setdefault(keys, method) != method:
-            found[method] = first[keys]
-    return found
+            same_as[method] = first[keys]
+    return same_as
 
 
 def load_run(record: dict[str, Any], runs: Path) -> Run:
@@ -184,9 +181,9 @@ def summarize_methods(comparison: Comparison) -> list[dict[str, Any]]:
     table = [_row(comparison, method) for method in comparison.methods]
     table.sort(key=lambda row: (row["same_as"] is not None, row[MAIN] is None, row[MAIN] or 0.0))
     for metric in SCORES:
-        found = differences_to_full(comparison, metric)
+        differences = differences_to_full(comparison, metric)
         for row in table:
-            if difference := found.get(row["method"]):
+            if difference := differences.get(row["method"]):
                 values = (difference.mean, difference.views, difference.scenes)
                 row |= {f"{metric}_{what}": value for what, value in zip(DIFFERENCE_COLUMNS, values, strict=True)}
     return table
@@ -257,7 +254,7 @@ def save_csv(path: Path, rows: list[dict[str, Any]]) -> None:
 
 def differences_to_full(comparison: Comparison, metric: str) -> dict[str, Difference]:
     """Method -> its difference to the full method in a score, over the views that both have."""
-    found = {}
+    differences = {}
     for method in comparison.distinct_methods:
         if method == FULL:
             continue
@@ -267,5 +264,5 @@ def differences_to_full(comparison: Comparison, metric: str) -> dict[str, Differ
             both = [v for v in run.views if metric in run.views[v] and metric in full.views.get(v, {})]
             scenes.append(np.array([run.views[v][metric] - full.views[v][metric] for v in both]))
         if difference := paired_difference(scenes):
-            found[method] = difference
-    return found
+            differences[method] = difference
+    return differences

@@ -54,8 +54,8 @@ def statistics_tables(rows: list[tuple]) -> list[str]:
         )
     names = [name for name in SCORES if name in by_stage[WHOLE_JOB]]
     result = [["result", *(format_quartiles(by_stage[WHOLE_JOB][name], 2 if "psnr" in name else 4) for name in names)]]
-    made = [page.table(["stage", "scenes", "seconds", "peak MB", "error at its end"], lines, text=(4,))]
-    return made + ([page.table(["mean over test views", *names], result)] if names else [])
+    parts = [page.table(["stage", "scenes", "seconds", "peak MB", "error at its end"], lines, text=(4,))]
+    return parts + ([page.table(["mean over test views", *names], result)] if names else [])
 
 
 def format_quartiles(values: tuple, digits: int | None = None) -> str:
@@ -68,17 +68,17 @@ def format_quartiles(values: tuple, digits: int | None = None) -> str:
 
 def main_error_curves(jobs: list[Job]) -> dict[str, tuple[str, list[np.ndarray]]]:
     """Stage -> its main quantity (the one most traces have), and a curve [moments, 2] for each scene that has it."""
-    found: dict[str, tuple[str, list[np.ndarray]]] = {}
+    curves: dict[str, tuple[str, list[np.ndarray]]] = {}
     for stage in dict.fromkeys(stage for job in jobs for stage in job.traces):
         traces = [job.traces[stage][""] for job in jobs if job.traces.get(stage, {}).get("")]
         names = [name for lines in traces for name in trace_charts.pick_errors(stage, lines)[:1]]
         if names:
             name = max(names, key=names.count)
-            found[stage] = (
+            curves[stage] = (
                 name,
                 [points for lines in traces if len(points := trace_charts.quantity_curve(lines, name))],
             )
-    return found
+    return curves
 
 
 def summarize_stages(jobs: list[Job]) -> list[tuple]:

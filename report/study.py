@@ -112,13 +112,13 @@ def _pairs(comparison: Comparison, methods: list[str], frames: int) -> Iterator[
     for scene in comparison.scenes:
         runs = [comparison.runs[method, scene] for method in (FULL, *methods)]
         ours, *others = [run for run in runs if run.state == "done"] if runs[0].state == "done" else [runs[0]]
-        path_clip, found = _render_path(ours, frames), []
+        path_clip, pairs = _render_path(ours, frames), []
         for run in others:
             theirs = _render_path(run, frames) if path_clip else None
             pair = (path_clip, theirs) if theirs else (_load_test_views(ours), _load_test_views(run))
             if all(pair):
-                found.append(pair)
-        yield scene, found
+                pairs.append(pair)
+        yield scene, pairs
 
 
 def _render_path(run: Run, frames: int) -> Clip | None:

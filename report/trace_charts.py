@@ -60,7 +60,7 @@ def draw_stage_chart(stage: str, series: dict[str, Lines], path: Path) -> list[s
     names = pick_errors(stage, [line for lines in series.values() for line in lines])
     if not names:
         return []
-    made, grid = new_figure(3.0, 1, len(names))
+    figure, grid = new_figure(3.0, 1, len(names))
     for axes, name in zip(grid[0], names, strict=True):
         curves = {key: quantity_curve(lines, name) for key, lines in series.items()}
         curves = {key: clamp_first_seconds(points) for key, points in curves.items() if len(points)}
@@ -75,7 +75,7 @@ def draw_stage_chart(stage: str, series: dict[str, Lines], path: Path) -> list[s
         set_time_axis(axes, np.concatenate([points[:, 0] for points in curves.values()]))
         axes.set_title(axis_title(name), fontsize=10, loc="left")
         axes.set_xlabel("seconds of work", fontsize=10)
-    save_chart(made, path)
+    save_chart(figure, path)
     return names
 
 
@@ -137,7 +137,7 @@ def draw_job_chart(
     rows = 2 if curves or ends else 1
     bars = 0.6 + 0.26 * len(seconds)
     ratios = [3.4, bars][-rows:]
-    made, grid = new_figure(sum(ratios), rows, 1, sharex=True, height_ratios=ratios)
+    figure, grid = new_figure(sum(ratios), rows, 1, sharex=True, height_ratios=ratios)
     if rows == 2:
         _errors(grid[0, 0], curves, ends, sum(seconds.values()))
         if ceiling is not None:
@@ -145,7 +145,7 @@ def draw_job_chart(
             words = f"box, a fit to photographs without the object: {ceiling:.2f}"
             annotate(grid[0, 0], words, (0, ceiling), (4, 6))
     _bars(grid[-1, 0], seconds, begins)
-    save_chart(made, path)
+    save_chart(figure, path)
     return begins
 
 
@@ -197,7 +197,7 @@ def quartile_band(curves: Sequence[np.ndarray], count: int = 200) -> tuple[np.nd
 
 def draw_scenes_chart(curves: dict[str, tuple[str, list[np.ndarray]]], path: Path) -> None:
     """One panel per stage: its main error in every scene, with median and quartiles."""
-    made, grid = new_figure(3.3, 1, len(curves))
+    figure, grid = new_figure(3.3, 1, len(curves))
     for axes, (stage, (name, raw)) in zip(grid[0], curves.items(), strict=True):
         lines = [clamp_first_seconds(points) for points in raw]
         for points in lines:
@@ -209,4 +209,4 @@ def draw_scenes_chart(curves: dict[str, tuple[str, list[np.ndarray]]], path: Pat
         annotate(axes, f"{quartiles[1, -1]:.3g}", (moments[-1], quartiles[1, -1]), (5, 0), BLUE)
         axes.set_title(f"{stage}, {len(lines)} scenes\n{axis_title(name)}", fontsize=9, loc="left")
         axes.set_xlabel("seconds of work", fontsize=10)
-    save_chart(made, path)
+    save_chart(figure, path)

@@ -28,11 +28,11 @@ def make(home: Path, frames: int = FRAMES) -> Path:
     Raises:
         ValueError: that stage has not run, or this OpenCV writes no such video.
     """
-    finished = home / "evaluate" / "scene.ply"
-    if not finished.exists():
-        raise ValueError(f"{finished} is missing; `make scene={home.name.split('@')[0]} all` makes it")
+    result = home / "evaluate" / "scene.ply"
+    if not result.exists():
+        raise ValueError(f"{result} is missing; `make scene={home.name.split('@')[0]} all` makes it")
     scene = load_scene(home.with_name(home.name.split("@")[0]) / "poses")
-    gaussians = load_ply(finished, scene.similarity)
+    gaussians = load_ply(result, scene.similarity)
     train = [scene.cameras[name] for name in scene.train]
     path, cameras = home / "turntable.webm", camera_path.ellipse_path(train, scene.points, frames)
     save_video(path, (to_uint8(rasterizer.render(gaussians, camera).color.numpy()) for camera in cameras))

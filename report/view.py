@@ -149,9 +149,9 @@ class Viewer:
         lens = {"fov": vertical_fov(camera), "aspect": camera.width / camera.height}
         look = {"scale": FRUSTUM_SCALE, "thickness": thickness, "color": color}
         add = self.server.scene.add_camera_frustum
-        made = add(f"/{kind}/{camera.name}", **lens, **place, **look, image=small, visible=False)
-        made.on_click(lambda event: move_to_view(event.client.camera, camera, target))
-        return made
+        frustum = add(f"/{kind}/{camera.name}", **lens, **place, **look, image=small, visible=False)
+        frustum.on_click(lambda event: move_to_view(event.client.camera, camera, target))
+        return frustum
 
     def _serve_visitor(self, client: Any) -> None:
         self.requests[client.client_id] = threading.Event()

@@ -48,7 +48,7 @@ def count_votes(answers: list[dict[str, Any]], key: dict[str, Any]) -> tuple[lis
     Raises:
         ValueError: answers of another study, of one participant twice, or to an unknown pair.
     """
-    accepted, left_out, names = [], [], set()
+    accepted, excluded, names = [], [], set()
     for entry in answers:
         name = entry["participant"]
         if entry["study"] != key["study"]:
@@ -59,14 +59,14 @@ def count_votes(answers: list[dict[str, Any]], key: dict[str, Any]) -> tuple[lis
         checks = [answer for answer in entry["answers"] if answer["trial"] in key["checks"]]
         right = [answer["overall"] == key["checks"][answer["trial"]]["right"] for answer in checks]
         if len(right) < len(key["checks"]):
-            left_out.append(f"{name}: not to its end")
+            excluded.append(f"{name}: not to its end")
         elif not all(right):
-            left_out.append(f"{name}: {right.count(False)} of {len(right)} attention checks failed")
+            excluded.append(f"{name}: {right.count(False)} of {len(right)} attention checks failed")
         else:
             accepted.append([answer for answer in entry["answers"] if answer["trial"] not in key["checks"]])
     methods = list(dict.fromkeys(pair["method"] for pair in key["pairs"].values()))
-    found = [_preference(accepted, key, method, question) for method in methods for question in QUESTIONS]
-    return [each for each in found if each], left_out
+    preferences = [_preference(accepted, key, method, question) for method in methods for question in QUESTIONS]
+    return [each for each in preferences if each], excluded
 
 
 def _preference(
@@ -105,7 +105,7 @@ def share_interval(wins: np.ndarray, totals: np.ndarray, seed: int) -> tuple[flo
         wilson = binomtest(round(share * people), people).proportion_ci(LEVEL, "wilson")
         return float(wilson.low), float(wilson.high)
     ratio = lambda won, all_votes, axis=-1: won.sum(axis) / all_votes.sum(axis)
-    found = bootstrap(
+    interval = bootstrap(
         (wins, totals),
         ratio,
         paired=True,
@@ -115,10 +115,10 @@ def share_interval(wins: np.ndarray, totals: np.ndarray, seed: int) -> tuple[flo
         method="percentile",
         rng=np.random.default_rng(seed),
     ).confidence_interval
-    return float(found.low), float(found.high)
+    return float(interval.low), float(interval.high)
 
 
-def preference_table(found: list[Preference]) -> str:
+def preference_table(preferences: list[Preference]) -> str:
     """Markdown table."""
     header = ["preferred to", "question", "share", "95 % interval", "votes", "participants"]
     percent = lambda part: f"{100 * part:.1f} %"
@@ -131,7 +131,7 @@ def preference_table(found: list[Preference]) -> str:
             str(each.votes),
             str(each.participants),
         ]
-        for each in found
+        for each in preferences
     ]
     return page.markdown_table(header, rows)
 
@@ -142,11 +142,11 @@ def main() -> None:
     parser.add_argument("--key", type=Path, required=True, help="runs/X/study-key.json")
     arguments = parser.parse_args()
     try:
-        found, left_out = count_votes([_read(path) for path in arguments.answers], load_json(arguments.key))
+        preferences, excluded = count_votes([_read(path) for path in arguments.answers], load_json(arguments.key))
     except (ValueError, OSError) as error:
         raise SystemExit(f"error: {error}") from None
-    print(preference_table(found), end="")
-    for words in left_out:
+    print(preference_table(preferences), end="")
+    for words in excluded:
         print(f"left out: {words}")
 
 

@@ -51,27 +51,34 @@ def main() -> int:
     parser.add_argument("--write-baselines", action="store_true", help="store the measured values as baselines")
     parser.add_argument("--baselines", type=Path, default=BASELINES)
     parser.add_argument("--only", nargs="+", choices=[*QUICK, "tile", "personalization"], help="these diagrams")
-    given = parser.parse_args()
-    slow = {"tile": splat.tile_diagram, "personalization": lambda: personalization.diagram(given.run, given.out)}
+    arguments = parser.parse_args()
+    slow = {
+        "tile": splat.tile_diagram,
+        "personalization": lambda: personalization.diagram(arguments.run, arguments.out),
+    }
     every = QUICK | slow
-    chosen = given.only or [*QUICK, *(slow if given.slow else ())]
-    baselines = gate.load(given.baselines) if given.gate else None  # a missing file is reported before any work
+    chosen = arguments.only or [*QUICK, *(slow if arguments.slow else ())]
+    baselines = gate.load(arguments.baselines) if arguments.gate else None  # a missing file is reported before any work
     torch.set_num_threads(1)
-    given.out.mkdir(parents=True, exist_ok=True)
+    arguments.out.mkdir(parents=True, exist_ok=True)
     unit, diagrams = gate.machine_unit(), []
     for name in chosen:
         diagram = every[name]()
         diagrams.append(diagram)
-        draw(diagram, given.out / f"{name}.png")
+        draw(diagram, arguments.out / f"{name}.png")
         print(recommendation(diagram), flush=True)
     unit = min(unit, gate.machine_unit())  # the less disturbed measurement
     measured = gate.baseline_table(diagrams, unit)
-    (given.out / "precision.json").write_text(json.dumps(measured, indent=1) + "\n")
-    print(f"pictures and precision.json in {given.out}/; machine unit {1e3 * unit:.1f} ms")
-    if given.write_baselines:
-        old = json.loads(given.baselines.read_text())["diagrams"] if given.only and given.baselines.exists() else {}
+    (arguments.out / "precision.json").write_text(json.dumps(measured, indent=1) + "\n")
+    print(f"pictures and precision.json in {arguments.out}/; machine unit {1e3 * unit:.1f} ms")
+    if arguments.write_baselines:
+        old = (
+            json.loads(arguments.baselines.read_text())["diagrams"]
+            if arguments.only and arguments.baselines.exists()
+            else {}
+        )
         measured["diagrams"] = old | measured["diagrams"]
-        given.baselines.write_text(json.dumps(measured, indent=1) + "\n")
+        arguments.baselines.write_text(json.dumps(measured, indent=1) + "\n")
     worse = gate.regressions(diagrams, unit, baselines) if baselines else []
     for _ in range(RETRIES if worse else 0):  # on a busy machine only repeated slowness counts
         named = {line.split(":")[0] for line in worse}

@@ -38,32 +38,32 @@ def baseline_table(diagrams: list[Diagram], unit: float) -> dict[str, Any]:
 
 def regressions(diagrams: list[Diagram], unit: float, baselines: dict[str, Any]) -> list[str]:
     """One line for each point that is worse than its baseline, or exists on one side only."""
-    found, pace = [], unit / baselines["machine_unit"]
+    lines, pace = [], unit / baselines["machine_unit"]
     for diagram in diagrams:
         if diagram.name not in baselines["diagrams"]:
-            found.append(f"{diagram.name}: no baseline; write one with --write-baselines")
+            lines.append(f"{diagram.name}: no baseline; write one with --write-baselines")
             continue
         known = dict(baselines["diagrams"][diagram.name])
         for point in diagram.points:
             name = f"{point.curve}, {point.setting}"
             if name not in known:
-                found.append(f"{diagram.name}: {name}: no baseline; write one with --write-baselines")
+                lines.append(f"{diagram.name}: {name}: no baseline; write one with --write-baselines")
                 continue
             error, seconds = known.pop(name)
             if point.error > diagram.tolerance * error + LEAST_ERROR:
-                found.append(f"{diagram.name}: {name}: error {point.error:.4g}, baseline {error:.4g}")
+                lines.append(f"{diagram.name}: {name}: error {point.error:.4g}, baseline {error:.4g}")
             if point.seconds > SLOWER * pace * seconds + LEAST_SECONDS:
-                found.append(
+                lines.append(
                     f"{diagram.name}: {name}: {1e3 * point.seconds:.3g} ms, baseline {1e3 * pace * seconds:.3g} ms "
                     "at this machine's speed"
                 )
-        found += [f"{diagram.name}: {name}: is in the baselines and was not measured" for name in known]
-    return found
+        lines += [f"{diagram.name}: {name}: is in the baselines and was not measured" for name in known]
+    return lines
 
 
-def take_faster(diagram: Diagram, again: Diagram) -> Diagram:
+def take_faster(diagram: Diagram, repeated: Diagram) -> Diagram:
     """The diagram with the shorter of two measured times at each point, and the errors of the first."""
-    seconds = {(p.curve, p.setting): p.seconds for p in again.points}
+    seconds = {(p.curve, p.setting): p.seconds for p in repeated.points}
     points = [replace(p, seconds=min(p.seconds, seconds[p.curve, p.setting])) for p in diagram.points]
     return replace(diagram, points=points)
 

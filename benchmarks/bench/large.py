@@ -123,9 +123,9 @@ def time_step(case: Case, clock) -> tuple[float, float]:
     """Milliseconds of one forward and one backward pass."""
     leaves = case.gaussians.map(lambda tensor: tensor.detach().requires_grad_())
     start = clock()
-    drawn = rasterizer.render(leaves, case.camera)
+    rendering = rasterizer.render(leaves, case.camera)
     middle = clock()
-    images = drawn.color, drawn.depth, drawn.alpha
+    images = rendering.color, rendering.depth, rendering.alpha
     torch.autograd.grad(images, [getattr(leaves, n) for n in PARAMETERS], [torch.ones_like(i) for i in images])
     return 1e3 * (middle - start), 1e3 * (clock() - middle)
 

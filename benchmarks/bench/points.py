@@ -54,10 +54,10 @@ class Diagram:
 
     @property
     def curves(self) -> dict[str, list[Point]]:
-        found: dict[str, list[Point]] = {}
+        curves_by_name: dict[str, list[Point]] = {}
         for point in self.points:
-            found.setdefault(point.curve, []).append(point)
-        return found
+            curves_by_name.setdefault(point.curve, []).append(point)
+        return curves_by_name
 
 
 def recommendation(diagram: Diagram) -> str:

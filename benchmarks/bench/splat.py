@@ -57,8 +57,8 @@ def relative(value: torch.Tensor, truth: torch.Tensor) -> float:
 
 def errors(gaussians: Gaussians) -> tuple[float, float]:
     """Relative errors of float32: of the image, and the largest of the gradients."""
-    (drawn, slopes), (color, gradients) = step(gaussians.map(torch.Tensor.float), "cpu"), step(gaussians, "reference")
-    return relative(drawn, color), max(relative(a, b) for a, b in zip(slopes, gradients, strict=True))
+    (picture, slopes), (color, gradients) = step(gaussians.map(torch.Tensor.float), "cpu"), step(gaussians, "reference")
+    return relative(picture, color), max(relative(a, b) for a, b in zip(slopes, gradients, strict=True))
 
 
 def footprint_diagram() -> Diagram:
@@ -95,11 +95,11 @@ def cutoff_diagram() -> Diagram:
         color, gradients = draw()
         for cutoff in CUTOFFS:
             reference.MIN_ALPHA = cutoff
-            drawn, slopes = draw()
+            picture, slopes = draw()
             per_pair = 4.2e-9  # seconds, docs/method.md#splatting: the oracle's own time does not depend on the cut-off
             seconds, name = per_pair * pairs(), f"1/{1 / cutoff:.0f}"
             worst = max(relative(a, b) for a, b in zip(slopes, gradients, strict=True))
-            points.append(Point("image", name, cutoff, relative(drawn, color), seconds))
+            points.append(Point("image", name, cutoff, relative(picture, color), seconds))
             points.append(Point("worst gradient", name, cutoff, worst, seconds, False))
     finally:
         reference.MIN_ALPHA = original
@@ -136,12 +136,12 @@ def tile_diagram() -> Diagram:
 def measured() -> dict[str, tuple[float, float]]:
     """Curve -> (error of the worst gradient, seconds), with the present constants."""
     torch.set_num_threads(1)
-    found = {}
+    diagrams = {}
     for sigma in (1.0, 3.0, 10.0):
         single = scene(sigma).map(torch.Tensor.float)
         seconds = cpu_seconds(lambda single=single: step(single, "cpu"), repeats=9)
-        found[f"footprints of {sigma:g} px"] = (errors(scene(sigma))[1], seconds)
-    return found
+        diagrams[f"footprints of {sigma:g} px"] = (errors(scene(sigma))[1], seconds)
+    return diagrams
 
 
 if __name__ == "__main__":

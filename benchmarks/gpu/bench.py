@@ -75,9 +75,9 @@ class Bench:
 
     def scene(self) -> tuple[Gaussians, Tensor]:
         """Gaussians that fill the view, and labels."""
-        made = full_size.gaussians(self.sizes.gaussians, self.device)
-        masked = torch.rand(len(made), generator=generator(0, "labels")) < 0.1
-        return made, masked.to(self.device)
+        gaussians = full_size.gaussians(self.sizes.gaussians, self.device)
+        masked = torch.rand(len(gaussians), generator=generator(0, "labels")) < 0.1
+        return gaussians, masked.to(self.device)
 
     def measure(self, work: Callable[[], dict[str, float] | None]) -> dict[str, Any]:
         """Median seconds after a warm-up, peak memory of the GPU (or of live tensors), and the values of `work`."""
@@ -89,11 +89,11 @@ class Bench:
             self._wait()
             seconds.append(time.perf_counter() - began)
         peak = memory.peak_bytes(work, self.device)
-        found = {"seconds": float(np.median(seconds)), "peak_gb": peak / 1e9}
+        result = {"seconds": float(np.median(seconds)), "peak_gb": peak / 1e9}
         if self.device == "cuda":
-            found["peak_gb"] += torch.cuda.memory_allocated() / 1e9
-            found["reserved_gb"] = torch.cuda.max_memory_reserved() / 1e9
-        return found | values
+            result["peak_gb"] += torch.cuda.memory_allocated() / 1e9
+            result["reserved_gb"] = torch.cuda.max_memory_reserved() / 1e9
+        return result | values
 
     def _wait(self) -> None:
         if self.device == "cuda":

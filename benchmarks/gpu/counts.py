@@ -38,13 +38,13 @@ class _TrafficCounter(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         result = func(*args, **(kwargs or {}))
-        given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
-        made = [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor)]
-        homes = {leaf.untyped_storage()._cdata for leaf in given}
+        inputs = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+        outputs = [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor)]
+        homes = {leaf.untyped_storage()._cdata for leaf in inputs}
         in_place = func.__name__.split(".")[0].endswith("_")
-        view = made and all(leaf.untyped_storage()._cdata in homes for leaf in made) and not in_place
-        if not view and not any(map(_attention, given + made)):
-            self.bytes += sum(leaf.numel() * leaf.element_size() for leaf in given + made)
+        view = outputs and all(leaf.untyped_storage()._cdata in homes for leaf in outputs) and not in_place
+        if not view and not any(map(_attention, inputs + outputs)):
+            self.bytes += sum(leaf.numel() * leaf.element_size() for leaf in inputs + outputs)
         return result
 
 
@@ -66,29 +66,29 @@ def count_prior(shape: full_size.Shape, name: str) -> dict[str, dict[str, float]
     The UNet, encoding, encoding with its backward pass, decoding, and a personalization sample forward and backward.
     """
     with torch.device("meta"):
-        made = full_size.networks(shape, torch.float16)
-    prior = full_size.assemble_prior(shape, made, "meta")
+        models = full_size.networks(shape, torch.float16)
+    prior = full_size.assemble_prior(shape, models, "meta")
     size, side = prior.native_size, prior.native_size // prior.factor
     image = torch.zeros(1, 3, size, size, device="meta")
     latents = torch.zeros(1, 4, side, side, device="meta")
-    found = {
+    counts = {
         "unet": count_work(lambda: run_unet(prior, latents)),
         "encode": count_work(_without(diffusion.encode, prior, image)),
     }
-    found["decode"] = count_work(_without(diffusion.decode, prior, latents))
+    counts["decode"] = count_work(_without(diffusion.decode, prior, latents))
     if prior.text_encoder_2 is None:  # SDXL only inpaints references
         graded = image.clone().requires_grad_()
-        found["encode and back"] = count_work(lambda: diffusion.encode(prior, graded).sum().backward())
+        counts["encode and back"] = count_work(lambda: diffusion.encode(prior, graded).sum().backward())
         full_size.trainer(prior, 1)
         picture = full_size.reference(size)
-        found["personalize a sample"] = count_work(lambda: denoising.backward_one_sample(prior, [picture], 0))
-    return {f"{name} {part}": each for part, each in found.items()}
+        counts["personalize a sample"] = count_work(lambda: denoising.backward_one_sample(prior, [picture], 0))
+    return {f"{name} {part}": each for part, each in counts.items()}
 
 
-def _without(function: Callable[..., Tensor], *given: Any) -> Callable[[], Tensor]:
+def _without(function: Callable[..., Tensor], *arguments: Any) -> Callable[[], Tensor]:
     def work() -> Tensor:
         with torch.no_grad():
-            return function(*given)
+            return function(*arguments)
 
     return work
 
@@ -161,17 +161,17 @@ def count_adam() -> dict[str, float]:
     return _scaled(count_work(lambda: adam.adam(updates, *given)), GAUSSIANS)
 
 
-def _scaled(found: dict[str, float], count: int) -> dict[str, float]:
+def _scaled(counts: dict[str, float], count: int) -> dict[str, float]:
     """Values per million."""
-    return {name: round(value * 1e6 / count, 5) for name, value in found.items()}
+    return {name: round(value * 1e6 / count, 5) for name, value in counts.items()}
 
 
 def main() -> None:
-    found = count_prior(full_size.SD2, "SD2") | count_prior(full_size.SDXL, "SDXL")
-    found |= {f"critic {width}": count_critic_step(width) for width in (256, 512)}
-    found |= {"depth network": count_depth_network(), "loss, a million pixels": count_pixel_loss()}
-    found["Adam, a million Gaussians"] = count_adam()
-    rows = "".join(f"    {json.dumps(name)}: {json.dumps(each)},\n" for name, each in found.items())
+    counts = count_prior(full_size.SD2, "SD2") | count_prior(full_size.SDXL, "SDXL")
+    counts |= {f"critic {width}": count_critic_step(width) for width in (256, 512)}
+    counts |= {"depth network": count_depth_network(), "loss, a million pixels": count_pixel_loss()}
+    counts["Adam, a million Gaussians"] = count_adam()
+    rows = "".join(f"    {json.dumps(name)}: {json.dumps(each)},\n" for name, each in counts.items())
     print('"""TFLOP and GB of the parts of a step: made by `python -m benchmarks.gpu.counts`."""')
     print(f"\nCOUNTS = {{\n{rows}}}")
 

@@ -37,24 +37,24 @@ def render_with_gradients(
     features, background = place(random(len(scene), 3)), place(torch.tensor([0.2, 0.3, 0.4]))
     probe = place(torch.zeros(len(scene), 2))
     picture = rasterizer.render(leaf, camera, features=features, background=background, probe=probe, impl=impl)
-    shown = {name: getattr(picture, name) for name in ("color", "depth", "alpha", "features")}
-    loss = sum((image * random(*image.shape)).sum() for image in shown.values())
+    images = {name: getattr(picture, name) for name in ("color", "depth", "alpha", "features")}
+    loss = sum((image * random(*image.shape)).sum() for image in images.values())
     names = (*PARAMETERS, "features", "background", "probe")
     leaves = (*(getattr(leaf, name) for name in PARAMETERS), features, background, probe)
     slopes = torch.autograd.grad(loss, leaves)
-    found = {name: image.detach() for name, image in shown.items()}
-    found |= {f"gradient of {name}": slope for name, slope in zip(names, slopes, strict=True)}
+    results = {name: image.detach() for name, image in images.items()}
+    results |= {f"gradient of {name}": slope for name, slope in zip(names, slopes, strict=True)}
     values, still = random(camera.height, camera.width, 2), leaf.map(Tensor.detach)
-    found["weights"] = rasterizer.accumulate(still, camera, values, impl=impl)
-    found["counts"] = rasterizer.accumulate(still, camera, torch.ones_like(values), impl=impl, count=True)
-    return {name: tensor.cpu().double() for name, tensor in found.items()}
+    results["weights"] = rasterizer.accumulate(still, camera, values, impl=impl)
+    results["counts"] = rasterizer.accumulate(still, camera, torch.ones_like(values), impl=impl, count=True)
+    return {name: tensor.cpu().double() for name, tensor in results.items()}
 
 
-def compare_blocks(found: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Any]:
+def compare_blocks(results: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Any]:
     """Relative errors: of images the one that only `FLIPPED` of the values exceed, over the maximum; else by norm."""
     errors, limits = {}, {}
     for name, true in truth.items():
-        difference = (found[name] - true).abs()
+        difference = (results[name] - true).abs()
         if name in ("color", "depth", "alpha", "features"):
             nearly_all = difference.flatten().sort().values[int((1 - FLIPPED) * (difference.numel() - 1))]
             errors[name], limits[name] = float(nearly_all / true.abs().max().clamp_min(1e-12)), VALUES
@@ -72,8 +72,8 @@ def check_splatting(bench: Bench, antialiased: bool = False, crop: bool = False)
     camera = camera.cropped(width // 3, height // 4, width // 3, height // 3) if crop else camera
     scene = replace(full_size.gaussians(count, "cpu").map(Tensor.detach), antialiased=antialiased)
     impl = "cuda" if bench.device == "cuda" else "cpu"
-    found = render_with_gradients(bench, scene, camera, impl, torch.float32)
-    return compare_blocks(found, render_with_gradients(bench, scene, camera, "reference", torch.float64))
+    results = render_with_gradients(bench, scene, camera, impl, torch.float32)
+    return compare_blocks(results, render_with_gradients(bench, scene, camera, "reference", torch.float64))
 
 
 def check_similarity(bench: Bench) -> dict[str, Any]:

@@ -129,12 +129,12 @@ def networks(shape: Shape, dtype: torch.dtype) -> dict[str, torch.nn.Module]:
     before = torch.get_default_dtype()
     torch.set_default_dtype(dtype)
     try:
-        made = {"unet": UNet2DConditionModel(**shape.unet)}
+        models = {"unet": UNet2DConditionModel(**shape.unet)}
         for name, kind, text in zip(("text_encoder", "text_encoder_2"), kinds, shape.texts, strict=False):
-            made[name] = kind(CLIPTextConfig(**text))
+            models[name] = kind(CLIPTextConfig(**text))
     finally:
         torch.set_default_dtype(before)
-    return made | {"vae": AutoencoderKL(**shape.vae)}
+    return models | {"vae": AutoencoderKL(**shape.vae)}
 
 
 def count_parameters(shape: Shape) -> int:
@@ -149,8 +149,8 @@ def peak_memory(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
     Attention is decomposed there, so GPU kernels need less.
     """
     with torch.device("meta"):
-        made = networks(shape, dtype)
-    prior = assemble_prior(shape, made, "meta")
+        models = networks(shape, dtype)
+    prior = assemble_prior(shape, models, "meta")
     picture = reference(prior.native_size)
     steps = {"inpainting": memory.inpaint_one_sample, "SDS": memory.encode_one_sample}
     sizes = {"weights": prior.bytes}
@@ -168,11 +168,11 @@ def build_prior(shape: Shape, dtype: torch.dtype, device: str = "cpu", seed: int
     """A prior with random weights, created on the device; equal seeds give equal weights there."""
     with torch.random.fork_rng(), torch.device(device):
         torch.manual_seed(seed)
-        made = networks(shape, dtype)
-    return assemble_prior(shape, made, device)
+        models = networks(shape, dtype)
+    return assemble_prior(shape, models, device)
 
 
-def assemble_prior(shape: Shape, made: dict[str, torch.nn.Module], device: str) -> Prior:
+def assemble_prior(shape: Shape, models: dict[str, torch.nn.Module], device: str) -> Prior:
     """Prior from networks, the embedded prior's tokenizer (words do not matter here) and SD2's schedule."""
     from diffusers import DDIMScheduler
     from transformers import CLIPTokenizer
@@ -182,9 +182,17 @@ def assemble_prior(shape: Shape, made: dict[str, torch.nn.Module], device: str) 
     schedule = DDIMScheduler(
         beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", clip_sample=False, steps_offset=1
     )
-    second = made.get("text_encoder_2")
+    second = models.get("text_encoder_2")
     return make_prior(
-        made["unet"], made["vae"], made["text_encoder"], tokens, schedule, device, "random weights", second, tokens
+        models["unet"],
+        models["vae"],
+        models["text_encoder"],
+        tokens,
+        schedule,
+        device,
+        "random weights",
+        second,
+        tokens,
     )
 
 
@@ -224,8 +232,8 @@ def epsilon(prior: Prior) -> torch.Tensor:
     """The prior's answer to fixed noise, a fixed picture and a prompt, compared before and after saving."""
     side, draw = prior.native_size // prior.factor, generator(0, "epsilon")
     channels = prior.vae.config.latent_channels
-    noisy, shown = (torch.randn(1, channels, side, side, generator=draw).to(prior.device) for _ in range(2))
-    condition = torch.cat([torch.ones_like(noisy[:, :1]), shown], 1)
+    noisy, blanked = (torch.randn(1, channels, side, side, generator=draw).to(prior.device) for _ in range(2))
+    condition = torch.cat([torch.ones_like(noisy[:, :1]), blanked], 1)
     at = torch.tensor([500], device=prior.device)
     return diffusion.raw_prediction(prior, noisy, at, condition, diffusion.embed_text(prior, [crops.PROMPTS[0]])).cpu()
 
@@ -247,8 +255,8 @@ def gaussians(number: int, device: str, degree: int = 3) -> Gaussians:
     means = torch.cat([rand(number, 2) * 2.4 - 1.2, 2 + rand(number, 1)], 1)
     sizes = torch.full((number, 3), float(np.log(2.0 / number**0.5))) + 0.3 * rand(number, 3)
     harmonics = torch.cat([rand(number, 1, 3) - 0.5, 0.1 * (rand(number, (degree + 1) ** 2 - 1, 3) - 0.5)], 1)
-    made = Gaussians(means, rand(number, 4) - 0.5, sizes, 2 * rand(number), harmonics)
-    return made.map(lambda p: p.to(device).requires_grad_(True))
+    cloud = Gaussians(means, rand(number, 4) - 0.5, sizes, 2 * rand(number), harmonics)
+    return cloud.map(lambda p: p.to(device).requires_grad_(True))
 
 
 def sds_step(

@@ -17,11 +17,11 @@ from reffusion.io.machine import Machine, detect, find_missing
 COMPILER_GB = 1.0  # memory of one compiler; gsplat's largest file takes 0.85
 
 
-def refusal_reasons(here: Machine, before: bool) -> list[str]:
+def refusal_reasons(machine: Machine, before_install: bool) -> list[str]:
     """Reasons why CUDA jobs cannot run here, one line each."""
-    if here.driver is None and here.gpu is None:
+    if machine.driver is None and machine.gpu is None:
         return ["there is no NVIDIA driver on this machine: nothing to do; profile=laptop needs no GPU"]
-    return find_missing(here, splats=not before)
+    return find_missing(machine, splats=not before_install)
 
 
 def compiler_jobs(cores: int, free_gb: float) -> int:
@@ -33,8 +33,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--before", action="store_true", help="check driver and torch only, load nothing")
     before = parser.parse_args().before
-    if found := refusal_reasons(detect(), before):
-        print(f"error: {'; '.join(found)}", file=sys.stderr)
+    if reasons := refusal_reasons(detect(), before):
+        print(f"error: {'; '.join(reasons)}", file=sys.stderr)
         return 2
     if before:
         return 0

@@ -24,19 +24,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/stability.json"))
     parser.add_argument("--only", default="", help="only cases whose name contains this")
-    given = parser.parse_args()
-    cases = [case for case in all_cases() if given.only in case.name]
+    arguments = parser.parse_args()
+    cases = [case for case in all_cases() if arguments.only in case.name]
     if not cases:
-        parser.error(f"no case's name contains {given.only!r}")
+        parser.error(f"no case's name contains {arguments.only!r}")
     torch.set_num_threads(1)  # tiny scenes: other threads would only wait
     rows = []
     for case in cases:
         rows.append(run(case))
         print(format_row(rows[-1]), flush=True)
-    given.out.parent.mkdir(parents=True, exist_ok=True)
-    given.out.write_text(json.dumps([row._asdict() for row in rows], indent=1) + "\n")
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(json.dumps([row._asdict() for row in rows], indent=1) + "\n")
     bad = [row.case for row in rows if not row.ok]
-    print(f"{len(rows) - len(bad)} of {len(rows)} cases within bound; {given.out}")
+    print(f"{len(rows) - len(bad)} of {len(rows)} cases within bound; {arguments.out}")
     return 1 if bad else 0
 
 

@@ -37,8 +37,8 @@ def robust_error(outliers: float) -> float:
 def robust_difference() -> float:
     """Without outliers: difference of the robust line from plain L2, in L2's standard errors at the range's end."""
     x, y, _ = make_samples(0.0)
-    apart = alignment.align(x, y, robust=True).apply(x) - alignment.align(x, y).apply(x)
-    return float(np.abs(apart).max() / (NOISE * 2.0 / np.sqrt(len(x))))
+    difference = alignment.align(x, y, robust=True).apply(x) - alignment.align(x, y).apply(x)
+    return float(np.abs(difference).max() / (NOISE * 2.0 / np.sqrt(len(x))))
 
 
 def two_lines_error() -> float:
@@ -114,8 +114,8 @@ def count_invalid_depths() -> float:
     disparity = np.linspace(-0.5, 2.0, 120).reshape(12, 10)
     known = disparity > 0.1
     depth = np.where(known, 1.0 / np.where(known, disparity, 1.0), 0.0)
-    found = alignment.align_depth(disparity, depth, known)
-    return float((~(np.isfinite(found) & (found > 0))).sum())
+    aligned = alignment.align_depth(disparity, depth, known)
+    return float((~(np.isfinite(aligned) & (aligned > 0))).sum())
 
 
 def plain_condition() -> float:

@@ -95,13 +95,13 @@ def half_precision_error(dtype: torch.dtype) -> float:
     """The prior in half precision against float32: relative L2 of eps at the first and the last timestep."""
     mask, worst = torch.ones(1, 1, SIZE, SIZE), 0.0
     for t in (0, model().timesteps - 1):
-        found = []
+        errors = []
         for kind in (torch.float32, dtype):
             with torch.no_grad():
                 condition = diffusion.conditioning(model(kind), images(), mask)
                 noisy = normal(1, condition.shape[1] - 1, *condition.shape[-2:])
-                found.append(diffusion.predict(model(kind), noisy, torch.tensor([t]), condition, prompts()[:1])[0])
-        worst = nan_safe_max(worst, ((found[1] - found[0]).norm() / found[0].norm()).item())
+                errors.append(diffusion.predict(model(kind), noisy, torch.tensor([t]), condition, prompts()[:1])[0])
+        worst = nan_safe_max(worst, ((errors[1] - errors[0]).norm() / errors[0].norm()).item())
     return worst
 
 
@@ -116,12 +116,12 @@ def sds_error(t: int, dtype: torch.dtype) -> float:
     noisy = a * latents.double() + s * noise.double()
     exact = {"x0": latents.double() - a * noisy, "sigma2": s**2 * (s * noisy - noise), "one": s * noisy - noise}
     for weighting, truth in exact.items():
-        found = sds.sds_gradient(
+        gradient = sds.sds_gradient(
             latents, lambda z, _: (s.to(z) * z, a.to(z) * z), times, noise, abar, weighting=weighting
         )
         # Each is a difference of numbers of order one (at t = 0, or at T-1), relative to which its error is measured.
         size = {"x0": latents.double(), "sigma2": s**2 * noise.double(), "one": noise.double()}[weighting].norm()
-        worst = nan_safe_max(worst, ((found.double() - truth).norm() / size).item())
+        worst = nan_safe_max(worst, ((gradient.double() - truth).norm() / size).item())
     return worst
 
 
@@ -129,8 +129,8 @@ def empty_mask_gradient() -> float:
     """Largest SDS gradient under an empty mask."""
     latents, noise, abar = normal(2, 4, 8, 8), normal(2, 4, 8, 8, label="noise"), model().alphas_cumprod
     times, nothing = torch.tensor([3, 700]), torch.zeros(2, 1, 8, 8)
-    found = sds.sds_gradient(latents, lambda z, _: (z, z), times, noise, abar, keep_contrast=True, mask=nothing)
-    return found.abs().max().item()
+    gradient = sds.sds_gradient(latents, lambda z, _: (z, z), times, noise, abar, keep_contrast=True, mask=nothing)
+    return gradient.abs().max().item()
 
 
 def full_mask_leak() -> float:
@@ -144,8 +144,8 @@ def empty_mask_error() -> float:
     """With an empty mask the conditioning must equal the picture's latents bit for bit."""
     with torch.no_grad():
         condition = diffusion.conditioning(model(), images(), torch.zeros(1, 1, SIZE, SIZE))
-        apart = condition[:, 1:] - diffusion.encode(model(), images())
-    return nan_safe_max(condition[:, :1].abs().max().item(), apart.abs().max().item())
+        difference = condition[:, 1:] - diffusion.encode(model(), images())
+    return nan_safe_max(condition[:, :1].abs().max().item(), difference.abs().max().item())
 
 
 def refuse_empty_window() -> float:
@@ -168,8 +168,8 @@ def count_bad_gradients(low: float, high: float, guidance: float) -> float:
 def count_out_of_range() -> float:
     """Inpainting in one step with a full mask: pixels that are outside [-1, 1] or NaN."""
     full, draws = torch.ones(1, 1, SIZE, SIZE), seeding.generator(0)
-    found = diffusion.sample(model(), images(), full, prompts()[:1], 1, draws, 100.0, prompts()[2:])
-    return float((~(found.abs() <= 1)).sum())
+    sample = diffusion.sample(model(), images(), full, prompts()[:1], 1, draws, 100.0, prompts()[2:])
+    return float((~(sample.abs() <= 1)).sum())
 
 
 # ------------------------------------------------------------------------------------------ discriminator
@@ -217,8 +217,8 @@ def flat_critic_penalty() -> float:
     patches = torch.rand(4, 3, 16, 16, generator=seeding.generator(1)).requires_grad_()
     penalty = discriminator.gradient_penalty(flat(patches), patches)
     slopes = torch.autograd.grad(penalty, list(flat.parameters()), allow_unused=True)
-    found = [penalty.item(), *(slope.abs().max().item() for slope in slopes if slope is not None)]
-    return nan_safe_max(*found)
+    values = [penalty.item(), *(slope.abs().max().item() for slope in slopes if slope is not None)]
+    return nan_safe_max(*values)
 
 
 def count_invalid_scores() -> float:

@@ -45,7 +45,7 @@ def fold_filter_naively(log_scales: np.ndarray, logits: np.ndarray, sizes: np.nd
 
 def change_result(change: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """Correct function -> one whose result is changed."""
-    return lambda right: lambda *given: change(right(*given))
+    return lambda right: lambda *arguments: change(right(*arguments))
 
 
 def log_of_sigmoid(real: torch.Tensor, fake: torch.Tensor) -> torch.Tensor:
@@ -78,7 +78,7 @@ FAULTS = (
               z, denoise, t, noise, alphas.to(z), weighting=weighting),
           "timestep 0, half precision, score distillation"),
     Fault("guidance of a instead of 1 + a", "reffusion.prior.diffusion", "guided",
-          lambda right: lambda *given: (right(*given)[0] - right(*given[:-1], 0)[0], right(*given)[1]),
+          lambda right: lambda *arguments: (right(*arguments)[0] - right(*arguments[:-1], 0)[0], right(*arguments)[1]),
           "guidance 100, equal prompts"),
     Fault("a tie that masks", "reffusion.masks.voting", "label_gaussians",
           lambda right: lambda votes, tau=1.0: votes.masked >= tau * votes.unmasked, "masks contradicting"),

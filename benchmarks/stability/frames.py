@@ -124,16 +124,16 @@ def position_error(extent: float, offset: float) -> float:
     """Largest error of exported positions, in extents."""
     scene, gaussians, _ = fit_scene(extent, offset)
     table = export_vertices(extent, offset)
-    found = np.stack([table[axis] for axis in "xyz"], 1).astype(np.float64)
-    return float(np.abs(found - scene.similarity.invert(gaussians.means.numpy())).max() / extent)
+    positions = np.stack([table[axis] for axis in "xyz"], 1).astype(np.float64)
+    return float(np.abs(positions - scene.similarity.invert(gaussians.means.numpy())).max() / extent)
 
 
 def scale_error(extent: float, offset: float) -> float:
     """Largest error of an exported log-scale."""
     scene, gaussians, _ = fit_scene(extent, offset)
     table = export_vertices(extent, offset)
-    found = np.stack([table[f"scale_{k}"] for k in range(3)], 1).astype(np.float64)
-    return float(np.abs(found - (gaussians.log_scales.double().numpy() - math.log(scene.similarity.scale))).max())
+    scales = np.stack([table[f"scale_{k}"] for k in range(3)], 1).astype(np.float64)
+    return float(np.abs(scales - (gaussians.log_scales.double().numpy() - math.log(scene.similarity.scale))).max())
 
 
 def export_picture_error(extent: float, offset: float) -> float:

@@ -35,26 +35,26 @@ def flat(value: float, height: int = 24, width: int = 32) -> np.ndarray:
 
 def identical() -> float:
     """PSNR infinite, SSIM 1, FLIP 0, and 100 dB in a mean: how many of the four are not."""
-    found = image_metrics.score(picture(), picture())
-    good = found["psnr"] == math.inf, abs(found["ssim"] - 1) < 1e-12, found["flip"] == 0
-    return float(4 - sum(good) - (image_metrics.mean([found["psnr"]]) == image_metrics.PSNR_CAP))
+    scores = image_metrics.score(picture(), picture())
+    good = scores["psnr"] == math.inf, abs(scores["ssim"] - 1) < 1e-12, scores["flip"] == 0
+    return float(4 - sum(good) - (image_metrics.mean([scores["psnr"]]) == image_metrics.PSNR_CAP))
 
 
 def constant_ssim() -> float:
     """Of two constant images SSIM is its luminance term, (2ab + C1) / (a^2 + b^2 + C1); difference."""
-    apart = 0.0
+    worst = 0.0
     for a, b in ((0.0, 1.0), (0.25, 0.75), (0.0, 0.0), (1.0, 1.0)):
-        apart = nan_safe_max(apart, abs(image_metrics.ssim(flat(a), flat(b)) - (2 * a * b + C1) / (a * a + b * b + C1)))
-    return apart
+        worst = nan_safe_max(worst, abs(image_metrics.ssim(flat(a), flat(b)) - (2 * a * b + C1) / (a * a + b * b + C1)))
+    return worst
 
 
 def constant_psnr() -> float:
     """-20 log10 of the difference, also where that is a grey level of 2^-24; relative error."""
-    apart = 0.0
+    worst = 0.0
     for step in (1.0, 0.5, 2.0**-8, 2.0**-24):
         missed = abs(image_metrics.psnr(flat(0.0), flat(step)) + 20 * math.log10(step))
-        apart = nan_safe_max(apart, missed / max(1, -math.log2(step)))
-    return apart
+        worst = nan_safe_max(worst, missed / max(1, -math.log2(step)))
+    return worst
 
 
 def constant_flip() -> float:
@@ -66,8 +66,8 @@ def constant_flip() -> float:
 def one_pixel() -> float:
     """PSNR and FLIP of 1 x 1 px are finite numbers, SSIM has none: how many of the three are wrong."""
     black, grey = flat(0.0, 1, 1), flat(0.5, 1, 1)
-    found = image_metrics.score(black, grey)
-    good = abs(found["psnr"] + 20 * math.log10(0.5)) < 1e-9, 0 < found["flip"] <= 1, found["ssim"] is None
+    scores = image_metrics.score(black, grey)
+    good = abs(scores["psnr"] + 20 * math.log10(0.5)) < 1e-9, 0 < scores["flip"] <= 1, scores["ssim"] is None
     return float(3 - sum(good))
 
 
@@ -123,9 +123,9 @@ def loss_of_one_pixel() -> float:
 # -------------------------------------------------------------------------------------------------- masks
 
 
-def count_labelled(given: dict[str, np.ndarray]) -> float:
+def count_labelled(masks: dict[str, np.ndarray]) -> float:
     """Number of visible Gaussians that are labelled as the object."""
-    return float(voting.label_gaussians(voting.cast_votes(cloud(), NAMED, given)).sum())
+    return float(voting.label_gaussians(voting.cast_votes(cloud(), NAMED, masks)).sum())
 
 
 def count_seen() -> int:
@@ -160,10 +160,10 @@ def empty_scene_errors() -> float:
     nobody = cloud().map(lambda p: p[:0])
     views = visibility.render_depth_views(nobody, NAMED, {view.name: FULL for view in NAMED})
     planes = continuation.find_planes(np.zeros(3), 1.0, views, np.zeros((0, 3)))
-    found = unobserved.find_unobserved(nobody, NAMED[0], FULL, views, planes)
-    said = visibility.count_views(np.zeros((1, 3)), views)
+    pixels = unobserved.find_unobserved(nobody, NAMED[0], FULL, views, planes)
+    counts = visibility.count_views(np.zeros((1, 3)), views)
     return float(
-        (~found.unobserved).sum() + np.isfinite(found.continued_depth).sum() + said.seen.sum() + said.free.sum()
+        (~pixels.unobserved).sum() + np.isfinite(pixels.continued_depth).sum() + counts.seen.sum() + counts.free.sum()
     )
 
 

@@ -60,13 +60,13 @@ def fast_fit_fails(factor: float) -> float:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         try:
-            found = fit(
+            result = fit(
                 list(scene.cameras.values()), frames.render_photographs(), start, settings, folder=folder, rates=rates
             )
         except FloatingPointError as error:
             return float(not (names_step_and_term(error, "reconstruction") and is_trace_finite(folder)))
-        finite = all(torch.isfinite(getattr(found, n)).all() for n in PARAMETERS)
-        return float(not (finite and is_trace_finite(folder) and (psnr(found) > psnr(start) or factor > 100)))
+        finite = all(torch.isfinite(getattr(result, n)).all() for n in PARAMETERS)
+        return float(not (finite and is_trace_finite(folder) and (psnr(result) > psnr(start) or factor > 100)))
 
 
 def fast_distillation_fails(factor: float) -> float:
@@ -86,11 +86,11 @@ def fast_distillation_fails(factor: float) -> float:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         try:
-            found, _ = distill(start, masked, inputs, settings, folder, rates)
+            result, _ = distill(start, masked, inputs, settings, folder, rates)
         except FloatingPointError as error:
             return float(not (names_step_and_term(error, "re") and is_trace_finite(folder)))
-        finite = all(torch.isfinite(getattr(found, n)).all() for n in PARAMETERS)
-        return float(not (finite and is_trace_finite(folder) and psnr(found) > psnr(start)))
+        finite = all(torch.isfinite(getattr(result, n)).all() for n in PARAMETERS)
+        return float(not (finite and is_trace_finite(folder) and psnr(result) > psnr(start)))
 
 
 def empty_scene_errors() -> float:

@@ -51,15 +51,15 @@ def render_with_gradients(gaussians: Gaussians, camera: Camera, impl: str, seed:
     features, background, probe = leaf(normal(count, CHANNELS)), leaf(normal(3)), leaf(torch.zeros(count, 2))
     extras = {"features": features, "background": background, "probe": probe}
     if impl == "cpu":
-        drawn = rasterizer.render(gaussians, camera, impl="cpu", **extras)
-        images, radii = {name: getattr(drawn, name) for name in IMAGES}, drawn.radii
+        rendering = rasterizer.render(gaussians, camera, impl="cpu", **extras)
+        images, radii = {name: getattr(rendering, name) for name in IMAGES}, rendering.radii
     else:
         images, radii = _render_reference(blended, gaussians, camera, **extras)
     units = {"depth": far}
     loss = sum((image * normal(*image.shape)).sum() / units.get(name, 1.0) for name, image in images.items())
     leaves = [*(getattr(gaussians, name) for name in PARAMETERS), features, background, probe]
-    found = torch.autograd.grad(loss, leaves, allow_unused=True)
-    gradients = {n: torch.zeros_like(x) if g is None else g for n, x, g in zip(BLOCKS, leaves, found, strict=True)}
+    slopes = torch.autograd.grad(loss, leaves, allow_unused=True)
+    gradients = {n: torch.zeros_like(x) if g is None else g for n, x, g in zip(BLOCKS, leaves, slopes, strict=True)}
     return Rendered({name: image.detach() for name, image in images.items()}, gradients, radii)
 
 
@@ -111,7 +111,7 @@ def errors(gaussians: Gaussians, camera: Camera, relative: float, seed: int = 0)
     if not torch.equal(fast.radii, exact.radii):
         return {"radii": float("inf")}
     lengths = gaussians.quaternions.double().norm(dim=1, keepdim=True)
-    found = {}
+    by_name = {}
     for kind, here, there in (
         ("values", fast.images, exact.images),
         ("gradients", *_scale_quaternions(fast, exact, lengths)),
@@ -119,17 +119,17 @@ def errors(gaussians: Gaussians, camera: Camera, relative: float, seed: int = 0)
         for name in there:
             error = (here[name].double() - there[name]).norm().item()
             label = name if kind == "values" else f"gradient of {name}"
-            found[label] = error / (there[name].norm().item() + FLOOR[kind] / relative)
-    return found
+            by_name[label] = error / (there[name].norm().item() + FLOOR[kind] / relative)
+    return by_name
 
 
 def _scale_quaternions(fast: Rendered, exact: Rendered, lengths: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Both gradients, with those of quaternions multiplied by their lengths."""
-    turn = lambda found: {**found, "quaternions": found["quaternions"].double() * lengths}
+    turn = lambda blocks: {**blocks, "quaternions": blocks["quaternions"].double() * lengths}
     return turn(fast.gradients), turn(exact.gradients)
 
 
 def worst_error(gaussians: Gaussians, camera: Camera, relative: float) -> float:
     """The largest of `errors`; infinite if one is NaN."""
-    found = errors(gaussians, camera, relative).values()
-    return max(error if error == error else float("inf") for error in found)
+    values = errors(gaussians, camera, relative).values()
+    return max(error if error == error else float("inf") for error in values)

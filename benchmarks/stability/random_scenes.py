@@ -104,13 +104,13 @@ def _gaussians(arrays, antialiased: bool) -> Gaussians:
 
 def find_worst(scenes: Callable, relative: float, count: int) -> Worst:
     """Draw `count` scenes, the same ones each time, and compare each with the oracle."""
-    found = []
+    results = []
     for number in range(count):
         errors = oracle.errors(*scenes(np.random.default_rng((0, number))), relative, seed=number)
         where = max(errors, key=lambda name: errors[name] if errors[name] == errors[name] else math.inf)
-        found.append((errors[where] if errors[where] == errors[where] else math.inf, where))
-    at = max(range(len(found)), key=lambda k: found[k][0])
-    return Worst(*found[at], at, len(found))
+        results.append((errors[where] if errors[where] == errors[where] else math.inf, where))
+    at = max(range(len(results)), key=lambda k: results[k][0])
+    return Worst(*results[at], at, len(results))
 
 
 def _measured(scenes: Callable, relative: float, count: int) -> float:

@@ -103,21 +103,6 @@ def constant_plane_error() -> float:
     return float(np.abs(model.disparity / 0.7 - 1.0).max())
 
 
-def condition_of_completion() -> float:
-    """Condition number of the completion's system with a hole of 17 px.
-
-    It is the stiffness times the fourth power of the free width.
-    """
-    return completion.condition_number((~HOLE).astype(float))
-
-
-def condition_of_solver() -> float:
-    """Condition number with Jacobi's preconditioning, relative to the one without."""
-    confidence = 10 ** np.random.default_rng(0).uniform(-2, 2, PLANE.shape)
-    plain, scaled = bilateral.condition_numbers(confidence, noise_guide())
-    return scaled / plain
-
-
 # A plane has no data misfit and no bending, so only the rounding of its fit over some 2,000 pixels is left.
 ROUNDING = 16 * np.sqrt(PLANE.size) * EPS64
 CG_TOL = 1e-8  # relative residual at which the solver stops

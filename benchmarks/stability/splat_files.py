@@ -60,9 +60,9 @@ def count_invalid_rows() -> float:
     count = len(logits)
     rows = Rows(np.ones((count, 3)), np.ones((count, 4), np.float32), scales.astype(np.float32),
                 logits.astype(np.float32), np.ones((count, 1, 3), np.float32))  # fmt: skip
-    found, _ = drop_invalid(rows)
-    lost = count - len(found)
-    return float(lost + (~np.isfinite(found.log_scales)).sum() + (~np.isfinite(found.opacity_logits)).sum())
+    valid, _ = drop_invalid(rows)
+    lost = count - len(valid)
+    return float(lost + (~np.isfinite(valid.log_scales)).sum() + (~np.isfinite(valid.opacity_logits)).sum())
 
 
 def rows_of(gaussians: Gaussians) -> Rows:
@@ -76,22 +76,22 @@ def clamping_error(gradients: bool) -> float:
     The scene has an opaque, a transparent and flat splats, written with infinite values. Infinite if a value is not
     finite.
     """
-    given = cloud()
-    given.opacity_logits[:2] = torch.tensor([math.inf, -math.inf])
-    given.log_scales[2, 1] = given.log_scales[3, 0] = -math.inf
+    original = cloud()
+    original.opacity_logits[:2] = torch.tensor([math.inf, -math.inf])
+    original.log_scales[2, 1] = original.log_scales[3, 0] = -math.inf
     with tempfile.TemporaryDirectory() as folder:
-        save_ply(Path(folder) / "g.ply", given)
+        save_ply(Path(folder) / "g.ply", original)
         read = load_splats(Path(folder) / "g.ply").gaussians()
     limit = read.map(torch.clone)
     limit.opacity_logits[:2] = torch.tensor([2 * MOST_LOGIT, -2 * MOST_LOGIT])
     limit.log_scales[2, 1] = limit.log_scales[3, 0] = 2 * FLAT
-    found = []
+    errors = []
     for gaussians in (read, limit):
         leaves = gaussians.map(lambda p: p.requires_grad_())
         picture = rasterizer.render(leaves, camera()).color
         picture.square().sum().backward()
-        found.append((picture.detach(), [getattr(leaves, name).grad for name in PARAMETERS]))
-    (picture, slopes), (other, others) = found
+        errors.append((picture.detach(), [getattr(leaves, name).grad for name in PARAMETERS]))
+    (picture, slopes), (other, others) = errors
     if not gradients:
         return (picture - other).abs().max().item()
     return nan_safe_max(
@@ -101,10 +101,10 @@ def clamping_error(gradients: bool) -> float:
 
 def splat_error(what: str) -> float:
     """Largest error of a .splat after writing and reading, in steps of its format."""
-    given = cloud(500, degree=0)
-    given.opacity_logits[:2] = torch.tensor([MOST_LOGIT, -MOST_LOGIT])
-    given.log_scales[2] = FLAT
-    rows = rows_of(given)
+    original = cloud(500, degree=0)
+    original.opacity_logits[:2] = torch.tensor([MOST_LOGIT, -MOST_LOGIT])
+    original.log_scales[2] = FLAT
+    rows = rows_of(original)
     with tempfile.TemporaryDirectory() as folder:
         save_splat(Path(folder) / "s.splat", rows)
         read, _ = drop_invalid(open_splat(Path(folder) / "s.splat")(slice(0, 500)))
@@ -116,8 +116,8 @@ def splat_error(what: str) -> float:
 
 def spz_error(extent: float) -> float:
     """Largest error of a position after a .spz, in extents; infinite if rows are lost."""
-    given = cloud(500, degree=3)
-    rows = rows_of(given)
+    original = cloud(500, degree=3)
+    rows = rows_of(original)
     rows = Rows(rows.means * extent, *list(vars(rows).values())[1:])
     with tempfile.TemporaryDirectory() as folder:
         save_spz(Path(folder) / "s.spz", rows)

@@ -77,8 +77,8 @@ def set_opacity(logit: float, gaussians: Gaussians) -> Gaussians:
 
 def faint_contribution() -> float:
     """Opacity e^-30 is under 1/255, so no pixel and no gradient may show it; largest value that does."""
-    drawn = oracle.render_with_gradients(set_opacity(-30.0, cloud()), camera(), "cpu")
-    blocks = [drawn.gradients[name] for name in PARAMETERS] + [drawn.images["alpha"]]
+    rendering = oracle.render_with_gradients(set_opacity(-30.0, cloud()), camera(), "cpu")
+    blocks = [rendering.gradients[name] for name in PARAMETERS] + [rendering.images["alpha"]]
     return nan_safe_max(*(block.abs().max().item() for block in blocks))
 
 
@@ -90,12 +90,12 @@ def zero_quaternion_error() -> float:
     """Zero is the identity bit for bit, with zero gradient; largest difference."""
     zero = replace(cloud(), quaternions=torch.zeros(8, 4))
     one = replace(zero, quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(8, 1))
-    drawn, expected = (
+    rendering, expected = (
         oracle.render_with_gradients(zero, camera(), "cpu"),
         oracle.render_with_gradients(one, camera(), "cpu"),
     )
-    apart = max((drawn.images[n] - expected.images[n]).abs().max().item() for n in oracle.IMAGES)
-    return nan_safe_max(apart, drawn.gradients["quaternions"].abs().max().item())
+    difference = max((rendering.images[n] - expected.images[n]).abs().max().item() for n in oracle.IMAGES)
+    return nan_safe_max(difference, rendering.gradients["quaternions"].abs().max().item())
 
 
 def short_quaternion_error() -> float:
@@ -155,15 +155,15 @@ def make_far_needles(gaussians: Gaussians) -> Gaussians:
 def equal_depth_differences() -> float:
     """Forty opaque Gaussians in one place, rendered repeatedly with one and three threads: values that differ."""
     place = replace(cloud(40), means=torch.zeros(40, 3), opacity_logits=torch.full((40,), 2.0))
-    before, drawn = torch.get_num_threads(), []
+    before, renderings = torch.get_num_threads(), []
     try:
         for threads in (1, 3, 1):
             torch.set_num_threads(threads)
-            found = oracle.render_with_gradients(place, camera(), "cpu")
-            drawn.append([*found.images.values(), *found.gradients.values()])
+            rendering = oracle.render_with_gradients(place, camera(), "cpu")
+            renderings.append([*rendering.images.values(), *rendering.gradients.values()])
     finally:
         torch.set_num_threads(before)
-    return float(sum((a != b).sum() for other in drawn[1:] for a, b in zip(drawn[0], other, strict=True)))
+    return float(sum((a != b).sum() for other in renderings[1:] for a, b in zip(renderings[0], other, strict=True)))
 
 
 def move_to_origin(gaussians: Gaussians) -> Gaussians:
@@ -187,10 +187,10 @@ def count_invalid_values() -> float:
     gaussians, broken = cloud(), (math.nan, math.inf, -math.inf, math.nan)
     for row, (name, value) in enumerate(zip(("means", "quaternions", "means", "log_scales"), broken, strict=True)):
         getattr(gaussians, name)[row] = value
-    drawn = oracle.render_with_gradients(gaussians, camera(), "cpu")
-    bad = sum((~torch.isfinite(image)).sum() for image in drawn.images.values())
-    bad += sum((~torch.isfinite(gradient)).sum() for gradient in drawn.gradients.values())
-    return float(bad + (drawn.radii[:4] > 0).sum())
+    rendering = oracle.render_with_gradients(gaussians, camera(), "cpu")
+    bad = sum((~torch.isfinite(image)).sum() for image in rendering.images.values())
+    bad += sum((~torch.isfinite(gradient)).sum() for gradient in rendering.gradients.values())
+    return float(bad + (rendering.radii[:4] > 0).sum())
 
 
 def oracle_case(name: str, change: Callable[[Gaussians], Gaussians], view: Camera | None = None) -> Case:

@@ -68,7 +68,7 @@ def load_holes(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray]
 def paint_hole(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str, steps: int) -> np.ndarray:
     """uint8 [H, W, 3]: the hole inpainted from the noise of `SEED`."""
     inside = torch.from_numpy(hole)
-    made = inpaint.repaint(
+    painting = inpaint.repaint(
         prior,
         inpaint.to_input(picture) * ~inside,
         inside,
@@ -80,7 +80,7 @@ def paint_hole(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str,
         steps=steps,
         guidance=0.0,
     )
-    return inpaint.to_picture(made)
+    return inpaint.to_picture(painting)
 
 
 def save_sheet(models: dict[str, Prior], run: Path, count: int, steps: int, out: Path) -> list[str]:
@@ -90,10 +90,10 @@ def save_sheet(models: dict[str, Prior], run: Path, count: int, steps: int, out:
         row = {"to paint": view_ranking.painting_template(picture, hole)}
         for column, (when, prompt) in COLUMNS.items():
             row[column] = paint_hole(models[when], picture, hole, prompt, steps)
-        for column, made in row.items():
-            save_image(out / name / f"{column.replace(', ', '-').replace(' ', '-')}.png", made)
+        for column, cell in row.items():
+            save_image(out / name / f"{column.replace(', ', '-').replace(' ', '-')}.png", cell)
         scale = max(1, round(WIDTH / picture.shape[1]))
-        rows.append([enlarge(made, scale) for made in row.values()])
+        rows.append([enlarge(cell, scale) for cell in row.values()])
         print(f"{name}: painted by {len(COLUMNS)}", flush=True)
     save_image(out / "sheet.png", compose_sheet(rows, ["to paint", *COLUMNS], list(views)))
     return list(views)
@@ -103,12 +103,12 @@ def main() -> None:
     parser = scene_priors.study_parser(__doc__, "the stages up to personalize", "adapted")
     parser.add_argument("--views", type=int, default=VIEWS)
     parser.add_argument("--steps", type=int, default=Sampler().steps, help="sampler steps from pure noise")
-    given = parser.parse_args()
-    models, base = scene_priors.load_priors(given)
-    out = given.out or given.run / "adapted"
-    views = save_sheet(models, given.run, given.views, given.steps, out)
+    arguments = parser.parse_args()
+    models, base = scene_priors.load_priors(arguments)
+    out = arguments.out or arguments.run / "adapted"
+    views = save_sheet(models, arguments.run, arguments.views, arguments.steps, out)
     scene_priors.save_results(
-        given, out, "adapted.json", {"prior": base, "seed": SEED, "steps": given.steps, "views": views}
+        arguments, out, "adapted.json", {"prior": base, "seed": SEED, "steps": arguments.steps, "views": views}
     )
     print(out / "sheet.png")
 

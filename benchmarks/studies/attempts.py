@@ -76,16 +76,16 @@ def load_test_views(run: Path) -> list[tuple]:
     Raises:
         ValueError: no test view has ground truth and a mask.
     """
-    scene, found = load_scene(run / "poses"), []
+    scene, views = load_scene(run / "poses"), []
     for name in scene.test:
         camera = scene.cameras[name]
         truth = load_ground_truth(camera, run / "poses")
         box = image_metrics.mask_box(load_object_mask(camera, run / "raw_masks", run / "masks"))
         if truth is not None and box is not None:
-            found.append((camera, truth, box))
-    if not found:
+            views.append((camera, truth, box))
+    if not views:
         raise ValueError(f"{run / 'poses'}: no test view shows the scene without the object; take another scene")
-    return [found[place] for place in np.linspace(0, len(found) - 1, min(VIEWS, len(found))).round().astype(int)]
+    return [views[place] for place in np.linspace(0, len(views) - 1, min(VIEWS, len(views))).round().astype(int)]
 
 
 @torch.no_grad()
@@ -148,22 +148,24 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=list(ATTEMPTS), help="these attempts")
     parser.add_argument("--out", type=Path, default=Path("runs/attempts"))
     parser.add_argument("--threads", type=int, default=2)
-    given = parser.parse_args()
-    torch.set_num_threads(given.threads)
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
     for need in (*NEEDS, "personalize"):
-        if not (given.run / need).is_dir():
-            raise ValueError(f"{given.run / need} is missing: run `make scene={given.run.name} all` first")
-    given.out.mkdir(parents=True, exist_ok=True)
-    file, views = given.out / "attempts.json", load_test_views(given.run)
+        if not (arguments.run / need).is_dir():
+            raise ValueError(f"{arguments.run / need} is missing: run `make scene={arguments.run.name} all` first")
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    file, views = arguments.out / "attempts.json", load_test_views(arguments.run)
     curves = load_json(file) if file.exists() else {}
-    for name in given.only or ATTEMPTS:
+    for name in arguments.only or ATTEMPTS:
         if name not in curves:
-            curves[name] = run_attempt(ATTEMPTS[name], given.run, given.start or given.run / "initialize", views)
+            curves[name] = run_attempt(
+                ATTEMPTS[name], arguments.run, arguments.start or arguments.run / "initialize", views
+            )
             save_json(file, curves)
         last = curves[name][-1]
         print(f"{name:44}", {s: round(last[s], 4) for s in SCORES}, f"{last['seconds']:.0f} s", flush=True)
-    draw(curves, given.out / "attempts.png", str(given.start or given.run))
-    print(given.out / "attempts.png")
+    draw(curves, arguments.out / "attempts.png", str(arguments.start or arguments.run))
+    print(arguments.out / "attempts.png")
 
 
 if __name__ == "__main__":

@@ -39,25 +39,25 @@ COLUMNS = (
 )
 
 
-def pose_errors(found: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def pose_errors(estimate: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Errors of the views that both have, after the similarity transform that brings the centres closest.
 
     Args:
-        found, truth: view -> world-to-camera [4, 4].
+        estimate, truth: view -> world-to-camera [4, 4].
 
     Returns:
         [V] distances of centres in % of the extent of the true ones, and [V] rotation errors in degrees.
     """
-    names = sorted(set(found) & set(truth))
-    here, there = (np.stack([poses[name] for name in names]) for poses in (found, truth))
-    a, b = camera_centers(here), camera_centers(there)
+    names = sorted(set(estimate) & set(truth))
+    poses_a, poses_b = (np.stack([poses[name] for name in names]) for poses in (estimate, truth))
+    a, b = camera_centers(poses_a), camera_centers(poses_b)
     a, b = a - a.mean(0), b - b.mean(0)
     u, stretch, v = np.linalg.svd(b.T @ a)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
     turn = u @ np.diag(sign) @ v
     aligned = (stretch * sign).sum() / (a**2).sum() * a @ turn.T
     extent = np.linalg.norm(b[:, None] - b, axis=-1).max()
-    rotations = Rotation.from_matrix(there[:, :3, :3] @ turn @ here[:, :3, :3].transpose(0, 2, 1))
+    rotations = Rotation.from_matrix(poses_b[:, :3, :3] @ turn @ poses_a[:, :3, :3].transpose(0, 2, 1))
     return 100 * np.linalg.norm(aligned - b, axis=1) / extent, np.degrees(rotations.magnitude())
 
 
@@ -79,8 +79,8 @@ def evaluate_capture(folder: Path, images: str | None, every: int, longest: int)
             poses.run(poses.Params(masks="none", longest=longest, refine=refine), out, scene=scene)
             seconds, facts = time.process_time() - start, load_json(out / "sfm.json")
             adjusted = refine and load_json(out / "refine.json")["after"] is not None
-            found = {name: camera.world_to_camera for name, camera in load_scene(out).cameras.items()}
-            centers, degrees = pose_errors(found, truth)
+            estimate = {name: camera.world_to_camera for name, camera in load_scene(out).cameras.items()}
+            centers, degrees = pose_errors(estimate, truth)
             values = (
                 f"{folder.name}/{every}",
                 f"{facts['placed']} of {facts['photographs']}",
@@ -107,15 +107,15 @@ def main() -> None:
     parser.add_argument("--images", help="folder of pictures inside the capture")
     parser.add_argument("--longest", type=int, default=640, help="px of the longer side, as poses.longest")
     parser.add_argument("--out", type=Path, default=Path("runs/bare_photographs"))
-    given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
     table = []
-    for folder in given.captures:
-        for row in evaluate_capture(folder, given.images, given.every, given.longest):
+    for folder in arguments.captures:
+        for row in evaluate_capture(folder, arguments.images, arguments.every, arguments.longest):
             table.append(row)
             print(format_row(row), flush=True)
-    (given.out / "bare_photographs.json").write_text(json.dumps(table, indent=1))
+    (arguments.out / "bare_photographs.json").write_text(json.dumps(table, indent=1))
 
 
 if __name__ == "__main__":

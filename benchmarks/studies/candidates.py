@@ -37,9 +37,9 @@ def score_candidates(run: Path, untouched: Path, out: Path, seed: int, models: d
         return None
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    given = load_json(run / "reference/receipt.json")["params"] | {"seed": seed, "reference": None}
+    params = load_json(run / "reference/receipt.json")["params"] | {"seed": seed, "reference": None}
     needs = {name: run / name for name in ("poses", "fit", "masks")}
-    reference.run(Params(**given), out, scene=out, **needs)
+    reference.run(Params(**params), out, scene=out, **needs)
     facts = load_json(out / "candidates.json")
     view, taken = facts["view"], facts["chosen"]
     pixels = load_mask_sets(run / "masks", [view])[view]
@@ -72,21 +72,21 @@ def main() -> int:
     parser.add_argument("--runs", type=Path, default=Path("runs/composites/runs"))
     parser.add_argument("--out", type=Path, default=Path("runs/candidates"))
     parser.add_argument("--seeds", type=int, default=3)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     models = {net: model for net in ("vgg", "alex") if (model := lpips.load(net)[0])}
     rows = []
-    for untouched in sorted(given.runs.glob("*-untouched")):
-        run = given.runs / f"{untouched.name.removesuffix('-untouched')}-alone"
-        for seed in range(given.seeds):
-            out = given.out / f"{run.name}-{seed}"
+    for untouched in sorted(arguments.runs.glob("*-untouched")):
+        run = arguments.runs / f"{untouched.name.removesuffix('-untouched')}-alone"
+        for seed in range(arguments.seeds):
+            out = arguments.out / f"{run.name}-{seed}"
             row = score_candidates(run, untouched, out, 10 * seed, models) if run.is_dir() else None
             if row:
                 rows.append({"place": run.name, "seed": seed, **row})
                 print(run.name, seed, row["taken"], [round(value, 4) for value in row["lpips_vgg"]], flush=True)
     if not rows:
-        print(f"error: no finished places with an untouched run in {given.runs}", file=sys.stderr)
+        print(f"error: no finished places with an untouched run in {arguments.runs}", file=sys.stderr)
         return 1
-    save_json(given.out / "candidates.json", rows)
+    save_json(arguments.out / "candidates.json", rows)
     print(table(rows))
     return 0
 

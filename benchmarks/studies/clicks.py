@@ -26,14 +26,14 @@ GOOD_IOU = 0.94  # from this IoU on a person would not correct
 TINT = (255, 0, 160)
 
 
-def iou(found: np.ndarray, true: np.ndarray) -> float:
+def iou(mask: np.ndarray, true: np.ndarray) -> float:
     """Intersection over union of bool [H, W] masks; 1 if both are empty."""
-    return float((found & true).sum() / (found | true).sum()) if (found | true).any() else 1.0
+    return float((mask & true).sum() / (mask | true).sum()) if (mask | true).any() else 1.0
 
 
-def next_click(found: np.ndarray, true: np.ndarray) -> tuple[float, float, bool]:
+def next_click(mask: np.ndarray, true: np.ndarray) -> tuple[float, float, bool]:
     """(x, y, on the object) of the pixel deepest inside what is missing or superfluous."""
-    depths = [ndimage.distance_transform_edt(np.pad(wrong, 1))[1:-1, 1:-1] for wrong in (found & ~true, true & ~found)]
+    depths = [ndimage.distance_transform_edt(np.pad(wrong, 1))[1:-1, 1:-1] for wrong in (mask & ~true, true & ~mask)]
     missing = bool(depths[1].max() >= depths[0].max())
     row, column = np.unravel_index(depths[missing].argmax(), true.shape)
     return column + 0.5, row + 0.5, missing
@@ -41,13 +41,13 @@ def next_click(found: np.ndarray, true: np.ndarray) -> tuple[float, float, bool]
 
 def simulate_clicks(image: np.ndarray, true: np.ndarray, most: int, relief: np.ndarray) -> Clicks:
     """The clicks that a person would make on a view, printing the IoU after each; `relief` is that of `view_mask`."""
-    chosen, found = [], np.zeros_like(true)
-    while len(chosen) < most and iou(found, true) < GOOD_IOU:
-        chosen.append(next_click(found, true))
+    chosen, mask = [], np.zeros_like(true)
+    while len(chosen) < most and iou(mask, true) < GOOD_IOU:
+        chosen.append(next_click(mask, true))
         clicks = Clicks(np.array([each[:2] for each in chosen]), np.array([each[2] for each in chosen]))
         began = time.monotonic()
-        found = segment_view(image, clicks, relief)
-        print(f"  click {len(chosen)}: {iou(found, true):.3f}, {time.monotonic() - began:.1f} s", flush=True)
+        mask = segment_view(image, clicks, relief)
+        print(f"  click {len(chosen)}: {iou(mask, true):.3f}, {time.monotonic() - began:.1f} s", flush=True)
     return clicks
 
 
@@ -64,14 +64,14 @@ def evaluate_run(run: Path, most: int, sheet: Path | None) -> str:
     began, cameras = time.monotonic(), {name: scene.cameras[name] for name in names}
     near = all_views.find_neighbours(gaussians)
     solved = all_views.segment_by_clicks(gaussians, near, cameras, images.__getitem__, {view: clicks}, {})
-    shown = lambda name: all_views.object_mask(gaussians, solved.labels, cameras[name], images[name])
-    found = {name: shown(name) for name in names}
+    render_mask = lambda name: all_views.object_mask(gaussians, solved.labels, cameras[name], images[name])
+    estimates = {name: render_mask(name) for name in names}
     seconds = time.monotonic() - began
-    shares = {name: iou(found[name], true[name]) for name in names}
+    shares = {name: iou(estimates[name], true[name]) for name in names}
     worst = min(shares, key=shares.__getitem__)
     if sheet:
         some = [*names[:: max(1, len(names) // 3)][:3], worst]
-        save_image(sheet, np.hstack([overlay_mask(images[name], found[name]) for name in some]))
+        save_image(sheet, np.hstack([overlay_mask(images[name], estimates[name]) for name in some]))
     mean = float(np.mean(list(shares.values())))
     return f"{run.name}: {len(clicks)} clicks, mean {mean:.3f}, worst {shares[worst]:.3f} ({worst}), {seconds:.1f} s"
 
@@ -86,9 +86,12 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, nargs="+", required=True)
     parser.add_argument("--clicks", type=int, default=5, help="largest number of clicks")
     parser.add_argument("--sheets", type=Path, help="folder for pictures")
-    given = parser.parse_args()
-    for run in given.runs:
-        print(evaluate_run(run, given.clicks, given.sheets / f"{run.name}.png" if given.sheets else None), flush=True)
+    arguments = parser.parse_args()
+    for run in arguments.runs:
+        print(
+            evaluate_run(run, arguments.clicks, arguments.sheets / f"{run.name}.png" if arguments.sheets else None),
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -114,18 +114,18 @@ def select_places(names: str, report: bool) -> tuple[Place, ...]:
     return tuple(known[name] for name in names.split(","))
 
 
-def run_benchmark(given: argparse.Namespace) -> int:
-    options = compositing.Options(not given.alone, given.shadow, given.rough, given.seed)
-    out, rows = given.out.resolve(), []
-    for place in select_places(given.places, given.report):
-        if not (given.captures / place.capture).is_dir():
-            print(f"{place.name} skipped: there is no capture {given.captures / place.capture}")
+def run_benchmark(arguments: argparse.Namespace) -> int:
+    options = compositing.Options(not arguments.alone, arguments.shadow, arguments.rough, arguments.seed)
+    out, rows = arguments.out.resolve(), []
+    for place in select_places(arguments.places, arguments.report):
+        if not (arguments.captures / place.capture).is_dir():
+            print(f"{place.name} skipped: there is no capture {arguments.captures / place.capture}")
             continue
-        if given.make:
-            print("made", *make_scenes(place, given.captures, options, out))
+        if arguments.make:
+            print("made", *make_scenes(place, arguments.captures, options, out))
             continue
-        variants = [name for name in given.variants.split(",") if name]
-        rows.append(evaluate_place(place, given.captures, options, out, given.profile, variants))
+        variants = [name for name in arguments.variants.split(",") if name]
+        rows.append(evaluate_place(place, arguments.captures, options, out, arguments.profile, variants))
         (out / "composites.json").write_text(json.dumps(rows, indent=1))
         (out / "composites.md").write_text(scoring.table(rows))
     if rows:
@@ -148,12 +148,12 @@ def main() -> int:
         "--variants", default="", help="variants of pipeline.yaml, separated by commas, to score as well"
     )
     parser.add_argument("--make", action="store_true", help="only make the scenes")
-    given = parser.parse_args()
-    if not given.captures.is_dir():
-        print(f"skipped: there are no captures at {given.captures}")
+    arguments = parser.parse_args()
+    if not arguments.captures.is_dir():
+        print(f"skipped: there are no captures at {arguments.captures}")
         return 0
     try:
-        return run_benchmark(given)
+        return run_benchmark(arguments)
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -154,9 +154,9 @@ def shadow_factor(view: PixelRays, camera: np.ndarray, thing: placement.PlacedOb
         far = ((thing.foot - camera[:3, 3]) @ thing.normal) / (ways @ thing.normal)
     ahead = np.isfinite(far) & (far > 0)
     at = (camera[:3, 3] + np.where(ahead, far, 0)[:, None] * ways - thing.foot) @ thing.axes[:2].T / thing.height
-    away = (((at - SHADOW_AT) / SHADOW_REACH) ** 2).sum(1)
-    left = np.where(ahead, 1 - strength * np.exp(-(away**2)), 1.0)
-    return left.reshape(view.capture.height, view.capture.width)
+    squared_distance = (((at - SHADOW_AT) / SHADOW_REACH) ** 2).sum(1)
+    light = np.where(ahead, 1 - strength * np.exp(-(squared_distance**2)), 1.0)
+    return light.reshape(view.capture.height, view.capture.width)
 
 
 def perturb_mask(mask: np.ndarray, most: int, random: np.random.Generator) -> np.ndarray:
@@ -189,8 +189,8 @@ def write_scene(place: placement.Place, capture: placement.Photographs, options:
             save_image(out / f"test_masks/{name}.png", mask)
             continue
         save_image(out / f"images/{name}.png", both)
-        given = perturb_mask(mask, options.rough, random) if options.rough else mask
-        save_image(out / f"masks/{name}.png", given)
+        raw_mask = perturb_mask(mask, options.rough, random) if options.rough else mask
+        save_image(out / f"masks/{name}.png", raw_mask)
     write_cameras(capture, views, out)
     lines = ["masks: masks", "test_masks: test_masks", f"test: {yaml_list(views.test)}"]
     if options.reference:

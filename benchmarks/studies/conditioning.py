@@ -58,14 +58,14 @@ def solver_errors() -> dict[str, tuple[float, list[tuple[float, float]]]]:
     exact = spsolve(system.tocsc(), right)
     jacobi = sparse.diags(1.0 / system.diagonal())
     conditions = bilateral.condition_numbers(confidence, guide)
-    found = {}
+    errors = {}
     for name, form, number in (("none", None, conditions[0]), ("Jacobi", jacobi, conditions[1])):
         iterates, began = [], time.perf_counter()
         note = lambda x, iterates=iterates, began=began: iterates.append((time.perf_counter() - began, x.copy()))
         cg(system, right, rtol=1e-14, maxiter=STEPS, M=form, callback=note)
         error = lambda x: float(np.linalg.norm(x - exact) / np.linalg.norm(exact))
-        found[name] = number, [(seconds, error(x)) for seconds, x in iterates]
-    return found
+        errors[name] = number, [(seconds, error(x)) for seconds, x in iterates]
+    return errors
 
 
 def completion_errors() -> tuple[float, list[tuple[float, float, float]]]:
@@ -77,7 +77,7 @@ def completion_errors() -> tuple[float, list[tuple[float, float, float]]]:
     _, confidence, _ = make_maps()
     known = confidence > 0
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] / WIDTH
-    tilted, found = columns - 0.6 * rows, []
+    tilted, errors = columns - 0.6 * rows, []
     plate = completion.Plate(ring=2.0)  # the whole map takes part, as in the absolute form
     factors = completion.factorize(
         completion.build_system(known.astype(float), None, np.ones(known.shape, bool), plate)
@@ -87,8 +87,8 @@ def completion_errors() -> tuple[float, list[tuple[float, float, float]]]:
         absolute = factors.solve(np.where(known, truth, 0.0).ravel()).reshape(truth.shape)
         ours = completion.complete(truth, known, plate=plate)
         error = lambda x, truth=truth: float(np.abs(x - truth)[~known].max() / np.ptp(tilted))
-        found.append((offset, error(absolute), error(ours)))
-    return completion.condition_number(known.astype(float), plate=plate), found
+        errors.append((offset, error(absolute), error(ours)))
+    return completion.condition_number(known.astype(float), plate=plate), errors
 
 
 def measure(say: Callable[[str], None]) -> tuple:
@@ -112,9 +112,9 @@ def draw(lines, systems, number, maps, path: Path) -> None:
 
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     first, second, third = figure.subplots(1, 3)
-    shown = lambda values: np.maximum(values, 2.0**-53)  # an error of 0 is drawn as one rounding
-    first.loglog([r[1] for r in lines], shown([r[2] for r in lines]), "o-", label="plain normal equations")
-    first.loglog([r[1] for r in lines], shown([r[3] for r in lines]), "s-", label="centred and scaled")
+    visible = lambda values: np.maximum(values, 2.0**-53)  # an error of 0 is drawn as one rounding
+    first.loglog([r[1] for r in lines], visible([r[2] for r in lines]), "o-", label="plain normal equations")
+    first.loglog([r[1] for r in lines], visible([r[3] for r in lines]), "s-", label="centred and scaled")
     first.set(title="alignment", xlabel="condition number of the plain equations", ylabel="relative error")
     for (name, (condition, steps)), style in zip(systems.items(), ("-", "--"), strict=True):
         label = f"preconditioning {name}, condition {condition:.0e}"
@@ -122,8 +122,8 @@ def draw(lines, systems, number, maps, path: Path) -> None:
     second.set(
         title="bilateral solver", xlabel="steps of conjugate gradients", ylabel="relative error", ylim=(1e-12, 3)
     )
-    third.loglog([r[0] for r in maps], shown([r[1] for r in maps]), "o-", label="disparity itself")
-    third.loglog([r[0] for r in maps], shown([r[2] for r in maps]), "s-", label="correction to a plane")
+    third.loglog([r[0] for r in maps], visible([r[1] for r in maps]), "o-", label="disparity itself")
+    third.loglog([r[0] for r in maps], visible([r[2] for r in maps]), "s-", label="correction to a plane")
     third.set(
         title=f"completion, condition {number:.0e}", xlabel="offset / spread of the data", ylabel="relative error"
     )
@@ -136,10 +136,10 @@ def draw(lines, systems, number, maps, path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/conditioning.png"))
-    given = parser.parse_args()
-    given.out.parent.mkdir(parents=True, exist_ok=True)
-    draw(*measure(print), given.out)
-    print(given.out)
+    arguments = parser.parse_args()
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    draw(*measure(print), arguments.out)
+    print(arguments.out)
 
 
 if __name__ == "__main__":

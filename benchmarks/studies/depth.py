@@ -58,11 +58,11 @@ def scene_pose(camera: Camera, similarity: Similarity) -> np.ndarray:
 def true_depth(seed: int, kind: str, camera: Camera, similarity: Similarity) -> np.ndarray:
     """[H, W] camera z in the normalised frame without the object, by the generator in a separate process."""
     with tempfile.TemporaryDirectory() as folder:
-        view, made = Path(folder) / "view.npz", Path(folder) / "depth.npy"
+        view, output = Path(folder) / "view.npz", Path(folder) / "depth.npy"
         np.savez(view, world_to_camera=scene_pose(camera, similarity), rays=pixel_rays(camera)[..., :2])
-        options = ["--seed", str(seed), "--kind", kind, "--view", str(view), "--out", str(made)]
+        options = ["--seed", str(seed), "--kind", kind, "--view", str(view), "--out", str(output)]
         subprocess.run([sys.executable, str(DATA / "depths.py"), *options], check=True)
-        return np.load(made) * similarity.scale
+        return np.load(output) * similarity.scale
 
 
 def near_edges(depth: np.ndarray) -> np.ndarray:
@@ -76,9 +76,9 @@ def near_edges(depth: np.ndarray) -> np.ndarray:
     return cv2.distanceTransform((~step).astype(np.uint8), cv2.DIST_L2, 5) <= NEAR if step.any() else step
 
 
-def relative_errors(made: np.ndarray, true: np.ndarray) -> np.ndarray:
+def relative_errors(depth: np.ndarray, true: np.ndarray) -> np.ndarray:
     """[H, W]: error relative to the true depth, positive if too far, infinite if there is no depth."""
-    return np.where(np.isfinite(made) & (made > 0), made / true - 1, np.inf)
+    return np.where(np.isfinite(depth) & (depth > 0), depth / true - 1, np.inf)
 
 
 def scores(error: np.ndarray) -> dict[str, float]:
@@ -89,25 +89,25 @@ def scores(error: np.ndarray) -> dict[str, float]:
     return {"pixels": error.size, **shares, "median": float(np.median(np.abs(error))), "bias": float(np.median(error))}
 
 
-def error_sheet(reference: Reference, true: np.ndarray, made: np.ndarray, error: np.ndarray) -> np.ndarray:
+def error_sheet(reference: Reference, true: np.ndarray, depth: np.ndarray, error: np.ndarray) -> np.ndarray:
     """[h, w, 3] uint8: reference, true depth, completed depth and error around the hole, whose border is drawn."""
     mask = reference.mask
     near, far = np.percentile(1 / true[mask], (99.5, 0.5))
     far, near = min(far, near / 1.02) / 1.02, near * 1.02
-    greys = [np.clip((1 / np.maximum(z, 1e-9) - far) / (near - far), 0, 1) for z in (true, made)]
+    greys = [np.clip((1 / np.maximum(z, 1e-9) - far) / (near - far), 0, 1) for z in (true, depth)]
     depths = [cv2.applyColorMap(np.uint8(255 * grey), cv2.COLORMAP_VIRIDIS)[..., ::-1] for grey in greys]
     share = np.clip(error / CLIP, -1, 1)[..., None]
     signed = 255 * (1 - np.where(share > 0, share * [0, 1, 1], -share * [1, 1, 0]))
     row, column = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
-    cut = tuple(slice(max(found[0] - MARGIN, 0), found[-1] + MARGIN + 1) for found in (row, column))
+    cut = tuple(slice(max(span[0] - MARGIN, 0), span[-1] + MARGIN + 1) for span in (row, column))
     larger = -(-SIDE // (cut[1].stop - cut[1].start))
     panels = []
     for panel in (reference.image, *depths, np.where(mask[..., None], signed, 200).astype(np.uint8)):
-        shown = np.ascontiguousarray(panel[cut].repeat(larger, 0).repeat(larger, 1))
+        cell = np.ascontiguousarray(panel[cut].repeat(larger, 0).repeat(larger, 1))
         outline, _ = cv2.findContours(
             mask[cut].astype(np.uint8).repeat(larger, 0).repeat(larger, 1), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
         )
-        panels.append(cv2.drawContours(shown, outline, -1, (255, 255, 255), 1))
+        panels.append(cv2.drawContours(cell, outline, -1, (255, 255, 255), 1))
     return np.concatenate(panels, 1)
 
 
@@ -121,27 +121,27 @@ def measure(scene_folder: Path, run: Path, out: Path, kind: str) -> dict[str, di
         ValueError: no reference's depth was completed, or the truth does not agree outside the masks.
     """
     seed, scene = load_json(scene_folder / "truth/facts.json")["seed"], load_scene(run / "poses")
-    found = {}
+    results = {}
     for reference in load_references(run / "reference", scene):
         name = reference.camera.name
         file = run / "initialize/depth" / f"{name}.exr"
         if not file.exists():
             continue
-        made, true = load_exr(file).astype(float), true_depth(seed, kind, reference.camera, scene.similarity)
-        error, edges, mask = relative_errors(made, true), near_edges(true), reference.mask
+        completed_depth, true = load_exr(file).astype(float), true_depth(seed, kind, reference.camera, scene.similarity)
+        error, edges, mask = relative_errors(completed_depth, true), near_edges(true), reference.mask
         sets = load_mask_sets(run / "masks", [name])[name]
         hidden = sets.raw | sets.consistent | mask
         parts = {"hole": mask, "near edges": mask & edges, "elsewhere": mask & ~edges}
         never = true_never_seen(scene_folder, [reference.camera])[name]
         parts |= {"rest of C": sets.consistent & ~mask, "never seen": never, "outside": ~hidden & ~edges}
-        found[name] = {part: scores(error[pixels]) for part, pixels in parts.items()}
-        if not found[name]["outside"].get("median", 0) < MAX_OUTSIDE_ERROR:
-            outside = found[name]["outside"]
+        results[name] = {part: scores(error[pixels]) for part, pixels in parts.items()}
+        if not results[name]["outside"].get("median", 0) < MAX_OUTSIDE_ERROR:
+            outside = results[name]["outside"]
             raise ValueError(f"{name}: depth outside the masks is not the true one ({outside}); is --kind right?")
-        save_image(out / f"{name}.png", error_sheet(reference, true, made, error))
-    if not found:
+        save_image(out / f"{name}.png", error_sheet(reference, true, completed_depth, error))
+    if not results:
         raise ValueError(f"{run / 'initialize/depth'}: no depth of a reference; run `make scene=... initialize`")
-    return found
+    return results
 
 
 def main() -> int:
@@ -150,22 +150,22 @@ def main() -> int:
     parser.add_argument("--run", type=Path, help="default: runs/<scene's name>")
     parser.add_argument("--out", type=Path, help="default: runs/depth/<scene's name>")
     parser.add_argument("--kind", choices=("demo", *KINDS), help="kind of the scene; default: taken from its name")
-    given = parser.parse_args()
-    name = given.scene.resolve().name
-    run, out = given.run or Path("runs") / name, given.out or Path("runs/depth") / name
-    for path in (given.scene / "truth/facts.json", run / "initialize/facts.json"):
+    arguments = parser.parse_args()
+    name = arguments.scene.resolve().name
+    run, out = arguments.run or Path("runs") / name, arguments.out or Path("runs/depth") / name
+    for path in (arguments.scene / "truth/facts.json", run / "initialize/facts.json"):
         if not path.exists():
             raise ValueError(
                 f"{path} is missing: make the scene with data/generate.py, and run `make scene=... initialize`"
             )
-    results = measure(given.scene, run, out, given.kind or scene_kind(name))
+    results = measure(arguments.scene, run, out, arguments.kind or scene_kind(name))
     (out / "depth.json").write_text(json.dumps(results, indent=1))
     for view, parts in results.items():
-        for part, found in parts.items():
-            if found["pixels"]:
-                shares = ", ".join(f"{found[f'within {limit:.0%}']:6.1%} within {limit:.0%}" for limit in WITHIN)
-                middle = f"median error {found['median']:.2%} ({found['bias']:+.2%})"
-                print(f"{name} {view} {part:10} {found['pixels']:6} px: {shares}, {middle}")
+        for part, row in parts.items():
+            if row["pixels"]:
+                shares = ", ".join(f"{row[f'within {limit:.0%}']:6.1%} within {limit:.0%}" for limit in WITHIN)
+                middle = f"median error {row['median']:.2%} ({row['bias']:+.2%})"
+                print(f"{name} {view} {part:10} {row['pixels']:6} px: {shares}, {middle}")
     return 0
 
 

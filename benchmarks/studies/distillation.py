@@ -41,16 +41,16 @@ SCALES = {"whole": "A photo of sks", "window": "A photo of sks, cropped"}
 
 def degraded_pictures(run: Path, cases: dict[str, list[Case]], renders: dict[str, dict[str, list[Case]]]):
     """Name -> scale -> [B, 3, H, W] in [-1, 1]: the mixes, then the run's renders."""
-    made: dict[str, dict[str, Tensor]] = {}
+    pictures: dict[str, dict[str, Tensor]] = {}
     for scale in SCALES:
         truth, hole = to_tensors(cases[scale])
         filled = [cv2.inpaint(c.truth, c.hole.astype(np.uint8), 5, cv2.INPAINT_TELEA) for c in cases[scale]]
         telea = to_tensors([replace(c, truth=f) for c, f in zip(cases[scale], filled, strict=True)])[0]
         for mix in MIXES:
-            made.setdefault(f"{mix:g} Telea", {})[scale] = truth + mix * hole * (telea - truth)
+            pictures.setdefault(f"{mix:g} Telea", {})[scale] = truth + mix * hole * (telea - truth)
         for name, crops in renders.items():
-            made.setdefault(name, {})[scale] = truth + hole * (to_tensors(crops[scale])[0] - truth)
-    return made
+            pictures.setdefault(name, {})[scale] = truth + hole * (to_tensors(crops[scale])[0] - truth)
+    return pictures
 
 
 @torch.no_grad()
@@ -105,11 +105,11 @@ def measure(models: dict[str, Prior], run: Path) -> list[dict]:
 def rendered_cases(run: Path, folder: str, size: int) -> dict[str, list[Case]]:
     """`scene_cases` with evaluate's renders instead of the truth."""
     scene = load_scene(run / "poses")
-    found = run / "evaluate" / folder
-    if not found.is_dir():
-        raise ValueError(f"{found} is missing: run `make scene={run.name} all` first")
-    shown = {name: load_image(found / f"{name}.png") for name in scene.test}
-    return scene_cases(run, size, shown)
+    source = run / "evaluate" / folder
+    if not source.is_dir():
+        raise ValueError(f"{source} is missing: run `make scene={run.name} all` first")
+    renders = {name: load_image(source / f"{name}.png") for name in scene.test}
+    return scene_cases(run, size, renders)
 
 
 def draw(rows: list[dict], path: Path) -> None:
@@ -145,16 +145,16 @@ def main() -> None:
     parser.add_argument("--prior", default="priors/tiny", help="a diffusers folder")
     parser.add_argument("--run", type=Path, required=True, help="runs/<scene>, finished, with ground truth")
     parser.add_argument("--out", type=Path, default=Path("runs/distillation"))
-    given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
     models = {
-        "unadapted": load_prior(given.prior),
-        "personalized": lora.merge(load_prior(given.prior), given.run / "personalize"),
+        "unadapted": load_prior(arguments.prior),
+        "personalized": lora.merge(load_prior(arguments.prior), arguments.run / "personalize"),
     }
-    rows = measure(models, given.run)
-    save_json(given.out / "distillation.json", rows)
-    draw(rows, given.out / "distillation.png")
-    print(given.out / "distillation.png")
+    rows = measure(models, arguments.run)
+    save_json(arguments.out / "distillation.json", rows)
+    draw(rows, arguments.out / "distillation.png")
+    print(arguments.out / "distillation.png")
 
 
 if __name__ == "__main__":

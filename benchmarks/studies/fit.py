@@ -37,8 +37,8 @@ VARIANTS = {
 
 def fit_params(profile: str, overrides: dict[str, object], every: int) -> fit.Params:
     """The profile's parameters of `fit` with overrides. ValueError names an unknown one."""
-    given = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"][profile].get("fit", {})
-    return fit.Params(**given).changed({**overrides, "holdout": every})
+    params = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"][profile].get("fit", {})
+    return fit.Params(**params).changed({**overrides, "holdout": every})
 
 
 def run_fit(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]]:
@@ -74,11 +74,13 @@ def main() -> None:
     parser.add_argument("--profile", default="laptop")
     parser.add_argument("--every", type=int, default=8, help="hold out every n-th training view")
     parser.add_argument("--only", nargs="+", choices=list(VARIANTS), help="these variants")
-    given = parser.parse_args()
-    poses, out = given.run / "poses", given.out or Path("runs/fit") / given.run.name
+    arguments = parser.parse_args()
+    poses, out = arguments.run / "poses", arguments.out or Path("runs/fit") / arguments.run.name
     if not (poses / "receipt.json").exists():
-        raise ValueError(f"{poses} is missing: run `make scene={given.run.name} poses` first")
-    chosen = {name: fit_params(given.profile, VARIANTS[name], given.every) for name in given.only or VARIANTS}
+        raise ValueError(f"{poses} is missing: run `make scene={arguments.run.name} poses` first")
+    chosen = {
+        name: fit_params(arguments.profile, VARIANTS[name], arguments.every) for name in arguments.only or VARIANTS
+    }
     curves = {}
     for name, params in chosen.items():
         curves[name] = run_fit(poses, out / name.replace(" ", "_").replace(",", ""), params)
@@ -91,7 +93,7 @@ def main() -> None:
     cells = [f"| {n} | {p['seconds']:.0f} | {p['gaussians']} | {p['psnr_held_out']:.2f} |" for n, p in ends]
     head = "| variant | seconds | Gaussians | held-out PSNR (dB) |\n|---|---|---|---|\n"
     (out / "fit.md").write_text(head + "\n".join(cells) + "\n")
-    draw(curves, f"{given.run.name}, every {given.every}th view held out", out / "fit.png")
+    draw(curves, f"{arguments.run.name}, every {arguments.every}th view held out", out / "fit.png")
 
 
 if __name__ == "__main__":

@@ -107,14 +107,14 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="+", help="runs/<scene> and runs/<scene>@<variant>, evaluated")
     parser.add_argument("--scene", type=Path, help="data/<scene> of the first, made by data/generate.py")
     parser.add_argument("--out", type=Path, default=Path("runs/gain"))
-    given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
-    first, runs = given.runs[0], {run.name: evaluate_run(run) for run in given.runs}
-    text = table(runs, {first.name: unseen_shares(first, given.scene)})
-    for run in given.runs:
-        save_sheet(run, given.out / f"{run.name}.png")
-    save_json(given.out / "gain.json", runs)
-    (given.out / "gain.md").write_text(text, encoding="utf-8")
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    first, runs = arguments.runs[0], {run.name: evaluate_run(run) for run in arguments.runs}
+    text = table(runs, {first.name: unseen_shares(first, arguments.scene)})
+    for run in arguments.runs:
+        save_sheet(run, arguments.out / f"{run.name}.png")
+    save_json(arguments.out / "gain.json", runs)
+    (arguments.out / "gain.md").write_text(text, encoding="utf-8")
     print(text)
 
 

@@ -69,7 +69,7 @@ def run_stages(scene: Path, runs: Path, profile: str, last: str) -> dict[str, di
     Raises:
         RuntimeError: a stage fails.
     """
-    record, found = runs / f"{scene.name}.json", {}
+    record, costs = runs / f"{scene.name}.json", {}
     if record.exists():
         return load_json(record)
     for stage in STAGES[: STAGES.index(last) + 1]:
@@ -82,9 +82,9 @@ def run_stages(scene: Path, runs: Path, profile: str, last: str) -> dict[str, di
         if receipt.exists():
             values = load_json(receipt)
             cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-            found[stage] = {"cpu": cpu, "seconds": values["seconds"], "mb": values["peak_memory_mb"]}
-    save_json(record, found)
-    return found
+            costs[stage] = {"cpu": cpu, "seconds": values["seconds"], "mb": values["peak_memory_mb"]}
+    save_json(record, costs)
+    return costs
 
 
 def growth_exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
@@ -92,14 +92,14 @@ def growth_exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
     return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
 
 
-def draw(found: dict[str, dict[str, dict[str, list[float]]]], path: Path) -> None:
+def draw(costs: dict[str, dict[str, dict[str, list[float]]]], path: Path) -> None:
     """For views and for pixels, a panel of CPU seconds and one of memory, one line per stage."""
     figure, grid = charts.new_figure(5.6, 2, 2)
-    for row, (of, stages) in zip(grid, found.items(), strict=True):
+    for row, (of, stages) in zip(grid, costs.items(), strict=True):
         for axes, what in zip(row, ("cpu", "mb"), strict=True):
-            for stage, told in stages.items():
+            for stage, cost in stages.items():
                 axes.plot(
-                    told["size"], told[what], "o-", label=f"{stage} {growth_exponent(told['size'], told[what]):.2f}"
+                    cost["size"], cost[what], "o-", label=f"{stage} {growth_exponent(cost['size'], cost[what]):.2f}"
                 )
             axes.set(xscale="log", yscale="log", xlabel=of, ylabel={"cpu": "CPU seconds", "mb": "memory (MB)"}[what])
             charts.use_plain_log_ticks(axes)
@@ -115,31 +115,33 @@ def main() -> None:
     parser.add_argument("--last", choices=STAGES, default=STAGES[-1], help="last stage to run")
     parser.add_argument("--largest", action="store_true", help="also run the most views with the most pixels")
     parser.add_argument("--out", type=Path, default=ROOT / "runs/growth")
-    given = parser.parse_args()
-    out = given.out.resolve()
+    arguments = parser.parse_args()
+    out = arguments.out.resolve()
     os.makedirs(out / "runs", exist_ok=True)
-    asked = {
-        f"training views of {given.pixels[0]} megapixels": [(views, given.pixels[0]) for views in given.views],
-        f"megapixels of {given.views[0]} views": [(given.views[0], each) for each in given.pixels],
+    axes = {
+        f"training views of {arguments.pixels[0]} megapixels": [
+            (views, arguments.pixels[0]) for views in arguments.views
+        ],
+        f"megapixels of {arguments.views[0]} views": [(arguments.views[0], each) for each in arguments.pixels],
     }
-    found: dict[str, dict[str, dict[str, list[float]]]] = {}
-    for axis, (of, scenes) in enumerate(asked.items()):
-        stages = found.setdefault(of, {})
+    costs: dict[str, dict[str, dict[str, list[float]]]] = {}
+    for axis, (of, scenes) in enumerate(axes.items()):
+        stages = costs.setdefault(of, {})
         for size in scenes:
-            taken = run_stages(make_room(*size, out / "scenes"), out / "runs", given.profile, given.last)
-            for stage, told in taken.items():
+            by_stage = run_stages(make_room(*size, out / "scenes"), out / "runs", arguments.profile, arguments.last)
+            for stage, cost in by_stage.items():
                 row = stages.setdefault(stage, {"size": [], "cpu": [], "seconds": [], "mb": []})
                 row["size"].append(size[axis])
                 for what in ("cpu", "seconds", "mb"):
-                    row[what].append(told[what])
+                    row[what].append(cost[what])
         for stage, row in stages.items():
             cpu, mb = (growth_exponent(row["size"], row[what]) for what in ("cpu", "mb"))
             print(f"{of}, {stage}: CPU {cpu:.2f}, memory {mb:.2f}")
-    save_json(out / "growth.json", found)
-    draw(found, out / "growth.png")
-    if given.largest:
-        scene = make_room(given.views[-1], given.pixels[-1], out / "scenes")
-        print(json.dumps(run_stages(scene, out / "runs", given.profile, given.last), indent=1))
+    save_json(out / "growth.json", costs)
+    draw(costs, out / "growth.png")
+    if arguments.largest:
+        scene = make_room(arguments.views[-1], arguments.pixels[-1], out / "scenes")
+        print(json.dumps(run_stages(scene, out / "runs", arguments.profile, arguments.last), indent=1))
 
 
 if __name__ == "__main__":

@@ -36,12 +36,12 @@ def true_never_seen(scene_folder: Path, cameras: list[Camera]) -> dict[str, np.n
     truth = load_json(scene_folder / "truth/cameras.json")
     size = (truth["width"], truth["height"])
     photo = lens.Lens(*size, truth["f"], truth["f"], truth["cx"], truth["cy"], radial=(truth["k1"],))
-    shown = {}
+    pictures = {}
     for camera in cameras:
         pinhole = lens.Lens(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         mask = load_mask(scene_folder / f"truth/never_seen/{camera.name}.png", size[::-1])
-        shown[camera.name] = lens.undistort_mask(mask, lens.sampling_map(photo, pinhole))
-    return shown
+        pictures[camera.name] = lens.undistort_mask(mask, lens.sampling_map(photo, pinhole))
+    return pictures
 
 
 def perturb_mask(mask: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -53,38 +53,38 @@ def perturb_mask(mask: np.ndarray, random: np.random.Generator) -> np.ndarray:
         move = np.float32([[1, 0, distance * np.cos(angle)], [0, 1, distance * np.sin(angle)]])
         return cv2.warpAffine(mask.astype(np.float32), move, mask.shape[::-1]) > 0.5
     # Distance to the nearest pixel of the mask or, for an erosion, to the nearest one outside it.
-    away = cv2.distanceTransform((~mask if way == "dilate" else mask).astype(np.uint8), cv2.DIST_L2, 5)
-    return away <= distance if way == "dilate" else away > distance
+    border_distance = cv2.distanceTransform((~mask if way == "dilate" else mask).astype(np.uint8), cv2.DIST_L2, 5)
+    return border_distance <= distance if way == "dilate" else border_distance > distance
 
 
-def save_raw_masks(given: dict[str, np.ndarray], folder: Path) -> Path:
+def save_raw_masks(raw: dict[str, np.ndarray], folder: Path) -> Path:
     """Write a folder like that of the stage `raw_masks`, with exactly these masks; return it."""
     shutil.rmtree(folder, ignore_errors=True)
-    for name, mask in given.items():
+    for name, mask in raw.items():
         save_mask(folder / "masks" / f"{name}.png", mask)
     return folder
 
 
-def iou(found: list[np.ndarray], truth: list[np.ndarray]) -> float:
+def iou(estimates: list[np.ndarray], truth: list[np.ndarray]) -> float:
     """Intersection over union of all views together, without the surroundings of the true border."""
     square = np.ones((2 * BORDER + 1,) * 2, np.uint8)
     both = either = 0
-    for made, true in zip(found, truth, strict=True):
+    for mask, true in zip(estimates, truth, strict=True):
         grown, shrunk = (change(true.astype(np.uint8), square) > 0 for change in (cv2.dilate, cv2.erode))
         counts = ~grown | shrunk
-        both += np.count_nonzero(made & true & counts)
-        either += np.count_nonzero((made | true) & counts)
+        both += np.count_nonzero(mask & true & counts)
+        either += np.count_nonzero((mask | true) & counts)
     return both / either if either else 1.0
 
 
-def scores(made: Path, scene: Scene, truth: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, float]]:
+def scores(artifact: Path, scene: Scene, truth: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, float]]:
     """Kind of mask -> IoU of the training views together, of the median and of the worst view."""
-    sets, found = load_mask_sets(made, scene.train), {}
+    sets, results = load_mask_sets(artifact, scene.train), {}
     for kind, true in truth.items():
         masks, truths = [getattr(sets[name], kind) for name in scene.train], [true[name] for name in scene.train]
-        each = [iou([mask], [wanted]) for mask, wanted in zip(masks, truths, strict=True)]
-        found[kind] = {"together": iou(masks, truths), "median": float(np.median(each)), "worst": min(each)}
-    return found
+        each = [iou([mask], [truth_mask]) for mask, truth_mask in zip(masks, truths, strict=True)]
+        results[kind] = {"together": iou(masks, truths), "median": float(np.median(each)), "worst": min(each)}
+    return results
 
 
 def measure(scene_folder: Path, run: Path, out: Path, seed: int) -> dict[str, dict[str, dict[str, float]]]:
@@ -98,13 +98,13 @@ def measure(scene_folder: Path, run: Path, out: Path, seed: int) -> dict[str, di
     noisy = {scene.train[k]: perturb_mask(exact[scene.train[k]], random) for k in sorted(kept)}
     params = masks_stage.Params(**load_json(run / "masks/receipt.json")["params"])
     results = {}
-    for kind, given in (("exact", exact), ("perturbed", noisy)):
-        made = out / kind
-        shutil.rmtree(made, ignore_errors=True)
-        made.mkdir(parents=True)
-        raw_masks = save_raw_masks(given, out / f"raw_masks-{kind}")
-        masks_stage.run(params, made, poses=run / "poses", raw_masks=raw_masks, fit=run / "fit")
-        results[kind] = scores(made, scene, truth)
+    for kind, raw in (("exact", exact), ("perturbed", noisy)):
+        artifact = out / kind
+        shutil.rmtree(artifact, ignore_errors=True)
+        artifact.mkdir(parents=True)
+        raw_masks = save_raw_masks(raw, out / f"raw_masks-{kind}")
+        masks_stage.run(params, artifact, poses=run / "poses", raw_masks=raw_masks, fit=run / "fit")
+        results[kind] = scores(artifact, scene, truth)
     results["perturbed"]["input"] = {"together": iou(list(noisy.values()), [exact[n] for n in noisy])}
     return results
 
@@ -116,23 +116,23 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="default: runs/masks/<scene's name>")
     parser.add_argument("--seed", type=int, default=0, help="of the perturbations")
     parser.add_argument("--check", action="store_true", help="exit with 1 if a required IoU is missed")
-    given = parser.parse_args()
-    name = given.scene.resolve().name
-    run, out = given.run or Path("runs") / name, given.out or Path("runs/masks") / name
-    for path in (given.scene / "truth/cameras.json", run / "masks/receipt.json"):
+    arguments = parser.parse_args()
+    name = arguments.scene.resolve().name
+    run, out = arguments.run or Path("runs") / name, arguments.out or Path("runs/masks") / name
+    for path in (arguments.scene / "truth/cameras.json", run / "masks/receipt.json"):
         if not path.exists():
             raise ValueError(f"{path} is missing: make the scene with data/generate.py, and run `make scene=... masks`")
-    results = measure(given.scene, run, out, given.seed)
+    results = measure(arguments.scene, run, out, arguments.seed)
     (out / "masks.json").write_text(json.dumps(results, indent=1))
     missed = 0
     for kind, required in REQUIRED_IOU.items():
         for mask, least in required.items():
-            found = results[kind][mask]
-            missed += found["together"] < least
-            numbers = f"{found['together']:.3f}, median view {found['median']:.3f}, worst {found['worst']:.3f}"
+            row = results[kind][mask]
+            missed += row["together"] < least
+            numbers = f"{row['together']:.3f}, median view {row['median']:.3f}, worst {row['worst']:.3f}"
             print(f"{kind:9} {mask:10} IoU {numbers} (required: {least})")
     print(f"the perturbed masks themselves: {results['perturbed']['input']['together']:.3f}")
-    return int(given.check and missed > 0)
+    return int(arguments.check and missed > 0)
 
 
 if __name__ == "__main__":

@@ -74,10 +74,10 @@ def write_scenes(
         shutil.rmtree(folder, ignore_errors=True)
     for name in views.all:
         camera, photo = capture.cameras[name], compositing.load_photograph(capture, name) / 255
-        shown, at_goal = compositing.composite_object(photo, pictured, camera, after, tints)
-        save_image(ceiling / f"images/{name}.png", shown)
+        picture, at_goal = compositing.composite_object(photo, pictured, camera, after, tints)
+        save_image(ceiling / f"images/{name}.png", picture)
         if name in views.test:
-            save_image(scene / f"images/{name}.png", shown)
+            save_image(scene / f"images/{name}.png", picture)
             for folder in (scene, ceiling):
                 save_image(folder / f"test_masks/{name}.png", at_goal)
             continue
@@ -85,7 +85,7 @@ def write_scenes(
         save_image(scene / f"images/{name}.png", with_it)
         save_image(scene / f"masks/{name}.png", mask)
         if name in references:
-            save_image(scene / f"references/{name}.png", shown)
+            save_image(scene / f"references/{name}.png", picture)
             depth = compositing.composite_depth(pictured, camera, after)
             depth[(mask > 0) & (at_goal == 0)] = np.nan  # unknown behind the object's first place
             np.save(scene / f"references/{name}.npy", depth)
@@ -95,12 +95,12 @@ def write_scenes(
         f"test_masks: test_masks\ntest: {compositing.yaml_list(views.test)}\nstages: {{poses: {{refine: false}}}}\n"
     )
     (ceiling / "scene.yaml").write_text(f"masks: none\n{tested}")
-    given = "".join(
+    entries = "".join(
         f'- {{view: "{name}", image: references/{name}.png, depth: references/{name}.npy}}\n' for name in references
     )
     radius = REGION_FACTOR * float(np.linalg.norm(after.half))
     region = f"region: {{center: {after.middle.tolist()}, radius: {radius}}}\n"
-    (scene / "scene.yaml").write_text(f"masks: masks\n{tested}{region}reference:\n{given}")
+    (scene / "scene.yaml").write_text(f"masks: masks\n{tested}{region}reference:\n{entries}")
     return scene
 
 
@@ -111,18 +111,22 @@ def main() -> None:
     parser.add_argument("--goal", default="bear-rock")
     parser.add_argument("--profile", default="laptop")
     parser.add_argument("--out", type=Path, default=composites.ROOT / "runs/moving")
-    given = parser.parse_args()
-    (start,), (goal,) = (composites.select_places(name, False) for name in (given.start, given.goal))
+    arguments = parser.parse_args()
+    (start,), (goal,) = (composites.select_places(name, False) for name in (arguments.start, arguments.goal))
     if start.capture != goal.capture:
         parser.error(
             f"{start.name} is a place of {start.capture}, {goal.name} of {goal.capture}; take two of one capture"
         )
-    scene = write_scenes(start, goal, placement.load_photographs(given.captures / start.capture), given.out / "scenes")
+    scene = write_scenes(
+        start, goal, placement.load_photographs(arguments.captures / start.capture), arguments.out / "scenes"
+    )
     folders = (scene, scene.with_name(f"{scene.name}-untouched"))
-    run, ceiling = (scoring.Run.load(composites.run_job(each, given.out / "runs", given.profile)) for each in folders)
-    save_image(given.out / f"{scene.name}.png", scoring.comparison_sheet(run, ceiling))
+    run, ceiling = (
+        scoring.Run.load(composites.run_job(each, arguments.out / "runs", arguments.profile)) for each in folders
+    )
+    save_image(arguments.out / f"{scene.name}.png", scoring.comparison_sheet(run, ceiling))
     scores = scoring.score_place(run, ceiling, {})
-    save_json(given.out / "moving.json", {"place": scene.name, **scores})
+    save_json(arguments.out / "moving.json", {"place": scene.name, **scores})
     print(scores)
 
 

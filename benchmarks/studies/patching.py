@@ -101,8 +101,8 @@ def delete_object(run: Path, folder: Path, tool: list[str]) -> None:
     line = [*tool, "-q", "-w", str(folder / "selected.ply"), "-V", "selected,lt,0.5", str(folder / "after.ply")]
     subprocess.run(line, check=True)
     cameras = load_json(exported / "cameras" / "transforms.json")
-    shown = {f"images/{name}.png" for name in placed.train}
-    cameras["frames"] = [frame for frame in cameras["frames"] if frame["file_path"] in shown]
+    photographs = {f"images/{name}.png" for name in placed.train}
+    cameras["frames"] = [frame for frame in cameras["frames"] if frame["file_path"] in photographs]
     save_json(folder / "cameras" / "transforms.json", cameras)
     shutil.copy(exported / "cameras" / "sparse_pc.ply", folder / "cameras")
     (folder / "cameras" / "images").mkdir()
@@ -149,14 +149,14 @@ def score(run: Path, out: Path, runs: Path) -> None:
     for kind in KINDS:
         cleaned = out / f"patch-{kind}" / "cleaned.compressed.ply"
         together[f"{kind}: cleaned and new"] = cleaned, files[kind].with_name("new.ply")
-    found, rows, some = {}, [], placed.test[:: max(1, len(placed.test) // SHOWN)][:SHOWN]
+    scores, rows, some = {}, [], placed.test[:: max(1, len(placed.test) // SHOWN)][:SHOWN]
     for title, parts in together.items():
         if all(path.exists() for path in parts):
             pictures = render_test_views(parts, placed, placed.similarity)
-            found[title] = box_psnr(pictures, run, placed)
+            scores[title] = box_psnr(pictures, run, placed)
             rows.append(np.concatenate([pictures[name] for name in some], 1))
-            print(f"{title}: {found[title]:.2f} dB", flush=True)
-    save_json(out / "patching.json", found)
+            print(f"{title}: {scores[title]:.2f} dB", flush=True)
+    save_json(out / "patching.json", scores)
     save_image(out / "patching.png", np.concatenate(rows))
 
 

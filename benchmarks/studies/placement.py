@@ -172,8 +172,8 @@ def _surface(capture: Photographs, place: Place) -> np.ndarray:
     image, depth = capture.project(capture.cameras[place.view], capture.points)
     close = (depth > 0) & (np.linalg.norm(image - place.pixel, axis=1) < place.near)
     if close.sum() < MIN_POINTS:
-        found = f"{close.sum()} points within {place.near:g} px of its pixel"
-        raise ValueError(f"{place.name}: {found}, {MIN_POINTS} are needed")
+        count = f"{close.sum()} points within {place.near:g} px of its pixel"
+        raise ValueError(f"{place.name}: {count}, {MIN_POINTS} are needed")
     return capture.points[close & (depth < FRONT_TOLERANCE * np.percentile(depth[close], 20))]
 
 

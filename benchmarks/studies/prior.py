@@ -118,23 +118,25 @@ def scene_cases(run: Path, size: int, pictures: dict[str, np.ndarray] | None = N
         ValueError: no test view has ground truth and a mask.
     """
     scene = load_scene(run / "poses")
-    found = {}
+    cases = {}
     for name in scene.test:
         truth = load_ground_truth(scene.cameras[name], run / "poses")
         hole = load_object_mask(scene.cameras[name], run / "raw_masks", run / "masks")
         if truth is not None and hole.any():
-            found[name] = Case(truth if pictures is None else pictures[name], hole, name)
-    if not found:
+            cases[name] = Case(truth if pictures is None else pictures[name], hole, name)
+    if not cases:
         raise ValueError(f"{run / 'poses'}: no test view shows the scene without the object; take another scene")
-    places = np.linspace(0, len(found) - 1, min(VIEWS, len(found))).round().astype(int)
-    chosen = [list(found.values())[place] for place in places]
-    given = load_references(run / "reference", scene)[0]
-    own = _reduced(Case(given.image, given.mask, given.camera.name), size)
+    places = np.linspace(0, len(cases) - 1, min(VIEWS, len(cases))).round().astype(int)
+    chosen = [list(cases.values())[place] for place in places]
+    reference = load_references(run / "reference", scene)[0]
+    own = _reduced(Case(reference.image, reference.mask, reference.camera.name), size)
     whole, windows = [_reduced(case, size) for case in chosen], []
     for case in chosen:
         top, left = window_around(torch.from_numpy(case.hole), size, seeding.generator(SEED, "window", case.kind))
-        here = (slice(top, top + size), slice(left, left + size))
-        windows.append(Case(np.ascontiguousarray(case.truth[here]), np.ascontiguousarray(case.hole[here]), case.kind))
+        window = (slice(top, top + size), slice(left, left + size))
+        windows.append(
+            Case(np.ascontiguousarray(case.truth[window]), np.ascontiguousarray(case.hole[window]), case.kind)
+        )
     return {
         "reference": [replace(own, kind=f"{own.kind}-{k}") for k in range(NOISES)],
         "whole": whole,
@@ -175,11 +177,13 @@ def measure_timesteps(prior: Prior, cases: list[Case], prompt: str) -> dict[str,
     result: dict[str, list[float]] = {"error": [], "variance": []}
     for timestep in TIMESTEPS:
         t = torch.full((len(cases),), timestep)
-        drawn = []
+        gradients = []
         for index in range(NOISES):
             noise = torch.randn(clean.shape, generator=seeding.generator(SEED, "noise", timestep, index))
-            drawn.append(diffusion.predict(prior, diffusion.add_noise(prior, clean, noise, t), t, condition, text)[1])
-        guesses = torch.stack(drawn)
+            gradients.append(
+                diffusion.predict(prior, diffusion.add_noise(prior, clean, noise, t), t, condition, text)[1]
+            )
+        guesses = torch.stack(gradients)
         result["error"].append(float((guesses - clean).square().mean(0)[inside].mean()))
         result["variance"].append(float(guesses.var(0)[inside].mean()))
     return result
@@ -196,11 +200,11 @@ def replace_references(reference: Path, picture: Path, folder: Path) -> Path:
 
 def personalize_prior(params: stage.Params, needs: dict[str, Path], folder: Path) -> tuple[Prior, list[dict]]:
     """The prior personalized in `folder`, and the trace; an earlier attempt with these parameters continues."""
-    settings, made = params.model_dump(mode="json"), folder / "settings.json"
-    if not made.exists() or load_json(made) != settings:
+    settings, record = params.model_dump(mode="json"), folder / "settings.json"
+    if not record.exists() or load_json(record) != settings:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        save_json(made, settings)
+        save_json(record, settings)
     if not (folder / lora.LORA_FILE).exists():
         stage.run(params, folder, **needs)
     return lora.merge(load_prior(params.prior), folder), trace.read_trace(folder / "trace.jsonl")
@@ -249,7 +253,7 @@ def measure_personalization(
         if wrong:
             models["wrong"] = personalize_wrongly(mine, needs, wrong, out / "personalize")
         pictures = {when: fill_scales(model, cases, seed, sampler) for when, model in models.items()}
-        result["seeds"][str(seed)] = {when: score_scales(made, cases) for when, made in pictures.items()}
+        result["seeds"][str(seed)] = {when: score_scales(samples, cases) for when, samples in pictures.items()}
         result["seeds"][str(seed)]["seconds"] = log[-1]["seconds"]
         print_seed(seed, result["seeds"][str(seed)])
         if seed == seeds[0]:
@@ -280,15 +284,15 @@ def measure_first_seed(
             for when, model in models.items()
         }
         for index, case in enumerate(some):
-            save_row(out / scale / f"{case.kind}.png", case, [made[scale][index] for made in pictures.values()])
+            save_row(out / scale / f"{case.kind}.png", case, [samples[scale][index] for samples in pictures.values()])
     result["sampler"] = {s: measure_steps(models["after"], cases[s], steps, PROMPTS[s]) for s in ("reference", "whole")}
     return result
 
 
 def parse_setting(text: str) -> tuple[str, object]:
     """("steps", 500) from "steps=500"."""
-    name, found, value = text.partition("=")
-    if not found:
+    name, separator, value = text.partition("=")
+    if not separator:
         raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE")
     return name, yaml.safe_load(value)
 
@@ -313,27 +317,33 @@ def parse_arguments() -> argparse.Namespace:
 
 
 def main() -> None:
-    given = parse_arguments()
-    torch.set_num_threads(given.threads)
+    arguments = parse_arguments()
+    torch.set_num_threads(arguments.threads)
     for folder in ("inpainting", "reference", "whole", "window"):
-        shutil.rmtree(given.out / folder, ignore_errors=True)
-    first = given.priors[0]
+        shutil.rmtree(arguments.out / folder, ignore_errors=True)
+    first = arguments.priors[0]
     result: dict = {"prior": first}
-    if given.pictures:
-        cases = make_cases(given.pictures)
-        result["inpainting"] = measure_inpainting(given.priors, cases, given.out)
+    if arguments.pictures:
+        cases = make_cases(arguments.pictures)
+        result["inpainting"] = measure_inpainting(arguments.priors, cases, arguments.out)
         for name, kinds in result["inpainting"]["scores"].items():
             print(name, {column: round(kinds["all"][column], 3) for column in (*COLUMNS, "seconds")}, flush=True)
-        result["sampler"] = measure_steps(load_prior(first), cases, given.steps)
+        result["sampler"] = measure_steps(load_prior(first), cases, arguments.steps)
         for count, row in result["sampler"].items():
             print(f"{count} steps", {column: round(row[column], 3) for column in (*COLUMNS, "seconds")}, flush=True)
-    if given.run:
-        params = profile_params(first, dict(given.set))
+    if arguments.run:
+        params = profile_params(first, dict(arguments.set))
         result["personalization"] = measure_personalization(
-            params, given.run, given.seeds, given.wrong_reference, given.steps, given.sampler, given.out
+            params,
+            arguments.run,
+            arguments.seeds,
+            arguments.wrong_reference,
+            arguments.steps,
+            arguments.sampler,
+            arguments.out,
         )
-    save_json(given.out / "prior.json", result)
-    print(given.out / "prior.json")
+    save_json(arguments.out / "prior.json", result)
+    print(arguments.out / "prior.json")
 
 
 if __name__ == "__main__":

@@ -114,11 +114,11 @@ class Photographs:
         """The other views by distance: between centres, relative to the median, plus twice the radians between axes."""
         centre = {name: -pose[:3, :3].T @ pose[:3, 3] for name, pose in self.world_to_camera.items()}
         others = [name for name in self.files if name != view]
-        away = {name: float(np.linalg.norm(centre[name] - centre[view])) for name in others}
+        distance = {name: float(np.linalg.norm(centre[name] - centre[view])) for name in others}
         axis = self.world_to_camera[view][2, :3]
         cosine = {name: np.clip(self.world_to_camera[name][2, :3] @ axis, -1, 1) for name in others}
-        usual = float(np.median(list(away.values())))
-        return sorted(others, key=lambda name: away[name] / usual + 2 * np.arccos(cosine[name]))
+        usual = float(np.median(list(distance.values())))
+        return sorted(others, key=lambda name: distance[name] / usual + 2 * np.arccos(cosine[name]))
 
 
 def load_photographs(folder: Path) -> Photographs:
@@ -184,20 +184,20 @@ def measure(capture: Photographs, foreign: np.ndarray, every: int) -> Rates:
         redrawn = redraw(photo)
         for number, make in enumerate(VARIANTS.values()):
             image = fit_size(make(redrawn), photo)
-            found = registration.register(image, photo, hole)
+            registered = registration.register(image, photo, hole)
             compare = number == index % len(VARIANTS)  # one variant per view is compared with neighbours, to save time
-            wrong = not found.fits or (compare and registration.find_better_view(image, found, others))
-            rates.own.append(found.inlier_ratio)
+            wrong = not registered.fits or (compare and registration.find_better_view(image, registered, others))
+            rates.own.append(registered.inlier_ratio)
             rates.refused += bool(wrong)
         for number, name in enumerate(nearest[:NEAREST]):
             image = fit_size(capture.picture(name) if number else redraw(capture.picture(name)), photo)
-            found = registration.register(image, photo, hole)
-            rates.other.append(found.inlier_ratio)
-            rates.accepted_by_place += found.fits
-            rates.accepted += found.fits and registration.find_better_view(image, found, others) is None
-        found = registration.register(fit_size(foreign, photo), photo, hole)
-        rates.foreign.append(found.inlier_ratio)
-        rates.accepted += found.fits
+            registered = registration.register(image, photo, hole)
+            rates.other.append(registered.inlier_ratio)
+            rates.accepted_by_place += registered.fits
+            rates.accepted += registered.fits and registration.find_better_view(image, registered, others) is None
+        registered = registration.register(fit_size(foreign, photo), photo, hole)
+        rates.foreign.append(registered.inlier_ratio)
+        rates.accepted += registered.fits
     return rates
 
 
@@ -228,14 +228,14 @@ def main() -> int:
     )
     parser.add_argument("--every", type=int, default=1, help="take every n-th view")
     parser.add_argument("--seconds", action="store_true", help="only measure the time of a registration")
-    given = parser.parse_args()
-    folders = [given.captures / name for name in given.names.split(",") if (given.captures / name).is_dir()]
+    arguments = parser.parse_args()
+    folders = [arguments.captures / name for name in arguments.names.split(",") if (arguments.captures / name).is_dir()]
     if len(folders) < 2:
-        print(f"skipped: fewer than two captures in {given.captures}")
+        print(f"skipped: fewer than two captures in {arguments.captures}")
         return 0
     captures = {folder.name: load_photographs(folder) for folder in folders}
     first = {name: capture.picture(next(iter(capture.files))) for name, capture in captures.items()}
-    if given.seconds:
+    if arguments.seconds:
         print(measure_seconds(next(iter(first.values()))))
         return 0
     print(HEADER)
@@ -243,7 +243,7 @@ def main() -> int:
     for name, capture in captures.items():
         foreign = first[names[names.index(name) - 1]]
         chosen = ", chosen on" if name in CHOSEN_ON else ""
-        print(measure(capture, foreign, given.every).row(name + chosen), flush=True)
+        print(measure(capture, foreign, arguments.every).row(name + chosen), flush=True)
     return 0
 
 

@@ -43,22 +43,22 @@ def run_study(study: Callable[[], None]) -> None:
         sys.exit(f"error: {error}")
 
 
-def load_priors(given: argparse.Namespace) -> tuple[dict[str, Prior], str]:
+def load_priors(arguments: argparse.Namespace) -> tuple[dict[str, Prior], str]:
     """{"before", "after"} personalization, and the prior's name.
 
     Raises:
         ValueError: the run has no personalized prior, or the device is not available.
     """
-    adapted: Path = given.run / "personalize"
+    adapted: Path = arguments.run / "personalize"
     if not adapted.is_dir():
-        make = f"make scene={given.run.name} personalize set=distill.sds.run=always"
+        make = f"make scene={arguments.run.name} personalize set=distill.sds.run=always"
         raise ValueError(f"{adapted} is missing: run `{make}` first")
-    if given.device == "cuda" and not torch.cuda.is_available():
+    if arguments.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("device=cuda: torch finds no CUDA device here; device=cpu")
-    if given.device == "cpu" and given.dtype == "float16":
+    if arguments.device == "cpu" and arguments.dtype == "float16":
         raise ValueError("dtype=float16 is for device=cuda; on the CPU float32 or bfloat16")
-    base = given.prior or load_json(adapted / "receipt.json")["params"]["prior"]
-    fresh = lambda: load_prior(base, given.device, getattr(torch, given.dtype))
+    base = arguments.prior or load_json(adapted / "receipt.json")["params"]["prior"]
+    fresh = lambda: load_prior(base, arguments.device, getattr(torch, arguments.dtype))
     return {"before": fresh(), "after": lora.merge(fresh(), adapted)}, base
 
 
@@ -69,8 +69,8 @@ def peak_mb(device: str) -> int:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6)
 
 
-def save_results(given: argparse.Namespace, folder: Path, name: str, found: dict[str, Any]) -> None:
+def save_results(arguments: argparse.Namespace, folder: Path, name: str, results: dict[str, Any]) -> None:
     """Save the study's results with the device and peak memory, which are also printed."""
-    peak = peak_mb(given.device)
-    save_json(folder / name, found | {"device": given.device, "dtype": given.dtype, "peak_mb": peak})
-    print(f"on {given.device} in {given.dtype}, both priors loaded: at most {peak:,} MB")
+    peak = peak_mb(arguments.device)
+    save_json(folder / name, results | {"device": arguments.device, "dtype": arguments.dtype, "peak_mb": peak})
+    print(f"on {arguments.device} in {arguments.dtype}, both priors loaded: at most {peak:,} MB")

@@ -136,10 +136,10 @@ def _untouched(run: Run, ceiling: Run, name: str) -> np.ndarray | None:
 def _worst(run: Run, truths: dict[str, np.ndarray | None]) -> float | None:
     """Largest uncovered share over the named views."""
     gaussians = run.gaussians()
-    found = [
+    worst = [
         uncovered_share(gaussians, run.scene.cameras[name], run.mask(name), truth) for name, truth in truths.items()
     ]
-    return max((share for share in found if share is not None), default=None)
+    return max((share for share in worst if share is not None), default=None)
 
 
 def uncovered_share(gaussians: Gaussians, camera: Camera, mask: np.ndarray, truth: np.ndarray | None) -> float | None:
@@ -170,8 +170,8 @@ def comparison_sheet(run: Run, ceiling: Run) -> np.ndarray:
         if box is None or same is None:
             continue
         truth, ours = box.crop(run.truth(name)), box.crop(run.picture(name))
-        apart = cv2.absdiff(truth, ours)
-        panels = [truth, box.crop(run.picture(name, "renders_fit")), ours, same.crop(ceiling.picture(name)), apart]
+        difference = cv2.absdiff(truth, ours)
+        panels = [truth, box.crop(run.picture(name, "renders_fit")), ours, same.crop(ceiling.picture(name)), difference]
         rows.append(_row(panels))
     width = max(row.shape[1] for row in rows)
     return np.concatenate([np.pad(row, ((0, 4), (0, width - row.shape[1]), (0, 0))) for row in rows])

@@ -74,22 +74,22 @@ def sds_gradients(prior: Prior, pictures: Tensor, holes: Tensor, prompt: str) ->
     """[T, K, M]: z - x0(z_t) at `TIMESTEPS`, for each of `NOISES` draws, in the M latent values of the holes."""
     latents, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
     text = diffusion.embed_text(prior, [prompt]).expand(len(latents), -1, -1)
-    inside, found = condition[:, :1].expand_as(latents) > 0.5, []
+    inside, gradients = condition[:, :1].expand_as(latents) > 0.5, []
     for part in TIMESTEPS:
         t = torch.full((len(latents),), round(part * (prior.timesteps - 1)), device=prior.device)
         for k in range(NOISES):
             noise = torch.randn(latents.shape, generator=seeding.generator(SEED, "sds variance", int(t[0]), k))
             noise = noise.to(latents)
             clean = diffusion.predict(prior, diffusion.add_noise(prior, latents, noise, t), t, condition, text)[1]
-            found.append((latents - clean)[inside])
-    return torch.stack(found).view(len(TIMESTEPS), NOISES, -1)
+            gradients.append((latents - clean)[inside])
+    return torch.stack(gradients).view(len(TIMESTEPS), NOISES, -1)
 
 
-def variances(drawn: Tensor) -> dict:
+def variances(samples: Tensor) -> dict:
     """Variances of gradients [T, K, M], T and K at least 2; see the module docstring."""
-    noise = drawn.var(1)  # [T, M], unbiased
-    mean = drawn.mean(1)
-    left = noise / drawn.shape[1]  # part of the noise that remains in the mean of K draws
+    noise = samples.var(1)  # [T, M], unbiased
+    mean = samples.mean(1)
+    left = noise / samples.shape[1]  # part of the noise that remains in the mean of K draws
     over_noise = noise.mean()
     over_timesteps = (mean.var(0) - left.mean(0)).mean().clamp(min=0)
     return {
@@ -103,17 +103,17 @@ def variances(drawn: Tensor) -> dict:
 
 def measure(models: dict[str, Prior], run: Path) -> dict[str, dict[str, dict]]:
     """Scale -> "before" or "after" -> `variances`."""
-    given = load_inputs(run, next(iter(models.values())))
+    inputs = load_inputs(run, next(iter(models.values())))
     return {
-        scale: {when: variances(sds_gradients(model, *given[scale], prompt)) for when, model in models.items()}
+        scale: {when: variances(sds_gradients(model, *inputs[scale], prompt)) for when, model in models.items()}
         for scale, prompt in zip(SCALES, PROMPTS, strict=False)
     }
 
 
-def table(found: dict[str, dict[str, dict]]) -> str:
+def table(results: dict[str, dict[str, dict]]) -> str:
     """Markdown: per scale a row for each timestep, then the three sums; variance before and after, and their ratio."""
     lines = []
-    for scale, by_time in found.items():
+    for scale, by_time in results.items():
         before, after = by_time["before"], by_time["after"]
         lines += [f"{scale}: squared latents", "", "| | before | after | after / before | pull before | pull after |"]
         lines.append("|---|---|---|---|---|---|")
@@ -131,12 +131,12 @@ def _pair(before: float, after: float) -> str:
 
 
 def main() -> None:
-    given = scene_priors.study_parser(__doc__, "initialize and personalize", "sds-variance").parse_args()
-    models, base = scene_priors.load_priors(given)
-    found, out = measure(models, given.run), given.out or given.run / "sds-variance"
+    arguments = scene_priors.study_parser(__doc__, "initialize and personalize", "sds-variance").parse_args()
+    models, base = scene_priors.load_priors(arguments)
+    results, out = measure(models, arguments.run), arguments.out or arguments.run / "sds-variance"
     out.mkdir(parents=True, exist_ok=True)
-    print(table(found))
-    scene_priors.save_results(given, out, "sds_variance.json", {"prior": base, "timesteps": TIMESTEPS} | found)
+    print(table(results))
+    scene_priors.save_results(arguments, out, "sds_variance.json", {"prior": base, "timesteps": TIMESTEPS} | results)
     print(out / "sds_variance.json")
 
 

@@ -51,13 +51,15 @@ def make_scene(scene: Path, count: int, folder: Path) -> Path:
     order = load_json(scene / "truth/facts.json").get("shown", [])
     if len(order) < count:
         raise ValueError(f"{scene / 'truth/facts.json'}: names no {count} views to show; is it a scene demo-sparse?")
-    made = folder / f"{scene.name}-{count}-views"
-    if not made.exists():
-        shutil.copytree(scene, made, copy_function=os.link, ignore=shutil.ignore_patterns("scene.yaml", ".generated"))
-    settings, shown = yaml.safe_load((scene / "scene.yaml").read_text()), order[:count]
-    given = [{"view": name, "image": f"images_4/{name}.png"} for name in shown]
-    save_text(made / "scene.yaml", yaml.safe_dump(settings | {"train": shown, "clean": shown, "reference": given}))
-    return made
+    target = folder / f"{scene.name}-{count}-views"
+    if not target.exists():
+        shutil.copytree(scene, target, copy_function=os.link, ignore=shutil.ignore_patterns("scene.yaml", ".generated"))
+    settings, names = yaml.safe_load((scene / "scene.yaml").read_text()), order[:count]
+    references = [{"view": name, "image": f"images_4/{name}.png"} for name in names]
+    save_text(
+        target / "scene.yaml", yaml.safe_dump(settings | {"train": names, "clean": names, "reference": references})
+    )
+    return target
 
 
 def run_method(scene: Path, way: str, runs: Path) -> dict[str, float]:
@@ -66,24 +68,24 @@ def run_method(scene: Path, way: str, runs: Path) -> dict[str, float]:
     command = [sys.executable, "-m", "runner", "run", "all", f"--scene={scene}", f"--runs={home}", *METHODS[way]]
     if subprocess.run(command, cwd=ROOT).returncode:
         raise ValueError(f"{scene.name}, {way}: failed; see above")
-    (found,) = home.glob(f"{scene.name}*/evaluate/metrics.json")
-    mean = load_json(found)["mean"]
+    (metrics,) = home.glob(f"{scene.name}*/evaluate/metrics.json")
+    mean = load_json(metrics)["mean"]
     return {name: mean[name] for name in SCORES}
 
 
-def draw(found: dict[str, dict[str, list[dict[str, float]]]], path: Path) -> None:
-    """Draw a panel per score. `found`: method -> number of views -> scores of each scene."""
-    made, grid = charts.new_figure(3.2, 1, len(SCORES))
+def draw(scores: dict[str, dict[str, list[dict[str, float]]]], path: Path) -> None:
+    """Draw a panel per score. `scores`: method -> number of views -> scores of each scene."""
+    figure, grid = charts.new_figure(3.2, 1, len(SCORES))
     for axes, (score, title) in zip(grid[0], SCORES.items(), strict=True):
-        for way, counts in found.items():
+        for way, counts in scores.items():
             means = [np.mean([each[score] for each in scenes]) for scenes in counts.values()]
             axes.plot([int(count) for count in counts], means, "o-", color=COLOURS[way], label=way)
         axes.set(xscale="log", xlabel="views with pixels", ylabel=title)
         charts.use_plain_log_ticks(axes)
-        counts = sorted({int(count) for each in found.values() for count in each})
+        counts = sorted({int(count) for each in scores.values() for count in each})
         axes.set_xticks(counts, [str(count) for count in counts])
     grid[0, 0].legend(frameon=False, fontsize=9)
-    charts.save_chart(made, path)
+    charts.save_chart(figure, path)
 
 
 def main() -> None:
@@ -92,15 +94,15 @@ def main() -> None:
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS)
     parser.add_argument("--ways", choices=METHODS, nargs="+", default=list(METHODS))
     parser.add_argument("--out", type=Path, default=ROOT / "runs/sparse")
-    given = parser.parse_args()
-    found: dict[str, dict[str, list[dict[str, float]]]] = {way: {} for way in given.ways}
-    for count in given.counts:
-        for way in given.ways:
-            scenes = [make_scene(scene, count, given.out / "scenes") for scene in given.scenes]
-            found[way][str(count)] = [run_method(scene, way, given.out) for scene in scenes]
-            save_json(given.out / "sparse.json", found)
-    draw(found, given.out / "sparse.png")
-    for way, counts in found.items():
+    arguments = parser.parse_args()
+    scores: dict[str, dict[str, list[dict[str, float]]]] = {way: {} for way in arguments.ways}
+    for count in arguments.counts:
+        for way in arguments.ways:
+            scenes = [make_scene(scene, count, arguments.out / "scenes") for scene in arguments.scenes]
+            scores[way][str(count)] = [run_method(scene, way, arguments.out) for scene in scenes]
+            save_json(arguments.out / "sparse.json", scores)
+    draw(scores, arguments.out / "sparse.png")
+    for way, counts in scores.items():
         for count, each in counts.items():
             print(f"{way:16} {count:>2} views", *(f"{s} {np.mean([e[s] for e in each]):.3f}" for s in SCORES))
 

@@ -42,23 +42,23 @@ def cpu_seconds(stage: ModuleType, params: object, needs: dict[str, Path | None]
 def measure_pairs(name: str, run: Path, steps: int, repeats: int) -> tuple[float, float, int, float]:
     """Median seconds without and with a trace, the additional moments, and seconds per step without a trace."""
     stage, count, needs, _ = STAGES[name]
-    given = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
-    given |= {count: steps, "checkpoint_seconds": 1e9} | ({"holdout": 8} if name == "fit" else {})
+    settings = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
+    settings |= {count: steps, "checkpoint_seconds": 1e9} | ({"holdout": 8} if name == "fit" else {})
     folders = {need: run / need if (run / need).exists() else None for need in needs}
-    params, every = stage.Params(**given), trace.log_spaced
-    taken: dict[bool, list[float]] = {False: [], True: []}
+    params, every = stage.Params(**settings), trace.log_spaced
+    times: dict[bool, list[float]] = {False: [], True: []}
     lines = {}
-    cpu_seconds(stage, stage.Params(**given | {count: 2}), folders)  # compiles, fills caches
+    cpu_seconds(stage, stage.Params(**settings | {count: 2}), folders)  # compiles, fills caches
     try:
         for _ in range(repeats):
             for traced in (False, True):
                 trace.log_spaced = every if traced else (lambda i, last, per_octave=2, first=1: i == last)
                 seconds, lines[traced] = cpu_seconds(stage, params, folders)
-                taken[traced].append(seconds)
+                times[traced].append(seconds)
     finally:
         trace.log_spaced = every
-    plain, traced = (sorted(taken[which])[repeats // 2] for which in (False, True))
-    short = cpu_seconds(stage, stage.Params(**given | {count: 2}), folders)[0]
+    plain, traced = (sorted(times[which])[repeats // 2] for which in (False, True))
+    short = cpu_seconds(stage, stage.Params(**settings | {count: 2}), folders)[0]
     return plain, traced, lines[True] - lines[False], (plain - short) / (steps - 2)
 
 
@@ -68,12 +68,12 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--only", nargs="+", choices=list(STAGES))
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     over = 0
     print(f"{'stage':<12} {'without':>9} {'with':>9} {'moments':>8} {'a moment':>9} {'a step':>8} {'full length':>12}")
-    for name in given.only or STAGES:
-        steps = 8 * given.steps if name == "fit" else given.steps
-        plain, traced, moments, step = measure_pairs(name, given.run, steps, given.repeats)
+    for name in arguments.only or STAGES:
+        steps = 8 * arguments.steps if name == "fit" else arguments.steps
+        plain, traced, moments, step = measure_pairs(name, arguments.run, steps, arguments.repeats)
         profile = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
         full = profile[STAGES[name][1]]
         moment = (traced - plain) / moments

@@ -24,13 +24,13 @@ def main() -> None:
                         "run has them")  # fmt: skip
     parser.add_argument("--page", action="store_true", help="nerfbaselines' page of results too, in OUTPUT/page")
     parser.add_argument("--output", type=Path, required=True, help="a folder that is not there yet")
-    given = parser.parse_args()
-    if given.output.exists():
-        raise SystemExit(f"error: {given.output} is there already")
+    arguments = parser.parse_args()
+    if arguments.output.exists():
+        raise SystemExit(f"error: {arguments.output} is there already")
     try:
-        print(made(given.run, given.data or poses_of(given.run), given.output))
-        if given.page:
-            pages(given.output / "results", given.output / "page")
+        print(made(arguments.run, arguments.data or poses_of(arguments.run), arguments.output))
+        if arguments.page:
+            pages(arguments.output / "results", arguments.output / "page")
     except (RefFusionError, FileNotFoundError) as error:
         raise SystemExit(f"error: {error}") from None
 

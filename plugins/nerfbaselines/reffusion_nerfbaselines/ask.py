@@ -21,10 +21,10 @@ class RefFusionError(RuntimeError):
 def python() -> str:
     """RefFusion's Python: $REFFUSION_PYTHON, else that of the checkout this lies in."""
     beside = WORKER.resolve().parents[3] / ".venv/bin/python"
-    found = os.environ.get("REFFUSION_PYTHON") or (str(beside) if beside.is_file() else "")
-    if not found:
+    path = os.environ.get("REFFUSION_PYTHON") or (str(beside) if beside.is_file() else "")
+    if not path:
         raise RefFusionError("set REFFUSION_PYTHON to the Python of the environment that RefFusion is installed in")
-    return found
+    return path
 
 
 @functools.cache
@@ -33,10 +33,10 @@ def _process() -> subprocess.Popen[bytes]:
     return subprocess.Popen([python(), str(WORKER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=outside)
 
 
-def ask(what: str, **arrays: Any) -> dict[str, np.ndarray]:
+def ask(request: str, **arrays: Any) -> dict[str, np.ndarray]:
     """The reply of worker.py's function of that name. Raises RefFusionError with what it refuses."""
     process = _process()
-    np.savez(buffer := io.BytesIO(), ask=what, **arrays)
+    np.savez(buffer := io.BytesIO(), ask=request, **arrays)
     data = buffer.getvalue()
     process.stdin.write(len(data).to_bytes(8, "little") + data)
     process.stdin.flush()

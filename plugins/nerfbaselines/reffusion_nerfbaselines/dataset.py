@@ -29,25 +29,25 @@ def load(path: str, split: str, features: Any = None, **_: Any) -> Any:
     cache = CACHE / hashlib.sha256(str(scene).encode()).hexdigest()[:16]
     cache.mkdir(parents=True, exist_ok=True)
     try:
-        found = ask("dataset", path=str(scene), split=split, cache=str(cache))
+        answer = ask("dataset", path=str(scene), split=split, cache=str(cache))
     except RefFusionError as error:
         raise DatasetNotFoundError(str(error)) from None
-    pictures = found["pictures"].tolist()
+    pictures = answer["pictures"].tolist()
     cameras = new_cameras(
-        poses=found["poses"],
-        intrinsics=found["intrinsics"],
+        poses=answer["poses"],
+        intrinsics=answer["intrinsics"],
         camera_models=np.full(len(pictures), camera_model_to_int("pinhole"), np.int32),
-        image_sizes=found["sizes"].astype(np.int32),
-        nears_fars=found["bounds"].astype(np.float32),
+        image_sizes=answer["sizes"].astype(np.int32),
+        nears_fars=answer["bounds"].astype(np.float32),
     )
     return new_dataset(
         cameras=cameras,
         image_paths=pictures,
         image_paths_root=str(Path(pictures[0]).parent),
-        mask_paths=found["masks"].tolist(),
+        mask_paths=answer["masks"].tolist(),
         mask_paths_root=str(cache / split),
-        points3D_xyz=found["points"].astype(np.float32),
-        points3D_rgb=found["colors"],
+        points3D_xyz=answer["points"].astype(np.float32),
+        points3D_rgb=answer["colors"],
         metadata={
             "id": DATASET,
             "scene": scene.parent.name if scene.name == "poses" and not labelled else scene.name,

@@ -85,8 +85,8 @@ def _undistorted(scene: Path, out: Path) -> Path:
 
 @cache
 def _scene(folder: str) -> tuple[Any, Similarity]:
-    said = load_json(Path(folder) / "transform.json")
-    similarity = Similarity(said["scale"], np.array(said["offset"], np.float64))
+    record = load_json(Path(folder) / "transform.json")
+    similarity = Similarity(record["scale"], np.array(record["offset"], np.float64))
     return load_ply(Path(folder) / "scene.ply", similarity), similarity
 
 
@@ -98,10 +98,10 @@ def render(folder: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray, size: n
     to_world[:3, 3] = similarity.scale * (to_world[:3, 3] - similarity.offset)
     width, height = (int(side) for side in size)
     camera = Camera("view", width, height, *(float(value) for value in intrinsics), np.linalg.inv(to_world))
-    drawn = rasterizer.render(gaussians, camera)
-    depth, alpha = (part.numpy().reshape(height, width) for part in (drawn.depth, drawn.alpha))
+    rendering = rasterizer.render(gaussians, camera)
+    depth, alpha = (part.numpy().reshape(height, width) for part in (rendering.depth, rendering.alpha))
     return {
-        "color": np.rint(255 * drawn.color.clamp(0, 1).numpy()).astype(np.uint8),
+        "color": np.rint(255 * rendering.color.clamp(0, 1).numpy()).astype(np.uint8),
         "depth": (depth / similarity.scale).astype(np.float32),
         "accumulation": alpha.astype(np.float32),
     }
@@ -109,8 +109,8 @@ def render(folder: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray, size: n
 
 @cache
 def _models(folder: str) -> dict[str, Any]:
-    found = {net: lpips.load(net, folder or None)[0] for net in ("vgg", "alex")}
-    return {net: model for net, model in found.items() if model}
+    models = {net: lpips.load(net, folder or None)[0] for net in ("vgg", "alex")}
+    return {net: model for net, model in models.items() if model}
 
 
 def score(image: np.ndarray, truth: np.ndarray, mask: np.ndarray, weights: np.ndarray) -> dict[str, Any]:
@@ -138,19 +138,19 @@ ASKED = {"dataset": dataset, "render": render, "score": score, "splats": splats}
 
 
 def main() -> None:
-    heard, said = sys.stdin.buffer, sys.stdout.buffer
+    input_stream, output = sys.stdin.buffer, sys.stdout.buffer
     sys.stdout = sys.stderr  # whatever is printed must not mix with replies
-    while len(length := heard.read(8)) == 8:
-        with np.load(io.BytesIO(heard.read(int.from_bytes(length, "little")))) as file:
-            asked = dict(file)
+    while len(length := input_stream.read(8)) == 8:
+        with np.load(io.BytesIO(input_stream.read(int.from_bytes(length, "little")))) as file:
+            request = dict(file)
         try:
-            reply = ASKED[str(asked.pop("ask"))](**asked)
+            reply = ASKED[str(request.pop("ask"))](**request)
         except (ValueError, OSError) as error:
             reply = {"error": " ".join(str(error).split())}
         np.savez(buffer := io.BytesIO(), **reply)
         data = buffer.getvalue()
-        said.write(len(data).to_bytes(8, "little") + data)
-        said.flush()
+        output.write(len(data).to_bytes(8, "little") + data)
+        output.flush()
 
 
 if __name__ == "__main__":
