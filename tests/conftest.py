@@ -28,7 +28,7 @@ def generate():
 @pytest.fixture(scope="module")
 def prior():
     """A small random inpainting prior, one for all tests of a module."""
-    from small_prior import small_prior
+    from scenes.networks import small_prior
 
     return small_prior()
 

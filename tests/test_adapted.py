@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_prior import small_prior
-from test_sds_variance import small_run
+from scenes.networks import small_prior
+from test_sds_variance import write_initialized_run
 
 from benchmarks.studies import adapted, scene_priors
 from reffusion.io.arrays import save_labels
@@ -19,8 +19,8 @@ HOLE[10:24, 12:30] = True
 
 
 def learnt_run(home):
-    """`small_run` as `reference` leaves it: photographs, a fit of which nothing is removed, view `a` completed."""
-    run = small_run(home, HOLE)
+    """`write_initialized_run` as `reference` leaves it: photographs, a fit of which nothing is removed, view `a` completed."""
+    run = write_initialized_run(home, HOLE)
     wall = load_ply(run / "initialize" / "gaussians.ply")
     save_ply(run / "fit" / "gaussians.ply", wall)
     save_labels(run / "masks" / "labels.npy", np.zeros(len(wall), bool))

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import small_scene as small
 import torch
+from scenes import wall_scene
 
 from benchmarks.studies import attempts as benchmark
 from reffusion.io.images import save_image, save_mask
@@ -26,18 +26,18 @@ NO_PRIOR = {"sds": {"weight": 0}, "iterations": 4}
 def run(tmp_path_factory):
     """A small run up to `initialize`, whose test views have a truth."""
     home = tmp_path_factory.mktemp("scene")
-    poses, fitted, _ = small.write(home, NEAR)
+    poses, fitted, _ = wall_scene.write_poses_and_fit(home, NEAR)
     for name in ("masks", "initialize"):
         (home / name).mkdir()
     folders = {"poses": poses, "fit": fitted, "masks": home / "masks", "reference": home / "reference"}
     masks.run(masks.Params(), home / "masks", poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fitted)
-    view = small.CAMERAS["a2"]
+    view = wall_scene.CAMERAS["a2"]
     invent = load_mask_sets(home / "masks", ["a2"])["a2"].invent
-    save_references(home / "reference", [Reference(view, small.photo(view), invent)])
+    save_references(home / "reference", [Reference(view, wall_scene.photo(view), invent)])
     initialize.run(initialize.Params(), home / "initialize", **folders)
-    for name in small.TEST:
-        save_image(poses / "images" / f"{name}.png", small.photo(small.CAMERAS[name]))
-        save_mask(poses / "test_masks" / f"{name}.png", small.true_mask(small.CAMERAS[name], NEAR))
+    for name in wall_scene.TEST:
+        save_image(poses / "images" / f"{name}.png", wall_scene.photo(wall_scene.CAMERAS[name]))
+        save_mask(poses / "test_masks" / f"{name}.png", wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR))
     return home
 
 
@@ -76,6 +76,6 @@ def test_scores_are_those_of_the_box(run):
 
 
 def test_a_scene_without_ground_truth_is_refused(run, tmp_path):
-    poses, _, _ = small.write(tmp_path, NEAR)
+    poses, _, _ = wall_scene.write_poses_and_fit(tmp_path, NEAR)
     with pytest.raises(ValueError, match="take another scene"):
         benchmark.load_test_views(poses.parent)

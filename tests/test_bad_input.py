@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from small_capture import HEIGHT, WIDTH, prepare, some_truth, write_masks, write_pictures
+from scenes.capture import HEIGHT, WIDTH, make_truth, write_capture, write_masks, write_pictures
 
 from reffusion.capture.roles import capture_views
 from reffusion.capture.scene_folder import read_scene
@@ -48,7 +48,7 @@ def captures(tmp_path_factory) -> Path:
     """A good capture of each layout, to copy and to spoil."""
     home = tmp_path_factory.mktemp("good")
     for layout in ("llff", "colmap", "colmap txt", "transforms", "photos"):
-        prepare(home / layout, layout, some_truth())
+        write_capture(home / layout, layout, make_truth())
     return home
 
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-import small_scene
 import torch
+from scenes import wall_scene
+from scenes.cameras import make_camera, yaw
 
 from reffusion.background import backdrop, training_coverage
 from reffusion.io.arrays import load_json
@@ -14,27 +15,24 @@ from reffusion.metrics import image_metrics
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
-TRAIN = [small_scene.CAMERAS[name] for name in small_scene.TRAIN]
+TRAIN = [wall_scene.CAMERAS[name] for name in wall_scene.TRAIN]
 
 
-def wall() -> Gaussians:
-    return small_scene.plane(small_scene.WALL, 2.0, 1.4, small_scene.texture)
+def wall_gaussians() -> Gaussians:
+    return wall_scene.rectangle_gaussians(wall_scene.WALL, 2.0, 1.4, wall_scene.wall_color)
 
 
-def picture(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+def render_color(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     return rasterizer.render(gaussians, camera).color.clamp(0, 1).numpy()
 
 
-def turned(degrees: float) -> Camera:
+def turned_camera(degrees: float) -> Camera:
     """A camera in the middle, turned to the right about its vertical axis."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    pose = np.eye(4)
-    pose[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
-    size = small_scene.WIDTH, small_scene.HEIGHT
-    return Camera("t", *size, small_scene.FOCAL, small_scene.FOCAL, size[0] / 2, size[1] / 2, pose)
+    rotation = yaw(np.radians(degrees))
+    return make_camera("t", (wall_scene.WIDTH, wall_scene.HEIGHT), wall_scene.FOCAL, rotation=rotation)
 
 
-def with_more(gaussians: Gaussians, mean, sizes, color) -> Gaussians:
+def add_gaussian(gaussians: Gaussians, mean, sizes, color) -> Gaussians:
     """One Gaussian more, opaque."""
     sh = torch.zeros(1, gaussians.sh.shape[1], 3)
     sh[0, 0] = (torch.tensor(color) - 0.5) / 0.2820948
@@ -46,17 +44,17 @@ def with_more(gaussians: Gaussians, mean, sizes, color) -> Gaussians:
 
 
 def test_beyond_the_capture_the_picture_goes_on_softly_and_seen_pixels_stay():
-    scene = wall()
+    scene = wall_gaussians()
     done = backdrop.complete_scene([scene], TRAIN)[0]
     for camera in TRAIN:
-        assert np.abs(picture(done, camera) - picture(scene, camera)).max() < 0.02
-    away = turned(75)
+        assert np.abs(render_color(done, camera) - render_color(scene, camera)).max() < 0.02
+    away = turned_camera(75)
     assert rasterizer.render(scene, away).alpha.numpy().mean() < 0.5  # black, most of it
     drawn = rasterizer.render(done, away)
     assert drawn.alpha.min() > 0.95
     open_ = rasterizer.render(scene, away).alpha.numpy() < 0.01
     colors = drawn.color.numpy()[open_]
-    seen = np.concatenate([picture(scene, camera).reshape(-1, 3) for camera in TRAIN])
+    seen = np.concatenate([render_color(scene, camera).reshape(-1, 3) for camera in TRAIN])
     assert (colors > seen.min(0) - 0.05).all() and (colors < seen.max(0) + 0.05).all()
     steps = np.abs(np.diff(drawn.color.numpy(), axis=1)).max(-1)[open_[:, 1:] & open_[:, :-1]]
     assert steps.max() < 0.03
@@ -65,28 +63,32 @@ def test_beyond_the_capture_the_picture_goes_on_softly_and_seen_pixels_stay():
 def test_each_direction_takes_the_colours_that_lie_there():
     left, right = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
     color = lambda x, y: np.where(x[..., None] < 0, left, right)
-    done = backdrop.complete_scene([small_scene.plane(small_scene.WALL, 2.0, 1.4, color)], TRAIN)[0]
-    to_the_left, to_the_right = (picture(done, turned(angle)).mean((0, 1)) for angle in (-80, 80))
+    done = backdrop.complete_scene([wall_scene.rectangle_gaussians(wall_scene.WALL, 2.0, 1.4, color)], TRAIN)[0]
+    to_the_left, to_the_right = (render_color(done, turned_camera(angle)).mean((0, 1)) for angle in (-80, 80))
     assert to_the_left[0] > 2 * to_the_left[2] and to_the_right[2] > 2 * to_the_right[0]
 
 
 def test_needles_beyond_the_capture_go():
-    needle = with_more(wall(), [5.0, 0.0, 2.0], [0.8, 0.01, 0.01], [0.0, 1.0, 0.0])
-    away = turned(65)
-    assert (picture(needle, away)[..., 1] - picture(wall(), away)[..., 1]).max() > 0.5
-    with_it, without = (picture(backdrop.complete_scene([scene], TRAIN)[0], away) for scene in (needle, wall()))
+    needle = add_gaussian(wall_gaussians(), [5.0, 0.0, 2.0], [0.8, 0.01, 0.01], [0.0, 1.0, 0.0])
+    away = turned_camera(65)
+    assert (render_color(needle, away)[..., 1] - render_color(wall_gaussians(), away)[..., 1]).max() > 0.5
+    with_it, without = (
+        render_color(backdrop.complete_scene([scene], TRAIN)[0], away) for scene in (needle, wall_gaussians())
+    )
     assert np.abs(with_it - without).max() < 0.05
 
 
 def test_what_one_training_view_shows_stays():
-    spot = with_more(wall(), [0.9, 0.0, 1.9], [0.02, 0.02, 0.02], [0.0, 1.0, 0.0])
-    assert any(np.abs(picture(spot, camera) - picture(wall(), camera)).max() > 0.3 for camera in TRAIN)
+    spot = add_gaussian(wall_gaussians(), [0.9, 0.0, 1.9], [0.02, 0.02, 0.02], [0.0, 1.0, 0.0])
+    assert any(
+        np.abs(render_color(spot, camera) - render_color(wall_gaussians(), camera)).max() > 0.3 for camera in TRAIN
+    )
     done = backdrop.complete_scene([spot], TRAIN)[0]
     assert (done.means == spot.means[-1]).all(1).any()
 
 
 def test_a_scene_without_training_views_or_gaussians_is_left_alone():
-    scene = wall()
+    scene = wall_gaussians()
     assert backdrop.complete_scene([scene], [])[0] is scene
     nothing = scene.map(lambda p: p[:0])
     assert len(backdrop.complete_scene([nothing], TRAIN)[0]) == 0
@@ -97,53 +99,61 @@ def test_a_scene_without_training_views_or_gaussians_is_left_alone():
 # --- what was seen
 
 
-def views_of(scene: Gaussians, masks=None) -> list[training_coverage.CoverageView]:
+def coverage_views(scene: Gaussians, masks=None) -> list[training_coverage.CoverageView]:
     return training_coverage.render_coverage_views(scene, TRAIN, masks or {})
 
 
 def test_a_view_that_everything_saw_has_nothing_unseen():
-    scene = wall()
-    for name in small_scene.TEST:
-        assert not training_coverage.unseen_pixels(scene, small_scene.CAMERAS[name], views_of(scene))[2:-2, 2:-2].any()
+    scene = wall_gaussians()
+    for name in wall_scene.TEST:
+        assert not training_coverage.unseen_pixels(scene, wall_scene.CAMERAS[name], coverage_views(scene))[
+            2:-2, 2:-2
+        ].any()
 
 
 def test_unseen_is_what_lies_outside_all_frames():
-    scene = small_scene.plane(small_scene.WALL, 4.0, 2.4, small_scene.texture)
-    aside = small_scene.camera("aside", 1.0)
-    x = small_scene.wall_points(aside)[..., 0]
-    edge = TRAIN[-1].center[0] + small_scene.WALL * small_scene.WIDTH / 2 / small_scene.FOCAL
-    found = training_coverage.unseen_pixels(scene, aside, views_of(scene))
-    assert small_scene.iou(found, x > edge) > 0.95
+    scene = wall_scene.rectangle_gaussians(wall_scene.WALL, 4.0, 2.4, wall_scene.wall_color)
+    aside = wall_scene.front_camera("aside", 1.0)
+    x = wall_scene.wall_points(aside)[..., 0]
+    edge = TRAIN[-1].center[0] + wall_scene.WALL * wall_scene.WIDTH / 2 / wall_scene.FOCAL
+    found = training_coverage.unseen_pixels(scene, aside, coverage_views(scene))
+    assert wall_scene.iou(found, x > edge) > 0.95
     assert 0.3 < found.mean() < 0.9
 
 
 def test_unseen_is_what_all_training_views_hide_behind_something_or_under_masks():
     at = 1.0
-    scene, _ = small_scene.gaussians(at)
-    full = small_scene.plane(small_scene.WALL, 2.0, 1.4, small_scene.texture)
-    square = small_scene.plane(at, small_scene.HALF, small_scene.HALF, lambda x, y: np.full((*x.shape, 3), 0.5))
+    scene, _ = wall_scene.wall_and_square(at)
+    full = wall_scene.rectangle_gaussians(wall_scene.WALL, 2.0, 1.4, wall_scene.wall_color)
+    square = wall_scene.rectangle_gaussians(
+        at, wall_scene.HALF, wall_scene.HALF, lambda x, y: np.full((*x.shape, 3), 0.5)
+    )
     both = full.zip_map(square, lambda a, b: torch.cat([a, b]))
-    aside = small_scene.camera("aside", 0.9)
-    points = small_scene.wall_points(aside)
-    framed = np.any([((uv >= 0) & (uv < (c.width, c.height))).all(-1) & ~small_scene.behind_square(points, c, at)
-                     for c in TRAIN for uv in [small_scene.geometry.project(points, c)[0]]], 0)  # fmt: skip
-    here = ~small_scene.behind_square(points, aside, at)  # the square itself was seen
-    assert small_scene.iou(training_coverage.unseen_pixels(both, aside, views_of(both)) & here, ~framed & here) > 0.85
+    aside = wall_scene.front_camera("aside", 0.9)
+    points = wall_scene.wall_points(aside)
+    framed = np.any([((uv >= 0) & (uv < (c.width, c.height))).all(-1) & ~wall_scene.is_behind_square(points, c, at)
+                     for c in TRAIN for uv in [wall_scene.geometry.project(points, c)[0]]], 0)  # fmt: skip
+    here = ~wall_scene.is_behind_square(points, aside, at)  # the square itself was seen
+    assert (
+        wall_scene.iou(training_coverage.unseen_pixels(both, aside, coverage_views(both)) & here, ~framed & here) > 0.85
+    )
     hidden = {c.name: np.ones((c.height, c.width), bool) for c in TRAIN}
-    assert training_coverage.unseen_pixels(scene, TRAIN[0], views_of(scene, hidden)).all()
+    assert training_coverage.unseen_pixels(scene, TRAIN[0], coverage_views(scene, hidden)).all()
 
 
 def test_a_view_tells_what_a_further_one_would_show_for_the_first_time():
     """Of the outermost views an outer strip is in no other one, and of those between nothing."""
-    scene = small_scene.plane(small_scene.WALL, 4.0, 2.4, small_scene.texture)
-    views = views_of(scene)
+    scene = wall_scene.rectangle_gaussians(wall_scene.WALL, 4.0, 2.4, wall_scene.wall_color)
+    views = coverage_views(scene)
     share = training_coverage.leave_one_out_unseen_share(scene, views)
     step = np.diff(sorted(view.camera.center[0] for view in views))
-    strips = [step[k] * small_scene.FOCAL / small_scene.WALL / small_scene.WIDTH for k in (0, -1)]
+    strips = [step[k] * wall_scene.FOCAL / wall_scene.WALL / wall_scene.WIDTH for k in (0, -1)]
     assert share == pytest.approx(sum(strips) / len(views), rel=0.2)
     assert training_coverage.leave_one_out_unseen_share(scene, views[:1]) == 1.0
     hidden = {c.name: np.ones((c.height, c.width), bool) for c in TRAIN}
-    assert training_coverage.leave_one_out_unseen_share(scene, views_of(scene, hidden)) == 0.0  # all is the object
+    assert (
+        training_coverage.leave_one_out_unseen_share(scene, coverage_views(scene, hidden)) == 0.0
+    )  # all is the object
     assert training_coverage.leave_one_out_unseen_share(scene, []) == 0.0
 
 
@@ -170,12 +180,12 @@ def test_scores_of_seen_pixels_only():
 def test_evaluate_counts_the_unseen_apart_and_shows_no_black(tmp_path, monkeypatch):
     from stages import evaluate, finish
 
-    poses, fit, _ = small_scene.write(tmp_path, 1.0)
+    poses, fit, _ = wall_scene.write_poses_and_fit(tmp_path, 1.0)
     scene = load_scene(poses)
-    aside = small_scene.camera("t0", 1.0)
+    aside = wall_scene.front_camera("t0", 1.0)
     cameras = scene.cameras | {"t0": aside}
     save_scene(poses, type(scene)(**{**scene.__dict__, "cameras": cameras}))
-    save_image(poses / "images" / "t0.png", small_scene.photo(aside))
+    save_image(poses / "images" / "t0.png", wall_scene.photo(aside))
     given = {"poses": poses, "raw_masks": poses.with_name("raw_masks"), "fit": fit}
     monkeypatch.setattr(finish, "MIN_UNSEEN_SHARE", 0.0)
     for name in ("on", "off"):
@@ -188,6 +198,6 @@ def test_evaluate_counts_the_unseen_apart_and_shows_no_black(tmp_path, monkeypat
     assert on["mean"]["psnr_outside_seen"] > off["mean"]["psnr_outside_seen"] - 0.05
     assert "unseen_share" in (tmp_path / "on" / "per_view.csv").read_text().splitlines()[0]
     assert "unseen_share" in on["protocol"]["seen"]
-    away = turned(75)
+    away = turned_camera(75)
     covered = [rasterizer.render(load_ply(tmp_path / name / "scene.ply"), away).alpha.min() for name in ("on", "off")]
     assert covered[0] > 0.9 and covered[1] < 0.01

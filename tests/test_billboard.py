@@ -1,6 +1,7 @@
 """What is drawn in front of a scene, without a depth map, stands on the surface beneath it."""
 
 import numpy as np
+from scenes.cameras import make_camera, world_rays
 
 from reffusion import geometry
 from reffusion.depth.billboard import billboard_depth
@@ -9,20 +10,18 @@ from reffusion.types import Camera
 TILT = np.radians(25)  # the camera looks down on a floor 1 below it
 
 
-def floor_view() -> tuple[Camera, np.ndarray]:
+def tilted_floor_view() -> tuple[Camera, np.ndarray]:
     """The camera, and the camera z [H, W] of the floor (a wall at 4 beyond it)."""
-    c, s = np.cos(TILT), np.sin(TILT)
-    pose = np.eye(4)
-    pose[:3, :3] = [[1, 0, 0], [0, c, -s], [0, s, c]]  # world: x right, y down, z ahead
-    camera = Camera("v", 96, 72, 80.0, 80.0, 48.0, 36.0, pose)
-    rays = geometry.pixel_rays(camera) @ pose[:3, :3]
+    c, s = np.cos(TILT), np.sin(TILT)  # world: x right, y down, z ahead
+    camera = make_camera("v", (96, 72), 80.0, rotation=np.array([[1, 0, 0], [0, c, -s], [0, s, c]]))
+    rays = world_rays(camera)
     with np.errstate(divide="ignore"):
         floor = np.where(rays[..., 1] > 0, 1.0 / rays[..., 1], np.inf)
     return camera, np.minimum(floor, 4.0 / rays[..., 2])
 
 
 def test_it_stands_upright_where_its_lowest_pixels_meet_the_floor():
-    camera, depth = floor_view()
+    camera, depth = tilted_floor_view()
     drawn = np.zeros(depth.shape, bool)
     drawn[20:50, 38:58] = True
     found = billboard_depth(drawn, depth, camera)
@@ -37,7 +36,7 @@ def test_it_stands_upright_where_its_lowest_pixels_meet_the_floor():
 
 
 def test_on_a_wall_it_hangs_facing_the_camera():
-    camera = Camera("v", 96, 72, 80.0, 80.0, 48.0, 36.0, np.eye(4))
+    camera = make_camera("v", (96, 72), 80.0)
     depth, drawn = np.full((72, 96), 2.0), np.zeros((72, 96), bool)
     drawn[30:40, 40:50] = True
     found = billboard_depth(drawn, depth, camera)

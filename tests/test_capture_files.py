@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from small_capture import (
+from scenes.capture import (
     HEIGHT,
     PINHOLE,
     WIDTH,
     Truth,
-    prepare,
-    run,
-    some_truth,
+    make_truth,
+    run_stages,
+    write_capture,
     write_masks,
     write_model,
     write_pictures,
@@ -46,7 +46,7 @@ def read(folder: Path, **params) -> tuple[Scene, Path, str]:
     """`poses` run on a folder: the scene, its artifact, and what it warns of."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        scene, out = run(folder, **params)
+        scene, out = run_stages(folder, **params)
     return scene, out, "\n".join(str(each.message) for each in said)
 
 
@@ -101,17 +101,17 @@ def write_textured(folder: Path, truth: Truth, names: dict[str, str]) -> np.ndar
 
 
 def flat_truth(views: int = 12, points: int = 400) -> Truth:
-    """The cameras of `some_truth` before points on the plane z = 0."""
+    """The cameras of `make_truth` before points on the plane z = 0."""
     places = np.random.default_rng(5).uniform(-0.9, 0.9, (points, 3)) * (1, 1, 0)
-    return replace(some_truth(views=views), points=places)
+    return replace(make_truth(views=views), points=places)
 
 
 # ---------------------------------------------------------------------------------------------- A: which model
 
 
 def test_the_model_with_most_images_is_taken(tmp_path):
-    truth = some_truth(views=9)
-    folder = prepare(tmp_path / "s", "colmap", truth)
+    truth = make_truth(views=9)
+    folder = write_capture(tmp_path / "s", "colmap", truth)
     (folder / "sparse/0").rename(folder / "sparse/1")
     write_model(folder / "sparse/0", replace(truth, world_to_camera=dict([*truth.world_to_camera.items()][:3])))
     scene, _, said = read(folder)
@@ -120,8 +120,8 @@ def test_the_model_with_most_images_is_taken(tmp_path):
 
 
 def test_a_lone_model_with_another_number_is_found(tmp_path):
-    truth = some_truth()
-    folder = prepare(tmp_path / "s", "colmap txt", truth)
+    truth = make_truth()
+    folder = write_capture(tmp_path / "s", "colmap txt", truth)
     (folder / "sparse/0").rename(folder / "sparse/1")
     scene, _, said = read(folder)
     assert_cameras(scene, truth, {view: view for view in truth.world_to_camera})
@@ -133,8 +133,8 @@ def test_a_lone_model_with_another_number_is_found(tmp_path):
 
 @pytest.mark.parametrize("name", ["day1/{}.png", "images/{}.png", "day1\\{}.png", "C:\\scans\\day1\\{}.PNG"])
 def test_names_of_the_model_with_folders(tmp_path, name):
-    truth = some_truth()
-    folder = prepare(tmp_path / "s", "transforms", truth)
+    truth = make_truth()
+    folder = write_capture(tmp_path / "s", "transforms", truth)
     (folder / "transforms.json").unlink()
     write_named_model(folder / "sparse/0", truth, {view: name.format(view) for view in truth.world_to_camera})
     scene, out, _ = read(folder)
@@ -144,7 +144,7 @@ def test_names_of_the_model_with_folders(tmp_path, name):
 
 @pytest.mark.parametrize("flat", [False, True], ids=["model with folders", "flat model"])
 def test_pictures_in_folders(tmp_path, flat):
-    truth, folder = some_truth(), tmp_path / "s"
+    truth, folder = make_truth(), tmp_path / "s"
     path = {view: f"day{k % 2}/{view}.png" for k, view in enumerate(sorted(truth.world_to_camera))}
     for view, each in path.items():
         write_pictures(folder / "images" / Path(each).parent, [view])
@@ -156,7 +156,7 @@ def test_pictures_in_folders(tmp_path, flat):
 
 
 def test_equal_names_in_two_folders_are_called_by_their_paths(tmp_path):
-    truth, folder = some_truth(), tmp_path / "s"
+    truth, folder = make_truth(), tmp_path / "s"
     path = {view: f"cam{k % 2}/{k // 2:04d}.png" for k, view in enumerate(sorted(truth.world_to_camera))}
     for each in path.values():
         kind = "test_masks" if each == "cam0/0001.png" else "masks"
@@ -174,8 +174,8 @@ def test_equal_names_in_two_folders_are_called_by_their_paths(tmp_path):
 
 
 def test_folders_of_masks_are_objects_where_a_view_has_several(tmp_path):
-    truth = some_truth()
-    folder = prepare(tmp_path / "s", "colmap", truth)
+    truth = make_truth()
+    folder = write_capture(tmp_path / "s", "colmap", truth)
     shutil.rmtree(folder / "masks")
     for thing in ("box", "ball"):
         write_masks(folder / "masks" / thing, truth.world_to_camera)
@@ -188,7 +188,7 @@ def test_folders_of_masks_are_objects_where_a_view_has_several(tmp_path):
 
 @pytest.mark.parametrize("splits", [("train", "test"), ("train", "val"), ("train", "test", "val")])
 def test_blenders_files_with_their_split(tmp_path, splits):
-    truth, folder = some_truth(views=8), tmp_path / "s"
+    truth, folder = make_truth(views=8), tmp_path / "s"
     views, flip = sorted(truth.world_to_camera), np.diag([1.0, -1, -1, 1])
     for k, split in enumerate(splits):
         mine = views[:4] if split == "train" else views[2 + 2 * k : 4 + 2 * k]
@@ -213,7 +213,7 @@ def test_blenders_files_with_their_split(tmp_path, splits):
 
 
 def test_a_palette_with_white_first(tmp_path):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     for path in (folder / "masks").iterdir():
         Image.open(path).convert("RGB").quantize(2).save(path)
         assert Image.open(path).getpalette()[:3] == [255, 255, 255]
@@ -221,7 +221,7 @@ def test_a_palette_with_white_first(tmp_path):
 
 
 def test_maps_of_object_numbers_ask_for_the_number(tmp_path):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     for path in (folder / "masks").iterdir():
         numbers = np.full((HEIGHT, WIDTH), 30, np.uint8)
         numbers[40:], numbers[18:36, 24:48] = 200, 32
@@ -257,7 +257,7 @@ def test_a_reference_among_bare_photographs_is_no_view(tmp_path):
 
 
 def test_a_reference_among_the_photographs_of_poses_bounds(tmp_path):
-    folder = prepare(tmp_path / "s", "llff", some_truth())
+    folder = write_capture(tmp_path / "s", "llff", make_truth())
     write_pictures(folder / "images_4", ["reference"])
     reference = {"view": "v01", "image": "images_4/reference.png"}
     assert read_scene(Params(reference=reference), folder)[1].train == tuple(f"v{k:02d}" for k in range(6))
@@ -265,7 +265,7 @@ def test_a_reference_among_the_photographs_of_poses_bounds(tmp_path):
 
 @pytest.mark.parametrize("masks", ["images", None])
 def test_masks_beside_their_photographs(tmp_path, masks):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     for path in (folder / "masks").iterdir():
         path.rename(folder / "images" / f"{path.stem}_mask.png")
     scene, out, said = read(folder, masks=masks)
@@ -274,7 +274,7 @@ def test_masks_beside_their_photographs(tmp_path, masks):
 
 
 def test_photographs_are_not_their_own_masks(tmp_path):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     with pytest.raises(
         BadInput, match=r"images: it holds photographs, and no mask beside one \(A_mask\.png beside A\.png\)"
     ):
@@ -285,7 +285,7 @@ def test_photographs_are_not_their_own_masks(tmp_path):
 
 
 def test_names_that_do_not_match_are_not_paired_by_order(tmp_path):
-    truth, folder = some_truth(views=12), tmp_path / "s"
+    truth, folder = make_truth(views=12), tmp_path / "s"
     write_pictures(folder / "images", [f"{k + 1:04d}" for k in range(12)])
     write_masks(folder / "masks", [f"{k + 1:04d}" for k in range(12)])
     views = sorted(truth.world_to_camera)
@@ -347,7 +347,7 @@ def test_points_of_another_frame_are_not_used(tmp_path, layout, change):
 
 
 def test_rows_of_poses_bounds_follow_the_file_names(tmp_path):
-    truth, folder = some_truth(), tmp_path / "s"
+    truth, folder = make_truth(), tmp_path / "s"
     times = ("104212", "104300", "104400")
     names = [name for time in times for name in (f"20220819_{time}(0)", f"20220819_{time}")]
     assert [f"{name}.jpg" for name in names] == sorted(f"{name}.jpg" for name in names)
@@ -359,7 +359,7 @@ def test_rows_of_poses_bounds_follow_the_file_names(tmp_path):
 
 
 def test_nothing_matched_is_not_zero_pixels(tmp_path, capsys):
-    _, out, _ = read(prepare(tmp_path / "s", "colmap", some_truth()), refine=True)
+    _, out, _ = read(write_capture(tmp_path / "s", "colmap", make_truth()), refine=True)
     assert "cameras as given: optical flow matches nothing between the views" in capsys.readouterr().out
     assert load_json(out / "refine.json") == {"before": None, "after": None}
 
@@ -368,7 +368,7 @@ def test_nothing_matched_is_not_zero_pixels(tmp_path, capsys):
 
 
 def test_composed_and_decomposed_accents_are_one_name(tmp_path):
-    truth, folder = some_truth(), tmp_path / "s"
+    truth, folder = make_truth(), tmp_path / "s"
     views = {view: f"Küche {view}" for view in truth.world_to_camera}
     split = {view: unicodedata.normalize("NFD", name) for view, name in views.items()}
     write_pictures(folder / "images", split.values())
@@ -381,7 +381,7 @@ def test_composed_and_decomposed_accents_are_one_name(tmp_path):
 
 
 def test_what_is_no_picture_is_named(tmp_path, monkeypatch):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     Image.init()  # every format registers now, not while the table is replaced
     monkeypatch.setattr(Image, "OPEN", {kind: opener for kind, opener in Image.OPEN.items() if kind != "HEIF"})
     (folder / "images/v01.png").write_text("<html>404</html>")
@@ -394,8 +394,8 @@ def test_what_is_no_picture_is_named(tmp_path, monkeypatch):
 )
 @pytest.mark.parametrize("text", [False, True])
 def test_colmaps_fisheyes_without_coefficients(tmp_path, model, params, text):
-    truth = some_truth((model, params))
-    folder = prepare(tmp_path / "s", "transforms", truth)
+    truth = make_truth((model, params))
+    folder = write_capture(tmp_path / "s", "transforms", truth)
     (folder / "transforms.json").unlink()
     cameras = {1: colmap.ModelCamera(model, WIDTH, HEIGHT, params)}
     images = {k: colmap.ModelImage(f"{v}.png", 1, pose) for k, (v, pose) in enumerate(truth.world_to_camera.items(), 1)}
@@ -415,7 +415,7 @@ def test_colmaps_fisheyes_without_coefficients(tmp_path, model, params, text):
 
 @pytest.mark.parametrize("model", ["SIMPLE_DIVISION", "DIVISION", "EUCM", "EQUIRECTANGULAR"])
 def test_other_models_of_colmap_4_are_refused_by_name(tmp_path, model):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     params = (90.0, 90.0, 48.0, 36.0, 0.1, 1.0)[: colmap.MODELS[model]]
     images = colmap.load_images(folder / "sparse/0/images.bin")
     cameras = {1: colmap.ModelCamera(model, WIDTH, HEIGHT, params)}
@@ -425,8 +425,8 @@ def test_other_models_of_colmap_4_are_refused_by_name(tmp_path, model):
 
 
 def test_windows_paths_in_transforms(tmp_path):
-    truth = some_truth()
-    folder = prepare(tmp_path / "s", "transforms", truth)
+    truth = make_truth()
+    folder = write_capture(tmp_path / "s", "transforms", truth)
     save_points(folder / "sparse_pc.ply", truth.points, np.full((60, 3), 99, np.uint8))
     record = json.loads((folder / "transforms.json").read_text()) | {"ply_file_path": ".\\sparse_pc.ply"}
     for frame in record["frames"]:
@@ -465,7 +465,7 @@ def test_mask_path_and_depth_file_path(tmp_path):
 
 
 def test_a_16_bit_grey_photograph(tmp_path):
-    folder = prepare(tmp_path / "s", "colmap", some_truth(PINHOLE))
+    folder = write_capture(tmp_path / "s", "colmap", make_truth(PINHOLE))
     levels = np.tile(np.linspace(0, 65535, WIDTH).astype(np.uint16), (HEIGHT, 1))
     Image.fromarray(levels).save(folder / "images/v02.png")
     _, out, _ = read(folder)

@@ -6,10 +6,10 @@ import time
 
 import numpy as np
 import pytest
-import small_capture
-import small_scene as small
 import torch
 from browser import visiting
+from scenes import capture as captures
+from scenes import wall_scene
 
 from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points
 from reffusion.clicks import all_views
@@ -67,8 +67,8 @@ def test_one_click_finds_what_is_of_one_colour_and_another_the_rest():
     picture, disk = scenery()
     rows = np.mgrid[:240, :320][0]
     red = disk & (abs(rows - 120) >= 12)
-    assert small.iou(segment_view(picture, on((150, 85), (150, 155))) & red, red) > 0.97
-    assert small.iou(segment_view(picture, on((150, 85), (150, 155), (150, 120))), disk) > 0.97
+    assert wall_scene.iou(segment_view(picture, on((150, 85), (150, 155))) & red, red) > 0.97
+    assert wall_scene.iou(segment_view(picture, on((150, 85), (150, 155), (150, 120))), disk) > 0.97
     assert not segment_view(picture, on((10, 10, False))).any()
     assert not segment_view(picture, Clicks(np.zeros((0, 2)), np.zeros(0, bool))).any()
 
@@ -78,19 +78,19 @@ def test_where_the_depth_is_known_a_click_goes_as_far_as_the_surface():
     picture[:, 180:] = picture[70:90, 140:160].mean((0, 1))  # what stands behind has the disk's colour, and touches it
     relief = np.where(disk, 0.0, 300.0)
     alone, flat = segment_view(picture, on((150, 85))), segment_view(picture, on((150, 85)), 0 * relief)
-    assert small.iou(alone, disk) < 0.9 and (alone == flat).all()
-    assert small.iou(segment_view(picture, on((150, 85)), relief), disk) > 0.95
+    assert wall_scene.iou(alone, disk) < 0.9 and (alone == flat).all()
+    assert wall_scene.iou(segment_view(picture, on((150, 85)), relief), disk) > 0.95
     half = disk & (np.mgrid[:240, :320][1] < 150)
-    assert small.iou(correct_mask(picture, half, on((165, 90)), relief), disk) > 0.9
+    assert wall_scene.iou(correct_mask(picture, half, on((165, 90)), relief), disk) > 0.9
 
 
 def test_a_click_takes_back_what_it_is_on():
     picture, disk = scenery()
     stripe = disk & (abs(np.mgrid[:240, :320][0] - 120) < 12)
     without = correct_mask(picture, disk, on((150, 120, False)))
-    assert not without[115:125, 140:160].any() and small.iou(without, disk & ~stripe) > 0.9
+    assert not without[115:125, 140:160].any() and wall_scene.iou(without, disk & ~stripe) > 0.9
     again = correct_mask(picture, without, on((150, 120)))
-    assert small.iou(again, disk) > 0.95
+    assert wall_scene.iou(again, disk) > 0.95
 
 
 def test_a_plain_picture_of_any_size_is_no_error():
@@ -106,18 +106,18 @@ def test_a_plain_picture_of_any_size_is_no_error():
 def scene(tmp_path_factory):
     """The wall with a square before it, photographed with the square; no masks."""
     folder = tmp_path_factory.mktemp("clicked")
-    placed, fit, _ = small.write(folder, NEAR, masks={})
-    everything, _ = small.gaussians(NEAR)
-    for name in small.TRAIN:
+    placed, fit, _ = wall_scene.write_poses_and_fit(folder, NEAR, masks={})
+    everything, _ = wall_scene.wall_and_square(NEAR)
+    for name in wall_scene.TRAIN:
         with torch.no_grad():
-            drawn = rasterizer.render(everything, small.CAMERAS[name]).color.clamp(0, 1).numpy()
+            drawn = rasterizer.render(everything, wall_scene.CAMERAS[name]).color.clamp(0, 1).numpy()
         save_image(placed / "images" / f"{name}.png", to_uint8(drawn))
-    small.write_photos(folder / "given", placed, small.CAMERAS)
+    wall_scene.write_capture_photos(folder / "given", placed, wall_scene.CAMERAS)
     return folder, placed, fit
 
 
 def truth(name):
-    return small.true_mask(small.CAMERAS[name], NEAR)
+    return wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR)
 
 
 def test_clicks_in_one_view_give_the_masks_of_all(scene, tmp_path):
@@ -125,9 +125,9 @@ def test_clicks_in_one_view_give_the_masks_of_all(scene, tmp_path):
     middle = np.argwhere(truth("a2")).mean(0)[::-1] + 0.5
     params = masks.Params(clicks={"a2": [[*middle, "+"]]})
     masks.run(params, tmp_path, poses=placed, raw_masks=placed.with_name("raw_masks"), fit=fit)
-    for name, found in load_mask_sets(tmp_path, small.CAMERAS).items():
-        if name in small.TRAIN:
-            assert small.iou(found.raw, truth(name)) > 0.9 and small.iou(found.consistent, truth(name)) > 0.85
+    for name, found in load_mask_sets(tmp_path, wall_scene.CAMERAS).items():
+        if name in wall_scene.TRAIN:
+            assert wall_scene.iou(found.raw, truth(name)) > 0.9 and wall_scene.iou(found.consistent, truth(name)) > 0.85
         else:
             assert not found.raw.any(), "test photographs do not show it"
 
@@ -146,13 +146,13 @@ def test_clicks_on_nothing_are_refused(scene, tmp_path):
 
 def test_a_mask_in_one_view_stays_as_it_was_given(scene):
     _, placed, _ = scene
-    everything, _ = small.gaussians(NEAR)
+    everything, _ = wall_scene.wall_and_square(NEAR)
     image_of = lambda name: load_image(placed / "images" / f"{name}.png")
     near = all_views.find_neighbours(everything)
-    found = all_views.segment_by_clicks(everything, near, small.CAMERAS, image_of, {}, {"a1": truth("a1")})
+    found = all_views.segment_by_clicks(everything, near, wall_scene.CAMERAS, image_of, {}, {"a1": truth("a1")})
     assert (found.masks["a1"] == truth("a1")).all()
-    shown = all_views.object_mask(everything, found.labels, small.CAMERAS["a4"], image_of("a4"))
-    assert small.iou(shown, truth("a4")) > 0.9
+    shown = all_views.object_mask(everything, found.labels, wall_scene.CAMERAS["a4"], image_of("a4"))
+    assert wall_scene.iou(shown, truth("a4")) > 0.9
 
 
 def sheet(origin, along, up, color, step=0.04):
@@ -179,7 +179,7 @@ def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
         torch.full((count,), 4.0),
         ((colors - 0.5) / SH0)[:, None],
     )
-    cameras = {name: small.camera(name, x) for name, x in (("left", -1.6), ("middle", 0.0), ("right", 1.6))}
+    cameras = {name: wall_scene.front_camera(name, x) for name, x in (("left", -1.6), ("middle", 0.0), ("right", 1.6))}
     with torch.no_grad():
         images = {n: to_uint8(rasterizer.render(scene, c).color.clamp(0, 1).numpy()) for n, c in cameras.items()}
     box = torch.arange(count) >= len(parts[0][0])
@@ -192,7 +192,7 @@ def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
 
 
 def test_clicks_find_their_place_through_the_lens():
-    lens = small_capture.some_truth(small_capture.OPENCV).lens
+    lens = captures.make_truth(captures.OPENCV).lens
     points = np.array([[1.0, 2.0], [50.0, 30.0], [190.0, 140.0]])
     there = undistort_points(points, lens, (192, 144))
     assert np.abs(distort_points(there, lens, (192, 144)) - points).max() < 1e-3
@@ -206,11 +206,11 @@ def test_clicks_find_their_place_through_the_lens():
 
 
 def written(folder, with_masks=False):
-    some = small_capture.some_truth()
-    small_capture.write_pictures(folder / "images", sorted(some.world_to_camera))
-    small_capture.write_model(folder / "sparse/0", some, ending=".png")
+    some = captures.make_truth()
+    captures.write_pictures(folder / "images", sorted(some.world_to_camera))
+    captures.write_model(folder / "sparse/0", some, ending=".png")
     if with_masks:
-        small_capture.write_masks(folder / "masks", ["v01"])
+        captures.write_masks(folder / "masks", ["v01"])
     return folder
 
 
@@ -256,14 +256,14 @@ def test_clicks_in_a_browser_make_masks_that_are_saved(page, tmp_path, width):
         tab.wait_for_function("state && state.fit && view")
         name = tab.evaluate("view")
         box = tab.locator("#stage").bounding_box()
-        column, row = np.argwhere(truth(name)).mean(0)[::-1] / (small.WIDTH, small.HEIGHT)
+        column, row = np.argwhere(truth(name)).mean(0)[::-1] / (wall_scene.WIDTH, wall_scene.HEIGHT)
         at = (box["x"] + column * box["width"], box["y"] + row * box["height"])
         tab.mouse.click(*at)
         tab.wait_for_function("!pending && !state.busy && state.views.every(v => v.mask !== null)", timeout=60_000)
-        assert small.iou(page.session.masks[name], truth(name)) > 0.9
+        assert wall_scene.iou(page.session.masks[name], truth(name)) > 0.9
         tab.mouse.click(*at, button="right")
         tab.wait_for_function("!pending && !state.busy && of(view).clicks.length === 2")
-        assert not page.session.masks[name][round(row * small.HEIGHT), round(column * small.WIDTH)]
+        assert not page.session.masks[name][round(row * wall_scene.HEIGHT), round(column * wall_scene.WIDTH)]
         tab.keyboard.press("Control+z")
         tab.wait_for_function("!pending && !state.busy && of(view).clicks.length === 1")
         tab.keyboard.press("ArrowRight")
@@ -271,8 +271,8 @@ def test_clicks_in_a_browser_make_masks_that_are_saved(page, tmp_path, width):
         tab.locator("#save").click()
         tab.wait_for_function("document.getElementById('status').textContent.includes('saved')")
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
-    for each in small.TRAIN:
-        assert small.iou(load_mask(tmp_path / "masks" / f"{each}.png"), truth(each)) > 0.85
+    for each in wall_scene.TRAIN:
+        assert wall_scene.iou(load_mask(tmp_path / "masks" / f"{each}.png"), truth(each)) > 0.85
 
 
 def test_what_was_clicked_is_there_the_next_time(page, tmp_path):

@@ -6,8 +6,8 @@ import json
 
 import numpy as np
 import pytest
-import small_scene as small
 import torch
+from scenes import wall_scene
 
 from reffusion.clicks.marks import Clicks
 from reffusion.clicks.network import encode_image, load_segmenter, make_segmenter, predict_mask
@@ -82,8 +82,8 @@ def test_weights_that_are_not_here_are_none_and_others_are_refused(folder, tmp_p
 
 
 def test_the_page_asks_the_network_and_takes_back_without_it(folder, tmp_path):
-    placed, fit, _ = small.write(tmp_path / "scene", 1.7, masks={})
-    small.write_photos(tmp_path / "scene/given", placed, small.CAMERAS)
+    placed, fit, _ = wall_scene.write_poses_and_fit(tmp_path / "scene", 1.7, masks={})
+    wall_scene.write_capture_photos(tmp_path / "scene/given", placed, wall_scene.CAMERAS)
     segmenter = load_segmenter(folder)
     session = Session(Capture(tmp_path, tmp_path / "masks", placed, fit, {}), lambda: False, segmenter)
     name, at = session.views[0], (10.0, 12.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import small_scene as small
+from scenes import wall_scene
 
 from reffusion.clicks.marks import Clicks
 from reffusion.clicks.single_view import segment_view
@@ -23,7 +23,7 @@ def chequered_on_gravel():
 def test_one_click_finds_a_chequered_thing_on_rough_ground():
     picture, relief, disk = chequered_on_gravel()
     found = segment_view(picture, Clicks(np.array([[110.5, 150.5]]), np.array([True])), relief)
-    assert small.iou(found, disk) > 0.9
+    assert wall_scene.iou(found, disk) > 0.9
 
 
 def test_a_further_click_never_loses_what_was_clicked_before():
@@ -34,4 +34,4 @@ def test_a_further_click_never_loses_what_was_clicked_before():
     picture[other], relief[other] = (200, 40, 40), 0
     clicks = Clicks(np.array([[110.5, 150.5], [200.5, 80.5]]), np.array([True, True]))
     found = segment_view(picture, clicks, relief)
-    assert small.iou(found & disk, disk) > 0.9 and small.iou(found & other, other) > 0.9
+    assert wall_scene.iou(found & disk, disk) > 0.9 and wall_scene.iou(found & other, other) > 0.9

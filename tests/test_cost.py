@@ -7,8 +7,8 @@ import os
 import re
 
 import pytest
-from test_installed import ROOT, write_capture
-from test_machine import with_nvidia_smi
+from test_installed import ROOT, write_four_photos
+from test_machine import fake_nvidia_smi
 
 from benchmarks.gpu import counts
 from reffusion.cost import estimate
@@ -76,8 +76,8 @@ def test_cards_by_any_name():
 
 def test_what_a_plan_prints(tmp_path, monkeypatch):
     """On a machine with a small GPU, an old driver and, as it may be, no gsplat and a torch without CUDA."""
-    write_capture(tmp_path / "row")
-    monkeypatch.setattr(os, "environ", with_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 440.10"))
+    write_four_photos(tmp_path / "row")
+    monkeypatch.setattr(os, "environ", fake_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 440.10"))
     monkeypatch.setattr("runner.plan.has_cuda", lambda: True)
     job = resolve(Request(ROOT, tmp_path / "runs", str(tmp_path / "row"), profile="paper"))
     decisions = plan(job, job.pipeline.closure("all"))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from small_params import altered
+from scenes.settings import with_changes
 
 from reffusion.distill.adversary import Adversary
 from reffusion.distill.discriminator import (
@@ -213,7 +213,7 @@ def textures(count, fine, label):
 @pytest.mark.parametrize("penalized", ["real", "fake"])
 @pytest.mark.parametrize("form", ["non-saturating", "saturating"])
 def test_the_critic_separates_two_textures_and_its_slope_leads_to_the_real_one(penalized, form):
-    adversary = Adversary(altered(SMALL, form=form, penalized=penalized), seed=0, rate=RATE)
+    adversary = Adversary(with_changes(SMALL, form=form, penalized=penalized), seed=0, rate=RATE)
     said = [adversary.train_step(textures(16, True, (step, 0)), textures(16, False, (step, 1))) for step in range(20)]
     assert said[-1]["critic_loss"] < 0.3 < 1 < said[0]["critic_loss"] and said[-1]["critic_slope"] > 0
     real, fake = textures(16, True, "r"), textures(16, False, "f")
@@ -233,7 +233,7 @@ def test_the_critic_separates_two_textures_and_its_slope_leads_to_the_real_one(p
 def test_the_penalty_holds_the_critics_slope_down():
     slopes = {}
     for penalty in (0.0, 10.0):
-        adversary = Adversary(altered(SMALL, penalty=penalty, penalized="real"), seed=0, rate=RATE)
+        adversary = Adversary(with_changes(SMALL, penalty=penalty, penalized="real"), seed=0, rate=RATE)
         for step in range(15):
             said = adversary.train_step(textures(16, True, (step, 0)), textures(16, False, (step, 1)))
         assert ("critic_slope" in said) == (penalty > 0)

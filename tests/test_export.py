@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
-from test_io import some_gaussians, some_scene
+from test_io import random_gaussians, random_scene
 
 from reffusion.io.cameras import save_cameras
 from reffusion.io.compressed import save_compressed
@@ -28,7 +28,7 @@ FRAME = Similarity(0.31, np.array([1.5, -20.0, 4.0]))
 
 
 def scene():
-    return replace(some_scene(), similarity=FRAME)
+    return replace(random_scene(), similarity=FRAME)
 
 
 def seen(gaussians, camera: Camera) -> np.ndarray:
@@ -38,7 +38,7 @@ def seen(gaussians, camera: Camera) -> np.ndarray:
 
 def gaussians_before(camera: Camera, degree: int = 2):
     """Some that a camera sees, in the normalised frame."""
-    made = some_gaussians(300, degree)
+    made = random_gaussians(300, degree)
     at = torch.tensor([0.0, 0.0, 4.0]) + made.means
     pose = torch.from_numpy(camera.world_to_camera).float()
     means = (at - pose[:3, 3]) @ pose[:3, :3]
@@ -76,7 +76,7 @@ def test_colmap_and_nerfstudio_see_the_scene_as_we_do(tmp_path):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_the_compressed_file_holds_the_same_by_gsply(tmp_path, degree):
-    gsply, made = pytest.importorskip("gsply"), some_gaussians(700, degree)
+    gsply, made = pytest.importorskip("gsply"), random_gaussians(700, degree)
     path = tmp_path / "scene.compressed.ply"
     save_compressed(path, made, FRAME)
     read = gsply.plyread(str(path))
@@ -99,7 +99,7 @@ def test_the_compressed_file_holds_the_same_by_gsply(tmp_path, degree):
 def test_a_compressed_file_that_is_cut_off_is_refused(tmp_path):
     pytest.importorskip("gsply")
     path = tmp_path / "scene.compressed.ply"
-    save_compressed(path, some_gaussians(300, 1), FRAME)
+    save_compressed(path, random_gaussians(300, 1), FRAME)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(BadInput, match=r"scene\.compressed\.ply: cut off"):
         load_ply(path)
@@ -110,7 +110,7 @@ def test_a_compressed_file_that_is_cut_off_is_refused(tmp_path):
 def test_splat_transform_reads_both_files(tmp_path, degree):
     if not (npx := shutil.which("npx")):
         pytest.skip("there is no npm")
-    made = some_gaussians(700, degree)
+    made = random_gaussians(700, degree)
     save_compressed(tmp_path / "scene.compressed.ply", made, FRAME)
     save_ply(tmp_path / "scene.ply", made, FRAME)
     for name, within in (("scene.ply", 1e-5), ("scene.compressed.ply", 0.02)):
@@ -140,7 +140,7 @@ def test_export_writes_all_and_says_what_is_there(tmp_path):
     save_scene(home / "poses", scene())
     for name in ("a", "b"):
         save_image(home / "poses" / "images" / f"{name}.png", np.zeros((8, 12, 3), np.uint8))
-    save_ply(home / "evaluate" / "scene.ply", replace(some_gaussians(300, 1), antialiased=True), FRAME)
+    save_ply(home / "evaluate" / "scene.ply", replace(random_gaussians(300, 1), antialiased=True), FRAME)
     said = export.make(home)
     assert "300 Gaussians of degree 1" in said[0] and "Mip-Splatting" in said[0]
     assert "3 pinholes" in said[2] and "2 undistorted photographs" in said[2] and len(said) == 3
@@ -152,6 +152,6 @@ def test_export_writes_all_and_says_what_is_there(tmp_path):
 
 def test_far_away_positions_stay_exact_and_are_said(tmp_path):
     far = Similarity(0.5, np.array([4e6, 5e5, 0.0]))
-    save_ply(tmp_path / "scene.ply", some_gaussians(20, 0), far)
+    save_ply(tmp_path / "scene.ply", random_gaussians(20, 0), far)
     assert "many editors read floats only" in export.viewer_caveats(tmp_path / "scene.ply", False)
     assert export.viewer_caveats(tmp_path / "scene.ply", False).count(";") == 1

@@ -18,8 +18,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_installed import write_capture
-from test_runner import FILES, REPO, finished, ran, request, result, root, start, wait_for, words, write
+from test_installed import write_four_photos
+from test_runner import (
+    FILES,
+    REPO,
+    finished_project,
+    make_request,
+    project,
+    read_score,
+    run_stages,
+    start_runner,
+    statuses,
+    wait_until,
+    write_files,
+)
 
 from reffusion import trace
 from runner import Refused, compare, maintenance
@@ -48,20 +60,20 @@ variants: {strong: {fit: {rate: 5}}}
 
 
 @pytest.fixture
-def fresh(tmp_path: Path) -> Path:
-    write(tmp_path / "project", SHORT)
+def short_project(tmp_path: Path) -> Path:
+    write_files(tmp_path / "project", SHORT)
     return tmp_path / "project"
 
 
-def command(root: Path, *arguments: str, **options) -> subprocess.Popen[str]:
-    whole = [sys.executable, "-m", "runner", *arguments, "--root", str(root), "--profile", "laptop"]
+def start_command(project: Path, *arguments: str, **options) -> subprocess.Popen[str]:
+    whole = [sys.executable, "-m", "runner", *arguments, "--root", str(project), "--profile", "laptop"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(whole, cwd=REPO, **pipes, **options)
 
 
-def told(root: Path, *arguments: str, **options) -> tuple[int, str, str]:
+def run_command(project: Path, *arguments: str, **options) -> tuple[int, str, str]:
     """Exit code, output and errors of a command."""
-    process = command(root, *arguments, **options)
+    process = start_command(project, *arguments, **options)
     output, errors = process.communicate(timeout=120)
     return process.returncode, output, errors
 
@@ -72,7 +84,7 @@ def assert_one_line(said: tuple[int, str, str]) -> str:
     return errors
 
 
-def assert_whole(runs: Path) -> None:
+def assert_artifacts_complete(runs: Path) -> None:
     """Every artifact in place is one that a stage finished, and every table and record is whole."""
     for receipt in runs.glob("*/[a-z]*/" + RECEIPT):
         worn = diff_artifact(receipt.parent, Hashes(runs / "none"))
@@ -91,39 +103,44 @@ LONG = {
 
 
 @pytest.mark.parametrize("what", LONG)
-def test_killed_at_random_moments(fresh, what):
-    write(fresh, {"data/toy/scene.yaml": "stages: {fit: {pause: 0.1}}"})
+def test_killed_at_random_moments(short_project, what):
+    write_files(short_project, {"data/toy/scene.yaml": "stages: {fit: {pause: 0.1}}"})
     if what == "batch":
-        write(fresh, {"data/wide/number.txt": "6"})
-    arguments = [str(fresh / "data") if word == "data" else word for word in LONG[what]]
+        write_files(short_project, {"data/wide/number.txt": "6"})
+    arguments = [str(short_project / "data") if word == "data" else word for word in LONG[what]]
     random, killed = np.random.default_rng(len(what)), 0
     while killed < -(-KILLS // 3):
-        process = command(fresh, *arguments)
+        process = start_command(short_project, *arguments)
         try:
             process.wait(random.uniform(0.2, 4 if SLOW else 1.5))
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGKILL)
             killed += 1
         else:  # too late: it was done
-            shutil.rmtree(fresh / "runs")
+            shutil.rmtree(short_project / "runs")
         process.communicate()
-        assert_whole(fresh / "runs")
-    code, _, errors = told(fresh, *arguments)
+        assert_artifacts_complete(short_project / "runs")
+    code, _, errors = run_command(short_project, *arguments)
     assert code == 0, errors
-    assert_whole(fresh / "runs")
-    assert result(fresh) == 10.0
+    assert_artifacts_complete(short_project / "runs")
+    assert read_score(short_project) == 10.0
     if what == "batch":
-        assert result(fresh, "wide") == 12.0 and "toy,done,10.0000" in (fresh / "runs/results.csv").read_text()
+        assert (
+            read_score(short_project, "wide") == 12.0
+            and "toy,done,10.0000" in (short_project / "runs/results.csv").read_text()
+        )
     if what == "compare":
-        assert result(fresh, "toy@strong") == 19.0
-        runs = json.loads((fresh / "runs/toy/compare.json").read_text())["runs"]
+        assert read_score(short_project, "toy@strong") == 19.0
+        runs = json.loads((short_project / "runs/toy/compare.json").read_text())["runs"]
         assert [run["state"] for run in runs] == ["done"] * 2
-    left = {path.name for home in (fresh / "runs").iterdir() for path in home.glob("*") if home.name != ".locks"}
+    left = {
+        path.name for home in (short_project / "runs").iterdir() for path in home.glob("*") if home.name != ".locks"
+    }
     assert not [name for name in left if name.startswith(".")] and "kept" not in left
 
 
 @contextmanager
-def disk(folder: Path):
+def mounted_disk(folder: Path):
     """A disk in memory at `folder`; yields what sets its size or makes it read-only."""
     folder.mkdir(exist_ok=True)
     mount = lambda *how: subprocess.run(["mount", "-t", "tmpfs", *how, "none", str(folder)], capture_output=True)
@@ -135,44 +152,44 @@ def disk(folder: Path):
         subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-def test_a_full_disk(fresh):
+def test_a_full_disk(short_project):
     random = np.random.default_rng(0)
-    with disk(fresh / "runs") as remount:
+    with mounted_disk(short_project / "runs") as remount:
         for _ in range(SIZES):
-            used = shutil.disk_usage(fresh / "runs").used // 1024
+            used = shutil.disk_usage(short_project / "runs").used // 1024
             remount(f"size={used + 4 * random.integers(1, 20)}k")
-            said = told(fresh, "run", "--scene", "toy")
+            said = run_command(short_project, "run", "--scene", "toy")
             assert said[0] == 0 or "make room" in assert_one_line(said)
-            assert_whole(fresh / "runs")
+            assert_artifacts_complete(short_project / "runs")
             if SLOW and random.random() < 0.3:
-                shutil.rmtree(fresh / "runs/toy", ignore_errors=True)
+                shutil.rmtree(short_project / "runs/toy", ignore_errors=True)
         remount("size=1m")
-        assert told(fresh, "run", "--scene", "toy")[0] == 0 and result(fresh) == 10.0
+        assert run_command(short_project, "run", "--scene", "toy")[0] == 0 and read_score(short_project) == 10.0
 
 
 @pytest.mark.parametrize("size", [700, 0, 60, 300, 1000][: 5 if SLOW else 1])
-def test_files_that_cannot_be_written_whole(fresh, size):
+def test_files_that_cannot_be_written_whole(short_project, size):
     limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
-    assert "make room" in assert_one_line(told(fresh, "run", "--scene", "toy", preexec_fn=limit))
-    assert_whole(fresh / "runs")
+    assert "make room" in assert_one_line(run_command(short_project, "run", "--scene", "toy", preexec_fn=limit))
+    assert_artifacts_complete(short_project / "runs")
 
 
-def test_a_folder_that_is_only_read(root):
-    kept = root / "made"
-    (root / "runs").rename(kept)
-    with disk(root / "runs") as remount:
-        shutil.copytree(kept, root / "runs", dirs_exist_ok=True)
+def test_a_folder_that_is_only_read(project):
+    kept = project / "made"
+    (project / "runs").rename(kept)
+    with mounted_disk(project / "runs") as remount:
+        shutil.copytree(kept, project / "runs", dirs_exist_ok=True)
         remount("ro")
-        code, output, _ = told(root, "plan", "--scene", "toy")
+        code, output, _ = run_command(project, "plan", "--scene", "toy")
         assert code == 0 and "cached    evaluate" in output
-        assert "Read-only file system; runs=FOLDER" in assert_one_line(told(root, "run", "--scene", "toy"))
-        assert "Read-only file system; runs=FOLDER" in assert_one_line(told(root, "clean", "--scene", "toy"))
+        assert "Read-only file system; runs=FOLDER" in assert_one_line(run_command(project, "run", "--scene", "toy"))
+        assert "Read-only file system; runs=FOLDER" in assert_one_line(run_command(project, "clean", "--scene", "toy"))
 
 
 # ------------------------------------------------------------------------------------------- lost, rotten, edited files
 
 
-def flip(path: Path, quietly: bool = False) -> None:
+def flip_byte(path: Path, quietly: bool = False) -> None:
     """Another byte in the middle; `quietly`: size and time say nothing of it."""
     data, then = bytearray(path.read_bytes()), path.stat().st_mtime_ns
     data[len(data) // 2] ^= 1
@@ -181,36 +198,47 @@ def flip(path: Path, quietly: bool = False) -> None:
         os.utime(path, ns=(then, then))
 
 
-def test_what_is_missing_or_changed_is_named_and_made_again(root, capsys):
-    made = [path for path in (root / "runs/toy").rglob("*.*") if path.suffix in (".ply", ".png", ".json", ".txt")]
+def test_what_is_missing_or_changed_is_named_and_made_again(project, capsys):
+    made = [path for path in (project / "runs/toy").rglob("*.*") if path.suffix in (".ply", ".png", ".json", ".txt")]
     before = {path: path.read_bytes() for path in made if path.name != RECEIPT}
-    (root / "runs/toy/evaluate/metrics.json").unlink()
-    (root / "runs/toy/masks/facts.json").unlink()
-    flip(root / "runs/toy/fit/gaussians.ply")
-    said = words(root)
+    (project / "runs/toy/evaluate/metrics.json").unlink()
+    (project / "runs/toy/masks/facts.json").unlink()
+    flip_byte(project / "runs/toy/fit/gaussians.ply")
+    said = statuses(project)
     assert said["fit"] == "run gaussians.ply changed since (keep=1 keeps it)" and said["poses"] == "cached"
     assert said["masks"] == "run facts.json missing" and said["evaluate"] == "run metrics.json missing"
-    flip(root / "runs/toy/poses/masks/a.png")
-    assert ran(capsys, root) == ["poses", "fit", "masks", "evaluate"]  # `distill` is as it was, and so are its needs
+    flip_byte(project / "runs/toy/poses/masks/a.png")
+    assert run_stages(capsys, project) == [
+        "poses",
+        "fit",
+        "masks",
+        "evaluate",
+    ]  # `distill` is as it was, and so are its needs
     assert {path: path.read_bytes() for path in before} == before
-    assert {path.name for path in (root / "runs/toy/kept").rglob("*.*")} == {"gaussians.ply", "a.png"}
+    assert {path.name for path in (project / "runs/toy/kept").rglob("*.*")} == {"gaussians.ply", "a.png"}
 
 
-def test_verify_hashes_everything(root, capsys):
-    assert maintenance.verify(request(root)) == 0 and "runs/toy/fit: as it was made" in capsys.readouterr().out
-    files = [path for path in (root / "runs/toy").glob("*/*") if path.is_file() and path.suffix in (".ply", ".json")]
+def test_verify_hashes_everything(project, capsys):
+    assert maintenance.verify(make_request(project)) == 0 and "runs/toy/fit: as it was made" in capsys.readouterr().out
+    files = [path for path in (project / "runs/toy").glob("*/*") if path.is_file() and path.suffix in (".ply", ".json")]
     files = sorted((path for path in files if path.name != RECEIPT), key=lambda path: path.name == "facts.json")
-    for path in (root / "data/toy/number.txt", *files):
-        flip(path, quietly=True)
-        assert path.name == "facts.json" or set(words(root).values()) == {"cached"}  # by size and time
-    assert maintenance.verify(request(root)) == len(files) + 1
+    for path in (project / "data/toy/number.txt", *files):
+        flip_byte(path, quietly=True)
+        assert path.name == "facts.json" or set(statuses(project).values()) == {"cached"}  # by size and time
+    assert maintenance.verify(make_request(project)) == len(files) + 1
     said = capsys.readouterr().out
     assert all(f"toy/{path.parent.name}: {path.name} changed" in said for path in files)
     assert "data/toy/number.txt: its content changed, its size and time did not" in said and "keep=1" in said
-    assert words(root)["poses"].startswith("run need scene changed") and "gaussians.ply changed" in words(root)["fit"]
+    assert (
+        statuses(project)["poses"].startswith("run need scene changed")
+        and "gaussians.ply changed" in statuses(project)["fit"]
+    )
     for spoiled in ("{", "[]", "{}"):
-        (root / "runs/toy/masks" / RECEIPT).write_text(spoiled)
-        assert maintenance.verify(request(root)) and "masks: receipt.json cannot be read" in capsys.readouterr().out
+        (project / "runs/toy/masks" / RECEIPT).write_text(spoiled)
+        assert (
+            maintenance.verify(make_request(project))
+            and "masks: receipt.json cannot be read" in capsys.readouterr().out
+        )
 
 
 @pytest.mark.parametrize("how", ["a byte", "half", "nothing", "text"])
@@ -221,41 +249,43 @@ def test_a_damaged_checkpoint_means_a_fresh_start(tmp_path, capsys, how):
     assert found["step"] == 3 and torch.equal(found["values"], state["values"]) and not capsys.readouterr().out
     path = tmp_path / "checkpoint.pt"
     if how == "a byte":
-        flip(path)
+        flip_byte(path)
     else:
         path.write_bytes({"half": path.read_bytes()[: path.stat().st_size // 2], "nothing": b"", "text": b"no"}[how])
     assert trace.load_checkpoint(tmp_path) is None and not path.exists()
     assert "checkpoint.pt is damaged: from the start" in capsys.readouterr().out
 
 
-def test_empty_records_are_none(root):
+def test_empty_records_are_none(project):
     for name in ("source", "profile"):
-        (root / "runs/toy" / name).write_text("")
-    (root / "runs/.hashes.json").write_text("[]")
-    assert set(words(root).values()) == {"cached"}
-    assert "no CUDA driver" in resolve(request(root, profile=None)).why or resolve(request(root)).profile
+        (project / "runs/toy" / name).write_text("")
+    (project / "runs/.hashes.json").write_text("[]")
+    assert set(statuses(project).values()) == {"cached"}
+    assert (
+        "no CUDA driver" in resolve(make_request(project, profile=None)).why or resolve(make_request(project)).profile
+    )
 
 
 # --------------------------------------------------------------------------------------------------------------- locks
 
 
-def test_a_lock_that_is_lost_while_a_stage_works(root):
-    process = start(root, "--scene", "toy", "--set", "fit.pause=0.1 fit.iterations=8")
-    wait_for(lambda: list((root / "runs/toy").glob(".partial-fit-*")))
-    (root / "runs/.locks/toy").unlink()
+def test_a_lock_that_is_lost_while_a_stage_works(project):
+    process = start_runner(project, "--scene", "toy", "--set", "fit.pause=0.1 fit.iterations=8")
+    wait_until(lambda: list((project / "runs/toy").glob(".partial-fit-*")))
+    (project / "runs/.locks/toy").unlink()
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 2 and "its lock in .locks was removed" in output and "Traceback" not in output
-    assert (root / "runs/toy/fit/gaussians.ply").read_text() == "10"
-    assert words(root, set="fit.pause=0.1 fit.iterations=8")["fit"].endswith("goes on where it stopped")
+    assert (project / "runs/toy/fit/gaussians.ply").read_text() == "10"
+    assert statuses(project, set="fit.pause=0.1 fit.iterations=8")["fit"].endswith("goes on where it stopped")
 
 
-def test_another_machine(root, capsys):
-    write(root, {"runs/.locks/toy": "77 elsewhere\n"})
-    ran(capsys, root)
-    run_scene(request(root), "all")
-    assert "elsewhere" not in capsys.readouterr().out and not (root / "runs/.locks/toy").read_text()
-    write(root, {"runs/.locks/toy": "77 elsewhere\n"})
-    run_scene(request(root), "all")
+def test_another_machine(project, capsys):
+    write_files(project, {"runs/.locks/toy": "77 elsewhere\n"})
+    run_stages(capsys, project)
+    run_scene(make_request(project), "all")
+    assert "elsewhere" not in capsys.readouterr().out and not (project / "runs/.locks/toy").read_text()
+    write_files(project, {"runs/.locks/toy": "77 elsewhere\n"})
+    run_scene(make_request(project), "all")
     assert "toy was last in use on elsewhere; is it still?" in capsys.readouterr().out
 
 
@@ -264,7 +294,7 @@ def test_another_machine(root, capsys):
 
 def test_pictures_outside_the_scene_count_and_are_listed(tmp_path):
     scene, pictures = tmp_path / "data/row", tmp_path / "pictures"
-    write_capture(scene)
+    write_four_photos(scene)
     (scene / "images").rename(pictures)
     record = json.loads((scene / "transforms.json").read_text())
     for number, frame in enumerate(record["frames"]):
@@ -278,15 +308,15 @@ def test_pictures_outside_the_scene_count_and_are_listed(tmp_path):
     assert decide(job(), "poses", {}).inputs.key != before.inputs.key
 
 
-def test_a_folder_above_the_scene_and_a_pipe_are_refused(root):
+def test_a_folder_above_the_scene_and_a_pipe_are_refused(project):
     for folder in ("/", "..", "../.."):
-        write(root, {"data/toy/scene.yaml": f"gaussians: {folder}\n"})
+        write_files(project, {"data/toy/scene.yaml": f"gaussians: {folder}\n"})
         with pytest.raises(Refused, match="holds the scene itself"):
-            words(root)
-    write(root, {"data/toy/scene.yaml": ""})
-    os.mkfifo(root / "data/toy/a.png")
+            statuses(project)
+    write_files(project, {"data/toy/scene.yaml": ""})
+    os.mkfifo(project / "data/toy/a.png")
     with pytest.raises(Refused, match=r"toy/a\.png: neither a file nor a folder"):
-        words(root)
+        statuses(project)
 
 
 # ---------------------------------------------------------------------------------------------------------- many scenes
@@ -302,28 +332,28 @@ UNREADABLE = {
 }
 
 
-def test_scenes_that_cannot_be_read_are_rows_that_failed(root, capsys):
+def test_scenes_that_cannot_be_read_are_rows_that_failed(project, capsys):
     for name, text in UNREADABLE.items():
-        write(root, {f"data/{name}/number.txt": "1", f"data/{name}/scene.yaml": text})
-    (root / "data/h").mkdir()
-    (root / "data/h/scene.yaml").write_bytes(b"\xff\xfe\x00")
-    assert compare.batch(request(root, scene=""), root / "data") == 8
-    rows = dict(line.split(",")[:2] for line in (root / "runs/results.csv").read_text().splitlines())
+        write_files(project, {f"data/{name}/number.txt": "1", f"data/{name}/scene.yaml": text})
+    (project / "data/h").mkdir()
+    (project / "data/h/scene.yaml").write_bytes(b"\xff\xfe\x00")
+    assert compare.batch(make_request(project, scene=""), project / "data") == 8
+    rows = dict(line.split(",")[:2] for line in (project / "runs/results.csv").read_text().splitlines())
     assert rows.pop("toy") == "done" and [rows[name] for name in "abcdefgh"] == ["failed"] * 8
     assert "Traceback" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("bad", ["toy", "toy-1"])
-def test_compare_goes_on_after_a_scene_that_cannot_be_read(root, bad):
-    write(root, {"data/toy-1/number.txt": "4", f"data/{bad}/scene.yaml": "shift: [1"})
+def test_compare_goes_on_after_a_scene_that_cannot_be_read(project, bad):
+    write_files(project, {"data/toy-1/number.txt": "4", f"data/{bad}/scene.yaml": "shift: [1"})
     if bad == "toy":  # what is done stays, for the other
-        (root / "runs/toy").rename(root / "runs/toy-1")
-        (root / "runs/toy-1/source").unlink()
-    assert compare.compare(request(root), "full", 2) == 1
-    states = {run["scene"]: run["state"] for run in json.loads((root / "runs/toy/compare.json").read_text())["runs"]}
+        (project / "runs/toy").rename(project / "runs/toy-1")
+        (project / "runs/toy-1/source").unlink()
+    assert compare.compare(make_request(project), "full", 2) == 1
+    states = {run["scene"]: run["state"] for run in json.loads((project / "runs/toy/compare.json").read_text())["runs"]}
     assert states.pop(bad) == "failed" and list(states.values()) == ["done"]
     with pytest.raises(Refused):  # nothing could be done
-        compare.compare(request(root, set="fit.rat=1"), "full", 2)
+        compare.compare(make_request(project, set="fit.rat=1"), "full", 2)
 
 
 # ---------------------------------------------------------------------------------------------------------------- make
@@ -340,7 +370,7 @@ TYPED = (
 
 
 @pytest.fixture
-def stub(tmp_path) -> Path:
+def stub_environment(tmp_path) -> Path:
     """An environment whose commands only say what they were given."""
     (tmp_path / "bin").mkdir()
     for name in ("reffusion", "python"):
@@ -352,9 +382,11 @@ def stub(tmp_path) -> Path:
 
 
 @pytest.mark.parametrize("typed", TYPED)
-def test_what_is_typed_is_no_command(stub, typed):
+def test_what_is_typed_is_no_command(stub_environment, typed):
     def made(*words: str) -> str:
-        done = subprocess.run(["make", "-s", "-C", str(REPO), f"VENV={stub}", *words], capture_output=True, text=True)
+        done = subprocess.run(
+            ["make", "-s", "-C", str(REPO), f"VENV={stub_environment}", *words], capture_output=True, text=True
+        )
         assert not list(REPO.glob("pwned*")), words
         return done.stdout
 
@@ -370,10 +402,12 @@ def test_what_is_typed_is_no_command(stub, typed):
     assert "which scene" not in made("plan", typed)
 
 
-def test_a_quote_in_a_scenes_name(fresh, capsys):
+def test_a_quote_in_a_scenes_name(short_project, capsys):
     name = 'anna\'s "room"'
-    (fresh / "data/toy").rename(fresh / "data" / name)
-    assert ran(capsys, fresh, "fit", scene=name) == ["fit"]
-    assert ran(capsys, fresh, "fit", scene=str(fresh / "data" / name), variant="strong") == ["fit"]
-    maintenance.clean(request(fresh, scene=name))
-    assert not list((fresh / "runs").glob("[!.]*"))
+    (short_project / "data/toy").rename(short_project / "data" / name)
+    assert run_stages(capsys, short_project, "fit", scene=name) == ["fit"]
+    assert run_stages(capsys, short_project, "fit", scene=str(short_project / "data" / name), variant="strong") == [
+        "fit"
+    ]
+    maintenance.clean(make_request(short_project, scene=name))
+    assert not list((short_project / "runs").glob("[!.]*"))

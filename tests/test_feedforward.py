@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 from pydantic import ValidationError
-from test_paint2d import Mean
-from test_references import ROOT, capture, wall  # noqa: F401 (a fixture)
+from test_paint2d import MeanInpainter
+from test_references import ROOT, wall_folders, write_wall_capture  # noqa: F401 (a fixture)
 
 from reffusion.inpaint import exemplar, feedforward
 from reffusion.inpaint.onnx_model import Network
@@ -98,7 +98,7 @@ def model(path, kind="lama", side=None, answer=None, **changes):
 
 
 def script(path):
-    torch.jit.script(Mean()).save(path)
+    torch.jit.script(MeanInpainter()).save(path)
     return path
 
 
@@ -271,7 +271,7 @@ def test_a_plain_string_is_the_kind():
 
 
 def test_the_key_of_scene_yaml_reaches_references_and_further_views(own_cache, tmp_path):
-    scene = capture(tmp_path / "wall")
+    scene = write_wall_capture(tmp_path / "wall")
     (scene / "scene.yaml").write_text("inpainter: auto\n")
 
     def machine():
@@ -306,7 +306,7 @@ def test_the_file_is_found_or_the_plan_says_where_people_get_it(own_cache, tmp_p
 
 
 def test_a_job_is_told_before_any_work_and_keyed_by_the_files_content(own_cache, tmp_path):
-    scene, file = capture(tmp_path / "wall"), tmp_path / "big.pt"
+    scene, file = write_wall_capture(tmp_path / "wall"), tmp_path / "big.pt"
 
     def planned(inpainter):
         asked = f"'reference.inpainter={inpainter}'"
@@ -328,18 +328,18 @@ def test_a_job_is_told_before_any_work_and_keyed_by_the_files_content(own_cache,
 
 
 @pytest.mark.parametrize("kind", ["lama", "migan"])
-def test_the_stage_paints_the_hole_in_one_pass(wall, tmp_path, kind):  # noqa: F811
+def test_the_stage_paints_the_hole_in_one_pass(wall_folders, tmp_path, kind):  # noqa: F811
     file = script(tmp_path / "big.pt") if kind == "lama" else model(tmp_path / "pipeline.onnx", "migan")
     out = tmp_path / "out"
     out.mkdir()
-    reference.run(Params(inpainter=setting(kind, file)), out, **wall)
-    (found,) = load_references(out, load_scene(wall["poses"]))
-    pixels = load_mask_sets(wall["masks"], ["a2"])["a2"]
+    reference.run(Params(inpainter=setting(kind, file)), out, **wall_folders)
+    (found,) = load_references(out, load_scene(wall_folders["poses"]))
+    pixels = load_mask_sets(wall_folders["masks"], ["a2"])["a2"]
     inner = exemplar.mask_to_paint(pixels.consistent, pixels.invent)
     assert found.camera.name == "a2" and np.array_equal(found.mask, pixels.invent)
     assert np.ptp(found.image[inner].astype(int), axis=0).max() <= 1, "the stand-in's mean"
     outside = ~inner & ~pixels.consistent
-    assert np.array_equal(found.image[outside], load_image(wall["poses"] / "images" / "a2.png")[outside])
+    assert np.array_equal(found.image[outside], load_image(wall_folders["poses"] / "images" / "a2.png")[outside])
     assert np.array_equal(load_image(out / "candidates.png"), found.image)
     name = {"lama": "LaMa (big.pt)", "migan": "MI-GAN (pipeline.onnx)"}[kind]
     record = json.loads((out / "candidates.json").read_text())

@@ -9,21 +9,21 @@ from scipy.sparse.linalg import spsolve
 from reffusion.prior.harmonic_fill import harmonic_extension
 
 
-def disc(height, width, radius):
+def disk_mask(height, width, radius):
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     return ((y - height / 2) ** 2 + (x - width / 2) ** 2 < radius**2)[None, None].double()
 
 
-def pictures(*shape, seed=0):
+def random_images(*shape, seed=0):
     return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 2 - 1
 
 
-def smooth(height, width):
+def smooth_image(height, width):
     y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
     return torch.stack([x, torch.sin(2 * y), x * y])[None].double()
 
 
-def exact(image, hole):
+def solve_laplace(image, hole):
     """Laplace's equation in the hole by a sparse solver, what is given as boundary, the picture's edge insulated."""
     height, width = hole.shape
     number = -np.ones(hole.shape, int)
@@ -46,7 +46,7 @@ def exact(image, hole):
 
 @pytest.mark.parametrize("size", [(64, 64), (37, 51), (1, 9), (1, 1)])
 def test_what_is_given_stays_and_the_hole_lies_within_its_range(size):
-    images, hidden = pictures(3, 3, *size), (pictures(3, 1, *size, seed=1) > 0).double()
+    images, hidden = random_images(3, 3, *size), (random_images(3, 1, *size, seed=1) > 0).double()
     hidden[..., 0, 0] = 0
     filled = harmonic_extension(images, hidden)
     given = (hidden == 0).expand_as(images)
@@ -58,27 +58,27 @@ def test_what_is_given_stays_and_the_hole_lies_within_its_range(size):
 
 def test_a_constant_is_continued_exactly():
     images = torch.full((1, 3, 40, 40), 0.3, dtype=torch.float64)
-    assert (harmonic_extension(images, disc(40, 40, 15)) - 0.3).abs().max() < 1e-14
+    assert (harmonic_extension(images, disk_mask(40, 40, 15)) - 0.3).abs().max() < 1e-14
 
 
 @pytest.mark.parametrize("radius", [3, 8, 16])
 def test_it_is_close_to_the_solution_of_laplaces_equation(radius):
-    images, hidden = smooth(48, 48), disc(48, 48, radius)
+    images, hidden = smooth_image(48, 48), disk_mask(48, 48, radius)
     hole = hidden[0, 0].numpy() > 0
-    solution = exact(images[0].permute(1, 2, 0).numpy(), hole)
+    solution = solve_laplace(images[0].permute(1, 2, 0).numpy(), hole)
     ours = harmonic_extension(images, hidden)[0].permute(1, 2, 0).numpy()
     assert np.abs(ours - solution)[hole].max() < 0.12  # of a range of 2
     assert np.square(ours - solution)[hole].mean() < 0.01 * np.square(solution)[hole].mean() + 2e-4
 
 
 def test_what_lies_in_the_hole_does_not_matter():
-    images, hidden = pictures(1, 3, 32, 32), disc(32, 32, 9)
+    images, hidden = random_images(1, 3, 32, 32), disk_mask(32, 32, 9)
     other = torch.where(hidden > 0, torch.nan, images)
     assert torch.equal(harmonic_extension(images, hidden), harmonic_extension(other, hidden))
 
 
 def test_nothing_given_gives_grey_and_leaves_its_neighbours_in_the_batch_alone():
-    images, hidden = pictures(2, 3, 32, 32), disc(32, 32, 9).repeat(2, 1, 1, 1)
+    images, hidden = random_images(2, 3, 32, 32), disk_mask(32, 32, 9).repeat(2, 1, 1, 1)
     hidden[0] = 1
     both = harmonic_extension(images, hidden)
     assert torch.equal(both[0], torch.zeros_like(both[0]))
@@ -86,5 +86,5 @@ def test_nothing_given_gives_grey_and_leaves_its_neighbours_in_the_batch_alone()
 
 
 def test_no_hole_changes_nothing():
-    images = pictures(1, 3, 20, 30)
+    images = random_images(1, 3, 20, 30)
     assert torch.equal(harmonic_extension(images, torch.zeros(1, 1, 20, 30, dtype=torch.float64)), images)

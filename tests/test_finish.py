@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import pytest
-import small_scene as small
 import torch
+from scenes import wall_scene
 
 from reffusion.background.backdrop import DISKS
 from reffusion.io.arrays import load_json
@@ -15,7 +15,7 @@ from stages import evaluate, finish
 
 @pytest.fixture
 def folders(tmp_path):
-    poses, fit, _ = small.write(tmp_path, 1.0)
+    poses, fit, _ = wall_scene.write_poses_and_fit(tmp_path, 1.0)
     return {"poses": poses, "raw_masks": poses.with_name("raw_masks"), "fit": fit}
 
 

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 import pytest
-import small_scene
 import torch
+from scenes import wall_scene
 
 from reffusion import geometry
 from reffusion.io.ply import save_ply
@@ -13,7 +13,7 @@ from reffusion.types import Camera, Scene, Similarity
 from report import camera_path, turntable
 
 
-def ring(count: int, radius: float, height: float = 0.3) -> list[Camera]:
+def ring_cameras(count: int, radius: float, height: float = 0.3) -> list[Camera]:
     """Cameras on a circle about the y axis, rows downwards along +y, all looking at the origin."""
     turns = 2 * np.pi * np.arange(count) / count
     centers = np.stack([radius * np.cos(turns), np.full(count, -height), radius * np.sin(turns)], 1)
@@ -22,16 +22,16 @@ def ring(count: int, radius: float, height: float = 0.3) -> list[Camera]:
 
 
 def test_a_ring_of_cameras_gives_the_ring_back():
-    made = camera_path.ellipse_path(ring(9, 2.0), np.random.default_rng(0).normal(0, 0.1, (50, 3)), 12)
+    made = camera_path.ellipse_path(ring_cameras(9, 2.0), np.random.default_rng(0).normal(0, 0.1, (50, 3)), 12)
     centers = np.stack([camera.center for camera in made])
     assert np.allclose(np.hypot(centers[:, 0], centers[:, 2]), 2.0) and np.allclose(centers[:, 1], -0.3)
     steps = np.linalg.norm(np.diff(centers, axis=0, append=centers[:1]), axis=1)
     assert np.allclose(steps, steps[0]), "closed, and even"
-    assert np.allclose(camera_path.focus_point(ring(9, 2.0), np.zeros((0, 3))), 0, atol=0.02)
+    assert np.allclose(camera_path.focus_point(ring_cameras(9, 2.0), np.zeros((0, 3))), 0, atol=0.02)
 
 
 def test_every_camera_looks_at_the_focus_upright():
-    cameras = list(small_scene.CAMERAS.values())
+    cameras = list(wall_scene.CAMERAS.values())
     points = np.array([[0.0, 0.0, 2.0]])
     target = camera_path.focus_point(cameras, points)
     assert target[2] == pytest.approx(2.0, abs=0.05), "parallel axes: the points say how far"
@@ -53,11 +53,11 @@ def test_odd_captures_have_a_way_too():
 
 
 def test_the_video_shows_the_result_of_a_variant_in_the_scenes_poses(tmp_path):
-    gaussians, labels = small_scene.gaussians(1.0)
+    gaussians, labels = wall_scene.wall_and_square(1.0)
     similarity = Similarity(2.0, np.array([0.1, 0.2, 0.3]))
-    train = {name: small_scene.CAMERAS[name] for name in small_scene.TRAIN}
+    train = {name: wall_scene.CAMERAS[name] for name in wall_scene.TRAIN}
     points = gaussians.means.double().numpy()[~labels.numpy()]
-    scene = Scene(train, small_scene.TRAIN, (), frozenset(), points, np.zeros((len(points), 3), np.uint8), similarity)
+    scene = Scene(train, wall_scene.TRAIN, (), frozenset(), points, np.zeros((len(points), 3), np.uint8), similarity)
     save_scene(tmp_path / "x" / "poses", scene)
     with pytest.raises(ValueError, match="make scene=x all"):
         turntable.make(tmp_path / "x@no_sds")
@@ -66,7 +66,7 @@ def test_the_video_shows_the_result_of_a_variant_in_the_scenes_poses(tmp_path):
     film, frames = cv2.VideoCapture(str(turntable.make(tmp_path / "x@no_sds", frames=6))), []
     while (read := film.read())[0]:
         frames.append(read[1])
-    assert len(frames) == 6 and frames[0].shape == (small_scene.HEIGHT, small_scene.WIDTH, 3)
+    assert len(frames) == 6 and frames[0].shape == (wall_scene.HEIGHT, wall_scene.WIDTH, 3)
     first = camera_path.ellipse_path(list(train.values()), points, 6)[0]
     drawn = turntable.rasterizer.render(wall, first).color
     assert (torch.from_numpy(frames[0][..., ::-1].copy()) / 255 - drawn).abs().mean() < 0.03, "but for compression"

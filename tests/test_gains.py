@@ -2,31 +2,31 @@
 
 import numpy as np
 import pytest
+from scenes import wall_scene
 
 from reffusion.fit.gains import brightness_deviation, estimate_gains
 from reffusion.io.scene import load_scene, load_views
 from reffusion.params.fit import Params
 from stages import fit as stage
-from tests import small_scene
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory):
-    poses, _, _ = small_scene.write(tmp_path_factory.mktemp("gains") / "wall", 1.5)
+def wall_photos(tmp_path_factory):
+    poses, _, _ = wall_scene.write_poses_and_fit(tmp_path_factory.mktemp("gains") / "wall", 1.5)
     scene = load_scene(poses)
     return scene, [scene.cameras[name] for name in scene.train], load_views(poses, scene.train)
 
 
-def dimmed(photos, bright):
+def dim_photos(photos, bright):
     shown = lambda photo, gain: (photo * gain).round().clip(0, 255).astype(np.uint8)
     return {name: shown(photos[name], gain) for name, gain in zip(photos, bright, strict=True)}
 
 
-def test_gains_are_found_though_some_photographs_show_something_else(shown):
-    scene, cameras, photos = shown
+def test_gains_are_found_though_some_photographs_show_something_else(wall_photos):
+    scene, cameras, photos = wall_photos
     bright = np.exp(np.random.default_rng(0).normal(0, 0.15, (len(cameras), 3)))
     bright /= bright.max() * 1.05
-    told = dimmed({camera.name: photos[camera.name] for camera in cameras}, bright)
+    told = dim_photos({camera.name: photos[camera.name] for camera in cameras}, bright)
     for photo in list(told.values())[::3]:  # a thing before a quarter of the picture
         photo[: photo.shape[0] // 2, : photo.shape[1] // 2] = 200
     found = estimate_gains(scene.points, cameras, told)
@@ -35,18 +35,18 @@ def test_gains_are_found_though_some_photographs_show_something_else(shown):
     assert brightness_deviation(found) > 0.05 > brightness_deviation(estimate_gains(scene.points, cameras, photos))
 
 
-def test_where_nothing_is_known_all_are_alike(shown):
-    scene, cameras, photos = shown
+def test_where_nothing_is_known_all_are_alike(wall_photos):
+    scene, cameras, photos = wall_photos
     assert np.array_equal(estimate_gains(np.zeros((0, 3)), cameras, photos), np.ones((len(cameras), 3)))
     black = {name: np.zeros_like(photo) for name, photo in photos.items()}
     assert np.array_equal(estimate_gains(scene.points, cameras, black), np.ones((len(cameras), 3)))
 
 
-def test_the_stage_fits_exposures_where_photographs_differ(shown, capsys):
-    scene, cameras, photos = shown
+def test_the_stage_fits_exposures_where_photographs_differ(wall_photos, capsys):
+    scene, cameras, photos = wall_photos
     asked = lambda how, images: stage.estimate_exposures(Params(exposure=how), scene, cameras, images)
     bright = np.where(np.arange(len(cameras)) % 2, 0.6, 0.9)[:, None]
-    uneven_ones = dimmed({camera.name: photos[camera.name] for camera in cameras}, bright)
+    uneven_ones = dim_photos({camera.name: photos[camera.name] for camera in cameras}, bright)
     assert asked("auto", photos) is None and asked("never", uneven_ones) is None
     assert asked("always", photos) is not None
     found = asked("auto", uneven_ones)

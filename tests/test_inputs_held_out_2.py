@@ -11,31 +11,31 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from held_out import (
-    OBJECT,
-    SHARE,
-    assert_cameras,
-    assert_masked,
-    assert_sentence,
-    attempt,
-    masked_share,
-    refusal,
-    refusal_before_work,
-    renamed,
-    write_named_model,
-)
 from PIL import Image
-from small_capture import (
+from scenes.capture import (
     HEIGHT,
     WIDTH,
     Truth,
-    prepare,
-    preview,
-    some_truth,
+    make_truth,
+    preview_stages,
+    write_capture,
     write_masks,
     write_pictures,
 )
-from test_sfm import draw_corner, noise, walk
+from scenes.capture_checks import (
+    OBJECT,
+    SHARE,
+    assert_cameras,
+    assert_masked_views,
+    assert_message,
+    masked_share,
+    refusal_before_writing,
+    refusal_message,
+    rename_views,
+    run_with_messages,
+    write_named_model,
+)
+from test_sfm import render_room_corner, room_walk, speckle_texture
 
 from reffusion.io.images import save_image
 
@@ -44,8 +44,8 @@ from reffusion.io.images import save_image
 
 def capture_with_masks(folder: Path, masks: str, draw) -> Truth:
     """A COLMAP capture whose masks are the Pillow images that `draw` returns."""
-    truth = some_truth()
-    prepare(folder, "colmap", truth)
+    truth = make_truth()
+    write_capture(folder, "colmap", truth)
     (folder / "masks").rename(folder / masks)
     for path in (folder / masks).iterdir():
         draw().save(path)
@@ -65,8 +65,8 @@ def test_F_palette_whose_black_is_the_last_entry(tmp_path):
     """As an annotation tool writes it whose table begins with the first label, dark red."""
     draw = lambda: palette_image(np.where(OBJECT, 0, 2), {0: (128, 0, 0), 1: (0, 128, 0), 2: (0, 0, 0)})
     truth = capture_with_masks(tmp_path / "s", "masks", draw)
-    _, out, _ = attempt(tmp_path / "s")
-    assert_masked(out, truth.world_to_camera)
+    _, out, _ = run_with_messages(tmp_path / "s")
+    assert_masked_views(out, truth.world_to_camera)
 
 
 def test_F_one_class_of_a_palette_by_its_number(tmp_path):
@@ -76,8 +76,8 @@ def test_F_one_class_of_a_palette_by_its_number(tmp_path):
     numbers[HEIGHT // 4 - 1, WIDTH // 4 : WIDTH // 2] = 255
     colors = {0: (0, 0, 0), 7: (128, 128, 128), 15: (192, 128, 128), 255: (224, 224, 192)}
     truth = capture_with_masks(tmp_path / "s", "SegmentationClass", lambda: palette_image(numbers, colors))
-    _, out, _ = attempt(tmp_path / "s", masks={"folder": "SegmentationClass", "id": 15})
-    assert_masked(out, truth.world_to_camera)
+    _, out, _ = run_with_messages(tmp_path / "s", masks={"folder": "SegmentationClass", "id": 15})
+    assert_masked_views(out, truth.world_to_camera)
 
 
 def numbered_16_bit() -> Image.Image:
@@ -90,20 +90,20 @@ def numbered_16_bit() -> Image.Image:
 
 def test_F_object_numbers_of_16_bits_are_refused_without_id(tmp_path):
     capture_with_masks(tmp_path / "s", "masks", numbered_16_bit)
-    message = refusal_before_work(tmp_path / "s")
+    message = refusal_before_writing(tmp_path / "s")
     assert ".png" in message and re.search(r"\bid\b", message), message
 
 
 def test_F_two_object_numbers_of_16_bits(tmp_path):
     truth = capture_with_masks(tmp_path / "s", "masks", numbered_16_bit)
-    _, out, _ = attempt(tmp_path / "s", masks={"id": [3, 1024]})
-    assert_masked(out, truth.world_to_camera)
+    _, out, _ = run_with_messages(tmp_path / "s", masks={"id": [3, 1024]})
+    assert_masked_views(out, truth.world_to_camera)
 
 
 def test_F_antialiased_outlines_are_no_object_numbers(tmp_path):
     soft = cv2.GaussianBlur(255 * OBJECT.astype(np.uint8), (0, 0), 0.8)
     truth = capture_with_masks(tmp_path / "s", "masks", lambda: Image.fromarray(soft))
-    _, out, _ = attempt(tmp_path / "s")
+    _, out, _ = run_with_messages(tmp_path / "s")
     assert [masked_share(out, v) for v in truth.world_to_camera] == pytest.approx([SHARE] * 6, abs=0.003)
 
 
@@ -116,43 +116,43 @@ def test_G_reference_and_its_depth_among_photographs_of_input(tmp_path):
     Image.fromarray(np.full((HEIGHT, WIDTH), 4000, np.uint16)).save(folder / "input/clean plate depth.png")
     write_masks(folder / "masks", names)
     reference = {"view": "IMG_2", "image": "input/clean plate.jpg", "depth": "input/clean plate depth.png"}
-    notes = preview(folder, reference=reference)
-    assert_sentence(notes, "6 training")
-    assert_sentence(notes, "6 masks")
-    assert_sentence(notes, "6 photos bring no poses")
+    notes = preview_stages(folder, reference=reference)
+    assert_message(notes, "6 training")
+    assert_message(notes, "6 masks")
+    assert_message(notes, "6 photos bring no poses")
 
 
 def test_G_two_references_beside_pictures_of_llff(tmp_path):
-    folder, truth = tmp_path / "s", some_truth()
-    prepare(folder, "llff", truth)
+    folder, truth = tmp_path / "s", make_truth()
+    write_capture(folder, "llff", truth)
     write_pictures(folder / "images_4", ["v00_inpainted", "v03_inpainted"])
     references = [{"view": f"v0{k}", "image": f"images_4/v0{k}_inpainted.png"} for k in (0, 3)]
-    scene, out, _ = attempt(folder, reference=references)
+    scene, out, _ = run_with_messages(folder, reference=references)
     assert scene.train == tuple(sorted(truth.world_to_camera))
     assert_cameras(scene, truth)
-    assert_masked(out, truth.world_to_camera)
+    assert_masked_views(out, truth.world_to_camera)
 
 
 # ---------------------------------------------------------------------------------------------- H: order
 
 
 def test_H_frames_of_another_tool_are_not_paired_by_order(tmp_path):
-    folder, truth = tmp_path / "s", some_truth()
+    folder, truth = tmp_path / "s", make_truth()
     stems = [f"frame_{k:05d}" for k in range(6)]
     write_pictures(folder / "images", stems, ending=".jpg")
     write_masks(folder / "masks", stems)
     names = {v: f"DJI_{10 * k:04d}_V.JPG" for k, v in enumerate(sorted(truth.world_to_camera))}
     write_named_model(folder / "sparse/0", truth, names, text=True)
-    assert_sentence([refusal(folder)], "images")
+    assert_message([refusal_message(folder)], "images")
 
 
 def corner_capture(folder: Path, order: list[int]) -> Truth:
     """A drawn corner of a room, its points coloured as seen, and images IMG_8 to IMG_13 in the model; `image00k.png` is
     the view number `order[k]`."""
-    generator, cameras = np.random.default_rng(5), walk(6)
-    textures = np.stack([cv2.GaussianBlur(noise(generator), (0, 0), 5) for _ in range(3)])
+    generator, cameras = np.random.default_rng(5), room_walk(6)
+    textures = np.stack([cv2.GaussianBlur(speckle_texture(generator), (0, 0), 5) for _ in range(3)])
     textures = 255 * (textures - textures.min()) / np.ptp(textures)
-    pictures = [draw_corner(pose, textures, (WIDTH, HEIGHT), 90.0) for pose in cameras.values()]
+    pictures = [render_room_corner(pose, textures, (WIDTH, HEIGHT), 90.0) for pose in cameras.values()]
     columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(4, WIDTH, 9), np.arange(4, HEIGHT, 9)))
     rays = np.stack([(columns + 0.5 - WIDTH / 2) / 90, (rows + 0.5 - HEIGHT / 2) / 90, np.ones(len(rows))], -1)
     points, colors = [], []
@@ -167,7 +167,7 @@ def corner_capture(folder: Path, order: list[int]) -> Truth:
     for k, chosen in enumerate(order):
         save_image(folder / f"images_4/image{k:03d}.png", pictures[chosen])
     write_masks(folder / "images_4/label", [f"image{k:03d}" for k in range(6)])
-    return renamed(truth, {f"p{chosen}": f"image{k:03d}" for k, chosen in enumerate(order)})
+    return rename_views(truth, {f"p{chosen}": f"image{k:03d}" for k, chosen in enumerate(order)})
 
 
 def recolor(path: Path, colors: np.ndarray) -> None:
@@ -182,11 +182,11 @@ def recolor(path: Path, colors: np.ndarray) -> None:
 def test_H_renamed_copies_follow_the_order_of_file_names(tmp_path):
     """IMG_10.JPG comes before IMG_8.JPG."""
     truth = corner_capture(tmp_path / "s", [2, 3, 4, 5, 0, 1])
-    scene, _, sentences = attempt(tmp_path / "s")
+    scene, _, sentences = run_with_messages(tmp_path / "s")
     assert_cameras(scene, truth)
-    assert_sentence(sentences, "order")
+    assert_message(sentences, "order")
 
 
 def test_H_renamed_copies_that_points_contradict_are_refused(tmp_path):
     corner_capture(tmp_path / "s", [0, 3, 5, 1, 4, 2])
-    assert_sentence([refusal_before_work(tmp_path / "s")], "images")
+    assert_message([refusal_before_writing(tmp_path / "s")], "images")

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from held_out import assert_sentence, attempt
 from plyfile import PlyData, PlyElement
-from small_capture import prepare, some_truth
+from scenes.capture import make_truth, write_capture
+from scenes.capture_checks import assert_message, run_with_messages
 
 SH0 = 0.28209479177387814
 
@@ -47,12 +47,12 @@ def write_gaussians(path: Path, table: np.ndarray, order: str = "<", text: bool 
 
 
 def capture(folder: Path) -> Path:
-    return prepare(folder, "transforms", some_truth())
+    return write_capture(folder, "transforms", make_truth())
 
 
 def taken(folder: Path, name: str, **params) -> tuple[dict[str, np.ndarray], list[str]]:
     """The columns of the Gaussians that `poses` wrote, brought back to the scene's own frame; and the sentences."""
-    scene, out, sentences = attempt(folder, gaussians=name, **params)
+    scene, out, sentences = run_with_messages(folder, gaussians=name, **params)
     data = PlyData.read(str(out / "gaussians.ply"), mmap=False)["vertex"].data
     columns = {each: np.array(data[each], np.float64) for each in data.dtype.names}
     places = scene.similarity.invert(np.stack([columns[axis] for axis in "xyz"], 1))
@@ -109,9 +109,9 @@ def test_E_not_finite_and_zero_rows_of_big_endian_doubles(tmp_path):
         assert flat.any() and (columns[name][flat] < -7).all()
         np.testing.assert_allclose(columns[name][~flat], table[name][kept][~flat], atol=1e-4)
     try:
-        assert_sentence(sentences, "5")
+        assert_message(sentences, "5")
     except AssertionError:
-        assert_sentence(sentences, "2", "3")
+        assert_message(sentences, "2", "3")
 
 
 def test_E_deleted_splats_are_those_of_the_rows_that_stay(tmp_path):
@@ -137,7 +137,7 @@ def test_E_text_file_with_words_for_what_is_not_finite(tmp_path):
     columns, sentences = taken(folder, "splats/scan.ply")
     assert_same(columns, np.delete(table, 8), [*PLACE_AND_COLOR, "scale_0", "rot_1"])
     assert sigmoid(columns["opacity"][4]) > 0.99 and np.isfinite(columns["scale_2"]).all()
-    assert_sentence(sentences, "1", "scan.ply")
+    assert_message(sentences, "1", "scan.ply")
 
 
 # ---------------------------------------------------------------------------------------------- P: other trainers
@@ -194,7 +194,7 @@ def test_P_fourth_degree_is_cut_channel_by_channel(tmp_path, text):
             ours, theirs = columns[f"f_rest_{15 * channel + k}"], table[f"f_rest_{24 * channel + k}"]
             np.testing.assert_allclose(ours, theirs, atol=1e-5)
     assert_same(columns, table, [*PLACE_AND_COLOR, "opacity", *SHAPE])
-    assert_sentence(sentences, "degree", "3")
+    assert_message(sentences, "degree", "3")
 
 
 def test_P_splat_file(tmp_path):

@@ -15,29 +15,29 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from held_out import (
+from PIL import Image
+from scenes.capture import (
+    HEIGHT,
+    WIDTH,
+    Truth,
+    make_truth,
+    reprojection_error,
+    write_capture,
+    write_masks,
+    write_pictures,
+    write_transforms,
+)
+from scenes.capture_checks import (
     EXACT,
     OBJECT,
     SHARE,
     assert_cameras,
-    assert_masked,
-    assert_sentence,
-    attempt,
+    assert_masked_views,
+    assert_message,
     masked_share,
-    refusal,
+    refusal_message,
+    run_with_messages,
     write_mask,
-)
-from PIL import Image
-from small_capture import (
-    HEIGHT,
-    WIDTH,
-    Truth,
-    prepare,
-    reprojection_error,
-    some_truth,
-    write_masks,
-    write_pictures,
-    write_transforms,
 )
 
 from reffusion.capture.layouts import video
@@ -62,9 +62,9 @@ CONSENT_PAGE = b"\xef\xbb\xbf\r\n<!DOCTYPE html><html><title>Google Drive - Viru
     ],
 )
 def test_N_pointers_and_pages_instead_of_pictures(tmp_path, layout, name, content):
-    folder = prepare(tmp_path / "s", layout, some_truth())
+    folder = write_capture(tmp_path / "s", layout, make_truth())
     (folder / name).write_bytes(content)
-    assert Path(name).name in refusal(folder)
+    assert Path(name).name in refusal_message(folder)
 
 
 @pytest.mark.parametrize("brand", [b"mif1", b"heix"])
@@ -75,13 +75,13 @@ def test_N_phone_picture_called_jpg_without_its_reader(tmp_path, monkeypatch, br
     write_masks(folder / "masks", [f"IMG_{k}" for k in range(5)])
     box = struct.pack(">I4s4sI4s4s", 24, b"ftyp", brand, 0, b"mif1", b"heic")
     (folder / "images/IMG_3.jpg").write_bytes(box + bytes(400))
-    assert_sentence([refusal(folder)], "IMG_3.jpg", "pi-heif")
+    assert_message([refusal_message(folder)], "IMG_3.jpg", "pi-heif")
 
 
 def fisheye_capture(folder: Path, params: tuple[float, ...]) -> Truth:
     """Speckled photographs of a fisheye without coefficients, as COLMAP's earlier model writes it."""
-    truth = some_truth(("OPENCV_FISHEYE", (*params, 0.0, 0.0, 0.0, 0.0)))
-    prepare(folder, "colmap", truth)
+    truth = make_truth(("OPENCV_FISHEYE", (*params, 0.0, 0.0, 0.0, 0.0)))
+    write_capture(folder, "colmap", truth)
     for k, view in enumerate(truth.world_to_camera):
         speckle = np.random.default_rng(k).integers(0, 256, (HEIGHT // 6, WIDTH // 6, 3), np.uint8)
         save_image(folder / "images" / f"{view}.png", cv2.resize(speckle, (WIDTH, HEIGHT)))
@@ -90,9 +90,9 @@ def fisheye_capture(folder: Path, params: tuple[float, ...]) -> Truth:
 
 def assert_undistorted_alike(folder: Path, truth: Truth, earlier: dict[str, np.ndarray]) -> None:
     """The capture gives the cameras, and the pictures that the earlier model gave."""
-    scene, out, sentences = attempt(folder)
+    scene, out, sentences = run_with_messages(folder)
     assert reprojection_error(scene, truth) < EXACT
-    assert_sentence(sentences, "undistortion", "moves the border")
+    assert_message(sentences, "undistortion", "moves the border")
     for view, picture in load_views(out, scene.train).items():
         assert np.abs(picture.astype(int) - earlier[view]).max() <= 1, view
 
@@ -104,7 +104,7 @@ def write_camera(folder: Path, number: int, params: tuple[float, ...]) -> None:
 
 
 def pictures_by_earlier_model(folder: Path) -> dict[str, np.ndarray]:
-    scene, out, _ = attempt(folder)
+    scene, out, _ = run_with_messages(folder)
     return load_views(out, scene.train)
 
 
@@ -136,25 +136,25 @@ def assert_names_model(message: str, file: str, model: str) -> None:
     [(17, "EQUIRECTANGULAR", (96.0, 72.0)), (12, "SIMPLE_DIVISION", (90.0, 48.0, 36.0, -0.1))],
 )
 def test_N_other_new_models_in_binary_are_named(tmp_path, number, name, params):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     write_camera(folder, number, params)
-    assert_names_model(refusal(folder), "cameras.bin", name)
+    assert_names_model(refusal_message(folder), "cameras.bin", name)
 
 
 @pytest.mark.parametrize("line", ["EUCM 96 72 60 60 48 36 0.5 1.1", "DIVISION 96 72 90 90 48 36 -0.1"])
 def test_N_other_new_models_in_text_are_named(tmp_path, line):
-    folder = prepare(tmp_path / "s", "colmap txt", some_truth())
+    folder = write_capture(tmp_path / "s", "colmap txt", make_truth())
     (folder / "sparse/0/cameras.txt").write_text(f"1 {line}\n")
-    assert_names_model(refusal(folder), "cameras.txt", line.split()[0])
+    assert_names_model(refusal_message(folder), "cameras.txt", line.split()[0])
 
 
 def test_N_points_in_a_folder_by_a_windows_path(tmp_path):
-    truth = some_truth()
-    folder = prepare(tmp_path / "s", "transforms", truth)
+    truth = make_truth()
+    folder = write_capture(tmp_path / "s", "transforms", truth)
     points = np.repeat(truth.points, 3, 0)
     save_points(folder / "colmap/sparse/points.ply", points, np.full((180, 3), 7, np.uint8))
     write_transforms(folder, truth, ply_file_path="colmap\\sparse\\points.ply")
-    scene, _, _ = attempt(folder)
+    scene, _, _ = run_with_messages(folder)
     assert scene.points.shape == (180, 3)
     np.testing.assert_allclose(scene.similarity.invert(scene.points), points, atol=1e-6)
 
@@ -192,7 +192,7 @@ def add_to_frames(folder: Path, key: str, path_of) -> None:
 
 def inverse_masks(folder: Path, where: str) -> Truth:
     """Masks as nerfstudio takes them, 0 is left out of the training, beside transforms.json that names them."""
-    truth = some_truth()
+    truth = make_truth()
     write_pictures(folder / "images", truth.world_to_camera)
     for view in truth.world_to_camera:
         write_mask(folder / where / f"{view}.png", ~OBJECT)
@@ -203,34 +203,34 @@ def inverse_masks(folder: Path, where: str) -> Truth:
 
 def test_O_masks_of_dynamic_objects(tmp_path):
     truth = inverse_masks(tmp_path / "s", "dynamic_masks/cam0")
-    _, out, sentences = attempt(tmp_path / "s")
-    assert_masked(out, truth.world_to_camera)
-    assert_sentence(sentences, "mask_path")
+    _, out, sentences = run_with_messages(tmp_path / "s")
+    assert_masked_views(out, truth.world_to_camera)
+    assert_message(sentences, "mask_path")
 
 
 def test_O_masks_of_the_scene_win(tmp_path):
     truth = inverse_masks(tmp_path / "s", "dynamic_masks")
     for view in truth.world_to_camera:
         write_mask(tmp_path / "s/mask" / f"{view}.png", np.roll(OBJECT[:, : WIDTH // 2], 3, 0).repeat(2, 1))
-    _, out, _ = attempt(tmp_path / "s")
-    assert_masked(out, truth.world_to_camera, 2 * SHARE)
+    _, out, _ = run_with_messages(tmp_path / "s")
+    assert_masked_views(out, truth.world_to_camera, 2 * SHARE)
 
 
 def test_O_masks_that_lie_where_ours_are_looked_for(tmp_path):
     """Nerfstudio's own name of the folder: taken as that file means them, or the sentence says how they are taken."""
     inverse_masks(tmp_path / "s", "masks")
     try:
-        _, out, sentences = attempt(tmp_path / "s")
+        _, out, sentences = run_with_messages(tmp_path / "s")
     except BadInput as error:
-        assert_sentence([str(error)], "mask_path")
+        assert_message([str(error)], "mask_path")
         return
     shares = [masked_share(out, f"v0{k}") for k in range(6)]
     if shares != pytest.approx(6 * [SHARE], abs=1e-3):
-        assert_sentence(sentences, "mask_path")
+        assert_message(sentences, "mask_path")
 
 
 def test_O_mask_of_half_of_the_frames(tmp_path):
-    folder, truth = tmp_path / "s", some_truth(views=8)
+    folder, truth = tmp_path / "s", make_truth(views=8)
     write_pictures(folder / "images", truth.world_to_camera)
     write_transforms(folder, truth)
     record = json.loads((folder / "transforms.json").read_text())
@@ -240,16 +240,16 @@ def test_O_mask_of_half_of_the_frames(tmp_path):
             write_mask(folder / "moving" / f"{view}_ignore.png", ~OBJECT)
             frame["mask_path"] = f"moving\\{view}_ignore.png"
     (folder / "transforms.json").write_text(json.dumps(record))
-    scene, out, _ = attempt(folder)
+    scene, out, _ = run_with_messages(folder)
     assert len(scene.train) == 8
-    assert_masked(out, ["v00", "v01", "v02", "v03"])
+    assert_masked_views(out, ["v00", "v01", "v02", "v03"])
 
 
 @pytest.mark.parametrize("unit", [None, 0.0005])
 def test_O_depth_of_a_phone_makes_points(tmp_path, unit):
     """16-bit maps of half the size, in millimetres unless the file says otherwise; 0 is unknown. The scene is z = 0."""
-    truth = some_truth()
-    folder = prepare(tmp_path / "s", "transforms", truth)
+    truth = make_truth()
+    folder = write_capture(tmp_path / "s", "transforms", truth)
     at = truth.lens.resized(WIDTH // 2, HEIGHT // 2)
     columns, rows = np.meshgrid(np.arange(at.width) + 0.5, np.arange(at.height) + 0.5)
     rays = np.stack([(columns - at.cx) / at.fx, (rows - at.cy) / at.fy, np.ones_like(rows)], -1)
@@ -264,10 +264,10 @@ def test_O_depth_of_a_phone_makes_points(tmp_path, unit):
     changes = {} if unit is None else {"depth_unit_scale_factor": unit}
     write_transforms(folder, truth, **changes)
     add_to_frames(folder, "depth_file_path", lambda view: f"depth/{view}.png")
-    scene, _, sentences = attempt(folder)
+    scene, _, sentences = run_with_messages(folder)
     height = np.abs(scene.similarity.invert(scene.points)[:, 2])
     if len(height) < 100 or np.median(height) > 0.02:
-        assert_sentence(sentences, "depth_file_path")
+        assert_message(sentences, "depth_file_path")
 
 
 # ---------------------------------------------------------------------------------------------- Q: 16 bits of grey
@@ -279,7 +279,7 @@ def test_O_depth_of_a_phone_makes_points(tmp_path, unit):
 )
 def test_Q_grey_photographs_of_16_bits(tmp_path, ending, order, low, high):
     """A camera of 12 bits, a scan in the other order of bytes, a thermal camera: a ramp stays a ramp."""
-    folder, truth = tmp_path / "s", some_truth()
+    folder, truth = tmp_path / "s", make_truth()
     write_masks(folder / "masks", truth.world_to_camera)
     (folder / "images").mkdir()
     ramp = np.linspace(low, high, WIDTH)[None].repeat(HEIGHT, 0)
@@ -287,7 +287,7 @@ def test_Q_grey_photographs_of_16_bits(tmp_path, ending, order, low, high):
         Image.fromarray(ramp.astype(order)).save(folder / "images" / f"{view}{ending}")
     write_transforms(folder, truth)
     add_to_frames(folder, "file_path", lambda view: f"images/{view}{ending}")
-    scene, out, _ = attempt(folder)
+    scene, out, _ = run_with_messages(folder)
     assert_cameras(scene, truth)
     for picture in load_views(out, scene.train).values():
         assert picture.shape == (HEIGHT, WIDTH, 3) and np.ptp(picture, axis=-1).max() == 0

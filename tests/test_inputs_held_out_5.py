@@ -9,9 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from held_out import attempt
 from PIL import Image
-from test_sfm import draw_corner, noise, walk
+from scenes.capture_checks import run_with_messages
+from test_sfm import render_room_corner, room_walk, speckle_texture
 
 from benchmarks.studies.bare_photographs import pose_errors
 
@@ -20,7 +20,7 @@ ORIENTATION, EXIF_FOLDER, FOCAL_35_MM = 0x0112, 0x8769, 0xA405
 
 def textures() -> np.ndarray:
     generator = np.random.default_rng(0)
-    return np.stack([noise(generator) for _ in range(3)])
+    return np.stack([speckle_texture(generator) for _ in range(3)])
 
 
 def exif(orientation: int = 1) -> Image.Exif:
@@ -32,10 +32,10 @@ def exif(orientation: int = 1) -> Image.Exif:
 
 
 def save_walk(folder: Path, ending: str, **options) -> dict[str, np.ndarray]:
-    truth, surfaces = walk(6), textures()
+    truth, surfaces = room_walk(6), textures()
     folder.mkdir(parents=True)
     for name, pose in truth.items():
-        Image.fromarray(draw_corner(pose, surfaces)).save(folder / f"{name}{ending}", **options)
+        Image.fromarray(render_room_corner(pose, surfaces)).save(folder / f"{name}{ending}", **options)
     return truth
 
 
@@ -48,23 +48,23 @@ def assert_placed(scene, truth: dict[str, np.ndarray]) -> None:
 
 def test_K_lossy_webp_with_focal_lengths_in_capitals(tmp_path):
     truth = save_walk(tmp_path / "s/images", ".WEBP", format="WEBP", quality=92, exif=exif())
-    scene, _, _ = attempt(tmp_path / "s", masks="none")
+    scene, _, _ = run_with_messages(tmp_path / "s", masks="none")
     assert_placed(scene, truth)
 
 
 def test_K_webp_saved_by_a_browser_as_jpg(tmp_path):
     truth = save_walk(tmp_path / "s", ".jpg", format="WEBP", lossless=True)
-    scene, _, _ = attempt(tmp_path / "s", masks="none")
+    scene, _, _ = run_with_messages(tmp_path / "s", masks="none")
     assert_placed(scene, truth)
 
 
 def save_both_ways(folder: Path, portrait: set[int], save) -> dict[str, np.ndarray]:
     """A walk of nine views, those in `portrait` with the phone upright; `save` takes path, picture, whether it is."""
-    truth, surfaces = walk(9), textures()
+    truth, surfaces = room_walk(9), textures()
     folder.mkdir(parents=True)
     for k, (name, pose) in enumerate(truth.items()):
         size = (150, 200) if k in portrait else (200, 150)
-        save(folder / name, Image.fromarray(draw_corner(pose, surfaces, size)), k in portrait)
+        save(folder / name, Image.fromarray(render_room_corner(pose, surfaces, size)), k in portrait)
     return truth
 
 
@@ -84,7 +84,7 @@ def test_R_turned_by_their_tag(tmp_path):
 
     portrait = {2, 5, 6, 8}
     truth = save_both_ways(tmp_path / "s/images", portrait, save)
-    scene, _, _ = attempt(tmp_path / "s", masks="none")
+    scene, _, _ = run_with_messages(tmp_path / "s", masks="none")
     assert_both_ways(scene, truth, portrait)
 
 
@@ -92,5 +92,5 @@ def test_R_stored_upright_without_tags(tmp_path):
     portrait = {0, 3, 4}
     save = lambda path, picture, upright: picture.save(path.with_suffix(".png"))
     truth = save_both_ways(tmp_path / "s/photos", portrait, save)
-    scene, _, _ = attempt(tmp_path / "s", masks="none")
+    scene, _, _ = run_with_messages(tmp_path / "s", masks="none")
     assert_both_ways(scene, truth, portrait)

@@ -13,29 +13,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from held_out import (
-    OBJECT,
-    assert_cameras,
-    assert_masked,
-    assert_sentence,
-    attempt,
-    masked_views,
-    renamed,
-    write_as_text,
-    write_mask,
-    write_named_model,
-)
 from PIL import Image
-from small_capture import (
+from scenes.capture import (
     HEIGHT,
     Truth,
-    prepare,
-    some_truth,
+    make_truth,
+    write_capture,
     write_masks,
     write_model,
     write_pictures,
     write_poses_bounds,
     write_transforms,
+)
+from scenes.capture_checks import (
+    OBJECT,
+    assert_cameras,
+    assert_masked_views,
+    assert_message,
+    masked_views,
+    rename_views,
+    run_with_messages,
+    write_as_text,
+    write_mask,
+    write_named_model,
 )
 
 # ---------------------------------------------------------------------------------------------- I: points
@@ -46,25 +46,25 @@ def assert_points_near(scene, sentences: list[str], file: str) -> None:
     extent = np.linalg.norm(np.ptp(centers, axis=0))
     assert extent > 0.1, "the normalised frame is as large as the other frame's points"
     assert np.abs(scene.points - centers.mean(0)).max() < 100 * extent, "points of the other frame"
-    assert_sentence(sentences, file, "not used")
+    assert_message(sentences, file, "not used")
 
 
 def test_I_points_in_millimetres_beside_cameras_in_metres(tmp_path):
-    folder, truth = tmp_path / "s", some_truth(offset=(12.0, -3.0, 40.0))
-    prepare(folder, "colmap", truth)
+    folder, truth = tmp_path / "s", make_truth(offset=(12.0, -3.0, 40.0))
+    write_capture(folder, "colmap", truth)
     points = np.repeat(1000 * truth.points, 5, 0)
     write_model(folder / "sparse/0", replace(truth, points=points), text=True)
-    scene, _, sentences = attempt(folder)
+    scene, _, sentences = run_with_messages(folder)
     assert_cameras(scene, truth)
     assert_points_near(scene, sentences, "points3D")
 
 
 def test_I_points_in_utm_beside_a_complete_model_of_llff(tmp_path):
-    folder, truth = tmp_path / "s", some_truth()
-    prepare(folder, "llff+bin", truth)
+    folder, truth = tmp_path / "s", make_truth()
+    write_capture(folder, "llff+bin", truth)
     utm = truth.points[:, [0, 2, 1]] * (1, 1, -1) + (448_262.0, 5_411_932.0, 35.0)
     write_model(folder / "sparse/0", replace(truth, points=np.repeat(utm, 3, 0)), factor=4)
-    scene, _, sentences = attempt(folder)
+    scene, _, sentences = run_with_messages(folder)
     assert_cameras(scene, truth)
     assert_points_near(scene, sentences, "points3D")
 
@@ -73,50 +73,50 @@ def test_I_points_in_utm_beside_a_complete_model_of_llff(tmp_path):
 
 
 def test_J_masks_beside_photographs_without_a_key(tmp_path):
-    folder, truth = tmp_path / "s", some_truth()
+    folder, truth = tmp_path / "s", make_truth()
     write_pictures(folder / "images", truth.world_to_camera, ending=".jpg")
     for view in truth.world_to_camera:
         write_mask(folder / "images" / f"{view}_mask.png")
     write_model(folder / "sparse/0", truth)
-    scene, out, sentences = attempt(folder)
+    scene, out, sentences = run_with_messages(folder)
     assert scene.train == tuple(sorted(truth.world_to_camera))
-    assert_masked(out, truth.world_to_camera)
+    assert_masked_views(out, truth.world_to_camera)
     assert not any("not in the model" in sentence for sentence in sentences)
 
 
 def test_J_masks_beside_pictures_of_llff(tmp_path):
     """Names that end in numbers; one view's photograph is called _mask too, and has no mask."""
-    folder, truth = tmp_path / "s", some_truth()
+    folder, truth = tmp_path / "s", make_truth()
     names = {v: f"2024-02-0{k + 1} party" for k, v in enumerate(sorted(truth.world_to_camera))}
     names["v05"] = "venetian_mask"
     write_pictures(folder / "images_4", names.values())
     for name in list(names.values())[:5]:
         write_mask(folder / "images_4" / f"{name}_mask.png")
     write_poses_bounds(folder, truth)
-    scene, out, _ = attempt(folder, masks="images_4")
+    scene, out, _ = run_with_messages(folder, masks="images_4")
     assert scene.train == tuple(sorted(names.values()))
-    assert_cameras(scene, renamed(truth, names))
-    assert_masked(out, list(names.values())[:5])
+    assert_cameras(scene, rename_views(truth, names))
+    assert_masked_views(out, list(names.values())[:5])
 
 
 # ---------------------------------------------------------------------------------------------- L: LLFF's order
 
 
 def test_L_copies_with_blanks_and_hyphens(tmp_path):
-    folder, truth = tmp_path / "s", some_truth()
+    folder, truth = tmp_path / "s", make_truth()
     files = ["DSC1 copy.png", "DSC1#2.png", "DSC1+.png", "DSC1-edited.png", "DSC1.png", "DSC10.png"]
     assert files == sorted(files) and [Path(f).stem for f in files] != sorted(Path(f).stem for f in files)
     names = {v: Path(file).stem for v, file in zip(sorted(truth.world_to_camera), files, strict=True)}
     write_pictures(folder / "images_4", names.values())
     write_masks(folder / "images_4/label", names.values())
     write_poses_bounds(folder, truth)
-    scene, _, _ = attempt(folder)
-    assert_cameras(scene, renamed(truth, names))
+    scene, _, _ = run_with_messages(folder)
+    assert_cameras(scene, rename_views(truth, names))
 
 
 def test_L_test_masks_follow_the_order_of_file_names(tmp_path):
     """Three views before the masked ones; out_00000 stands for the first by file name, and has the largest mask."""
-    folder, truth = tmp_path / "s", some_truth(views=8)
+    folder, truth = tmp_path / "s", make_truth(views=8)
     files = ["20220811(0).jpg", "20220811(1).jpg", "20220811.jpg", *(f"2022082{k}.jpg" for k in range(5))]
     assert files == sorted(files)
     names = {v: Path(file).stem for v, file in zip(sorted(truth.world_to_camera), files, strict=True)}
@@ -126,8 +126,8 @@ def test_L_test_masks_follow_the_order_of_file_names(tmp_path):
     for k, height in enumerate(heights):
         write_mask(folder / f"images_4/test_label/out_{k:05d}.png", np.arange(HEIGHT)[:, None] < height + 0 * OBJECT)
     write_poses_bounds(folder, truth)
-    scene, out, _ = attempt(folder)
-    assert_cameras(scene, renamed(truth, names))
+    scene, out, _ = run_with_messages(folder)
+    assert_cameras(scene, rename_views(truth, names))
     assert sorted(scene.test) == ["20220811", "20220811(0)", "20220811(1)"]
     for file, height in zip(files, heights, strict=False):
         mask = np.array(Image.open(out / "test_masks" / f"{Path(file).stem}.png")) > 0
@@ -149,11 +149,11 @@ def assert_right_for_composed(scene, truth: Truth, names: dict[str, str]) -> Non
     """The cameras are right, whichever form the views' names have."""
     found = {composed(name): name for name in scene.cameras}
     assert sorted(found) == sorted(composed(name) for name in names.values())
-    assert_cameras(scene, renamed(truth, {v: found[composed(n)] for v, n in names.items()}))
+    assert_cameras(scene, rename_views(truth, {v: found[composed(n)] for v, n in names.items()}))
 
 
 def test_M_transforms_json_and_masks_from_another_system(tmp_path):
-    folder, truth = tmp_path / "s", some_truth()
+    folder, truth = tmp_path / "s", make_truth()
     names = {v: composed(f"がぞう é {k}") for k, v in enumerate(sorted(truth.world_to_camera))}
     assert decomposed(names["v00"]) != names["v00"]
     write_pictures(folder / "images", [decomposed(name) for name in names.values()])
@@ -164,14 +164,14 @@ def test_M_transforms_json_and_masks_from_another_system(tmp_path):
     for frame in record["frames"]:
         frame["file_path"] = f"images/{names[Path(frame['file_path']).stem]}.png"
     (folder / "transforms.json").write_text(json.dumps(record))
-    scene, out, _ = attempt(folder, test=[names["v03"]])
+    scene, out, _ = run_with_messages(folder, test=[names["v03"]])
     assert [composed(view) for view in scene.test] == [names["v03"]]
     assert_right_for_composed(scene, truth, names)
     assert {composed(view) for view in masked_views(out)} >= set(names.values()) - {names["v03"]}
 
 
 def test_M_folder_of_a_model_written_on_another_system(tmp_path):
-    folder, truth = tmp_path / "s", some_truth()
+    folder, truth = tmp_path / "s", make_truth()
     names = {v: f"{'Ünterführung'}/Brücke_{k}" for k, v in enumerate(sorted(truth.world_to_camera))}
     write_named_model(folder / "sparse/0", truth, {v: f"{decomposed(n)}.jpg" for v, n in names.items()})
     write_as_text(folder / "sparse/0")
@@ -179,7 +179,7 @@ def test_M_folder_of_a_model_written_on_another_system(tmp_path):
     for name in names.values():
         write_mask(folder / "masks" / f"{decomposed(name)}.png")
     stems = {v: Path(name).name for v, name in names.items()}
-    scene, out, _ = attempt(folder, cameras_only=[decomposed(names["v01"]) + ".jpg"])
+    scene, out, _ = run_with_messages(folder, cameras_only=[decomposed(names["v01"]) + ".jpg"])
     assert [composed(view) for view in scene.blank] == [composed("Brücke_1")]
     assert_right_for_composed(scene, truth, stems)
     assert {composed(view) for view in masked_views(out)} == {composed(s) for v, s in stems.items() if v != "v01"}
@@ -187,12 +187,12 @@ def test_M_folder_of_a_model_written_on_another_system(tmp_path):
 
 def test_M_names_of_two_forms_in_one_folder(tmp_path):
     """Every second picture was copied through macOS."""
-    folder, truth = tmp_path / "s", some_truth()
+    folder, truth = tmp_path / "s", make_truth()
     names = {v: f"Straße à {k}" for k, v in enumerate(sorted(truth.world_to_camera))}
     pictures = {v: (decomposed, composed)[k % 2](n) for k, (v, n) in enumerate(names.items())}
     write_pictures(folder / "images", pictures.values())
     write_masks(folder / "masks", [decomposed(name) for name in names.values()])
     write_named_model(folder / "sparse/0", truth, {v: f"{composed(n)}.png" for v, n in names.items()})
-    scene, _, _ = attempt(folder)
+    scene, _, _ = run_with_messages(folder)
     assert len(scene.train) == 6
     assert_right_for_composed(scene, truth, names)

@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import small_scene as small
 import yaml
+from scenes import wall_scene
 
 from reffusion.capture import image_detail
 from reffusion.io.arrays import load_json
@@ -41,7 +41,7 @@ print(sorted({name.split(".")[0] for name in sys.modules} & set(sys.argv[2].spli
 
 
 def test_a_scene_whose_background_is_seen_imports_no_diffusion(tmp_path):
-    small.write(tmp_path, 0.8)  # far from the wall: each view shows what the others miss
+    wall_scene.write_poses_and_fit(tmp_path, 0.8)  # far from the wall: each view shows what the others miss
     command = [sys.executable, "-c", STAGES, str(tmp_path), " ".join(UNUSED)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
@@ -67,13 +67,13 @@ def test_personalization_is_left_out_where_sds_cannot_gain_and_the_profile_asks(
 
 
 def test_few_unseen_pixels_are_negligible_and_it_can_be_forced(tmp_path):
-    poses, fitted, _ = small.write(tmp_path, 0.8)
+    poses, fitted, _ = wall_scene.write_poses_and_fit(tmp_path, 0.8)
 
     def classified(**params):
         out = tmp_path / "-".join(map(str, params.values()))
         out.mkdir()
         masks.run(masks.Params(**params), out, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fitted)
-        return load_mask_sets(out, small.TRAIN).values(), load_json(out / "facts.json")
+        return load_mask_sets(out, wall_scene.TRAIN).values(), load_json(out / "facts.json")
 
     sets, facts = classified(negligible=0.0)
     assert 0 < facts["unobserved_share"] < 0.1 and facts["invent_pixels"] > 0
@@ -100,8 +100,8 @@ def test_enlarged_pictures_are_told_from_sharp_ones(filter_):
 
 
 def test_no_more_harmonics_than_views():
-    cameras = [small.camera(f"c{k}", 0.01 * k) for k in range(20)]
-    point, behind = np.array([[0.0, 0.0, small.WALL]]), np.array([[0.0, 0.0, -small.WALL]])
+    cameras = [wall_scene.front_camera(f"c{k}", 0.01 * k) for k in range(20)]
+    point, behind = np.array([[0.0, 0.0, wall_scene.WALL]]), np.array([[0.0, 0.0, -wall_scene.WALL]])
     for count, degree in ((1, 0), (3, 0), (4, 1), (8, 1), (9, 2), (16, 3), (20, 3)):
         assert image_detail.supported_sh_degree(point, cameras[:count], 3) == (degree, count)
     assert image_detail.supported_sh_degree(point, cameras, 1)[0] == 1
@@ -110,6 +110,6 @@ def test_no_more_harmonics_than_views():
 
 
 def test_fit_takes_the_degree_that_the_views_support(tmp_path):
-    poses, _, _ = small.write(tmp_path, 0.8)  # five training views
+    poses, _, _ = wall_scene.write_poses_and_fit(tmp_path, 0.8)  # five training views
     scene = load_scene(poses)
     assert fit.limit_sh_degree(fit.Params(), scene).sh.degree == 1

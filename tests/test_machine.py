@@ -82,7 +82,7 @@ def test_torch_is_asked_without_importing_it(tmp_path, monkeypatch, line, built)
     assert machine._torch_cuda() == built
 
 
-def with_nvidia_smi(folder: Path, said: str) -> dict[str, str]:
+def fake_nvidia_smi(folder: Path, said: str) -> dict[str, str]:
     """An environment whose nvidia-smi says this."""
     tool = folder / "nvidia-smi"
     tool.write_text(f"#!/bin/sh\necho '{said}'\n")
@@ -92,7 +92,7 @@ def with_nvidia_smi(folder: Path, said: str) -> dict[str, str]:
 
 def test_a_stage_says_what_it_lacks_at_once(tmp_path, monkeypatch):
     """Asked as the plan asks, on a machine with an old driver, a small GPU and torch without CUDA."""
-    monkeypatch.setattr(os, "environ", with_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 535.183.01"))
+    monkeypatch.setattr(os, "environ", fake_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 535.183.01"))
     monkeypatch.chdir(ROOT)
     machine.detect.cache_clear()
     asked = lambda **params: {"stage": "distill", "params": params, "takes": TAKES, "brings": []}

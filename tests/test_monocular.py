@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import small_scene as small
 import torch
+from scenes import wall_scene
 
 from reffusion.depth import monocular
 from reffusion.depth.background_depth import Completion, ViewDepth
@@ -18,7 +18,7 @@ from reffusion.types import Reference
 TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
 
 
-def small_model(kind="relative", seed=0):
+def small_depth_model(kind="relative", seed=0):
     """Depth Anything's architecture with random weights, 4 layers of 16 channels, for pictures of 56 px."""
     from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
@@ -37,7 +37,7 @@ def small_model(kind="relative", seed=0):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("network")
-    small_model().save_pretrained(path)
+    small_depth_model().save_pretrained(path)
     return path
 
 
@@ -78,7 +78,7 @@ def test_disparity_has_the_pictures_size_and_repeats(network, folder):
 
 
 def test_a_metric_model_is_inverted(network):
-    model = small_model("metric")
+    model = small_depth_model("metric")
     image = picture(48, 64)
     answer = model(pixel_values=monocular.preprocess(network, image)).predicted_depth
     found = monocular.predict_disparity(monocular.make_network(model), image)
@@ -106,16 +106,16 @@ def test_refusals_name_what_is_wrong(tmp_path, folder):
 
 def test_the_references_depth_is_the_estimate_aligned():
     """initialize: an estimate that is right but for scale and offset gives the hidden wall."""
-    view = small.CAMERAS["a2"]
-    gaussians, labels = small.gaussians(1.7)
-    hole = small.true_mask(view, 1.7)
-    reference = Reference(view, small.photo(view), hole)
+    view = wall_scene.CAMERAS["a2"]
+    gaussians, labels = wall_scene.wall_and_square(1.7)
+    hole = wall_scene.true_mask(view, 1.7)
+    reference = Reference(view, wall_scene.photo(view), hole)
     remaining = gaussians.map(lambda p: p[~labels])
     # A wall parallel to the view has one disparity, which fixes no scale: this one is tilted about the image's middle.
     means = remaining.means.clone()
-    means *= 1 / (1 - 0.2 * means[:, 1:2] / small.WALL)
-    height = (np.mgrid[: small.HEIGHT, : small.WIDTH][0] + 0.5 - small.HEIGHT / 2) / small.FOCAL
-    true = (1 - 0.2 * height) / small.WALL
+    means *= 1 / (1 - 0.2 * means[:, 1:2] / wall_scene.WALL)
+    height = (np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH][0] + 0.5 - wall_scene.HEIGHT / 2) / wall_scene.FOCAL
+    true = (1 - 0.2 * height) / wall_scene.WALL
     behind_it = lambda estimate: unprojection.estimate_depth(
         replace(remaining, means=means), reference, hole, hole, np.zeros((0, 3)), Completion(), estimate
     )
@@ -129,8 +129,8 @@ def test_the_references_depth_is_the_estimate_aligned():
 def test_the_stage_shows_the_model_the_reference(network):
     from reffusion.initialize.fill import _predict_disparity
 
-    view = small.CAMERAS["a2"]
-    reference = Reference(view, small.photo(view), np.zeros((small.HEIGHT, small.WIDTH), bool))
+    view = wall_scene.CAMERAS["a2"]
+    reference = Reference(view, wall_scene.photo(view), np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool))
     image = torch.from_numpy(reference.image).permute(2, 0, 1) / 255
     assert (_predict_disparity(network, reference) == monocular.predict_disparity(network, image).numpy()).all()
     assert _predict_disparity(None, reference) is None
@@ -140,9 +140,9 @@ def test_the_depth_term_asks_the_model_of_its_parameter(folder, network):
     """A scene whose disparity is the model's own answer, scaled and moved: that is what it finds in the hole."""
     from stages import distill
 
-    view, image = small.CAMERAS["a2"], picture(small.HEIGHT, small.WIDTH)
+    view, image = wall_scene.CAMERAS["a2"], picture(wall_scene.HEIGHT, wall_scene.WIDTH)
     true = 2.0 + 0.3 * monocular.predict_disparity(network, image).double().numpy()
-    hole = small.true_mask(view, 1.7)
+    hole = wall_scene.true_mask(view, 1.7)
     seen = ViewDepth(view, np.where(hole, 0.0, 1 / true), ~hole, hole, hole, np.zeros_like(hole))
     estimator = distill.build_depth_estimator(distill.Params(depth={"model": str(folder)}), np.zeros((0, 3)))
     np.testing.assert_allclose(estimator.disparity(seen, lambda: image.permute(1, 2, 0).numpy()), true, rtol=1e-6)

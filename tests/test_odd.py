@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import small_scene
+from scenes import wall_scene
 
 from reffusion.capture.checks import sanity
 from reffusion.capture.checks.sanity import find_odd_exposures, find_odd_masks
@@ -19,40 +19,40 @@ from report import check
 
 
 @pytest.fixture(scope="module")
-def brought(tmp_path_factory):
+def wall_capture(tmp_path_factory):
     """Scene, masks and pictures of a wall with a square before it; the wall's texture is fine enough to tell places."""
     folder = tmp_path_factory.mktemp("odd")
-    poses, _, _ = small_scene.write(folder, 1.5)
+    poses, _, _ = wall_scene.write_poses_and_fit(folder, 1.5)
     scene = load_scene(poses)
     return scene, load_raw_masks(folder / "raw_masks", scene.train), load_views(poses, scene.cameras)
 
 
-def said(scene, masks, pictures) -> str:
+def describe_oddities(scene, masks, pictures) -> str:
     return "; ".join([*find_odd_masks(scene, masks), *find_odd_exposures(scene, pictures.__getitem__)])
 
 
-def test_nothing_is_odd_about_a_good_capture(brought):
-    scene, masks, pictures = brought
-    assert said(scene, masks, pictures) == ""
-    assert said(replace(scene, points=scene.points[:3]), {}, pictures) == ""
+def test_nothing_is_odd_about_a_good_capture(wall_capture):
+    scene, masks, pictures = wall_capture
+    assert describe_oddities(scene, masks, pictures) == ""
+    assert describe_oddities(replace(scene, points=scene.points[:3]), {}, pictures) == ""
 
 
-def test_inverted_masks(brought):
-    scene, masks, pictures = brought
-    assert "the masks cover 9" in said(scene, {name: ~mask for name, mask in masks.items()}, pictures)
-    one = said(scene, masks | {"a1": ~masks["a1"]}, pictures)
+def test_inverted_masks(wall_capture):
+    scene, masks, pictures = wall_capture
+    assert "the masks cover 9" in describe_oddities(scene, {name: ~mask for name, mask in masks.items()}, pictures)
+    one = describe_oddities(scene, masks | {"a1": ~masks["a1"]}, pictures)
     assert "the mask of a1 covers more than 50%" in one and "inverted?" in one
 
 
-def test_masks_that_disagree_in_3d(brought):
-    scene, masks, pictures = brought
+def test_masks_that_disagree_in_3d(wall_capture):
+    scene, masks, pictures = wall_capture
     elsewhere = np.roll(masks["a3"], 40, 0)
-    assert said(scene, masks | {"a3": elsewhere}, pictures) == (
+    assert describe_oddities(scene, masks | {"a3": elsewhere}, pictures) == (
         "the mask of a3 shows something else than those of the other views do"
     )
     far = {name: np.roll(mask, 17 * k, 0) for k, (name, mask) in enumerate(masks.items())}
-    assert "masks do not agree in 3D" in said(scene, far, pictures)
-    assert said(replace(scene, clean=frozenset({"a3"})), masks | {"a3": elsewhere}, pictures) == ""
+    assert "masks do not agree in 3D" in describe_oddities(scene, far, pictures)
+    assert describe_oddities(replace(scene, clean=frozenset({"a3"})), masks | {"a3": elsewhere}, pictures) == ""
 
 
 def test_masks_of_a_small_object_in_a_deep_scene_agree():
@@ -78,15 +78,15 @@ def test_masks_of_a_small_object_in_a_deep_scene_agree():
     ]
 
 
-def test_exposure_that_jumps(brought):
-    scene, masks, pictures = brought
+def test_exposure_that_jumps(wall_capture):
+    scene, masks, pictures = wall_capture
     dark = (pictures["a2"] * 0.4).astype(np.uint8)
-    assert "exposed otherwise than the rest (a2; a2 is 0.4" in said(scene, masks, pictures | {"a2": dark})
+    assert "exposed otherwise than the rest (a2; a2 is 0.4" in describe_oddities(scene, masks, pictures | {"a2": dark})
 
 
-def test_the_sheet_shows_every_mask_over_its_photograph(tmp_path, brought):
-    _, masks, _ = brought
-    poses, _, _ = small_scene.write(tmp_path / "wall", 1.5)
+def test_the_sheet_shows_every_mask_over_its_photograph(tmp_path, wall_capture):
+    _, masks, _ = wall_capture
+    poses, _, _ = wall_scene.write_poses_and_fit(tmp_path / "wall", 1.5)
     save_json(tmp_path / "wall/raw_masks/warnings.json", ["the mask of a3 is odd"])
     path, lines = check.make(tmp_path / "wall")
     assert lines == ["the mask of a3 is odd"] and image_size(path)[0] > 3 * check.WIDTH
@@ -96,7 +96,7 @@ def test_the_sheet_shows_every_mask_over_its_photograph(tmp_path, brought):
 
 
 def test_check_says_how_structure_from_motion_went(tmp_path, monkeypatch, capsys):
-    poses, _, _ = small_scene.write(tmp_path / "wall", 1.5)
+    poses, _, _ = wall_scene.write_poses_and_fit(tmp_path / "wall", 1.5)
     save_json(poses / "sfm.json", {"summary": "structure from motion: 3 of 4 photographs"})
     monkeypatch.setattr("sys.argv", ["check", "--scene", "wall", "--runs", str(tmp_path)])
     check.main()

@@ -7,9 +7,9 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-import small_scene as small
 import torch
 from other_device import gpu, there_is_one
+from scenes import wall_scene
 
 from reffusion.io.arrays import load_labels
 from reffusion.io.ply import load_ply, save_ply
@@ -25,14 +25,16 @@ NEAR = 1.7
 def ready(tmp_path_factory):
     """A small scene, whose colours may change with the direction, up to a reference."""
     home = tmp_path_factory.mktemp("scene")
-    poses, fitted, _ = small.write(home, NEAR)
+    poses, fitted, _ = wall_scene.write_poses_and_fit(home, NEAR)
     gaussians = load_ply(fitted / "gaussians.ply")
     higher = torch.zeros(len(gaussians), 3, 3)
     save_ply(fitted / "gaussians.ply", replace(gaussians, sh=torch.cat([gaussians.sh, higher], 1)))
     (home / "masks").mkdir()
     masks.run(masks.Params(), home / "masks", poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fitted)
     hole = load_mask_sets(home / "masks", ["a2"])["a2"].invent
-    save_references(home / "reference", [Reference(small.CAMERAS["a2"], small.photo(small.CAMERAS["a2"]), hole)])
+    save_references(
+        home / "reference", [Reference(wall_scene.CAMERAS["a2"], wall_scene.photo(wall_scene.CAMERAS["a2"]), hole)]
+    )
     return SimpleNamespace(home=home, poses=poses, fit=fitted)
 
 
@@ -70,15 +72,15 @@ def test_masks_on_a_card(ready, tmp_path, vote):
     )
     cpu, cuda = both(tmp_path, run)
     assert torch.equal(load_labels(cpu / "labels.npy"), load_labels(cuda / "labels.npy"))
-    before, after = (load_mask_sets(folder, small.TRAIN) for folder in (cpu, cuda))
-    for name in small.TRAIN:
+    before, after = (load_mask_sets(folder, wall_scene.TRAIN) for folder in (cpu, cuda))
+    for name in wall_scene.TRAIN:
         for kind in ("consistent", "unobserved", "invent"):
             differs = getattr(before[name], kind) != getattr(after[name], kind)
             assert differs.mean() <= (0.01 if there_is_one() else 0), (name, kind)  # a GPU rounds otherwise
 
 
 def test_a_box_on_a_card():
-    gaussians, _ = small.gaussians(NEAR)
+    gaussians, _ = wall_scene.wall_and_square(NEAR)
     box = regions.Region((0, 0, NEAR), (0.5, 0.5, 0.1))
     with gpu():
         there = regions.inside_region(gaussians.map(lambda p: p.to("cuda")), box)

@@ -12,7 +12,7 @@ from reffusion.seeding import generator
 HEIGHT, WIDTH = 37, 50
 
 
-class Mean(torch.nn.Module):
+class MeanInpainter(torch.nn.Module):
     """Stands in for LaMa: paints the mean of what it is shown outside the mask, half a unit apart by its size."""
 
     def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
@@ -22,24 +22,24 @@ class Mean(torch.nn.Module):
         return image * (1 - mask) + shown * mask
 
 
-class Broken(torch.nn.Module):
+class WrongSizeInpainter(torch.nn.Module):
     def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         return image[:, :, 1:]
 
 
-def picture():
+def gradient_image():
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     return np.stack([3 * rows, 4 * columns, 100 + 0 * rows], -1).astype(np.uint8)
 
 
-def hole():
+def rectangular_hole():
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[12:24, 15:36] = True
     return mask
 
 
-def painters(folder):
-    torch.jit.script(Mean()).save(folder / "any-name.pt")
+def load_inpainters(folder):
+    torch.jit.script(MeanInpainter()).save(folder / "any-name.pt")
     return [
         classical.load_lama(folder / "any-name.pt"),
         classical.load_classical(),
@@ -48,24 +48,30 @@ def painters(folder):
 
 
 def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path):
-    image, noise = picture(), np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
-    poisoned = np.where(hole()[..., None], noise, image)
-    for painter in painters(tmp_path):
-        painted = painter.paint(image, hole())
-        assert (painted[~hole()] == image[~hole()]).all() and painted.dtype == np.uint8, painter.name
-        assert (painter.paint(poisoned, hole()) == painted).all(), painter.name
-        assert (painter.paint(image, np.zeros_like(hole())) == image).all(), painter.name
+    image, noise = gradient_image(), np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    poisoned = np.where(rectangular_hole()[..., None], noise, image)
+    for painter in load_inpainters(tmp_path):
+        painted = painter.paint(image, rectangular_hole())
+        assert (painted[~rectangular_hole()] == image[~rectangular_hole()]).all() and painted.dtype == np.uint8, (
+            painter.name
+        )
+        assert (painter.paint(poisoned, rectangular_hole()) == painted).all(), painter.name
+        assert (painter.paint(image, np.zeros_like(rectangular_hole())) == image).all(), painter.name
 
 
 def test_a_mask_is_widened_by_a_share_of_the_width():
-    wide = morphology.dilate(hole(), 0.04)  # 2 px
+    wide = morphology.dilate(rectangular_hole(), 0.04)  # 2 px
     assert (wide[10:26, 25]).all() and not wide[9, 25] and not wide[26, 25] and wide[18, 13] and not wide[18, 12]
-    assert (morphology.dilate(hole(), 0) == hole()).all() and not morphology.dilate(np.zeros_like(hole()), 0.1).any()
+    assert (morphology.dilate(rectangular_hole(), 0) == rectangular_hole()).all() and not morphology.dilate(
+        np.zeros_like(rectangular_hole()), 0.1
+    ).any()
 
 
 def test_a_smooth_picture_is_continued():
     for painter in (classical.load_classical(), classical.Painter("telea", classical.telea)):
-        error = np.abs(painter.paint(picture(), hole()).astype(int) - picture())[hole()]
+        error = np.abs(painter.paint(gradient_image(), rectangular_hole()).astype(int) - gradient_image())[
+            rectangular_hole()
+        ]
         assert error.mean() < 12, painter.name
 
 
@@ -79,9 +85,9 @@ def test_large_pictures_are_painted_small_by_fsr():
 
 
 def test_lama_is_fed_and_named(tmp_path):
-    lama, fallback, *_ = painters(tmp_path)
+    lama, fallback, *_ = load_inpainters(tmp_path)
     assert lama.name == "LaMa (any-name.pt)" and fallback.name.startswith("OpenCV")
-    painted = lama.paint(picture(), hole())[hole()]
+    painted = lama.paint(gradient_image(), rectangular_hole())[rectangular_hole()]
     assert (painted == painted[0]).all() and abs(int(painted[0, 2]) - 100) <= 1
 
 
@@ -90,9 +96,9 @@ def test_weights_that_are_none_are_refused(tmp_path):
     file.write_text("no module")
     with pytest.raises(ValueError, match=r"a.pt is no TorchScript module"):
         classical.load_lama(file)
-    torch.jit.script(Broken()).save(file)
+    torch.jit.script(WrongSizeInpainter()).save(file)
     with pytest.raises(ValueError, match="the module's answer"):
-        classical.load_lama(file).paint(picture(), hole())
+        classical.load_lama(file).paint(gradient_image(), rectangular_hole())
 
 
 def test_the_stand_in_for_lpips_is_named_as_such_and_measures_structure(tmp_path, monkeypatch):

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import small_scene as small
 import torch
 from other_device import there_is_one
-from test_monocular import small_model
+from scenes import wall_scene
+from test_monocular import small_depth_model
 
 from benchmarks.gpu import full_size
 from reffusion.depth import monocular
@@ -61,17 +61,18 @@ HERE = {} if there_is_one() else {"device": "cpu", "dtype": "float32"}
 
 
 def picture(view) -> torch.Tensor:
-    return torch.from_numpy(small.photo(view)).permute(2, 0, 1) / 255
+    return torch.from_numpy(wall_scene.photo(view)).permute(2, 0, 1) / 255
 
 
 def network_of_the_tilt() -> torch.nn.Module:
     """A random Depth Anything that happens to say how the wall leans; one that says the opposite is refused."""
-    wanted = -np.mgrid[: small.HEIGHT, : small.WIDTH][0].ravel()
+    wanted = -np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH][0].ravel()
     for seed in (28, *range(200)):
-        model = small_model(seed=seed)
+        model = small_depth_model(seed=seed)
         network = monocular.make_network(model)
         said = [
-            monocular.predict_disparity(network, picture(small.CAMERAS[n])).numpy().ravel() for n in ("a0", "a2", "a4")
+            monocular.predict_disparity(network, picture(wall_scene.CAMERAS[n])).numpy().ravel()
+            for n in ("a0", "a2", "a4")
         ]
         if min(np.corrcoef(answer, wanted)[0, 1] for answer in said) > 0.5:
             return model
@@ -81,7 +82,7 @@ def network_of_the_tilt() -> torch.nn.Module:
 def tilted(fit: Path) -> None:
     """The wall leans, as seen from the middle: a wall parallel to the views would not fix the scale of a depth."""
     gaussians = load_ply(fit / "gaussians.ply")
-    means = gaussians.means / (1 - 0.2 * gaussians.means[:, 1:2] / small.WALL)
+    means = gaussians.means / (1 - 0.2 * gaussians.means[:, 1:2] / wall_scene.WALL)
     save_ply(fit / "gaussians.ply", replace(gaussians, means=means))
 
 
@@ -107,8 +108,8 @@ def made(tmp_path_factory):
         prior = full_size.build_prior(full_size.shrink(shape), torch.float32)
         pipeline(replace(prior, zero_empty=True)).save_pretrained(home / name)
     network_of_the_tilt().save_pretrained(home / "depth")
-    small.write(home, 1.5)
-    small.write_photos(paths["scene"], paths["poses"], small.CAMERAS)
+    wall_scene.write_poses_and_fit(home, 1.5)
+    wall_scene.write_capture_photos(paths["scene"], paths["poses"], wall_scene.CAMERAS)
     tilted(paths["fit"])
     params = parameters(home)
     for stage, needs in STAGES.items():
@@ -119,7 +120,7 @@ def made(tmp_path_factory):
 
 
 def test_the_consistent_mask_is_the_mask_of_every_term(made):
-    sets = load_mask_sets(made["masks"], small.CAMERAS)
+    sets = load_mask_sets(made["masks"], wall_scene.CAMERAS)
     assert all((each.invent == each.consistent).all() and each.invent.any() for each in sets.values())
     scene = load_scene(made["poses"])
     (reference,) = load_references(made["reference"], scene)
@@ -155,4 +156,4 @@ def test_every_term_works_and_masked_gaussians_multiply(made):
 def test_the_scores_are_those_of_a_scene_with_noise_in_its_hole(made):
     mean = load_json(made["evaluate"] / "metrics.json")["mean"]
     assert mean["psnr_outside"] > 30 > 20 > mean["psnr_box"] > 5
-    assert {path.stem for path in (made["evaluate"] / "renders").iterdir()} == set(small.TEST)
+    assert {path.stem for path in (made["evaluate"] / "renders").iterdir()} == set(wall_scene.TEST)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import small_scene as small
 import torch
-from small_params import altered
-from small_prior import small_prior
-from test_distill import camera, train_view, wall
+from scenes import wall_scene
+from scenes.networks import small_prior
+from scenes.settings import with_changes
+from test_distill import random_wall, train_view, wall_camera
 
 from reffusion.background.model import Background
 from reffusion.distill import loop
@@ -53,15 +53,15 @@ def prior():
 def views_of(tmp_path_factory):
     """(parameters) -> the training views of a scene where I lies beside C, and view a3 has no I."""
     home = tmp_path_factory.mktemp("insertion")
-    poses, fitted, _ = small.write(home, NEAR, clean=("a4",))
-    hidden, drawn, none = (np.zeros((small.HEIGHT, small.WIDTH), bool) for _ in range(3))
+    poses, fitted, _ = wall_scene.write_poses_and_fit(home, NEAR, clean=("a4",))
+    hidden, drawn, none = (np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool) for _ in range(3))
     hidden[20:40, 10:30], drawn[20:40, 50:70] = True, True
-    sets = {name: MaskSet(none, hidden, none, none if name == "a3" else drawn) for name in small.CAMERAS}
+    sets = {name: MaskSet(none, hidden, none, none if name == "a3" else drawn) for name in wall_scene.CAMERAS}
     save_mask_sets(home / "masks", sets)
     scene = load_scene(poses)
 
     def made(**changes):
-        views = distill.load_train_views(altered(Params(), **changes), scene, poses, fitted, home / "masks")
+        views = distill.load_train_views(with_changes(Params(), **changes), scene, poses, fitted, home / "masks")
         return {view.camera.name: view for view in views}
 
     return made, torch.from_numpy(hidden), torch.from_numpy(drawn)
@@ -87,7 +87,7 @@ def test_the_refit_is_not_supervised_where_an_object_is_drawn(tmp_path, monkeypa
     found = {}
     monkeypatch.setattr(initialize, "refit", lambda scene, exact, known, *_: found.update(known.hidden) or scene)
     masked, invent = np.eye(4, dtype=bool), np.eye(4, dtype=bool)[::-1]
-    background = Background([type("View", (), {"camera": camera(), "masked": masked})], {})
+    background = Background([type("View", (), {"camera": wall_camera(), "masked": masked})], {})
     space = type("Space", (), {"scene": type("Scene", (), {"clean": (), "blank": ()})})
     sets = {"a": MaskSet(masked, masked, invent, invent)}
     draft = Draft(None, torch.zeros(0, dtype=torch.bool))
@@ -98,8 +98,8 @@ def test_the_refit_is_not_supervised_where_an_object_is_drawn(tmp_path, monkeypa
 def test_a_clean_view_can_be_a_reference(tmp_path):
     """The stages on it: its hole is C, and what is behind the object lies where the wall is."""
     paths = {name: tmp_path / name for name in ("scene", "poses", "fit", "masks", "reference", "initialize")}
-    poses, fitted, _ = small.write(tmp_path, NEAR, clean=("a2",))
-    small.write_photos(paths["scene"], poses, small.CAMERAS)
+    poses, fitted, _ = wall_scene.write_poses_and_fit(tmp_path, NEAR, clean=("a2",))
+    wall_scene.write_capture_photos(paths["scene"], poses, wall_scene.CAMERAS)
     for name in ("masks", "reference", "initialize"):
         paths[name].mkdir()
     masks.run(
@@ -161,7 +161,7 @@ def test_colours_above_1_are_shown_as_1_and_may_only_come_back():
 
 
 def test_no_term_shows_a_prior_or_a_critic_colours_above_1(prior, monkeypatch):
-    gaussians, masked = wall()
+    gaussians, masked = random_wall()
     bright = replace(gaussians, sh=gaussians.sh + 3)
     seen = []
     encode, patches = diffusion.encode, adversarial.draw_patches
@@ -204,7 +204,7 @@ def test_output_projections_are_adapted_or_not(layers):
 
 
 def test_positions_step_by_the_cameras_extent_as_3dgs_has_it():
-    cameras = [camera("a", -0.3), camera("b", 0.3), camera("c", 0.0)]
+    cameras = [wall_camera("a", -0.3), wall_camera("b", 0.3), wall_camera("c", 0.0)]
     assert cameras_extent(cameras) == pytest.approx(1.1 * 0.3)
     for unit, factor in (("distance", 1.0), ("cameras", 1.1 * 0.3)):
         rates = step.learning_rates(LearningRates(means_unit=unit), cameras)

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_io import some_gaussians
-from test_patch import edited, without_pictures
+from test_io import random_gaussians
+from test_patch import remove_pictures, write_edited_capture
 
 from reffusion.capture.layouts import ring
 from reffusion.gaussians import matching
@@ -39,7 +39,7 @@ def command(*words: object, cwd: Path = ROOT, **options) -> subprocess.Completed
 @pytest.fixture
 def files(tmp_path):
     """before.ply and after.ply, 300 splats and 250."""
-    made = some_gaussians(300, 1)
+    made = random_gaussians(300, 1)
     save_ply(tmp_path / "before.ply", made)
     save_ply(tmp_path / "after.ply", made.map(lambda p: p[50:]))
     return tmp_path / "before.ply", tmp_path / "after.ply"
@@ -86,8 +86,8 @@ def test_a_stage_that_refuses_ends_the_command(files, tmp_path):
 def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
     """Two files alone, then with their cameras: the same folder."""
     made = tmp_path / "made"
-    _, deleted = edited(made)
-    without_pictures(made)
+    _, deleted = write_edited_capture(made)
+    remove_pictures(made)
     asked = arguments(made / "scene.ply", made / "cleaned.ply", tmp_path / "out.ply")
     patch_files.check_arguments(asked)
     folder = patch_files.write_scene_folder(asked)
@@ -120,7 +120,7 @@ def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
 def test_the_ending_says_the_format(tmp_path, ending, within):
     if ending in (".spz", ".compressed.ply"):
         pytest.importorskip("gsply")
-    made, path = some_gaussians(300, 1), tmp_path / f"out{ending}"
+    made, path = random_gaussians(300, 1), tmp_path / f"out{ending}"
     check_can_save(path)
     save_splats(path, made, FRAME, ("x", "y", "z", "opacity"))
     read, means = load_ply(path), torch.from_numpy(FRAME.invert(made.means.double().numpy())).float()
@@ -139,9 +139,9 @@ def test_export_writes_the_scene_with_the_object_too(tmp_path):
 
     from reffusion.io.scene import save_scene
 
-    home, given = tmp_path / "s", some_gaussians(200, 1)
+    home, given = tmp_path / "s", random_gaussians(200, 1)
     save_scene(home / "poses", scene())
-    save_ply(home / "evaluate" / "scene.ply", some_gaussians(300, 1), FRAME)
+    save_ply(home / "evaluate" / "scene.ply", random_gaussians(300, 1), FRAME)
     save_ply(home / "fit" / "gaussians.ply", given)
     said = export.make(home)
     before, cameras = home / "export/with_object.ply", home / "export/cameras"
@@ -219,7 +219,7 @@ def test_the_command_fills_a_hole_and_goes_on(tmp_path):
     means, deleted = room("back")
     count = len(means)
     draw = lambda *shape: torch.rand(*shape, generator=torch.Generator().manual_seed(0))
-    made = some_gaussians(count, 0)
+    made = random_gaussians(count, 0)
     whole = type(made)(
         torch.from_numpy(means).float(), made.quaternions, torch.full((count, 3), np.log(0.03)).float(),
         torch.full((count,), 4.0), draw(count, 1, 3) - 0.5,

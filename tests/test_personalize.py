@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_params import altered
-from small_prior import small_prior
+from scenes.networks import small_prior
+from scenes.settings import with_changes
 
 from reffusion import trace
 from reffusion.params.personalize import Params, Samples
@@ -142,7 +142,7 @@ def test_learning_rate_warms_up_and_falls():
 
 def test_training_learns_the_reference_and_logs_it(tiny, tmp_path):
     trained = lora.attach(tiny, 8, 16, 0.1, "attention+conv", 0)
-    training = altered(TRAINING, steps=60, optimizer={"batch": 4, "lr_unet": 4e-3})
+    training = with_changes(TRAINING, steps=60, optimizer={"batch": 4, "lr_unet": 4e-3})
     P.personalize(tiny, trained, [striped()], training, tmp_path)
     records = read_trace(tmp_path / "trace.jsonl")
     assert [records[0]["iteration"], records[-1]["iteration"]] == [0, 60]
@@ -180,7 +180,7 @@ def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch)
     def trained(folder):
         prior = small_prior()
         trained = lora.attach(prior, 4, 8, 0.1, "attention", 0)
-        training = altered(TRAINING, optimizer={"schedule": "cosine", "warm_up": 2}, checkpoint_seconds=1e-9)
+        training = with_changes(TRAINING, optimizer={"schedule": "cosine", "warm_up": 2}, checkpoint_seconds=1e-9)
         P.personalize(prior, trained, [striped()], training, folder)
         return lora.state(prior)
 
@@ -213,4 +213,4 @@ def test_a_number_that_is_none_stops_the_training_and_names_the_step(tiny, tmp_p
         P.personalize(tiny, trained, [broken], TRAINING, tmp_path)
     assert all(torch.isfinite(w).all() for w in lora.state(tiny).values())
     with pytest.raises(ValueError, match="native 16 px"):
-        P.personalize(tiny, trained, [striped()], altered(TRAINING, samples={"size": 128}), tmp_path)
+        P.personalize(tiny, trained, [striped()], with_changes(TRAINING, samples={"size": 128}), tmp_path)

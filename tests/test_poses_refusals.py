@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_capture import HEIGHT, WIDTH, prepare, run, some_truth, write_masks, write_pictures
+from scenes.capture import HEIGHT, WIDTH, make_truth, run_stages, write_capture, write_masks, write_pictures
 
 
 def edit_transforms(change):
@@ -78,40 +78,40 @@ REFUSALS = [
 
 @pytest.mark.parametrize(("change", "params", "message"), [r[1:] for r in REFUSALS], ids=[r[0] for r in REFUSALS])
 def test_refusals_name_file_and_remedy(tmp_path, change, params, message):
-    folder = prepare(tmp_path / "s", "transforms", some_truth())
+    folder = write_capture(tmp_path / "s", "transforms", make_truth())
     if change is not None:
         change(folder)
     with pytest.raises(ValueError, match=message):
-        run(folder, **params)
+        run_stages(folder, **params)
     assert not list((tmp_path / "s_out").rglob("*.*"))  # nothing was done before
 
 
 def test_llff_refusals(tmp_path):
-    folder = prepare(tmp_path / "s", "llff", some_truth())
+    folder = write_capture(tmp_path / "s", "llff", make_truth())
     rows = np.load(folder / "poses_bounds.npy")
     np.save(folder / "poses_bounds.npy", rows[:-1])
     with pytest.raises(ValueError, match=r"5 poses.*6 pictures"):
-        run(folder)
+        run_stages(folder)
     rows[2, 3] = np.nan
     np.save(folder / "poses_bounds.npy", rows)
     with pytest.raises(ValueError, match=r"poses_bounds\.npy: rows \[2\]"):
-        run(folder)
+        run_stages(folder)
 
 
 def test_cut_off_model_is_named(tmp_path):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     for name in ("images.bin", "points3D.bin", "cameras.bin"):
         path = folder / "sparse" / "0" / name
         whole = path.read_bytes()
         path.write_bytes(whole[:-10])
         with pytest.raises(ValueError, match=rf"{name}.*cut off"):
-            run(folder)
+            run_stages(folder)
         path.write_bytes(whole)
 
 
 def test_masks_none_is_a_scene_to_fit_only(tmp_path):
-    folder = prepare(tmp_path / "s", "transforms", some_truth())
-    scene, out = run(folder, masks="none", test="every 3")
+    folder = write_capture(tmp_path / "s", "transforms", make_truth())
+    scene, out = run_stages(folder, masks="none", test="every 3")
     assert not (out / "masks").exists() and len(scene.test) == 2
     drop_masks(folder)
-    run(folder, region={"center": (0, 0, 0), "size": (1, 1, 1)})
+    run_stages(folder, region={"center": (0, 0, 0), "size": (1, 1, 1)})

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from small_prior import save_small_prior
+from scenes.networks import save_small_prior
 
 from priors.tiny import build, images, train
 

@@ -31,7 +31,7 @@ CAPTURES = ROOT.parent / "shared" / "data"
 slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
 
 
-def noise(generator: np.random.Generator, size: int = 256) -> np.ndarray:
+def speckle_texture(generator: np.random.Generator, size: int = 256) -> np.ndarray:
     """[size, size, 3] speckle at several scales, in [0, 255]."""
     total = np.zeros((size, size, 3))
     for cell in (2, 4, 8, 16, 32):
@@ -40,7 +40,7 @@ def noise(generator: np.random.Generator, size: int = 256) -> np.ndarray:
     return 255 * (total - total.min()) / np.ptp(total)
 
 
-def draw_corner(pose: np.ndarray, textures: np.ndarray, size=(200, 150), focal=170.0) -> np.ndarray:
+def render_room_corner(pose: np.ndarray, textures: np.ndarray, size=(200, 150), focal=170.0) -> np.ndarray:
     """The corner of a room, planes x = 2, y = 1.5, z = 3, ray-cast; uint8 [H, W, 3]."""
     columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
     rays = np.stack([(columns - size[0] / 2) / focal, (rows - size[1] / 2) / focal, np.ones_like(rows)], -1)
@@ -56,7 +56,7 @@ def draw_corner(pose: np.ndarray, textures: np.ndarray, size=(200, 150), focal=1
     return textures[plane, v.astype(int) % texels, u.astype(int) % texels].astype(np.uint8)
 
 
-def walk(count: int) -> dict[str, np.ndarray]:
+def room_walk(count: int) -> dict[str, np.ndarray]:
     """Views that face the corner, up and down by turns: centres on a line would leave the alignment free to turn."""
     result = {}
     for k in range(count):
@@ -78,7 +78,7 @@ def assert_accepted(scene, truth: dict[str, np.ndarray]) -> None:
 
 
 def test_pose_errors_are_those_that_no_similarity_explains():
-    truth = walk(6)
+    truth = room_walk(6)
     turn = Rotation.from_rotvec((0.3, -0.5, 0.2)).as_matrix()
 
     def elsewhere(pose: np.ndarray, shift=(0.0, 0.0, 0.0)) -> np.ndarray:
@@ -114,12 +114,12 @@ def solved_by(threads: int, photographs: dict[str, Path], work: Path) -> Poses:
 
 def test_a_walk_past_a_corner(tmp_path, capsys):
     """All views that belong to it are placed; the one that does not is named and left out, and so is its mask."""
-    generator, truth = np.random.default_rng(0), walk(6)
-    textures = np.stack([noise(generator) for _ in range(3)])
+    generator, truth = np.random.default_rng(0), room_walk(6)
+    textures = np.stack([speckle_texture(generator) for _ in range(3)])
     folder = tmp_path / "s"
     for name, pose in truth.items():
-        save_image(folder / f"{name}.png", draw_corner(pose, textures))
-    save_image(folder / "stray.png", noise(generator)[:150, :200].astype(np.uint8))
+        save_image(folder / f"{name}.png", render_room_corner(pose, textures))
+    save_image(folder / "stray.png", speckle_texture(generator)[:150, :200].astype(np.uint8))
     for name in (*truth, "stray"):
         save_mask(folder / "masks" / f"{name}.png", np.eye(150, 200, dtype=bool))
     with pytest.warns(UserWarning, match="1 views were not placed and are left out: stray"):
@@ -152,12 +152,12 @@ UPRIGHT, ACROSS = (150, 200), (200, 150)  # px: a phone held both ways
 
 
 def write_walk(folder: Path, sizes: Sequence[tuple[int, int]], endings: Sequence[str]) -> dict[str, np.ndarray]:
-    """One photograph of `walk` for each size and ending, in folder/images; the true poses."""
-    generator, truth = np.random.default_rng(0), walk(len(sizes))
-    textures = np.stack([noise(generator) for _ in range(3)])
+    """One photograph of `room_walk` for each size and ending, in folder/images; the true poses."""
+    generator, truth = np.random.default_rng(0), room_walk(len(sizes))
+    textures = np.stack([speckle_texture(generator) for _ in range(3)])
     (folder / "images").mkdir(parents=True)
     for (name, pose), size, ending in zip(truth.items(), sizes, endings, strict=True):
-        picture = Image.fromarray(draw_corner(pose, textures, size))
+        picture = Image.fromarray(render_room_corner(pose, textures, size))
         picture.save(folder / "images" / f"{name}.{ending}", **{"webp": {"lossless": True}}.get(ending, {}))
     return truth
 

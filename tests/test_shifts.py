@@ -18,7 +18,7 @@ HEIGHT, WIDTH = 120, 200
 PATH = slice(40, 56)
 
 
-def lawn(path: bool = True) -> np.ndarray:
+def paint_lawn(path: bool = True) -> np.ndarray:
     """Grass, and a pale path across, uint8 [H, W, 3]."""
     draws = np.random.default_rng(0)
     green = np.array([70, 110, 50]) + draws.normal(0, 18, (HEIGHT, WIDTH, 1))
@@ -27,60 +27,60 @@ def lawn(path: bool = True) -> np.ndarray:
     return green.clip(0, 255).astype(np.uint8)
 
 
-def hole() -> np.ndarray:
+def disk_mask() -> np.ndarray:
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     return (rows - 58) ** 2 + (columns - 100) ** 2 < 27**2
 
 
-def marked(image: np.ndarray, seed: int = 0, **fields) -> tuple[np.ndarray, np.ndarray]:
-    shown = replace(without_geometry(image, hole()), **fields)  # type: ignore[arg-type]
-    found = fill_from_photo(shown, hole(), shown, seed=seed)
+def fill_and_mark(image: np.ndarray, seed: int = 0, **fields) -> tuple[np.ndarray, np.ndarray]:
+    shown = replace(without_geometry(image, disk_mask()), **fields)  # type: ignore[arg-type]
+    found = fill_from_photo(shown, disk_mask(), shown, seed=seed)
     return found.image, found.filled
 
 
-def energy(image: np.ndarray) -> float:
-    inner = hole()[1:, 1:]
+def gradient_energy(image: np.ndarray) -> float:
+    inner = disk_mask()[1:, 1:]
     grey = image.astype(float).mean(2)
     return float((np.diff(grey, axis=0)[:, 1:][inner] ** 2 + np.diff(grey, axis=1)[1:][inner] ** 2).mean())
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_path_goes_on_and_the_lawn_stays_as_sharp_as_it_is(seed):
-    truth = lawn()
-    image = np.where(hole()[..., None], np.uint8((255, 0, 0)), truth)
-    painted, filled = marked(image, seed)
-    assert filled[hole()].all() and (painted[~hole()] == image[~hole()]).all()
-    inside = hole().copy()
+    truth = paint_lawn()
+    image = np.where(disk_mask()[..., None], np.uint8((255, 0, 0)), truth)
+    painted, filled = fill_and_mark(image, seed)
+    assert filled[disk_mask()].all() and (painted[~disk_mask()] == image[~disk_mask()]).all()
+    inside = disk_mask().copy()
     inside[:42], inside[54:] = False, False
     assert np.abs(painted[inside].mean(0) - truth[inside].mean(0)).max() < 6, "the path"
-    below = hole().copy()
+    below = disk_mask().copy()
     below[:60] = False
     assert np.abs(painted[below].mean(0) - truth[below].mean(0)).max() < 6, "the lawn"
-    assert 0.8 < energy(painted) / energy(truth) < 1.15
-    assert (marked(image, seed)[0] == painted).all(), "the same seed, the same picture"
+    assert 0.8 < gradient_energy(painted) / gradient_energy(truth) < 1.15
+    assert (fill_and_mark(image, seed)[0] == painted).all(), "the same seed, the same picture"
 
 
 def test_what_lies_otherwise_or_stands_before_the_rest_is_not_taken():
     """The lower half of the picture is bark of the lawn's colour; patches alone would not tell."""
-    truth = lawn(path=False)
+    truth = paint_lawn(path=False)
     truth[80:] = (90, 100, 90)
-    image = np.where(hole()[..., None], np.uint8((255, 0, 0)), truth)
+    image = np.where(disk_mask()[..., None], np.uint8((255, 0, 0)), truth)
     normal = np.zeros((HEIGHT, WIDTH, 3), np.float32)
     normal[..., 2] = 1
     normal[80:] = (0, 1, 0)
-    normal[hole()] = (0, 0, 1)
-    assert energy(marked(image, normal=normal)[0]) > 0.8 * energy(truth)
+    normal[disk_mask()] = (0, 0, 1)
+    assert gradient_energy(fill_and_mark(image, normal=normal)[0]) > 0.8 * gradient_energy(truth)
     layer = np.zeros((HEIGHT, WIDTH), np.int64)
-    layer[hole()] = 1
-    assert not marked(image, layer=layer)[1].any(), "nothing else of it is shown"
+    layer[disk_mask()] = 1
+    assert not fill_and_mark(image, layer=layer)[1].any(), "nothing else of it is shown"
 
 
 def test_nothing_is_said_where_there_is_nothing_to_take():
-    image = lawn()
+    image = paint_lawn()
     nowhere = np.zeros((HEIGHT, WIDTH), bool)
     none = fill_from_photo(without_geometry(image, nowhere), nowhere, without_geometry(image, nowhere))
     assert not none.filled.any() and (none.image == image).all()
-    assert not marked(image, usable=nowhere)[1].any()
+    assert not fill_and_mark(image, usable=nowhere)[1].any()
     everywhere = ~nowhere
     assert not fill_from_photo(
         without_geometry(image, everywhere), everywhere, without_geometry(image, everywhere)
@@ -115,14 +115,14 @@ def test_slopes_are_those_of_the_ground_and_short_among_leaves():
 def test_where_all_lies_otherwise_patches_are_left_to_do_it():
     normal = np.zeros((HEIGHT, WIDTH, 3), np.float32)
     normal[..., 2] = 1
-    normal[hole()] = (0, 1, 0)
-    image = np.where(hole()[..., None], np.uint8((255, 0, 0)), lawn())
-    assert not marked(image, normal=normal)[1].any()
+    normal[disk_mask()] = (0, 1, 0)
+    image = np.where(disk_mask()[..., None], np.uint8((255, 0, 0)), paint_lawn())
+    assert not fill_and_mark(image, normal=normal)[1].any()
 
 
 def test_a_plane_seen_edge_on_stops_nothing():
     surface, flat = np.ones((HEIGHT, WIDTH), np.int64), np.broadcast_to(np.eye(2), (HEIGHT, WIDTH, 2, 2)).copy()
     flat[:, :60], flat[:20] = 0.0, np.inf
-    image = np.where(hole()[..., None], np.uint8((255, 0, 0)), lawn())
-    painted, filled = marked(image, plane=surface, to_plane=flat)
-    assert filled[hole()].all() and energy(painted) > 0.8 * energy(lawn())
+    image = np.where(disk_mask()[..., None], np.uint8((255, 0, 0)), paint_lawn())
+    painted, filled = fill_and_mark(image, plane=surface, to_plane=flat)
+    assert filled[disk_mask()].all() and gradient_energy(painted) > 0.8 * gradient_energy(paint_lawn())

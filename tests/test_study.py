@@ -8,8 +8,8 @@ import re
 import cv2
 import numpy as np
 import pytest
-import small_scene as small
 from browser import visiting
+from scenes import wall_scene
 
 from reffusion.io.images import save_image
 from reffusion.io.ply import save_ply
@@ -22,15 +22,15 @@ METHODS = ("full", "no_sds", "inpaint_2d")
 @pytest.fixture
 def home(tmp_path):
     """Two compared scenes of a wall: `full` shows it, `no_sds` the square before it; `inpaint_2d` made pictures."""
-    everything, labels = small.gaussians(1.0)
+    everything, labels = wall_scene.wall_and_square(1.0)
     wall = everything.map(lambda part: part[~labels])
     runs = []
     for scene in ("x", "y"):
-        poses, _, _ = small.write(tmp_path / scene, 1.0)
+        poses, _, _ = wall_scene.write_poses_and_fit(tmp_path / scene, 1.0)
         for method in METHODS:
             place = tmp_path / (scene if method == "full" else f"{scene}@{method}") / "evaluate"
-            for name in small.TEST:
-                save_image(place / "renders" / f"{name}.png", small.photo(small.CAMERAS[name]))
+            for name in wall_scene.TEST:
+                save_image(place / "renders" / f"{name}.png", wall_scene.photo(wall_scene.CAMERAS[name]))
             metrics = {"mean": {}} | ({"inpainter": "telea"} if method == "inpaint_2d" else {})
             (place / "metrics.json").write_text(json.dumps(metrics))
             if method != "inpaint_2d":
@@ -38,7 +38,7 @@ def home(tmp_path):
             stages = {"poses": str(poses.relative_to(tmp_path)), "evaluate": str(place.relative_to(tmp_path))}
             if method == "full":
                 reference = tmp_path / scene / "reference"
-                save_image(reference / "references/a2.png", small.photo(small.CAMERAS["a2"]))
+                save_image(reference / "references/a2.png", wall_scene.photo(wall_scene.CAMERAS["a2"]))
                 stages["reference"] = str(reference.relative_to(tmp_path))
             runs.append({"scene": scene, "method": method, "state": "done", "stages": stages})
     record = {
@@ -85,7 +85,9 @@ def test_images_where_no_encoder_is(home, monkeypatch):
         browser.fill("#name", "someone")
         browser.click("#begin")
         browser.wait_for_function("document.querySelectorAll('.pair img').length == 2")
-        assert browser.evaluate("document.querySelector('.pair img').naturalWidth") == 3 * small.WIDTH + 2 * study.GAP
+        assert (
+            browser.evaluate("document.querySelector('.pair img').naturalWidth") == 3 * wall_scene.WIDTH + 2 * study.GAP
+        )
 
 
 def prefers_ours(browser, key: dict, trial: dict) -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenes.cameras import look_at_camera
 
 from reffusion import geometry
 from reffusion.background.mirrors import render_mirrors
@@ -28,16 +29,16 @@ SIDE = 128
 RED = (255, 0, 0)
 
 
-def alone_completed(image, mask, seed=0):
+def complete_alone(image, mask, seed=0):
     return complete(without_geometry(image, mask), mask, [without_geometry(image, mask)], seed=seed).image
 
 
-def board():
+def checker_image():
     rows, columns = np.mgrid[:96, :128] // 8
     return np.where((rows + columns) % 2, 200, 60).astype(np.uint8)[..., None].repeat(3, 2)
 
 
-def middle():
+def middle_mask():
     mask = np.zeros((96, 128), bool)
     mask[30:61, 45:84] = True
     return mask
@@ -45,19 +46,21 @@ def middle():
 
 def test_a_pattern_is_continued_as_sharp_as_it_is():
     """A hole in a checkerboard with period 16, of which nine tenths of the board's own contrast must come back."""
-    wrong = lambda painted: np.abs(painted[middle()].astype(int) - board()[middle()]).mean()
-    assert wrong(alone_completed(board(), middle())) < 0.1 * 70 < wrong(telea(board(), middle()))
+    wrong = lambda painted: np.abs(painted[middle_mask()].astype(int) - checker_image()[middle_mask()]).mean()
+    assert (
+        wrong(complete_alone(checker_image(), middle_mask())) < 0.1 * 70 < wrong(telea(checker_image(), middle_mask()))
+    )
 
 
 def test_only_the_hole_changes_and_its_content_does_not_count():
     noise = np.random.default_rng(0).integers(0, 256, (96, 128, 3), np.uint8)
-    image = np.where(np.arange(128)[None, :, None] < 64, board(), noise)
-    painted = alone_completed(image, middle())
-    assert (painted[~middle()] == image[~middle()]).all() and painted.dtype == np.uint8
-    poisoned = np.where(middle()[..., None], np.uint8(RED), image)
-    assert (alone_completed(poisoned, middle()) == painted).all()
-    assert (alone_completed(image, middle()) == painted).all(), "the same seed, the same picture"
-    assert (alone_completed(image, np.zeros_like(middle())) == image).all()
+    image = np.where(np.arange(128)[None, :, None] < 64, checker_image(), noise)
+    painted = complete_alone(image, middle_mask())
+    assert (painted[~middle_mask()] == image[~middle_mask()]).all() and painted.dtype == np.uint8
+    poisoned = np.where(middle_mask()[..., None], np.uint8(RED), image)
+    assert (complete_alone(poisoned, middle_mask()) == painted).all()
+    assert (complete_alone(image, middle_mask()) == painted).all(), "the same seed, the same picture"
+    assert (complete_alone(image, np.zeros_like(middle_mask())) == image).all()
 
 
 @pytest.mark.parametrize("kind", ["a pixel", "specks", "at the border", "nearly all"])
@@ -71,7 +74,7 @@ def test_every_hole_is_filled(kind):
         mask[20:, :30] = True
     else:
         mask[8:] = True
-    painted = alone_completed(image, mask)
+    painted = complete_alone(image, mask)
     assert (painted[~mask] == image[~mask]).all() and painted[mask].min() >= 20, "no pixel is left black"
 
 
@@ -83,14 +86,14 @@ def test_sources_may_have_other_sizes(shape):
     image, nothing = np.full((96, 128, 3), 128, np.uint8), np.zeros(shape, bool)
     beside = np.abs(np.arange(128) - 64) > 30
     image[:, beside] = np.where(np.arange(128) % 6 < 3, 40, 210)[None, beside, None]
-    painted = complete(without_geometry(image, middle()), middle(), [without_geometry(source, nothing)]).image
-    assert painted[middle()].std() > 50, "striped as the only source is"
+    painted = complete(without_geometry(image, middle_mask()), middle_mask(), [without_geometry(source, nothing)]).image
+    assert painted[middle_mask()].std() > 50, "striped as the only source is"
 
 
 def test_masked_pixels_of_a_source_never_show():
-    image, mask, red = board(), middle(), np.zeros((96, 128), bool)
+    image, mask, red = checker_image(), middle_mask(), np.zeros((96, 128), bool)
     red[::12, ::9] = True
-    other = np.where(red[..., None], np.uint8(RED), board())
+    other = np.where(red[..., None], np.uint8(RED), checker_image())
     source = replace(without_geometry(other, red), usable=np.ones_like(red))
     painted = (
         complete(without_geometry(image, mask), mask, [source, without_geometry(image, mask)]).image[mask].astype(int)
@@ -101,25 +104,16 @@ def test_masked_pixels_of_a_source_never_show():
 # ------------------------------------------------------------------------------------------------ along a plane
 
 
-def camera(name: str, centre: tuple[float, float, float], at=(0.0, 0.0, 0.0)) -> Camera:
-    """Looks from `centre` at a point, y down."""
-    centre, forward = np.array(centre), np.array(at) - np.array(centre)
-    forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
-    return Camera(name, SIDE, SIDE, 140.0, 140.0, SIDE / 2, SIDE / 2, pose)
-
-
-CAMERAS = [camera("a", (0.0, -1.2, 0.7)), camera("b", (0.7, -1.0, 0.8)), camera("c", (-0.8, -0.9, 0.6))]
+CAMERAS = [
+    look_at_camera(name, center, (0.0, 0.0, 0.0), (SIDE, SIDE), 140.0)
+    for name, center in (("a", (0.0, -1.2, 0.7)), ("b", (0.7, -1.0, 0.8)), ("c", (-0.8, -0.9, 0.6)))
+]
 EVERYWHERE, NOWHERE = np.ones((CELLS, CELLS), bool), np.zeros((CELLS, CELLS), bool)
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0, np.zeros(3), np.eye(3)[:2], 4 / CELLS, EVERYWHERE, EVERYWHERE, NOWHERE,
               EVERYWHERE, NOWHERE)  # fmt: skip
 
 
-def planks(view: Camera) -> np.ndarray:
+def paint_planks(view: Camera) -> np.ndarray:
     """A floor of planks 0.12 wide that run away from camera a, uint8 [H, W, 3]."""
     depth = FLOOR.depth(view)
     x, y, _ = np.moveaxis(geometry.unproject(np.where(np.isfinite(depth), depth, 1.0), view), -1, 0)
@@ -128,29 +122,31 @@ def planks(view: Camera) -> np.ndarray:
     return np.where(joint, 40, tone)[..., None].repeat(3, 2).astype(np.uint8)
 
 
-def hidden() -> np.ndarray:
+def disk_mask() -> np.ndarray:
     rows, columns = np.mgrid[:SIDE, :SIDE]
     return (rows - 70) ** 2 + (columns - 62) ** 2 < 24**2
 
 
-def floor() -> Background:
+def floor_background() -> Background:
     views = []
     for view in CAMERAS:
         depth = FLOOR.depth(view)
         depth = np.where(np.isfinite(depth) & (depth < 5), depth, 0).astype(np.float32)
-        views.append(DepthView.from_range(view, depth, depth_range(depth), hidden()))
-    return Background(views, {view.name: planks(view) for view in CAMERAS}, planes=[FLOOR], radius=1.0)
+        views.append(DepthView.from_range(view, depth, depth_range(depth), disk_mask()))
+    return Background(views, {view.name: paint_planks(view) for view in CAMERAS}, planes=[FLOOR], radius=1.0)
 
 
 def test_planks_run_on_in_their_own_perspective():
-    image = np.where(hidden()[..., None], np.uint8(RED), planks(CAMERAS[0]))
+    image = np.where(disk_mask()[..., None], np.uint8(RED), paint_planks(CAMERAS[0]))
 
     def off(around):
-        found = exemplar.complete_view(image, hidden(), CAMERAS[0], hidden(), around, range(3))
-        return np.mean([np.abs(each.image.astype(int) - planks(CAMERAS[0]))[hidden()].mean() for each in found])
+        found = exemplar.complete_view(image, disk_mask(), CAMERAS[0], disk_mask(), around, range(3))
+        return np.mean(
+            [np.abs(each.image.astype(int) - paint_planks(CAMERAS[0]))[disk_mask()].mean() for each in found]
+        )
 
-    plain = np.abs(telea(image, hidden()).astype(int) - planks(CAMERAS[0]))[hidden()].mean()
-    carried, shifted = off(floor()), off(replace(floor(), planes=[]))
+    plain = np.abs(telea(image, disk_mask()).astype(int) - paint_planks(CAMERAS[0]))[disk_mask()].mean()
+    carried, shifted = off(floor_background()), off(replace(floor_background(), planes=[]))
     assert carried < 0.9 * shifted and carried < 0.6 * plain
 
 
@@ -162,13 +158,13 @@ def plane_pixels(picture: np.ndarray, view: Camera) -> PlanePixels:
 
 
 def test_a_floor_of_planks_repeats_itself_by_their_width():
-    found = find_symmetry(plane_pixels(planks(CAMERAS[0]), CAMERAS[0]))
+    found = find_symmetry(plane_pixels(paint_planks(CAMERAS[0]), CAMERAS[0]))
     across = (found.motions @ (1.0, 0.3)) / 0.12  # planks' widths that each shift goes across them
     assert found.centre is None and len(found.motions) > 5 and np.abs(across - across.round()).max() < 0.25
     assert np.abs(across).max() > 2
 
 
-def tabletop(view: Camera) -> np.ndarray:
+def paint_tabletop(view: Camera) -> np.ndarray:
     """Twenty planks that meet in a point, and a plate of another colour where they do."""
     depth = FLOOR.depth(view)
     x, y, _ = np.moveaxis(geometry.unproject(np.where(np.isfinite(depth), depth, 1.0), view), -1, 0)
@@ -178,7 +174,7 @@ def tabletop(view: Camera) -> np.ndarray:
 
 
 def test_planks_that_meet_in_a_point_are_turned_about_it():
-    found = find_symmetry(plane_pixels(tabletop(CAMERAS[0]), CAMERAS[0]))
+    found = find_symmetry(plane_pixels(paint_tabletop(CAMERAS[0]), CAMERAS[0]))
     turns = found.motions[:, 0] / (np.pi / 10)
     assert np.linalg.norm(found.centre - (0.1, 0.4)) < 0.03
     assert np.abs(turns - turns.round()).max() < 0.15 and np.abs(turns).min() > 0.5 and np.abs(turns).max() > 4
@@ -190,7 +186,7 @@ def test_planks_that_meet_in_a_point_are_turned_about_it():
 
 
 def test_the_centre_is_found_from_afar_though_a_part_of_the_top_is_seen():
-    whole = plane_pixels(tabletop(CAMERAS[0]), CAMERAS[0])
+    whole = plane_pixels(paint_tabletop(CAMERAS[0]), CAMERAS[0])
     right = whole.coordinates[:, 0] > -0.1
     seen, cell = PlanePixels(whole.pixels[right], whole.coordinates[right], whole.image), 2.4 / plane_symmetry.SIDE
     for away in ((6, -5), (-4, 6)):
@@ -207,30 +203,34 @@ def test_what_does_not_repeat_itself_is_not_said_to():
     assert find_symmetry(PlanePixels(some.pixels[:MIN_CELLS], some.coordinates[:MIN_CELLS], some.image)) is None
 
 
-@pytest.mark.parametrize("shown", [planks, tabletop])
+@pytest.mark.parametrize("shown", [paint_planks, paint_tabletop])
 def test_joints_and_round_borders_go_on_where_a_floor_repeats_itself(shown):
-    around = replace(floor(), photos={view.name: shown(view) for view in CAMERAS})
+    around = replace(floor_background(), photos={view.name: shown(view) for view in CAMERAS})
     truth = shown(CAMERAS[0]).astype(int)
-    image = np.where(hidden()[..., None], np.uint8(RED), shown(CAMERAS[0]))
+    image = np.where(disk_mask()[..., None], np.uint8(RED), shown(CAMERAS[0]))
     target, sources, smooth, how = exemplar._find_surfaces(
-        image, hidden(), CAMERAS[0], hidden(), around, render_mirrors([], CAMERAS[0], hidden(), [])
+        image, disk_mask(), CAMERAS[0], disk_mask(), around, render_mirrors([], CAMERAS[0], disk_mask(), [])
     )
-    found = fill_plane(target, hidden(), sources, 1, how[1])
+    found = fill_plane(target, disk_mask(), sources, 1, how[1])
     picture, filled = found.image, found.filled
-    assert filled[hidden()].mean() > 0.9 and not filled[~hidden()].any() and (picture[~filled] == image[~filled]).all()
+    assert (
+        filled[disk_mask()].mean() > 0.9
+        and not filled[~disk_mask()].any()
+        and (picture[~filled] == image[~filled]).all()
+    )
     dark = lambda done: done.mean(-1)[filled] < 90  # joints; and what is bright is the plate
     kind = lambda done: dark(done).astype(int) + 2 * (done.mean(-1)[filled] > 195)
     wrong = lambda done: (kind(done) != kind(truth)).mean()
-    patches = np.mean([wrong(complete(target, hidden(), sources, smooth, k).image) for k in range(3)])
+    patches = np.mean([wrong(complete(target, disk_mask(), sources, smooth, k).image) for k in range(3)])
     assert wrong(picture) < 0.7 * patches
 
 
 def test_a_hole_without_anything_to_move_into_it_is_left():
-    image = np.where(hidden()[..., None], np.uint8(RED), planks(CAMERAS[0]))
+    image = np.where(disk_mask()[..., None], np.uint8(RED), paint_planks(CAMERAS[0]))
     target, sources, _, how = exemplar._find_surfaces(
-        image, hidden(), CAMERAS[0], hidden(), floor(), render_mirrors([], CAMERAS[0], hidden(), [])
+        image, disk_mask(), CAMERAS[0], disk_mask(), floor_background(), render_mirrors([], CAMERAS[0], disk_mask(), [])
     )
-    found = fill_plane(target, hidden(), [replace(s, usable=np.zeros_like(hidden())) for s in sources], 1, how[1])
+    found = fill_plane(target, disk_mask(), [replace(s, usable=np.zeros_like(disk_mask())) for s in sources], 1, how[1])
     assert not found.filled.any() and found.image is image
 
 
@@ -249,7 +249,7 @@ def test_frames_are_the_derivative_of_a_planes_coordinates():
 
 
 def test_a_floor_is_smooth_and_grass_is_not():
-    around = floor()
+    around = floor_background()
     assert exemplar._roughness(FLOOR, around) < 1e-6
     rng = np.random.default_rng(0)
     uneven = lambda view: replace(view, depth=view.depth * (1 + 0.03 * rng.standard_normal(view.depth.shape)))
@@ -259,7 +259,7 @@ def test_a_floor_is_smooth_and_grass_is_not():
 
 def test_the_misfit_is_the_mean_square_by_weight():
     """Against NumPy, in float64, for a patch that is turned and carried along the floor."""
-    around = floor()
+    around = floor_background()
     own, other = (exemplar._source_image(view, around.photos[view.camera.name], around) for view in around.views[:2])
     seen = [(completion._color_features(each.image, each.masked), each.masked) for each in (own, other)]
     marked = [
@@ -297,7 +297,7 @@ def test_the_misfit_is_the_mean_square_by_weight():
 
 
 def test_a_pictures_own_steps_give_it_back():
-    rng, hole = np.random.default_rng(0), middle()
+    rng, hole = np.random.default_rng(0), middle_mask()
     picture = rng.normal(size=(96, 128, 3))
     right, below = np.zeros_like(picture), np.zeros_like(picture)
     right[:, :-1], below[:-1] = np.diff(picture, axis=1), np.diff(picture, axis=0)

@@ -7,11 +7,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import small_scene as small
 import torch
 from pydantic import ValidationError
 from safetensors.torch import load_file
-from small_prior import save_small_prior
+from scenes import wall_scene
+from scenes.networks import save_small_prior
 
 from benchmarks.bench import gate
 from benchmarks.bench.points import Diagram, Point, recommendation
@@ -44,15 +44,15 @@ DISTILL = {"iterations": 8, "sds": OFF, "adversarial": OFF, "depth": OFF, "refer
 def ready(tmp_path_factory):
     """Folders of a small scene up to `initialize`, and of a random prior."""
     home = tmp_path_factory.mktemp("scene")
-    poses, fitted, _ = small.write(home, NEAR)
+    poses, fitted, _ = wall_scene.write_poses_and_fit(home, NEAR)
     folders = {"poses": poses, "fit": fitted, "masks": home / "masks", "reference": home / "reference"}
     for name in ("masks", "initialize"):
         (home / name).mkdir()
     masks.run(masks.Params(), home / "masks", poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fitted)
-    view = small.CAMERAS["a2"]
+    view = wall_scene.CAMERAS["a2"]
     save_references(
         folders["reference"],
-        [Reference(view, small.photo(view), load_mask_sets(home / "masks", ["a2"])["a2"].invent)],
+        [Reference(view, wall_scene.photo(view), load_mask_sets(home / "masks", ["a2"])["a2"].invent)],
     )
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(fill, "COMPLETION", Completion(planar_share=2.0))  # no planes: both solvers

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import small_scene as small
 import torch
-from small_capture import prepare as write_capture
-from small_capture import some_truth
-from small_params import altered
-from small_prior import save_small_prior
-from test_distill import OFF, PLAIN, hole, leaves, reached, train_view, wall
+from scenes import wall_scene
+from scenes.capture import make_truth
+from scenes.capture import write_capture as write_capture
+from scenes.networks import save_small_prior
+from scenes.settings import with_changes
+from test_distill import OFF, PLAIN, as_leaves, has_gradient, random_wall, square_hole, train_view
 
 from reffusion import seeding, trace
 from reffusion.distill import loop as D
@@ -74,7 +74,7 @@ def decisions(job: Job) -> dict[str, Decision]:
 def capture(tmp_path_factory):
     """A small scene, and runs/ as its own run would leave it, as far as the runner looks."""
     home = tmp_path_factory.mktemp("variants")
-    scene, runs = write_capture(home / "scene", "llff", some_truth()), home / "runs"
+    scene, runs = write_capture(home / "scene", "llff", make_truth()), home / "runs"
     job, said = resolve(Request(ROOT, runs, str(scene), profile="laptop")), {}
     for stage in job.pipeline.stages:
         said[stage] = decide(job, stage, said)
@@ -112,13 +112,13 @@ def test_a_variant_runs_what_it_changes_and_shares_the_rest(capture, variant):
 
 @pytest.mark.parametrize("variant", [name for name in PLANS if name.startswith("no_")])
 def test_with_the_papers_terms_every_ablation_leaves_something_out(tmp_path, variant):
-    scene = write_capture(tmp_path / "scene", "llff", some_truth())
+    scene = write_capture(tmp_path / "scene", "llff", make_truth())
     request = Request(ROOT, tmp_path / "runs", str(scene), profile="paper-terms")
     assert resolve(request).params != resolve(replace(request, variant=variant)).params
 
 
 def test_the_papers_terms_are_the_papers_at_the_laptops_size(tmp_path):
-    scene, runs = write_capture(tmp_path / "scene", "llff", some_truth()), tmp_path / "runs"
+    scene, runs = write_capture(tmp_path / "scene", "llff", make_truth()), tmp_path / "runs"
     terms = resolve(Request(ROOT, runs, str(scene), profile="paper-terms")).params
     laptop = resolve(Request(ROOT, runs, str(scene), profile="laptop")).params
     size = {"prior", "iterations", "depth.steps", *(f"adversarial.{name}" for name in ("patches", "size", "width"))}
@@ -155,23 +155,23 @@ def lifted(name="a", shift=0.0):
 
 @pytest.mark.parametrize("how", [MSE, PATCHES], ids=["mse", "patches"])
 def test_lifted_pictures_reach_the_gaussians_they_may_and_no_other(how):
-    start, masked = wall()
+    start, masked = random_wall()
     for allowed in (masked, torch.ones_like(masked)):
-        gaussians = leaves(start)
+        gaussians = as_leaves(start)
         given = lifted(), how, perceptual.multi_scale_dssim, seeding.generator(1)
         loss, rendering = evaluate_lift(gaussians, allowed, *given)
         loss.backward()
-        got = reached(gaussians)
+        got = has_gradient(gaussians)
         assert not got[~allowed].any() and (got & masked & (rendering.radii > 0)).any()
     assert got[~masked].any(), "unconfined it reaches the unmasked ones"
 
 
 def test_the_squared_error_is_that_of_the_holes_pixels():
-    (gaussians, masked), view = wall(), lifted()
+    (gaussians, masked), view = random_wall(), lifted()
     loss, rendering = evaluate_lift(gaussians, masked, view, MSE, None, seeding.generator(1))
-    expected = ((rendering.color - view.lifted)[hole()] ** 2).mean()
+    expected = ((rendering.color - view.lifted)[square_hole()] ** 2).mean()
     assert float(loss) == pytest.approx(float(expected))
-    outside = torch.where(hole()[..., None], view.lifted, float("nan"))
+    outside = torch.where(square_hole()[..., None], view.lifted, float("nan"))
     again, _ = evaluate_lift(gaussians, masked, replace(view, lifted=outside), MSE, None, seeding.generator(1))
     assert float(again) == float(loss), "pixels outside the hole were looked at"
 
@@ -188,8 +188,8 @@ def every_step(monkeypatch):
 
 def run_distill(folder, views, **changes):
     folder.mkdir()
-    settings = altered(PLAIN, **{"iterations": 3, "sds": OFF, "checkpoint_seconds": 10, **changes})
-    (start, masked), holes = wall(), [(train_view().camera, train_view().photo, hole())]
+    settings = with_changes(PLAIN, **{"iterations": 3, "sds": OFF, "checkpoint_seconds": 10, **changes})
+    (start, masked), holes = random_wall(), [(train_view().camera, train_view().photo, square_hole())]
     ended, labels = D.distill(start, masked, views, holes, None, None, settings, folder)
     return start, ended, masked, labels
 
@@ -231,7 +231,7 @@ def test_the_references_pixels_may_move_the_background_in_the_hole_too(tmp_path,
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
-    poses, fitted, _ = small.write(folder, NEAR)
+    poses, fitted, _ = wall_scene.write_poses_and_fit(folder, NEAR)
     found = {"poses": poses, "fit": fitted, "masks": folder / "masks"}
     found["masks"].mkdir()
     masks.run(masks.Params(), found["masks"], poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fitted)
@@ -253,21 +253,21 @@ def initialized(scene, out, start, **needs):
 
 
 def test_lift_paints_the_hole_of_every_view_and_names_the_painter(scene, painted):
-    sets, facts = load_mask_sets(scene["masks"], small.TRAIN), load_json(painted / "facts.json")
+    sets, facts = load_mask_sets(scene["masks"], wall_scene.TRAIN), load_json(painted / "facts.json")
     assert facts["views"] == 5 and facts["inpainter"].startswith("OpenCV")
-    for name in small.TRAIN:
-        view, found = small.CAMERAS[name], load_image(painted / "images" / f"{name}.png")
+    for name in wall_scene.TRAIN:
+        view, found = wall_scene.CAMERAS[name], load_image(painted / "images" / f"{name}.png")
         outside = ~sets[name].consistent & ~sets[name].invent
-        assert (found[outside] == small.photo(view)[outside]).all()
+        assert (found[outside] == wall_scene.photo(view)[outside]).all()
         # The square before the wall is red; what is painted continues the wall.
-        error = np.abs(found.astype(int) - small.photo(view))[sets[name].invent]
+        error = np.abs(found.astype(int) - wall_scene.photo(view))[sets[name].invent]
         assert error.mean() < 30, name
     (best,) = load_references(painted, load_scene(scene["poses"]))
     assert best.camera.name == load_json(scene["masks"] / "facts.json")["best_reference"]
 
 
 def test_lift_goes_on_where_it_was_killed(scene, painted, tmp_path):
-    marked = np.full((small.HEIGHT, small.WIDTH, 3), 7, np.uint8)
+    marked = np.full((wall_scene.HEIGHT, wall_scene.WIDTH, 3), 7, np.uint8)
     save_image(tmp_path / "images" / "a0.png", marked)
     (tmp_path / "images" / ".a1.png").write_bytes(b"half a picture")
     lift.run(lift.Params(), tmp_path, **scene)
@@ -300,8 +300,8 @@ def test_random_gaussians_fill_the_region_of_the_hole_by_their_seed(scene, tmp_p
     assert int(new.sum()) == max(removed - debris, random_init.MIN_GAUSSIANS)
     at = gaussians.means[new]
     # Removed were the square and what of the wall it hides from all views.
-    assert (at[:, :2].abs() < 1.3 * small.HALF).all()
-    assert (at[:, 2] > NEAR - 0.1).all() and (at[:, 2] < small.WALL + 0.1).all()
+    assert (at[:, :2].abs() < 1.3 * wall_scene.HALF).all()
+    assert (at[:, 2] > NEAR - 0.1).all() and (at[:, 2] < wall_scene.WALL + 0.1).all()
     again, _ = initialized(scene, tmp_path / "again", "random")
     assert (again.means == gaussians.means).all() and (again.sh == gaussians.sh).all()
 
@@ -310,8 +310,8 @@ def test_scattered_points_lie_where_the_holes_are():
     box = random_init.bounding_box(np.random.default_rng(0).uniform(-1, 1, (4000, 3)))
     assert np.allclose(box, [[-1.15] * 3, [1.15] * 3], atol=0.05)
     assert np.allclose(random_init.box_at((0, 1, 2), (2, 2, 4)), [[-1, 0, 0], [1, 2, 4]])
-    view, half = small.CAMERAS["a2"], np.zeros((small.HEIGHT, small.WIDTH), bool)
-    half[:, : small.WIDTH // 2] = True
+    view, half = wall_scene.CAMERAS["a2"], np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
+    half[:, : wall_scene.WIDTH // 2] = True
     holes, box = ([view], {"a2": half}), random_init.box_at((0, 0, 2), (0.5, 0.5, 0.5))
     points = random_init.sample_points(box, 300, *holes, torch.Generator())
     assert points.shape == (300, 3) and (points[:, 0] < 0).all()
@@ -326,7 +326,7 @@ def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
         initialized(scene, tmp_path / "without", "lift")
     reference = tmp_path / "reference"
     mask = load_mask_sets(scene["masks"], ["a2"])["a2"].invent
-    save_references(reference, [Reference(small.CAMERAS["a2"], small.photo(small.CAMERAS["a2"]), mask)])
+    save_references(reference, [Reference(wall_scene.CAMERAS["a2"], wall_scene.photo(wall_scene.CAMERAS["a2"]), mask)])
     chain = scene | {"reference": reference, "personalize": None, "initialize": tmp_path / "initialize"}
     for name in ("XDG_CACHE_HOME", "TORCH_HOME"):
         monkeypatch.setenv(name, str(tmp_path / "nothing"))  # as on a machine without weights
@@ -363,7 +363,7 @@ def test_rendered_views_inpainted_in_2d(scene, tmp_path):
     before, after = (load_json(tmp_path / n / "metrics.json") for n in ("fit", "inpainted"))
     assert before["inpainter"] is None and after["inpainter"].startswith("OpenCV") and after["result"] == "fit"
     assert after["mean"]["psnr_box"] > before["mean"]["psnr_box"] + 5, "the red square is still there"
-    for name in small.TEST:
+    for name in wall_scene.TEST:
         pictures = [load_image(tmp_path / n / "renders" / f"{name}.png") for n in ("fit", "inpainted")]
         mask = load_mask(scene["masks"] / "consistent" / f"{name}.png")
         assert (pictures[0][~mask] == pictures[1][~mask]).all() and (pictures[0][mask] != pictures[1][mask]).any()
@@ -377,10 +377,10 @@ def test_the_masked_fit_never_sees_a_masked_pixel(scene, tmp_path):
     params = fit.Params(pixels="unmasked").changed(values)
     found = []
     for seed in (0, 1):
-        poses = small.write(tmp_path / f"scene{seed}", NEAR)[0]
-        for name, mask in load_raw_masks(poses.with_name("raw_masks"), small.TRAIN).items():
+        poses = wall_scene.write_poses_and_fit(tmp_path / f"scene{seed}", NEAR)[0]
+        for name, mask in load_raw_masks(poses.with_name("raw_masks"), wall_scene.TRAIN).items():
             noise = np.random.default_rng(seed).integers(0, 256, (*mask.shape, 3), np.uint8)
-            picture = np.where(mask[..., None], noise, small.photo(small.CAMERAS[name]))
+            picture = np.where(mask[..., None], noise, wall_scene.photo(wall_scene.CAMERAS[name]))
             save_image(poses / "images" / f"{name}.png", picture)
         out = tmp_path / f"fit{seed}"
         out.mkdir()
@@ -392,18 +392,18 @@ def test_the_masked_fit_never_sees_a_masked_pixel(scene, tmp_path):
 
 
 def test_a_masked_fit_needs_masks_and_fits_a_scene_that_brings_gaussians(scene, tmp_path):
-    poses = small.write(tmp_path, NEAR, masks={})[0]
+    poses = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})[0]
     with pytest.raises(ValueError, match=r"fit.pixels is 'unmasked', but the scene has no masks"):
         fit.run(fit.Params(iterations=1, pixels="unmasked"), tmp_path, poses=poses, raw_masks=tmp_path / "raw_masks")
-    save_ply(poses / "gaussians.ply", small.gaussians(NEAR)[0])
+    save_ply(poses / "gaussians.ply", wall_scene.wall_and_square(NEAR)[0])
     assert plan_fit.preview(fit.Params(), poses=poses)
     assert not plan_fit.preview(fit.Params(pixels="unmasked"), poses=poses)
 
 
 def test_the_box_is_the_test_masks_whatever_was_left_out(scene, tmp_path):
-    view, given = small.CAMERAS["a1"], load_mask(scene["masks"] / "consistent" / "a1.png")
+    view, given = wall_scene.CAMERAS["a1"], load_mask(scene["masks"] / "consistent" / "a1.png")
     raw_masks = scene["poses"].with_name("raw_masks")
     raw = load_raw_masks(raw_masks, ["a1"])["a1"]
     assert (load_object_mask(view, raw_masks, scene["masks"]) == given).all()
     assert (load_object_mask(view, raw_masks, None) == raw).all()
-    assert not load_object_mask(small.CAMERAS["t0"], raw_masks, None).any()
+    assert not load_object_mask(wall_scene.CAMERAS["t0"], raw_masks, None).any()

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-import small_scene
 import torch
 from browser import visiting
+from scenes import wall_scene
 
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.images import save_image, save_mask
@@ -25,14 +25,14 @@ NEEDS = {"poses": "a", "fit": "b", "masks": "c", "initialize": "d", "distill": "
 
 def finished(home, needs):
     """A run whose result is the wall; before distillation the square stood before it, too."""
-    gaussians, labels = small_scene.gaussians(1.0)
-    train = {name: small_scene.CAMERAS[name] for name in small_scene.TRAIN}
+    gaussians, labels = wall_scene.wall_and_square(1.0)
+    train = {name: wall_scene.CAMERAS[name] for name in wall_scene.TRAIN}
     points = gaussians.means.double().numpy()
-    scene = Scene(train, small_scene.TRAIN, (), frozenset(), points, np.zeros((len(points), 3), np.uint8), SIMILARITY)
+    scene = Scene(train, wall_scene.TRAIN, (), frozenset(), points, np.zeros((len(points), 3), np.uint8), SIMILARITY)
     poses = home.with_name(home.name.split("@")[0]) / "poses"
     save_scene(poses, scene)
-    for name in small_scene.TRAIN:
-        save_image(poses / "images" / f"{name}.png", small_scene.photo(train[name]))
+    for name in wall_scene.TRAIN:
+        save_image(poses / "images" / f"{name}.png", wall_scene.photo(train[name]))
     for stage in ("fit", "masks", "initialize", "distill"):
         if stage != "masks":
             save_ply(home / stage / "gaussians.ply", gaussians)
@@ -52,8 +52,8 @@ def visitor(camera):
 
 
 def test_a_visitor_who_stands_at_a_view_sees_that_view():
-    gaussians, _ = small_scene.gaussians(1.0)
-    for camera in small_scene.CAMERAS.values():
+    gaussians, _ = wall_scene.wall_and_square(1.0)
+    for camera in wall_scene.CAMERAS.values():
         centred = camera.cropped(0, 0, round(2 * camera.cx), round(2 * camera.cy))
         seen = view.visitor_camera(visitor(centred), centred.height)
         assert (seen.width, seen.height) == (centred.width, centred.height)
@@ -129,7 +129,7 @@ def test_the_page_is_served_on_this_machine_only(window):
 def test_a_visitor_gets_a_small_picture_at_once_then_the_whole_and_another_when_he_chooses(window, monkeypatch):
     drawn = []
 
-    camera = visitor(small_scene.CAMERAS[small_scene.TRAIN[0]])
+    camera = visitor(wall_scene.CAMERAS[wall_scene.TRAIN[0]])
     camera.on_update = lambda _: None
     guest = SimpleNamespace(
         client_id=7, camera=camera, scene=SimpleNamespace(set_background_image=lambda image, **_: drawn.append(image))

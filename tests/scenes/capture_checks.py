@@ -11,29 +11,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from small_capture import HEIGHT, WIDTH, Truth, preview, reprojection_error, run, run_stages
 
 from reffusion.io import colmap
 from reffusion.io.files import BadInput
 from reffusion.types import Scene
+from scenes.capture import HEIGHT, WIDTH, Truth, preview_stages, reprojection_error, run_stages, run_stages_into
 
-SHARE = 1 / 16  # of a view, the rectangle that `small_capture.write_masks` masks
+SHARE = 1 / 16  # of a view, the rectangle that `scenes.capture.write_masks` masks
 EXACT = 0.01  # px, between a pinhole camera and the truth
 OBJECT = np.zeros((HEIGHT, WIDTH), bool)
 OBJECT[HEIGHT // 4 : HEIGHT // 2, WIDTH // 4 : WIDTH // 2] = True
 
 
-def attempt(folder: Path, **params) -> tuple[Scene, Path, list[str]]:
+def run_with_messages(folder: Path, **params) -> tuple[Scene, Path, list[str]]:
     """Preview and run `poses`: the scene, its folder, and all sentences that either says, paths below `folder`."""
-    sentences = preview(folder, **params)
+    sentences = preview_stages(folder, **params)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        scene, out = run(folder, **params)
+        scene, out = run_stages(folder, **params)
     sentences += [str(each.message) for each in caught]
     return scene, out, [each.replace(str(folder), "") for each in sentences]  # whose path may hold any word or number
 
 
-def assert_sentence(sentences: Iterable[str], *words: str) -> None:
+def assert_message(sentences: Iterable[str], *words: str) -> None:
     """One of the sentences holds all the words; numbers count as whole numbers."""
     sentences = list(sentences)
     patterns = [rf"(?<![\d.]){word}(?![\d])" if word.isdigit() else re.escape(word) for word in words]
@@ -41,22 +41,22 @@ def assert_sentence(sentences: Iterable[str], *words: str) -> None:
     assert found, f"no sentence with {words} among {sentences}"
 
 
-def refusal(folder: Path, **params) -> str:
-    """The one line with which `preview` refuses."""
+def refusal_message(folder: Path, **params) -> str:
+    """The one line with which `preview_stages` refuses."""
     with pytest.raises(BadInput) as caught:
-        preview(folder, **params)
+        preview_stages(folder, **params)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
-def refusal_before_work(folder: Path, **params) -> str:
-    """The one line with which `preview`, or `run` before it writes anything, refuses what only pixels show."""
+def refusal_before_writing(folder: Path, **params) -> str:
+    """The one line with which `preview_stages`, or `run_stages_into` before it writes anything, refuses what only pixels show."""
     out = folder.parent / f"{folder.name}_refused"
     out.mkdir()
     with pytest.raises(BadInput) as caught, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        preview(folder, **params)
-        run_stages(folder, out, **params)
+        preview_stages(folder, **params)
+        run_stages_into(folder, out, **params)
     written = sorted(path.name for path in out.iterdir())
     assert "\n" not in str(caught.value) and not written, (str(caught.value), written)
     return str(caught.value)
@@ -72,12 +72,12 @@ def assert_cameras(scene: Scene, truth: Truth) -> None:
         assert found == pytest.approx((at.fx, at.fy, at.cx, at.cy), abs=EXACT), name
 
 
-def renamed(truth: Truth, names: Mapping[str, str]) -> Truth:
+def rename_views(truth: Truth, names: Mapping[str, str]) -> Truth:
     """The truth of the views in `names`, under their new names."""
     return replace(truth, world_to_camera={new: truth.world_to_camera[old] for old, new in names.items()})
 
 
-def part(truth: Truth, first: int, last: int) -> Truth:
+def select_views(truth: Truth, first: int, last: int) -> Truth:
     """The truth of the views from `first` up to `last`."""
     return replace(truth, world_to_camera=dict(sorted(truth.world_to_camera.items())[first:last]))
 
@@ -116,7 +116,7 @@ def masked_views(out: Path) -> list[str]:
     return sorted(path.stem for path in (out / "masks").glob("*.png"))
 
 
-def assert_masked(out: Path, views: Iterable[str], share: float = SHARE) -> None:
+def assert_masked_views(out: Path, views: Iterable[str], share: float = SHARE) -> None:
     """Exactly these views have a mask, of the share, and no objects are told apart."""
     views = sorted(views)
     assert masked_views(out) == views, masked_views(out)

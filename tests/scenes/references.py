@@ -5,20 +5,20 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import small_scene as small
 from PIL import Image
 
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.images import save_image
 from reffusion.io.scene import load_references, load_scene, save_mask_sets
 from reffusion.types import MaskSet, Reference
+from scenes import wall_scene
 from stages import reference
 
 SIZE = (160, 120)
 COMMON = {"inpainter": "exemplar"}
 
 
-def pattern(seed: int, size=SIZE) -> np.ndarray:
+def natural_noise(seed: int, size=SIZE) -> np.ndarray:
     """uint8 [H, W, 3] with as much energy in each octave, as photographs have."""
     rng, (width, height) = np.random.default_rng(seed), size
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None]).clip(1 / width)
@@ -27,7 +27,7 @@ def pattern(seed: int, size=SIZE) -> np.ndarray:
     return np.stack([np.clip(128 + 40 * f / f.std(), 0, 255) for f in mixed], -1).astype(np.uint8)
 
 
-def from_another_tool(image: np.ndarray, scale=0.97, crop=5, quality=80, gain=0.92) -> np.ndarray:
+def resize_and_compress(image: np.ndarray, scale=0.97, crop=5, quality=80, gain=0.92) -> np.ndarray:
     """Resized, cropped at its upper left, darker, and saved as JPEG."""
     size = tuple(round(side * scale) for side in image.shape[1::-1])
     small_one = cv2.resize(image, size, interpolation=cv2.INTER_AREA)[crop:, crop:]
@@ -40,28 +40,28 @@ def psnr(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / max(((a.astype(float) - b)[where] ** 2).mean(), 1e-3)))
 
 
-def named(view, image="ref.png", **more):
+def reference_entry(view, image="ref.png", **more):
     return {"reference": {"view": view, "image": image, **more}}
 
 
-def write_wall(folder: Path) -> dict[str, Path]:
+def write_wall_stages(folder: Path) -> dict[str, Path]:
     """The folders that the stage is handed, of the wall with a square before it; a2's hole is to be invented."""
-    made_poses, fitted, labels = small.write(folder, 1.6)
-    small.write_photos(folder / "scene", made_poses, small.CAMERAS)
+    made_poses, fitted, labels = wall_scene.write_poses_and_fit(folder, 1.6)
+    wall_scene.write_capture_photos(folder / "scene", made_poses, wall_scene.CAMERAS)
     sets = {}
-    for name, camera in small.CAMERAS.items():
-        mask, unseen = small.true_mask(camera, 1.6), small.true_never_seen(camera, 1.6)
+    for name, camera in wall_scene.CAMERAS.items():
+        mask, unseen = wall_scene.true_mask(camera, 1.6), wall_scene.true_unobserved(camera, 1.6)
         sets[name] = MaskSet(mask, mask, unseen, unseen)
-        photo = np.where(mask[..., None], np.uint8([230, 26, 26]), small.photo(camera))
+        photo = np.where(mask[..., None], np.uint8([230, 26, 26]), wall_scene.photo(camera))
         save_image(made_poses / "images" / f"{name}.png", photo)
     save_mask_sets(folder / "masks", sets)
     save_labels(folder / "masks" / "labels.npy", labels)
     save_json(folder / "masks" / "facts.json", {"best_reference": "a2"})
-    small.write_background(made_poses, fitted, folder / "masks")
+    wall_scene.write_background(made_poses, fitted, folder / "masks")
     return {"scene": folder / "scene", "poses": made_poses, "fit": fitted, "masks": folder / "masks"}
 
 
-def completed(wall: dict[str, Path], out: Path, **params) -> dict[str, Reference]:
+def run_reference_stage(wall: dict[str, Path], out: Path, **params) -> dict[str, Reference]:
     """View name -> reference, as the stage writes it."""
     out.mkdir()
     reference.run(reference.Params(**COMMON, **params), out, **wall)

@@ -37,7 +37,7 @@ class Truth:
         return lens.from_colmap(self.model[0], WIDTH, HEIGHT, self.model[1])
 
 
-def some_truth(model=PINHOLE, views=6, scale=1.0, offset=(0.0, 0.0, 0.0)) -> Truth:
+def make_truth(model=PINHOLE, views=6, scale=1.0, offset=(0.0, 0.0, 0.0)) -> Truth:
     """Cameras on an arc, 4 away from a cloud of points around the offset."""
     generator, cameras, offset = np.random.default_rng(3), {}, np.array(offset)
     for k in range(views):
@@ -113,7 +113,7 @@ def write_poses_bounds(folder: Path, truth: Truth, factor=4) -> None:
     np.save(folder / "poses_bounds.npy", np.array(rows))
 
 
-def prepare(folder: Path, layout: str, truth: Truth) -> Path:
+def write_capture(folder: Path, layout: str, truth: Truth) -> Path:
     """Pictures, masks and poses in one of the layouts."""
     images = folder / ("images_4" if layout.startswith("llff") else "images")
     write_pictures(images, truth.world_to_camera)
@@ -129,7 +129,7 @@ def prepare(folder: Path, layout: str, truth: Truth) -> Path:
 
 def write_spin_nerf(folder: Path, test=2, full=True, mask_value=1, label_size=(WIDTH, HEIGHT + 3)) -> Truth:
     """A scene as SPIn-NeRF publishes its own, but 6 views of which the first `test` are test views."""
-    truth = some_truth(RADIAL)
+    truth = make_truth(RADIAL)
     names = sorted(truth.world_to_camera)
     write_pictures(folder / "images_4", names)
     if full:
@@ -141,22 +141,22 @@ def write_spin_nerf(folder: Path, test=2, full=True, mask_value=1, label_size=(W
     return truth
 
 
-def run(folder: Path, **params):
+def run_stages(folder: Path, **params):
     """The scene, and the folder in which both stages leave what they make of it."""
     out = folder.parent / (folder.name + "_out")
     out.mkdir(exist_ok=True)
-    run_stages(folder, out, **params)
+    run_stages_into(folder, out, **params)
     return load_scene(out), out
 
 
-def run_stages(folder: Path, out: Path, **params) -> None:
+def run_stages_into(folder: Path, out: Path, **params) -> None:
     """`poses` and `raw_masks` into the same folder, after the preview of the masks, which `poses` does not read."""
     raw_masks_plan.preview(_mask_params(params), scene=folder)
     poses.run(poses.Params(**params), out, scene=folder)
     raw_masks.run(_mask_params(params), out, scene=folder, poses=out)
 
 
-def preview(folder: Path, **params) -> list[str]:
+def preview_stages(folder: Path, **params) -> list[str]:
     """What both stages say before they run."""
     notes = poses_plan.preview(poses.Params(**params), folder)
     return notes + raw_masks_plan.preview(_mask_params(params), scene=folder)
