@@ -7,26 +7,25 @@ import pytest
 import torch
 from scenes import wall_scene
 from scenes.cameras import look_at_camera, make_camera, yaw
+from scenes.stage_runs import run_through_masks, write_true_references
 
 from reffusion import geometry
 from reffusion.background.model import Background
 from reffusion.depth import background_depth
-from reffusion.depth.background_depth import Completion
 from reffusion.gaussians.optimize import reconstruction_loss
 from reffusion.gaussians.sheets import Sheets, sheet_gaussians
 from reffusion.gaussians.surfels import surface_gaussians, surface_normals
-from reffusion.initialize import coverage, fill
+from reffusion.initialize import coverage
 from reffusion.initialize import unprojection as rules
 from reffusion.initialize.draft import Draft
 from reffusion.initialize.refit import Supervision, crop_to_mask, repetitions
-from reffusion.io.arrays import load_json, load_labels, save_labels
-from reffusion.io.images import load_exr
+from reffusion.io.arrays import load_labels
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_mask_sets, save_references
+from reffusion.io.scene import load_mask_sets
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Reference
-from stages import initialize, masks
+from stages import initialize
 
 NEAR = 1.7
 SHEETS = Sheets()
@@ -34,76 +33,7 @@ SHEETS = Sheets()
 
 @pytest.fixture(scope="module")
 def stage_folders(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene")
-    poses, fit, _ = wall_scene.write_poses_and_fit(folder, NEAR)
-    (folder / "masks").mkdir()
-    masks.run(masks.Params(), folder / "masks", poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
-    return {"poses": poses, "fit": fit, "masks": folder / "masks"}
-
-
-def write_references(stage_folders, folder, *names):
-    sets = load_mask_sets(stage_folders["masks"], names)
-    save_references(
-        folder,
-        [Reference(wall_scene.CAMERAS[n], wall_scene.photo(wall_scene.CAMERAS[n]), sets[n].invent) for n in names],
-    )
-    return folder
-
-
-@pytest.mark.parametrize("how", [{}, {"planar_share": 2.0}], ids=["planes", "smooth"])
-def test_the_hidden_wall_is_rebuilt_where_it_was(stage_folders, tmp_path, monkeypatch, how):
-    monkeypatch.setattr(fill, "COMPLETION", Completion(**how))
-    initialize.run(
-        initialize.Params(), tmp_path, **stage_folders, reference=write_references(stage_folders, tmp_path / "r", "a2")
-    )
-    gaussians, new = load_ply(tmp_path / "gaussians.ply"), load_labels(tmp_path / "labels.npy")
-    before, removed = (
-        load_ply(stage_folders["fit"] / "gaussians.ply"),
-        load_labels(stage_folders["masks"] / "labels.npy"),
-    )
-    haze = load_json(tmp_path / "facts.json")["floaters"]
-    assert len(gaussians) == len(new) and int((~new).sum()) == len(before) - int(removed.sum()) - haze
-    sheet = wall_scene.WALL / wall_scene.FOCAL * SHEETS.offset_px  # the second one lies so far behind the wall
-    distance = gaussians.means[new][:, 2] - wall_scene.WALL
-    assert (torch.minimum(distance.abs(), (distance - sheet).abs()) < 0.03).all() and (distance.abs() < 0.03).any()
-    depth = load_exr(tmp_path / "depth" / "a2.exr")
-    assert np.abs(depth - wall_scene.WALL).max() < 0.04
-    for name in wall_scene.TEST:
-        view = wall_scene.CAMERAS[name]
-        drawn = rasterizer.render(gaussians, view)
-        inner = wall_scene.true_mask(view, NEAR)
-        error = np.abs(drawn.color.numpy() - wall_scene.photo(view) / 255)[inner]
-        assert error.mean() < 0.03 and drawn.alpha.numpy()[inner].min() > 0.85
-    assert load_json(tmp_path / "facts.json")["uncovered_share"] < 0.15
-
-
-def test_without_references_it_only_removes(stage_folders, tmp_path):
-    initialize.run(initialize.Params(), tmp_path, **stage_folders, reference=None)
-    labels = load_labels(stage_folders["masks"] / "labels.npy")
-    before, after = load_ply(stage_folders["fit"] / "gaussians.ply"), load_ply(tmp_path / "gaussians.ply")
-    haze = load_json(tmp_path / "facts.json")["floaters"]
-    assert len(after) == len(before) - int(labels.sum()) - haze and haze < 0.01 * len(before)
-    assert not load_labels(tmp_path / "labels.npy").any()
-
-
-def test_a_second_reference_fills_only_what_the_first_left(stage_folders, tmp_path):
-    counts = []
-    for names in (("a2",), ("a2", "a4")):
-        out = tmp_path / "".join(names)
-        out.mkdir()
-        initialize.run(
-            initialize.Params(), out, **stage_folders, reference=write_references(stage_folders, out / "r", *names)
-        )
-        counts.append(int(load_labels(out / "labels.npy").sum()))
-    assert counts[0] <= counts[1] < 1.5 * counts[0]
-
-
-def test_labels_of_another_fit_are_refused(stage_folders, tmp_path):
-    wrong = tmp_path / "masks"
-    wrong.mkdir()
-    save_labels(wrong / "labels.npy", np.zeros(3, bool))
-    with pytest.raises(ValueError, match="3 labels for"):
-        initialize.run(initialize.Params(), tmp_path, **(stage_folders | {"masks": wrong}), reference=None)
+    return run_through_masks(tmp_path_factory.mktemp("scene"), NEAR)
 
 
 def slanted_disparity(degrees: float):
@@ -272,7 +202,7 @@ def test_settling_moves_the_gaussians_and_leaves_no_checkpoint(stage_folders, tm
     for name, steps in (("none", 0), ("first", 40), ("again", 40)):
         out = tmp_path / name
         out.mkdir()
-        given = write_references(stage_folders, out / "r", "a2")
+        given = write_true_references(out / "r", stage_folders["masks"], "a2")
         initialize.run(
             initialize.Params(refit_steps=steps, view_dependent_color=True, depth={"sweep": True}, extra_views=2),
             out,

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from scenes import wall_scene
+from scenes.stage_runs import run_masks
 
 from reffusion.capture import image_detail
 from reffusion.io.arrays import load_json
@@ -22,7 +23,7 @@ ROOT = Path(__file__).resolve().parent.parent
 UNUSED = ("diffusers", "transformers", "peft", "tokenizers", "pycolmap", "torchvision", "viser", "ray", "gsplat")
 
 
-STAGES = """
+RUN_STAGES = """
 import sys
 from pathlib import Path
 from stages import evaluate, finish, initialize, masks
@@ -42,7 +43,7 @@ print(sorted({name.split(".")[0] for name in sys.modules} & set(sys.argv[2].spli
 
 def test_a_scene_whose_background_is_seen_imports_no_diffusion(tmp_path):
     wall_scene.write_poses_and_fit(tmp_path, 0.8)  # far from the wall: each view shows what the others miss
-    command = [sys.executable, "-c", STAGES, str(tmp_path), " ".join(UNUSED)]
+    command = [sys.executable, "-c", RUN_STAGES, str(tmp_path), " ".join(UNUSED)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert load_json(tmp_path / "masks/facts.json")["invent_pixels"] == 0
@@ -70,9 +71,7 @@ def test_few_unseen_pixels_are_negligible_and_it_can_be_forced(tmp_path):
     poses, fitted, _ = wall_scene.write_poses_and_fit(tmp_path, 0.8)
 
     def classified(**params):
-        out = tmp_path / "-".join(map(str, params.values()))
-        out.mkdir()
-        masks.run(masks.Params(**params), out, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fitted)
+        out = run_masks(poses, fitted, tmp_path / "-".join(map(str, params.values())), masks.Params(**params))
         return load_mask_sets(out, wall_scene.TRAIN).values(), load_json(out / "facts.json")
 
     sets, facts = classified(negligible=0.0)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from scenes import wall_scene
+from scenes.stage_runs import run_masks
 
 from reffusion import geometry, morphology
 from reffusion.io.arrays import load_json, load_labels, save_json
@@ -12,16 +13,14 @@ from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets
 from reffusion.masks import consolidation, regions, voting
 from reffusion.types import Gaussians
-from stages.masks import Params, run
+from stages.masks import Params
 
 NEAR, FAR = 1.7, 0.8  # a square close to the wall hides part of it from all views; a distant one next to nothing
 
 
-def run_masks(tmp_path, square_at, params=None, **scene):
+def classify(tmp_path, square_at, params=None, **scene):
     poses, fit, labels = wall_scene.write_poses_and_fit(tmp_path, square_at, **scene)
-    out = tmp_path / "masks"
-    out.mkdir()
-    run(params or Params(), out, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
+    out = run_masks(poses, fit, tmp_path / "masks", params)
     found = load_labels(out / "labels.npy")
     return load_mask_sets(out, wall_scene.CAMERAS), load_json(out / "facts.json"), found, labels
 
@@ -104,7 +103,7 @@ def test_tidy_removes_specks_and_closes_gaps():
 
 
 def test_consistent_and_undecided_masks_match_the_truth(tmp_path):
-    sets, facts, found, labels = run_masks(tmp_path, NEAR)
+    sets, facts, found, labels = classify(tmp_path, NEAR)
     assert (found == labels).float().mean() > 0.99
     for name, view in wall_scene.CAMERAS.items():
         assert wall_scene.iou(sets[name].consistent, wall_scene.true_mask(view, NEAR)) > 0.9
@@ -117,7 +116,7 @@ def test_consistent_and_undecided_masks_match_the_truth(tmp_path):
 
 
 def test_what_other_views_saw_is_not_invented(tmp_path):
-    sets, facts, _, _ = run_masks(tmp_path, FAR)
+    sets, facts, _, _ = classify(tmp_path, FAR)
     assert all(
         wall_scene.iou(sets[n].consistent, wall_scene.true_mask(v, FAR)) > 0.9 for n, v in wall_scene.CAMERAS.items()
     )
@@ -128,7 +127,7 @@ def test_what_other_views_saw_is_not_invented(tmp_path):
 def test_a_missing_and_a_contradicting_mask_are_outvoted(tmp_path):
     given = {name: wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR) for name in wall_scene.TRAIN[1:]}
     given["a3"] = np.zeros_like(given["a3"])
-    sets, facts, _, _ = run_masks(tmp_path, NEAR, masks=given)
+    sets, facts, _, _ = classify(tmp_path, NEAR, masks=given)
     assert facts["voting_views"] == 4
     assert wall_scene.iou(sets["a0"].consistent, wall_scene.true_mask(wall_scene.CAMERAS["a0"], NEAR)) > 0.9
     assert not sets["a0"].raw.any()
@@ -147,7 +146,7 @@ def test_what_stands_inside_every_mask_is_the_object_although_it_was_outvoted(tm
     for hull in (0.9, 1.0):
         (tmp_path / str(hull)).mkdir()
         params = Params(hull=hull, debris=False)
-        _, _, found[hull], truth = run_masks(tmp_path / str(hull), NEAR, params, masks=given)
+        _, _, found[hull], truth = classify(tmp_path / str(hull), NEAR, params, masks=given)
     lost = truth & ~found[1.0]
     assert lost.sum() >= 4, "the vote alone leaves the spot standing"
     assert found[0.9][lost].all()
@@ -156,17 +155,17 @@ def test_what_stands_inside_every_mask_is_the_object_although_it_was_outvoted(tm
 
 def test_a_clean_view_shows_what_the_object_hid(tmp_path):
     given = {name: wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR) for name in wall_scene.TRAIN if name != "a2"}
-    sets, facts, _, _ = run_masks(tmp_path, NEAR, masks=given, clean=("a2",))
+    sets, facts, _, _ = classify(tmp_path, NEAR, masks=given, clean=("a2",))
     assert facts["voting_views"] == 5
     assert not sets["a2"].unobserved.any()
-    hidden = run_masks(tmp_path / "b", NEAR)[1] if (tmp_path / "b").mkdir() is None else None
+    hidden = classify(tmp_path / "b", NEAR)[1] if (tmp_path / "b").mkdir() is None else None
     assert facts["invent_pixels"] <= hidden["invent_pixels"]
 
 
 @pytest.mark.parametrize("value", [False, True])
 def test_empty_and_full_masks_are_handled(tmp_path, value):
     given = np.full((wall_scene.HEIGHT, wall_scene.WIDTH), value)
-    sets, facts, found, _ = run_masks(tmp_path, NEAR, masks=dict.fromkeys(wall_scene.TRAIN, given))
+    sets, facts, found, _ = classify(tmp_path, NEAR, masks=dict.fromkeys(wall_scene.TRAIN, given))
     assert bool(found.any()) == value
     assert all(each.consistent.mean() == (1.0 if value else 0.0) for each in sets.values())
     assert (facts["best_reference"] is None) == (not value)
@@ -175,9 +174,9 @@ def test_empty_and_full_masks_are_handled(tmp_path, value):
 def test_a_region_alone_marks_and_fills(tmp_path):
     poses, fit, labels = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})
     with pytest.raises(ValueError, match="neither masks nor a region"):
-        run(Params(), tmp_path, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
+        run_masks(poses, fit, tmp_path)
     save_json(tmp_path / "raw_masks/region.json", {"center": [0, 0, NEAR], "size": [0.5, 0.5, 0.1]})
-    run(Params(), tmp_path, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
+    run_masks(poses, fit, tmp_path)
     sets = load_mask_sets(tmp_path, wall_scene.CAMERAS)
     assert (load_labels(tmp_path / "labels.npy") == labels).all()
     rows, columns = np.nonzero(sets["a2"].invent)
@@ -191,7 +190,7 @@ def test_a_region_to_be_filled_removes_nothing_and_is_a_part_of_m(tmp_path, inve
     save_json(
         tmp_path / "raw_masks/region.json", {"center": [0, 0, NEAR], "size": [0.5] * 3, "round": True, "holds": False}
     )
-    run(Params(invent=invent), tmp_path, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
+    run_masks(poses, fit, tmp_path, Params(invent=invent))
     sets = load_mask_sets(tmp_path, wall_scene.CAMERAS)
     assert not load_labels(tmp_path / "labels.npy").any()
     assert not any(each.consistent.any() for each in sets.values())
@@ -205,7 +204,7 @@ def test_masks_say_what_is_to_be_filled(tmp_path):
     wanted[10:30, 5:40] = True
     for name in wall_scene.TRAIN:
         save_mask(tmp_path / "raw_masks/fill" / f"{name}.png", wanted)
-    run(Params(), tmp_path, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
+    run_masks(poses, fit, tmp_path)
     sets = load_mask_sets(tmp_path, wall_scene.CAMERAS)
     assert not load_labels(tmp_path / "labels.npy").any()
     assert all((sets[name].invent == wanted).all() and not sets[name].consistent.any() for name in wall_scene.TRAIN)
@@ -276,7 +275,7 @@ def test_any_subset_of_the_objects_goes_and_the_others_stay(tmp_path):
     for remove in (None, ["left"], ["right"], ["left", "right"]):
         out = tmp_path / f"masks-{remove}"
         out.mkdir()
-        run(Params(remove=remove), out, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
+        run_masks(poses, fit, out, Params(remove=remove))
         found[str(remove)] = load_labels(out / "labels.npy"), load_json(out / "facts.json")["kept"]
     everything, left, right, both = found.values()
     assert torch.equal(everything[0], both[0]) and everything[1] == both[1] == []

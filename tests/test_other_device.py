@@ -4,41 +4,37 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
 from other_device import gpu, there_is_one
 from scenes import wall_scene
+from scenes.stage_runs import run_masks, write_true_references
 
 from reffusion.io.arrays import load_labels
 from reffusion.io.ply import load_ply, save_ply
-from reffusion.io.scene import load_mask_sets, save_references
+from reffusion.io.scene import load_mask_sets
 from reffusion.masks import regions
-from reffusion.types import PARAMETERS, Reference
+from reffusion.types import PARAMETERS
 from stages import fit, initialize, masks
 
 NEAR = 1.7
 
 
 @pytest.fixture(scope="module")
-def ready(tmp_path_factory):
+def reference_folders(tmp_path_factory):
     """A small scene, whose colours may change with the direction, up to a reference."""
     home = tmp_path_factory.mktemp("scene")
-    poses, fitted, _ = wall_scene.write_poses_and_fit(home, NEAR)
-    gaussians = load_ply(fitted / "gaussians.ply")
+    poses, fit_folder, _ = wall_scene.write_poses_and_fit(home, NEAR)
+    gaussians = load_ply(fit_folder / "gaussians.ply")
     higher = torch.zeros(len(gaussians), 3, 3)
-    save_ply(fitted / "gaussians.ply", replace(gaussians, sh=torch.cat([gaussians.sh, higher], 1)))
-    (home / "masks").mkdir()
-    masks.run(masks.Params(), home / "masks", poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fitted)
-    hole = load_mask_sets(home / "masks", ["a2"])["a2"].invent
-    save_references(
-        home / "reference", [Reference(wall_scene.CAMERAS["a2"], wall_scene.photo(wall_scene.CAMERAS["a2"]), hole)]
-    )
-    return SimpleNamespace(home=home, poses=poses, fit=fitted)
+    save_ply(fit_folder / "gaussians.ply", replace(gaussians, sh=torch.cat([gaussians.sh, higher], 1)))
+    masks_folder = run_masks(poses, fit_folder, home / "masks")
+    reference = write_true_references(home / "reference", masks_folder, "a2")
+    return {"poses": poses, "fit": fit_folder, "masks": masks_folder, "reference": reference}
 
 
-def both(tmp_path, work) -> list:
+def run_on_both_devices(tmp_path, work) -> list:
     """The folders that `work(device, folder)` fills on the CPU and on the GPU."""
     folders = [tmp_path / "cpu", tmp_path / "cuda"]
     for folder in folders:
@@ -62,15 +58,10 @@ def test_the_stand_in_refuses_what_cuda_refuses():
 
 
 @pytest.mark.parametrize("vote", ["weight", "count"])
-def test_masks_on_a_card(ready, tmp_path, vote):
-    run = lambda device, out: masks.run(
-        masks.Params(device=device, vote=vote),
-        out,
-        poses=ready.poses,
-        raw_masks=ready.poses.with_name("raw_masks"),
-        fit=ready.fit,
-    )
-    cpu, cuda = both(tmp_path, run)
+def test_masks_on_a_card(reference_folders, tmp_path, vote):
+    poses, fit_folder = reference_folders["poses"], reference_folders["fit"]
+    run = lambda device, out: run_masks(poses, fit_folder, out, masks.Params(device=device, vote=vote))
+    cpu, cuda = run_on_both_devices(tmp_path, run)
     assert torch.equal(load_labels(cpu / "labels.npy"), load_labels(cuda / "labels.npy"))
     before, after = (load_mask_sets(folder, wall_scene.TRAIN) for folder in (cpu, cuda))
     for name in wall_scene.TRAIN:
@@ -92,10 +83,10 @@ def test_a_box_on_a_card():
     [{"view_dependent_color": True, "refit_steps": 2, "extra_views": 1}, {"start": "random"}, {"start": "nothing"}],
     ids=["reference", "random", "nothing"],
 )
-def test_initialize_on_a_card(ready, tmp_path, changed):
-    needs = {"poses": ready.poses, "fit": ready.fit, "masks": ready.home / "masks"}
-    needs |= {"reference": ready.home / "reference"}
-    cpu, cuda = both(tmp_path, lambda d, out: initialize.run(initialize.Params(device=d, **changed), out, **needs))
+def test_initialize_on_a_card(reference_folders, tmp_path, changed):
+    cpu, cuda = run_on_both_devices(
+        tmp_path, lambda d, out: initialize.run(initialize.Params(device=d, **changed), out, **reference_folders)
+    )
     assert torch.equal(load_labels(cpu / "labels.npy"), load_labels(cuda / "labels.npy"))
     before, after = (load_ply(folder / "gaussians.ply") for folder in (cpu, cuda))
     for name in PARAMETERS:  # settling takes other kernels of SSIM and Adam there, which round otherwise
@@ -103,11 +94,13 @@ def test_initialize_on_a_card(ready, tmp_path, changed):
         assert (~near).float().mean() <= (0.01 if there_is_one() else 0), name
 
 
-def test_a_fit_on_a_card(ready, tmp_path):
+def test_a_fit_on_a_card(reference_folders, tmp_path):
     changed = {"iterations": 6, "sh.degree": 1, "densify.cap_max": 300, "holdout": 3, "densify.stop": 0.5}
     changed |= {"densify.every": 2, "densify.start": 0.1, "checkpoint_seconds": 1e-9}
-    run = lambda device, out: fit.run(fit.Params().changed(changed | {"device": device}), out, poses=ready.poses)
-    cpu, cuda = both(tmp_path, run)
+    run = lambda device, out: fit.run(
+        fit.Params().changed(changed | {"device": device}), out, poses=reference_folders["poses"]
+    )
+    cpu, cuda = run_on_both_devices(tmp_path, run)
     before, after = (load_ply(folder / "gaussians.ply") for folder in (cpu, cuda))
     assert len(before) == len(after)
     assert all(torch.allclose(getattr(before, n), getattr(after, n), atol=2e-2) for n in PARAMETERS)

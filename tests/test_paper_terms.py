@@ -12,6 +12,7 @@ import torch
 from scenes import wall_scene
 from scenes.networks import small_prior
 from scenes.settings import with_changes
+from scenes.stage_runs import run_masks
 from test_distill import random_wall, train_view, wall_camera
 
 from reffusion.background.model import Background
@@ -50,7 +51,7 @@ def prior():
 
 
 @pytest.fixture(scope="module")
-def views_of(tmp_path_factory):
+def load_views_with(tmp_path_factory):
     """(parameters) -> the training views of a scene where I lies beside C, and view a3 has no I."""
     home = tmp_path_factory.mktemp("insertion")
     poses, fitted, _ = wall_scene.write_poses_and_fit(home, NEAR, clean=("a4",))
@@ -67,8 +68,8 @@ def views_of(tmp_path_factory):
     return made, torch.from_numpy(hidden), torch.from_numpy(drawn)
 
 
-def test_photographs_do_not_supervise_where_an_object_is_drawn(views_of):
-    made, hidden, drawn = views_of
+def test_photographs_do_not_supervise_where_an_object_is_drawn(load_views_with):
+    made, hidden, drawn = load_views_with
     views = made()
     assert torch.equal(views["a0"].supervises, ~(hidden | drawn)) and torch.equal(views["a3"].supervises, ~hidden)
     assert views["a4"].clean and views["a4"].supervises.all()
@@ -76,8 +77,8 @@ def test_photographs_do_not_supervise_where_an_object_is_drawn(views_of):
     assert torch.equal(not_seen, hidden | drawn)
 
 
-def test_a_view_without_invented_pixels_is_distilled_where_c_is_repainted(views_of):
-    made, hidden, _ = views_of
+def test_a_view_without_invented_pixels_is_distilled_where_c_is_repainted(load_views_with):
+    made, hidden, _ = load_views_with
     assert not made(repaint="invent")["a3"].repaint.any()
     views = made(repaint="consistent")
     assert torch.equal(views["a3"].repaint, hidden) and not views["a4"].repaint.any()
@@ -100,15 +101,9 @@ def test_a_clean_view_can_be_a_reference(tmp_path):
     paths = {name: tmp_path / name for name in ("scene", "poses", "fit", "masks", "reference", "initialize")}
     poses, fitted, _ = wall_scene.write_poses_and_fit(tmp_path, NEAR, clean=("a2",))
     wall_scene.write_capture_photos(paths["scene"], poses, wall_scene.CAMERAS)
-    for name in ("masks", "reference", "initialize"):
+    for name in ("reference", "initialize"):
         paths[name].mkdir()
-    masks.run(
-        masks.Params(invent="consistent"),
-        paths["masks"],
-        poses=poses,
-        raw_masks=poses.with_name("raw_masks"),
-        fit=fitted,
-    )
+    run_masks(poses, fitted, paths["masks"], masks.Params(invent="consistent"))
     given = {"view": "a2", "image": "images/a2.png"}
     asked = reference.Params(reference=given)
     reference.run(asked, paths["reference"], **{k: paths[k] for k in ("scene", "poses", "fit", "masks")})

@@ -10,6 +10,7 @@ import torch
 from plyfile import PlyData
 from scenes import wall_scene
 from scenes.capture import make_truth, write_capture
+from scenes.stage_runs import run_masks
 
 from reffusion.capture.layouts import ring
 from reffusion.fit import exposure
@@ -22,7 +23,7 @@ from reffusion.io.scene import load_mask_sets, load_scene
 from reffusion.splat import rasterizer
 from reffusion.types import Gaussians, Similarity
 from report import patch
-from stages import masks, poses
+from stages import poses
 from stages.plan import poses as planned
 
 NEAR = 1.7  # of the square before the wall, small_scene's
@@ -200,8 +201,7 @@ def test_a_walled_in_hole_is_in_sight_from_nowhere():
 def test_what_was_deleted_stands_for_votes(tmp_path):
     folder, fit, labels = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})
     save_labels(folder / "deleted.npy", labels)
-    (out := tmp_path / "masks").mkdir()
-    masks.run(masks.Params(), out, poses=folder, raw_masks=folder.with_name("raw_masks"), fit=fit)
+    out = run_masks(folder, fit, tmp_path / "masks")
     assert (load_labels(out / "labels.npy") | ~labels).all()
     found = load_mask_sets(out, wall_scene.CAMERAS)
     for name in wall_scene.TRAIN:
@@ -218,7 +218,7 @@ def test_gaussians_in_another_frame_than_the_cameras_are_refused(tmp_path, moved
         save_ply(path / "gaussians.ply", shifted)
     save_labels(folder / "deleted.npy", labels)
     with pytest.raises(ValueError, match=r"`gaussians` of scene\.yaml: .* in another frame"):
-        masks.run(masks.Params(), tmp_path, poses=folder, raw_masks=folder.with_name("raw_masks"), fit=fit)
+        run_masks(folder, fit, tmp_path)
 
 
 # ---------------------------------------------------------------------------------------------- what is given back
