@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scenes.distill_scene import write_initialized_run
 from scenes.networks import small_prior
-from test_sds_variance import write_initialized_run
 
 from benchmarks.studies import adapted, scene_priors
 from reffusion.io.arrays import save_labels

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 from browser import visiting
-from test_compare import FILES, write_project
-from test_compare import make_request as asked
+from scenes.toy_projects import COMPARE_FILES, make_request, write_project
 
 from report import batch as page
 from runner import Refused
@@ -25,7 +24,7 @@ from runner.progress import Progress
 from runner.resolve import Request
 
 REPO = Path(__file__).resolve().parent.parent
-STAGE = FILES["stages/distill.py"].replace(
+STAGE = COMPARE_FILES["stages/distill.py"].replace(
     "    time.sleep(params.pause)\n",
     """    import os
     begun = time.time()
@@ -72,7 +71,7 @@ def local_engine(cores: int, memory_mb: int = 10_000) -> LocalEngine:
 
 def test_several_at_once_and_a_second_call_runs_what_failed(tmp_path, capsys):
     root = write_projects(tmp_path, meet=3)
-    assert batch(asked(root, ""), root / "many", Execution(local_engine(4))) == 1
+    assert batch(make_request(root, ""), root / "many", Execution(local_engine(4))) == 1
     output = capsys.readouterr().out
     assert "4 scenes, 4 at once, 1 core each" in output
     assert re.search(r"^\d\d:\d\d:\d\d a: distill", output, re.MULTILINE)
@@ -86,7 +85,7 @@ def test_several_at_once_and_a_second_call_runs_what_failed(tmp_path, capsys):
     assert "c,failed," in (root / "runs/results.csv").read_text()
     assert "poses: done in" in (root / "runs/a/output.log").read_text()
     (root / "many/c/number.txt").write_text("20")
-    assert batch(asked(root, ""), root / "many", Execution(local_engine(4))) == 0
+    assert batch(make_request(root, ""), root / "many", Execution(local_engine(4))) == 0
     assert len(read_spans(root)) == 4 and "failed" not in (root / "runs/results.md").read_text()
     (root / "alone").mkdir()
     for other in "ac":  # it waits for three
@@ -102,7 +101,7 @@ def test_several_at_once_and_a_second_call_runs_what_failed(tmp_path, capsys):
 def test_never_more_than_there_are_cores_or_memory(tmp_path, cores, memory_mb, most):
     """By pipeline.yaml 500 MB, and 100 for each MB of what poses wrote (next to nothing); then by what it last took."""
     root = write_projects(tmp_path, 0.5, "memory: {distill: {mb: 600, each: 100}}\n")
-    batch(asked(root, ""), root / "many", Execution(local_engine(cores, memory_mb), 1))
+    batch(make_request(root, ""), root / "many", Execution(local_engine(cores, memory_mb), 1))
     assert len(read_spans(root)) == 3 and max_concurrent(read_spans(root)) <= most
 
 
@@ -118,13 +117,13 @@ def test_what_is_killed_beside_others_goes_on_alone(tmp_path):
     time.sleep(params.pause)
 """
     (root / "stages/distill.py").write_text(stage.replace("    time.sleep(params.pause)\n", kill))
-    assert batch(asked(root, ""), root / "many", Execution(local_engine(4))) == 1
+    assert batch(make_request(root, ""), root / "many", Execution(local_engine(4))) == 1
     assert len(read_spans(root)) == 3 and max_concurrent(read_spans(root)[-1:]) == 1
 
 
 def test_cores_are_as_asked_for(tmp_path):
     root = write_projects(tmp_path, 0.0)
-    batch(asked(root, "", variant="better"), root / "many", Execution(local_engine(4), 2))
+    batch(make_request(root, "", variant="better"), root / "many", Execution(local_engine(4), 2))
     assert {threads for _, _, threads, _ in read_spans(root)} == {"2"}
     assert (root / "runs/results@better.csv").is_file()
 
@@ -132,7 +131,7 @@ def test_cores_are_as_asked_for(tmp_path):
 def test_variants_of_several_scenes_at_once(tmp_path):
     root = write_projects(tmp_path, 0.1)
     assert (
-        compare(asked(root, ""), "better,twin", data=root / "many", execution=Execution(local_engine(4))) == 3
+        compare(make_request(root, ""), "better,twin", data=root / "many", execution=Execution(local_engine(4))) == 3
     )  # of scene c
     lines = (root / "runs/ran.txt").read_text().splitlines()
     assert sorted(lines) == sorted(set(lines)), "what is equal is done once"
@@ -143,8 +142,8 @@ def test_variants_of_several_scenes_at_once(tmp_path):
 def test_stopped_while_several_run(tmp_path):
     root = write_projects(tmp_path, 60)
     code = "import sys; from test_batch import *; signal.signal(signal.SIGINT, signal.default_int_handler);"
-    code = f"{code} batch(asked(Path(sys.argv[1]), ''), Path(sys.argv[1]) / 'many',"
-    code = f"{code} Execution(machine(4)))"
+    code = f"{code} batch(make_request(Path(sys.argv[1]), ''), Path(sys.argv[1]) / 'many',"
+    code = f"{code} Execution(local_engine(4)))"
     environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO}/tests"}
     process = subprocess.Popen([sys.executable, "-c", code, str(root)], env=environment, stderr=subprocess.DEVNULL)
     until = time.monotonic() + 60
@@ -155,8 +154,8 @@ def test_stopped_while_several_run(tmp_path):
     assert process.wait(30) != 0
     assert not (root / "runs/spans.txt").exists()
     assert not subprocess.run(["pgrep", "-f", f"runner.worker run.*{root}"], capture_output=True).stdout
-    (root / "stages/distill.py").write_text(FILES["stages/distill.py"])
-    assert batch(asked(root, ""), root / "many", Execution(local_engine(4))) == 1
+    (root / "stages/distill.py").write_text(COMPARE_FILES["stages/distill.py"])
+    assert batch(make_request(root, ""), root / "many", Execution(local_engine(4))) == 1
     assert (root / "runs/ran.txt").read_text().count("poses") == 3
 
 
@@ -164,10 +163,10 @@ def test_what_ended_when_the_runner_was_interrupted_is_not_done_again(tmp_path):
     """`distill` takes no notice of Ctrl-C; `evaluate` after it is not begun."""
     root = write_projects(tmp_path, 0.0)
     takes = "    import signal\n    signal.signal(2, signal.SIG_IGN)\n    (out / 'begun').touch()\n    time.sleep(2)\n"
-    stage = FILES["stages/distill.py"].replace("    time.sleep(params.pause)\n", takes)
+    stage = COMPARE_FILES["stages/distill.py"].replace("    time.sleep(params.pause)\n", takes)
     (root / "stages/distill.py").write_text(stage)
     code = "import sys; from test_batch import *; signal.signal(signal.SIGINT, signal.default_int_handler);"
-    code = f"{code} run_scene(asked(Path(sys.argv[1])), 'all')"
+    code = f"{code} run_scene(make_request(Path(sys.argv[1])), 'all')"
     environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO}/tests"}
     process = subprocess.Popen([sys.executable, "-c", code, str(root)], env=environment, stderr=subprocess.DEVNULL)
     until = time.monotonic() + 60
@@ -203,7 +202,7 @@ def test_the_live_table(tmp_path):
 
 def test_the_page_of_a_batch(tmp_path, capsys):
     root = write_projects(tmp_path, 0.0)
-    batch(asked(root, ""), root / "many", Execution(local_engine(2)))
+    batch(make_request(root, ""), root / "many", Execution(local_engine(2)))
     made = page.make(root / "runs/results.json")
     with visiting(made.as_uri()) as browser:
         assert "3 of 4 scenes done, 1 failed" in browser.inner_text("body")

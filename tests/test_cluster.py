@@ -13,8 +13,8 @@ import time
 from pathlib import Path
 
 import pytest
-from test_batch import FILES, read_spans, write_projects, written
-from test_compare import make_request as asked
+from scenes.toy_projects import COMPARE_FILES, make_request, write_project
+from test_batch import read_spans, write_projects
 from test_faults import assert_artifacts_complete
 
 from runner.compare import compare
@@ -63,7 +63,7 @@ def make_task(root: Path) -> Task:
 
 
 def test_an_attempt_works_in_a_folder_of_its_own_and_goes_on_from_the_one_before(tmp_path):
-    root = written(tmp_path)
+    root = write_project(tmp_path)
     out = root / "runs/toy/.partial-distill-1"
     lost = out.with_name(out.name + ".0abc")
     lost.mkdir(parents=True)
@@ -78,7 +78,7 @@ def test_an_attempt_works_in_a_folder_of_its_own_and_goes_on_from_the_one_before
 
 def test_one_that_was_given_up_for_lost_writes_nowhere(tmp_path, monkeypatch):
     """While it works, another takes over and ends."""
-    root = written(tmp_path)
+    root = write_project(tmp_path)
     out = root / "runs/toy/.partial-distill-1"
 
     def work(task: Task, should_stop=None) -> StageResult:
@@ -97,7 +97,7 @@ def test_one_that_was_given_up_for_lost_writes_nowhere(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("heeds", [True, False])
 def test_one_that_is_told_to_end_is_interrupted_and_one_that_had_finished_has(tmp_path, heeds):
-    root = written(tmp_path)
+    root = write_project(tmp_path)
     out = root / "runs/toy/.partial-distill-1"
     wait = """    try:
         (out / "checkpoint.pt").touch()
@@ -106,7 +106,9 @@ def test_one_that_is_told_to_end_is_interrupted_and_one_that_had_finished_has(tm
         if HEEDS:
             raise
 """
-    stage = FILES["stages/distill.py"].replace("    time.sleep(params.pause)\n", wait.replace("HEEDS", str(heeds)))
+    stage = COMPARE_FILES["stages/distill.py"].replace(
+        "    time.sleep(params.pause)\n", wait.replace("HEEDS", str(heeds))
+    )
     (root / "stages/distill.py").write_text(stage)
     ended = run_attempt(make_task(root), lambda: bool(list(out.parent.glob("*/checkpoint.pt"))))
     assert ended.code == (INTERRUPTED if heeds else 0) and bool(ended.answer) != heeds
@@ -114,17 +116,17 @@ def test_one_that_is_told_to_end_is_interrupted_and_one_that_had_finished_has(tm
 
 
 def test_this_machine_goes_on_with_what_a_cluster_left(tmp_path, capsys):
-    root = written(tmp_path)
-    run_scene(asked(root), "poses")
+    root = write_project(tmp_path)
+    run_scene(make_request(root), "poses")
     (root / "data/toy/scene.yaml").write_text("stages: {distill: {gain: -1}}")
     with pytest.raises(Exception, match="a gain below 0"):
-        run_scene(asked(root), "distill")
+        run_scene(make_request(root), "distill")
     (partial,) = (root / "runs/toy").glob(".partial-distill-*")
     partial.rename(partial.with_name(partial.name + ".77"))
     (partial.with_name(partial.name + ".77") / "left.txt").touch()
     (root / "stages/distill.py").touch()
     with pytest.raises(Exception, match="a gain below 0"):
-        run_scene(asked(root), "distill")
+        run_scene(make_request(root), "distill")
     assert (partial / "left.txt").exists() and not list((root / "runs/toy").glob(".partial-distill-*.77"))
 
 
@@ -133,7 +135,7 @@ def test_this_machine_goes_on_with_what_a_cluster_left(tmp_path, capsys):
 
 def write_twelve_scenes(root: Path) -> Path:
     """Twelve scenes of the toy pipeline."""
-    written(root)
+    write_project(root)
     for number in range(12):
         (root / f"many/s{number:02}").mkdir(parents=True)
         (root / f"many/s{number:02}/number.txt").write_text(str(10 * number))
@@ -155,7 +157,10 @@ def test_twelve_scenes_with_three_variants_on_ray_are_those_of_one_machine(tmp_p
     killer.start()
     assert (
         compare(
-            asked(root, "", cuda=ray_engine.cuda), "better,none", data=root / "many", execution=Execution(ray_engine, 1)
+            make_request(root, "", cuda=ray_engine.cuda),
+            "better,none",
+            data=root / "many",
+            execution=Execution(ray_engine, 1),
         )
         == 0
     )
@@ -167,7 +172,7 @@ def test_twelve_scenes_with_three_variants_on_ray_are_those_of_one_machine(tmp_p
 def assert_same_as_one_machine(root: Path, variants: str, least: int) -> None:
     """runs/ holds what one machine makes, file by file; and nothing of it is run again by that machine."""
     there = root / "runs"
-    local = type(asked(root, ""))(root, root / "alone", "", "laptop")
+    local = type(make_request(root, ""))(root, root / "alone", "", "laptop")
     assert compare(local, variants, data=root / "many", execution=Execution(LocalEngine(), 1)) == 0
     here, away = artifact_hashes(root / "alone"), artifact_hashes(there)
     different = sorted(name for name in {*here, *away} if here.get(name) != away.get(name))
@@ -177,7 +182,7 @@ def assert_same_as_one_machine(root: Path, variants: str, least: int) -> None:
         assert one["mean"] == other["mean"] and one["gaussians"] == other["gaussians"]
     assert_artifacts_complete(there)
     times = {path: path.stat().st_mtime_ns for path in there.glob("*/*/receipt.json")}
-    assert compare(asked(root, ""), variants, data=root / "many", execution=Execution(LocalEngine(), 1)) == 0
+    assert compare(make_request(root, ""), variants, data=root / "many", execution=Execution(LocalEngine(), 1)) == 0
     assert {path: path.stat().st_mtime_ns for path in there.glob("*/*/receipt.json")} == times
 
 
@@ -188,7 +193,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 from runner.compare import batch
 root = Path(sys.argv[1])
 engine = make_engine("ray", sys.argv[2], root, root / "runs")
-sys.exit(batch(asked(root, "", cuda=engine.cuda), root / "many", Execution(engine, 1)))
+sys.exit(batch(make_request(root, "", cuda=engine.cuda), root / "many", Execution(engine, 1)))
 """
 
 
@@ -234,13 +239,13 @@ def test_what_ended_when_the_driver_was_interrupted_is_not_done_again(tmp_path, 
 @slow
 def test_ray_adds_little_and_a_stage_has_the_cores_it_was_given(tmp_path, ray_engine, capsys):
     root = write_projects(tmp_path)
-    run_scene(asked(root, str(root / "many/a"), cuda=ray_engine.cuda), "poses", None, Execution(ray_engine, 1))
+    run_scene(make_request(root, str(root / "many/a"), cuda=ray_engine.cuda), "poses", None, Execution(ray_engine, 1))
     begun = time.monotonic()
-    run_scene(asked(root, str(root / "many/a"), cuda=ray_engine.cuda), "distill", None, Execution(ray_engine, 1))
+    run_scene(make_request(root, str(root / "many/a"), cuda=ray_engine.cuda), "distill", None, Execution(ray_engine, 1))
     took = time.monotonic() - begun
     print(f"one stage by Ray, planning and all: {took:.2f} s")
     assert [threads for _, _, threads, _ in read_spans(root)] == ["1"]
-    run_scene(asked(root, str(root / "many/a"), cuda=False), "all")
+    run_scene(make_request(root, str(root / "many/a"), cuda=False), "all")
     assert len(read_spans(root)) == 1
 
 
@@ -249,13 +254,15 @@ def test_ray_adds_little_and_a_stage_has_the_cores_it_was_given(tmp_path, ray_en
 
 def test_slurm_by_submitits_local_executor(tmp_path, capsys):
     pytest.importorskip("submitit", reason="submitit is not installed")
-    root = written(tmp_path)
+    root = write_project(tmp_path)
     engine = make_engine("slurm", "local", root, root / "runs")
-    folders = run_scene(asked(root), "distill", None, Execution(engine, 1))
+    folders = run_scene(make_request(root), "distill", None, Execution(engine, 1))
     assert (folders["distill"] / "gain.txt").read_text() == "1"
-    (root / "stages/poses.py").write_text(FILES["stages/poses.py"].replace("    number =", "    boom\n    number ="))
+    (root / "stages/poses.py").write_text(
+        COMPARE_FILES["stages/poses.py"].replace("    number =", "    boom\n    number =")
+    )
     with pytest.raises(Exception, match="poses: NameError: name 'boom' is not defined"):
-        run_scene(asked(root), "poses", None, Execution(engine, 1))
+        run_scene(make_request(root), "poses", None, Execution(engine, 1))
     engine.stop()
     with pytest.raises(KeyboardInterrupt):
         engine.run(make_task(root), Resources(1, 0, 100), 0, lambda: None)

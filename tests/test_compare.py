@@ -16,130 +16,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import visiting
+from scenes.toy_projects import COMPARE_FILES, make_request, write_files, write_project
 
 from report import compare as page
 from report import compare_pictures, job, job_data, results, scenes_page, trace_charts
 from report.paired_statistics import confidence_half_width, paired_difference, pareto_front
 from runner import Refused
 from runner.compare import compare
-from runner.resolve import Request
 
 REPO = Path(__file__).resolve().parent.parent
-FILES = {
-    "pipeline.yaml": """
-scene_keys: {}
-stages:
-  poses: {needs: [scene]}
-  distill:
-    needs: [poses]
-    skip_if: [{param: distill.gain, equals: 0, reason: no gain}]
-  evaluate: {needs: [poses], optional: [distill]}
-profiles: {laptop: {}}
-variants:
-  better: {distill: {gain: 3}}
-  twin: {distill: {gain: 3}}
-  bad: {distill: {gain: -1}}
-  none: {distill: {gain: 0}}
-""",
-    "stages/__init__.py": "",
-    "stages/common.py": """
-import json, time
-from pathlib import Path
-
-VIEWS = "abcd"
-
-def ran(out, name):
-    \"\"\"A line for each stage that came to its end.\"\"\"
-    with open(out.parent.parent / "ran.txt", "a") as file:
-        file.write(f"{out.parent.name} {name}\\n")
-""",
-    "stages/poses.py": """
-from pydantic import BaseModel
-from stages.common import *
-
-class Params(BaseModel, extra="forbid"):
-    pass
-
-def run(params, out, *, scene):
-    from PIL import Image
-    (out / "images").mkdir(exist_ok=True)
-    number = int((scene / "number.txt").read_text())
-    for view in VIEWS:
-        Image.new("RGB", (40, 30), (number, 200, 90)).save(out / "images" / f"{view}.png")
-    (out / "views.json").write_text(json.dumps({"train": [], "test": list(VIEWS), "number": number}))
-    ran(out, "poses")
-""",
-    "stages/distill.py": """
-from pydantic import BaseModel
-from stages.common import *
-
-class Params(BaseModel, extra="forbid"):
-    gain: int = 1
-    pause: float = 0.0
-
-def run(params, out, *, poses):
-    if params.gain < 0:
-        raise ValueError("a gain below 0 | cannot be")
-    time.sleep(params.pause)
-    lines = [{"seconds": 2.0 ** i, "iteration": i, "reference_psnr": 20.0 + i * params.gain} for i in range(4)]
-    lines[-1] |= {"reason": "finished"}
-    (out / "trace.jsonl").write_text("".join(json.dumps(line) + "\\n" for line in lines))
-    (out / "facts.json").write_text(json.dumps({"inpainter": "a brush", "perceptual": None}))
-    (out / "gain.txt").write_text(str(params.gain))
-    ran(out, "distill")
-""",
-    "stages/evaluate.py": """
-import csv
-from pydantic import BaseModel
-from stages.common import *
-
-class Params(BaseModel, extra="forbid"):
-    pass
-
-def run(params, out, *, poses, distill):
-    from PIL import Image
-    number = json.loads((poses / "views.json").read_text())["number"]
-    gain = int((distill / "gain.txt").read_text()) if distill else 0
-    (out / "renders").mkdir()
-    rows = []
-    for index, view in enumerate(VIEWS):
-        Image.new("RGB", (40, 30), (number, 10 * gain, 90)).save(out / "renders" / f"{view}.png")
-        row = {"view": view, "left": 10, "top": 8, "right": 30, "bottom": 22}
-        row |= {"psnr_box": 20 + index + gain * (1 + 0.1 * index) + number / 10, "lpips_vgg_box": None}
-        row |= {"flip_box": 0.3 / (1 + gain), "ssim_box": 0.5 + gain / 10}
-        rows.append(row)
-    with open(out / "per_view.csv", "w") as file:
-        writer = csv.DictWriter(file, rows[0].keys())
-        writer.writeheader()
-        writer.writerows(rows)
-    mean = lambda name: sum(row[name] for row in rows) / len(rows)
-    metrics = {"mean": {name: mean(name) for name in ("psnr_box", "ssim_box", "flip_box")} | {"lpips_vgg_box": None}}
-    metrics |= {"result": "distill", "gaussians": {"distill": 100 + gain}, "lpips_unavailable": "no weights"}
-    metrics |= {"consistency": {"consistency": 0.01 * gain}}
-    (out / "metrics.json").write_text(json.dumps(metrics))
-    ran(out, "evaluate")
-""",
-    "reffusion/__init__.py": "",
-    **{f"data/{name}/number.txt": text for name, text in (("toy", "10"), ("toy-1", "30"))},
-}
-
-
-def make_request(root: Path, scene: str = "toy", **options) -> Request:
-    return Request(root, root / "runs", scene, **{"profile": "laptop", **options})
 
 
 PUBLISHED = 'method,metric,value,protocol\nsomebody,psnr_box,19.5,"ten scenes, 1600 px"\n'
-
-
-def write_files(root: Path, files: dict[str, str]) -> None:
-    for name, text in files.items():
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_text(text)
-
-
-def write_project(root: Path) -> Path:
-    write_files(root, FILES)
-    return root
 
 
 def finished_stages(root: Path) -> list[str]:
@@ -204,7 +92,7 @@ def test_the_same_job_is_no_row_of_figures(compared_project, pages):
 def test_methods_are_compared_in_a_profile_of_their_own(tmp_path):
     """The scene's own run is a method beside the others."""
     root = write_project(tmp_path)
-    pipeline = FILES["pipeline.yaml"].replace(
+    pipeline = COMPARE_FILES["pipeline.yaml"].replace(
         "profiles: {laptop: {}}", "profiles: {laptop: {}, terms: {distill: {gain: 2}}}"
     )
     pipeline = pipeline.replace("variants:\n", "comparisons: {laptop: terms}\nvariants:\n  full: {}\n")
@@ -328,7 +216,7 @@ def test_refused_before_any_work(tmp_path):
     ]:
         with pytest.raises(Refused, match=re.escape(message)):
             compare(make_request(root, **{"scene": "toy", **options}), *arguments)
-    (root / "pipeline.yaml").write_text(FILES["pipeline.yaml"].replace("{gain: 3}", "{gain: much}"))
+    (root / "pipeline.yaml").write_text(COMPARE_FILES["pipeline.yaml"].replace("{gain: 3}", "{gain: much}"))
     with pytest.raises(Refused, match=r"variant better: distill.gain = 'much'"):
         compare(make_request(root))
     assert not list((root / "runs").glob("*/*/receipt.json"))

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from scenes.cameras import rotation_along
 
 from benchmarks.studies import composites, compositing, placement, scoring
 from reffusion.capture import lens
@@ -27,11 +28,8 @@ PLACE = placement.Place("here", "small", "v03", (48.0, 40.0), 0.25, 60.0, train=
 def camera_at(angle: float) -> np.ndarray:
     """[4, 4] camera-to-world, on an arc 3 away from the origin and 2 above the ground y = 0."""
     center = np.array([3 * np.sin(angle), 2.0, 3 * np.cos(angle)])
-    forward = -center / np.linalg.norm(center)
-    right = np.cross(forward, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
     camera = np.eye(4)
-    camera[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    camera[:3, :3] = rotation_along(-center, (0.0, 1.0, 0.0)).T
     camera[:3, 3] = center
     return camera
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import os
 import re
+from pathlib import Path
 
 import pytest
-from test_installed import ROOT, write_four_photos
+from scenes.capture import write_four_photos
 from test_machine import fake_nvidia_smi
 
 from benchmarks.gpu import counts
@@ -20,6 +21,7 @@ from runner.plan import plan, plan_table
 from runner.resolve import Request, resolve
 from runner.text import format_seconds
 
+ROOT = Path(__file__).resolve().parent.parent
 HALF = {"device": "cuda", "dtype": "float16"}
 WORK = {
     "fit": (estimate.fit, fit.Params(device="cuda"), ["iterations"]),

@@ -6,6 +6,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scenes.distill_scene import (
+    ADVERSARIAL,
+    HEIGHT,
+    OFF,
+    PLAIN,
+    SDS,
+    SETTINGS,
+    WIDTH,
+    as_leaves,
+    has_changed,
+    has_gradient,
+    random_wall,
+    square_hole,
+    train_view,
+    wall_camera,
+)
 from scenes.networks import save_small_prior
 from scenes.settings import with_changes
 from scenes.wall_scene import write_background, write_capture_photos
@@ -19,7 +35,6 @@ from reffusion.distill.terms.adversarial import evaluate_adversarial
 from reffusion.distill.terms.reconstruction import evaluate_reconstruction
 from reffusion.distill.terms.reference import evaluate_reference
 from reffusion.distill.terms.sds import evaluate_sds, views_near_references
-from reffusion.distill.train_view import TrainView
 from reffusion.gaussians.optimize import Rates, reconstruction_loss
 from reffusion.inpaint.exemplar import RIM_WIDTH
 from reffusion.io.arrays import load_labels, save_json, save_labels
@@ -27,62 +42,13 @@ from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_references, load_scene, save_mask_sets, save_scene
 from reffusion.morphology import dilate
-from reffusion.params.distill import Adversarial, Params, Sds
+from reffusion.params.distill import Params
 from reffusion.prior import inpaint
 from reffusion.seeding import generator
 from reffusion.splat import rasterizer
 from reffusion.splat.rasterizer import render
 from reffusion.trace import load_checkpoint, read_trace
-from reffusion.types import PARAMETERS, Camera, Gaussians, MaskSet, Scene, Similarity
-
-WIDTH, HEIGHT = 36, 28
-SDS = Sds(weighting="x0", guidance=0.0)
-ADVERSARIAL = Adversarial(patches=4, size=8, width=4)
-
-
-def wall_camera(name="a", shift=0.0):
-    pose = np.eye(4)
-    pose[:3, 3] = shift, 0.0, 1.0
-    return Camera(name, WIDTH, HEIGHT, 30.0, 30.0, WIDTH / 2, HEIGHT / 2, pose)
-
-
-def random_wall(count=150, seed=0):
-    """Gaussians on a wall before the camera; those of its middle are masked."""
-    draw = generator(seed, "wall")
-    means = torch.rand(count, 3, generator=draw) * torch.tensor([1.2, 0.9, 0.1]) - torch.tensor([0.6, 0.45, 0.0])
-    sh = torch.zeros(count, 4, 3)
-    sh[:, 0] = torch.randn(count, 3, generator=draw)
-    sh[:, 1:] = 0.1 * torch.randn(count, 3, 3, generator=draw)
-    gaussians = Gaussians(
-        means,
-        torch.randn(count, 4, generator=draw),
-        torch.full((count, 3), -3.2) + 0.2 * torch.randn(count, 3, generator=draw),
-        torch.randn(count, generator=draw) + 1,
-        sh,
-    )
-    return gaussians, (means[:, 0].abs() < 0.25) & (means[:, 1].abs() < 0.2)
-
-
-def square_hole():
-    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-    mask[8:20, 11:25] = True
-    return mask
-
-
-def train_view(name="a", shift=0.0, clean=False):
-    photo = torch.rand(HEIGHT, WIDTH, 3, generator=generator(3, name))
-    supervises = torch.ones_like(square_hole()) if clean else ~square_hole()
-    return TrainView(wall_camera(name, shift), photo, supervises, square_hole() & (not clean), clean)
-
-
-def as_leaves(gaussians):
-    return gaussians.map(lambda p: p.clone().requires_grad_())
-
-
-def has_gradient(gaussians):
-    """[N] bool: has any gradient at all."""
-    columns = [getattr(gaussians, name).grad.flatten(1).ne(0).any(1) for name in PARAMETERS if name != "opacity_logits"]
-    return torch.stack([*columns, gaussians.opacity_logits.grad != 0]).any(0)
+from reffusion.types import PARAMETERS, MaskSet, Scene, Similarity
 
 
 def gradients_of(term, gaussians, masked, prior, text, view=None):
@@ -191,13 +157,7 @@ def test_region_changers_are_found_and_no_one_else():
     assert not has_changed_region(single, gaussians.means[:1], torch.tensor([True])).any()
 
 
-SETTINGS = Params(
-    iterations=6, sds=SDS, depth={"weight": 0}, adversarial=ADVERSARIAL, reference={"weight": 0.5},
-    densify={"every": 2, "stop": 1}, checkpoint_seconds=1e-9,
-)  # fmt: skip
-OFF = {"weight": 0}
 # Neither critic nor reference; no Gaussian is added.
-PLAIN = with_changes(SETTINGS, adversarial=OFF, reference=OFF, densify={"every": 0})
 
 
 def run_distill(folder, prior, text, settings=SETTINGS, views=None, gaussians=None):
@@ -318,12 +278,6 @@ def test_photographs_may_reach_the_masked_gaussians_that_show_outside_the_hole(t
         moved = has_changed(start, run_distill(tmp_path / reaches, None, None, settings, [view])[0])
         assert not (moved & ~outside).any() and (moved & ~masked).any()
         assert (moved & masked).any() == (reaches == "shown")
-
-
-def has_changed(before, after):
-    """[N] bool: any parameter."""
-    rows = [(getattr(before, n) != getattr(after, n)).reshape(len(before), -1) for n in PARAMETERS]
-    return torch.cat(rows, 1).any(1)
 
 
 def test_the_critic_waits_for_its_part_of_the_run(tmp_path):

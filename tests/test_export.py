@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
-from test_io import random_gaussians, random_scene
+from scenes.random_scene import random_gaussians, random_scene
 
 from reffusion.io.cameras import save_cameras
 from reffusion.io.compressed import save_compressed

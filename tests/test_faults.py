@@ -18,20 +18,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_installed import write_four_photos
-from test_runner import (
-    FILES,
-    REPO,
-    finished_project,
-    make_request,
-    project,
-    read_score,
-    run_stages,
-    start_runner,
-    statuses,
-    wait_until,
-    write_files,
-)
+from scenes.capture import write_four_photos
+from scenes.toy_projects import RUNNER_FILES, make_request, wait_until, write_files
+from test_runner import REPO, finished_project, project, read_score, run_stages, start_runner, statuses
 
 from reffusion import trace
 from runner import Refused, compare, maintenance
@@ -45,15 +34,15 @@ from runner.resolve import Request, resolve
 SLOW = os.environ.get("REFFUSION_SLOW") == "1"
 KILLS, SIZES = (200, 30) if SLOW else (3, 1)
 SHORT = {  # two stages are enough for what concerns no stage
-    **FILES,
+    **RUNNER_FILES,
     "pipeline.yaml": """
 scene_keys: {}
 stages: {fit: {needs: [scene]}, evaluate: {needs: [fit]}}
 profiles: {laptop: {fit: {rate: 2}}}
 variants: {strong: {fit: {rate: 5}}}
 """,
-    "stages/fit.py": FILES["stages/fit.py"].replace("poses", "scene"),
-    "stages/evaluate.py": FILES["stages/evaluate.py"]
+    "stages/fit.py": RUNNER_FILES["stages/fit.py"].replace("poses", "scene"),
+    "stages/evaluate.py": RUNNER_FILES["stages/evaluate.py"]
     .replace("poses: Path, fit: Path, masks: Path | None, distill: Path | None", "fit: Path")
     .replace("(distill or fit)", "fit"),
 }

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from pydantic import ValidationError
-from test_paint2d import MeanInpainter
+from scenes.networks import MeanInpainter
 from test_references import ROOT, wall_folders, write_wall_capture  # noqa: F401 (a fixture)
 
 from reffusion.inpaint import exemplar, feedforward

@@ -19,7 +19,7 @@ def stage_folders(tmp_path):
     return {"poses": poses, "raw_masks": poses.with_name("raw_masks"), "fit": fit}
 
 
-def add_stages(stage_folders, tmp_path):
+def add_stages(folders, tmp_path):
     """`initialize` and `distill` whose Gaussians differ from the fit's in number."""
     gaussians = load_ply(folders["fit"] / "gaussians.ply")
     for count, stage in enumerate(("initialize", "distill"), start=1):

@@ -26,11 +26,11 @@ from scenes.capture_checks import (
     assert_cameras,
     assert_masked_views,
     assert_message,
+    convert_to_text,
     masked_share,
     rename_views,
     run_with_messages,
     select_views,
-    write_as_text,
     write_mask,
     write_named_model,
 )
@@ -217,7 +217,7 @@ def test_D_training_file_alone_has_no_test_views(tmp_path):
     write_transforms(folder, truth, per_frame=True)
     (folder / "transforms.json").rename(folder / "transforms_train.json")
     write_model(folder / "sparse/0", other_frame(6))
-    write_as_text(folder / "sparse/0")
+    convert_to_text(folder / "sparse/0")
     scene, _, _ = run_with_messages(folder, masks="none", layout="transforms")
     assert len(scene.train) == 6 and scene.test == ()
     assert_cameras(scene, truth)

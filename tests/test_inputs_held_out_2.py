@@ -35,7 +35,7 @@ from scenes.capture_checks import (
     run_with_messages,
     write_named_model,
 )
-from test_sfm import render_room_corner, room_walk, speckle_texture
+from scenes.room import render_room_corner, room_walk, speckle_texture
 
 from reffusion.io.images import save_image
 

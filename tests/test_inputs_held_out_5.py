@@ -11,16 +11,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 from scenes.capture_checks import run_with_messages
-from test_sfm import render_room_corner, room_walk, speckle_texture
+from scenes.room import render_room_corner, room_textures, room_walk
 
 from benchmarks.studies.bare_photographs import pose_errors
 
 ORIENTATION, EXIF_FOLDER, FOCAL_35_MM = 0x0112, 0x8769, 0xA405
-
-
-def textures() -> np.ndarray:
-    generator = np.random.default_rng(0)
-    return np.stack([speckle_texture(generator) for _ in range(3)])
 
 
 def exif(orientation: int = 1) -> Image.Exif:
@@ -32,7 +27,7 @@ def exif(orientation: int = 1) -> Image.Exif:
 
 
 def save_walk(folder: Path, ending: str, **options) -> dict[str, np.ndarray]:
-    truth, surfaces = room_walk(6), textures()
+    truth, surfaces = room_walk(6), room_textures(np.random.default_rng(0))
     folder.mkdir(parents=True)
     for name, pose in truth.items():
         Image.fromarray(render_room_corner(pose, surfaces)).save(folder / f"{name}{ending}", **options)
@@ -60,7 +55,7 @@ def test_K_webp_saved_by_a_browser_as_jpg(tmp_path):
 
 def save_both_ways(folder: Path, portrait: set[int], save) -> dict[str, np.ndarray]:
     """A walk of nine views, those in `portrait` with the phone upright; `save` takes path, picture, whether it is."""
-    truth, surfaces = room_walk(9), textures()
+    truth, surfaces = room_walk(9), room_textures(np.random.default_rng(0))
     folder.mkdir(parents=True)
     for k, (name, pose) in enumerate(truth.items()):
         size = (150, 200) if k in portrait else (200, 150)

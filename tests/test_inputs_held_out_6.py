@@ -30,10 +30,10 @@ from scenes.capture_checks import (
     assert_cameras,
     assert_masked_views,
     assert_message,
+    convert_to_text,
     masked_views,
     rename_views,
     run_with_messages,
-    write_as_text,
     write_mask,
     write_named_model,
 )
@@ -174,7 +174,7 @@ def test_M_folder_of_a_model_written_on_another_system(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     names = {v: f"{'Ünterführung'}/Brücke_{k}" for k, v in enumerate(sorted(truth.world_to_camera))}
     write_named_model(folder / "sparse/0", truth, {v: f"{decomposed(n)}.jpg" for v, n in names.items()})
-    write_as_text(folder / "sparse/0")
+    convert_to_text(folder / "sparse/0")
     write_pictures(folder / "images", [composed(name) for name in names.values()], ending=".jpg")
     for name in names.values():
         write_mask(folder / "masks" / f"{decomposed(name)}.png")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -12,7 +11,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from PIL import Image
+from scenes.capture import write_four_photos
 
 from runner.keys import Hashes, code_fingerprints
 from runner.pipeline import load_pipeline
@@ -41,20 +40,6 @@ def wheel_folder(tmp_path_factory) -> Path:
         archive.extractall(out)
     wheel.unlink()
     return out
-
-
-def write_four_photos(folder: Path) -> None:
-    """Four photographs of 32 x 24 px from a row of cameras, and masks."""
-    (folder / "images").mkdir(parents=True)
-    (folder / "masks").mkdir()
-    frames = []
-    for k in range(4):
-        pose = [[1, 0, 0, 0.1 * k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-        frames.append({"file_path": f"images/v{k}.png", "transform_matrix": pose})
-        Image.new("RGB", (32, 24), (40 + k, 80, 120)).save(folder / "images" / f"v{k}.png")
-        Image.new("L", (32, 24), 255).save(folder / "masks" / f"v{k}.png")
-    lens = {"w": 32, "h": 24, "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 12.0}
-    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
 
 
 def run_command(wheel_folder: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scenes import wall_scene
+from scenes.networks import small_depth_model
 
 from reffusion.depth import monocular
 from reffusion.depth.background_depth import Completion, ViewDepth
@@ -16,22 +17,6 @@ from reffusion.seeding import generator
 from reffusion.types import Reference
 
 TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
-
-
-def small_depth_model(kind="relative", seed=0):
-    """Depth Anything's architecture with random weights, 4 layers of 16 channels, for pictures of 56 px."""
-    from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
-
-    backbone = Dinov2Config(
-        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, image_size=56, patch_size=14,
-        out_features=["stage1", "stage2", "stage3", "stage4"], reshape_hidden_states=False,
-    )  # fmt: skip
-    torch.manual_seed(seed)
-    config = DepthAnythingConfig(
-        backbone_config=backbone, reassemble_hidden_size=16, neck_hidden_sizes=[8, 8, 16, 16], fusion_hidden_size=8,
-        head_hidden_size=8, depth_estimation_type=kind, initializer_range=0.2,
-    )  # fmt: skip
-    return DepthAnythingForDepthEstimation(config)
 
 
 @pytest.fixture(scope="module")

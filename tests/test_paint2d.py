@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scenes.networks import MeanInpainter
 
 from reffusion import morphology
 from reffusion.distill import perceptual
@@ -10,16 +11,6 @@ from reffusion.inpaint import classical
 from reffusion.seeding import generator
 
 HEIGHT, WIDTH = 37, 50
-
-
-class MeanInpainter(torch.nn.Module):
-    """Stands in for LaMa: paints the mean of what it is shown outside the mask, half a unit apart by its size."""
-
-    def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-        assert image.size(2) % 8 == 0 and image.size(3) % 8 == 0
-        assert mask.size(1) == 1 and image.size(2) == mask.size(2)
-        shown = (image * (1 - mask)).sum([2, 3], keepdim=True) / (1 - mask).sum()
-        return image * (1 - mask) + shown * mask
 
 
 class WrongSizeInpainter(torch.nn.Module):

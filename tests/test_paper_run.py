@@ -12,7 +12,7 @@ import pytest
 import torch
 from other_device import there_is_one
 from scenes import wall_scene
-from test_monocular import small_depth_model
+from scenes.networks import small_depth_model
 
 from benchmarks.gpu import full_size
 from reffusion.depth import monocular

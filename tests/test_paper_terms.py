@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 from scenes import wall_scene
+from scenes.distill_scene import random_wall, train_view, wall_camera
 from scenes.networks import small_prior
 from scenes.settings import with_changes
 from scenes.stage_runs import run_masks
-from test_distill import random_wall, train_view, wall_camera
 
 from reffusion.background.model import Background
 from reffusion.distill import loop

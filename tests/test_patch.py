@@ -9,7 +9,8 @@ import pytest
 import torch
 from plyfile import PlyData
 from scenes import wall_scene
-from scenes.capture import make_truth, write_capture
+from scenes.capture import make_truth
+from scenes.edited_capture import EDITOR, FIELDS, plane_with_ball, remove_pictures, write_edited_capture
 from scenes.stage_runs import run_masks
 
 from reffusion.capture.layouts import ring
@@ -27,17 +28,7 @@ from stages import poses
 from stages.plan import poses as planned
 
 NEAR = 1.7  # of the square before the wall, small_scene's
-EDITOR = ("x", "y", "z", "scale_0", "scale_1", "scale_2", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "rot_0", "rot_1",
-          "rot_2", "rot_3")  # fmt: skip
 HERE = Similarity(1.0, np.zeros(3))
-
-
-def plane_with_ball(count=4000):
-    """Positions on a plane and above it, and which of them are in a ball."""
-    draws = np.random.default_rng(0)
-    points = draws.uniform(-1, 1, (count, 3)) * (1, 1, 0.02)
-    points[: count // 4] = 0.1 * draws.normal(size=(count // 4, 3)) + (0.2, 0.1, 0.5)
-    return points, np.linalg.norm(points - (0.2, 0.1, 0.5), axis=1) < 0.3
 
 
 @pytest.mark.parametrize("turn", matching.AXIS_FLIPS)
@@ -64,24 +55,6 @@ def test_what_was_moved_scaled_or_turned_otherwise_is_not_matched(moved):
 
 
 # ---------------------------------------------------------------------------------------------- the stage `poses`
-
-
-def write_edited_capture(folder, scale=5.0, offset=(50.0, 0.0, 0.0)):
-    """A capture with its Gaussians, and those that an editor left: other properties, order and degree."""
-    truth = make_truth(scale=scale, offset=offset)
-    points, deleted = plane_with_ball()
-    means = torch.from_numpy(points * scale + offset).float()
-    draw = lambda *shape: torch.rand(*shape, generator=torch.Generator().manual_seed(0))
-    count = len(points)
-    whole = Gaussians(means, draw(count, 4), draw(count, 3) - 3, draw(count) + 1, draw(count, 4, 3))
-    write_capture(folder, "transforms", truth)
-    save_ply(folder / "scene.ply", whole, properties=EDITOR)
-    left = whole.map(lambda p: p[torch.from_numpy(~deleted)].flip(0))
-    save_ply(folder / "cleaned.ply", Gaussians(*(getattr(left, n) for n in FIELDS[:4]), left.sh[:, :1]))
-    return whole, deleted
-
-
-FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 
 def run_poses(folder, **params):
@@ -136,11 +109,6 @@ def test_refusals_say_what_is_wrong_with_the_cleaned_scene(tmp_path):
 
 
 # ---------------------------------------------------------------------------------------------- without photographs
-
-
-def remove_pictures(folder):
-    for path in (*(folder / "images").iterdir(), *(folder / "masks").iterdir()):
-        path.unlink()
 
 
 def test_cameras_of_a_capture_look_at_renders(tmp_path):

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_io import random_gaussians
-from test_patch import remove_pictures, write_edited_capture
+from scenes.edited_capture import remove_pictures, write_edited_capture
+from scenes.random_scene import random_gaussians
 
 from reffusion.capture.layouts import ring
 from reffusion.gaussians import matching

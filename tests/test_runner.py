@@ -9,154 +9,20 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from scenes.toy_projects import RUNNER_FILES, make_request, wait_until, write_files
 
 from runner import Failed, Refused, compare, maintenance, process, results
 from runner.execute import run_scene
 from runner.keys import Hashes, code_fingerprints, fingerprint
 from runner.plan import plan, plan_table
-from runner.resolve import Request, resolve
+from runner.resolve import resolve
 
 REPO = Path(__file__).resolve().parent.parent
 
-FILES = {
-    "pipeline.yaml": """
-scene_keys: {poses: [shift, gaussians]}
-stages:
-  poses: {needs: [scene]}
-  fit: {needs: [poses], provided: {by: gaussians, artifact: poses}}
-  masks:
-    needs: [poses, fit]
-    skip_if: [{empty: poses/masks, reason: the scene has no masks}]
-  distill:
-    needs: [fit, masks]
-    skip_if:
-      - {fact: masks.invent, equals: 0, reason: nothing to invent}
-      - {param: distill.gain, equals: 0, reason: no gain}
-  evaluate: {needs: [poses, fit], optional: [masks, distill]}
-profiles: {laptop: {fit: {rate: 2}}, paper: {}}
-variants: {strong: {distill: {gain: 5}}, same: {}}
-""",
-    "stages/__init__.py": "",
-    "stages/poses.py": """
-from pathlib import Path
-from pydantic import BaseModel, ConfigDict
-
-class Params(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    shift: int = 0
-    gaussians: str | None = None
-
-def preview(params, scene):
-    if not (scene / "number.txt").exists():
-        raise ValueError(f"{scene}: no number.txt; write one")
-    return ["reads one number"]
-
-def run(params: Params, out: Path, *, scene: Path) -> None:
-    if (scene / "broken").exists():
-        raise ValueError(f"{scene}: it is\\nbroken")
-    number = abs(int((scene / "number.txt").read_text())) + params.shift
-    (out / "number.txt").write_text(str(number))
-    if params.gaussians:
-        (out / "gaussians.ply").write_text((scene / params.gaussians).read_text())
-    if not (scene / "unmasked").exists():
-        (out / "masks").mkdir(exist_ok=True)
-        (out / "masks" / "a.png").write_text("m")
-""",
-    "stages/fit.py": """
-import time
-from pathlib import Path
-from pydantic import BaseModel, ConfigDict, Field
-
-class Params(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    iterations: int = Field(3, ge=1, description="steps")
-    rate: int = 1
-    pause: float = 0.0  # seconds a step
-    device: str = "cpu"
-
-def run(params: Params, out: Path, *, poses: Path) -> None:
-    from reffusion.optimize import step
-    checkpoint = out / "checkpoint.pt"
-    number, start = map(int, checkpoint.read_text().split()) if checkpoint.exists() else (0, 0)
-    for index in range(start, params.iterations):
-        number = step(number, params.rate)
-        partial = out / "checkpoint.pt.writing"
-        partial.write_text(f"{number} {index + 1}")
-        partial.replace(checkpoint)
-        time.sleep(params.pause)
-    (out / "gaussians.ply").write_text(str(number + int((poses / "number.txt").read_text())))
-    (out / "trace.jsonl").write_text(str(start))
-    checkpoint.unlink()
-""",
-    "stages/masks.py": """
-import ast
-import json
-from pathlib import Path
-from pydantic import BaseModel, ConfigDict
-
-class Params(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    threshold: int = 100
-
-def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
-    invent = int(int((fit / "gaussians.ply").read_text()) < params.threshold)
-    (out / "facts.json").write_text(json.dumps({"invent": invent}))
-""",
-    "stages/distill.py": """
-from pathlib import Path
-from pydantic import BaseModel, ConfigDict, Field
-
-class Params(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    gain: int = 1
-    prior: str = Field("weights", json_schema_extra={"weights": True})
-
-def run(params: Params, out: Path, *, fit: Path, masks: Path) -> None:
-    (out / "gaussians.ply").write_text(str(int((fit / "gaussians.ply").read_text()) * params.gain))
-""",
-    "stages/evaluate.py": """
-import ast
-import json
-from pathlib import Path
-from pydantic import BaseModel, ConfigDict
-
-class Params(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-def run(params, out: Path, *, poses: Path, fit: Path, masks: Path | None, distill: Path | None) -> None:
-    result = int(((distill or fit) / "gaussians.ply").read_text())
-    metrics = {"mean": {"psnr_box": float(result), "lpips_vgg_box": None}}
-    (out / "metrics.json").write_text(json.dumps(metrics))
-""",
-    "reffusion/__init__.py": '"""The package."""',
-    "reffusion/optimize.py": '''
-"""Steps."""
-
-def step(number, rate):
-    """One step."""
-    from .numbers import plus
-    return plus(number, rate)  # forwards
-''',
-    "reffusion/numbers.py": "def plus(a, b):\n    return a + b\n",
-    "reffusion/unused.py": "x = 1\n",
-    "weights/model.bin": "w",
-    "data/toy/number.txt": "4",
-}
 WORDS = ["poses", "fit", "masks", "distill", "evaluate"]
-
-
-def write_files(project: Path, files: dict[str, str]) -> None:
-    for name, text in files.items():
-        (project / name).parent.mkdir(parents=True, exist_ok=True)
-        (project / name).write_text(text)
-
-
-def make_request(project: Path, scene: str = "toy", **options) -> Request:
-    return Request(project, project / "runs", scene, **{"profile": "laptop", **options})
 
 
 def statuses(project: Path, **options) -> dict[str, str]:
@@ -185,7 +51,7 @@ def replace_text(path: Path, old: str, new: str) -> None:
 @pytest.fixture(scope="module")
 def finished_project(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("finished")
-    write_files(root, FILES)
+    write_files(root, RUNNER_FILES)
     run_scene(make_request(root), "all")
     return root
 
@@ -199,7 +65,7 @@ def project(finished_project: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def empty_project(tmp_path: Path) -> Path:
-    write_files(tmp_path / "project", FILES)
+    write_files(tmp_path / "project", RUNNER_FILES)
     return tmp_path / "project"
 
 
@@ -213,14 +79,6 @@ def start_runner(project: Path, *arguments: str) -> subprocess.Popen[str]:
 
 def restore_ctrl_c() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def wait_until(found) -> None:
-    for _ in range(600):
-        if found():
-            return
-        time.sleep(0.05)
-    raise AssertionError("waited 30 s in vain")
 
 
 # ------------------------------------------------------------------------------------------------------ what reruns
@@ -449,10 +307,12 @@ def test_the_scenes_own_file_stands_for_a_stage_only_while_its_parameter_allows(
 
 def test_a_condition_may_ask_for_two_parameters(project):
     one, both = "{param: distill.gain, equals", "{param: [distill.gain, poses.shift], equals"
-    write_files(project, {"pipeline.yaml": FILES["pipeline.yaml"].replace(one, both)})
+    write_files(project, {"pipeline.yaml": RUNNER_FILES["pipeline.yaml"].replace(one, both)})
     assert statuses(project, set="distill.gain=0 poses.shift=0")["distill"] == "skip no gain"
     assert not statuses(project, set="distill.gain=0 poses.shift=1")["distill"].startswith("skip")
-    write_files(project, {"pipeline.yaml": FILES["pipeline.yaml"].replace(one, both.replace("shift", "nothing"))})
+    write_files(
+        project, {"pipeline.yaml": RUNNER_FILES["pipeline.yaml"].replace(one, both.replace("shift", "nothing"))}
+    )
     with pytest.raises(Refused, match=r"poses\.nothing, which is not there"):
         statuses(project, set="distill.gain=0")
 
@@ -460,7 +320,7 @@ def test_a_condition_may_ask_for_two_parameters(project):
 def test_a_condition_may_hold_for_some_parameters_only_and_name_facts(project, capsys):
     plain = "{fact: masks.invent, equals: 0, reason: nothing to invent}"
     named = '{fact: masks.invent, equals: 0, only: {distill.gain: 2}, reason: "nothing to gain: {invent} of 9"}'
-    write_files(project, {"pipeline.yaml": FILES["pipeline.yaml"].replace(plain, named)})
+    write_files(project, {"pipeline.yaml": RUNNER_FILES["pipeline.yaml"].replace(plain, named)})
     nothing = "masks.threshold=1 "
     assert statuses(project, set=nothing + "distill.gain=2")["distill"].endswith(
         "if nothing to gain: known after masks"
@@ -784,7 +644,7 @@ def run(params: Params, out: Path, *, fit: Path, masks: Path) -> None:
 """
 NESTING = {
     "stages/distill.py": NESTED,
-    "pipeline.yaml": FILES["pipeline.yaml"]
+    "pipeline.yaml": RUNNER_FILES["pipeline.yaml"]
     .replace("{param: distill.gain, equals: 0", "{param: distill.sds.weight, equals: 0")
     .replace("poses: [shift, gaussians]", "poses: [shift, gaussians], distill: [extra]")
     .replace("laptop: {fit: {rate: 2}}", "laptop: {fit: {rate: 2}, distill: {sds: {weight: 0.5, lora: {rank: 8}}}}")

@@ -5,14 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scenes.cameras import make_camera
+from scenes.distill_scene import write_initialized_run
 from scenes.networks import small_prior
 
 from benchmarks.studies import sds_variance as benchmark
 from reffusion import seeding
-from reffusion.io.ply import save_ply
-from reffusion.io.scene import save_mask_sets, save_scene
-from reffusion.types import Gaussians, MaskSet, Scene, Similarity
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -33,23 +30,6 @@ def test_without_noise_and_without_a_pull_nothing_is_left():
     found = benchmark.variances(same)
     assert found["over_noise"] == found["over_timesteps"] == found["together"] == 0
     assert found["pull"] == pytest.approx([0.49] * 3)
-
-
-def write_initialized_run(home, invent):
-    """A wall in front of three views; `invent`: bool [H, W], the hole in each."""
-    draw = seeding.generator(0, "wall")
-    means = torch.rand(80, 3, generator=draw) * torch.tensor([1.6, 1.2, 0.1]) - torch.tensor([0.8, 0.6, -1.5])
-    wall = Gaussians(
-        means, torch.zeros(80, 4), torch.full((80, 3), -2.0), torch.full((80,), 2.0), torch.zeros(80, 1, 3)
-    )
-    names, height, width = ("a", "b", "c"), *invent.shape
-    cameras = {name: make_camera(name, (width, height), 40.0) for name in names}
-    still = Similarity(1.0, np.zeros(3))
-    scene = Scene(cameras, names, (), frozenset({"c"}), np.zeros((1, 3)), np.zeros((1, 3), np.uint8), still)
-    save_scene(home / "poses", scene)
-    save_ply(home / "initialize" / "gaussians.ply", wall)
-    save_mask_sets(home / "masks", dict.fromkeys(names, MaskSet(*[invent] * 4)))
-    return home
 
 
 def test_on_a_scene_without_ground_truth(tmp_path):

@@ -15,6 +15,7 @@ import pytest
 import torch
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
+from scenes.room import render_room_corner, room_textures, room_walk, speckle_texture
 from scipy.spatial.transform import Rotation
 
 from benchmarks.studies.bare_photographs import pose_errors
@@ -29,47 +30,6 @@ from stages import poses
 ROOT = Path(__file__).parents[1]
 CAPTURES = ROOT.parent / "shared" / "data"
 slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
-
-
-def speckle_texture(generator: np.random.Generator, size: int = 256) -> np.ndarray:
-    """[size, size, 3] speckle at several scales, in [0, 255]."""
-    total = np.zeros((size, size, 3))
-    for cell in (2, 4, 8, 16, 32):
-        coarse = generator.random((size // cell, size // cell, 3))
-        total += np.kron(coarse, np.ones((cell, cell, 1))) * cell**0.5
-    return 255 * (total - total.min()) / np.ptp(total)
-
-
-def render_room_corner(pose: np.ndarray, textures: np.ndarray, size=(200, 150), focal=170.0) -> np.ndarray:
-    """The corner of a room, planes x = 2, y = 1.5, z = 3, ray-cast; uint8 [H, W, 3]."""
-    columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
-    rays = np.stack([(columns - size[0] / 2) / focal, (rows - size[1] / 2) / focal, np.ones_like(rows)], -1)
-    rays, center = rays @ pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
-    with np.errstate(divide="ignore"):
-        times = (np.array([2.0, 1.5, 3.0]) - center) / rays
-    times = np.where(times > 0, times, np.inf)
-    plane = times.argmin(-1)
-    hit = center + rays * times.min(-1)[..., None]
-    flat = np.stack([hit[..., 1], hit[..., 0], hit[..., 0]], -1), np.stack([hit[..., 2], hit[..., 2], hit[..., 1]], -1)
-    u, v = (np.take_along_axis(axis, plane[..., None], -1)[..., 0] * 40 for axis in flat)
-    texels = textures.shape[1]
-    return textures[plane, v.astype(int) % texels, u.astype(int) % texels].astype(np.uint8)
-
-
-def room_walk(count: int) -> dict[str, np.ndarray]:
-    """Views that face the corner, up and down by turns: centres on a line would leave the alignment free to turn."""
-    result = {}
-    for k in range(count):
-        t = k / (count - 1) - 0.5
-        center, forward = np.array([1.6 * t, 0.3 * (-1) ** k, -1.0 + 0.8 * t * t]), np.array([0.35 - 0.4 * t, 0.2, 1.0])
-        forward /= np.linalg.norm(forward)
-        right = np.cross([0.0, 1.0, 0.0], forward)
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-        pose[:3, 3] = -pose[:3, :3] @ center
-        result[f"p{k}"] = pose
-    return result
 
 
 def assert_accepted(scene, truth: dict[str, np.ndarray]) -> None:
@@ -115,7 +75,7 @@ def solved_by(threads: int, photographs: dict[str, Path], work: Path) -> Poses:
 def test_a_walk_past_a_corner(tmp_path, capsys):
     """All views that belong to it are placed; the one that does not is named and left out, and so is its mask."""
     generator, truth = np.random.default_rng(0), room_walk(6)
-    textures = np.stack([speckle_texture(generator) for _ in range(3)])
+    textures = room_textures(generator)
     folder = tmp_path / "s"
     for name, pose in truth.items():
         save_image(folder / f"{name}.png", render_room_corner(pose, textures))
@@ -154,7 +114,7 @@ UPRIGHT, ACROSS = (150, 200), (200, 150)  # px: a phone held both ways
 def write_walk(folder: Path, sizes: Sequence[tuple[int, int]], endings: Sequence[str]) -> dict[str, np.ndarray]:
     """One photograph of `room_walk` for each size and ending, in folder/images; the true poses."""
     generator, truth = np.random.default_rng(0), room_walk(len(sizes))
-    textures = np.stack([speckle_texture(generator) for _ in range(3)])
+    textures = room_textures(generator)
     (folder / "images").mkdir(parents=True)
     for (name, pose), size, ending in zip(truth.items(), sizes, endings, strict=True):
         picture = Image.fromarray(render_room_corner(pose, textures, size))

@@ -15,8 +15,8 @@ import torch
 from plyfile import PlyData, PlyElement
 from scenes.cameras import make_camera
 from scenes.capture import make_truth, write_capture
-from test_io import random_gaussians
-from test_patch import write_edited_capture
+from scenes.edited_capture import write_edited_capture
+from scenes.random_scene import random_gaussians
 
 from reffusion.io.arrays import load_labels
 from reffusion.io.compressed import load_spz, save_spz

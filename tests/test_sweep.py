@@ -6,8 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from test_compare import make_request as asked_for
-from test_compare import write_project
+from scenes.toy_projects import make_request, write_project
 
 from runner import Refused
 from runner.compare import compare
@@ -18,7 +17,7 @@ from runner.sweep import sweep
 @pytest.fixture(scope="module")
 def compared_project(tmp_path_factory) -> Path:
     root = write_project(tmp_path_factory.mktemp("swept"))
-    compare(asked_for(root), "better,none")
+    compare(make_request(root), "better,none")
     return root
 
 
@@ -36,7 +35,7 @@ def list_artifacts(project: Path) -> set[str]:
 
 def test_nothing_where_all_is_used(project, capsys):
     before = list_artifacts(project)
-    sweep(asked_for(project, ""), yes=True)
+    sweep(make_request(project, ""), yes=True)
     assert capsys.readouterr().out == "nothing that no plan uses\n" and list_artifacts(project) == before
 
 
@@ -49,17 +48,17 @@ def test_what_is_unused_is_told_first_and_removed_when_asked_for(project, capsys
     (project / "runs/toy/distill/gain.txt").write_text("changed by hand")
     (project / "runs/toy/mine").mkdir()
     (project / "runs/toy/mine/big.txt").write_text("no receipt")
-    sweep(asked_for(project, ""), yes=False)
+    sweep(make_request(project, ""), yes=False)
     said = capsys.readouterr().out
     assert (
         "runs/toy/distill: left out: no gain" in said and "runs/toy@better/evaluate: there is no variant better" in said
     )
     assert "nothing was removed; yes=1 removes them" in said and list_artifacts(project) == before
-    sweep(asked_for(project, ""), yes=True)
+    sweep(make_request(project, ""), yes=True)
     assert list_artifacts(project) == {"toy/poses", "toy@none/evaluate"}
     left = {path.name for path in (project / "runs/toy/distill").iterdir()}
     assert left == {"notes.txt", "gain.txt"} and (project / "runs/toy/mine/big.txt").exists()
-    run_scene(asked_for(project), "all")
+    run_scene(make_request(project), "all")
     assert "toy/evaluate" in list_artifacts(project)
 
 
@@ -67,17 +66,17 @@ def test_older_code_counts_as_used_and_a_scene_that_is_gone_is_kept(project, cap
     stage = project / "stages/distill.py"
     stage.write_text(stage.read_text() + "\nMORE = 1\n")
     before = list_artifacts(project)
-    sweep(asked_for(project, ""), yes=True)
+    sweep(make_request(project, ""), yes=True)
     assert list_artifacts(project) == before
     (project / "data/toy").rename(project / "data/elsewhere")
-    sweep(asked_for(project, ""), yes=True)
+    sweep(make_request(project, ""), yes=True)
     assert "toy: kept, as it cannot be planned: its scene is not there" in capsys.readouterr().out
     assert list_artifacts(project) == before
     with pytest.raises(Refused, match="nothing was computed for nobody"):
-        sweep(asked_for(project, "nobody"), yes=True)
+        sweep(make_request(project, "nobody"), yes=True)
 
 
 def test_other_parameters_are_those_of_the_command(project, capsys):
-    sweep(asked_for(project, "toy", set="distill.gain=7"), yes=False)
+    sweep(make_request(project, "toy", set="distill.gain=7"), yes=False)
     said = capsys.readouterr().out
     assert "runs/toy/distill: to be made again: param gain 1 -> 7" in said and "runs/toy/poses" not in said

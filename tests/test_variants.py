@@ -12,10 +12,10 @@ import torch
 from scenes import wall_scene
 from scenes.capture import make_truth
 from scenes.capture import write_capture as write_capture
+from scenes.distill_scene import OFF, PLAIN, as_leaves, has_gradient, random_wall, square_hole, train_view
 from scenes.networks import save_small_prior
 from scenes.settings import with_changes
 from scenes.stage_runs import run_through_masks
-from test_distill import OFF, PLAIN, as_leaves, has_gradient, random_wall, square_hole, train_view
 
 from reffusion import seeding, trace
 from reffusion.distill import loop as D

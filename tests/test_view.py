@@ -1,6 +1,5 @@
 """The viewer: whose camera is drawn, which layers there are, what a visitor is shown, and when."""
 
-import time
 import urllib.request
 from types import SimpleNamespace
 
@@ -10,6 +9,7 @@ import pytest
 import torch
 from browser import visiting
 from scenes import wall_scene
+from scenes.toy_projects import wait_until
 
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.images import save_image, save_mask
@@ -136,15 +136,15 @@ def test_a_visitor_gets_a_small_picture_at_once_then_the_whole_and_another_when_
     )
     monkeypatch.setattr(window.server, "get_clients", lambda: {7: guest})
     window._serve_visitor(guest)
-    wait(lambda: len(drawn) == 2)
+    wait_until(lambda: len(drawn) == 2)
     assert [image.shape[0] for image in drawn] == [view.MOVING, view.STILL]
     assert np.array_equal(drawn[-1], window._render_for(view.visitor_camera(camera, view.STILL), camera))
     there = next(h for h in window.server.gui._gui_input_handle_from_uuid.values() if h.label == "what was kept")
     there.value = False
-    wait(lambda: len(drawn) == 4)
+    wait_until(lambda: len(drawn) == 4)
     assert drawn[-1].mean() < drawn[1].mean(), "the wall is gone"
     monkeypatch.setattr(window.server, "get_clients", dict)
-    wait(lambda: 7 not in window.requests)
+    wait_until(lambda: 7 not in window.requests)
 
 
 @pytest.mark.parametrize("width", [1280, 390])
@@ -160,19 +160,11 @@ def test_a_browser_shows_the_result_without_what_is_unchecked_and_before_distill
             )
             return red > 150 > 100 > max(blue, green)
 
-        wait(red)
+        wait_until(red)
         added = page.get_by_role("checkbox").nth(1)
         added.uncheck()
-        wait(lambda: not red())
+        wait_until(lambda: not red())
         added.check()
-        wait(red)
+        wait_until(red)
         page.get_by_role("slider").press("ArrowLeft")
         page.wait_for_function("document.body.innerText.match(/initialization/g).length > 1")
-
-
-def wait(done):
-    for _ in range(600):
-        if done():
-            return
-        time.sleep(0.05)
-    raise AssertionError("it did not happen within half a minute")

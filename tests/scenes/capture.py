@@ -13,6 +13,7 @@ from reffusion.capture import lens
 from reffusion.io import colmap
 from reffusion.io.images import save_image
 from reffusion.io.scene import load_scene
+from scenes.cameras import rotation_along
 from stages import poses, raw_masks
 from stages.plan import poses as poses_plan
 from stages.plan import raw_masks as raw_masks_plan
@@ -43,11 +44,8 @@ def make_truth(model=PINHOLE, views=6, scale=1.0, offset=(0.0, 0.0, 0.0)) -> Tru
     for k in range(views):
         angle = np.radians(-25 + 50 * k / (views - 1))
         center = 4 * np.array([np.sin(angle), 0.15 * generator.normal(), -np.cos(angle)])
-        forward = -center / np.linalg.norm(center)
-        right = np.cross([0.0, 1.0, 0.1 * generator.normal()], forward)
-        right /= np.linalg.norm(right)
         pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+        pose[:3, :3] = rotation_along(-center, (0.0, -1.0, -0.1 * generator.normal()))
         pose[:3, 3] = -pose[:3, :3] @ (scale * center + offset)
         cameras[f"v{k:02d}"] = pose
     return Truth(cameras, generator.uniform(-0.9, 0.9, (60, 3)) * scale + offset, model)
@@ -80,11 +78,16 @@ def write_model(folder: Path, truth: Truth, text=False, factor=1, ending=".jpg")
     colors = np.full((len(truth.points), 3), 99, np.uint8)
     colmap.save_model(folder, cameras, images, truth.points, colors)
     if text:
-        import pycolmap
+        convert_to_text(folder)
 
-        pycolmap.Reconstruction(folder).write_text(folder)
-        for path in folder.glob("*.bin"):
-            path.unlink()
+
+def convert_to_text(folder: Path) -> None:
+    """Replace a binary COLMAP model by the same one as text."""
+    import pycolmap
+
+    pycolmap.Reconstruction(folder).write_text(folder)
+    for path in folder.glob("*.bin"):
+        path.unlink()
 
 
 def write_transforms(folder: Path, truth: Truth, per_frame=False, **changes) -> None:
@@ -179,3 +182,17 @@ def reprojection_error(scene, truth: Truth) -> float:
         worst = max(worst, float(np.abs(lens.to_pixels(back, truth.lens) - shown).max()))
         assert (camera.width, camera.height) == (WIDTH, HEIGHT)
     return worst
+
+
+def write_four_photos(folder: Path) -> None:
+    """Four photographs of 32 x 24 px from a row of cameras, and masks."""
+    (folder / "images").mkdir(parents=True)
+    (folder / "masks").mkdir()
+    frames = []
+    for k in range(4):
+        pose = [[1, 0, 0, 0.1 * k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+        frames.append({"file_path": f"images/v{k}.png", "transform_matrix": pose})
+        Image.new("RGB", (32, 24), (40 + k, 80, 120)).save(folder / "images" / f"v{k}.png")
+        Image.new("L", (32, 24), 255).save(folder / "masks" / f"v{k}.png")
+    lens = {"w": 32, "h": 24, "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 12.0}
+    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))

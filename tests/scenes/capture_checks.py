@@ -15,7 +15,16 @@ from PIL import Image
 from reffusion.io import colmap
 from reffusion.io.files import BadInput
 from reffusion.types import Scene
-from scenes.capture import HEIGHT, WIDTH, Truth, preview_stages, reprojection_error, run_stages, run_stages_into
+from scenes.capture import (
+    HEIGHT,
+    WIDTH,
+    Truth,
+    convert_to_text,
+    preview_stages,
+    reprojection_error,
+    run_stages,
+    run_stages_into,
+)
 
 SHARE = 1 / 16  # of a view, the rectangle that `scenes.capture.write_masks` masks
 EXACT = 0.01  # px, between a pinhole camera and the truth
@@ -90,16 +99,7 @@ def write_named_model(folder: Path, truth: Truth, names: Mapping[str, str], text
     images = {k: colmap.ModelImage(name, 1, truth.world_to_camera[view]) for k, (view, name) in listed}
     colmap.save_model(folder, cameras, images, truth.points, np.full((len(truth.points), 3), 99, np.uint8))
     if text:
-        write_as_text(folder)
-
-
-def write_as_text(folder: Path) -> None:
-    """Replace a binary model by the same one as text."""
-    import pycolmap
-
-    pycolmap.Reconstruction(folder).write_text(folder)
-    for path in folder.glob("*.bin"):
-        path.unlink()
+        convert_to_text(folder)
 
 
 def write_mask(path: Path, mask: np.ndarray = OBJECT) -> None:

@@ -41,3 +41,29 @@ def small_prior(seed: int = 0) -> Prior:
 def save_small_prior(folder: Path, seed: int = 0) -> None:
     """The same as a diffusers folder."""
     pipeline(small_prior(seed)).save_pretrained(folder)
+
+
+def small_depth_model(kind="relative", seed=0):
+    """Depth Anything's architecture with random weights, 4 layers of 16 channels, for pictures of 56 px."""
+    from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
+
+    backbone = Dinov2Config(
+        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, image_size=56, patch_size=14,
+        out_features=["stage1", "stage2", "stage3", "stage4"], reshape_hidden_states=False,
+    )  # fmt: skip
+    torch.manual_seed(seed)
+    config = DepthAnythingConfig(
+        backbone_config=backbone, reassemble_hidden_size=16, neck_hidden_sizes=[8, 8, 16, 16], fusion_hidden_size=8,
+        head_hidden_size=8, depth_estimation_type=kind, initializer_range=0.2,
+    )  # fmt: skip
+    return DepthAnythingForDepthEstimation(config)
+
+
+class MeanInpainter(torch.nn.Module):
+    """Stands in for LaMa: paints the mean of what it is shown outside the mask, half a unit apart by its size."""
+
+    def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        assert image.size(2) % 8 == 0 and image.size(3) % 8 == 0
+        assert mask.size(1) == 1 and image.size(2) == mask.size(2)
+        shown = (image * (1 - mask)).sum([2, 3], keepdim=True) / (1 - mask).sum()
+        return image * (1 - mask) + shown * mask
