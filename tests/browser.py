@@ -12,7 +12,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 
 
 @contextmanager
-def visiting(address: str, width: int = 1280) -> Iterator[object]:
+def open_page(address: str, width: int = 1280) -> Iterator[object]:
     """A page of that width at an address, which afterwards must have logged no error and asked no other machine."""
     if not CHROMIUM:
         pytest.skip("no Chromium is installed")

@@ -45,6 +45,14 @@ def text(prior):
         return embed_text(prior, list(PROMPTS))
 
 
+@pytest.fixture
+def wall_folders(tmp_path):
+    """The folders before the stage `reference`, of the wall with a square before it."""
+    from scenes.references import write_wall_stages
+
+    return write_wall_stages(tmp_path)
+
+
 def pytest_collection_modifyitems(items):
     """The file that takes longest first: at the end one process would be busy with it while the other waits."""
     items.sort(key=lambda item: item.path.name != "test_resume.py")

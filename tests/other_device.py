@@ -23,21 +23,21 @@ from reffusion.gaussians import adam, ssim
 from reffusion.splat import cpu, cuda
 from reffusion.types import Rendering
 
-CARD = torch.device("cuda:0")
-SAID = {torch.Tensor.device.__get__: CARD, torch.Tensor.is_cuda.__get__: True}
+GPU_DEVICE = torch.device("cuda:0")
+GPU_PROPERTIES = {torch.Tensor.device.__get__: GPU_DEVICE, torch.Tensor.is_cuda.__get__: True}
 ONLY_ON_CPU = (torch.Tensor.numpy, torch.Tensor.__array__)
 INDEXING = (torch.Tensor.__getitem__, torch.Tensor.__setitem__)
 
 
-class OnGpu(torch.Tensor):
+class GpuTensor(torch.Tensor):
     """In disguise."""
 
 
-def disguised(tensor: torch.Tensor) -> torch.Tensor:
-    return tensor if isinstance(tensor, OnGpu) else tensor.as_subclass(OnGpu)
+def disguise(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor if isinstance(tensor, GpuTensor) else tensor.as_subclass(GpuTensor)
 
 
-def plain(tensor: torch.Tensor) -> torch.Tensor:
+def undisguise(tensor: torch.Tensor) -> torch.Tensor:
     with torch._C.DisableTorchFunction():
         return tensor.as_subclass(torch.Tensor)
 
@@ -46,13 +46,13 @@ def _is_gpu(device: Any) -> bool:
     return isinstance(device, (str, torch.device)) and torch.device(device).type == "cuda"
 
 
-class Gpu(TorchFunctionMode):
+class GpuMode(TorchFunctionMode):
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
         tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
-        here = bool(args) and isinstance(args[0], OnGpu)
-        if func in SAID and here:
-            return SAID[func]
+        here = bool(args) and isinstance(args[0], GpuTensor)
+        if func in GPU_PROPERTIES and here:
+            return GPU_PROPERTIES[func]
         with torch._C.DisableTorchFunctionSubclass():
             if func in (torch.Tensor.cpu, torch.Tensor.to, torch.Tensor.cuda):
                 return self._moved(func, args, kwargs)
@@ -62,12 +62,12 @@ class Gpu(TorchFunctionMode):
             leaf = wanted and kwargs.pop("requires_grad", False)  # the disguised one, not what it hides
             if wanted:
                 kwargs.pop("device")
-            on_gpu = any(isinstance(t, OnGpu) for t in tensors)
+            on_gpu = any(isinstance(t, GpuTensor) for t in tensors)
             self._refuse_mixed(func, args, tensors)
             result = func(*args, **kwargs)
         if not (wanted or on_gpu) or func is torch.Tensor.as_subclass:
             return result
-        shown = tree_map(lambda each: disguised(each) if isinstance(each, torch.Tensor) else each, result)
+        shown = tree_map(lambda each: disguise(each) if isinstance(each, torch.Tensor) else each, result)
         return shown.requires_grad_() if leaf else shown
 
     def _moved(self, func: Any, args: Any, kwargs: dict[str, Any]) -> torch.Tensor:
@@ -77,24 +77,24 @@ class Gpu(TorchFunctionMode):
         if rest and (isinstance(rest[0], (str, torch.device))):
             device = given.pop(0)
         elif rest and isinstance(rest[0], torch.Tensor):  # to(other): its type and its place
-            device, given = (CARD if isinstance(rest[0], OnGpu) else "cpu"), [rest[0].dtype, *rest[1:]]
+            device, given = (GPU_DEVICE if isinstance(rest[0], GpuTensor) else "cpu"), [rest[0].dtype, *rest[1:]]
         if func is not torch.Tensor.to:
-            device, given, kwargs = ("cpu" if func is torch.Tensor.cpu else CARD), [], {}
-        on_gpu = isinstance(tensor, OnGpu) if device is None else _is_gpu(device)
+            device, given, kwargs = ("cpu" if func is torch.Tensor.cpu else GPU_DEVICE), [], {}
+        on_gpu = isinstance(tensor, GpuTensor) if device is None else _is_gpu(device)
         moved = tensor.to(*given, **kwargs) if given or kwargs else tensor
-        return disguised(moved) if on_gpu else moved.as_subclass(torch.Tensor)
+        return disguise(moved) if on_gpu else moved.as_subclass(torch.Tensor)
 
     def _refuse_mixed(self, func: Any, args: Any, tensors: list[torch.Tensor]) -> None:
         if func is torch.Tensor.copy_:
             return
-        if func in INDEXING and isinstance(args[0], OnGpu):  # CUDA takes indices from the CPU
+        if func in INDEXING and isinstance(args[0], GpuTensor):  # CUDA takes indices from the CPU
             tensors = [args[0], *(leaf for leaf in tree_leaves(args[2:]) if isinstance(leaf, torch.Tensor))]
-        kinds = {isinstance(t, OnGpu) for t in tensors if t.ndim or isinstance(t, OnGpu)}
+        kinds = {isinstance(t, GpuTensor) for t in tensors if t.ndim or isinstance(t, GpuTensor)}
         if len(kinds) > 1:
             raise RuntimeError(f"{getattr(func, '__name__', func)}: expected all tensors to be on the same device")
 
 
-def there_is_one() -> bool:
+def has_gpu() -> bool:
     """A GPU, and gsplat with its extension: without gsplat a machine with a GPU passes the tests all the same."""
     try:
         cuda.require_gpu(torch.zeros(1, device="cuda" if torch.cuda.is_available() else "cpu"))
@@ -104,13 +104,13 @@ def there_is_one() -> bool:
 
 
 @contextmanager
-def gpu() -> Iterator[None]:
+def simulated_gpu() -> Iterator[None]:
     """The block's machine has a GPU."""
-    if there_is_one():
+    if has_gpu():
         yield
         return
-    leave = lambda value: plain(value) if isinstance(value, torch.Tensor) else value
-    enter = lambda value: disguised(value) if isinstance(value, torch.Tensor) else value
+    leave = lambda value: undisguise(value) if isinstance(value, torch.Tensor) else value
+    enter = lambda value: disguise(value) if isinstance(value, torch.Tensor) else value
 
     def render(gaussians, camera, features, background, degree, probe):
         given = (leave(each) for each in (features, background))
@@ -120,11 +120,11 @@ def gpu() -> Iterator[None]:
     def accumulate(gaussians, camera, values, count):
         return enter(cpu.accumulate(gaussians.map(leave), camera, leave(values), count))
 
-    with pytest.MonkeyPatch.context() as patched, Gpu():
+    with pytest.MonkeyPatch.context() as patched, GpuMode():
         patched.setattr(cuda, "require_gpu", lambda means: None)
         patched.setattr(cuda, "render", render)
         patched.setattr(cuda, "accumulate", accumulate)
         patched.setattr(ssim, "triton_works", lambda: False)
         patched.setattr(adam, "triton_works", lambda: False)
-        patched.setattr(view_loader, "ThreadPoolExecutor", partial(ThreadPoolExecutor, initializer=Gpu().__enter__))
+        patched.setattr(view_loader, "ThreadPoolExecutor", partial(ThreadPoolExecutor, initializer=GpuMode().__enter__))
         yield

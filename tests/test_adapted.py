@@ -18,8 +18,8 @@ HOLE = np.zeros((36, 48), bool)
 HOLE[10:24, 12:30] = True
 
 
-def learnt_run(home):
-    """`write_initialized_run` as `reference` leaves it: photographs, a fit of which nothing is removed, view `a` completed."""
+def write_reference_run(home):
+    """An initialized run with photographs, a fit from which nothing is removed, and a reference for view `a`."""
     run = write_initialized_run(home, HOLE)
     wall = load_ply(run / "initialize" / "gaussians.ply")
     save_ply(run / "fit" / "gaussians.ply", wall)
@@ -32,7 +32,7 @@ def learnt_run(home):
 
 
 def test_same_views_same_noise_and_holes_alone_are_painted(tmp_path):
-    prior, run = small_prior(), learnt_run(tmp_path / "run")
+    prior, run = small_prior(), write_reference_run(tmp_path / "run")
     views = adapted.save_sheet({"before": prior, "after": prior}, run, 3, 2, tmp_path / "out")
     assert views == ["b"]  # the reference's own view is what was learnt, the third is clean
     pictures = {path.stem: load_image(path) for path in (tmp_path / "out/b").glob("*.png")}

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from browser import visiting
+from browser import open_page
 from scenes.toy_projects import COMPARE_FILES, make_request, write_project
 
 from report import batch as page
@@ -204,7 +204,7 @@ def test_the_page_of_a_batch(tmp_path, capsys):
     root = write_projects(tmp_path, 0.0)
     batch(make_request(root, ""), root / "many", Execution(local_engine(2)))
     made = page.make(root / "runs/results.json")
-    with visiting(made.as_uri()) as browser:
+    with open_page(made.as_uri()) as browser:
         assert "3 of 4 scenes done, 1 failed" in browser.inner_text("body")
         assert "failed: poses: " in browser.inner_text("tr:has-text('c') td.text")
         assert browser.evaluate("[...document.images].every(i => i.naturalWidth == 240)")

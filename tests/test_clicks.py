@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 import torch
-from browser import visiting
+from browser import open_page
 from scenes import capture as captures
 from scenes import wall_scene
 from scenes.stage_runs import run_masks
@@ -120,20 +120,20 @@ def clicked_scene(tmp_path_factory):
     return folder, placed, fit
 
 
-def true_mask(name):
+def square_mask(name):
     return wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR)
 
 
 def test_clicks_in_one_view_give_the_masks_of_all(clicked_scene, tmp_path):
     _, placed, fit = clicked_scene
-    middle = np.argwhere(true_mask("a2")).mean(0)[::-1] + 0.5
+    middle = np.argwhere(square_mask("a2")).mean(0)[::-1] + 0.5
     params = masks.Params(clicks={"a2": [[*middle, "+"]]})
     run_masks(placed, fit, tmp_path, params)
     for name, found in load_mask_sets(tmp_path, wall_scene.CAMERAS).items():
         if name in wall_scene.TRAIN:
             assert (
-                wall_scene.iou(found.raw, true_mask(name)) > 0.9
-                and wall_scene.iou(found.consistent, true_mask(name)) > 0.85
+                wall_scene.iou(found.raw, square_mask(name)) > 0.9
+                and wall_scene.iou(found.consistent, square_mask(name)) > 0.85
             )
         else:
             assert not found.raw.any(), "test photographs do not show it"
@@ -150,10 +150,10 @@ def test_a_mask_in_one_view_stays_as_it_was_given(clicked_scene):
     everything, _ = wall_scene.wall_and_square(NEAR)
     image_of = lambda name: load_image(placed / "images" / f"{name}.png")
     near = all_views.find_neighbours(everything)
-    found = all_views.segment_by_clicks(everything, near, wall_scene.CAMERAS, image_of, {}, {"a1": true_mask("a1")})
-    assert (found.masks["a1"] == true_mask("a1")).all()
+    found = all_views.segment_by_clicks(everything, near, wall_scene.CAMERAS, image_of, {}, {"a1": square_mask("a1")})
+    assert (found.masks["a1"] == square_mask("a1")).all()
     shown = all_views.object_mask(everything, found.labels, wall_scene.CAMERAS["a4"], image_of("a4"))
-    assert wall_scene.iou(shown, true_mask("a4")) > 0.9
+    assert wall_scene.iou(shown, square_mask("a4")) > 0.9
 
 
 def sheet_points(origin, along, up, color, step=0.04):
@@ -255,15 +255,15 @@ def page_server(clicked_scene, tmp_path):
 
 @pytest.mark.parametrize("width", [1280, 390])
 def test_clicks_in_a_browser_make_masks_that_are_saved(page_server, tmp_path, width):
-    with visiting(page_server.address, width) as tab:
+    with open_page(page_server.address, width) as tab:
         tab.wait_for_function("state && state.fit && view")
         name = tab.evaluate("view")
         box = tab.locator("#stage").bounding_box()
-        column, row = np.argwhere(true_mask(name)).mean(0)[::-1] / (wall_scene.WIDTH, wall_scene.HEIGHT)
+        column, row = np.argwhere(square_mask(name)).mean(0)[::-1] / (wall_scene.WIDTH, wall_scene.HEIGHT)
         at = (box["x"] + column * box["width"], box["y"] + row * box["height"])
         tab.mouse.click(*at)
         tab.wait_for_function("!pending && !state.busy && state.views.every(v => v.mask !== null)", timeout=60_000)
-        assert wall_scene.iou(page_server.session.masks[name], true_mask(name)) > 0.9
+        assert wall_scene.iou(page_server.session.masks[name], square_mask(name)) > 0.9
         tab.mouse.click(*at, button="right")
         tab.wait_for_function("!pending && !state.busy && of(view).clicks.length === 2")
         assert not page_server.session.masks[name][round(row * wall_scene.HEIGHT), round(column * wall_scene.WIDTH)]
@@ -275,7 +275,7 @@ def test_clicks_in_a_browser_make_masks_that_are_saved(page_server, tmp_path, wi
         tab.wait_for_function("document.getElementById('status').textContent.includes('saved')")
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
     for each in wall_scene.TRAIN:
-        assert wall_scene.iou(load_mask(tmp_path / "masks" / f"{each}.png"), true_mask(each)) > 0.85
+        assert wall_scene.iou(load_mask(tmp_path / "masks" / f"{each}.png"), square_mask(each)) > 0.85
 
 
 def test_what_was_clicked_is_there_the_next_time(page_server, tmp_path):
@@ -287,7 +287,7 @@ def test_what_was_clicked_is_there_the_next_time(page_server, tmp_path):
 
 
 def test_masks_of_others_are_never_overwritten(page_server, tmp_path):
-    save_mask(tmp_path / "masks/a3.png", true_mask("a3"))
+    save_mask(tmp_path / "masks/a3.png", square_mask("a3"))
     before = load_image(tmp_path / "masks/a3.png")
     page_server.session.click("a2", [(48.0, 36.0, True)])
     with pytest.raises(ValueError, match=r"a3\.png: not written by this page"):

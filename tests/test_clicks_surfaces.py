@@ -9,7 +9,7 @@ from reffusion.clicks.marks import Clicks
 from reffusion.clicks.single_view import segment_view
 
 
-def chequered_on_gravel():
+def checkered_disk_on_gravel():
     """A chequered disk before gravel, whose depth and colours are noise; picture, relief, disk."""
     draw, (rows, columns) = np.random.default_rng(3), np.mgrid[:256, :256]
     disk = np.hypot(rows - 150, columns - 110) < 26
@@ -21,14 +21,14 @@ def chequered_on_gravel():
 
 
 def test_one_click_finds_a_chequered_thing_on_rough_ground():
-    picture, relief, disk = chequered_on_gravel()
+    picture, relief, disk = checkered_disk_on_gravel()
     found = segment_view(picture, Clicks(np.array([[110.5, 150.5]]), np.array([True])), relief)
     assert wall_scene.iou(found, disk) > 0.9
 
 
 def test_a_further_click_never_loses_what_was_clicked_before():
     """A second part is no reason to keep of the first only the pixel that was clicked."""
-    picture, relief, disk = chequered_on_gravel()
+    picture, relief, disk = checkered_disk_on_gravel()
     rows, columns = np.mgrid[:256, :256]
     other = np.hypot(rows - 80, columns - 200) < 20
     picture[other], relief[other] = (200, 40, 40), 0

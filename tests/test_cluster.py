@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+from scenes.processes import run_module
 from scenes.toy_projects import COMPARE_FILES, make_request, write_project
 from test_batch import read_spans, write_projects
 from test_faults import assert_artifacts_complete
@@ -270,8 +271,7 @@ def test_slurm_by_submitits_local_executor(tmp_path, capsys):
 
 def test_a_cluster_that_is_not_there_is_told_in_a_line(tmp_path):
     pytest.importorskip("submitit", reason="submitit is not installed")
-    command = [sys.executable, "-m", "runner", "run", "--scene", "x", "--engine", "slurm"]
-    done = subprocess.run(command, cwd=REPO, capture_output=True, text=True)
+    done = run_module("runner", "run", "--scene", "x", "--engine", "slurm")
     if shutil.which("srun"):
         pytest.skip("there is a Slurm here")
     assert done.returncode == 2 and "address=local tries it without a cluster" in done.stderr

@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import visiting
+from browser import open_page
+from scenes.processes import run_module
 from scenes.toy_projects import COMPARE_FILES, make_request, write_files, write_project
 
 from report import compare as page
@@ -359,9 +360,8 @@ def test_the_median_of_curves():
 
 
 def record_plan(root: Path, runs: Path, *options: str) -> None:
-    command = [sys.executable, "-m", "runner", "plan", "--record", "--scene", "toy", "--root", str(root)]
-    environment = {**os.environ, "PYTHONPATH": str(REPO)}
-    subprocess.run([*command, "--runs", str(runs), *options], cwd=REPO, env=environment, check=True)
+    command = ("plan", "--record", "--scene", "toy", "--root", root, "--runs", runs, *options)
+    assert run_module("runner", *command).returncode == 0
 
 
 def test_report_of_a_job(compared_project, job_folder):
@@ -431,7 +431,7 @@ def test_a_job_that_failed_is_still_reported(job_folder):
 @pytest.mark.parametrize("width", [1280, 390])
 def test_the_report_is_walked_through_in_a_browser(compared_project, job_folder, width):
     record_plan(compared_project, job_folder.parent)
-    with visiting(job.make(job_folder).as_uri(), width) as page:
+    with open_page(job.make(job_folder).as_uri(), width) as page:
         view, left, right = page.locator(".compare select").all()
         names = [option.inner_text() for option in view.locator("option").all()]
         shown = lambda: [pair.get_attribute("data-view") for pair in page.locator(".pair:visible").all()]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scenes.cameras import make_camera, world_rays, yaw
+from scenes.images import rectangle_mask
 
 from reffusion.metrics import consistency
 from reffusion.metrics.consistency import RenderedView
@@ -31,9 +32,7 @@ def plane_view(view, mask=None, **scene):
 
 
 def middle_mask():
-    mask = np.zeros((HEIGHT, WIDTH), bool)
-    mask[10:40, 20:44] = True
-    return mask
+    return rectangle_mask((HEIGHT, WIDTH), (10, 40), (20, 44))
 
 
 def test_views_of_one_plane_agree_to_the_rounding_of_their_pictures():

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from scenes.capture import write_four_photos
-from test_machine import fake_nvidia_smi
+from scenes.processes import fake_nvidia_smi
 
 from benchmarks.gpu import counts
 from reffusion.cost import estimate

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import torch
 from scenes.cameras import make_camera
+from scenes.distill_scene import as_leaves
 from scenes.settings import with_changes
+from scenes.stage_runs import trace_lines
 
 from reffusion import trace
 from reffusion.depth import background_depth, estimates
@@ -24,7 +26,7 @@ from reffusion.params.distill import Depth, Params
 from reffusion.prior import inpaint
 from reffusion.seeding import generator
 from reffusion.splat.rasterizer import render
-from reffusion.trace import load_checkpoint, read_trace
+from reffusion.trace import load_checkpoint
 from reffusion.types import PARAMETERS, Gaussians
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 30.0
@@ -54,10 +56,6 @@ def slanted_wall(moved: float = 1.0):
 def train_view(hole=HOLE):
     hole = torch.from_numpy(hole)
     return TrainView(VIEW, torch.zeros(HEIGHT, WIDTH, 3), ~hole, hole, False)
-
-
-def as_leaves(gaussians):
-    return gaussians.map(lambda p: p.clone().requires_grad_())
 
 
 def evaluate_term(gaussians, masked, estimator, prior=None, text=None, view=None, **more):
@@ -311,7 +309,7 @@ RUN = Params(
 )  # fmt: skip
 
 
-def run_distill(folder, prior, text, estimator, settings=RUN):
+def run_depth_distill(folder, prior, text, estimator, settings=RUN):
     folder.mkdir(exist_ok=True)
     gaussians, masked = slanted_wall(0.95)
     with torch.no_grad():
@@ -320,13 +318,9 @@ def run_distill(folder, prior, text, estimator, settings=RUN):
     return D.distill(gaussians, masked, [train_view()], holes, prior, text, settings, folder, estimator)
 
 
-def trace_lines(folder):
-    return [{k: v for k, v in line.items() if k != "seconds"} for line in read_trace(folder / "trace.jsonl")]
-
-
 def test_interrupted_distillation_with_the_depth_term_resumes_bit_for_bit(prior, text, tmp_path, monkeypatch):
     monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
-    whole, _ = run_distill(tmp_path / "whole", prior, text, constant_estimator(WALL))
+    whole, _ = run_depth_distill(tmp_path / "whole", prior, text, constant_estimator(WALL))
     real = D.take_step
 
     def interrupted(optimizer, step, *others):
@@ -336,10 +330,10 @@ def test_interrupted_distillation_with_the_depth_term_resumes_bit_for_bit(prior,
 
     monkeypatch.setattr(D, "take_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        run_distill(tmp_path / "broken", prior, text, constant_estimator(WALL))
+        run_depth_distill(tmp_path / "broken", prior, text, constant_estimator(WALL))
     assert load_checkpoint(tmp_path / "broken")["step"] == 3
     monkeypatch.setattr(D, "take_step", real)
-    resumed, _ = run_distill(tmp_path / "broken", prior, text, constant_estimator(WALL))
+    resumed, _ = run_depth_distill(tmp_path / "broken", prior, text, constant_estimator(WALL))
     for name in PARAMETERS:
         assert (getattr(whole, name) == getattr(resumed, name)).all(), name
     assert trace_lines(tmp_path / "whole") == trace_lines(tmp_path / "broken")
@@ -347,7 +341,7 @@ def test_interrupted_distillation_with_the_depth_term_resumes_bit_for_bit(prior,
 
 
 def test_skipped_views_are_counted_by_reason_and_move_nothing(prior, text, tmp_path):
-    ended, _ = run_distill(tmp_path, prior, text, constant_estimator(np.full(WALL.shape, 2.0)))
+    ended, _ = run_depth_distill(tmp_path, prior, text, constant_estimator(np.full(WALL.shape, 2.0)))
     assert trace_lines(tmp_path)[-1]["depth_skipped_constant"] == 3 and "depth" not in trace_lines(tmp_path)[-1]
     for name in PARAMETERS:
         assert (getattr(ended, name) == getattr(slanted_wall(0.95)[0], name)).all(), name
@@ -356,9 +350,9 @@ def test_skipped_views_are_counted_by_reason_and_move_nothing(prior, text, tmp_p
 def test_an_estimate_that_is_not_finite_names_step_and_view(prior, text, tmp_path):
     nowhere = DepthEstimator(HOW, lambda view, picture: np.full(WALL.shape, np.nan))
     with pytest.raises(FloatingPointError, match="step 0, depth, view 'a'"):
-        run_distill(tmp_path, prior, text, nowhere)
+        run_depth_distill(tmp_path, prior, text, nowhere)
     with pytest.raises(ValueError, match="estimator"):
-        run_distill(tmp_path, prior, text, None)
+        run_depth_distill(tmp_path, prior, text, None)
 
 
 def test_both_stages_find_depth_alike():

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scenes.cameras import make_scene
 from scenes.distill_scene import (
     ADVERSARIAL,
     HEIGHT,
@@ -48,7 +49,7 @@ from reffusion.seeding import generator
 from reffusion.splat import rasterizer
 from reffusion.splat.rasterizer import render
 from reffusion.trace import load_checkpoint, read_trace
-from reffusion.types import PARAMETERS, MaskSet, Scene, Similarity
+from reffusion.types import PARAMETERS, MaskSet
 
 
 def gradients_of(term, gaussians, masked, prior, text, view=None):
@@ -395,8 +396,7 @@ def stage_folders(tmp_path):
     """The artifacts of a miniature scene: poses, fit, masks, initialize, and a prior."""
     gaussians, masked = random_wall()
     cameras = {name: wall_camera(name, shift) for name, shift in (("a", 0.0), ("b", 0.1), ("t", 0.05))}
-    here = Similarity(1.0, np.zeros(3))
-    scene = Scene(cameras, ("a", "b"), ("t",), frozenset(), np.zeros((4, 3)), np.zeros((4, 3), np.uint8), here)
+    scene = make_scene(cameras, ("t",), points=np.zeros((4, 3)))
     names = ("scene", "poses", "raw_masks", "fit", "masks", "initialize", "reference", "personalize", "distill")
     paths = {name: tmp_path / name for name in names}
     for path in paths.values():

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scenes.cameras import make_camera
+from scenes.cameras import make_camera, make_scene
 
 from reffusion import seeding
 from reffusion.background import training_coverage
@@ -41,15 +41,7 @@ def write_stages(home):
     cameras = {
         name: make_camera(name, (WIDTH, HEIGHT), 40.0, (0.3 - 0.1 * i, 0.0, 0.0)) for i, name in enumerate(names)
     }
-    scene = Scene(
-        cameras,
-        tuple(names[3:]),
-        tuple(names[:3]),
-        frozenset(),
-        np.zeros((1, 3)),
-        np.zeros((1, 3), np.uint8),
-        SIMILARITY,
-    )
+    scene = make_scene(cameras, names[:3], similarity=SIMILARITY)
     made = {name: home / name for name in ("poses", "raw_masks", "fit", "masks", "initialize", "distill")}
     rng = np.random.default_rng(0)
     save_scene(made["poses"], scene)

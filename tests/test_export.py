@@ -27,16 +27,16 @@ from report import export
 FRAME = Similarity(0.31, np.array([1.5, -20.0, 4.0]))
 
 
-def scene():
+def random_scene_in_frame():
     return replace(random_scene(), similarity=FRAME)
 
 
-def seen(gaussians, camera: Camera) -> np.ndarray:
+def render_color(gaussians, camera: Camera) -> np.ndarray:
     with torch.no_grad():
         return rasterizer.render(gaussians, camera).color.numpy()
 
 
-def gaussians_before(camera: Camera, degree: int = 2):
+def visible_gaussians(camera: Camera, degree: int = 2):
     """Some that a camera sees, in the normalised frame."""
     made = random_gaussians(300, degree)
     at = torch.tensor([0.0, 0.0, 4.0]) + made.means
@@ -49,7 +49,7 @@ def test_colmap_and_nerfstudio_see_the_scene_as_we_do(tmp_path):
     """Renders of the exported .ply by the exported cameras, in the scene's own frame, are those of the normalised."""
     import pycolmap
 
-    given = scene()
+    given = random_scene_in_frame()
     save_cameras(tmp_path, given, "images")
     model = pycolmap.Reconstruction(str(tmp_path / "sparse/0"))
     frames = {f["file_path"]: f for f in json.loads((tmp_path / "transforms.json").read_text())["frames"]}
@@ -60,7 +60,7 @@ def test_colmap_and_nerfstudio_see_the_scene_as_we_do(tmp_path):
     assert len(model.images) == len(frames) == len(given.cameras)
     for image in model.images.values():
         camera = given.cameras[image.name.removesuffix(".png")]
-        made = gaussians_before(camera)
+        made = visible_gaussians(camera)
         save_ply(tmp_path / "scene.ply", made, FRAME)
         own = load_ply(tmp_path / "scene.ply")
         pinhole, frame = model.cameras[image.camera_id], frames[f"images/{image.name}"]
@@ -69,9 +69,9 @@ def test_colmap_and_nerfstudio_see_the_scene_as_we_do(tmp_path):
         to_world = np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])
         lens = [frame[key] for key in ("fl_x", "fl_y", "cx", "cy")]
         by_nerfstudio = Camera("n", frame["w"], frame["h"], *lens, np.linalg.inv(to_world))
-        assert seen(made, camera).max() > 0.1
+        assert render_color(made, camera).max() > 0.1
         for other in (by_colmap, by_nerfstudio):
-            np.testing.assert_allclose(seen(own, other), seen(made, camera), atol=2e-4)
+            np.testing.assert_allclose(render_color(own, other), render_color(made, camera), atol=2e-4)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -137,7 +137,7 @@ def test_export_writes_all_and_says_what_is_there(tmp_path):
     home = tmp_path / "s"
     with pytest.raises(ValueError, match=r"scene\.ply is missing; `make scene=s export`"):
         export.make(home)
-    save_scene(home / "poses", scene())
+    save_scene(home / "poses", random_scene_in_frame())
     for name in ("a", "b"):
         save_image(home / "poses" / "images" / f"{name}.png", np.zeros((8, 12, 3), np.uint8))
     save_ply(home / "evaluate" / "scene.ply", replace(random_gaussians(300, 1), antialiased=True), FRAME)

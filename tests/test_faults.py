@@ -19,7 +19,8 @@ import numpy as np
 import pytest
 import torch
 from scenes.capture import write_four_photos
-from scenes.toy_projects import RUNNER_FILES, make_request, wait_until, write_files
+from scenes.processes import run_module, start_module, wait_until
+from scenes.toy_projects import RUNNER_FILES, make_request, write_files
 from test_runner import REPO, finished_project, project, read_score, run_stages, start_runner, statuses
 
 from reffusion import trace
@@ -54,22 +55,13 @@ def short_project(tmp_path: Path) -> Path:
     return tmp_path / "project"
 
 
-def start_command(project: Path, *arguments: str, **options) -> subprocess.Popen[str]:
-    whole = [sys.executable, "-m", "runner", *arguments, "--root", str(project), "--profile", "laptop"]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(whole, cwd=REPO, **pipes, **options)
+OPTIONS = ("--profile", "laptop", "--root")
 
 
-def run_command(project: Path, *arguments: str, **options) -> tuple[int, str, str]:
-    """Exit code, output and errors of a command."""
-    process = start_command(project, *arguments, **options)
-    output, errors = process.communicate(timeout=120)
-    return process.returncode, output, errors
-
-
-def assert_one_line(said: tuple[int, str, str]) -> str:
-    code, output, errors = said
-    assert code == 2 and errors.startswith("error: ") and errors.count("\n") == 1, (output, errors)
+def assert_one_line(ended: subprocess.CompletedProcess[str]) -> str:
+    """The command refused in one line, which is returned."""
+    errors = ended.stderr
+    assert ended.returncode == 2 and errors.startswith("error: ") and errors.count("\n") == 1, (ended.stdout, errors)
     return errors
 
 
@@ -99,7 +91,7 @@ def test_killed_at_random_moments(short_project, what):
     arguments = [str(short_project / "data") if word == "data" else word for word in LONG[what]]
     random, killed = np.random.default_rng(len(what)), 0
     while killed < -(-KILLS // 3):
-        process = start_command(short_project, *arguments)
+        process = start_module("runner", *arguments, *OPTIONS, short_project)
         try:
             process.wait(random.uniform(0.2, 4 if SLOW else 1.5))
         except subprocess.TimeoutExpired:
@@ -109,8 +101,8 @@ def test_killed_at_random_moments(short_project, what):
             shutil.rmtree(short_project / "runs")
         process.communicate()
         assert_artifacts_complete(short_project / "runs")
-    code, _, errors = run_command(short_project, *arguments)
-    assert code == 0, errors
+    ended = run_module("runner", *arguments, *OPTIONS, short_project, timeout=120)
+    assert ended.returncode == 0, ended.stderr
     assert_artifacts_complete(short_project / "runs")
     assert read_score(short_project) == 10.0
     if what == "batch":
@@ -142,24 +134,25 @@ def mounted_disk(folder: Path):
 
 
 def test_a_full_disk(short_project):
-    random = np.random.default_rng(0)
+    random, command = np.random.default_rng(0), ("run", "--scene", "toy", *OPTIONS, short_project)
     with mounted_disk(short_project / "runs") as remount:
         for _ in range(SIZES):
             used = shutil.disk_usage(short_project / "runs").used // 1024
             remount(f"size={used + 4 * random.integers(1, 20)}k")
-            said = run_command(short_project, "run", "--scene", "toy")
-            assert said[0] == 0 or "make room" in assert_one_line(said)
+            said = run_module("runner", *command, timeout=120)
+            assert said.returncode == 0 or "make room" in assert_one_line(said)
             assert_artifacts_complete(short_project / "runs")
             if SLOW and random.random() < 0.3:
                 shutil.rmtree(short_project / "runs/toy", ignore_errors=True)
         remount("size=1m")
-        assert run_command(short_project, "run", "--scene", "toy")[0] == 0 and read_score(short_project) == 10.0
+        assert run_module("runner", *command, timeout=120).returncode == 0 and read_score(short_project) == 10.0
 
 
 @pytest.mark.parametrize("size", [700, 0, 60, 300, 1000][: 5 if SLOW else 1])
 def test_files_that_cannot_be_written_whole(short_project, size):
     limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
-    assert "make room" in assert_one_line(run_command(short_project, "run", "--scene", "toy", preexec_fn=limit))
+    command = ("run", "--scene", "toy", *OPTIONS, short_project)
+    assert "make room" in assert_one_line(run_module("runner", *command, timeout=120, preexec_fn=limit))
     assert_artifacts_complete(short_project / "runs")
 
 
@@ -169,10 +162,13 @@ def test_a_folder_that_is_only_read(project):
     with mounted_disk(project / "runs") as remount:
         shutil.copytree(kept, project / "runs", dirs_exist_ok=True)
         remount("ro")
-        code, output, _ = run_command(project, "plan", "--scene", "toy")
-        assert code == 0 and "cached    evaluate" in output
-        assert "Read-only file system; runs=FOLDER" in assert_one_line(run_command(project, "run", "--scene", "toy"))
-        assert "Read-only file system; runs=FOLDER" in assert_one_line(run_command(project, "clean", "--scene", "toy"))
+        planned, ran, cleaned = (
+            run_module("runner", command, "--scene", "toy", *OPTIONS, project, timeout=120)
+            for command in ("plan", "run", "clean")
+        )
+        assert planned.returncode == 0 and "cached    evaluate" in planned.stdout
+        assert "Read-only file system; runs=FOLDER" in assert_one_line(ran)
+        assert "Read-only file system; runs=FOLDER" in assert_one_line(cleaned)
 
 
 # ------------------------------------------------------------------------------------------- lost, rotten, edited files

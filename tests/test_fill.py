@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 import torch
+from scenes import images
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import spsolve
 
 from reffusion.prior.harmonic_fill import harmonic_extension
 
 
-def disk_mask(height, width, radius):
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    return ((y - height / 2) ** 2 + (x - width / 2) ** 2 < radius**2)[None, None].double()
+def disk_tensor(height, width, radius):
+    return torch.from_numpy(images.disk_mask((height, width), height / 2, width / 2, radius))[None, None].double()
 
 
 def random_images(*shape, seed=0):
@@ -58,12 +58,12 @@ def test_what_is_given_stays_and_the_hole_lies_within_its_range(size):
 
 def test_a_constant_is_continued_exactly():
     images = torch.full((1, 3, 40, 40), 0.3, dtype=torch.float64)
-    assert (harmonic_extension(images, disk_mask(40, 40, 15)) - 0.3).abs().max() < 1e-14
+    assert (harmonic_extension(images, disk_tensor(40, 40, 15)) - 0.3).abs().max() < 1e-14
 
 
 @pytest.mark.parametrize("radius", [3, 8, 16])
 def test_it_is_close_to_the_solution_of_laplaces_equation(radius):
-    images, hidden = smooth_image(48, 48), disk_mask(48, 48, radius)
+    images, hidden = smooth_image(48, 48), disk_tensor(48, 48, radius)
     hole = hidden[0, 0].numpy() > 0
     solution = solve_laplace(images[0].permute(1, 2, 0).numpy(), hole)
     ours = harmonic_extension(images, hidden)[0].permute(1, 2, 0).numpy()
@@ -72,13 +72,13 @@ def test_it_is_close_to_the_solution_of_laplaces_equation(radius):
 
 
 def test_what_lies_in_the_hole_does_not_matter():
-    images, hidden = random_images(1, 3, 32, 32), disk_mask(32, 32, 9)
+    images, hidden = random_images(1, 3, 32, 32), disk_tensor(32, 32, 9)
     other = torch.where(hidden > 0, torch.nan, images)
     assert torch.equal(harmonic_extension(images, hidden), harmonic_extension(other, hidden))
 
 
 def test_nothing_given_gives_grey_and_leaves_its_neighbours_in_the_batch_alone():
-    images, hidden = random_images(2, 3, 32, 32), disk_mask(32, 32, 9).repeat(2, 1, 1, 1)
+    images, hidden = random_images(2, 3, 32, 32), disk_tensor(32, 32, 9).repeat(2, 1, 1, 1)
     hidden[0] = 1
     both = harmonic_extension(images, hidden)
     assert torch.equal(both[0], torch.zeros_like(both[0]))

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from scenes.cameras import make_camera, yaw
+from scenes.cameras import make_camera, make_scene, yaw
 
 from reffusion import seeding, trace
 from reffusion.fit import exposure, step, view_loader
@@ -21,7 +21,7 @@ from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_views, save_scene
 from reffusion.params.fit import Densify, Init, LearningRates, Params, SphericalHarmonics
 from reffusion.splat.rasterizer import render
-from reffusion.types import PARAMETERS, Camera, Gaussians, Scene, Similarity
+from reffusion.types import PARAMETERS, Camera, Gaussians, Similarity
 from stages import fit as stage
 from stages.plan import fit as plan
 
@@ -303,11 +303,8 @@ def write_poses(folder) -> None:
     names = [c.name for c in cameras]
     points = np.repeat(true_gaussians().means.numpy().astype(np.float64), 3, 0)
     points += np.random.default_rng(0).normal(0, 0.01, points.shape)
-    scene = Scene(
-        cameras={c.name: c for c in cameras}, train=tuple(names[1:]), test=(names[0],), clean=frozenset(),
-        points=points, point_colors=np.full((len(points), 3), 128, np.uint8),
-        similarity=Similarity(1.0, np.zeros(3)),
-    )  # fmt: skip
+    colors = np.full((len(points), 3), 128, np.uint8)
+    scene = make_scene({c.name: c for c in cameras}, names[:1], points=points, colors=colors)
     save_scene(folder, scene)
     for name in scene.train:  # the test view has no picture here: reading it would fail
         save_image(folder / "images" / f"{name}.png", pictures[name])

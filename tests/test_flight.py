@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 import torch
 from scenes import wall_scene
+from scenes.cameras import make_scene
 
 from reffusion import geometry
 from reffusion.io.ply import save_ply
 from reffusion.io.scene import save_scene
-from reffusion.types import Camera, Scene, Similarity
+from reffusion.types import Camera, Similarity
 from report import camera_path, turntable
 
 
@@ -57,7 +58,7 @@ def test_the_video_shows_the_result_of_a_variant_in_the_scenes_poses(tmp_path):
     similarity = Similarity(2.0, np.array([0.1, 0.2, 0.3]))
     train = {name: wall_scene.CAMERAS[name] for name in wall_scene.TRAIN}
     points = gaussians.means.double().numpy()[~labels.numpy()]
-    scene = Scene(train, wall_scene.TRAIN, (), frozenset(), points, np.zeros((len(points), 3), np.uint8), similarity)
+    scene = make_scene(train, points=points, similarity=similarity)
     save_scene(tmp_path / "x" / "poses", scene)
     with pytest.raises(ValueError, match="make scene=x all"):
         turntable.make(tmp_path / "x@no_sds")

@@ -39,12 +39,12 @@ from reffusion.capture.load import load_capture
 from reffusion.io.scene import list_objects
 
 
-def other_frame(views: int) -> Truth:
+def truth_in_other_frame(views: int) -> Truth:
     """A model of the same views by another run: its frame is another."""
     return make_truth(views=views, scale=2.5, offset=(7.0, -3.0, 11.0))
 
 
-def write_listed(folder: Path, truth: Truth, paths: dict[str, str]) -> None:
+def write_transforms_with_paths(folder: Path, truth: Truth, paths: dict[str, str]) -> None:
     """transforms.json with frames of these file paths: view -> file_path."""
     write_transforms(folder, truth)
     record = json.loads((folder / "transforms.json").read_text())
@@ -60,9 +60,9 @@ def test_A_largest_of_three_models_that_nerfstudio_left(tmp_path):
     folder, truth = tmp_path / "s", make_truth(views=8)
     write_pictures(folder / "images", truth.world_to_camera, ending=".jpg")
     write_masks(folder / "masks", truth.world_to_camera)
-    write_model(folder / "colmap/sparse/0", select_views(other_frame(8), 0, 4))
+    write_model(folder / "colmap/sparse/0", select_views(truth_in_other_frame(8), 0, 4))
     write_model(folder / "colmap/sparse/1", select_views(truth, 1, 8), text=True)
-    write_model(folder / "colmap/sparse/2", select_views(other_frame(8), 5, 8))
+    write_model(folder / "colmap/sparse/2", select_views(truth_in_other_frame(8), 5, 8))
     scene, _, sentences = run_with_messages(folder)
     assert scene.train == tuple(f"v{k:02d}" for k in range(1, 8))
     assert_cameras(scene, select_views(truth, 1, 8))
@@ -73,7 +73,7 @@ def test_A_two_digit_model_beside_masks_of_images_4(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     write_pictures(folder / "images_4", truth.world_to_camera)
     write_masks(folder / "images_4/label", truth.world_to_camera)
-    write_model(folder / "sparse/2", select_views(other_frame(6), 2, 5), factor=4)
+    write_model(folder / "sparse/2", select_views(truth_in_other_frame(6), 2, 5), factor=4)
     write_model(folder / "sparse/10", truth, factor=4, ending=".JPG")
     (folder / "sparse/0").mkdir()
     (folder / "sparse/0/cameras.bin").write_bytes((folder / "sparse/10/cameras.bin").read_bytes())
@@ -107,7 +107,7 @@ def test_B_equal_names_in_transforms_json(tmp_path):
     paths = {v: f"cam_{'ab'[k % 2]}/frame_{k // 2:05d}" for k, v in enumerate(sorted(truth.world_to_camera))}
     write_pictures(folder / "images", paths.values())
     written = {v: f"./images/{path}" if "cam_a" in path else rf"images\{path}.png" for v, path in paths.items()}
-    write_listed(folder, truth, {v: p.replace("cam_b/", "cam_b\\") for v, p in written.items()})
+    write_transforms_with_paths(folder, truth, {v: p.replace("cam_b/", "cam_b\\") for v, p in written.items()})
     scene, _, _ = run_with_messages(folder, masks="none", test=["cam_b/frame_00001.png"])
     views = {v: path.replace("/", "-") for v, path in paths.items()}
     assert scene.test == ("cam_b-frame_00001",) and len(scene.train) == 5
@@ -149,7 +149,7 @@ def test_C_masks_of_one_day_only(tmp_path):
     write_pictures(folder / "images", days.values(), ending=".jpg")
     for path in list(days.values())[:3]:
         write_mask(folder / "segmentation" / f"{path}.png")
-    write_listed(folder, truth, {v: f"images/{path}.jpg" for v, path in days.items()})
+    write_transforms_with_paths(folder, truth, {v: f"images/{path}.jpg" for v, path in days.items()})
     scene, out, sentences = run_with_messages(folder, masks="segmentation")
     assert list_objects(out) == [] and len(scene.train) == 6
     assert_masked_views(out, ["IMG_0", "IMG_1", "IMG_2"])
@@ -216,7 +216,7 @@ def test_D_training_file_alone_has_no_test_views(tmp_path):
     write_pictures(folder / "images", truth.world_to_camera)
     write_transforms(folder, truth, per_frame=True)
     (folder / "transforms.json").rename(folder / "transforms_train.json")
-    write_model(folder / "sparse/0", other_frame(6))
+    write_model(folder / "sparse/0", truth_in_other_frame(6))
     convert_to_text(folder / "sparse/0")
     scene, _, _ = run_with_messages(folder, masks="none", layout="transforms")
     assert len(scene.train) == 6 and scene.test == ()

@@ -42,7 +42,7 @@ from reffusion.io.images import save_image
 # ---------------------------------------------------------------------------------------------- F: masks of any kind
 
 
-def capture_with_masks(folder: Path, masks: str, draw) -> Truth:
+def write_capture_with_masks(folder: Path, masks: str, draw) -> Truth:
     """A COLMAP capture whose masks are the Pillow images that `draw` returns."""
     truth = make_truth()
     write_capture(folder, "colmap", truth)
@@ -64,7 +64,7 @@ def palette_image(numbers: np.ndarray, colors: dict[int, tuple[int, int, int]]) 
 def test_F_palette_whose_black_is_the_last_entry(tmp_path):
     """As an annotation tool writes it whose table begins with the first label, dark red."""
     draw = lambda: palette_image(np.where(OBJECT, 0, 2), {0: (128, 0, 0), 1: (0, 128, 0), 2: (0, 0, 0)})
-    truth = capture_with_masks(tmp_path / "s", "masks", draw)
+    truth = write_capture_with_masks(tmp_path / "s", "masks", draw)
     _, out, _ = run_with_messages(tmp_path / "s")
     assert_masked_views(out, truth.world_to_camera)
 
@@ -75,7 +75,7 @@ def test_F_one_class_of_a_palette_by_its_number(tmp_path):
     numbers[50:60, 10:90] = 7
     numbers[HEIGHT // 4 - 1, WIDTH // 4 : WIDTH // 2] = 255
     colors = {0: (0, 0, 0), 7: (128, 128, 128), 15: (192, 128, 128), 255: (224, 224, 192)}
-    truth = capture_with_masks(tmp_path / "s", "SegmentationClass", lambda: palette_image(numbers, colors))
+    truth = write_capture_with_masks(tmp_path / "s", "SegmentationClass", lambda: palette_image(numbers, colors))
     _, out, _ = run_with_messages(tmp_path / "s", masks={"folder": "SegmentationClass", "id": 15})
     assert_masked_views(out, truth.world_to_camera)
 
@@ -89,20 +89,20 @@ def numbered_16_bit() -> Image.Image:
 
 
 def test_F_object_numbers_of_16_bits_are_refused_without_id(tmp_path):
-    capture_with_masks(tmp_path / "s", "masks", numbered_16_bit)
+    write_capture_with_masks(tmp_path / "s", "masks", numbered_16_bit)
     message = refusal_before_writing(tmp_path / "s")
     assert ".png" in message and re.search(r"\bid\b", message), message
 
 
 def test_F_two_object_numbers_of_16_bits(tmp_path):
-    truth = capture_with_masks(tmp_path / "s", "masks", numbered_16_bit)
+    truth = write_capture_with_masks(tmp_path / "s", "masks", numbered_16_bit)
     _, out, _ = run_with_messages(tmp_path / "s", masks={"id": [3, 1024]})
     assert_masked_views(out, truth.world_to_camera)
 
 
 def test_F_antialiased_outlines_are_no_object_numbers(tmp_path):
     soft = cv2.GaussianBlur(255 * OBJECT.astype(np.uint8), (0, 0), 0.8)
-    truth = capture_with_masks(tmp_path / "s", "masks", lambda: Image.fromarray(soft))
+    truth = write_capture_with_masks(tmp_path / "s", "masks", lambda: Image.fromarray(soft))
     _, out, _ = run_with_messages(tmp_path / "s")
     assert [masked_share(out, v) for v in truth.world_to_camera] == pytest.approx([SHARE] * 6, abs=0.003)
 
@@ -146,7 +146,7 @@ def test_H_frames_of_another_tool_are_not_paired_by_order(tmp_path):
     assert_message([refusal_message(folder)], "images")
 
 
-def corner_capture(folder: Path, order: list[int]) -> Truth:
+def write_corner_capture(folder: Path, order: list[int]) -> Truth:
     """A drawn corner of a room, its points coloured as seen, and images IMG_8 to IMG_13 in the model; `image00k.png` is
     the view number `order[k]`."""
     generator, cameras = np.random.default_rng(5), room_walk(6)
@@ -181,12 +181,12 @@ def recolor(path: Path, colors: np.ndarray) -> None:
 
 def test_H_renamed_copies_follow_the_order_of_file_names(tmp_path):
     """IMG_10.JPG comes before IMG_8.JPG."""
-    truth = corner_capture(tmp_path / "s", [2, 3, 4, 5, 0, 1])
+    truth = write_corner_capture(tmp_path / "s", [2, 3, 4, 5, 0, 1])
     scene, _, sentences = run_with_messages(tmp_path / "s")
     assert_cameras(scene, truth)
     assert_message(sentences, "order")
 
 
 def test_H_renamed_copies_that_points_contradict_are_refused(tmp_path):
-    corner_capture(tmp_path / "s", [0, 3, 5, 1, 4, 2])
+    write_corner_capture(tmp_path / "s", [0, 3, 5, 1, 4, 2])
     assert_message([refusal_before_writing(tmp_path / "s")], "images")

@@ -46,11 +46,11 @@ def write_gaussians(path: Path, table: np.ndarray, order: str = "<", text: bool 
     PlyData([PlyElement.describe(table, "vertex")], text=text, byte_order="=" if text else order).write(str(path))
 
 
-def capture(folder: Path) -> Path:
+def write_transforms_capture(folder: Path) -> Path:
     return write_capture(folder, "transforms", make_truth())
 
 
-def taken(folder: Path, name: str, **params) -> tuple[dict[str, np.ndarray], list[str]]:
+def load_written_gaussians(folder: Path, name: str, **params) -> tuple[dict[str, np.ndarray], list[str]]:
     """The columns of the Gaussians that `poses` wrote, brought back to the scene's own frame; and the sentences."""
     scene, out, sentences = run_with_messages(folder, gaussians=name, **params)
     data = PlyData.read(str(out / "gaussians.ply"), mmap=False)["vertex"].data
@@ -61,7 +61,7 @@ def taken(folder: Path, name: str, **params) -> tuple[dict[str, np.ndarray], lis
     return columns, sentences
 
 
-def assert_same(columns: dict[str, np.ndarray], table: np.ndarray, names, atol: float = 1e-4) -> None:
+def assert_columns_equal(columns: dict[str, np.ndarray], table: np.ndarray, names, atol: float = 1e-4) -> None:
     for name in names:
         np.testing.assert_allclose(columns[name], table[name], atol=atol, err_msg=name)
 
@@ -86,7 +86,7 @@ SHAPE = ("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 
 
 def test_E_not_finite_and_zero_rows_of_big_endian_doubles(tmp_path):
-    folder, table = capture(tmp_path / "s"), gaussian_table(60, rest=9, kind="f8")
+    folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(60, rest=9, kind="f8")
     table["rot_2"][3] = table["f_rest_4"][41] = np.nan
     for row in (10, 11, 55):
         table[row] = 0
@@ -95,10 +95,10 @@ def test_E_not_finite_and_zero_rows_of_big_endian_doubles(tmp_path):
     for name in ("scale_0", "scale_1", "scale_2"):
         table[name][59] = -np.inf
     write_gaussians(folder / "edited.ply", table, ">")
-    columns, sentences = taken(folder, "edited.ply")
+    columns, sentences = load_written_gaussians(folder, "edited.ply")
     kept = np.delete(np.arange(60), [3, 10, 11, 41, 55])
     assert len(columns["x"]) == 55
-    assert_same(columns, table[kept], [*PLACE_AND_COLOR, "f_rest_0", "f_rest_8", "rot_0", "rot_3"])
+    assert_columns_equal(columns, table[kept], [*PLACE_AND_COLOR, "f_rest_0", "f_rest_8", "rot_0", "rot_3"])
     assert all(np.isfinite(values).all() for values in columns.values())
     opacity, clamped = sigmoid(columns["opacity"]), np.isinf(table["opacity"][kept])
     assert (opacity[np.isposinf(table["opacity"][kept])] > 0.99).all()
@@ -116,14 +116,14 @@ def test_E_not_finite_and_zero_rows_of_big_endian_doubles(tmp_path):
 
 def test_E_deleted_splats_are_those_of_the_rows_that_stay(tmp_path):
     """Before and after an editor deleted 30: bad rows are in both files, in front of what was deleted."""
-    folder, before = capture(tmp_path / "s"), gaussian_table(400)
+    folder, before = write_transforms_capture(tmp_path / "s"), gaussian_table(400)
     before["z"][5] = np.nan
     before[[17, 18]] = 0
     before["opacity"][100:140] = np.inf
     gone = np.arange(200, 230)
     write_gaussians(folder / "before.ply", before)
     write_gaussians(folder / "after.ply", np.delete(before, gone))
-    columns, _ = taken(folder, "before.ply", cleaned="after.ply")
+    columns, _ = load_written_gaussians(folder, "before.ply", cleaned="after.ply")
     deleted = np.load(tmp_path / "s_out" / "deleted.npy")
     kept = np.delete(np.arange(400), [5, 17, 18])
     assert len(deleted) == len(columns["x"]) == 397
@@ -131,11 +131,11 @@ def test_E_deleted_splats_are_those_of_the_rows_that_stay(tmp_path):
 
 
 def test_E_text_file_with_words_for_what_is_not_finite(tmp_path):
-    folder, table = capture(tmp_path / "s"), gaussian_table(20)
+    folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(20)
     table["opacity"][4], table["scale_2"][6], table["f_dc_1"][8] = np.inf, -np.inf, np.nan
     write_gaussians(folder / "splats/scan.ply", table, text=True)
-    columns, sentences = taken(folder, "splats/scan.ply")
-    assert_same(columns, np.delete(table, 8), [*PLACE_AND_COLOR, "scale_0", "rot_1"])
+    columns, sentences = load_written_gaussians(folder, "splats/scan.ply")
+    assert_columns_equal(columns, np.delete(table, 8), [*PLACE_AND_COLOR, "scale_0", "rot_1"])
     assert sigmoid(columns["opacity"][4]) > 0.99 and np.isfinite(columns["scale_2"]).all()
     assert_message(sentences, "1", "scan.ply")
 
@@ -143,7 +143,7 @@ def test_E_text_file_with_words_for_what_is_not_finite(tmp_path):
 # ---------------------------------------------------------------------------------------------- P: other trainers
 
 
-def assert_folded(columns: dict[str, np.ndarray], table: np.ndarray, atol: float) -> None:
+def assert_filter_folded(columns: dict[str, np.ndarray], table: np.ndarray, atol: float) -> None:
     filters = np.asarray(table["filter_3D"], np.float64)
     squares = np.exp(2 * np.stack([np.asarray(table[f"scale_{k}"], np.float64) for k in range(3)], 1))
     wider = squares + filters[:, None] ** 2
@@ -151,55 +151,58 @@ def assert_folded(columns: dict[str, np.ndarray], table: np.ndarray, atol: float
     for k in range(3):
         np.testing.assert_allclose(columns[f"scale_{k}"], 0.5 * np.log(wider[:, k]), atol=1e-4)
     np.testing.assert_allclose(sigmoid(columns["opacity"]), opacity, atol=atol)
-    assert_same(columns, table, [*PLACE_AND_COLOR, "rot_0", "rot_1", "rot_2", "rot_3"])
+    assert_columns_equal(columns, table, [*PLACE_AND_COLOR, "rot_0", "rot_1", "rot_2", "rot_3"])
     assert "filter_3D" not in columns
 
 
 def test_P_filter_of_some_splats_in_doubles(tmp_path):
-    folder, table = capture(tmp_path / "s"), gaussian_table(30, rest=45, more=("filter_3D",), kind="f8")
+    folder, table = (
+        write_transforms_capture(tmp_path / "s"),
+        gaussian_table(30, rest=45, more=("filter_3D",), kind="f8"),
+    )
     table["filter_3D"] = np.linspace(0, 0.4, 30)
     write_gaussians(folder / "mip.ply", table)
-    columns, _ = taken(folder, "mip.ply")
-    assert_folded(columns, table, 1e-5)
-    assert_same(columns, table, ["f_rest_0", "f_rest_44"])
+    columns, _ = load_written_gaussians(folder, "mip.ply")
+    assert_filter_folded(columns, table, 1e-5)
+    assert_columns_equal(columns, table, ["f_rest_0", "f_rest_44"])
 
 
 def test_P_filter_of_opaque_splats(tmp_path):
     """Infinite opacities become those of the filter."""
-    folder, table = capture(tmp_path / "s"), gaussian_table(24, more=("filter_3D",))
+    folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(24, more=("filter_3D",))
     table["filter_3D"], table["opacity"][::3] = 0.05, np.inf
     write_gaussians(folder / "mip.ply", table, text=True)
-    columns, _ = taken(folder, "mip.ply")
-    assert_folded(columns, table, 5e-3)  # infinite ones may be clamped first
+    columns, _ = load_written_gaussians(folder, "mip.ply")
+    assert_filter_folded(columns, table, 5e-3)  # infinite ones may be clamped first
 
 
 @pytest.mark.parametrize("rest", [0, 24])
 def test_P_two_scales_are_flat_along_the_third_axis(tmp_path, rest):
-    folder, table = capture(tmp_path / "s"), gaussian_table(25, rest=rest, scales=2)
+    folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(25, rest=rest, scales=2)
     write_gaussians(folder / "surfels.ply", table)
-    columns, _ = taken(folder, "surfels.ply")
-    assert_same(columns, table, [*PLACE_AND_COLOR, "opacity", "scale_0", "scale_1", "rot_0", "rot_2"])
+    columns, _ = load_written_gaussians(folder, "surfels.ply")
+    assert_columns_equal(columns, table, [*PLACE_AND_COLOR, "opacity", "scale_0", "scale_1", "rot_0", "rot_2"])
     assert np.isfinite(columns["scale_2"]).all()
     assert (columns["scale_2"] < np.minimum(table["scale_0"], table["scale_1"]) - 2).all()
 
 
 @pytest.mark.parametrize("text", [False, True])
 def test_P_fourth_degree_is_cut_channel_by_channel(tmp_path, text):
-    folder, table = capture(tmp_path / "s"), gaussian_table(12, rest=72)
+    folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(12, rest=72)
     write_gaussians(folder / "four.ply", table, ">", text)
-    columns, sentences = taken(folder, "four.ply")
+    columns, sentences = load_written_gaussians(folder, "four.ply")
     assert sum(name.startswith("f_rest_") for name in columns) == 45
     for channel in range(3):
         for k in range(15):
             ours, theirs = columns[f"f_rest_{15 * channel + k}"], table[f"f_rest_{24 * channel + k}"]
             np.testing.assert_allclose(ours, theirs, atol=1e-5)
-    assert_same(columns, table, [*PLACE_AND_COLOR, "opacity", *SHAPE])
+    assert_columns_equal(columns, table, [*PLACE_AND_COLOR, "opacity", *SHAPE])
     assert_message(sentences, "degree", "3")
 
 
 def test_P_splat_file(tmp_path):
     """32 bytes each: place and sizes as floats, colour and opacity, rotation as bytes around 128."""
-    folder, table = capture(tmp_path / "s"), gaussian_table(16)
+    folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(16)
     colors = np.random.default_rng(2).integers(0, 256, (16, 4)).astype(np.uint8)
     colors[:2, 3] = 255, 1
     turns = np.random.default_rng(4).normal(size=(16, 4))
@@ -210,8 +213,8 @@ def test_P_splat_file(tmp_path):
             file.write(struct.pack("<3f", row["x"], row["y"], row["z"]))
             file.write(struct.pack("<3f", *(np.exp(row[f"scale_{k}"]) for k in range(3))))
             file.write(color.tobytes() + turn.tobytes())
-    columns, _ = taken(folder, "scan.splat")
-    assert_same(columns, table, ["x", "y", "z", "scale_0", "scale_1", "scale_2"])
+    columns, _ = load_written_gaussians(folder, "scan.splat")
+    assert_columns_equal(columns, table, ["x", "y", "z", "scale_0", "scale_1", "scale_2"])
     for k in range(3):
         np.testing.assert_allclose(columns[f"f_dc_{k}"], (colors[:, k] / 255 - 0.5) / SH0, atol=1e-3)
     np.testing.assert_allclose(sigmoid(columns["opacity"]), colors[:, 3] / 255, atol=0.01)
@@ -250,18 +253,18 @@ def spz_bytes(table: np.ndarray, turns: np.ndarray, version: int) -> bytes:
 def test_P_spz_file(tmp_path, version):
     """Its axes are right, up, back. Taken as such, or turned to those of the PLY file that it was made of: places and
     rotations go together."""
-    folder, table = capture(tmp_path / "s"), gaussian_table(32)
+    folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(32)
     turns = np.random.default_rng(6).normal(size=(32, 4))
     turns[:, 0] += np.sign(turns[:, 0])  # near 0 version 2 is coarse
     turns /= np.linalg.norm(turns, axis=1, keepdims=True)
     (folder / "scan.spz").write_bytes(spz_bytes(table, turns, version))
-    columns, _ = taken(folder, "scan.spz")
-    assert_same(columns, table, ["x"], 2e-3)
+    columns, _ = load_written_gaussians(folder, "scan.spz")
+    assert_columns_equal(columns, table, ["x"], 2e-3)
     side = float(np.sign(columns["y"] @ table["y"]))
     for axis in "yz":
         np.testing.assert_allclose(columns[axis], side * table[axis], atol=2e-3)
-    assert_same(columns, table, ["f_dc_0", "f_dc_1", "f_dc_2"], 0.02)
-    assert_same(columns, table, ["scale_0", "scale_1", "scale_2"], 0.04)
+    assert_columns_equal(columns, table, ["f_dc_0", "f_dc_1", "f_dc_2"], 0.02)
+    assert_columns_equal(columns, table, ["scale_0", "scale_1", "scale_2"], 0.04)
     np.testing.assert_allclose(sigmoid(columns["opacity"]), sigmoid(table["opacity"]), atol=0.01)
     signs = (1, 1, side * -1, side * -1)
     expected = {f"scale_{k}": columns[f"scale_{k}"] for k in range(3)}

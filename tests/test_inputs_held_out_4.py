@@ -78,7 +78,7 @@ def test_N_phone_picture_called_jpg_without_its_reader(tmp_path, monkeypatch, br
     assert_message([refusal_message(folder)], "IMG_3.jpg", "pi-heif")
 
 
-def fisheye_capture(folder: Path, params: tuple[float, ...]) -> Truth:
+def write_fisheye_capture(folder: Path, params: tuple[float, ...]) -> Truth:
     """Speckled photographs of a fisheye without coefficients, as COLMAP's earlier model writes it."""
     truth = make_truth(("OPENCV_FISHEYE", (*params, 0.0, 0.0, 0.0, 0.0)))
     write_capture(folder, "colmap", truth)
@@ -88,7 +88,7 @@ def fisheye_capture(folder: Path, params: tuple[float, ...]) -> Truth:
     return truth
 
 
-def assert_undistorted_alike(folder: Path, truth: Truth, earlier: dict[str, np.ndarray]) -> None:
+def assert_same_undistortion(folder: Path, truth: Truth, earlier: dict[str, np.ndarray]) -> None:
     """The capture gives the cameras, and the pictures that the earlier model gave."""
     scene, out, sentences = run_with_messages(folder)
     assert reprojection_error(scene, truth) < EXACT
@@ -103,26 +103,26 @@ def write_camera(folder: Path, number: int, params: tuple[float, ...]) -> None:
     (folder / "sparse/0/cameras.bin").write_bytes(head + struct.pack(f"<{len(params)}d", *params))
 
 
-def pictures_by_earlier_model(folder: Path) -> dict[str, np.ndarray]:
+def load_undistorted(folder: Path) -> dict[str, np.ndarray]:
     scene, out, _ = run_with_messages(folder)
     return load_views(out, scene.train)
 
 
 def test_N_fisheye_of_two_focal_lengths_in_text(tmp_path):
     params = (58.0, 61.0, 47.0, 36.5)
-    truth = fisheye_capture(tmp_path / "s", params)
-    earlier, model = pictures_by_earlier_model(tmp_path / "s"), tmp_path / "s/sparse/0"
+    truth = write_fisheye_capture(tmp_path / "s", params)
+    earlier, model = load_undistorted(tmp_path / "s"), tmp_path / "s/sparse/0"
     (model / "cameras.bin").unlink()
     (model / "cameras.txt").write_text(f"# Camera list\n1 FISHEYE {WIDTH} {HEIGHT} {' '.join(map(str, params))}\n")
-    assert_undistorted_alike(tmp_path / "s", truth, earlier)
+    assert_same_undistortion(tmp_path / "s", truth, earlier)
 
 
 @pytest.mark.parametrize(("number", "params"), [(14, (60.0, 48.5, 35.0)), (15, (60.0, 57.0, 48.5, 35.0))])
 def test_N_fisheyes_in_binary(tmp_path, number, params):
-    truth = fisheye_capture(tmp_path / "s", params if number == 15 else (60.0, *params))
-    earlier = pictures_by_earlier_model(tmp_path / "s")
+    truth = write_fisheye_capture(tmp_path / "s", params if number == 15 else (60.0, *params))
+    earlier = load_undistorted(tmp_path / "s")
     write_camera(tmp_path / "s", number, params)
-    assert_undistorted_alike(tmp_path / "s", truth, earlier)
+    assert_same_undistortion(tmp_path / "s", truth, earlier)
 
 
 def assert_names_model(message: str, file: str, model: str) -> None:
@@ -190,7 +190,7 @@ def add_to_frames(folder: Path, key: str, path_of) -> None:
     (folder / "transforms.json").write_text(json.dumps(record))
 
 
-def inverse_masks(folder: Path, where: str) -> Truth:
+def write_inverse_masks(folder: Path, where: str) -> Truth:
     """Masks as nerfstudio takes them, 0 is left out of the training, beside transforms.json that names them."""
     truth = make_truth()
     write_pictures(folder / "images", truth.world_to_camera)
@@ -202,14 +202,14 @@ def inverse_masks(folder: Path, where: str) -> Truth:
 
 
 def test_O_masks_of_dynamic_objects(tmp_path):
-    truth = inverse_masks(tmp_path / "s", "dynamic_masks/cam0")
+    truth = write_inverse_masks(tmp_path / "s", "dynamic_masks/cam0")
     _, out, sentences = run_with_messages(tmp_path / "s")
     assert_masked_views(out, truth.world_to_camera)
     assert_message(sentences, "mask_path")
 
 
 def test_O_masks_of_the_scene_win(tmp_path):
-    truth = inverse_masks(tmp_path / "s", "dynamic_masks")
+    truth = write_inverse_masks(tmp_path / "s", "dynamic_masks")
     for view in truth.world_to_camera:
         write_mask(tmp_path / "s/mask" / f"{view}.png", np.roll(OBJECT[:, : WIDTH // 2], 3, 0).repeat(2, 1))
     _, out, _ = run_with_messages(tmp_path / "s")
@@ -218,7 +218,7 @@ def test_O_masks_of_the_scene_win(tmp_path):
 
 def test_O_masks_that_lie_where_ours_are_looked_for(tmp_path):
     """Nerfstudio's own name of the folder: taken as that file means them, or the sentence says how they are taken."""
-    inverse_masks(tmp_path / "s", "masks")
+    write_inverse_masks(tmp_path / "s", "masks")
     try:
         _, out, sentences = run_with_messages(tmp_path / "s")
     except BadInput as error:

@@ -53,7 +53,7 @@ def test_K_webp_saved_by_a_browser_as_jpg(tmp_path):
     assert_placed(scene, truth)
 
 
-def save_both_ways(folder: Path, portrait: set[int], save) -> dict[str, np.ndarray]:
+def save_two_orientations(folder: Path, portrait: set[int], save) -> dict[str, np.ndarray]:
     """A walk of nine views, those in `portrait` with the phone upright; `save` takes path, picture, whether it is."""
     truth, surfaces = room_walk(9), room_textures(np.random.default_rng(0))
     folder.mkdir(parents=True)
@@ -63,7 +63,7 @@ def save_both_ways(folder: Path, portrait: set[int], save) -> dict[str, np.ndarr
     return truth
 
 
-def assert_both_ways(scene, truth: dict[str, np.ndarray], portrait: set[int]) -> None:
+def assert_two_orientations(scene, truth: dict[str, np.ndarray], portrait: set[int]) -> None:
     assert_placed(scene, truth)
     for k, name in enumerate(truth):
         camera = scene.cameras[name]
@@ -78,14 +78,14 @@ def test_R_turned_by_their_tag(tmp_path):
         stored.save(path.with_suffix(".jpg"), quality=95, exif=exif(6 if upright else 1))
 
     portrait = {2, 5, 6, 8}
-    truth = save_both_ways(tmp_path / "s/images", portrait, save)
+    truth = save_two_orientations(tmp_path / "s/images", portrait, save)
     scene, _, _ = run_with_messages(tmp_path / "s", masks="none")
-    assert_both_ways(scene, truth, portrait)
+    assert_two_orientations(scene, truth, portrait)
 
 
 def test_R_stored_upright_without_tags(tmp_path):
     portrait = {0, 3, 4}
     save = lambda path, picture, upright: picture.save(path.with_suffix(".png"))
-    truth = save_both_ways(tmp_path / "s/photos", portrait, save)
+    truth = save_two_orientations(tmp_path / "s/photos", portrait, save)
     scene, _, _ = run_with_messages(tmp_path / "s", masks="none")
-    assert_both_ways(scene, truth, portrait)
+    assert_two_orientations(scene, truth, portrait)

@@ -137,26 +137,26 @@ def test_L_test_masks_follow_the_order_of_file_names(tmp_path):
 # ---------------------------------------------------------------------------------------------- M: forms of Unicode
 
 
-def decomposed(name: str) -> str:
+def to_nfd(name: str) -> str:
     return unicodedata.normalize("NFD", name)
 
 
-def composed(name: str) -> str:
+def to_nfc(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
-def assert_right_for_composed(scene, truth: Truth, names: dict[str, str]) -> None:
+def assert_cameras_by_nfc(scene, truth: Truth, names: dict[str, str]) -> None:
     """The cameras are right, whichever form the views' names have."""
-    found = {composed(name): name for name in scene.cameras}
-    assert sorted(found) == sorted(composed(name) for name in names.values())
-    assert_cameras(scene, rename_views(truth, {v: found[composed(n)] for v, n in names.items()}))
+    found = {to_nfc(name): name for name in scene.cameras}
+    assert sorted(found) == sorted(to_nfc(name) for name in names.values())
+    assert_cameras(scene, rename_views(truth, {v: found[to_nfc(n)] for v, n in names.items()}))
 
 
 def test_M_transforms_json_and_masks_from_another_system(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
-    names = {v: composed(f"がぞう é {k}") for k, v in enumerate(sorted(truth.world_to_camera))}
-    assert decomposed(names["v00"]) != names["v00"]
-    write_pictures(folder / "images", [decomposed(name) for name in names.values()])
+    names = {v: to_nfc(f"がぞう é {k}") for k, v in enumerate(sorted(truth.world_to_camera))}
+    assert to_nfd(names["v00"]) != names["v00"]
+    write_pictures(folder / "images", [to_nfd(name) for name in names.values()])
     for name in names.values():
         write_mask(folder / "masks" / f"{name}.png.png")
     write_transforms(folder, truth)
@@ -165,34 +165,34 @@ def test_M_transforms_json_and_masks_from_another_system(tmp_path):
         frame["file_path"] = f"images/{names[Path(frame['file_path']).stem]}.png"
     (folder / "transforms.json").write_text(json.dumps(record))
     scene, out, _ = run_with_messages(folder, test=[names["v03"]])
-    assert [composed(view) for view in scene.test] == [names["v03"]]
-    assert_right_for_composed(scene, truth, names)
-    assert {composed(view) for view in masked_views(out)} >= set(names.values()) - {names["v03"]}
+    assert [to_nfc(view) for view in scene.test] == [names["v03"]]
+    assert_cameras_by_nfc(scene, truth, names)
+    assert {to_nfc(view) for view in masked_views(out)} >= set(names.values()) - {names["v03"]}
 
 
 def test_M_folder_of_a_model_written_on_another_system(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     names = {v: f"{'Ünterführung'}/Brücke_{k}" for k, v in enumerate(sorted(truth.world_to_camera))}
-    write_named_model(folder / "sparse/0", truth, {v: f"{decomposed(n)}.jpg" for v, n in names.items()})
+    write_named_model(folder / "sparse/0", truth, {v: f"{to_nfd(n)}.jpg" for v, n in names.items()})
     convert_to_text(folder / "sparse/0")
-    write_pictures(folder / "images", [composed(name) for name in names.values()], ending=".jpg")
+    write_pictures(folder / "images", [to_nfc(name) for name in names.values()], ending=".jpg")
     for name in names.values():
-        write_mask(folder / "masks" / f"{decomposed(name)}.png")
+        write_mask(folder / "masks" / f"{to_nfd(name)}.png")
     stems = {v: Path(name).name for v, name in names.items()}
-    scene, out, _ = run_with_messages(folder, cameras_only=[decomposed(names["v01"]) + ".jpg"])
-    assert [composed(view) for view in scene.blank] == [composed("Brücke_1")]
-    assert_right_for_composed(scene, truth, stems)
-    assert {composed(view) for view in masked_views(out)} == {composed(s) for v, s in stems.items() if v != "v01"}
+    scene, out, _ = run_with_messages(folder, cameras_only=[to_nfd(names["v01"]) + ".jpg"])
+    assert [to_nfc(view) for view in scene.blank] == [to_nfc("Brücke_1")]
+    assert_cameras_by_nfc(scene, truth, stems)
+    assert {to_nfc(view) for view in masked_views(out)} == {to_nfc(s) for v, s in stems.items() if v != "v01"}
 
 
 def test_M_names_of_two_forms_in_one_folder(tmp_path):
     """Every second picture was copied through macOS."""
     folder, truth = tmp_path / "s", make_truth()
     names = {v: f"Straße à {k}" for k, v in enumerate(sorted(truth.world_to_camera))}
-    pictures = {v: (decomposed, composed)[k % 2](n) for k, (v, n) in enumerate(names.items())}
+    pictures = {v: (to_nfd, to_nfc)[k % 2](n) for k, (v, n) in enumerate(names.items())}
     write_pictures(folder / "images", pictures.values())
-    write_masks(folder / "masks", [decomposed(name) for name in names.values()])
-    write_named_model(folder / "sparse/0", truth, {v: f"{composed(n)}.png" for v, n in names.items()})
+    write_masks(folder / "masks", [to_nfd(name) for name in names.values()])
+    write_named_model(folder / "sparse/0", truth, {v: f"{to_nfc(n)}.png" for v, n in names.items()})
     scene, _, _ = run_with_messages(folder)
     assert len(scene.train) == 6
-    assert_right_for_composed(scene, truth, names)
+    assert_cameras_by_nfc(scene, truth, names)

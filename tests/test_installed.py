@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import subprocess
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from scenes.capture import write_four_photos
+from scenes.processes import run_module
 
 from runner.keys import Hashes, code_fingerprints
 from runner.pipeline import load_pipeline
@@ -43,10 +43,8 @@ def wheel_folder(tmp_path_factory) -> Path:
 
 
 def run_command(wheel_folder: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """`reffusion <arguments>` in a folder that has nothing to do with the project."""
-    environment = {**os.environ, "PYTHONPATH": str(wheel_folder)}
-    whole = [sys.executable, "-m", "reffusion.command", *arguments]
-    return subprocess.run(whole, cwd=folder, env=environment, capture_output=True, text=True)
+    """`reffusion <arguments>` in a folder outside the project."""
+    return run_module("reffusion.command", *arguments, cwd=folder, env={"PYTHONPATH": str(wheel_folder)})
 
 
 def test_all_is_in_one_package(wheel_folder):

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from scenes.processes import fake_nvidia_smi
 
 from benchmarks.gpu import ready
 from reffusion.io import machine
@@ -80,14 +81,6 @@ def test_torch_is_asked_without_importing_it(tmp_path, monkeypatch, line, built)
     (tmp_path / "version.py").write_text(f"__version__ = '2.13.0'\ndebug = False\n{line}\ngit_version = 'a'\n")
     monkeypatch.setattr(machine, "_package", lambda name: tmp_path)
     assert machine._torch_cuda() == built
-
-
-def fake_nvidia_smi(folder: Path, said: str) -> dict[str, str]:
-    """An environment whose nvidia-smi says this."""
-    tool = folder / "nvidia-smi"
-    tool.write_text(f"#!/bin/sh\necho '{said}'\n")
-    tool.chmod(0o755)
-    return {**os.environ, "PATH": f"{folder}:{os.environ['PATH']}"}
 
 
 def test_a_stage_says_what_it_lacks_at_once(tmp_path, monkeypatch):

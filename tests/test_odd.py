@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scenes import wall_scene
+from scenes.cameras import make_scene
 
 from reffusion.capture.checks import sanity
 from reffusion.capture.checks.sanity import find_odd_exposures, find_odd_masks
@@ -14,7 +15,7 @@ from reffusion.geometry import pixel_rays
 from reffusion.io.arrays import save_json
 from reffusion.io.images import image_size
 from reffusion.io.scene import load_raw_masks, load_scene, load_views
-from reffusion.types import Camera, Scene, Similarity
+from reffusion.types import Camera
 from report import check
 
 
@@ -70,7 +71,7 @@ def test_masks_of_a_small_object_in_a_deep_scene_agree():
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     points = directions * np.geomspace(0.5, 40, 40_000)[:, None]
     colours = np.zeros((40_000, 3), np.uint8)
-    scene = Scene(cameras, tuple(cameras), (), frozenset(), points, colours, Similarity(1.0, np.zeros(3)))
+    scene = make_scene(cameras, points=points, colors=colours)
     assert sanity._warn_inconsistent(scene, masks) == []
     moved = masks | {"v4": np.roll(masks["v4"], 20, 0)}
     assert sanity._warn_inconsistent(scene, moved) == [

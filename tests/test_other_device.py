@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from other_device import gpu, there_is_one
+from other_device import has_gpu, simulated_gpu
 from scenes import wall_scene
 from scenes.stage_runs import run_masks, write_true_references
 
@@ -34,19 +34,19 @@ def reference_folders(tmp_path_factory):
     return {"poses": poses, "fit": fit_folder, "masks": masks_folder, "reference": reference}
 
 
-def run_on_both_devices(tmp_path, work) -> list:
+def run_on_cpu_and_gpu(tmp_path, work) -> list:
     """The folders that `work(device, folder)` fills on the CPU and on the GPU."""
     folders = [tmp_path / "cpu", tmp_path / "cuda"]
     for folder in folders:
         folder.mkdir()
     work("cpu", folders[0])
-    with gpu():
+    with simulated_gpu():
         work("cuda", folders[1])
     return folders
 
 
 def test_the_stand_in_refuses_what_cuda_refuses():
-    with gpu():
+    with simulated_gpu():
         here, there = torch.ones(3), torch.ones(3, device="cuda")
         assert there.device.type == "cuda" and not here.is_cuda and (there + 1).is_cuda and there[here > 0].is_cuda
         for mixed in (lambda: here + there, lambda: torch.where(here > 0, there, 0.0), lambda: here[there > 0]):
@@ -61,19 +61,19 @@ def test_the_stand_in_refuses_what_cuda_refuses():
 def test_masks_on_a_card(reference_folders, tmp_path, vote):
     poses, fit_folder = reference_folders["poses"], reference_folders["fit"]
     run = lambda device, out: run_masks(poses, fit_folder, out, masks.Params(device=device, vote=vote))
-    cpu, cuda = run_on_both_devices(tmp_path, run)
+    cpu, cuda = run_on_cpu_and_gpu(tmp_path, run)
     assert torch.equal(load_labels(cpu / "labels.npy"), load_labels(cuda / "labels.npy"))
     before, after = (load_mask_sets(folder, wall_scene.TRAIN) for folder in (cpu, cuda))
     for name in wall_scene.TRAIN:
         for kind in ("consistent", "unobserved", "invent"):
             differs = getattr(before[name], kind) != getattr(after[name], kind)
-            assert differs.mean() <= (0.01 if there_is_one() else 0), (name, kind)  # a GPU rounds otherwise
+            assert differs.mean() <= (0.01 if has_gpu() else 0), (name, kind)  # a GPU rounds otherwise
 
 
 def test_a_box_on_a_card():
     gaussians, _ = wall_scene.wall_and_square(NEAR)
     box = regions.Region((0, 0, NEAR), (0.5, 0.5, 0.1))
-    with gpu():
+    with simulated_gpu():
         there = regions.inside_region(gaussians.map(lambda p: p.to("cuda")), box)
         assert there.is_cuda and there.any() and torch.equal(there.cpu(), regions.inside_region(gaussians, box))
 
@@ -84,14 +84,14 @@ def test_a_box_on_a_card():
     ids=["reference", "random", "nothing"],
 )
 def test_initialize_on_a_card(reference_folders, tmp_path, changed):
-    cpu, cuda = run_on_both_devices(
+    cpu, cuda = run_on_cpu_and_gpu(
         tmp_path, lambda d, out: initialize.run(initialize.Params(device=d, **changed), out, **reference_folders)
     )
     assert torch.equal(load_labels(cpu / "labels.npy"), load_labels(cuda / "labels.npy"))
     before, after = (load_ply(folder / "gaussians.ply") for folder in (cpu, cuda))
     for name in PARAMETERS:  # settling takes other kernels of SSIM and Adam there, which round otherwise
         near = (getattr(before, name) - getattr(after, name)).abs() <= 2e-2  # not where one is NaN
-        assert (~near).float().mean() <= (0.01 if there_is_one() else 0), name
+        assert (~near).float().mean() <= (0.01 if has_gpu() else 0), name
 
 
 def test_a_fit_on_a_card(reference_folders, tmp_path):
@@ -100,7 +100,7 @@ def test_a_fit_on_a_card(reference_folders, tmp_path):
     run = lambda device, out: fit.run(
         fit.Params().changed(changed | {"device": device}), out, poses=reference_folders["poses"]
     )
-    cpu, cuda = run_on_both_devices(tmp_path, run)
+    cpu, cuda = run_on_cpu_and_gpu(tmp_path, run)
     before, after = (load_ply(folder / "gaussians.ply") for folder in (cpu, cuda))
     assert len(before) == len(after)
     assert all(torch.allclose(getattr(before, n), getattr(after, n), atol=2e-2) for n in PARAMETERS)

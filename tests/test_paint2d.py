@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scenes.images import gradient_image, rectangle_mask
 from scenes.networks import MeanInpainter
 
 from reffusion import morphology
@@ -11,22 +12,13 @@ from reffusion.inpaint import classical
 from reffusion.seeding import generator
 
 HEIGHT, WIDTH = 37, 50
+PICTURE = gradient_image((HEIGHT, WIDTH), 3, 4)
+HOLE = rectangle_mask((HEIGHT, WIDTH), (12, 24), (15, 36))
 
 
 class WrongSizeInpainter(torch.nn.Module):
     def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         return image[:, :, 1:]
-
-
-def gradient_image():
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    return np.stack([3 * rows, 4 * columns, 100 + 0 * rows], -1).astype(np.uint8)
-
-
-def rectangular_hole():
-    mask = np.zeros((HEIGHT, WIDTH), bool)
-    mask[12:24, 15:36] = True
-    return mask
 
 
 def load_inpainters(folder):
@@ -39,30 +31,24 @@ def load_inpainters(folder):
 
 
 def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path):
-    image, noise = gradient_image(), np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
-    poisoned = np.where(rectangular_hole()[..., None], noise, image)
+    image, noise = PICTURE, np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    poisoned = np.where(HOLE[..., None], noise, image)
     for painter in load_inpainters(tmp_path):
-        painted = painter.paint(image, rectangular_hole())
-        assert (painted[~rectangular_hole()] == image[~rectangular_hole()]).all() and painted.dtype == np.uint8, (
-            painter.name
-        )
-        assert (painter.paint(poisoned, rectangular_hole()) == painted).all(), painter.name
-        assert (painter.paint(image, np.zeros_like(rectangular_hole())) == image).all(), painter.name
+        painted = painter.paint(image, HOLE)
+        assert (painted[~HOLE] == image[~HOLE]).all() and painted.dtype == np.uint8, painter.name
+        assert (painter.paint(poisoned, HOLE) == painted).all(), painter.name
+        assert (painter.paint(image, np.zeros_like(HOLE)) == image).all(), painter.name
 
 
 def test_a_mask_is_widened_by_a_share_of_the_width():
-    wide = morphology.dilate(rectangular_hole(), 0.04)  # 2 px
+    wide = morphology.dilate(HOLE, 0.04)  # 2 px
     assert (wide[10:26, 25]).all() and not wide[9, 25] and not wide[26, 25] and wide[18, 13] and not wide[18, 12]
-    assert (morphology.dilate(rectangular_hole(), 0) == rectangular_hole()).all() and not morphology.dilate(
-        np.zeros_like(rectangular_hole()), 0.1
-    ).any()
+    assert (morphology.dilate(HOLE, 0) == HOLE).all() and not morphology.dilate(np.zeros_like(HOLE), 0.1).any()
 
 
 def test_a_smooth_picture_is_continued():
     for painter in (classical.load_classical(), classical.Painter("telea", classical.telea)):
-        error = np.abs(painter.paint(gradient_image(), rectangular_hole()).astype(int) - gradient_image())[
-            rectangular_hole()
-        ]
+        error = np.abs(painter.paint(PICTURE, HOLE).astype(int) - PICTURE)[HOLE]
         assert error.mean() < 12, painter.name
 
 
@@ -78,7 +64,7 @@ def test_large_pictures_are_painted_small_by_fsr():
 def test_lama_is_fed_and_named(tmp_path):
     lama, fallback, *_ = load_inpainters(tmp_path)
     assert lama.name == "LaMa (any-name.pt)" and fallback.name.startswith("OpenCV")
-    painted = lama.paint(gradient_image(), rectangular_hole())[rectangular_hole()]
+    painted = lama.paint(PICTURE, HOLE)[HOLE]
     assert (painted == painted[0]).all() and abs(int(painted[0, 2]) - 100) <= 1
 
 
@@ -89,7 +75,7 @@ def test_weights_that_are_none_are_refused(tmp_path):
         classical.load_lama(file)
     torch.jit.script(WrongSizeInpainter()).save(file)
     with pytest.raises(ValueError, match="the module's answer"):
-        classical.load_lama(file).paint(gradient_image(), rectangular_hole())
+        classical.load_lama(file).paint(PICTURE, HOLE)
 
 
 def test_the_stand_in_for_lpips_is_named_as_such_and_measures_structure(tmp_path, monkeypatch):

@@ -42,11 +42,6 @@ ROOT = Path(__file__).resolve().parent.parent
 NEAR = 1.6
 
 
-@pytest.fixture(scope="module")
-def prior():
-    return small_prior()
-
-
 # ------------------------------------------------------------------------------------------------ what supervises
 
 

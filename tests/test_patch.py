@@ -57,7 +57,7 @@ def test_what_was_moved_scaled_or_turned_otherwise_is_not_matched(moved):
 # ---------------------------------------------------------------------------------------------- the stage `poses`
 
 
-def run_poses(folder, **params):
+def run_poses_after_edit(folder, **params):
     out = folder.parent / f"{folder.name}_out"
     out.mkdir(exist_ok=True)
     given = poses.Params(gaussians="scene.ply", cleaned="cleaned.ply", **params)
@@ -72,7 +72,7 @@ def test_poses_says_which_splats_were_deleted(tmp_path, compressed, capsys):
     if compressed:
         left = whole.map(lambda p: p[torch.from_numpy(~deleted)])
         save_compressed(tmp_path / "s" / "cleaned.ply", left, HERE)
-    out = run_poses(tmp_path / "s", masks="none")
+    out = run_poses_after_edit(tmp_path / "s", masks="none")
     assert np.count_nonzero(load_labels(out / "deleted.npy").numpy() != deleted) <= 2 * compressed
     assert f"{deleted.sum()} of 4000 splats were deleted" in capsys.readouterr().out
     brought = load_ply(out / "gaussians.ply", None)
@@ -84,7 +84,7 @@ def test_poses_says_which_splats_were_deleted(tmp_path, compressed, capsys):
 
 def assert_refusal(folder, message, **params):
     with pytest.raises(ValueError, match=message) as told:
-        run_poses(folder, **params)
+        run_poses_after_edit(folder, **params)
     assert "\n" not in str(told.value)
 
 
@@ -116,7 +116,7 @@ def test_cameras_of_a_capture_look_at_renders(tmp_path):
     write_edited_capture(folder)
     remove_pictures(folder)
     with pytest.warns(UserWarning, match=r"no photographs: the 6 cameras of .*transforms\.json look at"):
-        out = run_poses(folder)
+        out = run_poses_after_edit(folder)
     scene, truth = load_scene(out), make_truth(scale=5.0, offset=(50.0, 0.0, 0.0))
     assert scene.train == tuple(sorted(truth.world_to_camera)) and not scene.test
     for name, pose in truth.world_to_camera.items():
@@ -140,7 +140,7 @@ def test_a_ring_of_cameras_sees_the_hole_from_above_what_it_stands_on(tmp_path):
     remove_pictures(folder)
     (folder / "transforms.json").unlink()
     with pytest.warns(UserWarning, match=r"no photographs: \d+ cameras around the hole"):
-        out = run_poses(folder, longest=64)
+        out = run_poses_after_edit(folder, longest=64)
     scene, means = load_scene(out), load_ply(out / "gaussians.ply").means.double().numpy()
     hole = means[deleted].mean(0)
     assert len(scene.train) > 5 and len(load_labels(out / "deleted.npy")) == len(means)
@@ -194,7 +194,7 @@ def test_gaussians_in_another_frame_than_the_cameras_are_refused(tmp_path, moved
 
 def test_the_patch_is_given_back_as_the_editor_wrote_the_scene(tmp_path):
     write_edited_capture(tmp_path / "s")
-    out = run_poses(tmp_path / "s", masks="none")
+    out = run_poses_after_edit(tmp_path / "s", masks="none")
     home = tmp_path / "runs" / "s"
     home.mkdir(parents=True)
     out.rename(home / "poses")
@@ -223,13 +223,13 @@ def test_exported_cameras_are_a_capture_without_photographs(tmp_path):
     """What `export` wrote is what `patch` takes."""
     folder = tmp_path / "s"
     write_edited_capture(folder)
-    out = run_poses(folder, masks="none")
+    out = run_poses_after_edit(folder, masks="none")
     for name in ("transforms.json", "images", "masks"):
         (folder / name).rename(tmp_path / name)
     save_cameras(folder, load_scene(out), "images")
     (folder / "transforms.json").unlink()
     with pytest.warns(UserWarning, match=r"no photographs: the 6 cameras of .*sparse/0"):
-        again = load_scene(run_poses(folder))
+        again = load_scene(run_poses_after_edit(folder))
     was = load_scene(out)
     for name, camera in was.cameras.items():
         place = was.similarity.invert(camera.center)

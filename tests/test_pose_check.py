@@ -81,7 +81,7 @@ def write_two_planes(folder: Path, **pictures: np.ndarray) -> Path:
     return folder
 
 
-def run_poses(folder: Path, **params) -> tuple[Path, list[str]]:
+def run_poses_with_warnings(folder: Path, **params) -> tuple[Path, list[str]]:
     """The folder that `poses` leaves, and its warnings."""
     out = folder.parent / "run" / "poses"
     with warnings.catch_warnings():
@@ -141,7 +141,7 @@ def test_plain_photographs_and_few_points_tell_nothing():
 
 
 def test_a_photograph_that_contradicts_its_pose_is_left_out(tmp_path):
-    out, said = run_poses(write_two_planes(tmp_path / "scene", **{BAD: PICTURES["v08"]}))
+    out, said = run_poses_with_warnings(write_two_planes(tmp_path / "scene", **{BAD: PICTURES["v08"]}))
     scene = load_scene(out)
     assert scene.outliers == (BAD,) and BAD not in scene.cameras and len(scene.train) == 9
     assert json.loads((out / "views.json").read_text())["outliers"] == [BAD]
@@ -155,8 +155,8 @@ def test_a_photograph_that_contradicts_its_pose_is_left_out(tmp_path):
 
 
 def test_what_the_other_photographs_show_stays_as_it_was(tmp_path):
-    whole, said = run_poses(write_two_planes(tmp_path / "a" / "scene"))
-    less, _ = run_poses(write_two_planes(tmp_path / "b" / "scene", **{BAD: PICTURES["v08"]}))
+    whole, said = run_poses_with_warnings(write_two_planes(tmp_path / "a" / "scene"))
+    less, _ = run_poses_with_warnings(write_two_planes(tmp_path / "b" / "scene", **{BAD: PICTURES["v08"]}))
     assert said == [] and "outliers" not in json.loads((whole / "views.json").read_text())
     for name, camera in load_scene(less).cameras.items():
         assert np.allclose(camera.world_to_camera, load_scene(whole).cameras[name].world_to_camera, atol=1e-12)
@@ -164,18 +164,18 @@ def test_what_the_other_photographs_show_stays_as_it_was(tmp_path):
 
 def test_keep_uses_it_and_exclude_leaves_it_out_without_a_word(tmp_path):
     folder = write_two_planes(tmp_path / "scene", **{BAD: PICTURES["v08"]})
-    out, said = run_poses(folder, keep=[f"{BAD}.png"])
+    out, said = run_poses_with_warnings(folder, keep=[f"{BAD}.png"])
     assert said == [] and BAD in load_scene(out).train and load_scene(out).suspects == ()
-    out, said = run_poses(folder.parent / "scene", exclude=[BAD])
+    out, said = run_poses_with_warnings(folder.parent / "scene", exclude=[BAD])
     assert said == [] and BAD not in load_scene(out).cameras and load_scene(out).outliers == ()
     save_image(folder / "images" / "v07.png", PICTURES["v01"])
-    out, (line,) = run_poses(folder, exclude=[BAD])
+    out, (line,) = run_poses_with_warnings(folder, exclude=[BAD])
     assert 'are left out: v07; in scene.yaml, `exclude: ["v04", "v07"]`' in line
 
 
 def test_test_and_clean_views_stay_and_are_named(tmp_path):
     folder = write_two_planes(tmp_path / "scene", v02=PICTURES["v07"], v06=PICTURES["v01"])
-    out, (test, clean) = run_poses(folder, test=["v02"], clean=["v06"])
+    out, (test, clean) = run_poses_with_warnings(folder, test=["v02"], clean=["v06"])
     scene = load_scene(out)
     assert scene.suspects == ("v02", "v06") and scene.outliers == ()
     assert "v02" in scene.test and "v06" in scene.clean
@@ -189,14 +189,14 @@ def test_test_and_clean_views_stay_and_are_named(tmp_path):
 def test_where_most_contradict_nothing_is_left_out(tmp_path):
     noise = np.random.default_rng(1).integers(0, 256, (10, 9, 12, 3)).astype(np.uint8)
     blocks = {n: np.kron(each, np.ones((8, 8, 1), np.uint8)) for n, each in zip(PICTURES, noise, strict=True)}
-    out, said = run_poses(write_two_planes(tmp_path / "scene", **blocks))
+    out, said = run_poses_with_warnings(write_two_planes(tmp_path / "scene", **blocks))
     assert said == ["at least 5 of 10 photographs contradict their poses; do poses and pictures belong together?"]
     assert len(load_scene(out).train) == 10
 
 
 def test_no_fewer_than_three_training_views_are_left(tmp_path):
     folder = write_two_planes(tmp_path / "scene", v05=PICTURES["v09"])
-    out, (line,) = run_poses(folder, train=["v04", "v05", "v06"])
+    out, (line,) = run_poses_with_warnings(folder, train=["v04", "v05", "v06"])
     assert "are used all the same, for fewer than 3 would be left: v05;" in line
     assert load_scene(out).train == ("v04", "v05", "v06")
 
@@ -210,13 +210,13 @@ def test_what_scene_yaml_brings_for_such_a_view_is_refused(tmp_path):
     save_image(folder / "reference.png", PICTURES[BAD])
     reference = {"view": "v04.png", "image": "reference.png"}
     with pytest.raises(BadInput) as refused:
-        run_poses(folder, reference=reference)
+        run_poses_with_warnings(folder, reference=reference)
     assert str(refused.value) == f"scene.yaml: reference: {refusal}"
-    out, _ = run_poses(folder)
+    out, _ = run_poses_with_warnings(folder)
     with pytest.raises(BadInput) as refused:  # named later, when `poses` is done
         load_reference_files(folder, load_placed_views(out), ReferenceSpec(**reference))
     assert str(refused.value) == f"{folder / 'reference.png'}: {refusal}"
-    out, _ = run_poses(folder, reference=reference, keep=[BAD])
+    out, _ = run_poses_with_warnings(folder, reference=reference, keep=[BAD])
     assert [each.view for each in load_reference_files(folder, load_placed_views(out), ReferenceSpec(**reference))] == [
         BAD
     ]
@@ -225,7 +225,7 @@ def test_what_scene_yaml_brings_for_such_a_view_is_refused(tmp_path):
 def test_a_view_is_excluded_or_kept(tmp_path):
     folder = write_two_planes(tmp_path / "scene")
     with pytest.raises(BadInput, match=r"scene.yaml: v01 in both exclude and keep; name a view in one of them"):
-        run_poses(folder, exclude=["v01"], keep=["v01.png"])
+        run_poses_with_warnings(folder, exclude=["v01"], keep=["v01.png"])
     with pytest.raises(BadInput, match=r"scene.yaml: exclude: there is no view 'v77'"):
-        run_poses(folder, exclude=["v77"])
+        run_poses_with_warnings(folder, exclude=["v77"])
     assert np.array_equal(load_image(folder / "images" / "v01.png"), PICTURES["v01"])

@@ -23,6 +23,7 @@ from scenes.capture import (
     WIDTH,
     Truth,
     make_truth,
+    real_capture,
     reprojection_error,
     run_stages,
     run_stages_into,
@@ -49,8 +50,6 @@ from reffusion.types import Gaussians
 from stages import fit, poses, raw_masks
 from stages.plan import poses as plan
 from stages.plan import raw_masks as raw_masks_plan
-
-CAPTURES = Path(__file__).parents[2] / "shared" / "data"
 
 
 @pytest.mark.parametrize("model", [PINHOLE, RADIAL, OPENCV, FISHEYE], ids=lambda m: m[0])
@@ -442,26 +441,20 @@ def test_preview_is_light_and_says_what_will_happen(tmp_path):
 # ------------------------------------------------------------------------------------------------- real captures
 
 
-def capture(name: str) -> Path:
-    if not (CAPTURES / name).is_dir():
-        pytest.skip(f"the capture {name} is not in ../shared/data")
-    return CAPTURES / name
-
-
-def real(tmp_path: Path, name: str, **params):
+def run_on_real_capture(tmp_path: Path, name: str, **params):
     (tmp_path / "out").mkdir(parents=True)
-    run_stages_into(capture(name), tmp_path / "out", **params)
+    run_stages_into(real_capture(name), tmp_path / "out", **params)
     return load_scene(tmp_path / "out"), tmp_path / "out"
 
 
 def test_statue(tmp_path):
-    found = load_capture(capture("statue"))
+    found = load_capture(real_capture("statue"))
     assert (
         len(found.pictures) == 29 and found.pose_source.name == "poses_bounds.npy" and len(found.poses.points) == 15881
     )
     assert next(iter(found.poses.lenses.values())).model == "PINHOLE" and not found.warnings
     names = ["IMG_2707", "IMG_2716", "IMG_2736"]
-    scene, out = real(tmp_path, "statue", train=names, longest=504)  # images_2, whose masks these are
+    scene, out = run_on_real_capture(tmp_path, "statue", train=names, longest=504)  # images_2, whose masks these are
     masks = load_raw_masks(out, names)
     assert all(0.03 < mask.mean() < 0.3 and mask.shape == (378, 504) for mask in masks.values())
     # The statue's points, by the masks, agree from view to view: the poses and the points share a frame.
@@ -481,9 +474,9 @@ def test_statue(tmp_path):
 
 def test_bear(tmp_path):
     with pytest.raises(ValueError, match="no mask at all"):
-        load_roles(capture("bear"), load_capture(capture("bear")))
+        load_roles(real_capture("bear"), load_capture(real_capture("bear")))
     names = ["frame_00001", "frame_00030", "frame_00060", "frame_00090"]
-    scene, out = real(tmp_path, "bear", masks="none", train=names[:3], test=names[3:])
+    scene, out = run_on_real_capture(tmp_path, "bear", masks="none", train=names[:3], test=names[3:])
     assert len(scene.points) == 34174 and scene.test == ("frame_00090",)
     shares = []
     for name, image in load_views(out, names).items():
@@ -499,19 +492,19 @@ def test_bear(tmp_path):
 
 def test_fox(tmp_path):
     with pytest.warns(UserWarning, match=r"17 of the 67 frames.*images/0005\.jpg.*images/0113\.jpg"):
-        scene, _ = real(tmp_path, "fox", masks="none", train=["0001", "0002", "0003"], longest=240)
+        scene, _ = run_on_real_capture(tmp_path, "fox", masks="none", train=["0001", "0002", "0003"], longest=240)
     camera = scene.cameras["0001"]
     assert (camera.width, camera.height) == (135, 240)
     assert 100 < len(scene.points) <= 10_000, "it brings none, these are of flow"
-    notes = plan.preview(poses.Params(masks="none", test="every 8"), capture("fox"))
+    notes = plan.preview(poses.Params(masks="none", test="every 8"), real_capture("fox"))
     assert "43 training and 7 test views" in notes and any("OPENCV k1=0.05784" in n for n in notes)
 
 
 def test_statue_has_its_cameras_adjusted(tmp_path, monkeypatch):
     """Its phone's stabiliser moved the lens: far things miss near ones by a third of a pixel at 252 x 189."""
     monkeypatch.setattr("reffusion.capture.refine.TRACKS", 4000)
-    plain, _ = real(tmp_path / "plain", "statue", longest=252)
-    scene, out = real(tmp_path / "adjusted", "statue", longest=252, refine=True)
+    plain, _ = run_on_real_capture(tmp_path / "plain", "statue", longest=252)
+    scene, out = run_on_real_capture(tmp_path / "adjusted", "statue", longest=252, refine=True)
     said = load_json(out / "refine.json")
     assert said["before"] > 0.15 and said["after"] < 0.6 * said["before"]
     shifts = [scene.cameras[n].cy - plain.cameras[n].cy for n in scene.train]

@@ -19,20 +19,20 @@ def edit_transforms(change):
     return edit
 
 
-def nan_pose(record):
+def set_nan_pose(record):
     record["frames"][2]["transform_matrix"][0][3] = float("nan")
 
 
-def mirrored_pose(record):
+def mirror_pose(record):
     record["frames"][2]["transform_matrix"][0][:3] = [-v for v in record["frames"][2]["transform_matrix"][0][:3]]
 
 
-def same_stem(folder: Path) -> None:
+def share_stem(folder: Path) -> None:
     write_pictures(folder / "images", ["v00"], ending=".bmp")
     edit_transforms(lambda r: r["frames"][0].update(file_path="images/v00.bmp"))(folder)
 
 
-def mask_of_two(folder: Path) -> None:
+def share_mask(folder: Path) -> None:
     write_pictures(folder / "other", ["v00"])
     edit_transforms(lambda r: r["frames"][0].update(file_path="other/v00.png"))(folder)
 
@@ -57,10 +57,10 @@ REFUSALS = [
     ("two training views", drop_views, {}, "2 training views.*at least 3"),
     ("all views are test views", None, {"test": "every 1"}, "0 training views.*at least 3"),
     ("unreadable picture", lambda f: (f / "images" / "v01.png").write_text("x"), {}, r"v01\.png.*readable image"),
-    ("NaN pose", edit_transforms(nan_pose), {}, r"transforms\.json.*'v03' is not finite"),
-    ("mirrored pose", edit_transforms(mirrored_pose), {}, "'v03' is no rotation"),
-    ("two views of a name", same_stem, {}, "view name 'v00' is also"),
-    ("a mask of two views", mask_of_two, {}, r"masks/v00\.png: images-v00 and other-v00 are called so"),
+    ("NaN pose", edit_transforms(set_nan_pose), {}, r"transforms\.json.*'v03' is not finite"),
+    ("mirrored pose", edit_transforms(mirror_pose), {}, "'v03' is no rotation"),
+    ("two views of a name", share_stem, {}, "view name 'v00' is also"),
+    ("a mask of two views", share_mask, {}, r"masks/v00\.png: images-v00 and other-v00 are called so"),
     ("no intrinsics", edit_transforms(lambda r: r.pop("fl_x")), {}, "neither fl_x nor camera_angle_x"),
     ("unknown camera model", edit_transforms(lambda r: r.update(camera_model="X")), {}, "camera_model X"),
     ("other proportions than the camera", edit_transforms(lambda r: r.update(w=50)), {}, "other proportions"),

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 from scenes import wall_scene
-from scenes.references import natural_noise, psnr, reference_entry, run_reference_stage, write_wall_stages
+from scenes.capture import real_capture
+from scenes.images import natural_noise, paint_red, psnr, rectangle_mask
+from scenes.references import reference_entry, run_reference_stage
 
 from benchmarks.studies import redrawn
 from reffusion.capture.views import load_placed_views
@@ -20,18 +20,15 @@ from reffusion.params.reference import ReferenceSpec
 from reffusion.references import color, registration
 from reffusion.references.files import load_reference_files
 
-CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "data"
 SIZE = (480, 360)
 
 
 def hole_mask(shape) -> np.ndarray:
-    hole = np.zeros(shape[:2], bool)
-    hole[120:220, 150:290] = True
-    return hole
+    return rectangle_mask(shape[:2], (120, 220), (150, 290))
 
 
 def paint_object(image: np.ndarray) -> np.ndarray:
-    return np.where(hole_mask(image.shape)[..., None], np.uint8([230, 26, 26]), image)
+    return paint_red(image, hole_mask(image.shape))
 
 
 def shift_bands(image: np.ndarray, parallax: float) -> np.ndarray:
@@ -113,11 +110,6 @@ def test_the_nearest_photograph_tells_views_of_a_plane_apart():
 # ------------------------------------------------------------------------------------------------------- the stage
 
 
-@pytest.fixture
-def wall_folders(tmp_path):
-    return write_wall_stages(tmp_path)
-
-
 def test_only_the_hole_of_a_redrawn_reference_is_taken(wall_folders, tmp_path):
     truth, mask = wall_scene.photo(wall_scene.CAMERAS["a2"]), wall_scene.true_mask(wall_scene.CAMERAS["a2"], 1.6)
     picture = redrawn.darken(redrawn.redraw(truth))
@@ -190,10 +182,8 @@ def test_a_painting_is_trusted_by_a_line_that_names_it(wall_folders, tmp_path):
 @pytest.mark.parametrize("name", ["bear", "dinosaur", "fox", "garden", "statue"])
 def test_real_photographs(name):
     """Every tenth view: its redrawn picture is accepted; its nearest views' photographs and another scene's are not."""
-    if not (CAPTURES / name).is_dir() or not (CAPTURES / "bear").is_dir():
-        pytest.skip("no ../shared/data")
     capture, foreign = (
-        redrawn.load_photographs(CAPTURES / each) for each in (name, "bear" if name != "bear" else "garden")
+        redrawn.load_photographs(real_capture(each)) for each in (name, "bear" if name != "bear" else "garden")
     )
     photo_of_another = foreign.picture(next(iter(foreign.files)))
     for view in list(capture.files)[5::40]:

@@ -21,16 +21,14 @@ from scenes.capture import (
     run_stages,
     write_capture,
     write_pictures,
-    write_transforms,
 )
+from scenes.images import natural_noise, psnr, rectangle_mask
 from scenes.references import (
     SIZE,
-    natural_noise,
-    psnr,
     reference_entry,
     resize_and_compress,
     run_reference_stage,
-    write_wall_stages,
+    write_wall_capture,
 )
 
 from reffusion import geometry
@@ -59,9 +57,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def object_mask() -> np.ndarray:
-    hidden = np.zeros(SIZE[::-1], bool)
-    hidden[40:80, 60:100] = True
-    return hidden
+    return rectangle_mask(SIZE[::-1], (40, 80), (60, 100))
 
 
 def paint_object(image: np.ndarray) -> np.ndarray:
@@ -338,11 +334,6 @@ def test_a_view_that_was_not_placed_is_told(tmp_path):
 # ---------------------------------------------------------------------------------------------- the stage's artifact
 
 
-@pytest.fixture
-def wall_folders(tmp_path):
-    return write_wall_stages(tmp_path)
-
-
 def test_a_reference_from_another_tool_ends_near_the_clean_one(wall_folders, tmp_path):
     truth, mask = wall_scene.photo(wall_scene.CAMERAS["a2"]), wall_scene.true_mask(wall_scene.CAMERAS["a2"], 1.6)
     save_image(wall_folders["scene"] / "clean.png", truth)
@@ -412,24 +403,6 @@ def test_views_are_ranked_by_what_they_cover_beyond_those_before():
 
 
 # ------------------------------------------------------------------------------------------ what reruns, and what stays
-
-
-def write_wall_capture(folder: Path) -> Path:
-    """A scene on disk: the wall with a red square before it, masks of the square."""
-    cameras = {name: wall_scene.CAMERAS[name] for name in wall_scene.TRAIN}
-    truth = make_truth()
-    points = np.stack([*(a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 20), np.linspace(-0.7, 0.7, 14))),
-                       np.full(280, wall_scene.WALL)], -1)  # fmt: skip
-    shown = type(truth)({n: c.world_to_camera for n, c in cameras.items()}, points, truth.model)
-    folder.mkdir()
-    write_transforms(folder, shown)
-    for name, camera in cameras.items():
-        mask = wall_scene.true_mask(camera, 1.4)
-        save_image(
-            folder / f"images/{name}.png", np.where(mask[..., None], np.uint8([230, 26, 26]), wall_scene.photo(camera))
-        )
-        save_mask(folder / f"masks/{name}.png", mask)
-    return folder
 
 
 SMALL = "poses.refine=false fit.iterations=20 fit.densify.cap_max=1000 masks.invent=consistent masks.hull=1"

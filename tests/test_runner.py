@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import ast
 import json
-import os
 import shutil
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from scenes.toy_projects import RUNNER_FILES, make_request, wait_until, write_files
+from scenes.processes import start_module, wait_until
+from scenes.toy_projects import RUNNER_FILES, make_request, write_files
 
 from runner import Failed, Refused, compare, maintenance, process, results
 from runner.execute import run_scene
@@ -70,11 +69,9 @@ def empty_project(tmp_path: Path) -> Path:
 
 
 def start_runner(project: Path, *arguments: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "runner", "run", "fit", "--root", str(project), "--profile", "laptop", *arguments]
-    environment = {**os.environ, "PYTHONPATH": str(REPO)}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    # A shell starts background jobs, and so their children, with Ctrl-C ignored: as from a terminal, it is not.
-    return subprocess.Popen(command, cwd=REPO, env=environment, preexec_fn=restore_ctrl_c, **pipes)
+    """Run `fit`. A shell starts background jobs, and their children, with Ctrl-C ignored; a terminal does not."""
+    options = ("--root", project, "--profile", "laptop", *arguments)
+    return start_module("runner", "run", "fit", *options, merge_stderr=True, preexec_fn=restore_ctrl_c)
 
 
 def restore_ctrl_c() -> None:

@@ -15,6 +15,7 @@ import pytest
 import torch
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
+from scenes.capture import real_capture
 from scenes.room import render_room_corner, room_textures, room_walk, speckle_texture
 from scipy.spatial.transform import Rotation
 
@@ -28,7 +29,6 @@ from reffusion.io.scene import load_scene
 from stages import poses
 
 ROOT = Path(__file__).parents[1]
-CAPTURES = ROOT.parent / "shared" / "data"
 slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
 
 
@@ -57,13 +57,13 @@ def test_pose_errors_are_those_that_no_similarity_explains():
     assert shifts.argmax() == 2 and 0.5 < shifts.max() < 1.0
 
 
-def run(folder: Path, out: Path, **params):
+def run_poses(folder: Path, out: Path, **params):
     out.mkdir()
     poses.run(poses.Params(**params), out, scene=folder)
     return load_scene(out)
 
 
-def solved_by(threads: int, photographs: dict[str, Path], work: Path) -> Poses:
+def reconstruct_with_threads(threads: int, photographs: dict[str, Path], work: Path) -> Poses:
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
@@ -83,7 +83,7 @@ def test_a_walk_past_a_corner(tmp_path, capsys):
     for name in (*truth, "stray"):
         save_mask(folder / "masks" / f"{name}.png", np.eye(150, 200, dtype=bool))
     with pytest.warns(UserWarning, match="1 views were not placed and are left out: stray"):
-        scene = run(folder, tmp_path / "out")
+        scene = run_poses(folder, tmp_path / "out")
     facts = load_json(tmp_path / "out" / "sfm.json")
     assert (facts["placed"], facts["photographs"], facts["lenses"]) == (6, 7, 1)
     assert facts["points"] == len(scene.points) and 2 < facts["mean_track_length"] < 6
@@ -92,7 +92,9 @@ def test_a_walk_past_a_corner(tmp_path, capsys):
     assert f"structure from motion: 6 of 7 photographs, 1 lens, {facts['points']:,} points in " in said
     assert sorted(scene.cameras) == sorted(truth) == list(scene.train)
     assert_accepted(scene, truth)
-    again, once_more = (solved_by(threads, {n: folder / f"{n}.png" for n in truth}, tmp_path) for threads in (1, 3))
+    again, once_more = (
+        reconstruct_with_threads(threads, {n: folder / f"{n}.png" for n in truth}, tmp_path) for threads in (1, 3)
+    )
     assert all(np.array_equal(again.world_to_camera[n], once_more.world_to_camera[n]) for n in truth)
     assert np.array_equal(again.points, once_more.points)
     assert len(scene.points) > 300 and "stray" not in scene.cameras
@@ -105,7 +107,7 @@ def test_views_that_do_not_belong_together_are_named(tmp_path):
     for name in ("a", "b", "c"):
         save_image(tmp_path / "s" / "images" / f"{name}.jpg", np.full((60, 80, 3), 90, np.uint8))
     with pytest.raises(ValueError, match=r"placed 0 of 3 views.*not a, b, c\. Take more photos"):
-        run(tmp_path / "s", tmp_path / "out", masks="none")
+        run_poses(tmp_path / "s", tmp_path / "out", masks="none")
 
 
 UPRIGHT, ACROSS = (150, 200), (200, 150)  # px: a phone held both ways
@@ -126,7 +128,7 @@ def test_photographs_of_every_kind_are_placed(tmp_path):
     """WebP and TIFF among them: COLMAP does not read their EXIF data, or them at all."""
     endings = ("webp", "webp", "tiff", "bmp", "png", "webp")
     truth = write_walk(tmp_path / "s", [ACROSS] * 6, endings)
-    scene = run(tmp_path / "s", tmp_path / "out", masks="none")
+    scene = run_poses(tmp_path / "s", tmp_path / "out", masks="none")
     assert sorted(scene.cameras) == sorted(truth)
     assert_accepted(scene, truth)
 
@@ -135,7 +137,7 @@ def test_photographs_of_two_orientations_are_placed(tmp_path):
     """They share a lens, for a phone that is turned is the same phone, and its focal length is found."""
     sizes = [ACROSS, UPRIGHT, UPRIGHT, ACROSS, UPRIGHT, ACROSS, UPRIGHT, UPRIGHT]
     truth = write_walk(tmp_path / "s", sizes, ["png"] * 8)
-    scene = run(tmp_path / "s", tmp_path / "out", masks="none")
+    scene = run_poses(tmp_path / "s", tmp_path / "out", masks="none")
     assert sorted(scene.cameras) == sorted(truth)
     assert_accepted(scene, truth)
     assert [(c.width, c.height) for _, c in sorted(scene.cameras.items())] == sizes
@@ -189,7 +191,7 @@ def test_demo_photos(tmp_path):
     subprocess.run(made, check=True)
     record = json.loads((tmp_path / "s" / "truth" / "cameras.json").read_text())
     truth = {name: np.array(pose) for name, pose in record["world_to_camera"].items()}
-    scene = run(tmp_path / "s", tmp_path / "out")
+    scene = run_poses(tmp_path / "s", tmp_path / "out")
     assert sorted(scene.cameras) == sorted(truth)
     assert_accepted(scene, truth)
 
@@ -197,19 +199,17 @@ def test_demo_photos(tmp_path):
 @slow
 def test_bear(tmp_path):
     """A dozen neighbouring photographs against the poses they came with (which are COLMAP's own, from 96)."""
-    if not (CAPTURES / "bear").is_dir():
-        pytest.skip("the capture bear is not in ../shared/data")
-    brought = load_capture(CAPTURES / "bear")
+    brought = load_capture(real_capture("bear"))
     names = sorted(brought.pictures)[:24:2]
     (tmp_path / "s" / "images").mkdir(parents=True)
     for name in names:
         shutil.copy(brought.pictures[name], tmp_path / "s" / "images")
-    scene = run(tmp_path / "s", tmp_path / "out", masks="none")
+    scene = run_poses(tmp_path / "s", tmp_path / "out", masks="none")
     assert sorted(scene.cameras) == names
-    assert_accepted(scene, {name: about_the_middle(brought.poses, name) for name in names})
+    assert_accepted(scene, {name: center_principal_ray(brought.poses, name) for name in names})
 
 
-def about_the_middle(given: Poses, name: str) -> np.ndarray:
+def center_principal_ray(given: Poses, name: str) -> np.ndarray:
     """The pose [4, 4] turned so that it looks along the ray through the middle of its picture.
 
     bear's pictures are crops, their principal point 17 px off the middle. Structure from motion keeps it in the

@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scenes.images import disk_mask
 
 from reffusion import geometry
 from reffusion.inpaint.normals import mean_normals
@@ -16,6 +17,7 @@ from reffusion.types import Camera
 
 HEIGHT, WIDTH = 120, 200
 PATH = slice(40, 56)
+HOLE = disk_mask((HEIGHT, WIDTH), 58, 100, 27)
 
 
 def paint_lawn(path: bool = True) -> np.ndarray:
@@ -27,19 +29,14 @@ def paint_lawn(path: bool = True) -> np.ndarray:
     return green.clip(0, 255).astype(np.uint8)
 
 
-def disk_mask() -> np.ndarray:
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    return (rows - 58) ** 2 + (columns - 100) ** 2 < 27**2
-
-
 def fill_and_mark(image: np.ndarray, seed: int = 0, **fields) -> tuple[np.ndarray, np.ndarray]:
-    shown = replace(without_geometry(image, disk_mask()), **fields)  # type: ignore[arg-type]
-    found = fill_from_photo(shown, disk_mask(), shown, seed=seed)
+    shown = replace(without_geometry(image, HOLE), **fields)  # type: ignore[arg-type]
+    found = fill_from_photo(shown, HOLE, shown, seed=seed)
     return found.image, found.filled
 
 
 def gradient_energy(image: np.ndarray) -> float:
-    inner = disk_mask()[1:, 1:]
+    inner = HOLE[1:, 1:]
     grey = image.astype(float).mean(2)
     return float((np.diff(grey, axis=0)[:, 1:][inner] ** 2 + np.diff(grey, axis=1)[1:][inner] ** 2).mean())
 
@@ -47,13 +44,13 @@ def gradient_energy(image: np.ndarray) -> float:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_path_goes_on_and_the_lawn_stays_as_sharp_as_it_is(seed):
     truth = paint_lawn()
-    image = np.where(disk_mask()[..., None], np.uint8((255, 0, 0)), truth)
+    image = np.where(HOLE[..., None], np.uint8((255, 0, 0)), truth)
     painted, filled = fill_and_mark(image, seed)
-    assert filled[disk_mask()].all() and (painted[~disk_mask()] == image[~disk_mask()]).all()
-    inside = disk_mask().copy()
+    assert filled[HOLE].all() and (painted[~HOLE] == image[~HOLE]).all()
+    inside = HOLE.copy()
     inside[:42], inside[54:] = False, False
     assert np.abs(painted[inside].mean(0) - truth[inside].mean(0)).max() < 6, "the path"
-    below = disk_mask().copy()
+    below = HOLE.copy()
     below[:60] = False
     assert np.abs(painted[below].mean(0) - truth[below].mean(0)).max() < 6, "the lawn"
     assert 0.8 < gradient_energy(painted) / gradient_energy(truth) < 1.15
@@ -64,14 +61,14 @@ def test_what_lies_otherwise_or_stands_before_the_rest_is_not_taken():
     """The lower half of the picture is bark of the lawn's colour; patches alone would not tell."""
     truth = paint_lawn(path=False)
     truth[80:] = (90, 100, 90)
-    image = np.where(disk_mask()[..., None], np.uint8((255, 0, 0)), truth)
+    image = np.where(HOLE[..., None], np.uint8((255, 0, 0)), truth)
     normal = np.zeros((HEIGHT, WIDTH, 3), np.float32)
     normal[..., 2] = 1
     normal[80:] = (0, 1, 0)
-    normal[disk_mask()] = (0, 0, 1)
+    normal[HOLE] = (0, 0, 1)
     assert gradient_energy(fill_and_mark(image, normal=normal)[0]) > 0.8 * gradient_energy(truth)
     layer = np.zeros((HEIGHT, WIDTH), np.int64)
-    layer[disk_mask()] = 1
+    layer[HOLE] = 1
     assert not fill_and_mark(image, layer=layer)[1].any(), "nothing else of it is shown"
 
 
@@ -115,14 +112,14 @@ def test_slopes_are_those_of_the_ground_and_short_among_leaves():
 def test_where_all_lies_otherwise_patches_are_left_to_do_it():
     normal = np.zeros((HEIGHT, WIDTH, 3), np.float32)
     normal[..., 2] = 1
-    normal[disk_mask()] = (0, 1, 0)
-    image = np.where(disk_mask()[..., None], np.uint8((255, 0, 0)), paint_lawn())
+    normal[HOLE] = (0, 1, 0)
+    image = np.where(HOLE[..., None], np.uint8((255, 0, 0)), paint_lawn())
     assert not fill_and_mark(image, normal=normal)[1].any()
 
 
 def test_a_plane_seen_edge_on_stops_nothing():
     surface, flat = np.ones((HEIGHT, WIDTH), np.int64), np.broadcast_to(np.eye(2), (HEIGHT, WIDTH, 2, 2)).copy()
     flat[:, :60], flat[:20] = 0.0, np.inf
-    image = np.where(disk_mask()[..., None], np.uint8((255, 0, 0)), paint_lawn())
+    image = np.where(HOLE[..., None], np.uint8((255, 0, 0)), paint_lawn())
     painted, filled = fill_and_mark(image, plane=surface, to_plane=flat)
-    assert filled[disk_mask()].all() and gradient_energy(painted) > 0.8 * gradient_energy(paint_lawn())
+    assert filled[HOLE].all() and gradient_energy(painted) > 0.8 * gradient_energy(paint_lawn())

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from other_device import there_is_one
+from other_device import has_gpu
 from scenes.cameras import make_camera
 
 from reffusion.splat import cuda, rasterizer, reference
@@ -427,7 +427,7 @@ def test_bad_gaussians_are_named():
         rasterizer.render(gaussians.map(torch.Tensor.double), off_center_camera(4, 4), impl="cpu")
 
 
-@pytest.mark.skipif(not there_is_one(), reason="needs a CUDA GPU and gsplat")
+@pytest.mark.skipif(not has_gpu(), reason="needs a CUDA GPU and gsplat")
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_cuda_equals_reference(antialiased):
     gaussians = replace(random_cloud(300, -3.2), opacity_logits=torch.linspace(-5, 4, 300))

@@ -15,68 +15,73 @@ from runner.sweep import sweep
 
 
 @pytest.fixture(scope="module")
-def compared_project(tmp_path_factory) -> Path:
+def finished_comparison(tmp_path_factory) -> Path:
     root = write_project(tmp_path_factory.mktemp("swept"))
     compare(make_request(root), "better,none")
     return root
 
 
 @pytest.fixture
-def project(compared_project, tmp_path) -> Path:
-    shutil.copytree(compared_project, tmp_path / "project")
+def comparison_copy(finished_comparison, tmp_path) -> Path:
+    shutil.copytree(finished_comparison, tmp_path / "project")
     for source in (tmp_path / "project/runs").glob("*/source"):
         source.write_text("data/toy\n")
     return tmp_path / "project"
 
 
-def list_artifacts(project: Path) -> set[str]:
-    return {str(path.parent.relative_to(project / "runs")) for path in (project / "runs").glob("*/*/receipt.json")}
+def list_artifacts(comparison_copy: Path) -> set[str]:
+    return {
+        str(path.parent.relative_to(comparison_copy / "runs"))
+        for path in (comparison_copy / "runs").glob("*/*/receipt.json")
+    }
 
 
-def test_nothing_where_all_is_used(project, capsys):
-    before = list_artifacts(project)
-    sweep(make_request(project, ""), yes=True)
-    assert capsys.readouterr().out == "nothing that no plan uses\n" and list_artifacts(project) == before
+def test_nothing_where_all_is_used(comparison_copy, capsys):
+    before = list_artifacts(comparison_copy)
+    sweep(make_request(comparison_copy, ""), yes=True)
+    assert capsys.readouterr().out == "nothing that no plan uses\n" and list_artifacts(comparison_copy) == before
 
 
-def test_what_is_unused_is_told_first_and_removed_when_asked_for(project, capsys):
-    before = list_artifacts(project)
-    text = (project / "pipeline.yaml").read_text()
-    (project / "pipeline.yaml").write_text(text.replace("  better: {distill: {gain: 3}}\n", ""))
-    (project / "data/toy/scene.yaml").write_text("stages: {distill: {gain: 0}}")  # left out now, in every variant
-    (project / "runs/toy/distill/notes.txt").write_text("mine")
-    (project / "runs/toy/distill/gain.txt").write_text("changed by hand")
-    (project / "runs/toy/mine").mkdir()
-    (project / "runs/toy/mine/big.txt").write_text("no receipt")
-    sweep(make_request(project, ""), yes=False)
+def test_what_is_unused_is_told_first_and_removed_when_asked_for(comparison_copy, capsys):
+    before = list_artifacts(comparison_copy)
+    text = (comparison_copy / "pipeline.yaml").read_text()
+    (comparison_copy / "pipeline.yaml").write_text(text.replace("  better: {distill: {gain: 3}}\n", ""))
+    (comparison_copy / "data/toy/scene.yaml").write_text(
+        "stages: {distill: {gain: 0}}"
+    )  # left out now, in every variant
+    (comparison_copy / "runs/toy/distill/notes.txt").write_text("mine")
+    (comparison_copy / "runs/toy/distill/gain.txt").write_text("changed by hand")
+    (comparison_copy / "runs/toy/mine").mkdir()
+    (comparison_copy / "runs/toy/mine/big.txt").write_text("no receipt")
+    sweep(make_request(comparison_copy, ""), yes=False)
     said = capsys.readouterr().out
     assert (
         "runs/toy/distill: left out: no gain" in said and "runs/toy@better/evaluate: there is no variant better" in said
     )
-    assert "nothing was removed; yes=1 removes them" in said and list_artifacts(project) == before
-    sweep(make_request(project, ""), yes=True)
-    assert list_artifacts(project) == {"toy/poses", "toy@none/evaluate"}
-    left = {path.name for path in (project / "runs/toy/distill").iterdir()}
-    assert left == {"notes.txt", "gain.txt"} and (project / "runs/toy/mine/big.txt").exists()
-    run_scene(make_request(project), "all")
-    assert "toy/evaluate" in list_artifacts(project)
+    assert "nothing was removed; yes=1 removes them" in said and list_artifacts(comparison_copy) == before
+    sweep(make_request(comparison_copy, ""), yes=True)
+    assert list_artifacts(comparison_copy) == {"toy/poses", "toy@none/evaluate"}
+    left = {path.name for path in (comparison_copy / "runs/toy/distill").iterdir()}
+    assert left == {"notes.txt", "gain.txt"} and (comparison_copy / "runs/toy/mine/big.txt").exists()
+    run_scene(make_request(comparison_copy), "all")
+    assert "toy/evaluate" in list_artifacts(comparison_copy)
 
 
-def test_older_code_counts_as_used_and_a_scene_that_is_gone_is_kept(project, capsys):
-    stage = project / "stages/distill.py"
+def test_older_code_counts_as_used_and_a_scene_that_is_gone_is_kept(comparison_copy, capsys):
+    stage = comparison_copy / "stages/distill.py"
     stage.write_text(stage.read_text() + "\nMORE = 1\n")
-    before = list_artifacts(project)
-    sweep(make_request(project, ""), yes=True)
-    assert list_artifacts(project) == before
-    (project / "data/toy").rename(project / "data/elsewhere")
-    sweep(make_request(project, ""), yes=True)
+    before = list_artifacts(comparison_copy)
+    sweep(make_request(comparison_copy, ""), yes=True)
+    assert list_artifacts(comparison_copy) == before
+    (comparison_copy / "data/toy").rename(comparison_copy / "data/elsewhere")
+    sweep(make_request(comparison_copy, ""), yes=True)
     assert "toy: kept, as it cannot be planned: its scene is not there" in capsys.readouterr().out
-    assert list_artifacts(project) == before
+    assert list_artifacts(comparison_copy) == before
     with pytest.raises(Refused, match="nothing was computed for nobody"):
-        sweep(make_request(project, "nobody"), yes=True)
+        sweep(make_request(comparison_copy, "nobody"), yes=True)
 
 
-def test_other_parameters_are_those_of_the_command(project, capsys):
-    sweep(make_request(project, "toy", set="distill.gain=7"), yes=False)
+def test_other_parameters_are_those_of_the_command(comparison_copy, capsys):
+    sweep(make_request(comparison_copy, "toy", set="distill.gain=7"), yes=False)
     said = capsys.readouterr().out
     assert "runs/toy/distill: to be made again: param gain 1 -> 7" in said and "runs/toy/poses" not in said

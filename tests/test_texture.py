@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scenes.cameras import look_at_camera
+from scenes.images import disk_mask, rectangle_mask
 
 from reffusion import geometry
 from reffusion.background.mirrors import render_mirrors
@@ -39,9 +40,7 @@ def checker_image():
 
 
 def middle_mask():
-    mask = np.zeros((96, 128), bool)
-    mask[30:61, 45:84] = True
-    return mask
+    return rectangle_mask((96, 128), (30, 61), (45, 84))
 
 
 def test_a_pattern_is_continued_as_sharp_as_it_is():
@@ -122,30 +121,37 @@ def paint_planks(view: Camera) -> np.ndarray:
     return np.where(joint, 40, tone)[..., None].repeat(3, 2).astype(np.uint8)
 
 
-def disk_mask() -> np.ndarray:
-    rows, columns = np.mgrid[:SIDE, :SIDE]
-    return (rows - 70) ** 2 + (columns - 62) ** 2 < 24**2
-
-
 def floor_background() -> Background:
     views = []
     for view in CAMERAS:
         depth = FLOOR.depth(view)
         depth = np.where(np.isfinite(depth) & (depth < 5), depth, 0).astype(np.float32)
-        views.append(DepthView.from_range(view, depth, depth_range(depth), disk_mask()))
+        views.append(DepthView.from_range(view, depth, depth_range(depth), disk_mask((SIDE, SIDE), 70, 62, 24)))
     return Background(views, {view.name: paint_planks(view) for view in CAMERAS}, planes=[FLOOR], radius=1.0)
 
 
 def test_planks_run_on_in_their_own_perspective():
-    image = np.where(disk_mask()[..., None], np.uint8(RED), paint_planks(CAMERAS[0]))
+    image = np.where(disk_mask((SIDE, SIDE), 70, 62, 24)[..., None], np.uint8(RED), paint_planks(CAMERAS[0]))
 
     def off(around):
-        found = exemplar.complete_view(image, disk_mask(), CAMERAS[0], disk_mask(), around, range(3))
+        found = exemplar.complete_view(
+            image,
+            disk_mask((SIDE, SIDE), 70, 62, 24),
+            CAMERAS[0],
+            disk_mask((SIDE, SIDE), 70, 62, 24),
+            around,
+            range(3),
+        )
         return np.mean(
-            [np.abs(each.image.astype(int) - paint_planks(CAMERAS[0]))[disk_mask()].mean() for each in found]
+            [
+                np.abs(each.image.astype(int) - paint_planks(CAMERAS[0]))[disk_mask((SIDE, SIDE), 70, 62, 24)].mean()
+                for each in found
+            ]
         )
 
-    plain = np.abs(telea(image, disk_mask()).astype(int) - paint_planks(CAMERAS[0]))[disk_mask()].mean()
+    plain = np.abs(telea(image, disk_mask((SIDE, SIDE), 70, 62, 24)).astype(int) - paint_planks(CAMERAS[0]))[
+        disk_mask((SIDE, SIDE), 70, 62, 24)
+    ].mean()
     carried, shifted = off(floor_background()), off(replace(floor_background(), planes=[]))
     assert carried < 0.9 * shifted and carried < 0.6 * plain
 
@@ -207,30 +213,48 @@ def test_what_does_not_repeat_itself_is_not_said_to():
 def test_joints_and_round_borders_go_on_where_a_floor_repeats_itself(shown):
     around = replace(floor_background(), photos={view.name: shown(view) for view in CAMERAS})
     truth = shown(CAMERAS[0]).astype(int)
-    image = np.where(disk_mask()[..., None], np.uint8(RED), shown(CAMERAS[0]))
+    image = np.where(disk_mask((SIDE, SIDE), 70, 62, 24)[..., None], np.uint8(RED), shown(CAMERAS[0]))
     target, sources, smooth, how = exemplar._find_surfaces(
-        image, disk_mask(), CAMERAS[0], disk_mask(), around, render_mirrors([], CAMERAS[0], disk_mask(), [])
+        image,
+        disk_mask((SIDE, SIDE), 70, 62, 24),
+        CAMERAS[0],
+        disk_mask((SIDE, SIDE), 70, 62, 24),
+        around,
+        render_mirrors([], CAMERAS[0], disk_mask((SIDE, SIDE), 70, 62, 24), []),
     )
-    found = fill_plane(target, disk_mask(), sources, 1, how[1])
+    found = fill_plane(target, disk_mask((SIDE, SIDE), 70, 62, 24), sources, 1, how[1])
     picture, filled = found.image, found.filled
     assert (
-        filled[disk_mask()].mean() > 0.9
-        and not filled[~disk_mask()].any()
+        filled[disk_mask((SIDE, SIDE), 70, 62, 24)].mean() > 0.9
+        and not filled[~disk_mask((SIDE, SIDE), 70, 62, 24)].any()
         and (picture[~filled] == image[~filled]).all()
     )
     dark = lambda done: done.mean(-1)[filled] < 90  # joints; and what is bright is the plate
     kind = lambda done: dark(done).astype(int) + 2 * (done.mean(-1)[filled] > 195)
     wrong = lambda done: (kind(done) != kind(truth)).mean()
-    patches = np.mean([wrong(complete(target, disk_mask(), sources, smooth, k).image) for k in range(3)])
+    patches = np.mean(
+        [wrong(complete(target, disk_mask((SIDE, SIDE), 70, 62, 24), sources, smooth, k).image) for k in range(3)]
+    )
     assert wrong(picture) < 0.7 * patches
 
 
 def test_a_hole_without_anything_to_move_into_it_is_left():
-    image = np.where(disk_mask()[..., None], np.uint8(RED), paint_planks(CAMERAS[0]))
+    image = np.where(disk_mask((SIDE, SIDE), 70, 62, 24)[..., None], np.uint8(RED), paint_planks(CAMERAS[0]))
     target, sources, _, how = exemplar._find_surfaces(
-        image, disk_mask(), CAMERAS[0], disk_mask(), floor_background(), render_mirrors([], CAMERAS[0], disk_mask(), [])
+        image,
+        disk_mask((SIDE, SIDE), 70, 62, 24),
+        CAMERAS[0],
+        disk_mask((SIDE, SIDE), 70, 62, 24),
+        floor_background(),
+        render_mirrors([], CAMERAS[0], disk_mask((SIDE, SIDE), 70, 62, 24), []),
     )
-    found = fill_plane(target, disk_mask(), [replace(s, usable=np.zeros_like(disk_mask())) for s in sources], 1, how[1])
+    found = fill_plane(
+        target,
+        disk_mask((SIDE, SIDE), 70, 62, 24),
+        [replace(s, usable=np.zeros_like(disk_mask((SIDE, SIDE), 70, 62, 24))) for s in sources],
+        1,
+        how[1],
+    )
     assert not found.filled.any() and found.image is image
 
 

@@ -10,7 +10,7 @@ import torch
 from pydantic import ValidationError
 from safetensors.torch import load_file
 from scenes.networks import save_small_prior
-from scenes.stage_runs import run_through_initialize
+from scenes.stage_runs import run_through_initialize, trace_lines
 
 from benchmarks.bench import gate
 from benchmarks.bench.points import Diagram, Point, recommendation
@@ -76,10 +76,6 @@ def load_result(folder: Path) -> list[torch.Tensor]:
 def has_same_result(one: Path, other: Path) -> bool:
     pairs = list(zip(load_result(one), load_result(other), strict=True))
     return all(torch.equal(a, b) for a, b in pairs) and trace_lines(one) == trace_lines(other)
-
-
-def trace_lines(folder: Path) -> list[dict]:
-    return [{k: v for k, v in line.items() if k != "seconds"} for line in trace.read_trace(folder / "trace.jsonl")]
 
 
 # ------------------------------------------------------------------------------------------------------ the schema

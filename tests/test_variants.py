@@ -187,7 +187,7 @@ def check_regions_every_step(monkeypatch):
     monkeypatch.setattr(D, "REGION_EVERY", 1)
 
 
-def run_distill(folder, views, **changes):
+def run_short_distill(folder, views, **changes):
     folder.mkdir()
     settings = with_changes(PLAIN, **{"iterations": 3, "sds": OFF, "checkpoint_seconds": 10, **changes})
     (start, masked), holes = random_wall(), [(train_view().camera, train_view().photo, square_hole())]
@@ -198,23 +198,23 @@ def run_distill(folder, views, **changes):
 def test_distillation_carries_lifted_pictures_to_masked_gaussians_only(tmp_path, check_regions_every_step):
     views = [lifted_view("a"), lifted_view("b", 0.1)]
     chosen = {"lift": {"weight": 1}, "reconstruction": {"every": 0}}
-    start, ended, masked, _ = run_distill(tmp_path / "x", views, **chosen)
+    start, ended, masked, _ = run_short_distill(tmp_path / "x", views, **chosen)
     assert has_moved(start, ended)[masked].any() and not has_moved(start, ended)[~masked].any()
     assert trace.read_trace(tmp_path / "x" / "trace.jsonl")[-1]["lift"] > 0
     with pytest.raises(ValueError, match="pictures of the stage lift"):
-        run_distill(tmp_path / "y", [train_view()], lift={"weight": 1})
+        run_short_distill(tmp_path / "y", [train_view()], lift={"weight": 1})
     with pytest.raises(ValueError, match="needs a distance"):
-        run_distill(tmp_path / "z", views, lift={"weight": 1, "loss": "perceptual"})
+        run_short_distill(tmp_path / "z", views, lift={"weight": 1, "loss": "perceptual"})
 
 
 @pytest.mark.parametrize("confined", [True, False])
 def test_without_confinement_every_term_reaches_all_gaussians(tmp_path, check_regions_every_step, confined):
     views = [train_view("a"), train_view("b", 0.1)]
     photographs = {"confined": confined}
-    start, ended, masked, labels = run_distill(tmp_path / "photographs", views, **photographs)
+    start, ended, masked, labels = run_short_distill(tmp_path / "photographs", views, **photographs)
     assert has_moved(start, ended)[~masked].any() and has_moved(start, ended)[masked].any() != confined
     reference = {"confined": confined, "reference": {"weight": 1}, "reconstruction": {"every": 0}}
-    start, ended, masked, _ = run_distill(tmp_path / "reference", views, **reference)
+    start, ended, masked, _ = run_short_distill(tmp_path / "reference", views, **reference)
     assert has_moved(start, ended)[masked].any() and has_moved(start, ended)[~masked].any() != confined
     assert (labels == masked).all()
 
@@ -222,7 +222,7 @@ def test_without_confinement_every_term_reaches_all_gaussians(tmp_path, check_re
 @pytest.mark.parametrize("reaches", ["masked", "all"])
 def test_the_references_pixels_may_move_the_background_in_the_hole_too(tmp_path, check_regions_every_step, reaches):
     chosen = {"reference": {"weight": 1, "reaches": reaches}, "reconstruction": {"every": 0}}
-    start, ended, masked, _ = run_distill(tmp_path / reaches, [train_view("a")], **chosen)
+    start, ended, masked, _ = run_short_distill(tmp_path / reaches, [train_view("a")], **chosen)
     assert has_moved(start, ended)[masked].any() and has_moved(start, ended)[~masked].any() == (reaches == "all")
 
 

@@ -1,15 +1,15 @@
-"""Cameras and rays of small scenes."""
+"""Cameras of small scenes, their rays, and the scenes that they make up."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import cv2
 import numpy as np
 
 from reffusion import geometry
 from reffusion.background.visibility import DepthView
-from reffusion.types import Camera
+from reffusion.types import Camera, Scene, Similarity
 
 Vector = Sequence[float] | np.ndarray
 
@@ -94,3 +94,24 @@ def uneven_depth_view(view: Camera, depth: np.ndarray, hidden: np.ndarray, toler
     mask = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     near, far = (1 - tolerance) * cv2.erode(depth, kernel), (1 + tolerance) * cv2.dilate(depth, kernel)
     return DepthView.from_range(view, depth, (near, far), mask)
+
+
+def make_scene(
+    cameras: Mapping[str, Camera],
+    test: Sequence[str] = (),
+    clean: Collection[str] = (),
+    points: np.ndarray | None = None,
+    colors: np.ndarray | None = None,
+    similarity: Similarity | None = None,
+) -> Scene:
+    """A scene whose views are training views unless `test` names them; without `similarity` in its own frame.
+
+    Args:
+        points: [N, 3]; None: one at the origin.
+        colors: uint8 [N, 3]; None: black.
+    """
+    train = tuple(name for name in cameras if name not in test)
+    points = np.zeros((1, 3)) if points is None else points
+    colors = np.zeros((len(points), 3), np.uint8) if colors is None else colors
+    similarity = similarity or Similarity(1.0, np.zeros(3))
+    return Scene(dict(cameras), train, tuple(test), frozenset(clean), points, colors, similarity)

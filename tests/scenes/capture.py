@@ -1,4 +1,4 @@
-"""A small capture with known truth, written in any layout, and `poses` and `raw_masks` run on it."""
+"""A small capture with known truth in each layout, and the stages `poses` and `raw_masks` run on it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from reffusion.capture import lens
@@ -19,6 +20,7 @@ from stages.plan import poses as poses_plan
 from stages.plan import raw_masks as raw_masks_plan
 
 WIDTH, HEIGHT = 96, 72
+CAPTURES = Path(__file__).resolve().parents[3] / "shared" / "data"
 FISHEYE = ("OPENCV_FISHEYE", (60.0, 61.0, 48.5, 35.0, 0.02, -0.01, 0.002, 0.001))
 OPENCV = ("OPENCV", (90.0, 91.0, 47.0, 36.5, 0.06, -0.08, -0.001, 0.002))
 RADIAL = ("SIMPLE_RADIAL", (90.0, 48.0, 36.0, 0.05))
@@ -27,7 +29,7 @@ PINHOLE = ("SIMPLE_PINHOLE", (90.0, 48.0, 36.0))
 
 @dataclass(frozen=True)
 class Truth:
-    """A made-up capture in its own frame: view name -> [4, 4], points, the lens at the size of the pictures."""
+    """A capture in its own frame: view name -> world to camera [4, 4], points [N, 3], COLMAP model and parameters."""
 
     world_to_camera: dict[str, np.ndarray]
     points: np.ndarray
@@ -117,7 +119,7 @@ def write_poses_bounds(folder: Path, truth: Truth, factor=4) -> None:
 
 
 def write_capture(folder: Path, layout: str, truth: Truth) -> Path:
-    """Pictures, masks and poses in one of the layouts."""
+    """Write pictures, masks and poses in one of the layouts; return the folder."""
     images = folder / ("images_4" if layout.startswith("llff") else "images")
     write_pictures(images, truth.world_to_camera)
     write_masks(images / "label" if layout.startswith("llff") else folder / "masks", truth.world_to_camera)
@@ -145,7 +147,7 @@ def write_spin_nerf(folder: Path, test=2, full=True, mask_value=1, label_size=(W
 
 
 def run_stages(folder: Path, **params):
-    """The scene, and the folder in which both stages leave what they make of it."""
+    """Run `poses` and `raw_masks`: the scene, and the folder that both write to."""
     out = folder.parent / (folder.name + "_out")
     out.mkdir(exist_ok=True)
     run_stages_into(folder, out, **params)
@@ -153,14 +155,14 @@ def run_stages(folder: Path, **params):
 
 
 def run_stages_into(folder: Path, out: Path, **params) -> None:
-    """`poses` and `raw_masks` into the same folder, after the preview of the masks, which `poses` does not read."""
+    """Run `poses` and `raw_masks` into the same folder, after the preview of the masks."""
     raw_masks_plan.preview(_mask_params(params), scene=folder)
     poses.run(poses.Params(**params), out, scene=folder)
     raw_masks.run(_mask_params(params), out, scene=folder, poses=out)
 
 
 def preview_stages(folder: Path, **params) -> list[str]:
-    """What both stages say before they run."""
+    """The messages of both stages before they run."""
     notes = poses_plan.preview(poses.Params(**params), folder)
     return notes + raw_masks_plan.preview(_mask_params(params), scene=folder)
 
@@ -170,7 +172,7 @@ def _mask_params(params: dict) -> raw_masks.Params:
 
 
 def reprojection_error(scene, truth: Truth) -> float:
-    """Pixels between where a point is in the photograph and where the undistorted picture reads it from."""
+    """Largest distance in px between a point in the photograph and the place that undistortion reads it from."""
     worst = 0.0
     for name, pose in truth.world_to_camera.items():
         at = truth.points @ pose[:3, :3].T + pose[:3, 3]
@@ -196,3 +198,10 @@ def write_four_photos(folder: Path) -> None:
         Image.new("L", (32, 24), 255).save(folder / "masks" / f"v{k}.png")
     lens = {"w": 32, "h": 24, "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 12.0}
     (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+
+
+def real_capture(name: str) -> Path:
+    """The folder of a real capture; skips the test where it is not on this machine."""
+    if not (CAPTURES / name).is_dir():
+        pytest.skip(f"the capture {name} is not in ../shared/data")
+    return CAPTURES / name

@@ -1,4 +1,4 @@
-"""What the held-out tests of inputs share: runs with their sentences, refusals, models with names of any kind."""
+"""Runs of the first stages with their messages and refusals, and captures with names of any kind."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ OBJECT[HEIGHT // 4 : HEIGHT // 2, WIDTH // 4 : WIDTH // 2] = True
 
 
 def run_with_messages(folder: Path, **params) -> tuple[Scene, Path, list[str]]:
-    """Preview and run `poses`: the scene, its folder, and all sentences that either says, paths below `folder`."""
+    """Preview and run the stages: the scene, its folder, and all messages, with paths relative to `folder`."""
     sentences = preview_stages(folder, **params)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -43,7 +43,7 @@ def run_with_messages(folder: Path, **params) -> tuple[Scene, Path, list[str]]:
 
 
 def assert_message(sentences: Iterable[str], *words: str) -> None:
-    """One of the sentences holds all the words; numbers count as whole numbers."""
+    """One of the messages contains all words; a number must not be part of a longer number."""
     sentences = list(sentences)
     patterns = [rf"(?<![\d.]){word}(?![\d])" if word.isdigit() else re.escape(word) for word in words]
     found = any(all(re.search(p, each, re.IGNORECASE) for p in patterns) for each in sentences)
@@ -51,7 +51,7 @@ def assert_message(sentences: Iterable[str], *words: str) -> None:
 
 
 def refusal_message(folder: Path, **params) -> str:
-    """The one line with which `preview_stages` refuses."""
+    """The one line with which the preview refuses a capture."""
     with pytest.raises(BadInput) as caught:
         preview_stages(folder, **params)
     assert "\n" not in str(caught.value)
@@ -59,7 +59,7 @@ def refusal_message(folder: Path, **params) -> str:
 
 
 def refusal_before_writing(folder: Path, **params) -> str:
-    """The one line with which `preview_stages`, or `run_stages_into` before it writes anything, refuses what only pixels show."""
+    """The one line with which the preview, or the stages before they write anything, refuse a capture."""
     out = folder.parent / f"{folder.name}_refused"
     out.mkdir()
     with pytest.raises(BadInput) as caught, warnings.catch_warnings():
@@ -108,7 +108,7 @@ def write_mask(path: Path, mask: np.ndarray = OBJECT) -> None:
 
 
 def masked_share(out: Path, view: str) -> float:
-    """Of the view that `poses` wrote, the share that its mask covers."""
+    """The share of the view's pixels that its mask covers."""
     return float((np.array(Image.open(out / "masks" / f"{view}.png")) > 0).mean())
 
 
@@ -117,7 +117,7 @@ def masked_views(out: Path) -> list[str]:
 
 
 def assert_masked_views(out: Path, views: Iterable[str], share: float = SHARE) -> None:
-    """Exactly these views have a mask, of the share, and no objects are told apart."""
+    """Exactly these views have a mask of this share, and objects are not distinguished."""
     views = sorted(views)
     assert masked_views(out) == views, masked_views(out)
     shares = [masked_share(out, view) for view in views]

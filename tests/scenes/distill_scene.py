@@ -1,6 +1,5 @@
 """A small wall of random Gaussians whose middle is masked, and the views and settings that distill it."""
 
-import numpy as np
 import torch
 
 from reffusion.distill.train_view import TrainView
@@ -8,8 +7,8 @@ from reffusion.io.ply import save_ply
 from reffusion.io.scene import save_mask_sets, save_scene
 from reffusion.params.distill import Adversarial, Params, Sds
 from reffusion.seeding import generator
-from reffusion.types import PARAMETERS, Gaussians, MaskSet, Scene, Similarity
-from scenes.cameras import make_camera
+from reffusion.types import PARAMETERS, Gaussians, MaskSet
+from scenes.cameras import make_camera, make_scene
 from scenes.settings import with_changes
 
 WIDTH, HEIGHT = 36, 28
@@ -92,9 +91,7 @@ def write_initialized_run(home, invent):
     )
     names, height, width = ("a", "b", "c"), *invent.shape
     cameras = {name: make_camera(name, (width, height), 40.0) for name in names}
-    still = Similarity(1.0, np.zeros(3))
-    scene = Scene(cameras, names, (), frozenset({"c"}), np.zeros((1, 3)), np.zeros((1, 3), np.uint8), still)
-    save_scene(home / "poses", scene)
+    save_scene(home / "poses", make_scene(cameras, clean=("c",)))
     save_ply(home / "initialize" / "gaussians.ply", wall)
     save_mask_sets(home / "masks", dict.fromkeys(names, MaskSet(*[invent] * 4)))
     return home

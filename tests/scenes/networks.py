@@ -1,4 +1,4 @@
-"""A random inpainting prior of 16 px, for tests that need how a prior behaves, not what it knows."""
+"""Small networks of real architectures with random weights, and a stand-in for an inpainting network."""
 
 from pathlib import Path
 
@@ -39,7 +39,7 @@ def small_prior(seed: int = 0) -> Prior:
 
 
 def save_small_prior(folder: Path, seed: int = 0) -> None:
-    """The same as a diffusers folder."""
+    """Write `small_prior` as a diffusers folder."""
     pipeline(small_prior(seed)).save_pretrained(folder)
 
 

@@ -1,4 +1,4 @@
-"""References for tests: pictures as other tools write them, and a wall with a square before it whose hole they fill."""
+"""References as other tools write them, and a wall with a square before it whose hole they fill."""
 
 import io
 from pathlib import Path
@@ -8,23 +8,16 @@ import numpy as np
 from PIL import Image
 
 from reffusion.io.arrays import save_json, save_labels
-from reffusion.io.images import save_image
+from reffusion.io.images import save_image, save_mask
 from reffusion.io.scene import load_references, load_scene, save_mask_sets
 from reffusion.types import MaskSet, Reference
 from scenes import wall_scene
+from scenes.capture import PINHOLE, Truth, write_transforms
+from scenes.images import paint_red
 from stages import reference
 
 SIZE = (160, 120)
 COMMON = {"inpainter": "exemplar"}
-
-
-def natural_noise(seed: int, size=SIZE) -> np.ndarray:
-    """uint8 [H, W, 3] with as much energy in each octave, as photographs have."""
-    rng, (width, height) = np.random.default_rng(seed), size
-    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None]).clip(1 / width)
-    fields = [np.fft.ifft2(np.fft.fft2(rng.normal(size=(height, width))) / frequency).real for _ in range(3)]
-    mixed = [fields[0] + 0.3 * field for field in fields]  # mostly grey, as photographs are
-    return np.stack([np.clip(128 + 40 * f / f.std(), 0, 255) for f in mixed], -1).astype(np.uint8)
 
 
 def resize_and_compress(image: np.ndarray, scale=0.97, crop=5, quality=80, gain=0.92) -> np.ndarray:
@@ -34,10 +27,6 @@ def resize_and_compress(image: np.ndarray, scale=0.97, crop=5, quality=80, gain=
     file = io.BytesIO()
     Image.fromarray((small_one * gain).astype(np.uint8)).save(file, "JPEG", quality=quality)
     return np.array(Image.open(file).convert("RGB"))
-
-
-def psnr(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> float:
-    return float(10 * np.log10(255**2 / max(((a.astype(float) - b)[where] ** 2).mean(), 1e-3)))
 
 
 def reference_entry(view, image="ref.png", **more):
@@ -52,8 +41,7 @@ def write_wall_stages(folder: Path) -> dict[str, Path]:
     for name, camera in wall_scene.CAMERAS.items():
         mask, unseen = wall_scene.true_mask(camera, 1.6), wall_scene.true_unobserved(camera, 1.6)
         sets[name] = MaskSet(mask, mask, unseen, unseen)
-        photo = np.where(mask[..., None], np.uint8([230, 26, 26]), wall_scene.photo(camera))
-        save_image(made_poses / "images" / f"{name}.png", photo)
+        save_image(made_poses / "images" / f"{name}.png", paint_red(wall_scene.photo(camera), mask))
     save_mask_sets(folder / "masks", sets)
     save_labels(folder / "masks" / "labels.npy", labels)
     save_json(folder / "masks" / "facts.json", {"best_reference": "a2"})
@@ -66,3 +54,17 @@ def run_reference_stage(wall: dict[str, Path], out: Path, **params) -> dict[str,
     out.mkdir()
     reference.run(reference.Params(**COMMON, **params), out, **wall)
     return {r.camera.name: r for r in load_references(out, load_scene(wall["poses"]))}
+
+
+def write_wall_capture(folder: Path) -> Path:
+    """A scene on disk: the wall with a red square before it, masks of the square."""
+    cameras = {name: wall_scene.CAMERAS[name] for name in wall_scene.TRAIN}
+    points = np.stack([*(a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 20), np.linspace(-0.7, 0.7, 14))),
+                       np.full(280, wall_scene.WALL)], -1)  # fmt: skip
+    folder.mkdir()
+    write_transforms(folder, Truth({n: c.world_to_camera for n, c in cameras.items()}, points, PINHOLE))
+    for name, camera in cameras.items():
+        mask = wall_scene.true_mask(camera, 1.4)
+        save_image(folder / f"images/{name}.png", paint_red(wall_scene.photo(camera), mask))
+        save_mask(folder / f"masks/{name}.png", mask)
+    return folder

@@ -1,4 +1,4 @@
-"""Parameters that differ from others in some places."""
+"""Parameters derived from others."""
 
 from reffusion.params.base import Settings
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from reffusion.io.scene import load_mask_sets, save_references
+from reffusion.trace import read_trace
 from reffusion.types import Reference
 from scenes import wall_scene
 from stages import initialize, masks
@@ -38,3 +39,8 @@ def run_through_initialize(home: Path, square_at: float) -> dict[str, Path]:
     (home / "initialize").mkdir()
     initialize.run(initialize.Params(), home / "initialize", **folders)
     return folders | {"initialize": home / "initialize"}
+
+
+def trace_lines(folder: Path) -> list[dict]:
+    """What a stage logged, without run times."""
+    return [{k: v for k, v in line.items() if k != "seconds"} for line in read_trace(folder / "trace.jsonl")]

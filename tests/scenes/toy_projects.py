@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 from runner.resolve import Request
@@ -244,11 +243,3 @@ def write_files(root: Path, files: dict[str, str]) -> None:
 def write_project(root: Path) -> Path:
     write_files(root, COMPARE_FILES)
     return root
-
-
-def wait_until(found) -> None:
-    for _ in range(600):
-        if found():
-            return
-        time.sleep(0.05)
-    raise AssertionError("waited 30 s in vain")

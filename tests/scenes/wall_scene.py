@@ -14,9 +14,9 @@ from reffusion.io.arrays import save_arrays
 from reffusion.io.images import load_image, save_image, save_mask
 from reffusion.io.ply import save_ply
 from reffusion.io.scene import save_scene
-from reffusion.types import Camera, Scene, Similarity
+from reffusion.types import Camera
 from reffusion.workspace import SURFACES, Workspace
-from scenes.cameras import make_camera
+from scenes.cameras import make_camera, make_scene
 
 WALL, HALF, RIM = 2.0, 0.17, 0.015  # depth of the wall; half the side of the square, and its soft rim; scene units
 WIDTH, HEIGHT, FOCAL = 96, 72, 90.0
@@ -50,7 +50,7 @@ def rectangle_gaussians(depth: float, half_x: float, half_y: float, color):
 
 
 def wall_and_square(square_at: float):
-    """(Gaussians, labels that are True for the square at depth `square_at`), without the wall that no training view sees."""
+    """Gaussians without the wall that no training view sees, and labels: True for the square at depth `square_at`."""
     wall = rectangle_gaussians(WALL, 2.0, 1.4, wall_color)
     seen = torch.from_numpy(~is_hidden_everywhere(wall.means.numpy(), square_at))
     square = rectangle_gaussians(square_at, HALF, HALF, lambda x, y: np.broadcast_to((0.9, 0.1, 0.1), (*x.shape, 3)))
@@ -99,9 +99,7 @@ def write_poses_and_fit(folder, square_at: float, masks=None, clean=()):
     points = np.stack([*(a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 25), np.linspace(-0.7, 0.7, 19))),
                        np.full(475, WALL)], -1)  # fmt: skip
     points = points[~is_hidden_everywhere(points, square_at)]
-    scene = Scene(dict(CAMERAS), TRAIN, TEST, frozenset(clean), points, np.zeros((len(points), 3), np.uint8),
-                  Similarity(1.0, np.zeros(3)))  # fmt: skip
-    save_scene(poses, scene)
+    save_scene(poses, make_scene(CAMERAS, TEST, clean, points))
     for name, view in CAMERAS.items():
         save_image(poses / "images" / f"{name}.png", photo(view))
     for name, mask in masks.items():
