@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from browser import open_page
+from scenes.browser import open_page
 from scenes.toy_projects import COMPARE_FILES, make_request, write_project
 
 from report import batch as page

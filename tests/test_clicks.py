@@ -7,9 +7,9 @@ import time
 import numpy as np
 import pytest
 import torch
-from browser import open_page
 from scenes import capture as captures
 from scenes import wall_scene
+from scenes.browser import open_page
 from scenes.stage_runs import run_masks
 
 from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points

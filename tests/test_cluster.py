@@ -16,7 +16,7 @@ import pytest
 from scenes.processes import run_module
 from scenes.toy_projects import COMPARE_FILES, make_request, write_project
 from test_batch import read_spans, write_projects
-from test_faults import assert_artifacts_complete
+from test_runner_faults import assert_artifacts_complete
 
 from runner.compare import compare
 from runner.engine import LocalEngine, Resources, StageResult, Task, make_engine

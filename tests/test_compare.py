@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import open_page
+from scenes.browser import open_page
 from scenes.processes import run_module
 from scenes.toy_projects import COMPARE_FILES, make_request, write_files, write_project
 

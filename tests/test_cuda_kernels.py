@@ -6,7 +6,7 @@ import os
 
 import pytest
 import torch
-from other_device import has_gpu
+from scenes.simulated_gpu import has_gpu
 
 from reffusion.gaussians import adam, optimize
 from reffusion.gaussians.ssim import C1, C2, dssim_torch, window

@@ -16,7 +16,7 @@ from pathlib import Path
 from threading import Thread
 
 import pytest
-from browser import CHROMIUM
+from scenes.browser import CHROMIUM
 
 REPO = Path(__file__).resolve().parent.parent
 PYTHON = os.environ.get("NERFBASELINES_PYTHON", "")

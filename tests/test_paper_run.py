@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from other_device import has_gpu
 from scenes import wall_scene
 from scenes.networks import small_depth_model
+from scenes.simulated_gpu import has_gpu
 
 from benchmarks.gpu import full_size
 from reffusion.depth import monocular

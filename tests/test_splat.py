@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from other_device import has_gpu
 from scenes.cameras import make_camera
+from scenes.simulated_gpu import has_gpu
 
 from reffusion.splat import cuda, rasterizer, reference
 from reffusion.types import PARAMETERS, Camera, Gaussians

@@ -8,8 +8,8 @@ import re
 import cv2
 import numpy as np
 import pytest
-from browser import open_page
 from scenes import wall_scene
+from scenes.browser import open_page
 
 from reffusion.io.images import save_image
 from reffusion.io.ply import save_ply

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from browser import open_page
 from scenes import wall_scene
+from scenes.browser import open_page
 from scenes.cameras import make_scene
 from scenes.processes import wait_until
 

@@ -1,5 +1,5 @@
 """Stages on a GPU give what they give on the CPU; a stand-in for one, which refuses to mix tensors of two devices
-(tests/other_device.py)."""
+(tests/scenes/simulated_gpu.py)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from other_device import has_gpu, simulated_gpu
 from scenes import wall_scene
+from scenes.simulated_gpu import has_gpu, simulated_gpu
 from scenes.stage_runs import run_masks, write_true_references
 
 from reffusion.io.arrays import load_labels
