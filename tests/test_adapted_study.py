@@ -43,7 +43,7 @@ def test_same_views_same_noise_and_holes_alone_are_painted(tmp_path):
     assert load_image(tmp_path / "out/sheet.png").shape[1] > 4 * HOLE.shape[1]
 
 
-def test_what_is_missing_is_named(tmp_path):
+def test_missing_inputs_are_named(tmp_path):
     with pytest.raises(ValueError, match="make scene=nowhere personalize"):
         adapted.load_holes(tmp_path / "nowhere", 3)
 

@@ -33,7 +33,7 @@ def initialized_run(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", benchmark.ATTEMPTS)
-def test_every_attempt_is_a_setting_of_the_stage(name):
+def test_every_attempt_is_a_setting_of_distill(name):
     changed = {key: value for key, value in benchmark.ATTEMPTS[name].items() if key != benchmark.BASE}
     params = benchmark.profile_params(benchmark.ATTEMPTS[name])
     found = params.model_dump()

@@ -43,7 +43,7 @@ def add_gaussian(gaussians: Gaussians, mean, sizes, color) -> Gaussians:
 # --- what is shown there
 
 
-def test_beyond_the_capture_the_picture_goes_on_softly_and_seen_pixels_stay():
+def test_the_backdrop_continues_the_picture_and_keeps_seen_pixels():
     scene = wall_gaussians()
     done = backdrop.complete_scene([scene], TRAIN)[0]
     for camera in TRAIN:
@@ -68,7 +68,7 @@ def test_each_direction_takes_the_colours_that_lie_there():
     assert to_the_left[0] > 2 * to_the_left[2] and to_the_right[2] > 2 * to_the_right[0]
 
 
-def test_needles_beyond_the_capture_go():
+def test_needles_outside_the_capture_are_removed():
     needle = add_gaussian(wall_gaussians(), [5.0, 0.0, 2.0], [0.8, 0.01, 0.01], [0.0, 1.0, 0.0])
     away = turned_camera(65)
     assert (render_color(needle, away)[..., 1] - render_color(wall_gaussians(), away)[..., 1]).max() > 0.5
@@ -141,7 +141,7 @@ def test_unseen_is_what_all_training_views_hide_behind_something_or_under_masks(
     assert training_coverage.unseen_pixels(scene, TRAIN[0], coverage_views(scene, hidden)).all()
 
 
-def test_a_view_tells_what_a_further_one_would_show_for_the_first_time():
+def test_an_extra_view_shows_pixels_for_the_first_time():
     """Of the outermost views an outer strip is in no other one, and of those between nothing."""
     scene = wall_scene.rectangle_gaussians(wall_scene.WALL, 4.0, 2.4, wall_scene.wall_color)
     views = coverage_views(scene)

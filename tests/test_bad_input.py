@@ -370,12 +370,12 @@ SET = {
 
 
 @pytest.mark.parametrize("text", SET.values(), ids=SET.keys())
-def test_what_is_typed_as_set(good_captures, tmp_path, text):
+def test_set_options_are_refused(good_captures, tmp_path, text):
     assert_bad_input(good_captures, tmp_path, "transforms", lambda folder: None, "", text)
 
 
 @pytest.mark.parametrize("kind", ["folder", "pipe", "link"])
-def test_scene_yaml_that_is_no_file(good_captures, tmp_path, kind):
+def test_scene_yaml_of_other_file_types(good_captures, tmp_path, kind):
     assert_bad_input(good_captures, tmp_path, "transforms", replace_by("scene.yaml", kind), "scene.yaml")
 
 

@@ -105,7 +105,7 @@ def test_never_more_than_there_are_cores_or_memory(tmp_path, cores, memory_mb, m
     assert len(read_spans(root)) == 3 and max_concurrent(read_spans(root)) <= most
 
 
-def test_what_is_killed_beside_others_goes_on_alone(tmp_path):
+def test_a_stage_killed_beside_others_is_retried_alone(tmp_path):
     """As where memory runs out: the one whose number is highest is killed while others are at it."""
     root = write_projects(tmp_path, meet=3)
     stage = (root / "stages/distill.py").read_text()
@@ -159,7 +159,7 @@ def test_stopped_while_several_run(tmp_path):
     assert (root / "runs/ran.txt").read_text().count("poses") == 3
 
 
-def test_what_ended_when_the_runner_was_interrupted_is_not_done_again(tmp_path):
+def test_work_finished_at_an_interruption_is_not_repeated(tmp_path):
     """`distill` takes no notice of Ctrl-C; `evaluate` after it is not begun."""
     root = write_projects(tmp_path, 0.0)
     takes = "    import signal\n    signal.signal(2, signal.SIG_IGN)\n    (out / 'begun').touch()\n    time.sleep(2)\n"
@@ -217,6 +217,6 @@ def test_the_page_of_a_batch(tmp_path, capsys):
     "name, address, message",
     [("slrum", None, "unknown"), (None, "here:6379", "of which engine"), ("local", "here", "of which engine")],
 )
-def test_engines_that_are_not_there(tmp_path, name, address, message):
+def test_missing_engines_are_refused(tmp_path, name, address, message):
     with pytest.raises(Refused, match=message):
         make_engine(name, address, tmp_path, tmp_path)

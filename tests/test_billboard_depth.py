@@ -20,7 +20,7 @@ def tilted_floor_view() -> tuple[Camera, np.ndarray]:
     return camera, np.minimum(floor, 4.0 / rays[..., 2])
 
 
-def test_it_stands_upright_where_its_lowest_pixels_meet_the_floor():
+def test_an_object_stands_upright_where_it_meets_the_floor():
     camera, depth = tilted_floor_view()
     drawn = np.zeros(depth.shape, bool)
     drawn[20:50, 38:58] = True
@@ -35,7 +35,7 @@ def test_it_stands_upright_where_its_lowest_pixels_meet_the_floor():
     assert 0.05 < edge - middle < 0.2, "and its middle comes nearer by about half of half its width"
 
 
-def test_on_a_wall_it_hangs_facing_the_camera():
+def test_an_object_on_a_wall_faces_the_camera():
     camera = make_camera("v", (96, 72), 80.0)
     depth, drawn = np.full((72, 96), 2.0), np.zeros((72, 96), bool)
     drawn[30:40, 40:50] = True

@@ -44,7 +44,7 @@ def test_every_camera_looks_at_the_focus_upright():
         assert rotation[1, 1] > 0.9, "rows go down as the photographs' do"
 
 
-def test_odd_captures_have_a_way_too():
+def test_degenerate_captures_have_a_path():
     above = [camera_path.look_at(np.array([0.0, -2.0, 0.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))]
     one = [Camera("v", 8, 6, 9.0, 9.0, 4.0, 3.0, above[0])]
     for camera in camera_path.ellipse_path(one, np.zeros((0, 3)), 3):

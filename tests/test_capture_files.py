@@ -372,7 +372,7 @@ def test_composed_and_decomposed_accents_are_one_name(tmp_path):
     assert len(mask_shares(out)) == 6
 
 
-def test_what_is_no_picture_is_named(tmp_path, monkeypatch):
+def test_files_that_are_no_pictures_are_named(tmp_path, monkeypatch):
     folder = write_capture(tmp_path / "s", "colmap", make_truth())
     Image.init()  # every format registers now, not while the table is replaced
     monkeypatch.setattr(Image, "OPEN", {kind: opener for kind, opener in Image.OPEN.items() if kind != "HEIF"})

@@ -224,7 +224,7 @@ def write_small_capture(folder, with_masks=False):
     ({"v01": [[1, 1]]}, "has a mask"),
     ({"v00": [[1, 1]], "v00.png": [[2, 2]]}, "named twice"),
 ])  # fmt: skip
-def test_clicks_that_cannot_be_right(tmp_path, clicks, said):
+def test_contradicting_clicks_are_refused(tmp_path, clicks, said):
     folder = write_small_capture(tmp_path / "scene", with_masks="v01" in clicks)
     (tmp_path / "out").mkdir()
     with pytest.raises(BadInput, match=said):
@@ -232,7 +232,7 @@ def test_clicks_that_cannot_be_right(tmp_path, clicks, said):
 
 
 @pytest.mark.parametrize("click", [[1], [1, 2, 3], [1, 2, "*"], [-1, 2], "1, 2", [1, 2, "+", 4], ["a", 2]])
-def test_what_is_no_click(click):
+def test_invalid_clicks_are_refused(click):
     with pytest.raises(ValueError):
         masks.Params(clicks={"v00": [click]})
 
@@ -278,7 +278,7 @@ def test_clicks_in_a_browser_make_masks_that_are_saved(page_server, tmp_path, wi
         assert wall_scene.iou(load_mask(tmp_path / "masks" / f"{each}.png"), square_mask(each)) > 0.85
 
 
-def test_what_was_clicked_is_there_the_next_time(page_server, tmp_path):
+def test_clicks_are_restored_the_next_time(page_server, tmp_path):
     page_server.session.click("a2", [(48.0, 36.0, True)])
     page_server.session.save()
     again = Session(page_server.session.capture, lambda: True)
@@ -296,7 +296,7 @@ def test_masks_of_others_are_never_overwritten(page_server, tmp_path):
     assert sorted(p.name for p in (tmp_path / "masks").iterdir()) == ["a3.png"]
 
 
-def test_the_page_is_for_this_machine_only(page_server):
+def test_the_page_is_served_on_localhost_only(page_server):
     import urllib.error
     import urllib.request
 

@@ -77,7 +77,7 @@ def test_an_attempt_works_in_a_folder_of_its_own_and_goes_on_from_the_one_before
     assert [path.name for path in out.parent.iterdir()] == [out.name]
 
 
-def test_one_that_was_given_up_for_lost_writes_nowhere(tmp_path, monkeypatch):
+def test_an_attempt_given_up_as_lost_writes_nothing(tmp_path, monkeypatch):
     """While it works, another takes over and ends."""
     root = write_project(tmp_path)
     out = root / "runs/toy/.partial-distill-1"
@@ -97,7 +97,7 @@ def test_one_that_was_given_up_for_lost_writes_nowhere(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("heeds", [True, False])
-def test_one_that_is_told_to_end_is_interrupted_and_one_that_had_finished_has(tmp_path, heeds):
+def test_a_stopped_attempt_is_interrupted_unless_it_finished(tmp_path, heeds):
     root = write_project(tmp_path)
     out = root / "runs/toy/.partial-distill-1"
     wait = """    try:
@@ -221,7 +221,7 @@ def test_the_driver_killed_and_started_again(tmp_path, ray_cluster, send):
 
 @slow
 @pytest.mark.parametrize("last", ["poses", "distill", "evaluate"])
-def test_what_ended_when_the_driver_was_interrupted_is_not_done_again(tmp_path, ray_cluster, last):
+def test_work_finished_when_the_driver_is_interrupted_is_not_repeated(tmp_path, ray_cluster, last):
     root = write_projects(tmp_path)
     environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO}/tests"}
     command = [sys.executable, "-c", DRIVER, str(root), ray_cluster.address]
@@ -269,7 +269,7 @@ def test_slurm_by_submitits_local_executor(tmp_path, capsys):
         engine.run(make_task(root), Resources(1, 0, 100), 0, lambda: None)
 
 
-def test_a_cluster_that_is_not_there_is_told_in_a_line(tmp_path):
+def test_a_missing_cluster_is_reported_in_one_line(tmp_path):
     pytest.importorskip("submitit", reason="submitit is not installed")
     done = run_module("runner", "run", "--scene", "x", "--engine", "slurm")
     if shutil.which("srun"):

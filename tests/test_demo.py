@@ -183,7 +183,7 @@ def test_two_fifths_of_the_mask_are_never_seen(generate, tmp_path, name):
         assert 0.06 < facts["mask_share"]["train"] < 0.25
 
 
-def test_what_hangs_hides_nothing_that_other_views_miss(generate, tmp_path):
+def test_floating_objects_hide_nothing_from_all_views(generate, tmp_path):
     kind = replace(
         generate.KINDS["seen"], width=48, height=36, samples=1, train=20, test=6, texture=256, node=0.4, points=60
     )
@@ -216,7 +216,7 @@ def test_insertion_and_outpainting_are_asked_for_by_scene_files(generate, tmp_pa
     assert said["outpaint"]["region"]["outside"]
 
 
-def test_photos_bring_no_poses(generate, tmp_path):
+def test_the_photos_layout_has_no_poses(generate, tmp_path):
     kind = replace(generate.KINDS["photos"], width=48, height=36, train=4, texture=256, node=0.4)
     generate.generate(tmp_path / "photos", 7, kind)
     assert png_stems(tmp_path / "photos/images") == png_stems(tmp_path / "photos/masks")

@@ -230,7 +230,7 @@ def test_estimates_that_fit_nothing_are_degenerate(estimate, reason, prior, text
     assert caught.value.reason == reason
 
 
-def test_views_without_known_or_drawn_pixels_are_degenerate(prior, text):
+def test_views_without_known_or_rendered_pixels_are_degenerate(prior, text):
     everywhere = train_view(np.ones_like(HOLE))
     for estimator, reason in (
         (constant_estimator(WALL), "few pixels"),
@@ -355,7 +355,7 @@ def test_an_estimate_that_is_not_finite_names_step_and_view(prior, text, tmp_pat
         run_depth_distill(tmp_path, prior, text, None)
 
 
-def test_both_stages_find_depth_alike():
+def test_initialize_and_distill_complete_depth_alike():
     from reffusion.initialize import fill
     from stages import distill
 

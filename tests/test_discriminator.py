@@ -272,7 +272,7 @@ def test_an_adversary_continues_from_its_state_bit_for_bit():
         assert (a == b).all()
 
 
-def test_a_patch_that_is_no_number_stops_the_critic_before_it_changes():
+def test_a_nan_patch_stops_the_critic_before_it_changes():
     adversary = Adversary(SMALL, seed=0, rate=RATE)
     before = [weights.detach().clone() for weights in adversary.critic.parameters()]
     with pytest.raises(FloatingPointError, match="critic's loss"):

@@ -84,7 +84,7 @@ def test_a_clean_view_reconstructs_all_gaussians(prior, text):
 
 
 @pytest.mark.parametrize("term", ["sds", "reconstruction"])
-def test_the_photo_where_it_is_not_trusted_changes_nothing(term, prior, text):
+def test_unsupervised_pixels_of_a_photograph_change_nothing(term, prior, text):
     gaussians, masked = random_wall()
     view = train_view()
     poisoned = replace(view, photo=torch.where(view.supervises[..., None], view.photo, float("nan")))
@@ -141,7 +141,7 @@ def test_the_adversarial_gradient_is_that_of_the_patches_by_finite_differences()
     assert (moved.sh.grad * direction).sum().item() == pytest.approx(by_hand, rel=0.02)
 
 
-def test_region_changers_are_found_and_no_one_else():
+def test_only_gaussians_that_changed_region_are_found():
     gaussians, masked = random_wall(600)
     region = build_region(gaussians.means, masked)
     assert not has_changed_region(region, gaussians.means, masked).any(), "an initialization is in its regions"
@@ -319,7 +319,7 @@ def test_the_reference_term_is_that_of_the_whole_view():
     assert float(nothing) == 0
 
 
-def test_a_number_that_is_none_names_step_term_and_view(prior, text, tmp_path):
+def test_nan_names_step_term_and_view(prior, text, tmp_path):
     broken = replace(prior, alphas_cumprod=torch.full_like(prior.alphas_cumprod, float("nan")))
     with pytest.raises(FloatingPointError, match=r"step 0, SDS, view 'a'"):
         run_distill(tmp_path / "x", broken, text, views=[train_view()])

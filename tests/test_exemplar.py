@@ -200,7 +200,7 @@ def test_the_centre_is_found_from_afar_though_a_part_of_the_top_is_seen():
         assert flat is not None and np.linalg.norm(centre - (0.1, 0.4)) < 2 * cell, away
 
 
-def test_what_does_not_repeat_itself_is_not_said_to():
+def test_a_texture_without_period_has_no_symmetry():
     noise = np.random.default_rng(0).integers(0, 256, (SIDE, SIDE, 3), np.uint8)
     some = plane_pixels(noise, CAMERAS[0])
     assert find_symmetry(some) is None
@@ -238,7 +238,7 @@ def test_joints_and_round_borders_go_on_where_a_floor_repeats_itself(shown):
     assert wrong(picture) < 0.7 * patches
 
 
-def test_a_hole_without_anything_to_move_into_it_is_left():
+def test_a_hole_without_source_pixels_is_left():
     image = np.where(disk_mask((SIDE, SIDE), 70, 62, 24)[..., None], np.uint8(RED), paint_planks(CAMERAS[0]))
     target, sources, _, how = exemplar._find_surfaces(
         image,
@@ -320,7 +320,7 @@ def test_the_misfit_is_the_mean_square_by_weight():
 # ------------------------------------------------------------------------------------------------------- blending
 
 
-def test_a_pictures_own_steps_give_it_back():
+def test_blending_its_own_gradients_returns_a_picture():
     rng, hole = np.random.default_rng(0), middle_mask()
     picture = rng.normal(size=(96, 128, 3))
     right, below = np.zeros_like(picture), np.zeros_like(picture)

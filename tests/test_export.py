@@ -132,7 +132,7 @@ def test_splat_transform_reads_both_files(tmp_path, degree):
 # ---------------------------------------------------------------------------------------------- the command
 
 
-def test_export_writes_all_and_says_what_is_there(tmp_path):
+def test_export_writes_and_lists_all_files(tmp_path):
     pytest.importorskip("gsply")
     home = tmp_path / "s"
     with pytest.raises(ValueError, match=r"scene\.ply is missing; `make scene=s export`"):
@@ -150,7 +150,7 @@ def test_export_writes_all_and_says_what_is_there(tmp_path):
     assert (home / "export/cameras/note.txt").read_text() == "mine"
 
 
-def test_far_away_positions_stay_exact_and_are_said(tmp_path):
+def test_far_away_positions_stay_exact_and_are_reported(tmp_path):
     far = Similarity(0.5, np.array([4e6, 5e5, 0.0]))
     save_ply(tmp_path / "scene.ply", random_gaussians(20, 0), far)
     assert "many editors read floats only" in export.viewer_caveats(tmp_path / "scene.ply", False)

@@ -22,7 +22,7 @@ def dim_photos(photos, bright):
     return {name: shown(photos[name], gain) for name, gain in zip(photos, bright, strict=True)}
 
 
-def test_gains_are_found_though_some_photographs_show_something_else(wall_photos):
+def test_gains_are_robust_to_occluders(wall_photos):
     scene, cameras, photos = wall_photos
     bright = np.exp(np.random.default_rng(0).normal(0, 0.15, (len(cameras), 3)))
     bright /= bright.max() * 1.05
@@ -35,7 +35,7 @@ def test_gains_are_found_though_some_photographs_show_something_else(wall_photos
     assert brightness_deviation(found) > 0.05 > brightness_deviation(estimate_gains(scene.points, cameras, photos))
 
 
-def test_where_nothing_is_known_all_are_alike(wall_photos):
+def test_gains_are_one_without_shared_points(wall_photos):
     scene, cameras, photos = wall_photos
     assert np.array_equal(estimate_gains(np.zeros((0, 3)), cameras, photos), np.ones((len(cameras), 3)))
     black = {name: np.zeros_like(photo) for name, photo in photos.items()}

@@ -226,7 +226,7 @@ def write_published_model(empty_weight_cache, kind):
     return write_onnx_model(folder / PAINTERS[kind].file, kind)
 
 
-def test_auto_takes_the_best_that_is_here(empty_weight_cache):
+def test_auto_takes_the_best_available_model(empty_weight_cache):
     auto, exemplar, diffusion = (Inpainter(kind=kind) for kind in ("auto", "exemplar", "diffusion"))
     assert painters.resolve_inpainter(auto) == exemplar and load_inpainter("auto") is None
     assert painters.inpainter_facts(auto) == {"inpainter": "exemplar"}
@@ -302,7 +302,7 @@ def test_the_file_is_found_or_the_plan_says_where_people_get_it(empty_weight_cac
     assert not plan_reference.needed_weights(params, frozenset({"painted"}))
 
 
-def test_a_job_is_told_before_any_work_and_keyed_by_the_files_content(empty_weight_cache, tmp_path):
+def test_a_model_file_is_checked_before_any_work_and_keyed_by_content(empty_weight_cache, tmp_path):
     scene, file = write_wall_capture(tmp_path / "wall"), tmp_path / "big.pt"
 
     def planned(inpainter):

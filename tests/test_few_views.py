@@ -117,7 +117,7 @@ def test_photographs_tell_a_slanted_plane_within_a_thousandth():
     assert np.median(error) < 1e-3 and (error < 5e-3).mean() > 0.97, (np.median(error), (error < 5e-3).mean())
 
 
-def test_where_photographs_show_nothing_what_is_believed_stays():
+def test_depth_stays_where_photographs_have_no_texture():
     views, grey = [front_camera("a", 0.0), front_camera("b", 0.2)], np.full((72, 96, 3), 90, np.uint8)
     believed = np.full((72, 96), 2.0)
     planes = patchmatch.estimate_planes(views[0], grey, [(views[1], grey)], believed, np.random.default_rng(0))
@@ -155,7 +155,7 @@ def render_aperiodic_square(view):
     return depth, aperiodic_color(view.center + rays * depth[..., None])
 
 
-def test_points_that_lie_behind_what_is_seen_are_refuted_by_the_photographs():
+def test_points_behind_the_visible_surface_are_refuted():
     draw = np.random.default_rng(0)
     wall = np.column_stack([draw.uniform(-1.2, 1.2, 900), draw.uniform(-0.9, 0.9, 900), np.full(900, WALL)])
     square = np.column_stack([draw.uniform(-HALF, HALF, (25, 2)), np.full(25, NEAR)])

@@ -74,7 +74,7 @@ def test_training_views_decide_and_not_test_views(stage_folders, tmp_path):
     assert shares[0] == shares[1] > 0.01 and shares[2] == shares[3] < 0.01
 
 
-def test_a_scene_that_brings_its_gaussians_keeps_them(stage_folders, tmp_path):
+def test_a_scene_with_gaussians_keeps_them(stage_folders, tmp_path):
     """They may know more than the views do."""
     save_ply(stage_folders["poses"] / "gaussians.ply", load_ply(stage_folders["fit"] / "gaussians.ply"))
     facts, scene = run_finish(tmp_path / "out", stage_folders)

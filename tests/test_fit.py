@@ -74,7 +74,7 @@ def run_fit(folder, cameras=None, initial=None, settings=SETTINGS, **given) -> G
     return fit(cameras, render_photos(arc_cameras()), initial or initial_model(), settings, folder=folder, **given)
 
 
-def test_it_learns_and_says_so(tmp_path):
+def test_a_fit_improves_and_logs_it(tmp_path):
     held = arc_cameras()[2:3]
     cameras = [c for c in arc_cameras() if c.name != held[0].name]
     settings = SETTINGS.changed({"iterations": 240, "densify.reset_every": 0, "random_background": False})
@@ -253,7 +253,7 @@ def test_a_scene_a_thousand_times_larger_and_far_away_fits_alike(tmp_path):
 
 
 @pytest.mark.parametrize("broken", ["picture", "parameter"])
-def test_what_is_not_finite_stops_and_is_named(tmp_path, monkeypatch, broken):
+def test_a_value_that_is_not_finite_stops_the_fit_and_is_named(tmp_path, monkeypatch, broken):
     initial = initial_model()
     if broken == "parameter":
         initial.sh[3, 0, 0] = float("nan")

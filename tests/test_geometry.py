@@ -50,7 +50,7 @@ def test_unproject_refuses_a_map_of_another_size():
         geometry.unproject(np.ones((4, 4)), random_camera())
 
 
-def test_samples_outside_are_told():
+def test_samples_outside_the_image_are_marked():
     image = np.arange(6).reshape(2, 3)
     uv = np.array([[0.0, 0.0], [2.9, 1.9], [3.0, 0.5], [-0.1, 0.5], [np.nan, np.nan]])
     values, inside = geometry.sample_nearest(image, uv)

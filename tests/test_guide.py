@@ -48,7 +48,7 @@ def test_the_guide_names_these_commands():
     assert all(command.split()[1] == "scene=my-photos" for command in COMMANDS)
 
 
-def test_before_any_long_work(photo_folder):
+def test_short_commands_run(photo_folder):
     assert "fit" in run_make(*(c for c in COMMANDS if c.endswith("plan")), photo_folder)
     run_make(*(c for c in COMMANDS if c.endswith("check")), photo_folder)
     assert (photo_folder.parent / "runs/my-photos/check.png").is_file()
@@ -66,7 +66,7 @@ def test_the_mask_page(photo_folder):
 
 
 @pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="a minute; set REFFUSION_SLOW=1")
-def test_to_the_end(photo_folder):
+def test_long_commands_run(photo_folder):
     for goal, made in (("reference", "to_paint"), ("all", "evaluate/scene.ply"), ("report", "report.html")):
         run_make(*(c for c in COMMANDS if c.endswith(goal)), photo_folder)
         assert goal == "reference" or (photo_folder.parent / "runs/my-photos" / made).exists()

@@ -45,7 +45,7 @@ def solve_laplace(image, hole):
 
 
 @pytest.mark.parametrize("size", [(64, 64), (37, 51), (1, 9), (1, 1)])
-def test_what_is_given_stays_and_the_hole_lies_within_its_range(size):
+def test_known_pixels_stay_and_the_hole_lies_within_their_range(size):
     images, hidden = random_images(3, 3, *size), (random_images(3, 1, *size, seed=1) > 0).double()
     hidden[..., 0, 0] = 0
     filled = harmonic_extension(images, hidden)
@@ -71,7 +71,7 @@ def test_it_is_close_to_the_solution_of_laplaces_equation(radius):
     assert np.square(ours - solution)[hole].mean() < 0.01 * np.square(solution)[hole].mean() + 2e-4
 
 
-def test_what_lies_in_the_hole_does_not_matter():
+def test_the_content_of_the_hole_does_not_matter():
     images, hidden = random_images(1, 3, 32, 32), disk_tensor(32, 32, 9)
     other = torch.where(hidden > 0, torch.nan, images)
     assert torch.equal(harmonic_extension(images, hidden), harmonic_extension(other, hidden))

@@ -110,14 +110,14 @@ def test_stages_import_the_library_only(path):
 
 
 @pytest.mark.parametrize("stage", [path.stem for path in sources("stages/plan") if path.stem != "__init__"])
-def test_what_is_told_before_a_stage_runs_needs_nothing_heavy(stage):
+def test_plan_modules_import_nothing_heavy(stage):
     """So that `plan` answers at once."""
     code = f"import sys, stages.plan.{stage}; print(*sorted(set(sys.argv[1:]) & set(sys.modules)))"
     command = [sys.executable, "-c", code, "torch", "scipy", "numba", "cv2", "diffusers", "transformers"]
     assert subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip() == ""
 
 
-def test_no_module_imports_itself_by_a_detour():
+def test_there_are_no_import_cycles():
     """Neither do the packages of the library: what lies below knows nothing of what lies above."""
     paths = sources("reffusion", "stages", "runner", "report")
     modules = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in paths}
@@ -132,21 +132,21 @@ def test_no_module_imports_itself_by_a_detour():
     tuple(graphlib.TopologicalSorter(rooms).static_order())
 
 
-def test_package_faces_are_empty():
+def test_init_files_are_empty():
     """What a stage depends on is what it imports."""
     for folder in {path.parent for path in sources("reffusion")}:
         assert folder.name == "reffusion" or not (folder / "__init__.py").read_text().strip(), folder
 
 
 @pytest.mark.parametrize("path", sources("reffusion"), ids=relative_path)
-def test_library(path):
+def test_library_imports_no_upper_layer(path):
     names = {name.split(".")[0] for name in imports(path)}
     assert not names & {"stages", "runner", "report", "yaml", "argparse"}
     for package, doors in DOORS.items():
         assert package not in names or relative_path(path) in doors, f"only {' and '.join(doors)} import {package}"
 
 
-def test_the_command_starts_at_once():
+def test_command_imports_only_the_standard_library():
     assert foreign_packages(ROOT / "reffusion" / "command.py", set()) == set()
 
 

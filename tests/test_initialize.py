@@ -138,7 +138,7 @@ def test_bad_depth_is_refused():
     assert len(none) == 0 and none.sh.shape == (0, 4, 3)
 
 
-def test_what_haze_left_open_is_filled_too(stage_folders, tmp_path):
+def test_holes_left_by_faint_gaussians_are_filled(stage_folders, tmp_path):
     """The rim of the hole that the mask leaves to the remaining Gaussians, with these taken away."""
     view = wall_scene.CAMERAS["a2"]
     sets = load_mask_sets(stage_folders["masks"], ["a2"])["a2"]
@@ -196,7 +196,7 @@ def test_a_hidden_gaussian_does_not_become_a_speck_of_another_colour():
     assert colors.min() > 110 / 255 - 0.11 and colors.max() < 140 / 255 + 0.11
 
 
-def test_settling_moves_the_gaussians_and_leaves_no_checkpoint(stage_folders, tmp_path):
+def test_refit_moves_the_gaussians_and_leaves_no_checkpoint(stage_folders, tmp_path):
     """Twice the same, as many as before, nearer to the photographs; what it needs to resume goes when it is done."""
     found = {}
     for name, steps in (("none", 0), ("first", 40), ("again", 40)):
@@ -222,7 +222,7 @@ def test_settling_moves_the_gaussians_and_leaves_no_checkpoint(stage_folders, tm
     assert error["first"] < error["none"]
 
 
-def test_a_few_pixels_of_a_further_view_do_not_cost_the_reference_its_turns():
+def test_an_extra_view_with_few_pixels_is_sampled_less_than_the_reference():
     view = wall_scene.CAMERAS["a4"]
     picture, large, few = (
         wall_scene.photo(view),

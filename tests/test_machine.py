@@ -35,14 +35,14 @@ POOR = {
 
 
 @pytest.mark.parametrize("name", list(POOR))
-def test_what_is_lacking_is_one_line_that_mends_it(name):
+def test_each_missing_requirement_is_one_line_with_a_remedy(name):
     changes, said = POOR[name]
     (line,) = find_missing(replace(GOOD, **changes), 16.0, memory_param="distill.memory_gb")
     assert "\n" not in line
     assert re.search(said, line), line
 
 
-def test_nothing_is_lacking():
+def test_a_complete_machine_has_no_warning():
     assert find_missing(GOOD, 16.0) == []
     assert find_missing(replace(GOOD, extension=False, nvcc="13.0")) == [], "it is built when it is first needed"
     assert find_missing(replace(GOOD, extension=False, nvcc="")) == [], "nvcc does not say its version"
@@ -83,7 +83,7 @@ def test_torch_is_asked_without_importing_it(tmp_path, monkeypatch, line, built)
     assert machine._torch_cuda() == built
 
 
-def test_a_stage_says_what_it_lacks_at_once(tmp_path, monkeypatch):
+def test_a_stage_reports_missing_requirements_first(tmp_path, monkeypatch):
     """Asked as the plan asks, on a machine with an old driver, a small GPU and torch without CUDA."""
     monkeypatch.setattr(os, "environ", fake_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 535.183.01"))
     monkeypatch.chdir(ROOT)
@@ -101,7 +101,7 @@ def test_a_stage_says_what_it_lacks_at_once(tmp_path, monkeypatch):
 TAKES = ["poses", "fit", "masks", "reference", "initialize", "personalize", "lift"]
 
 
-def test_it_imports_nothing_heavy():
+def test_the_check_imports_nothing_heavy():
     code = "import sys; from reffusion.io import machine; machine.detect(); print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True).stdout == "False\n"
 

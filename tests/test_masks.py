@@ -77,7 +77,7 @@ def test_wrong_masks_are_refused():
         voting.cast_votes(one_gaussian(1.0), [wall_scene.front_camera("v", 0.0)], {"v": np.ones((4, 4), bool)})
 
 
-def test_gaussians_that_nobody_sees_go_with_what_surrounds_them():
+def test_unseen_gaussians_take_the_label_of_their_neighbours():
     views = [wall_scene.front_camera("v", -0.2), wall_scene.front_camera("w", 0.2)]
     ballots = {view.name: wall_scene.true_mask(view, 1.0) for view in views}
     aside = one_gaussian(1.0).map(lambda p: p.clone())
@@ -102,7 +102,7 @@ def test_tidy_removes_specks_and_closes_gaps():
     assert not morphology.remove_small_parts(mask, 3, 3)[15, 15]
 
 
-def test_consistent_and_undecided_masks_match_the_truth(tmp_path):
+def test_consistent_and_unobserved_masks_match_the_truth(tmp_path):
     sets, facts, found, labels = classify(tmp_path, NEAR)
     assert (found == labels).float().mean() > 0.99
     for name, view in wall_scene.CAMERAS.items():
@@ -115,7 +115,7 @@ def test_consistent_and_undecided_masks_match_the_truth(tmp_path):
     assert facts["invent_pixels"] == sum(int(sets[name].invent.sum()) for name in wall_scene.TRAIN)
 
 
-def test_what_other_views_saw_is_not_invented(tmp_path):
+def test_pixels_seen_by_other_views_are_not_invented(tmp_path):
     sets, facts, _, _ = classify(tmp_path, FAR)
     assert all(
         wall_scene.iou(sets[n].consistent, wall_scene.true_mask(v, FAR)) > 0.9 for n, v in wall_scene.CAMERAS.items()
@@ -133,7 +133,7 @@ def test_a_missing_and_a_contradicting_mask_are_outvoted(tmp_path):
     assert not sets["a0"].raw.any()
 
 
-def test_what_stands_inside_every_mask_is_the_object_although_it_was_outvoted(tmp_path, monkeypatch):
+def test_gaussians_inside_every_mask_are_the_object_even_if_outvoted(tmp_path, monkeypatch):
     """All masks leave out the same spot of the object, as a bright reflection is left out: C closes over it."""
     rows, columns = np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH] + 0.5
     given = {}
@@ -210,7 +210,7 @@ def test_masks_say_what_is_to_be_filled(tmp_path):
     assert all((sets[name].invent == wanted).all() and not sets[name].consistent.any() for name in wall_scene.TRAIN)
 
 
-def test_of_a_region_what_was_drawn_is_repainted_and_its_rim():
+def test_the_drawn_part_of_a_region_and_its_rim_are_repainted():
     """Within C all of it is, whatever was drawn there; what is thin or faint was not drawn."""
     invent, consistent, shown = np.zeros((60, 100), bool), np.zeros((60, 100), bool), np.zeros((60, 100))
     invent[10:50, 10:90], consistent[10:50, 10:20], shown[20:40, 40:60] = True, True, 0.9
@@ -231,7 +231,7 @@ def test_a_box_behind_the_surface_has_no_silhouette():
     assert not regions.silhouette(regions.Region([0, 0, -1.5], [0.2] * 3), view, wall).any()
 
 
-def test_what_lies_beyond_a_sphere_on_the_optical_axis():
+def test_masks_of_a_sphere_cover_what_lies_beyond_it():
     """A sphere of radius r at distance d shows as a disc of tan(asin(r / d)), and the rest of the view is beyond it."""
     view = wall_scene.front_camera("v", 0.0)
     ahead, radius = view.center + 1.0 * view.world_to_camera[2, :3], 0.25
@@ -253,7 +253,7 @@ def test_the_best_view_has_the_largest_mask_clear_of_the_border():
     assert voting.best_view({"s": blank}, ["s"]) is None
 
 
-def test_haze_shows_mostly_where_nobody_saw():
+def test_faint_gaussians_show_mostly_where_no_view_saw():
     view, blob = wall_scene.front_camera("v", 0.0), one_gaussian(1.0)
     inside = wall_scene.true_mask(view, 1.0)
     aside = blob.map(lambda p: p.clone())

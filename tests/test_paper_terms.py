@@ -121,7 +121,7 @@ def test_an_unadapted_prior_is_not_prompted_unless_asked():
     assert [job.params["distill"]["prompts"] for job in jobs] == ["sks", "empty", "sks", "empty", "sks"]
 
 
-def test_what_the_prior_is_told(prior, monkeypatch):
+def test_prompts_of_the_prior(prior, monkeypatch):
     monkeypatch.setattr(distill, "load_prior", lambda *_, **__: prior)
     _, told = distill.load_adapted_prior(Params(), None)
     _, nothing = distill.load_adapted_prior(Params(prompts="empty"), None)

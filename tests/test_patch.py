@@ -49,7 +49,7 @@ def test_splats_on_each_other_are_matched_one_to_one():
 
 
 @pytest.mark.parametrize("moved", [lambda p: p + 0.3, lambda p: 1.3 * p, lambda p: p[:, [1, 2, 0]]])
-def test_what_was_moved_scaled_or_turned_otherwise_is_not_matched(moved):
+def test_splats_with_changed_pose_or_size_are_not_matched(moved):
     points, deleted = plane_with_ball()
     assert matching.match_gaussians(points, moved(points[~deleted])).found < matching.MIN_MATCHED_SHARE
 
@@ -166,7 +166,7 @@ def test_a_walled_in_hole_is_in_sight_from_nowhere():
 # ---------------------------------------------------------------------------------------------- the stage `masks`
 
 
-def test_what_was_deleted_stands_for_votes(tmp_path):
+def test_deleted_splats_replace_votes(tmp_path):
     folder, fit, labels = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})
     save_labels(folder / "deleted.npy", labels)
     out = run_masks(folder, fit, tmp_path / "masks")

@@ -45,7 +45,7 @@ def parse_arguments(before, after, out, **others) -> argparse.Namespace:
     return argparse.Namespace(files=[before, after], out=out, **given)
 
 
-def test_what_is_wrong_is_said_in_one_line(splat_files, tmp_path):
+def test_errors_are_one_line(splat_files, tmp_path):
     before, after = splat_files
     out = tmp_path / "patched.ply"
     (tmp_path / "s.ksplat").write_bytes(bytes(4096))
@@ -122,7 +122,7 @@ def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
 @pytest.mark.parametrize(
     ("ending", "within"), [(".ply", 1e-6), (".splat", 1e-6), (".spz", 2e-5), (".compressed.ply", 0.2)]
 )
-def test_the_ending_says_the_format(tmp_path, ending, within):
+def test_the_suffix_chooses_the_format(tmp_path, ending, within):
     if ending in (".spz", ".compressed.ply"):
         pytest.importorskip("gsply")
     made, path = random_gaussians(300, 1), tmp_path / f"out{ending}"

@@ -206,7 +206,7 @@ def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch)
     assert errors("whole") == errors("broken")
 
 
-def test_a_number_that_is_none_stops_the_training_and_names_the_step(fresh_prior, tmp_path):
+def test_nan_stops_the_training_and_names_the_step(fresh_prior, tmp_path):
     trained = lora.attach(fresh_prior, 4, 8, 0.0, "attention", 0)
     broken = replace(striped_reference(), image=torch.full((3, 70, 90), float("nan")))
     with pytest.raises(FloatingPointError, match="step 0"):

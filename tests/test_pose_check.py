@@ -162,7 +162,7 @@ def test_what_the_other_photographs_show_stays_as_it_was(tmp_path):
         assert np.allclose(camera.world_to_camera, load_scene(whole).cameras[name].world_to_camera, atol=1e-12)
 
 
-def test_keep_uses_it_and_exclude_leaves_it_out_without_a_word(tmp_path):
+def test_keep_uses_a_view_and_exclude_drops_it_silently(tmp_path):
     folder = write_two_planes(tmp_path / "scene", **{BAD: PICTURES["v08"]})
     out, said = run_poses_with_warnings(folder, keep=[f"{BAD}.png"])
     assert said == [] and BAD in load_scene(out).train and load_scene(out).suspects == ()

@@ -142,7 +142,7 @@ def test_cameras_without_pixels_stay(tmp_path):
         plan.preview(poses.Params(**asked | {"cameras_only": ["v04"]}), folder)
 
 
-def test_objects_that_are_told_apart(tmp_path):
+def test_object_numbers_make_separate_masks(tmp_path):
     folder = write_capture(tmp_path / "s", "colmap", make_truth())
     usual = folder / "masks"
     for name in ("box", "ball"):
@@ -215,7 +215,7 @@ def test_spin_nerf_full_size_pictures_of_other_names_are_not_taken(tmp_path):
     assert image_size(out / "images/v00.png") == (WIDTH, HEIGHT)
 
 
-def test_spin_nerf_folders_are_told_in_a_line_each(tmp_path):
+def test_spin_nerf_folders_are_named_in_a_line_each(tmp_path):
     for name in ("1", "2", "3", "book"):
         write_spin_nerf(tmp_path / name, full=name != "2")
     shutil.rmtree(tmp_path / "2/images_4/test_label")
@@ -343,7 +343,7 @@ def test_normalisation_knows_no_units_and_no_offset(tmp_path, monkeypatch, bring
     assert found[0].similarity.scale == pytest.approx(1000 * found[1].similarity.scale, rel=1e-6)
 
 
-def test_depth_falls_back_where_nothing_tells_it():
+def test_depth_has_a_fallback_without_points():
     poses_along = np.stack([np.eye(4)] * 4)
     poses_along[:, 0, 3] = np.arange(4.0)
     pinholes = [lens.Lens(10, 10, 10.0, 10.0, 5.0, 5.0)] * 4
@@ -419,7 +419,7 @@ def test_a_sphere_on_an_optical_axis_is_filled_or_masks_what_lies_beyond(tmp_pat
         run_stages(folder, region={**sphere, "view": "nobody"})
 
 
-def test_preview_is_light_and_says_what_will_happen(tmp_path):
+def test_preview_is_fast_and_describes_the_run(tmp_path):
     write_spin_nerf(tmp_path / "s", full=False)
     notes = plan.preview(poses.Params(), tmp_path / "s")
     assert notes[0] == "4 training and 2 test views"

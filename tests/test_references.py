@@ -319,7 +319,7 @@ def test_paintings_stand_for_named_references_and_masks_beside_them_are_passed_o
     assert not plan_reference.needed_weights(reference.Params(), frozenset({"painted"}))
 
 
-def test_a_view_that_was_not_placed_is_told(tmp_path):
+def test_a_view_without_a_pose_is_named(tmp_path):
     folder = write_capture(tmp_path / "s", "transforms", make_truth())
     write_pictures(folder, ["ref"])
     save_lenses(tmp_path, {"v00": make_truth().lens}, False, {})
@@ -363,7 +363,7 @@ def test_depth_of_a_reference_reaches_its_artifact(wall_folders, tmp_path):
     )
 
 
-def test_what_is_to_be_painted_is_laid_out_and_a_painting_comes_back(wall_folders, tmp_path):
+def test_pictures_to_paint_are_exported_and_paintings_are_read_back(wall_folders, tmp_path):
     first = run_reference_stage(wall_folders, tmp_path / "first")
     assert list(first) == ["a2"]
     laid_out = tmp_path / "first" / "to_paint"
@@ -490,7 +490,7 @@ def test_a_photograph_that_is_also_a_reference_still_counts_for_poses(tmp_path):
     assert len(scene.cameras) == 6
 
 
-def test_references_that_contradict_each_other_are_told_from_those_that_agree():
+def test_contradicting_references_are_detected():
     """Two views of a wall: the same paint on it, then another in one of them."""
     views = [wall_scene.front_camera("a", -0.2), wall_scene.front_camera("b", 0.2)]
     depth = np.full((wall_scene.HEIGHT, wall_scene.WIDTH), wall_scene.WALL)
@@ -508,7 +508,7 @@ def test_references_that_contradict_each_other_are_told_from_those_that_agree():
     assert (first, second) == ("a", "b") and unlike > 2 * agreement.CONTRADICTION
 
 
-def test_what_references_draw_before_a_scene_is_compared_at_its_own_depth():
+def test_objects_in_front_of_a_scene_are_compared_at_their_own_depth():
     """A striped square before a wall and a step: true in both views; without its depth nothing can be said."""
     near, step = 1.4, 1.7
     floor = wall_scene.rectangle_gaussians(step, 2.0, 0.25, wall_scene.wall_color)

@@ -70,7 +70,7 @@ def test_exact_cameras_are_left_as_they_are():
 
 
 @pytest.mark.parametrize(("shift", "turn"), [(1.5, 0.0), (0.0, 0.2), (1.0, 0.15)])
-def test_shaken_cameras_are_put_right(shift, turn):
+def test_perturbed_cameras_are_corrected(shift, turn):
     given, found = perturb_cameras(shift, turn), refine_perturbed(shift, turn)
     assert found.before > 2 * refine.GOOD_RESIDUAL and found.after < 0.12
     # where the pixels of the far and the near wall's points come to lie, against the truth
@@ -114,7 +114,7 @@ def test_the_same_pictures_give_the_same_cameras():
         assert (first[name].cx, first[name].cy) == (second[name].cx, second[name].cy)
 
 
-def test_what_no_camera_explains_moves_no_camera():
+def test_inexplicable_matches_move_no_camera():
     """Leaves in the wind, a rolling shutter: each picture is bent by another half a pixel, the cameras are exact."""
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     rng, pictures = np.random.default_rng(7), {}

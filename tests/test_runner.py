@@ -163,7 +163,7 @@ def preview(""",
     assert set(statuses(project).values()) == {"cached"}
 
 
-def test_what_a_stage_did_without_makes_it_anew_once_it_is_there(project, capsys):
+def test_a_stage_reruns_once_an_optional_need_exists(project, capsys):
     """And where it is gone again, on another machine, what was made with it stays."""
     replace_text(
         project / "stages/evaluate.py",
@@ -204,7 +204,7 @@ def run(params: Params, out: Path, *, scene: Path,""",
     assert not (empty_project / "runs/toy/poses").exists()
 
 
-def test_what_is_handed_out_outlives_its_artifact_and_is_never_lost(project, capsys):
+def test_exported_files_outlive_their_artifact(project, capsys):
     replace_text(project / "pipeline.yaml", "masks:\n    needs", "masks:\n    export: [drafts]\n    needs")
     replace_text(
         project / "stages/masks.py",
@@ -249,7 +249,7 @@ def test_fingerprint():
     assert fingerprint(ast.parse("x = '''a'''")) != fingerprint(ast.parse("x = '''b'''"))
 
 
-def test_a_models_card_and_its_training_script_are_no_weights(project):
+def test_readmes_and_scripts_in_a_weights_folder_do_not_count(project):
     before = statuses(project)
     for name in ("README.md", "train.py", "held_out.png"):
         (project / "weights" / name).write_text("about it")
@@ -275,7 +275,7 @@ def test_weights_profile_and_hand_edits(project, capsys):
     assert (project / "runs/toy/kept/fit/gaussians.ply").read_text() == "11"
 
 
-def test_left_out_and_provided(project, capsys):
+def test_skipped_and_provided_stages(project, capsys):
     assert run_stages(capsys, project, set="masks.threshold=1") == ["masks", "evaluate"]
     assert statuses(project, set="masks.threshold=1")["distill"] == "skip nothing to invent"
     assert statuses(project, set="distill.gain=0")["distill"] == "skip no gain"
@@ -583,7 +583,7 @@ class Need:
 """
 
 
-def test_weights_that_are_missing_are_told_before_any_work_and_fetched(empty_project, capsys):
+def test_missing_weights_are_reported_before_any_work_and_fetched(empty_project, capsys):
     from runner.weights import fetch_weights
 
     source = empty_project / "stages" / "distill.py"
@@ -816,7 +816,7 @@ def test_stages_are_asked_once_for_the_same_inputs(project, capsys, worker_start
     )  # which files are read, as the scene changed; what the run will do, as far as it is known
 
 
-def test_what_a_stage_says_of_its_parameters_is_remembered_until_its_code_changes(project, worker_starts):
+def test_descriptions_of_parameters_are_cached_until_the_code_changes(project, worker_starts):
     statuses(project)  # in this folder for the first time
     del worker_starts[:]
     assert set(statuses(project).values()) == {"cached"} and worker_starts == []
@@ -832,7 +832,7 @@ def test_what_a_stage_says_of_its_parameters_is_remembered_until_its_code_change
         statuses(project)
 
 
-def test_a_stage_that_was_described_and_cannot_be_imported_any_more_is_refused_before_any_work(empty_project):
+def test_a_stage_that_cannot_be_imported_any_more_is_refused_before_any_work(empty_project):
     replace_text(empty_project / "stages/distill.py", "from pydantic", "import installed\nfrom pydantic")
     write_files(empty_project, {"installed.py": ""})
     assert statuses(empty_project)["distill"].startswith("pending")

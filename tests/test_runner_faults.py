@@ -183,7 +183,7 @@ def flip_byte(path: Path, quietly: bool = False) -> None:
         os.utime(path, ns=(then, then))
 
 
-def test_what_is_missing_or_changed_is_named_and_made_again(project, capsys):
+def test_missing_and_changed_files_are_named_and_made_again(project, capsys):
     made = [path for path in (project / "runs/toy").rglob("*.*") if path.suffix in (".ply", ".png", ".json", ".txt")]
     before = {path: path.read_bytes() for path in made if path.name != RECEIPT}
     (project / "runs/toy/evaluate/metrics.json").unlink()
@@ -241,7 +241,7 @@ def test_a_damaged_checkpoint_means_a_fresh_start(tmp_path, capsys, how):
     assert "checkpoint.pt is damaged: from the start" in capsys.readouterr().out
 
 
-def test_empty_records_are_none(project):
+def test_empty_records_count_as_missing(project):
     for name in ("source", "profile"):
         (project / "runs/toy" / name).write_text("")
     (project / "runs/.hashes.json").write_text("[]")
@@ -367,7 +367,7 @@ def stub_environment(tmp_path) -> Path:
 
 
 @pytest.mark.parametrize("typed", TYPED)
-def test_what_is_typed_is_no_command(stub_environment, typed):
+def test_typed_names_are_never_run_as_commands(stub_environment, typed):
     def made(*words: str) -> str:
         done = subprocess.run(
             ["make", "-s", "-C", str(REPO), f"VENV={stub_environment}", *words], capture_output=True, text=True

@@ -32,7 +32,7 @@ def describe_oddities(scene, masks, pictures) -> str:
     return "; ".join([*find_odd_masks(scene, masks), *find_odd_exposures(scene, pictures.__getitem__)])
 
 
-def test_nothing_is_odd_about_a_good_capture(wall_capture):
+def test_a_good_capture_has_no_warning(wall_capture):
     scene, masks, pictures = wall_capture
     assert describe_oddities(scene, masks, pictures) == ""
     assert describe_oddities(replace(scene, points=scene.points[:3]), {}, pictures) == ""

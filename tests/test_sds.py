@@ -88,13 +88,13 @@ def test_a_faded_answer_gets_the_contrast_of_the_render_and_keeps_its_mean():
     torch.testing.assert_close(match_contrast(clear, z, mask), clear)
 
 
-def test_what_the_prior_has_more_of_it_may_add():
+def test_matching_contrast_keeps_contrast_that_the_prior_adds():
     for factor in (1.0, 1.5, -0.5):  # as strong, stronger, the opposite
         x0, z, mask = fade_contrast(factor)
         torch.testing.assert_close(match_contrast(x0, z, mask), x0)
 
 
-def test_unfading_asks_for_no_more_contrast_and_blows_nothing_up():
+def test_matching_contrast_never_exceeds_the_render_and_stays_bounded():
     draw = generator(10)
     z, mask = torch.randn(1, 4, 8, 8, generator=draw, dtype=torch.float64), torch.ones(1, 1, 8, 8, dtype=torch.float64)
     centred = lambda x: x - x.mean((2, 3), keepdim=True)

@@ -44,7 +44,7 @@ def test_on_a_scene_without_ground_truth(tmp_path):
     assert text.count("| 1.00 |") == 2 * (len(benchmark.TIMESTEPS) + 3)
 
 
-def test_what_is_missing_is_named(tmp_path):
+def test_missing_inputs_are_named(tmp_path):
     with pytest.raises(ValueError, match="make scene=nowhere initialize"):
         benchmark.load_inputs(tmp_path / "nowhere", small_prior())
     with pytest.raises(ValueError, match="nothing is to be invented"):

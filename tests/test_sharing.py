@@ -46,13 +46,13 @@ def test_a_surface_is_drawn_by_the_view_that_shows_it_most_finely(order):
     assert drawn[1].sum() < 0.1 * views[1].pixels.sum()  # a border, to a pixel
 
 
-def test_of_two_alike_the_earlier_draws():
+def test_of_two_equal_views_the_earlier_is_used():
     same = make_surface(FRONT, floor_depth(FRONT))
     first, second = select_finest([same, same])
     assert np.array_equal(first, same.pixels) and not second.any()
 
 
-def test_what_only_one_shows_stays_its_own():
+def test_a_surface_of_one_view_stays_with_it():
     wide = make_surface(SIDE, floor_depth(SIDE), is_near_origin(SIDE, floor_depth(SIDE), 0.5))
     narrow = make_surface(FRONT, floor_depth(FRONT), is_near_origin(FRONT, floor_depth(FRONT), 0.2))
     _, left = select_finest([narrow, wide])
@@ -61,7 +61,7 @@ def test_what_only_one_shows_stays_its_own():
     assert left[is_near_origin(SIDE, floor_depth(SIDE), 0.15)].mean() < 0.05
 
 
-def test_nothing_stands_where_another_looks_past_it():
+def test_a_surface_is_dropped_where_another_view_sees_past_it():
     """A sheet that one view has in mid-air, where the other sees the floor."""
     sheet = floor_depth(SIDE, z=0.2)
     hanging = is_near_origin(SIDE, sheet, 0.4)
@@ -72,7 +72,7 @@ def test_nothing_stands_where_another_looks_past_it():
     assert not drawn[hanging].any()
 
 
-def test_without_depth_nothing_is_said():
+def test_without_depth_nothing_is_selected():
     empty = np.zeros((SIZE, SIZE))
     whole = make_surface(SIDE, floor_depth(SIDE))
     drawn, nothing = select_finest([whole, ReferenceSurface(FRONT, empty, np.zeros((SIZE, SIZE), bool))])

@@ -57,7 +57,7 @@ def test_a_path_goes_on_and_the_lawn_stays_as_sharp_as_it_is(seed):
     assert (fill_and_mark(image, seed)[0] == painted).all(), "the same seed, the same picture"
 
 
-def test_what_lies_otherwise_or_stands_before_the_rest_is_not_taken():
+def test_pixels_of_other_slope_or_layer_are_not_copied():
     """The lower half of the picture is bark of the lawn's colour; patches alone would not tell."""
     truth = paint_lawn(path=False)
     truth[80:] = (90, 100, 90)
@@ -72,7 +72,7 @@ def test_what_lies_otherwise_or_stands_before_the_rest_is_not_taken():
     assert not fill_and_mark(image, layer=layer)[1].any(), "nothing else of it is shown"
 
 
-def test_nothing_is_said_where_there_is_nothing_to_take():
+def test_without_source_pixels_nothing_is_filled():
     image = paint_lawn()
     nowhere = np.zeros((HEIGHT, WIDTH), bool)
     none = fill_from_photo(without_geometry(image, nowhere), nowhere, without_geometry(image, nowhere))
@@ -109,7 +109,7 @@ def test_slopes_are_those_of_the_ground_and_short_among_leaves():
     assert (mean_normals(depth, np.zeros_like(known), view) == 0).all()
 
 
-def test_where_all_lies_otherwise_patches_are_left_to_do_it():
+def test_without_matching_slopes_nothing_is_filled():
     normal = np.zeros((HEIGHT, WIDTH, 3), np.float32)
     normal[..., 2] = 1
     normal[HOLE] = (0, 1, 0)

@@ -58,7 +58,7 @@ def test_the_stand_in_refuses_what_cuda_refuses():
 
 
 @pytest.mark.parametrize("vote", ["weight", "count"])
-def test_masks_on_a_card(reference_folders, tmp_path, vote):
+def test_masks_on_a_gpu(reference_folders, tmp_path, vote):
     poses, fit_folder = reference_folders["poses"], reference_folders["fit"]
     run = lambda device, out: run_masks(poses, fit_folder, out, masks.Params(device=device, vote=vote))
     cpu, cuda = run_on_cpu_and_gpu(tmp_path, run)
@@ -70,7 +70,7 @@ def test_masks_on_a_card(reference_folders, tmp_path, vote):
             assert differs.mean() <= (0.01 if has_gpu() else 0), (name, kind)  # a GPU rounds otherwise
 
 
-def test_a_box_on_a_card():
+def test_a_region_on_a_gpu():
     gaussians, _ = wall_scene.wall_and_square(NEAR)
     box = regions.Region((0, 0, NEAR), (0.5, 0.5, 0.1))
     with simulated_gpu():
@@ -83,7 +83,7 @@ def test_a_box_on_a_card():
     [{"view_dependent_color": True, "refit_steps": 2, "extra_views": 1}, {"start": "random"}, {"start": "nothing"}],
     ids=["reference", "random", "nothing"],
 )
-def test_initialize_on_a_card(reference_folders, tmp_path, changed):
+def test_initialize_on_a_gpu(reference_folders, tmp_path, changed):
     cpu, cuda = run_on_cpu_and_gpu(
         tmp_path, lambda d, out: initialize.run(initialize.Params(device=d, **changed), out, **reference_folders)
     )
@@ -94,7 +94,7 @@ def test_initialize_on_a_card(reference_folders, tmp_path, changed):
         assert (~near).float().mean() <= (0.01 if has_gpu() else 0), name
 
 
-def test_a_fit_on_a_card(reference_folders, tmp_path):
+def test_a_fit_on_a_gpu(reference_folders, tmp_path):
     changed = {"iterations": 6, "sh.degree": 1, "densify.cap_max": 300, "holdout": 3, "densify.stop": 0.5}
     changed |= {"densify.every": 2, "densify.start": 0.1, "checkpoint_seconds": 1e-9}
     run = lambda device, out: fit.run(

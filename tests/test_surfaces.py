@@ -106,7 +106,7 @@ def hole_gaussians(sh_degree: int) -> Gaussians:
     return Gaussians(*(torch.from_numpy(part).float() for part in parts))
 
 
-def test_what_is_new_shines_as_the_surface_around_it(depth_views):
+def test_new_gaussians_reflect_as_the_surface_around_them(depth_views):
     photos = {view.name: paint_ground(view, shines=True) for view in CAMERAS}
     fresh = hole_gaussians(1)
     every = torch.ones(len(fresh), dtype=torch.bool)
@@ -148,7 +148,7 @@ def test_a_shadow_that_a_reference_does_not_show_is_no_shine(depth_views):
     torch.testing.assert_close(lit.sh, fresh.sh, atol=0.01, rtol=0)
 
 
-def test_nothing_is_lent_where_nothing_is_known_or_harmonics_are_flat(depth_views):
+def test_no_reflection_is_transferred_without_observations_or_harmonics(depth_views):
     photos = {view.name: paint_ground(view, shines=True) for view in CAMERAS}
     flat, fresh = hole_gaussians(0), hole_gaussians(1)
     around = view_dependent_color.measure_change(
@@ -170,7 +170,7 @@ def test_harmonics_are_orthonormal():
     torch.testing.assert_close(gram, torch.eye(16, dtype=torch.float64), atol=0.03, rtol=0)
 
 
-def test_what_a_plane_surrounds_is_told_from_what_lies_beyond_it():
+def test_points_inside_a_plane_differ_from_points_beyond_it():
     rows, columns = np.mgrid[:CELLS, :CELLS] - CELLS / 2
     away = np.hypot(rows, columns)
     seen = (away > 20) & (away < 60)

@@ -36,13 +36,13 @@ def list_artifacts(comparison_copy: Path) -> set[str]:
     }
 
 
-def test_nothing_where_all_is_used(comparison_copy, capsys):
+def test_nothing_is_listed_where_all_is_used(comparison_copy, capsys):
     before = list_artifacts(comparison_copy)
     sweep(make_request(comparison_copy, ""), yes=True)
     assert capsys.readouterr().out == "nothing that no plan uses\n" and list_artifacts(comparison_copy) == before
 
 
-def test_what_is_unused_is_told_first_and_removed_when_asked_for(comparison_copy, capsys):
+def test_unused_artifacts_are_listed_first_and_removed_on_request(comparison_copy, capsys):
     before = list_artifacts(comparison_copy)
     text = (comparison_copy / "pipeline.yaml").read_text()
     (comparison_copy / "pipeline.yaml").write_text(text.replace("  better: {distill: {gain: 3}}\n", ""))

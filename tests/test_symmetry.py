@@ -128,7 +128,7 @@ def test_the_half_that_the_box_hides_stands_where_it_is(vase_mirrors):
         assert wrong.sum() < 0.02 * behind_box.sum()
 
 
-def test_its_pixels_are_undecided_and_have_its_depth(vase_mirrors):
+def test_mirrored_pixels_are_unobserved_and_have_its_depth(vase_mirrors):
     views, gaussians, planes, mirrors = vase_mirrors
     view = views[5]
     true, hidden, vase = render_vase(view.camera)
@@ -141,13 +141,13 @@ def test_its_pixels_are_undecided_and_have_its_depth(vase_mirrors):
 
 
 @pytest.mark.parametrize("how", [{"cut": True}, {"halved": True}])
-def test_what_is_unlike_on_its_other_side_has_no_mirror(how):
+def test_an_asymmetric_object_has_no_mirror(how):
     views, photos, gaussians = make_vase_scene(**how)
     planes = find_planes(CENTRE, RADIUS, views, NO_POINTS)
     assert not left_right_mirrors(find_mirrors(gaussians, CENTRE, RADIUS, views, planes, photos))
 
 
-def test_nothing_stands_there_and_nothing_is_asked():
+def test_without_an_object_there_is_no_mirror():
     views, photos, gaussians = make_vase_scene()
     assert find_mirrors(gaussians, CENTRE, RADIUS, views, [], photos) == []
     planes = find_planes(CENTRE, RADIUS, views, NO_POINTS)

@@ -232,12 +232,12 @@ def test_a_stage_gives_the_same_after_a_kill(stage_folders, tmp_path, monkeypatc
     ("text", "seconds"),
     [("5m", 300), ("90s", 90), ("1h30m", 5400), ("2.5m", 150), (120, 120), ("45", 45), ("1H", 3600)],
 )
-def test_times_are_read(text, seconds):
+def test_durations_are_parsed(text, seconds):
     assert parse_duration(text, "x") == seconds
 
 
 @pytest.mark.parametrize("text", ["", "m", "5 minutes", "-5m", "0", "5x", None, "5m5", [5]])
-def test_what_is_no_time_is_refused(text):
+def test_invalid_durations_are_refused(text):
     with pytest.raises(Refused, match=r"scene.yaml: budget .* like 5m"):
         parse_duration(text, "scene.yaml")
 

@@ -106,7 +106,7 @@ def test_a_table_is_seen_from_above_though_what_stands_beside_it_is_lower(depth_
 
 
 @pytest.mark.parametrize(("wide", "through"), [(0.15, False), (0.4, True)])
-def test_a_speck_that_views_look_through_is_no_hole(wide, through):
+def test_a_speck_that_views_see_through_is_no_hole(wide, through):
     """Beside the box's edge views' depth is rough."""
     views = []
     for turn in range(0, 360, 30):
@@ -159,7 +159,7 @@ def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
     assert ground.continued[under].mean() > 0.95
 
 
-def test_what_lies_beneath_the_table_in_all_views_but_one_is_not_what_is_behind_the_box(depth_views):
+def test_gaussians_beneath_the_table_are_not_the_surface_behind_the_box(depth_views):
     """Left there by a fit that is wrong about the ground in one view."""
     camera = depth_views[0].camera
     rays = world_rays(camera)
@@ -183,7 +183,7 @@ def test_what_lies_beneath_the_table_in_all_views_but_one_is_not_what_is_behind_
     assert one.unobserved[asked].mean() > 0.75 and all_of_them.unobserved[asked].mean() < 0.1
 
 
-def test_what_stands_before_a_plane_does_not_speak_against_it():
+def test_objects_in_front_of_a_plane_do_not_refute_it():
     """Half of what is around the patch is a ball before the wall; behind, it would be one that cuts through."""
     view, everywhere, nowhere = table_camera("v", 0, 0.0), np.ones((CELLS, CELLS), bool), np.zeros((CELLS, CELLS), bool)
     wall = Plane(
@@ -206,7 +206,7 @@ def test_slivers_go_and_patches_stay():
     assert not found[:40].any() and found[52:78, 52:88].all() and not (found & ~mask).any()
 
 
-def test_a_vase_that_hides_its_far_side_does_not_speak_against_it(depth_views):
+def test_an_object_that_hides_its_far_side_does_not_refute_it(depth_views):
     """Half of the views look at the box's side from behind: something stands before it there."""
     exact = lambda depth: (depth, (depth, depth))
     whole = [
@@ -248,7 +248,7 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(depth_vi
     assert (again[outside] == (lit * 0.6).astype(np.uint8)[outside]).all(), "where nothing is known it stays as it is"
 
 
-def test_what_has_other_colours_than_gravel_is_debris():
+def test_gaussians_of_other_colours_than_gravel_are_debris():
     """Before rough ground nearly everything counts as seen; a teal splinter of the object does not belong there."""
     view = table_camera("v", 0, 2.0)
     depth, _, _ = render_table(view)
@@ -264,7 +264,7 @@ def test_what_has_other_colours_than_gravel_is_debris():
     assert not count_color_mismatches(Gaussians(*parts), [smooth], {"v": photo}).any()
 
 
-def test_views_say_of_points_what_the_formulas_say(depth_views):
+def test_visibility_of_points_follows_the_formulas(depth_views):
     """Points on both surfaces, before, behind and beside them, behind cameras and nowhere; with and without a side."""
     noise = np.random.default_rng(0)
     points = noise.uniform(-1.5, 1.5, (3000, 3)) * (1, 1, 0.7)

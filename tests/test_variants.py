@@ -155,7 +155,7 @@ def lifted_view(name="a", shift=0.0):
 
 
 @pytest.mark.parametrize("how", [MSE, PATCHES], ids=["mse", "patches"])
-def test_lifted_pictures_reach_the_gaussians_they_may_and_no_other(how):
+def test_lifted_pictures_reach_only_the_gaussians_they_may(how):
     start, masked = random_wall()
     for allowed in (masked, torch.ones_like(masked)):
         gaussians = as_leaves(start)
@@ -282,7 +282,7 @@ def test_lift_by_diffusion(masked_scene, tmp_path):
     assert facts["inpainter"].startswith("diffusion by") and facts["views"] == 5
 
 
-def test_nothing_is_filled_where_nothing_shall_be(masked_scene, tmp_path):
+def test_initialize_by_nothing_adds_no_gaussians(masked_scene, tmp_path):
     gaussians, new = run_initialize(masked_scene, tmp_path / "nothing", "nothing", reference=tmp_path / "never read")
     labels = load_labels(masked_scene["masks"] / "labels.npy")
     assert not new.any() and labels.any()
@@ -302,7 +302,7 @@ def test_random_gaussians_fill_the_region_of_the_hole_by_their_seed(masked_scene
     assert (again.means == gaussians.means).all() and (again.sh == gaussians.sh).all()
 
 
-def test_scattered_points_lie_where_the_holes_are():
+def test_random_points_lie_in_the_holes():
     box = random_init.bounding_box(np.random.default_rng(0).uniform(-1, 1, (4000, 3)))
     assert np.allclose(box, [[-1.15] * 3, [1.15] * 3], atol=0.05)
     assert np.allclose(random_init.box_at((0, 1, 2), (2, 2, 4)), [[-1, 0, 0], [1, 2, 4]])

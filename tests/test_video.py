@@ -112,7 +112,7 @@ def test_a_film_that_was_held_upright_stands_upright(walk_video, tmp_path):
         (lambda path: path.mkdir(), "a folder; a file is expected"),
     ],
 )
-def test_what_is_no_walk_around_a_scene(tmp_path, made, message):
+def test_videos_without_enough_views_are_refused(tmp_path, made, message):
     made(tmp_path / "x.mp4")
     with pytest.raises(BadInput, match=message):
         video.extract_frames(tmp_path / "x.mp4", tmp_path / "out", "")
@@ -156,7 +156,7 @@ def test_photographs_of_a_phone(tmp_path):
         load_image(path)
 
 
-def test_heic_without_its_reader_is_told_in_a_line(tmp_path):
+def test_heic_without_its_reader_is_refused_in_one_line(tmp_path):
     (tmp_path / "a.heic").write_bytes(base64.b64decode(PHONE))
     code = "import sys; sys.modules['pi_heif'] = None\nfrom reffusion.io.images import load_image; load_image('a.heic')"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)

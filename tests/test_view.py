@@ -83,7 +83,7 @@ def test_the_layers_are_those_that_the_result_was_made_from(tmp_path):
         gaussian_layers.load_layers(tmp_path / "x@no_sds", SIMILARITY)
 
 
-def test_what_evaluate_adds_beyond_the_capture_counts_as_kept(tmp_path):
+def test_the_backdrop_of_evaluate_counts_as_kept(tmp_path):
     """And what it leaves out is missing from either."""
     gaussians, labels = write_finished_job(tmp_path / "x", NEEDS)
     backdrop = gaussians.map(lambda p: p[:5] + 3)
@@ -93,7 +93,7 @@ def test_what_evaluate_adds_beyond_the_capture_counts_as_kept(tmp_path):
     assert len(kept) + len(added) == len(fewer) and len(added) == int(labels[1:].sum())
 
 
-def test_what_no_photograph_shows_is_hatched(tmp_path):
+def test_unobserved_pixels_are_hatched(tmp_path):
     gaussians, _ = write_finished_job(tmp_path / "x", NEEDS)
     scene = load_scene(tmp_path / "x/poses")
     shape = next(iter(scene.cameras.values()))
@@ -108,7 +108,7 @@ def test_what_no_photograph_shows_is_hatched(tmp_path):
     assert unseen_overlay.load_seen_views(tmp_path / "y", scene) == []
 
 
-def test_nothing_is_served_of_a_scene_that_is_not_there(tmp_path):
+def test_a_missing_scene_is_not_served(tmp_path):
     with pytest.raises(ValueError, match="make scene=y all"):
         view.Viewer(tmp_path / "y")
 

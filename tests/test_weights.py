@@ -96,7 +96,7 @@ def test_the_hubs_own_variables_are_read(empty_caches, monkeypatch):
     assert local.hub_cache() == empty_caches / "other"
 
 
-def test_what_is_not_here_is_told_at_once_with_the_alternatives(empty_caches):
+def test_missing_weights_are_reported_at_once_with_alternatives(empty_caches):
     with pytest.raises(
         ValueError, match=r"prior priors/tiny is not on this machine: no folder .*elsewhere/priors/tiny"
     ):
@@ -190,7 +190,7 @@ def test_a_lost_shard_is_named(empty_caches):
         local.check(folder)
 
 
-def test_what_a_stage_needs(empty_caches):
+def test_weights_needed_by_a_stage(empty_caches):
     need = local.model_need(published.SD2, "float16")
     assert "not on this machine" in need.problem and need.fetched and 2.5e9 < need.bytes < 2.7e9
     folder = copy_prior(empty_caches / "good")
@@ -330,7 +330,7 @@ def fetch_models(*names, **environment) -> list[str]:
     return done.stdout.strip().splitlines()
 
 
-def test_a_model_is_fetched_from_the_hub_and_its_refusals_are_told_apart(tmp_path, monkeypatch, hub):
+def test_a_model_is_fetched_from_the_hub_and_each_refusal_has_its_message(tmp_path, monkeypatch, hub):
     said = fetch_models(
         "acme/paint", "acme/gated", "acme/gone", published.SD2, HF_ENDPOINT=hub[0], HF_HOME=str(tmp_path)
     )
@@ -396,7 +396,7 @@ def test_weights_of_the_laptop_are_fetched_killed_resumed_and_checked(tmp_path, 
             assert [path.read_bytes() for path in found] == ([files[name]] if name != "README.md" else [])
 
 
-def test_no_network_and_the_offline_switch_are_told(tmp_path):
+def test_missing_network_and_offline_mode_have_their_messages(tmp_path):
     (unreachable,) = fetch_models("acme/paint", HF_ENDPOINT="http://127.0.0.1:9", HF_HOME=str(tmp_path))
     assert "acme/paint: the hub does not answer" in unreachable and "copy its cache" in unreachable
     (offline,) = fetch_models("acme/paint", HF_HUB_OFFLINE="1", HF_HOME=str(tmp_path))
