@@ -1,4 +1,4 @@
-"""What several tests are given."""
+"""Fixtures that several test files use."""
 
 import os
 import sys

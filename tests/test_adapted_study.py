@@ -1,4 +1,4 @@
-"""The sheet of the adapted prior beside the prior as it is: same views, same noise, holes alone painted."""
+"""The study of the personalized prior: it compares both priors on the same views and noise, and paints only holes."""
 
 from __future__ import annotations
 

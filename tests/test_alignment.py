@@ -1,4 +1,4 @@
-"""The exact limits of the alignment of depth."""
+"""Alignment of disparity and depth: exact recovery, outliers and degenerate input."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Ways of distilling, error against seconds: every setting is one of the stage's, and a curve is that of the stage."""
+"""The study of settings of `distill`: each is a setting of the stage, and its curve is the stage's."""
 
 from pathlib import Path
 

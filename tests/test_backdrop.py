@@ -1,4 +1,4 @@
-"""What no training view saw: rendered without holes and blobs, and counted apart."""
+"""The backdrop outside all training views: it has no holes or blobs, and is scored separately."""
 
 import numpy as np
 import pytest

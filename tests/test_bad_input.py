@@ -1,6 +1,6 @@
-"""Bad input, a row each: one line that names the file or the key, at once, and nothing is touched.
+"""Bad input is refused at once, in one line that names the file or the key, and nothing is written.
 
-Most rows go through what the command does below its process start (`first_message`); some through the command itself.
+Most cases call what the command calls after it starts (`first_message`); some run the command itself.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Several scenes at once on a toy pipeline: cores, memory, what is told, what a second call runs."""
+"""Several scenes at once on a toy pipeline: cores, memory, progress, and what a second call runs."""
 
 from __future__ import annotations
 

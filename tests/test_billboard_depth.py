@@ -1,4 +1,4 @@
-"""What is drawn in front of a scene, without a depth map, stands on the surface beneath it."""
+"""An object that a reference adds without a depth map stands on the surface beneath it."""
 
 import numpy as np
 from scenes.cameras import make_camera, world_rays

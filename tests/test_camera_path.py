@@ -1,4 +1,4 @@
-"""The way around a capture: where its cameras stand, what they look at, and the video along it."""
+"""The camera path around a capture and the video along it."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Captures as other programs write them: each is read with the right cameras and masks, or refused in one line."""
+"""Captures of other programs are read with the right cameras and masks, or refused in one line."""
 
 from __future__ import annotations
 

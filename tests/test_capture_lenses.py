@@ -1,8 +1,4 @@
-"""Held-out variants of the inputs that people bring, rows N, O and Q: files that are not what they are called, new
-lenses, masks and depth maps of transforms.json, 16-bit photographs.
-
-The letter in a test's name is its row in the list of inputs that went wrong.
-"""
+"""Captures with mislabelled files, uncommon lenses, masks and depth maps in transforms.json, and 16-bit photographs."""
 
 from __future__ import annotations
 
@@ -61,14 +57,14 @@ CONSENT_PAGE = b"\xef\xbb\xbf\r\n<!DOCTYPE html><html><title>Google Drive - Viru
         ("colmap", "images/v05.png", b""),
     ],
 )
-def test_N_pointers_and_pages_instead_of_pictures(tmp_path, layout, name, content):
+def test_pointers_and_pages_instead_of_pictures(tmp_path, layout, name, content):
     folder = write_capture(tmp_path / "s", layout, make_truth())
     (folder / name).write_bytes(content)
     assert Path(name).name in refusal_message(folder)
 
 
 @pytest.mark.parametrize("brand", [b"mif1", b"heix"])
-def test_N_phone_picture_called_jpg_without_its_reader(tmp_path, monkeypatch, brand):
+def test_phone_picture_called_jpg_without_its_reader(tmp_path, monkeypatch, brand):
     monkeypatch.setitem(sys.modules, "pi_heif", None)
     folder = tmp_path / "s"
     write_pictures(folder / "images", [f"IMG_{k}" for k in range(5)], ending=".jpg")
@@ -108,7 +104,7 @@ def load_undistorted(folder: Path) -> dict[str, np.ndarray]:
     return load_views(out, scene.train)
 
 
-def test_N_fisheye_of_two_focal_lengths_in_text(tmp_path):
+def test_fisheye_of_two_focal_lengths_in_text(tmp_path):
     params = (58.0, 61.0, 47.0, 36.5)
     truth = write_fisheye_capture(tmp_path / "s", params)
     earlier, model = load_undistorted(tmp_path / "s"), tmp_path / "s/sparse/0"
@@ -118,7 +114,7 @@ def test_N_fisheye_of_two_focal_lengths_in_text(tmp_path):
 
 
 @pytest.mark.parametrize(("number", "params"), [(14, (60.0, 48.5, 35.0)), (15, (60.0, 57.0, 48.5, 35.0))])
-def test_N_fisheyes_in_binary(tmp_path, number, params):
+def test_fisheyes_in_binary(tmp_path, number, params):
     truth = write_fisheye_capture(tmp_path / "s", params if number == 15 else (60.0, *params))
     earlier = load_undistorted(tmp_path / "s")
     write_camera(tmp_path / "s", number, params)
@@ -135,20 +131,20 @@ def assert_names_model(message: str, file: str, model: str) -> None:
     ("number", "name", "params"),
     [(17, "EQUIRECTANGULAR", (96.0, 72.0)), (12, "SIMPLE_DIVISION", (90.0, 48.0, 36.0, -0.1))],
 )
-def test_N_other_new_models_in_binary_are_named(tmp_path, number, name, params):
+def test_other_new_models_in_binary_are_named(tmp_path, number, name, params):
     folder = write_capture(tmp_path / "s", "colmap", make_truth())
     write_camera(folder, number, params)
     assert_names_model(refusal_message(folder), "cameras.bin", name)
 
 
 @pytest.mark.parametrize("line", ["EUCM 96 72 60 60 48 36 0.5 1.1", "DIVISION 96 72 90 90 48 36 -0.1"])
-def test_N_other_new_models_in_text_are_named(tmp_path, line):
+def test_other_new_models_in_text_are_named(tmp_path, line):
     folder = write_capture(tmp_path / "s", "colmap txt", make_truth())
     (folder / "sparse/0/cameras.txt").write_text(f"1 {line}\n")
     assert_names_model(refusal_message(folder), "cameras.txt", line.split()[0])
 
 
-def test_N_points_in_a_folder_by_a_windows_path(tmp_path):
+def test_points_in_a_folder_by_a_windows_path(tmp_path):
     truth = make_truth()
     folder = write_capture(tmp_path / "s", "transforms", truth)
     points = np.repeat(truth.points, 3, 0)
@@ -160,7 +156,7 @@ def test_N_points_in_a_folder_by_a_windows_path(tmp_path):
 
 
 @pytest.mark.parametrize("coded", [True, False])
-def test_N_video_without_frames(tmp_path, coded):
+def test_video_without_frames(tmp_path, coded):
     """Frames of a phone's AV1 that cannot be decoded here; a sound recording in the container of a video."""
     path = tmp_path / "walk.mp4"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 30, (64, 48))
@@ -201,14 +197,14 @@ def write_inverse_masks(folder: Path, where: str) -> Truth:
     return truth
 
 
-def test_O_masks_of_dynamic_objects(tmp_path):
+def test_masks_of_dynamic_objects(tmp_path):
     truth = write_inverse_masks(tmp_path / "s", "dynamic_masks/cam0")
     _, out, sentences = run_with_messages(tmp_path / "s")
     assert_masked_views(out, truth.world_to_camera)
     assert_message(sentences, "mask_path")
 
 
-def test_O_masks_of_the_scene_win(tmp_path):
+def test_masks_of_the_scene_win(tmp_path):
     truth = write_inverse_masks(tmp_path / "s", "dynamic_masks")
     for view in truth.world_to_camera:
         write_mask(tmp_path / "s/mask" / f"{view}.png", np.roll(OBJECT[:, : WIDTH // 2], 3, 0).repeat(2, 1))
@@ -216,7 +212,7 @@ def test_O_masks_of_the_scene_win(tmp_path):
     assert_masked_views(out, truth.world_to_camera, 2 * SHARE)
 
 
-def test_O_masks_that_lie_where_ours_are_looked_for(tmp_path):
+def test_masks_that_lie_where_ours_are_looked_for(tmp_path):
     """Nerfstudio's own name of the folder: taken as that file means them, or the sentence says how they are taken."""
     write_inverse_masks(tmp_path / "s", "masks")
     try:
@@ -229,7 +225,7 @@ def test_O_masks_that_lie_where_ours_are_looked_for(tmp_path):
         assert_message(sentences, "mask_path")
 
 
-def test_O_mask_of_half_of_the_frames(tmp_path):
+def test_mask_of_half_of_the_frames(tmp_path):
     folder, truth = tmp_path / "s", make_truth(views=8)
     write_pictures(folder / "images", truth.world_to_camera)
     write_transforms(folder, truth)
@@ -246,7 +242,7 @@ def test_O_mask_of_half_of_the_frames(tmp_path):
 
 
 @pytest.mark.parametrize("unit", [None, 0.0005])
-def test_O_depth_of_a_phone_makes_points(tmp_path, unit):
+def test_depth_of_a_phone_makes_points(tmp_path, unit):
     """16-bit maps of half the size, in millimetres unless the file says otherwise; 0 is unknown. The scene is z = 0."""
     truth = make_truth()
     folder = write_capture(tmp_path / "s", "transforms", truth)
@@ -277,7 +273,7 @@ def test_O_depth_of_a_phone_makes_points(tmp_path, unit):
     ("ending", "order", "low", "high"),
     [(".tif", "<u2", 0, 4095), (".tiff", ">u2", 300, 64_000), (".png", "<u2", 7_000, 21_000)],
 )
-def test_Q_grey_photographs_of_16_bits(tmp_path, ending, order, low, high):
+def test_grey_photographs_of_16_bits(tmp_path, ending, order, low, high):
     """A camera of 12 bits, a scan in the other order of bytes, a thermal camera: a ramp stays a ramp."""
     folder, truth = tmp_path / "s", make_truth()
     write_masks(folder / "masks", truth.world_to_camera)

@@ -1,7 +1,4 @@
-"""Held-out variants of the inputs that people bring, rows F to H: masks, references, pairing by order.
-
-The letter in a test's name is its row in the list of inputs that went wrong.
-"""
+"""Captures with uncommon masks and references, and pictures paired with poses by order."""
 
 from __future__ import annotations
 
@@ -61,7 +58,7 @@ def palette_image(numbers: np.ndarray, colors: dict[int, tuple[int, int, int]]) 
     return image
 
 
-def test_F_palette_whose_black_is_the_last_entry(tmp_path):
+def test_palette_whose_black_is_the_last_entry(tmp_path):
     """As an annotation tool writes it whose table begins with the first label, dark red."""
     draw = lambda: palette_image(np.where(OBJECT, 0, 2), {0: (128, 0, 0), 1: (0, 128, 0), 2: (0, 0, 0)})
     truth = write_capture_with_masks(tmp_path / "s", "masks", draw)
@@ -69,7 +66,7 @@ def test_F_palette_whose_black_is_the_last_entry(tmp_path):
     assert_masked_views(out, truth.world_to_camera)
 
 
-def test_F_one_class_of_a_palette_by_its_number(tmp_path):
+def test_one_class_of_a_palette_by_its_number(tmp_path):
     """Pascal VOC: classes by number, the contour is 255 and bright."""
     numbers = np.where(OBJECT, 15, 0)
     numbers[50:60, 10:90] = 7
@@ -88,19 +85,19 @@ def numbered_16_bit() -> Image.Image:
     return Image.fromarray(numbers)
 
 
-def test_F_object_numbers_of_16_bits_are_refused_without_id(tmp_path):
+def test_object_numbers_of_16_bits_are_refused_without_id(tmp_path):
     write_capture_with_masks(tmp_path / "s", "masks", numbered_16_bit)
     message = refusal_before_writing(tmp_path / "s")
     assert ".png" in message and re.search(r"\bid\b", message), message
 
 
-def test_F_two_object_numbers_of_16_bits(tmp_path):
+def test_two_object_numbers_of_16_bits(tmp_path):
     truth = write_capture_with_masks(tmp_path / "s", "masks", numbered_16_bit)
     _, out, _ = run_with_messages(tmp_path / "s", masks={"id": [3, 1024]})
     assert_masked_views(out, truth.world_to_camera)
 
 
-def test_F_antialiased_outlines_are_no_object_numbers(tmp_path):
+def test_antialiased_outlines_are_no_object_numbers(tmp_path):
     soft = cv2.GaussianBlur(255 * OBJECT.astype(np.uint8), (0, 0), 0.8)
     truth = write_capture_with_masks(tmp_path / "s", "masks", lambda: Image.fromarray(soft))
     _, out, _ = run_with_messages(tmp_path / "s")
@@ -110,7 +107,7 @@ def test_F_antialiased_outlines_are_no_object_numbers(tmp_path):
 # ---------------------------------------------------------------------------------------------- G: references
 
 
-def test_G_reference_and_its_depth_among_photographs_of_input(tmp_path):
+def test_reference_and_its_depth_among_photographs_of_input(tmp_path):
     folder, names = tmp_path / "s", [f"IMG_{k}" for k in range(6)]
     write_pictures(folder / "input", [*names, "clean plate"], ending=".jpg")
     Image.fromarray(np.full((HEIGHT, WIDTH), 4000, np.uint16)).save(folder / "input/clean plate depth.png")
@@ -122,7 +119,7 @@ def test_G_reference_and_its_depth_among_photographs_of_input(tmp_path):
     assert_message(notes, "6 photos bring no poses")
 
 
-def test_G_two_references_beside_pictures_of_llff(tmp_path):
+def test_two_references_beside_pictures_of_llff(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     write_capture(folder, "llff", truth)
     write_pictures(folder / "images_4", ["v00_inpainted", "v03_inpainted"])
@@ -136,7 +133,7 @@ def test_G_two_references_beside_pictures_of_llff(tmp_path):
 # ---------------------------------------------------------------------------------------------- H: order
 
 
-def test_H_frames_of_another_tool_are_not_paired_by_order(tmp_path):
+def test_frames_of_another_tool_are_not_paired_by_order(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     stems = [f"frame_{k:05d}" for k in range(6)]
     write_pictures(folder / "images", stems, ending=".jpg")
@@ -179,7 +176,7 @@ def recolor(path: Path, colors: np.ndarray) -> None:
     path.write_bytes(data[:8] + records.tobytes())
 
 
-def test_H_renamed_copies_follow_the_order_of_file_names(tmp_path):
+def test_renamed_copies_follow_the_order_of_file_names(tmp_path):
     """IMG_10.JPG comes before IMG_8.JPG."""
     truth = write_corner_capture(tmp_path / "s", [2, 3, 4, 5, 0, 1])
     scene, _, sentences = run_with_messages(tmp_path / "s")
@@ -187,6 +184,6 @@ def test_H_renamed_copies_follow_the_order_of_file_names(tmp_path):
     assert_message(sentences, "order")
 
 
-def test_H_renamed_copies_that_points_contradict_are_refused(tmp_path):
+def test_renamed_copies_that_points_contradict_are_refused(tmp_path):
     write_corner_capture(tmp_path / "s", [0, 3, 5, 1, 4, 2])
     assert_message([refusal_before_writing(tmp_path / "s")], "images")

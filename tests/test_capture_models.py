@@ -1,7 +1,4 @@
-"""Held-out variants of the inputs that people bring, rows A to D: models, names with folders, Blender's files.
-
-The letter in a test's name is its row in the list of inputs that went wrong.
-"""
+"""Captures with uncommon COLMAP models, views in folders, and Blender's files."""
 
 from __future__ import annotations
 
@@ -56,7 +53,7 @@ def write_transforms_with_paths(folder: Path, truth: Truth, paths: dict[str, str
 # ---------------------------------------------------------------------------------------------- A: several models
 
 
-def test_A_largest_of_three_models_that_nerfstudio_left(tmp_path):
+def test_largest_of_three_models_that_nerfstudio_left(tmp_path):
     folder, truth = tmp_path / "s", make_truth(views=8)
     write_pictures(folder / "images", truth.world_to_camera, ending=".jpg")
     write_masks(folder / "masks", truth.world_to_camera)
@@ -69,7 +66,7 @@ def test_A_largest_of_three_models_that_nerfstudio_left(tmp_path):
     assert_message(sentences, "sparse", "1", "0", "2")
 
 
-def test_A_two_digit_model_beside_masks_of_images_4(tmp_path):
+def test_two_digit_model_beside_masks_of_images_4(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     write_pictures(folder / "images_4", truth.world_to_camera)
     write_masks(folder / "images_4/label", truth.world_to_camera)
@@ -86,7 +83,7 @@ def test_A_two_digit_model_beside_masks_of_images_4(tmp_path):
 # ---------------------------------------------------------------------------------------------- B: names and folders
 
 
-def test_B_rig_of_two_cameras_two_folders_deep(tmp_path):
+def test_rig_of_two_cameras_two_folders_deep(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     paths = {v: f"rig1/{('left', 'right')[k % 2]}/{k // 2:03d}" for k, v in enumerate(sorted(truth.world_to_camera))}
     write_pictures(folder / "images", paths.values(), ending=".jpg")
@@ -102,7 +99,7 @@ def test_B_rig_of_two_cameras_two_folders_deep(tmp_path):
     assert list_objects(out) == [] and masked_share(out, "rig1-left-002") == pytest.approx(SHARE, abs=1e-3)
 
 
-def test_B_equal_names_in_transforms_json(tmp_path):
+def test_equal_names_in_transforms_json(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     paths = {v: f"cam_{'ab'[k % 2]}/frame_{k // 2:05d}" for k, v in enumerate(sorted(truth.world_to_camera))}
     write_pictures(folder / "images", paths.values())
@@ -114,7 +111,7 @@ def test_B_equal_names_in_transforms_json(tmp_path):
     assert_cameras(scene, rename_views(truth, views))
 
 
-def test_B_absolute_windows_paths_and_other_case(tmp_path):
+def test_absolute_windows_paths_and_other_case(tmp_path):
     folder, truth = tmp_path / "s", make_truth(views=7)
     stems = {v: f"img_{k:04d}" for k, v in enumerate(sorted(truth.world_to_camera))}
     names = {v: rf"D:\Scans\Garden 2\photos\{stem.upper()}.JPG" for v, stem in stems.items()}
@@ -130,7 +127,7 @@ def test_B_absolute_windows_paths_and_other_case(tmp_path):
 # ---------------------------------------------------------------------------------------------- C: masks in folders
 
 
-def test_C_masks_by_colmaps_rule_for_equal_names(tmp_path):
+def test_masks_by_colmaps_rule_for_equal_names(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     paths = {v: f"site/cam{k % 3}/A{k // 3}.jpg" for k, v in enumerate(sorted(truth.world_to_camera))}
     write_pictures(folder / "images", [path.removesuffix(".jpg") for path in paths.values()], ending=".jpg")
@@ -143,7 +140,7 @@ def test_C_masks_by_colmaps_rule_for_equal_names(tmp_path):
     assert_masked_views(out, views)
 
 
-def test_C_masks_of_one_day_only(tmp_path):
+def test_masks_of_one_day_only(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     days = {v: f"2024-05-0{1 + k // 3}/IMG_{k}" for k, v in enumerate(sorted(truth.world_to_camera))}
     write_pictures(folder / "images", days.values(), ending=".jpg")
@@ -156,7 +153,7 @@ def test_C_masks_of_one_day_only(tmp_path):
     assert_message(sentences, "3", "no mask", "IMG_4")
 
 
-def test_C_folders_of_objects_stay_objects(tmp_path):
+def test_folders_of_objects_stay_objects(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     write_pictures(folder / "images", truth.world_to_camera, ending=".jpg")
     for thing in ("chair", "lamp"):
@@ -175,7 +172,7 @@ def blender_frames(truth: Truth, paths: dict[str, str]) -> list[dict]:
     return [{"file_path": path, "rotation": 0.0125, "transform_matrix": pose(v)} for v, path in paths.items()]
 
 
-def test_D_nerf_synthetic_with_three_splits_of_equal_names(tmp_path):
+def test_nerf_synthetic_with_three_splits_of_equal_names(tmp_path):
     folder, truth = tmp_path / "s", make_truth(views=8)
     counts, views = {"train": 4, "test": 2, "val": 2}, sorted(truth.world_to_camera)
     named, angle = {}, 2 * float(np.arctan(WIDTH / 2 / truth.lens.fx))
@@ -195,7 +192,7 @@ def test_D_nerf_synthetic_with_three_splits_of_equal_names(tmp_path):
     assert_message(sentences, "val")
 
 
-def test_D_addon_that_writes_validation_but_no_test(tmp_path):
+def test_addon_that_writes_validation_but_no_test(tmp_path):
     folder, truth = tmp_path / "s", make_truth(views=7)
     at, views = truth.lens, sorted(truth.world_to_camera)
     lens = {"fl_x": at.fx, "fl_y": at.fy, "cx": at.cx, "cy": at.cy, "w": WIDTH, "h": HEIGHT, "aabb_scale": 4}
@@ -211,7 +208,7 @@ def test_D_addon_that_writes_validation_but_no_test(tmp_path):
     assert_masked_views(out, scene.train)
 
 
-def test_D_training_file_alone_has_no_test_views(tmp_path):
+def test_training_file_alone_has_no_test_views(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     write_pictures(folder / "images", truth.world_to_camera)
     write_transforms(folder, truth, per_frame=True)

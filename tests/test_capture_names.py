@@ -1,8 +1,4 @@
-"""Held-out variants of the inputs that people bring, rows I, J, L, M: points, masks beside photographs,
-order and form of names.
-
-The letter in a test's name is its row in the list of inputs that went wrong.
-"""
+"""Captures with points in other frames, masks beside photographs, and uncommon forms and orders of names."""
 
 from __future__ import annotations
 
@@ -49,7 +45,7 @@ def assert_points_near(scene, sentences: list[str], file: str) -> None:
     assert_message(sentences, file, "not used")
 
 
-def test_I_points_in_millimetres_beside_cameras_in_metres(tmp_path):
+def test_points_in_millimetres_beside_cameras_in_metres(tmp_path):
     folder, truth = tmp_path / "s", make_truth(offset=(12.0, -3.0, 40.0))
     write_capture(folder, "colmap", truth)
     points = np.repeat(1000 * truth.points, 5, 0)
@@ -59,7 +55,7 @@ def test_I_points_in_millimetres_beside_cameras_in_metres(tmp_path):
     assert_points_near(scene, sentences, "points3D")
 
 
-def test_I_points_in_utm_beside_a_complete_model_of_llff(tmp_path):
+def test_points_in_utm_beside_a_complete_model_of_llff(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     write_capture(folder, "llff+bin", truth)
     utm = truth.points[:, [0, 2, 1]] * (1, 1, -1) + (448_262.0, 5_411_932.0, 35.0)
@@ -72,7 +68,7 @@ def test_I_points_in_utm_beside_a_complete_model_of_llff(tmp_path):
 # ---------------------------------------------------------------------------------------------- J: masks beside
 
 
-def test_J_masks_beside_photographs_without_a_key(tmp_path):
+def test_masks_beside_photographs_without_a_key(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     write_pictures(folder / "images", truth.world_to_camera, ending=".jpg")
     for view in truth.world_to_camera:
@@ -84,7 +80,7 @@ def test_J_masks_beside_photographs_without_a_key(tmp_path):
     assert not any("not in the model" in sentence for sentence in sentences)
 
 
-def test_J_masks_beside_pictures_of_llff(tmp_path):
+def test_masks_beside_pictures_of_llff(tmp_path):
     """Names that end in numbers; one view's photograph is called _mask too, and has no mask."""
     folder, truth = tmp_path / "s", make_truth()
     names = {v: f"2024-02-0{k + 1} party" for k, v in enumerate(sorted(truth.world_to_camera))}
@@ -102,7 +98,7 @@ def test_J_masks_beside_pictures_of_llff(tmp_path):
 # ---------------------------------------------------------------------------------------------- L: LLFF's order
 
 
-def test_L_copies_with_blanks_and_hyphens(tmp_path):
+def test_copies_with_blanks_and_hyphens(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     files = ["DSC1 copy.png", "DSC1#2.png", "DSC1+.png", "DSC1-edited.png", "DSC1.png", "DSC10.png"]
     assert files == sorted(files) and [Path(f).stem for f in files] != sorted(Path(f).stem for f in files)
@@ -114,7 +110,7 @@ def test_L_copies_with_blanks_and_hyphens(tmp_path):
     assert_cameras(scene, rename_views(truth, names))
 
 
-def test_L_test_masks_follow_the_order_of_file_names(tmp_path):
+def test_test_masks_follow_the_order_of_file_names(tmp_path):
     """Three views before the masked ones; out_00000 stands for the first by file name, and has the largest mask."""
     folder, truth = tmp_path / "s", make_truth(views=8)
     files = ["20220811(0).jpg", "20220811(1).jpg", "20220811.jpg", *(f"2022082{k}.jpg" for k in range(5))]
@@ -152,7 +148,7 @@ def assert_cameras_by_nfc(scene, truth: Truth, names: dict[str, str]) -> None:
     assert_cameras(scene, rename_views(truth, {v: found[to_nfc(n)] for v, n in names.items()}))
 
 
-def test_M_transforms_json_and_masks_from_another_system(tmp_path):
+def test_transforms_json_and_masks_from_another_system(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     names = {v: to_nfc(f"がぞう é {k}") for k, v in enumerate(sorted(truth.world_to_camera))}
     assert to_nfd(names["v00"]) != names["v00"]
@@ -170,7 +166,7 @@ def test_M_transforms_json_and_masks_from_another_system(tmp_path):
     assert {to_nfc(view) for view in masked_views(out)} >= set(names.values()) - {names["v03"]}
 
 
-def test_M_folder_of_a_model_written_on_another_system(tmp_path):
+def test_folder_of_a_model_written_on_another_system(tmp_path):
     folder, truth = tmp_path / "s", make_truth()
     names = {v: f"{'Ünterführung'}/Brücke_{k}" for k, v in enumerate(sorted(truth.world_to_camera))}
     write_named_model(folder / "sparse/0", truth, {v: f"{to_nfd(n)}.jpg" for v, n in names.items()})
@@ -185,7 +181,7 @@ def test_M_folder_of_a_model_written_on_another_system(tmp_path):
     assert {to_nfc(view) for view in masked_views(out)} == {to_nfc(s) for v, s in stems.items() if v != "v01"}
 
 
-def test_M_names_of_two_forms_in_one_folder(tmp_path):
+def test_names_of_two_forms_in_one_folder(tmp_path):
     """Every second picture was copied through macOS."""
     folder, truth = tmp_path / "s", make_truth()
     names = {v: f"Straße à {k}" for k, v in enumerate(sorted(truth.world_to_camera))}

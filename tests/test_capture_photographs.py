@@ -1,8 +1,4 @@
-"""Held-out variants of the inputs that people bring, rows K and R: photographs without poses of other formats, and of
-two orientations.
-
-The letter in a test's name is its row in the list of inputs that went wrong.
-"""
+"""Photographs without poses, in uncommon formats and in two orientations."""
 
 from __future__ import annotations
 
@@ -41,13 +37,13 @@ def assert_placed(scene, truth: dict[str, np.ndarray]) -> None:
     assert degrees.max() < 2 and percents.max() < 2
 
 
-def test_K_lossy_webp_with_focal_lengths_in_capitals(tmp_path):
+def test_lossy_webp_with_focal_lengths_in_capitals(tmp_path):
     truth = save_walk(tmp_path / "s/images", ".WEBP", format="WEBP", quality=92, exif=exif())
     scene, _, _ = run_with_messages(tmp_path / "s", masks="none")
     assert_placed(scene, truth)
 
 
-def test_K_webp_saved_by_a_browser_as_jpg(tmp_path):
+def test_webp_saved_by_a_browser_as_jpg(tmp_path):
     truth = save_walk(tmp_path / "s", ".jpg", format="WEBP", lossless=True)
     scene, _, _ = run_with_messages(tmp_path / "s", masks="none")
     assert_placed(scene, truth)
@@ -70,7 +66,7 @@ def assert_two_orientations(scene, truth: dict[str, np.ndarray], portrait: set[i
         assert (camera.width < camera.height) == (k in portrait), name
 
 
-def test_R_turned_by_their_tag(tmp_path):
+def test_turned_by_their_tag(tmp_path):
     """A phone stores all lying, and says in a tag which to turn."""
 
     def save(path: Path, picture: Image.Image, upright: bool) -> None:
@@ -83,7 +79,7 @@ def test_R_turned_by_their_tag(tmp_path):
     assert_two_orientations(scene, truth, portrait)
 
 
-def test_R_stored_upright_without_tags(tmp_path):
+def test_stored_upright_without_tags(tmp_path):
     portrait = {0, 3, 4}
     save = lambda path, picture, upright: picture.save(path.with_suffix(".png"))
     truth = save_two_orientations(tmp_path / "s/photos", portrait, save)

@@ -1,4 +1,4 @@
-"""2D inpainters: only the hole changes, what lies in it is not looked at, LaMa's module is fed as it expects."""
+"""2D inpainters change only the hole and ignore its content; LaMa gets the input that it expects."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Clicks become masks: in one photograph, in all views by the Gaussians, and in a browser."""
+"""Clicks become masks: in one photograph, in all views through the Gaussians, and in a browser."""
 
 import itertools
 import threading

@@ -1,4 +1,4 @@
-"""The segmentation network of the mask page: its real architecture, small and with random weights."""
+"""The segmentation network of the mask page: the real architecture, small and with random weights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a click means where the depth is known: the thing that stands for itself, however rough what is around it."""
+"""Clicks where the depth is known select the object that stands out, also on rough ground."""
 
 from __future__ import annotations
 

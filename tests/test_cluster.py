@@ -1,4 +1,4 @@
-"""Engines other than this machine: a local Ray cluster of three nodes, submitit's local executor; work that is lost."""
+"""Engines other than this machine: a local Ray cluster of three nodes, submitit's local executor, lost work."""
 
 from __future__ import annotations
 

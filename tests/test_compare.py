@@ -1,4 +1,4 @@
-"""compare and report on a toy pipeline: resuming, failing variants, tables, intervals, the Pareto front, pages."""
+"""The commands compare and report on a toy pipeline: resuming, failures, tables, intervals, Pareto front, pages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Composites of real captures: where the object stands, what its drawing touches, the table."""
+"""Composites of real captures: where the object stands, which pixels it changes, and the table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Consistency of neighbouring views against scenes whose warp is known in closed form."""
+"""Consistency of neighbouring views, on scenes whose warp is known in closed form."""
 
 import numpy as np
 import pytest

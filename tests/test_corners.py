@@ -1,4 +1,4 @@
-"""A wall that comes forward: its side, narrow in all photographs, goes on behind what stands before it."""
+"""A step in a wall continues behind an object, although its side is narrow in all photographs."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,4 @@
-"""What a plan says that a stage takes on a GPU: from counted operations; longer for more work, less on a faster GPU;
-and what that rests on."""
+"""The cost forecast on a GPU: it counts operations, grows with the work, and falls with a faster GPU."""
 
 from __future__ import annotations
 

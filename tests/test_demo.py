@@ -1,4 +1,4 @@
-"""The generator of synthetic scenes: layout, poses, lens, and above all its truth."""
+"""The generator of synthetic scenes: layout, poses, lens and ground truth."""
 
 from __future__ import annotations
 

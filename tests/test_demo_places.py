@@ -1,4 +1,4 @@
-"""The generator's harder places: before the object something stays, a table's edge, a wall's corner, foliage."""
+"""The generator's harder scenes: an object in front that stays, the edge of a table, a corner of walls, foliage."""
 
 from __future__ import annotations
 

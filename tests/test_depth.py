@@ -1,4 +1,4 @@
-"""Completion continues planes and creases; the bilateral solver smooths within edges."""
+"""Depth completion continues planes and creases; the bilateral solver smooths within edges."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The true depth that `benchmarks/studies/depth.py` compares with: the generator's, and where it has steps."""
+"""The true depth of the depth study: it agrees with the generator, and its edges are found."""
 
 from __future__ import annotations
 

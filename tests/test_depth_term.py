@@ -1,4 +1,4 @@
-"""The depth term: alignment, target, gradient and whom it reaches, convergence, views that tell nothing, resume."""
+"""The depth term: alignment, target, gradients, convergence, degenerate views, resume."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The patch critic against closed forms, float64 and finite differences; that it learns, and pulls the right way."""
+"""The patch critic against closed forms, float64 and finite differences, and what it learns."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Distillation: confinement to the bit, the region, resume, guards; the reference by hand and by the prior."""
+"""Distillation: bit-exact confinement, regions, resume, guards, and references by hand and by the prior."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""`evaluate` on folders written to disk: what it leaves behind must be recomputable from its own pictures."""
+"""The stage `evaluate` on written folders: its scores can be recomputed from its own pictures."""
 
 import csv
 import json

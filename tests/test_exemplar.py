@@ -1,4 +1,4 @@
-"""Texture without a network: patches of photographs, carried along surfaces, blended without seams."""
+"""Exemplar inpainting: patches of photographs, transported along surfaces and blended without seams."""
 
 from __future__ import annotations
 

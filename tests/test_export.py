@@ -1,4 +1,4 @@
-"""A finished scene as other tools read it: each file read back by what is not ours."""
+"""Exported scenes, read back by other libraries."""
 
 from __future__ import annotations
 

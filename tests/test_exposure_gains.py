@@ -1,4 +1,4 @@
-"""How bright each photograph is beside the others, from the points that they share."""
+"""The relative brightness of photographs, estimated from the points that they share."""
 
 import numpy as np
 import pytest

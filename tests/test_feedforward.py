@@ -1,7 +1,7 @@
-"""LaMa and MI-GAN from files: what they are shown, what of it is taken, and which files are refused.
+"""LaMa and MI-GAN from files: their input, their output, and which files are refused.
 
-Stand-ins for the published files, of the same inputs and outputs, are built here; they fill a hole with the mean of
-what lies around it.
+The tests build stand-ins with the inputs and outputs of the published files; they fill a hole with the mean of its
+surroundings.
 """
 
 import json

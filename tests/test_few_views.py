@@ -1,4 +1,4 @@
-"""Few photographs: depth between sparse points has edges, and a fit on it shows other views."""
+"""Few photographs: depth between sparse points keeps edges, and a fit on it generalizes to other views."""
 
 from dataclasses import replace
 

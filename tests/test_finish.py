@@ -1,4 +1,4 @@
-"""`finish`: which result becomes scene.ply, and when it gets a backdrop; test views decide nothing."""
+"""The stage `finish`: which result becomes scene.ply, and when it gets a backdrop; test views have no influence."""
 
 from dataclasses import replace
 

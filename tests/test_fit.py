@@ -1,4 +1,4 @@
-"""The fit of a whole scene: it learns, resumes, ignores masked pixels, and fails by name."""
+"""The fit of a whole scene: it improves, resumes, ignores masked pixels, and names what fails."""
 
 import json
 import re

@@ -1,7 +1,7 @@
-"""Every reader of what people hand over, on spoilt files: only our own errors come out.
+"""All readers of user files, on corrupted files: they raise only their own errors.
 
-`REFFUSION_SLOW=1` spends `REFFUSION_FUZZ_SECONDS` (600) on each reader; `python -m tests.test_fuzz` likewise, without
-pytest. What was found once stays in `FOUND`.
+`REFFUSION_SLOW=1` spends `REFFUSION_FUZZ_SECONDS` (600) on each reader; so does `python -m tests.test_fuzz`, without
+pytest. Files that once broke a reader stay in `FOUND`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What distillation gains: the energy of gradients against the truth's, the table, the scene's own run of a variant."""
+"""The study of what distillation gains: energy of gradients against the truth, its table, and runs of variants."""
 
 from pathlib import Path
 

@@ -1,8 +1,4 @@
-"""Held-out variants of the inputs that people bring, rows E and P: files of Gaussians as editors and trainers write
-them.
-
-The letter in a test's name is its row in the list of inputs that went wrong.
-"""
+"""Files of Gaussians as editors and trainers write them: precisions, byte orders, filters, .splat and .spz."""
 
 from __future__ import annotations
 
@@ -85,7 +81,7 @@ SHAPE = ("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 # ---------------------------------------------------------------------------------------------- E: not finite, zero
 
 
-def test_E_not_finite_and_zero_rows_of_big_endian_doubles(tmp_path):
+def test_not_finite_and_zero_rows_of_big_endian_doubles(tmp_path):
     folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(60, rest=9, kind="f8")
     table["rot_2"][3] = table["f_rest_4"][41] = np.nan
     for row in (10, 11, 55):
@@ -114,7 +110,7 @@ def test_E_not_finite_and_zero_rows_of_big_endian_doubles(tmp_path):
         assert_message(sentences, "2", "3")
 
 
-def test_E_deleted_splats_are_those_of_the_rows_that_stay(tmp_path):
+def test_deleted_splats_are_those_of_the_rows_that_stay(tmp_path):
     """Before and after an editor deleted 30: bad rows are in both files, in front of what was deleted."""
     folder, before = write_transforms_capture(tmp_path / "s"), gaussian_table(400)
     before["z"][5] = np.nan
@@ -130,7 +126,7 @@ def test_E_deleted_splats_are_those_of_the_rows_that_stay(tmp_path):
     assert deleted.dtype == np.bool_ and kept[deleted].tolist() == gone.tolist()
 
 
-def test_E_text_file_with_words_for_what_is_not_finite(tmp_path):
+def test_text_file_with_words_for_what_is_not_finite(tmp_path):
     folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(20)
     table["opacity"][4], table["scale_2"][6], table["f_dc_1"][8] = np.inf, -np.inf, np.nan
     write_gaussians(folder / "splats/scan.ply", table, text=True)
@@ -155,7 +151,7 @@ def assert_filter_folded(columns: dict[str, np.ndarray], table: np.ndarray, atol
     assert "filter_3D" not in columns
 
 
-def test_P_filter_of_some_splats_in_doubles(tmp_path):
+def test_filter_of_some_splats_in_doubles(tmp_path):
     folder, table = (
         write_transforms_capture(tmp_path / "s"),
         gaussian_table(30, rest=45, more=("filter_3D",), kind="f8"),
@@ -167,7 +163,7 @@ def test_P_filter_of_some_splats_in_doubles(tmp_path):
     assert_columns_equal(columns, table, ["f_rest_0", "f_rest_44"])
 
 
-def test_P_filter_of_opaque_splats(tmp_path):
+def test_filter_of_opaque_splats(tmp_path):
     """Infinite opacities become those of the filter."""
     folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(24, more=("filter_3D",))
     table["filter_3D"], table["opacity"][::3] = 0.05, np.inf
@@ -177,7 +173,7 @@ def test_P_filter_of_opaque_splats(tmp_path):
 
 
 @pytest.mark.parametrize("rest", [0, 24])
-def test_P_two_scales_are_flat_along_the_third_axis(tmp_path, rest):
+def test_two_scales_are_flat_along_the_third_axis(tmp_path, rest):
     folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(25, rest=rest, scales=2)
     write_gaussians(folder / "surfels.ply", table)
     columns, _ = load_written_gaussians(folder, "surfels.ply")
@@ -187,7 +183,7 @@ def test_P_two_scales_are_flat_along_the_third_axis(tmp_path, rest):
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_P_fourth_degree_is_cut_channel_by_channel(tmp_path, text):
+def test_fourth_degree_is_cut_channel_by_channel(tmp_path, text):
     folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(12, rest=72)
     write_gaussians(folder / "four.ply", table, ">", text)
     columns, sentences = load_written_gaussians(folder, "four.ply")
@@ -200,7 +196,7 @@ def test_P_fourth_degree_is_cut_channel_by_channel(tmp_path, text):
     assert_message(sentences, "degree", "3")
 
 
-def test_P_splat_file(tmp_path):
+def test_splat_file(tmp_path):
     """32 bytes each: place and sizes as floats, colour and opacity, rotation as bytes around 128."""
     folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(16)
     colors = np.random.default_rng(2).integers(0, 256, (16, 4)).astype(np.uint8)
@@ -250,7 +246,7 @@ def spz_bytes(table: np.ndarray, turns: np.ndarray, version: int) -> bytes:
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_P_spz_file(tmp_path, version):
+def test_spz_file(tmp_path, version):
     """Its axes are right, up, back. Taken as such, or turned to those of the PLY file that it was made of: places and
     rotations go together."""
     folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(32)

@@ -1,4 +1,4 @@
-"""Projection against its inverse."""
+"""Projection and its inverse."""
 
 from dataclasses import replace
 

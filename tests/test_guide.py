@@ -1,5 +1,4 @@
-"""docs/guide.md: every command in it is run as it stands there, on a small scene; with REFFUSION_SLOW=1 the longer
-ones, too."""
+"""Every command of docs/guide.md runs as written on a small scene; the longer ones with REFFUSION_SLOW=1."""
 
 from __future__ import annotations
 

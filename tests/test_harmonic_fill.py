@@ -1,4 +1,4 @@
-"""The harmonic extension of a hole's surroundings: its limits, and how far it is from the exact one."""
+"""The harmonic extension of a hole's surroundings: its limits, and its distance from the exact solution."""
 
 import numpy as np
 import pytest

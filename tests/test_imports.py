@@ -1,4 +1,4 @@
-"""Who may import whom, who may open files: read from the sources."""
+"""The structure of the code: which package imports which, and which modules open files."""
 
 from __future__ import annotations
 

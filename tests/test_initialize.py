@@ -1,4 +1,4 @@
-"""New Gaussians lie on the hidden surface, show the reference, and leave no holes."""
+"""New Gaussians lie on the hidden surface, reproduce the reference, and leave no holes."""
 
 from dataclasses import replace
 

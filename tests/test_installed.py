@@ -1,4 +1,4 @@
-"""The wheel: one package, that works from any folder as a checkout does."""
+"""The wheel is one package that works from any folder as a checkout does."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Round trips of every file format, and the refusals."""
+"""Round trips of every file format, and what is refused."""
 
 from __future__ import annotations
 

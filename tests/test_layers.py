@@ -1,4 +1,4 @@
-"""Which surface a hole's pixels belong to, and what depth they have: analytic steps, a vase on a table, a recess."""
+"""Surface labels and depth of a hole's pixels: analytic steps, a vase on a table, a recess."""
 
 import itertools
 

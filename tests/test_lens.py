@@ -1,4 +1,4 @@
-"""Lenses against COLMAP's, and what undistortion does to pictures and masks."""
+"""Lens models against COLMAP, and the undistortion of pictures and masks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""LPIPS: its formula, its published weights, and where they come from."""
+"""LPIPS: its formula, its published weights, and where they are found."""
 
 import hashlib
 import io

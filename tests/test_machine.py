@@ -1,4 +1,4 @@
-"""What a machine lacks for CUDA is said beforehand, a line each, with what mends it; nothing heavy is imported."""
+"""Missing requirements of CUDA are reported beforehand, a line and a remedy each, without heavy imports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Votes, labels and pixel classes on a scene whose truth is known by hand."""
+"""Votes, labels and pixel classes on a scene with known truth."""
 
 import numpy as np
 import pytest

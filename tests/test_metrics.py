@@ -1,4 +1,4 @@
-"""Metrics against their definitions, written out again here, and at the edges: one pixel, constant, identical."""
+"""Metrics against independent implementations, and at the limits: one pixel, constant, identical."""
 
 import math
 

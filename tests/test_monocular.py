@@ -1,4 +1,4 @@
-"""The depth network: loaded from a folder, fed as its own processor would feed it; clear refusals."""
+"""The monocular depth network: loading, preprocessing as in its own processor, and refusals."""
 
 import shutil
 from dataclasses import replace

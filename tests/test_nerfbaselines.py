@@ -1,4 +1,4 @@
-"""The plug-in for nerfbaselines, in the environment that $NERFBASELINES_PYTHON names, on a run of a made scene.
+"""The plug-in for nerfbaselines on a synthetic scene, in the environment that $NERFBASELINES_PYTHON names.
 
 python3 -m venv nb && nb/bin/pip install ./plugins/nerfbaselines
 NERFBASELINES_PYTHON=nb/bin/python pytest tests/test_nerfbaselines.py

@@ -1,4 +1,4 @@
-"""docs/paper.md, `pipeline.yaml` and the paper agree, value by value."""
+"""docs/paper.md, `pipeline.yaml` and the paper agree on every value."""
 
 import re
 from fractions import Fraction

@@ -1,4 +1,4 @@
-"""The profile `paper` from masks to scores, every term on, with small random models of the real architectures."""
+"""The profile `paper` from masks to scores with all terms, on small random models of the real architectures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where code and paper once parted: what supervises, what stands for what, prompts, masks, step sizes, colours."""
+"""Details in which the code follows the paper: supervision, references, prompts, masks, step sizes, colours."""
 
 from __future__ import annotations
 

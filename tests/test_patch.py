@@ -1,4 +1,4 @@
-"""A scene from which someone deleted splats: found, filled without masks, and given back to the editor."""
+"""A scene from which splats were deleted in an editor: detected, filled without masks, and returned to the editor."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""`reffusion patch before.ply after.ply --out patched.ply`: refusals, the folder it works in, what it writes, and the
-cameras that it finds around a hole."""
+"""The command `reffusion patch before.ply after.ply --out patched.ply`: refusals, its folder, its output, and cameras
+around a hole."""
 
 from __future__ import annotations
 

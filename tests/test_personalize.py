@@ -1,4 +1,4 @@
-"""Personalization: which pixels a sample may show, what the loss measures, that training learns, resumes and stops."""
+"""Personalization: the pixels of a sample, the loss, learning, resume and early stops."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Photographs that contradict their poses are left out, named with the line of scene.yaml that decides otherwise."""
+"""Photographs that contradict their poses are left out, and a message names the line that keeps them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Captures that `poses` refuses: each time with the file and the remedy, and before any work."""
+"""Captures that `poses` refuses before any work; each message names the file and a remedy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The prior: exact VAE, conversions between eps, v and z_0, sampling, and LoRA files that diffusers reads."""
+"""The prior: VAE, conversions between eps, v and z_0, sampling, and LoRA files that diffusers reads."""
 
 import json
 import shutil

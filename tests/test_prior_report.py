@@ -1,4 +1,4 @@
-"""The prior's report: scores inside a hole, a held-out set that was never trained on, the page that is drawn."""
+"""The report on a prior: scores inside a hole, a held-out set outside the training data, and the page."""
 
 import argparse
 import json

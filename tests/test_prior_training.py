@@ -1,4 +1,4 @@
-"""Training the embedded prior: pictures and steps depend on the seed alone; the code is exact, resumes are too."""
+"""Training of the embedded prior: pictures and steps depend on the seed alone, and runs resume exactly."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The production path at a small size: SDXL, parts of a batch, half precision, memory budgets, the two benchmarks."""
+"""The production path at a small size: SDXL, parts of a batch, half precision, memory budgets, two benchmarks."""
 
 import gc
 import json

@@ -1,4 +1,4 @@
-"""References whose texture was redrawn everywhere: accepted where they show their view, else refused with numbers."""
+"""References with a redrawn texture are accepted if they show their view, and else refused with numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""References that people bring: named, painted or from other tools; what reruns for them, and what is refused."""
+"""User references: named, painted or from other tools; what reruns for them, and what is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras that miss their photographs are found and put right; those that fit, and those that cannot be told, stay."""
+"""Camera refinement corrects wrong cameras, and leaves exact and undetermined ones."""
 
 from dataclasses import replace
 from functools import cache

@@ -1,4 +1,4 @@
-"""What lies in the repository works on every machine."""
+"""The repository works on every machine: no links, no paths of one machine."""
 
 from __future__ import annotations
 

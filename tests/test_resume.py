@@ -1,6 +1,6 @@
-"""A miniature scene end to end, the runner killed at random moments: the result must not show it.
+"""A small scene end to end, with the runner killed at random moments: the result is the same.
 
-RESUME_KILLS sets the number of kills: 3, to spare time; 20 before a release.
+RESUME_KILLS sets the number of kills: 3 by default to save time, 20 before a release.
 """
 
 from __future__ import annotations

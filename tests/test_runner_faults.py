@@ -1,5 +1,5 @@
-"""Faults of the machine and of hands: kills, full disks, lost and rotten files, locks, quotes. Nothing is lost, and
-what went wrong is told in one line. REFFUSION_SLOW=1: all kills and all sizes of a disk, a few of them otherwise."""
+"""Faults of machines and users: kills, full disks, lost and corrupted files, locks, quotes. Nothing is lost, and each
+error is one line. REFFUSION_SLOW=1 runs all kills and all sizes of a disk."""
 
 # ruff: noqa: F401, F811 (fixtures are imported, and taken as arguments)
 

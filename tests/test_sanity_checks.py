@@ -1,4 +1,4 @@
-"""What is odd about a capture is said in plain words, and what is not odd is not."""
+"""Warnings about unusual captures, and their absence for good ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Score distillation against a distribution whose score is known, and the two scales it looks at."""
+"""Score distillation against a distribution with a known score, and its two scales."""
 
 import pytest
 import torch

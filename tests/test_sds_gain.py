@@ -1,4 +1,4 @@
-"""Can SDS gain? What the initialization shows beside the hole, and who reads the answer."""
+"""The prediction whether SDS can improve the initialization, from its error beside the hole."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The variance of the SDS gradient: its parts against draws of known variance, and on a small run."""
+"""The variance of the SDS gradient: its parts against samples of known variance, and on a small run."""
 
 from pathlib import Path
 

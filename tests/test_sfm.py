@@ -1,4 +1,4 @@
-"""Structure from motion: on a small drawn room always; on photographs with REFFUSION_SLOW=1 (minutes)."""
+"""Structure from motion: on a small synthetic room, and with REFFUSION_SLOW=1 (minutes) on photographs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Of several references that bring their depth, who draws what: surfaces in closed form, seen by two cameras."""
+"""Which of several references with depth supplies a surface, on surfaces in closed form that two cameras see."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Holes put together from large pieces of their own photograph."""
+"""Holes filled with large pieces of their own photograph."""
 
 from __future__ import annotations
 

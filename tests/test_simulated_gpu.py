@@ -1,5 +1,4 @@
-"""Stages on a GPU give what they give on the CPU; a stand-in for one, which refuses to mix tensors of two devices
-(tests/scenes/simulated_gpu.py)."""
+"""Stages on a GPU, simulated where there is none, agree with the CPU and do not mix tensors of two devices."""
 
 from __future__ import annotations
 

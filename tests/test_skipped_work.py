@@ -1,4 +1,4 @@
-"""Nothing a scene does not need: no library, no pixel and no coefficient."""
+"""Scenes skip what they do not need: libraries, pixels and coefficients."""
 
 from __future__ import annotations
 

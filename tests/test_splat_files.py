@@ -1,4 +1,4 @@
-"""Files of splats as editors and other trainers write them: each read to the right values, or refused in one line."""
+"""Files of splats from editors and other trainers are read to the right values, or refused in one line."""
 
 from __future__ import annotations
 

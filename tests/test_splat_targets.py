@@ -1,4 +1,4 @@
-"""The compiled splatting on processors other than the one at hand: LLVM is told what it may use."""
+"""The compiled splatting for other processors than this one."""
 
 from __future__ import annotations
 

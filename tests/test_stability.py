@@ -1,4 +1,4 @@
-"""The stability suite: every case within its bound, every phrase of what was asked for a case, every fault caught."""
+"""The stability suite: every case is within its bound, all required cases exist, and every planted fault is caught."""
 
 import json
 import sys

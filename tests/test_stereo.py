@@ -1,4 +1,4 @@
-"""Points by optical flow: exact where the matches are, robust where one is wrong, honest where there is no parallax."""
+"""Points by optical flow: exact for exact matches, robust to a wrong one, and far away without parallax."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The preference study: clips of two methods, a whole session in a browser, votes with a known preference."""
+"""The preference study: clips of two methods, a session in a browser, votes with a known preference."""
 
 from __future__ import annotations
 

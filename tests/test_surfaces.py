@@ -1,4 +1,4 @@
-"""A completed surface among photographs: its depth from comparing them, its shine from what is around it."""
+"""Completed surfaces: their depth from photo-consistency, and their view-dependent colour from the surroundings."""
 
 import numpy as np
 import pytest

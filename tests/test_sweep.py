@@ -1,4 +1,4 @@
-"""gc: what no plan uses is listed, and removed where asked for; nothing that no receipt vouches for."""
+"""The command gc lists artifacts that no plan uses, and removes them on request if a receipt names them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What nobody saw of a thing: its mirror image, where photographs agree; a vase by a box, seen by analytic views."""
+"""Unseen parts of an object as its mirror image, where photographs agree: a vase beside a box, in analytic views."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Insertion, outpainting and all else are settings of a scene: no code knows which of them it runs."""
+"""Insertion, outpainting and other tasks are settings of a scene: the code has no case for any of them."""
 
 import ast
 import re

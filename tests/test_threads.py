@@ -1,4 +1,4 @@
-"""How many threads the steps of a long work on the CPU take."""
+"""The number of threads of a long computation on the CPU."""
 
 import time
 

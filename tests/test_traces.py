@@ -1,4 +1,4 @@
-"""Error against run time: what stages log, a clock that stands while it measures, early ends, budgets, the gate."""
+"""Error against run time: traces of stages, pauses of the clock, early ends, budgets, and the regression gate."""
 
 import copy
 import json

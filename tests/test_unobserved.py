@@ -1,4 +1,4 @@
-"""What photographs say of the space behind an object: a table with free space under it, seen by analytic views."""
+"""The visibility of the space behind an object: a table with free space below, in analytic views."""
 
 from dataclasses import replace
 

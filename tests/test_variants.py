@@ -1,4 +1,4 @@
-"""The variants of pipeline.yaml: what each leaves out and shares, which Gaussians its terms reach, and that it runs."""
+"""The variants of pipeline.yaml: the stages that each skips and shares, the Gaussians it changes, and runs."""
 
 from __future__ import annotations
 

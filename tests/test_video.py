@@ -1,4 +1,4 @@
-"""A video as a scene: which frames are taken, what is refused, what is kept; and HEIC photographs."""
+"""Videos as scenes: the choice of frames, refusals, and their cache; HEIC photographs."""
 
 import base64
 import csv

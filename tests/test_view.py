@@ -1,4 +1,4 @@
-"""The viewer: whose camera is drawn, which layers there are, what a visitor is shown, and when."""
+"""The viewer: cameras, layers, and which picture a visitor gets when."""
 
 import urllib.request
 from types import SimpleNamespace

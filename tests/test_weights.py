@@ -1,4 +1,4 @@
-"""Weights: found in each layout without a network; each way in which they may be wrong has its message; fetching."""
+"""Weights: found in each layout without a network, a message for each fault, and downloads."""
 
 import hashlib
 import http.server
