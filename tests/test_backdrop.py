@@ -6,6 +6,7 @@ import torch
 from scenes import wall_scene
 from scenes.cameras import make_camera, yaw
 
+from reffusion import geometry
 from reffusion.background import backdrop, training_coverage
 from reffusion.io.arrays import load_json
 from reffusion.io.images import save_image
@@ -132,7 +133,7 @@ def test_unseen_is_what_all_training_views_hide_behind_something_or_under_masks(
     aside = wall_scene.front_camera("aside", 0.9)
     points = wall_scene.wall_points(aside)
     framed = np.any([((uv >= 0) & (uv < (c.width, c.height))).all(-1) & ~wall_scene.is_behind_square(points, c, at)
-                     for c in TRAIN for uv in [wall_scene.geometry.project(points, c)[0]]], 0)  # fmt: skip
+                     for c in TRAIN for uv in [geometry.project(points, c)[0]]], 0)  # fmt: skip
     here = ~wall_scene.is_behind_square(points, aside, at)  # the square itself was seen
     assert (
         wall_scene.iou(training_coverage.unseen_pixels(both, aside, coverage_views(both)) & here, ~framed & here) > 0.85

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scenes import wall_scene
-from scenes.cameras import look_at_camera, make_camera, yaw
+from scenes.cameras import look_at_camera, make_camera, orbit_camera, yaw
 from scenes.stage_runs import run_through_masks, write_true_references
 
 from reffusion import geometry
@@ -100,7 +100,7 @@ def render_floor(view: Camera) -> tuple[np.ndarray, np.ndarray]:
 def test_no_view_is_completed_from_behind_where_nobody_photographed():
     at = np.array([0.0, 0.0, 0.2])
     turns = {"photographed": 0, "beside": 40, "before the other": 205, "behind": 110, "the other": 180}
-    cameras = [wall_scene.orbit_camera(name, angle, 0.5, 2.0, at, 32, 40.0) for name, angle in turns.items()]
+    cameras = [orbit_camera(name, angle, 0.5, 2.0, at, 32, 40.0) for name, angle in turns.items()]
     blank = frozenset({"beside", "before the other", "behind"})
     views = [type("View", (), {"camera": camera}) for camera in cameras]
     background = Background(views, {}, without_photo=blank)
