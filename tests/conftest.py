@@ -15,7 +15,7 @@ DATA = Path(__file__).parents[1] / "data"
 
 @pytest.fixture(scope="module")
 def generate():
-    """data/generate.py, its neighbours importable."""
+    """The module data/generate.py, with its neighbours importable."""
     sys.path.insert(0, str(DATA))
     try:
         import generate
@@ -54,5 +54,5 @@ def wall_folders(tmp_path):
 
 
 def pytest_collection_modifyitems(items):
-    """The file that takes longest first: at the end one process would be busy with it while the other waits."""
+    """Run the longest file first: with two processes it would otherwise run alone at the end."""
     items.sort(key=lambda item: item.path.name != "test_resume.py")

@@ -23,7 +23,7 @@ NO_PRIOR = {"sds": {"weight": 0}, "iterations": 4}
 
 @pytest.fixture(scope="module")
 def initialized_run(tmp_path_factory):
-    """A small run up to `initialize`, whose test views have a truth."""
+    """A small run up to `initialize`, whose test views have ground truth."""
     home = tmp_path_factory.mktemp("scene")
     poses = run_through_initialize(home, NEAR)["poses"]
     for name in wall_scene.TEST:

@@ -34,7 +34,7 @@ def turned_camera(degrees: float) -> Camera:
 
 
 def add_gaussian(gaussians: Gaussians, mean, sizes, color) -> Gaussians:
-    """One Gaussian more, opaque."""
+    """The Gaussians and one opaque Gaussian more."""
     sh = torch.zeros(1, gaussians.sh.shape[1], 3)
     sh[0, 0] = (torch.tensor(color) - 0.5) / 0.2820948
     rows = torch.tensor([mean]), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([sizes]).log(), torch.tensor([4.0]), sh
@@ -143,7 +143,7 @@ def test_unseen_is_what_all_training_views_hide_behind_something_or_under_masks(
 
 
 def test_an_extra_view_shows_pixels_for_the_first_time():
-    """Of the outermost views an outer strip is in no other one, and of those between nothing."""
+    """Only the outermost views show a strip that no other view shows."""
     scene = wall_scene.rectangle_gaussians(wall_scene.WALL, 4.0, 2.4, wall_scene.wall_color)
     views = coverage_views(scene)
     share = training_coverage.leave_one_out_unseen_share(scene, views)

@@ -44,7 +44,7 @@ Change = Callable[[Path], None]
 
 @pytest.fixture(scope="session")
 def good_captures(tmp_path_factory) -> Path:
-    """A good capture of each layout, to copy and to spoil."""
+    """A good capture of each layout, to copy and to corrupt."""
     home = tmp_path_factory.mktemp("good")
     for layout in ("llff", "colmap", "colmap txt", "transforms", "photos"):
         write_capture(home / layout, layout, make_truth())
@@ -52,7 +52,7 @@ def good_captures(tmp_path_factory) -> Path:
 
 
 def first_message(folder: Path, out: Path, set_: str = "") -> str | None:
-    """What the command says of a scene, or None where it goes through `poses`. Other errors than ours come out."""
+    """The message of the command for a scene, or None where `poses` accepts it. Unexpected errors are raised."""
     try:
         scene = load_scene_file(folder, PIPELINE)
         profile, _ = choose_profile("laptop" if scene.profile is None else None, scene, [], PIPELINE)
@@ -87,7 +87,7 @@ def first_message(folder: Path, out: Path, set_: str = "") -> str | None:
 def assert_bad_input(
     good_captures: Path, tmp_path: Path, layout: str, change: Change, names: str, set_: str = ""
 ) -> str:
-    """Spoil a copy of a good capture, and check what is said of it."""
+    """Corrupt a copy of a good capture, and check the message."""
     folder, out = tmp_path / "s", tmp_path / "out"
     shutil.copytree(good_captures / layout, folder)
     out.mkdir()
@@ -118,7 +118,7 @@ def write_yaml(text: str) -> Change:
 
 
 def truncate_file(name: str, keep: int) -> Change:
-    """The first bytes of a file; without its last ones where `keep` is negative."""
+    """Keep the first bytes of a file; a negative `keep` drops the last ones."""
     return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:keep])
 
 
@@ -132,7 +132,7 @@ def replace_in_file(name: str, old: str, new: str) -> Change:
 
 
 def replace_by(name: str, kind: str) -> Change:
-    """A folder, a pipe, or a link to nothing where a file is expected."""
+    """Put a folder, a pipe, or a dangling link in place of a file."""
 
     def change(folder: Path) -> None:
         path = folder / name
@@ -182,7 +182,7 @@ def do_all(*changes: Change) -> Change:
 
 
 def png_header(width: int, height: int, kind: int = 2) -> bytes:
-    """A PNG file that declares a size, and holds hardly anything."""
+    """A PNG file that declares a size and contains almost no data."""
     chunk = lambda tag, data: struct.pack(">I", len(data)) + tag + data + struct.pack(">I", zlib.crc32(tag + data))
     header = struct.pack(">IIBBBBB", width, height, 8, kind, 0, 0, 0)
     return (
@@ -541,7 +541,7 @@ def test_colmap_text(good_captures, tmp_path, names, change):
 
 
 def overwrite_number(name: str, at: int, layout: str, value: float) -> Change:
-    """A number written over another in a binary file."""
+    """Overwrite a number in a binary file."""
 
     def change(folder: Path) -> None:
         data = bytearray((folder / name).read_bytes())

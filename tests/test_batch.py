@@ -41,7 +41,7 @@ SCENES = ("a", "b", "c", "d")
 
 
 def write_projects(root: Path, pause: float = 0.0, memory: str = "", meet: int = 0) -> Path:
-    """Scenes a to d, of which c cannot be read. `distill` waits until `meet` of them are at it, and takes `pause` s."""
+    """Write scenes a to d; c is unreadable. `distill` waits until `meet` of them run, and takes `pause` s."""
     write_project(root)
     (root / "stages/distill.py").write_text(
         STAGE.replace("pause: float = 0.0", f"pause: float = {pause}\n    meet: int = {meet}")
@@ -64,7 +64,7 @@ def max_concurrent(found: list[list]) -> int:
 
 
 def local_engine(cores: int, memory_mb: int = 10_000) -> LocalEngine:
-    """One with so many cores, whatever this one has."""
+    """An engine with this many cores, whatever the machine has."""
     real = sorted(os.sched_getaffinity(0))
     return LocalEngine([real[n % len(real)] for n in range(cores)], memory_mb, [])
 

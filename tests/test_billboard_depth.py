@@ -11,7 +11,7 @@ TILT = np.radians(25)  # the camera looks down on a floor 1 below it
 
 
 def tilted_floor_view() -> tuple[Camera, np.ndarray]:
-    """The camera, and the camera z [H, W] of the floor (a wall at 4 beyond it)."""
+    """A camera that looks down on a floor, and camera z [H, W] of the floor and a wall at 4."""
     c, s = np.cos(TILT), np.sin(TILT)  # world: x right, y down, z ahead
     camera = make_camera("v", (96, 72), 80.0, rotation=np.array([[1, 0, 0], [0, c, -s], [0, s, c]]))
     rays = world_rays(camera)

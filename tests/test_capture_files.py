@@ -44,7 +44,7 @@ SHARE = 1 / 16  # of a picture that `write_masks` masks
 
 
 def run_with_warnings(folder: Path, **params) -> tuple[Scene, Path, str]:
-    """`poses` run on a folder: the scene, its artifact, and what it warns of."""
+    """Run the stages: the scene, its folder, and the warnings."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         scene, out = run_stages(folder, **params)
@@ -52,7 +52,7 @@ def run_with_warnings(folder: Path, **params) -> tuple[Scene, Path, str]:
 
 
 def assert_view_cameras(scene: Scene, truth: Truth, views: dict[str, str]) -> None:
-    """Poses and intrinsics of `views` (ours -> the truth's)."""
+    """Assert poses and intrinsics of `views`: our name -> name in the truth."""
     assert sorted(scene.cameras) == sorted(views)
     similarity, at = scene.similarity, undistorted_pinhole(truth.lens)
     for view, name in views.items():
@@ -72,7 +72,7 @@ def mask_shares(out: Path) -> dict[str, float]:
 
 
 def write_textured_views(folder: Path, truth: Truth, names: dict[str, str]) -> np.ndarray:
-    """Pictures of a plane with blobs of brightness, and the colours of the truth's points on it: view -> file name."""
+    """Write pictures of a textured plane (view -> file name); return the colours of the truth's points."""
     generator = np.random.default_rng(0)
     waves = generator.normal(size=(12, 3)) * 7
     phases = generator.uniform(0, 2 * np.pi, 12)
@@ -91,7 +91,7 @@ def write_textured_views(folder: Path, truth: Truth, names: dict[str, str]) -> n
 
 
 def flat_truth(views: int = 12, points: int = 400) -> Truth:
-    """The cameras of `make_truth` before points on the plane z = 0."""
+    """The cameras of `make_truth` in front of points on the plane z = 0."""
     places = np.random.default_rng(5).uniform(-0.9, 0.9, (points, 3)) * (1, 1, 0)
     return replace(make_truth(views=views), points=places)
 

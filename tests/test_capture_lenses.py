@@ -75,7 +75,7 @@ def test_phone_picture_called_jpg_without_its_reader(tmp_path, monkeypatch, bran
 
 
 def write_fisheye_capture(folder: Path, params: tuple[float, ...]) -> Truth:
-    """Speckled photographs of a fisheye without coefficients, as COLMAP's earlier model writes it."""
+    """Write speckled photographs of a fisheye without coefficients, in COLMAP's earlier model."""
     truth = make_truth(("OPENCV_FISHEYE", (*params, 0.0, 0.0, 0.0, 0.0)))
     write_capture(folder, "colmap", truth)
     for k, view in enumerate(truth.world_to_camera):
@@ -85,7 +85,7 @@ def write_fisheye_capture(folder: Path, params: tuple[float, ...]) -> Truth:
 
 
 def assert_same_undistortion(folder: Path, truth: Truth, earlier: dict[str, np.ndarray]) -> None:
-    """The capture gives the cameras, and the pictures that the earlier model gave."""
+    """Assert the true cameras, and the pictures that the earlier model gives."""
     scene, out, sentences = run_with_messages(folder)
     assert reprojection_error(scene, truth) < EXACT
     assert_message(sentences, "undistortion", "moves the border")
@@ -94,7 +94,7 @@ def assert_same_undistortion(folder: Path, truth: Truth, earlier: dict[str, np.n
 
 
 def write_camera(folder: Path, number: int, params: tuple[float, ...]) -> None:
-    """cameras.bin of one camera, by COLMAP's number of its model."""
+    """Write cameras.bin with one camera of the model with this number."""
     head = struct.pack("<QIiQQ", 1, 1, number, WIDTH, HEIGHT)
     (folder / "sparse/0/cameras.bin").write_bytes(head + struct.pack(f"<{len(params)}d", *params))
 
@@ -122,7 +122,7 @@ def test_fisheyes_in_binary(tmp_path, number, params):
 
 
 def assert_names_model(message: str, file: str, model: str) -> None:
-    """The file, the model, and a way out."""
+    """The message names the file, the model and a remedy."""
     assert file in message and re.search(rf"\b{model}\b", message), message
     assert any(word in message.lower() for word in ("convert", "undistort")), message
 
@@ -179,7 +179,7 @@ def test_video_without_frames(tmp_path, coded):
 
 
 def add_to_frames(folder: Path, key: str, path_of) -> None:
-    """`key` to every frame of transforms.json: what `path_of` makes of the view's name."""
+    """Add `key` to every frame of transforms.json; `path_of` maps a view's name to its value."""
     record = json.loads((folder / "transforms.json").read_text())
     for frame in record["frames"]:
         frame[key] = path_of(Path(frame["file_path"]).stem)
@@ -187,7 +187,7 @@ def add_to_frames(folder: Path, key: str, path_of) -> None:
 
 
 def write_inverse_masks(folder: Path, where: str) -> Truth:
-    """Masks as nerfstudio takes them, 0 is left out of the training, beside transforms.json that names them."""
+    """Write masks as nerfstudio has them (0 is excluded), named in transforms.json."""
     truth = make_truth()
     write_pictures(folder / "images", truth.world_to_camera)
     for view in truth.world_to_camera:

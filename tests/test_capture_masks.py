@@ -40,7 +40,7 @@ from reffusion.io.images import save_image
 
 
 def write_capture_with_masks(folder: Path, masks: str, draw) -> Truth:
-    """A COLMAP capture whose masks are the Pillow images that `draw` returns."""
+    """Write a COLMAP capture whose masks are the Pillow images that `draw` returns."""
     truth = make_truth()
     write_capture(folder, "colmap", truth)
     (folder / "masks").rename(folder / masks)
@@ -78,7 +78,7 @@ def test_one_class_of_a_palette_by_its_number(tmp_path):
 
 
 def numbered_16_bit() -> Image.Image:
-    """An object index pass: the object has two parts, 3 and 1024, and stands on 40000."""
+    """A 16-bit map of object numbers: the object has the parts 3 and 1024 and stands on 40000."""
     numbers = np.where(OBJECT, 1024, 0).astype(np.uint16)
     numbers[HEIGHT // 4 : HEIGHT // 4 + 5][:, WIDTH // 4 : WIDTH // 2] = 3
     numbers[50:] = 40000

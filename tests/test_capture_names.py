@@ -142,7 +142,7 @@ def to_nfc(name: str) -> str:
 
 
 def assert_cameras_by_nfc(scene, truth: Truth, names: dict[str, str]) -> None:
-    """The cameras are right, whichever form the views' names have."""
+    """Assert the true cameras, whichever Unicode form the names have."""
     found = {to_nfc(name): name for name in scene.cameras}
     assert sorted(found) == sorted(to_nfc(name) for name in names.values())
     assert_cameras(scene, rename_views(truth, {v: found[to_nfc(n)] for v, n in names.items()}))

@@ -15,7 +15,7 @@ ORIENTATION, EXIF_FOLDER, FOCAL_35_MM = 0x0112, 0x8769, 0xA405
 
 
 def exif(orientation: int = 1) -> Image.Exif:
-    """As of a phone whose focal length is the drawn one, 170 px of 200."""
+    """The EXIF data of a phone with the focal length of the rendering, 170 px of 200."""
     result = Image.Exif()
     result[ORIENTATION] = orientation
     result.get_ifd(EXIF_FOLDER)[FOCAL_35_MM] = round(36 * 170 / 200)
@@ -31,7 +31,7 @@ def save_walk(folder: Path, ending: str, **options) -> dict[str, np.ndarray]:
 
 
 def assert_placed(scene, truth: dict[str, np.ndarray]) -> None:
-    """All views, rotations within 2 degrees and centres within 2 % of their extent."""
+    """Assert that all views are placed: rotations within 2 degrees, centres within 2 % of their extent."""
     assert sorted(scene.train) == sorted(truth)
     percents, degrees = pose_errors({name: scene.cameras[name].world_to_camera for name in scene.train}, truth)
     assert degrees.max() < 2 and percents.max() < 2
@@ -50,7 +50,7 @@ def test_webp_saved_by_a_browser_as_jpg(tmp_path):
 
 
 def save_two_orientations(folder: Path, portrait: set[int], save) -> dict[str, np.ndarray]:
-    """A walk of nine views, those in `portrait` with the phone upright; `save` takes path, picture, whether it is."""
+    """Save nine views, those in `portrait` upright, with `save(path, picture, is_portrait)`; return the true poses."""
     truth, surfaces = room_walk(9), room_textures(np.random.default_rng(0))
     folder.mkdir(parents=True)
     for k, (name, pose) in enumerate(truth.items()):

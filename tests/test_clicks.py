@@ -33,7 +33,7 @@ NEAR = 1.7
 
 
 def make_clicks(*points):
-    """Clicks on the object, (x, y) each; a third entry False: not on it."""
+    """Clicks at (x, y); a third entry False marks a click beside the object."""
     return Clicks(np.array([p[:2] for p in points], float), np.array([len(p) < 3 for p in points]))
 
 
@@ -54,7 +54,7 @@ def test_the_cut_is_the_cheapest_of_all():
 
 
 def disk_picture(shape=(240, 320)):
-    """A picture: noise on a slope of blue, with a red disk that has a yellow stripe; and the disk."""
+    """A noisy blue slope with a red disk that has a yellow stripe, and the mask of the disk."""
     rows, columns = np.mgrid[: shape[0], : shape[1]]
     disk = np.hypot(rows - 120, columns - 150) < 60
     noise = np.random.default_rng(1).normal(0, 6, (*shape, 3))
@@ -108,7 +108,7 @@ def test_a_plain_picture_of_any_size_is_no_error():
 
 @pytest.fixture(scope="module")
 def clicked_scene(tmp_path_factory):
-    """The wall with a square before it, photographed with the square; no masks."""
+    """The wall with a square before it, photographed with the square, without masks."""
     folder = tmp_path_factory.mktemp("clicked")
     placed, fit, _ = wall_scene.write_poses_and_fit(folder, NEAR, masks={})
     everything, _ = wall_scene.wall_and_square(NEAR)

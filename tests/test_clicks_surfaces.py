@@ -10,7 +10,7 @@ from reffusion.clicks.single_view import segment_view
 
 
 def checkered_disk_on_gravel():
-    """A chequered disk before gravel, whose depth and colours are noise; picture, relief, disk."""
+    """Picture, relief and mask of a checkered disk in front of noisy gravel."""
     draw, (rows, columns) = np.random.default_rng(3), np.mgrid[:256, :256]
     disk = np.hypot(rows - 150, columns - 110) < 26
     picture = np.repeat(draw.integers(60, 180, (256, 256, 1)), 3, 2)

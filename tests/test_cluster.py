@@ -29,14 +29,14 @@ slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes
 
 
 def artifact_hashes(runs: Path) -> dict[str, str]:
-    """Every file of every artifact with its hash, as receipts have them."""
+    """The hash of every file of every artifact, from the receipts."""
     receipts = {path.parent.relative_to(runs): json.loads(path.read_text()) for path in runs.glob("*/*/receipt.json")}
     return {f"{place}/{name}": file for place, each in receipts.items() for name, file in each["files"].items()}
 
 
 @pytest.fixture(scope="module")
 def ray_cluster():
-    """Three nodes with a core each."""
+    """Three Ray nodes with a core each."""
     pytest.importorskip("ray", reason="ray is not installed")
     from ray.cluster_utils import Cluster
 
@@ -171,7 +171,7 @@ def test_twelve_scenes_with_three_variants_on_ray_are_those_of_one_machine(tmp_p
 
 
 def assert_same_as_one_machine(root: Path, variants: str, least: int) -> None:
-    """runs/ holds what one machine makes, file by file; and nothing of it is run again by that machine."""
+    """Assert that runs/ equals a local run file by file, and that a local run repeats nothing."""
     there = root / "runs"
     local = type(make_request(root, ""))(root, root / "alone", "", "laptop")
     assert compare(local, variants, data=root / "many", execution=Execution(LocalEngine(), 1)) == 0

@@ -54,7 +54,7 @@ def pages(compared_project) -> dict[str, Path]:
 
 @pytest.fixture
 def job_folder(compared_project, tmp_path) -> Path:
-    """A copy of its runs; the scene's folder."""
+    """The scene's folder in a copy of the compared runs."""
     shutil.copytree(compared_project / "runs", tmp_path / "runs")
     return tmp_path / "runs/toy"
 

@@ -64,7 +64,7 @@ def load_masks(scene: Path, folder: str = "masks") -> dict[str, np.ndarray]:
 
 
 def project_through_lens(capture: placement.Photographs, name: str, points: np.ndarray) -> np.ndarray:
-    """Image points [P, 2] by the project's own lens."""
+    """Image points [P, 2], projected by the project's own lens."""
     of = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
     bent = lens.from_colmap("OPENCV", WIDTH, HEIGHT, tuple(LENS[key] for key in of))
     camera = capture.cameras[name]

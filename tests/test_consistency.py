@@ -17,7 +17,7 @@ def turned_camera(name, x=0.0, angle=0.0):
 
 
 def render_plane(view, slope=0.0, shift=0.0):
-    """The view of the plane z = 2 + slope x, painted with colours that are linear in x and y: depth and picture."""
+    """Depth and picture of the plane z = 2 + slope x, whose colours are linear in x and y."""
     rays = world_rays(view)
     start = view.center
     depth = (2 + slope * start[0] - start[2]) / (rays[..., 2] - slope * rays[..., 0])

@@ -20,7 +20,7 @@ def edge_camera(turn):
 
 
 def edge_depth_view(view, step=0.0):
-    """The floor and the wall, masked where the box hides them; step: height of every second board of the floor."""
+    """Floor and wall, masked where the box hides them; `step`: height of every second board of the floor."""
     rays = world_rays(view)
     with np.errstate(divide="ignore", invalid="ignore"):
         floor, front, behind, side = (

@@ -30,7 +30,7 @@ def read_files(folder: Path) -> dict[str, bytes]:
 
 
 def project_by_truth(truth: dict, view: str, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Image points [P, 2] and camera z of scene points, from truth/cameras.json alone."""
+    """Image points [P, 2] and camera z of scene points, by truth/cameras.json alone."""
     pose = np.array(truth["world_to_camera"][view])
     x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).T
     x, y = x / z, y / z

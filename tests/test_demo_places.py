@@ -23,12 +23,12 @@ def test_harder_places_have_masks_of_the_demos_size(generate, tmp_path, name, ma
 
 
 def shrink_kind(kind):
-    """A kind at the size of a stamp."""
+    """The kind at a tiny size."""
     return replace(kind, width=48, height=36, samples=1, train=24, test=6, texture=256, node=0.4, points=60)
 
 
 def photograph_scene(generate, kind, seed: int):
-    """(solids, cameras of the training views, what `photographs.take_photographs` makes) of a scene."""
+    """Solids, cameras of the training views, and the photographs of a scene."""
     import photographs
 
     furniture, target = generate.furnish(seed, kind)

@@ -13,7 +13,7 @@ INNER = (ROWS > 14) & (ROWS < 34) & (COLUMNS > 20) & (COLUMNS < 45)
 
 
 def room_corner():
-    """Disparity of a floor below a wall, and a picture that tells them apart."""
+    """Disparity of a floor below a wall, and a picture in which their colours differ."""
     floor, wall = 0.5 + 0.02 * (ROWS - 24.0), 0.5 + 0.001 * (COLUMNS - 32)
     picture = np.where((floor > wall)[..., None], (0.8, 0.5, 0.2), (0.3, 0.4, 0.6))
     return np.maximum(floor, wall), picture

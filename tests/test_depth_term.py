@@ -12,7 +12,6 @@ from scenes.stage_runs import trace_lines
 
 from reffusion import trace
 from reffusion.depth import background_depth, estimates
-from reffusion.depth.alignment import align
 from reffusion.depth.background_depth import Completion
 from reffusion.distill import depth_estimator
 from reffusion.distill import loop as D
@@ -40,7 +39,7 @@ DEPTH = Depth(steps=2)
 
 
 def slanted_wall(moved: float = 1.0):
-    """The wall as Gaussians; those of its middle, masked, stand `moved` times as far from the camera as they should."""
+    """The wall as Gaussians; the masked ones in its middle stand `moved` times as far away as they should."""
     wide = make_camera("sheet", (52, 44), FOCAL)
     rows, columns = np.mgrid[:44, :52] + 0.5
     disparity = 0.5 + 0.004 * (columns - 26) - 0.002 * (rows - 22)
@@ -64,31 +63,17 @@ def evaluate_term(gaussians, masked, estimator, prior=None, text=None, view=None
 
 
 def wall_depth(moved=1.0, how=HOW):
-    """What the view shows of the wall's depth."""
+    """The depth of the wall that the view renders."""
     with torch.no_grad():
         return background_depth.extract_depth(render(slanted_wall(moved)[0], VIEW), VIEW, HOLE, HOLE, how)
 
 
 def constant_estimator(estimate):
-    """The paper's estimator with a network that says `estimate`, whatever it is shown."""
+    """The paper's estimator with a network that always returns `estimate`."""
     return depth_estimator.network_estimator(lambda image: torch.as_tensor(np.asarray(estimate)), HOW)
 
 
 # ------------------------------------------------------------------------------------------ alignment and target
-
-
-@pytest.mark.parametrize("weighted", [False, True])
-def test_alignment_solves_the_normal_equations(weighted):
-    draw = np.random.default_rng(0)
-    x, noise = draw.normal(3, 2, 200), draw.normal(0, 0.3, 200)
-    y = 0.7 * x - 1.2 + noise
-    w = draw.random(200) if weighted else np.ones(200)
-    matrix = np.array([[(w * x * x).sum(), (w * x).sum()], [(w * x).sum(), w.sum()]])
-    scale, offset = np.linalg.inv(matrix) @ ((w * x * y).sum(), (w * y).sum())
-    found = align(x, y, w)
-    np.testing.assert_allclose((found.scale, found.offset), (scale, offset), rtol=1e-10)
-    misfit = np.sqrt((w * (y - scale * x - offset) ** 2).sum() / w.sum())
-    assert found.residual == pytest.approx(misfit, rel=1e-9)
 
 
 @pytest.mark.parametrize("unit", [1e-8, 1.0, 1e8])

@@ -202,7 +202,7 @@ def test_patches_lie_between_black_at_minus_one_and_white_at_one():
 
 
 def checker_patches(count, fine, label):
-    """Patches of one mean and deviation: checkered by single pixels, or by blocks of four."""
+    """Checkered patches of equal mean and deviation, with cells of one pixel or of four."""
     period = 1 if fine else 4
     cells = torch.arange(8) // period
     board = ((cells[:, None] + cells) % 2).float() * 2 - 1

@@ -393,7 +393,7 @@ def test_the_seam_prefers_the_candidate_that_continues_its_surroundings():
 
 @pytest.fixture
 def stage_folders(tmp_path):
-    """The artifacts of a miniature scene: poses, fit, masks, initialize, and a prior."""
+    """The folders of a small scene: poses, fit, masks, initialize, and a prior."""
     gaussians, masked = random_wall()
     cameras = {name: wall_camera(name, shift) for name, shift in (("a", 0.0), ("b", 0.1), ("t", 0.05))}
     scene = make_scene(cameras, ("t",), points=np.zeros((4, 3)))

@@ -36,7 +36,7 @@ def random_blobs(count, seed=0):
 
 
 def write_stages(home):
-    """Folders of the stages before: views 0-2 test (2 without a mask of its own), 3-7 training."""
+    """Write the folders of earlier stages: views 0-2 are test views (2 without a mask), 3-7 training views."""
     names = [f"view{i}" for i in range(8)]
     cameras = {
         name: make_camera(name, (WIDTH, HEIGHT), 40.0, (0.3 - 0.1 * i, 0.0, 0.0)) for i, name in enumerate(names)
@@ -61,7 +61,7 @@ def write_stages(home):
 
 
 def run_finish_and_evaluate(out, stage_folders, **params):
-    """The stages `finish`, beside `out`, and `evaluate`: metrics.json."""
+    """Run `finish`, in a folder beside `out`, and `evaluate`; return metrics.json."""
     finished = out.with_name(f"finish-{out.name}")
     for folder in (finished, out):
         folder.mkdir()
@@ -115,7 +115,7 @@ def stage_folders(tmp_path):
 
 @pytest.fixture(scope="module")
 def finished_job(tmp_path_factory):
-    """A scene's folder with every stage done, not to be changed; as on a machine without LPIPS weights."""
+    """The folder of a finished scene without LPIPS weights; tests must not change it."""
     home = tmp_path_factory.mktemp("scene")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(home / "nothing"))

@@ -113,7 +113,7 @@ FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0, np.zeros(3), np.eye(3)[:2], 4 / CE
 
 
 def paint_planks(view: Camera) -> np.ndarray:
-    """A floor of planks 0.12 wide that run away from camera a, uint8 [H, W, 3]."""
+    """uint8 [H, W, 3]: a floor of planks 0.12 wide that run away from camera a."""
     depth = FLOOR.depth(view)
     x, y, _ = np.moveaxis(geometry.unproject(np.where(np.isfinite(depth), depth, 1.0), view), -1, 0)
     joint = np.abs((x + 0.3 * y) / 0.12 % 1 - 0.5) > 0.42
@@ -157,7 +157,7 @@ def test_planks_run_on_in_their_own_perspective():
 
 
 def plane_pixels(picture: np.ndarray, view: Camera) -> PlanePixels:
-    """The floor within 1.2 of its middle, as a picture shows it."""
+    """The pixels of the floor within 1.2 of its middle."""
     places = plane_frames.plane_coordinates(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
     rows, columns = np.nonzero((np.linalg.norm(places, axis=-1) < 1.2) & np.isfinite(FLOOR.depth(view)))
     return PlanePixels(np.stack([columns, rows], 1), places[rows, columns], picture)
@@ -171,7 +171,7 @@ def test_a_floor_of_planks_repeats_itself_by_their_width():
 
 
 def paint_tabletop(view: Camera) -> np.ndarray:
-    """Twenty planks that meet in a point, and a plate of another colour where they do."""
+    """uint8 [H, W, 3]: twenty planks that meet in a point, covered by a plate of another colour."""
     depth = FLOOR.depth(view)
     x, y, _ = np.moveaxis(geometry.unproject(np.where(np.isfinite(depth), depth, 1.0), view), -1, 0)
     away, turn = np.hypot(x - 0.1, y - 0.4), np.arctan2(y - 0.4, x - 0.1) / (np.pi / 10)

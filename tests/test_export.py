@@ -37,7 +37,7 @@ def render_color(gaussians, camera: Camera) -> np.ndarray:
 
 
 def visible_gaussians(camera: Camera, degree: int = 2):
-    """Some that a camera sees, in the normalised frame."""
+    """Gaussians in front of a camera, in the normalised frame."""
     made = random_gaussians(300, degree)
     at = torch.tensor([0.0, 0.0, 4.0]) + made.means
     pose = torch.from_numpy(camera.world_to_camera).float()

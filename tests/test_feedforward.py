@@ -49,11 +49,11 @@ def two_part_hole() -> np.ndarray:
 
 
 def write_onnx_model(path, kind="lama", side=None, answer=None, **changes):
-    """An ONNX file of the inputs and outputs of LaMa's ("lama") or MI-GAN's.
+    """Write an ONNX file with the inputs and outputs of LaMa ("lama") or MI-GAN.
 
     Args:
-        side: fixed size, None: any.
-        answer: factor of the answer, another than its kind's.
+        side: fixed size; None: any.
+        answer: factor of the output, if not the kind's own.
         changes: "names" of the inputs, channels of the "mask", "size" (height, width) of the image, "batch", "outputs".
     """
     onnx = pytest.importorskip("onnx", reason="needs onnx and onnxruntime")
@@ -135,7 +135,7 @@ def test_a_torchscript_lama_is_read_as_by_the_baselines(tmp_path):
 
 
 def record_network_input(side, inner):
-    """What a network of this size is shown: (picture, hole)."""
+    """The input (picture, hole) of a network of this size."""
     shown = []
 
     def paint(image, mask):
@@ -212,7 +212,7 @@ def needed_weights(kind, weights=None):
 
 @pytest.fixture
 def empty_weight_cache(tmp_path, monkeypatch):
-    """A cache of weights with nothing in it; its folder of models by owner/name."""
+    """An empty cache of weights; its folder of models by owner/name."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("HF_HOME", str(tmp_path / "hub"))
     monkeypatch.delenv("HF_HUB_CACHE", raising=False)
@@ -220,7 +220,7 @@ def empty_weight_cache(tmp_path, monkeypatch):
 
 
 def write_published_model(empty_weight_cache, kind):
-    """The stand-in where `make weights` leaves the published file."""
+    """Write the stand-in where `make weights` puts the published file."""
     folder = empty_weight_cache / PAINTERS[kind].repo
     folder.mkdir(parents=True)
     return write_onnx_model(folder / PAINTERS[kind].file, kind)

@@ -30,7 +30,7 @@ def interpolate_depth(points, view, picture):
 
 
 def render_wall_and_square(view):
-    """Depth [H, W] and picture uint8 [H, W, 3] of the wall, with the square before it."""
+    """Depth [H, W] and picture uint8 [H, W, 3] of the wall with the square before it."""
     rays = (world_rays(view)).reshape(view.height, view.width, 3)
     at = lambda z: view.center + rays * ((z - view.center[2]) / rays[..., 2:])
     square = (np.abs(at(NEAR)[..., :2]) < HALF).all(-1)
@@ -42,7 +42,7 @@ def render_wall_and_square(view):
 
 
 def sample_wall_and_square(count=700, seed=0):
-    """Points of the wall, those behind the square too, as other cameras saw them, and of the square."""
+    """Points of the square and of the whole wall, also behind the square, and their colours."""
     draw = np.random.default_rng(seed)
     wall = np.column_stack([draw.uniform(-1.2, 1.2, count), draw.uniform(-0.9, 0.9, count), np.full(count, WALL)])
     square = np.column_stack([draw.uniform(-HALF, HALF, (60, 2)) * 0.97, np.full(60, NEAR)])
@@ -93,7 +93,7 @@ def test_too_few_points_tell_nothing():
 
 
 def aperiodic_color(points):
-    """uint8 [..., 3]: a pattern in space that never repeats itself."""
+    """uint8 [..., 3]: a pattern in space without period."""
     x, y, z = np.moveaxis(points, -1, 0)
     waves = [np.sin(31 * x + 17 * y + 9 * z), np.sin(23 * y - 29 * x + 5), np.sin(41 * x * y + 37 * y), np.cos(53 * x)]
     return (127 + 30 * np.stack([waves[0] + waves[2], waves[1] + waves[3], waves[2] + waves[3]], -1)).astype(np.uint8)
@@ -147,7 +147,7 @@ def test_other_photographs_may_be_of_another_size_and_threads_do_not_matter():
 
 
 def render_aperiodic_square(view):
-    """Depth [H, W] and picture of a wall and a square before it, both of one pattern."""
+    """Depth [H, W] and picture of a wall and a square before it, both with an aperiodic pattern."""
     rays = world_rays(view)
     at = lambda z: view.center + rays * ((z - view.center[2]) / rays[..., 2:])
     square = (np.abs(at(NEAR)[..., :2]) < HALF).all(-1)
@@ -193,7 +193,7 @@ def test_a_further_view_adds_what_those_before_do_not_show():
 
 
 def write_poses(folder, train):
-    """A `poses` folder of the room, these views given; the views to look from."""
+    """Write a `poses` folder with these training views; return all views."""
     views = {view.name: view for view in (front_camera(f"v{k}", x) for k, x in enumerate((0.0, -0.12, 0.06)))}
     points, colors = sample_wall_and_square()
     save_scene(folder, Scene(views, train, ("v2",), frozenset(train), points, colors, Similarity(1.0, np.zeros(3))))

@@ -20,7 +20,7 @@ def stage_folders(tmp_path):
 
 
 def add_stages(folders, tmp_path):
-    """`initialize` and `distill` whose Gaussians differ from the fit's in number."""
+    """Add `initialize` and `distill`, whose Gaussians differ from the fit's in number."""
     gaussians = load_ply(folders["fit"] / "gaussians.ply")
     for count, stage in enumerate(("initialize", "distill"), start=1):
         folders = folders | {stage: tmp_path / stage}

@@ -35,7 +35,7 @@ SETTINGS = Params(
 
 
 def arc_cameras(count: int = 5, scale: float = 1.0, offset=(0.0, 0.0, 0.0)) -> list[Camera]:
-    """Views of the origin from distance 1, in a frame where a point p of the normalised one is p / scale + offset."""
+    """Views of the origin from distance 1, in a frame where the normalised point p is p / scale + offset."""
     cameras = []
     for k in range(count):
         angle = 0.8 * (k / (count - 1) - 0.5)

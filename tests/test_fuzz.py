@@ -46,7 +46,7 @@ LONGEST = 10.0  # seconds that a file may take
 
 @dataclass(frozen=True)
 class Reader:
-    """What reads a file of that name, and good files to spoil."""
+    """A reader of files of this name, and good files to corrupt."""
 
     name: str
     read: Callable[[Path], object]
@@ -57,7 +57,7 @@ class Reader:
 
 
 def good_files() -> dict[str, bytes]:
-    """File name -> content, of every kind."""
+    """File name -> content, of every kind of file."""
     import torch
 
     draw = np.random.default_rng(0)
@@ -124,7 +124,7 @@ stages:
 
 
 def capture_reader(name: str, others: dict[str, bytes]) -> Callable[[Path], object]:
-    """Reads the folder of a file as a capture, pictures and other files beside it."""
+    """A reader of the file's folder as a capture, with pictures and other files beside it."""
 
     def read(path: Path) -> object:
         folder = path.parent
@@ -209,7 +209,7 @@ WORDS = [word.encode() for word in (
 
 @st.composite
 def corrupted_bytes(draw: st.DrawFn, seeds: tuple[bytes, ...]) -> bytes:
-    """A good file with some changes: cut, bytes and numbers and words put in or over, pieces doubled or taken out."""
+    """A good file with random changes: cut, overwritten, inserted, repeated and removed parts."""
     data = bytearray(draw(st.sampled_from(seeds)))
     for _ in range(draw(st.integers(1, 6))):
         at = draw(st.integers(0, max(len(data), 1)))
@@ -239,7 +239,7 @@ def corrupted_bytes(draw: st.DrawFn, seeds: tuple[bytes, ...]) -> bytes:
 
 
 def fix_png_checksums(data: bytes) -> bytes:
-    """A PNG with its checksums made right again, so that what lies behind them is reached."""
+    """A PNG with correct checksums, so that the reader gets past them."""
     if not data.startswith(b"\x89PNG\r\n\x1a\n"):
         return data
     out, at = bytearray(data[:8]), 8
@@ -265,7 +265,7 @@ def try_read(read: Callable[[Path], object], path: Path) -> None:
 
 
 def try_reader(reader: Reader, data: bytes) -> None:
-    """Only our own errors come out, of one line, that name the file."""
+    """Only the project's own errors are raised, in one line that names the file."""
     with tempfile.TemporaryDirectory() as name, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         path = Path(name) / reader.name
@@ -274,7 +274,7 @@ def try_reader(reader: Reader, data: bytes) -> None:
 
 
 def fuzz(reader: Reader, files: int | None, seconds: float = 0.0) -> int:
-    """Try so many files, always the same; or ever new ones for so many seconds. How many were tried."""
+    """Try a number of fixed files, or new ones for some seconds; return how many."""
     count = 0
 
     def one(data: bytes) -> None:

@@ -25,7 +25,7 @@ def sigmoid(values):
 
 
 def gaussian_table(count: int, rest: int = 0, scales: int = 3, more: tuple[str, ...] = (), kind: str = "f4"):
-    """A structured array of Gaussians around the origin with the properties of a 3DGS file; `more` ones are 0."""
+    """A structured array of Gaussians around the origin with the properties of a 3DGS file; those in `more` are 0."""
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{k}" for k in range(rest))]
     names += ["opacity", *(f"scale_{k}" for k in range(scales)), "rot_0", "rot_1", "rot_2", "rot_3", *more]
     table, generator = np.zeros(count, [(name, kind) for name in names]), np.random.default_rng(11)
@@ -47,7 +47,7 @@ def write_transforms_capture(folder: Path) -> Path:
 
 
 def load_written_gaussians(folder: Path, name: str, **params) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The columns of the Gaussians that `poses` wrote, brought back to the scene's own frame; and the sentences."""
+    """The columns of the Gaussians that `poses` wrote, in the scene's own frame, and the messages."""
     scene, out, sentences = run_with_messages(folder, gaussians=name, **params)
     data = PlyData.read(str(out / "gaussians.ply"), mmap=False)["vertex"].data
     columns = {each: np.array(data[each], np.float64) for each in data.dtype.names}
@@ -63,7 +63,7 @@ def assert_columns_equal(columns: dict[str, np.ndarray], table: np.ndarray, name
 
 
 def covariances(columns) -> np.ndarray:
-    """[N, 3, 3], whatever the sign of the quaternions and the order of axes."""
+    """[N, 3, 3], independent of the sign of quaternions and the order of axes."""
     w, x, y, z = (np.asarray(columns[f"rot_{k}"], np.float64) for k in range(4))
     length = np.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w / length, x / length, y / length, z / length
@@ -220,7 +220,7 @@ def test_splat_file(tmp_path):
 
 
 def spz_bytes(table: np.ndarray, turns: np.ndarray, version: int) -> bytes:
-    """A .spz file of degree 0: its places with y and z turned round, as the format has them, `turns` too (wxyz)."""
+    """A .spz file of degree 0 with rotations `turns` (wxyz); the format flips y and z of the places."""
     count = len(table)
     places = np.stack([table["x"], -table["y"], -table["z"]], 1).astype(np.float64)
     fixed = np.round(places * 4096).astype("<i4")

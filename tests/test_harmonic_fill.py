@@ -24,7 +24,7 @@ def smooth_image(height, width):
 
 
 def solve_laplace(image, hole):
-    """Laplace's equation in the hole by a sparse solver, what is given as boundary, the picture's edge insulated."""
+    """Laplace's equation in the hole by a sparse solver, with known pixels and an insulated border as boundary."""
     height, width = hole.shape
     number = -np.ones(hole.shape, int)
     number[hole] = np.arange(hole.sum())

@@ -37,7 +37,7 @@ def stage_folders(tmp_path_factory):
 
 
 def slanted_disparity(degrees: float):
-    """Disparity of a plane through (0, 0, 2), turned about the vertical, and the view that sees it."""
+    """Disparity of a plane through (0, 0, 2) turned about the vertical, its view, and its normal."""
     view = wall_scene.front_camera("v", 0.0)
     rays = geometry.pixel_rays(view)
     normal = np.array([np.sin(np.radians(degrees)), 0.0, -np.cos(np.radians(degrees))])
@@ -89,7 +89,7 @@ def floor_view(turn: float) -> Camera:
 
 
 def render_floor(view: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Depth of the floor and a soft chequered picture of it."""
+    """Depth of the floor and a smooth checkered picture of it."""
     rays, up = geometry.pixel_rays(view), view.world_to_camera[:3, 1]
     depth = (up @ view.world_to_camera[:3, 3]) / (rays @ up)
     points = geometry.unproject(depth, view)

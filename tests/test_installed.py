@@ -23,7 +23,7 @@ BUILD = "import sys, setuptools.build_meta as build; build.build_wheel(sys.argv[
 
 @pytest.fixture(scope="module")
 def wheel_folder(tmp_path_factory) -> Path:
-    """A folder with what the wheel would put among Python's packages."""
+    """A folder with the contents of the wheel."""
     pytest.importorskip("setuptools", "77", reason="building a wheel needs setuptools 77 or later")
     copy, out = tmp_path_factory.mktemp("copy"), tmp_path_factory.mktemp("out")  # building leaves folders behind
     for name in (*FOLDERS, "priors"):

@@ -13,7 +13,7 @@ from reffusion.morphology import dilate_by_distance
 
 
 def step_scene():
-    """Disparity with a step at column 60 that goes on through a hole, and a picture whose edge is there."""
+    """Disparity with a step at column 60 that continues through a hole, a picture with the same edge, and the hole."""
     rows, columns = np.mgrid[:100, :120]
     disparity = np.where(columns < 60, 1.0 + 0.001 * rows, 0.6 + 0.0005 * columns)
     picture = np.where((columns < 60)[..., None], (0.8, 0.3, 0.2), (0.2, 0.5, 0.3))

@@ -12,7 +12,7 @@ from reffusion.io.scene import load_raw_masks, load_views
 
 
 def splat_dots(truth: Truth, name: str) -> np.ndarray:
-    """The view of a grid of soft dots on a plane, through the lens; uint8 [H, W, 3], and the dots' directions."""
+    """uint8 [H, W, 3]: a grid of soft dots on a plane through the lens, and the directions of the dots."""
     pose = truth.world_to_camera[name]
     grid = np.stack(np.meshgrid(np.linspace(-1.2, 1.2, 5), np.linspace(-0.9, 0.9, 4), [0.0]), -1).reshape(-1, 3)
     at = grid @ pose[:3, :3].T + pose[:3, 3]

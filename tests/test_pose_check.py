@@ -73,7 +73,7 @@ PICTURES = {name: render_two_planes(camera, smooth_textures()) for name, camera 
 
 
 def write_two_planes(folder: Path, **pictures: np.ndarray) -> Path:
-    """A COLMAP capture of the wall, some of its pictures others than they should be."""
+    """Write a COLMAP capture of the wall, with some pictures replaced; return the folder."""
     for name, image in (PICTURES | pictures).items():
         save_image(folder / "images" / f"{name}.png", image)
     captures.write_masks(folder / "masks", TRUTH.world_to_camera)
@@ -82,7 +82,7 @@ def write_two_planes(folder: Path, **pictures: np.ndarray) -> Path:
 
 
 def run_poses_with_warnings(folder: Path, **params) -> tuple[Path, list[str]]:
-    """The folder that `poses` leaves, and its warnings."""
+    """Run `poses`: its folder and its warnings."""
     out = folder.parent / "run" / "poses"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -288,7 +288,7 @@ SIZES = {"v00": (1.0, 0), "v01": (0.5, 0), "v02": (1.0, 20), "v03": (1.5, 0), "v
 
 
 def write_several_sizes(folder: Path, truth: Truth, layout: str) -> dict[str, tuple[int, int]]:
-    """Pictures of noise enlarged by a factor after columns were cut off left and right, each with its own camera."""
+    """Write resized pictures of noise, some cropped left and right, each with its own camera; return their sizes."""
     (folder / "images").mkdir(parents=True)
     noise, flip, frames, cameras, images, sizes = np.random.default_rng(0), np.diag([1.0, -1, -1, 1]), [], {}, {}, {}
     for k, (name, (factor, left)) in enumerate(SIZES.items(), start=1):

@@ -87,7 +87,7 @@ def test_settings_are_checked_and_come_last():
 
 
 def write_benchmark_result(folder: Path) -> None:
-    """A small result of the benchmark, made up."""
+    """Write a small synthetic result of the benchmark."""
     row = {"psnr": 20.0, "ssim": 0.5, "flip": 0.2, "energy": 0.7, "psnr_error": 0.3, "pictures": 2}
     better, scales = row | {"psnr": 22.0}, ("reference", "whole", "window")
     sampler = {"4": row | {"seconds": 0.05}}

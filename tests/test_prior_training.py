@@ -96,7 +96,7 @@ def load_weights(folder):
 
 @pytest.fixture
 def train_command(monkeypatch, tmp_path):
-    """`train.py` with small batches; gives back the exported weights."""
+    """`train.py` with small batches, as a function that returns the exported weights."""
     for name, value in (
         ("POOL", 6),
         ("SMALL", (16, 2)),

@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @pytest.fixture(scope="module")
 def sdxl_prior(tmp_path_factory):
-    """An SDXL-shaped prior as `load_prior` gives it, from a folder that diffusers wrote."""
+    """A prior in the shape of SDXL, loaded from a folder that diffusers wrote."""
     folder = tmp_path_factory.mktemp("sdxl")
     pipeline(replace(F.build_prior(F.shrink(F.SDXL), torch.float32), zero_empty=True)).save_pretrained(folder)
     return load_prior(folder)

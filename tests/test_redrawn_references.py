@@ -32,7 +32,7 @@ def paint_object(image: np.ndarray) -> np.ndarray:
 
 
 def shift_bands(image: np.ndarray, parallax: float) -> np.ndarray:
-    """The picture with depth in it, from beside: bands displaced by 4 px, and every second one by so many px more."""
+    """The picture from beside: bands displaced by 4 px, and every second one by `parallax` px more."""
     rows, columns = (grid.astype(np.float32) for grid in np.mgrid[: image.shape[0], : image.shape[1]])
     displaced = 4 + parallax * ((columns // 80).astype(int) % 2)
     return cv2.remap(

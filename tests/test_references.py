@@ -255,7 +255,7 @@ REFUSALS = [
 
 
 def write_reference_capture(folder: Path, painted=()) -> Path:
-    """A capture with the files that `REFUSALS` names."""
+    """Write a capture with the files that `REFUSALS` names."""
     write_capture(folder, "transforms", make_truth())
     write_pictures(folder, ["ref"])
     write_pictures(folder, ["tall"], (HEIGHT, WIDTH))

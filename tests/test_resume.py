@@ -62,7 +62,7 @@ def kill_during(mini_scene: Path, runs: Path, stage: str, delay: float) -> bool:
 
 
 def assert_artifacts_complete(home: Path) -> None:
-    """Every artifact in place is one that a stage finished."""
+    """Assert that every artifact is one that a stage finished."""
     for stage in ("poses", *STAGES):
         if (home / stage).exists():
             found = read_json(home / stage / RECEIPT)
@@ -79,7 +79,7 @@ def mini_scene(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def unbroken_run(mini_scene, tmp_path_factory) -> tuple[Path, dict]:
-    """Where the results of a run from end to end are, and its metrics."""
+    """The folder of an uninterrupted run, and its metrics."""
     runs = tmp_path_factory.mktemp("unbroken")
     return runs / "mini", run_to_end(mini_scene, runs)
 

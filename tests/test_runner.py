@@ -25,13 +25,13 @@ WORDS = ["poses", "fit", "masks", "distill", "evaluate"]
 
 
 def statuses(project: Path, **options) -> dict[str, str]:
-    """Stage -> "word reason" as planned."""
+    """Stage -> "status reason" of the plan."""
     job = resolve(make_request(project, **options))
     return {s: f"{d.status} {d.reason}".strip() for s, d in plan(job, job.pipeline.closure("all")).items()}
 
 
 def run_stages(capsys, project: Path, target: str = "all", **options) -> list[str]:
-    """The stages that ran, in order."""
+    """Run the scene; return the stages that ran, in order."""
     capsys.readouterr()
     run_scene(make_request(project, **options), target)
     return [line.split(":")[0] for line in capsys.readouterr().out.splitlines() if ": done in" in line]
@@ -57,7 +57,7 @@ def finished_project(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def project(finished_project: Path, tmp_path: Path) -> Path:
-    """A toy project in which everything is done."""
+    """A toy project in which all stages are done."""
     shutil.copytree(finished_project, tmp_path / "project")
     return tmp_path / "project"
 
@@ -361,7 +361,7 @@ def test_variants_share_what_they_do_not_change(project, capsys):
 
 
 def kill_in_fit(project: Path, steps: int, send: int) -> tuple[int, str]:
-    """Start a long fit, send the runner a signal once a few steps are done; exit code and output."""
+    """Start a long fit, and send the runner a signal after a few steps; return exit code and output."""
     process = start_runner(project, "--scene", "toy", "--set", f"fit.pause=0.1 fit.iterations={steps}")
     wait_until(lambda: any((p / "checkpoint.pt").exists() for p in (project / "runs/toy").glob(".partial-fit-*")))
     process.send_signal(send)
@@ -800,7 +800,7 @@ def test_a_run_that_does_not_fit_its_needs_is_refused_without_importing_it(empty
 
 @pytest.fixture
 def worker_starts(monkeypatch) -> list[str]:
-    """What each process is started for that imports stages."""
+    """The purpose of each process that is started to import stages."""
     started, start = [], process.start_worker
     monkeypatch.setattr(process, "start_worker", lambda *given, **how: started.append(given[1]) or start(*given, **how))
     return started

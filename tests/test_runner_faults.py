@@ -59,14 +59,14 @@ OPTIONS = ("--profile", "laptop", "--root")
 
 
 def assert_one_line(ended: subprocess.CompletedProcess[str]) -> str:
-    """The command refused in one line, which is returned."""
+    """Assert that the command refused in one line; return it."""
     errors = ended.stderr
     assert ended.returncode == 2 and errors.startswith("error: ") and errors.count("\n") == 1, (ended.stdout, errors)
     return errors
 
 
 def assert_artifacts_complete(runs: Path) -> None:
-    """Every artifact in place is one that a stage finished, and every table and record is whole."""
+    """Assert that every artifact is one that a stage finished, and that tables and records are complete."""
     for receipt in runs.glob("*/[a-z]*/" + RECEIPT):
         worn = diff_artifact(receipt.parent, Hashes(runs / "none"))
         assert json.loads(receipt.read_text())["files"] and not worn.describe(), receipt
@@ -122,7 +122,7 @@ def test_killed_at_random_moments(short_project, what):
 
 @contextmanager
 def mounted_disk(folder: Path):
-    """A disk in memory at `folder`; yields what sets its size or makes it read-only."""
+    """A disk in memory at `folder`; yields a function that sets its size or makes it read-only."""
     folder.mkdir(exist_ok=True)
     mount = lambda *how: subprocess.run(["mount", "-t", "tmpfs", *how, "none", str(folder)], capture_output=True)
     if shutil.which("mount") is None or mount("-o", "size=1m").returncode:
@@ -175,7 +175,7 @@ def test_a_folder_that_is_only_read(project):
 
 
 def flip_byte(path: Path, quietly: bool = False) -> None:
-    """Another byte in the middle; `quietly`: size and time say nothing of it."""
+    """Flip a bit in the middle of a file; `quietly` keeps its size and time."""
     data, then = bytearray(path.read_bytes()), path.stat().st_mtime_ns
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
@@ -356,7 +356,7 @@ TYPED = (
 
 @pytest.fixture
 def stub_environment(tmp_path) -> Path:
-    """An environment whose commands only say what they were given."""
+    """An environment whose commands only print their arguments."""
     (tmp_path / "bin").mkdir()
     for name in ("reffusion", "python"):
         (tmp_path / "bin" / name).write_text('#!/bin/sh\nfor each in "$@"; do printf "%s|" "$each"; done; echo\n')

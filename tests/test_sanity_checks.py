@@ -21,7 +21,7 @@ from report import check
 
 @pytest.fixture(scope="module")
 def wall_capture(tmp_path_factory):
-    """Scene, masks and pictures of a wall with a square before it; the wall's texture is fine enough to tell places."""
+    """Scene, masks and pictures of a wall with a square before it; its texture is fine enough to localize."""
     folder = tmp_path_factory.mktemp("odd")
     poses, _, _ = wall_scene.write_poses_and_fit(folder, 1.5)
     scene = load_scene(poses)

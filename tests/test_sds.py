@@ -12,14 +12,14 @@ MEAN, VARIANCE = 0.7, 0.25
 
 
 def perfect_denoiser(noisy, t):
-    """What a perfect denoiser answers when clean data are independent normal numbers: the posterior means."""
+    """The posterior means of a perfect denoiser for independent normal data."""
     a, s = ABAR[t].sqrt().view(-1, 1, 1, 1), (1 - ABAR[t]).sqrt().view(-1, 1, 1, 1)
     eps = s * (noisy - a * MEAN) / (a**2 * VARIANCE + s**2)
     return eps, (noisy - s * eps) / a
 
 
 def expected_gradient(latent, t, weighting):
-    """E over noise of w(t) (eps_theta - eps), by hand."""
+    """The expectation over noise of w(t) (eps_theta - eps), in closed form."""
     a2 = ABAR[t]
     mean = (1 - a2).sqrt() * a2.sqrt() * (latent - MEAN) / (a2 * VARIANCE + 1 - a2)
     return mean * {"one": 1.0, "sigma2": 1 - a2, "x0": ((1 - a2) / a2).sqrt()}[weighting]
@@ -73,7 +73,7 @@ def test_weightings_differ_by_a_function_of_the_timestep_only():
 
 
 def fade_contrast(factor, shift=0.2):
-    """(x0, z, mask): x0 has `factor` of z's contrast inside the mask and a mean of its own; outside, other noise."""
+    """(x0, z, mask): x0 has `factor` of z's contrast and another mean inside the mask, and other noise outside."""
     z, other = torch.randn(2, 3, 4, 8, 8, generator=generator(9), dtype=torch.float64)
     mask = torch.zeros(3, 1, 8, 8, dtype=torch.float64)
     mask[:, :, 1:6, 2:7] = 1

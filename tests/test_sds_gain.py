@@ -21,7 +21,7 @@ AT, TRAINED = 0.8, [CAMERAS[name] for name in TRAIN]
 
 @pytest.fixture(scope="module")
 def wall_without_square():
-    """The wall without its square, masks, and photographs that show just what it does."""
+    """The wall without its square, masks, and photographs that equal its renders."""
     scene, labels = wall_and_square(AT)
     wall = scene.map(lambda p: p[~labels])
     hidden = {camera.name: true_mask(camera, AT) for camera in TRAINED}

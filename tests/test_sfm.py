@@ -114,7 +114,7 @@ UPRIGHT, ACROSS = (150, 200), (200, 150)  # px: a phone held both ways
 
 
 def write_walk(folder: Path, sizes: Sequence[tuple[int, int]], endings: Sequence[str]) -> dict[str, np.ndarray]:
-    """One photograph of `room_walk` for each size and ending, in folder/images; the true poses."""
+    """Write a photograph of `room_walk` for each size and ending to folder/images; return the true poses."""
     generator, truth = np.random.default_rng(0), room_walk(len(sizes))
     textures = room_textures(generator)
     (folder / "images").mkdir(parents=True)

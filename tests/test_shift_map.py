@@ -21,7 +21,7 @@ HOLE = disk_mask((HEIGHT, WIDTH), 58, 100, 27)
 
 
 def paint_lawn(path: bool = True) -> np.ndarray:
-    """Grass, and a pale path across, uint8 [H, W, 3]."""
+    """uint8 [H, W, 3]: grass, and a pale path across it."""
     draws = np.random.default_rng(0)
     green = np.array([70, 110, 50]) + draws.normal(0, 18, (HEIGHT, WIDTH, 1))
     if path:

@@ -22,7 +22,7 @@ NEAR = 1.7
 
 @pytest.fixture(scope="module")
 def reference_folders(tmp_path_factory):
-    """A small scene, whose colours may change with the direction, up to a reference."""
+    """The folders of a small scene with view-dependent colours, up to `reference`."""
     home = tmp_path_factory.mktemp("scene")
     poses, fit_folder, _ = wall_scene.write_poses_and_fit(home, NEAR)
     gaussians = load_ply(fit_folder / "gaussians.ply")
@@ -34,7 +34,7 @@ def reference_folders(tmp_path_factory):
 
 
 def run_on_cpu_and_gpu(tmp_path, work) -> list:
-    """The folders that `work(device, folder)` fills on the CPU and on the GPU."""
+    """Run `work(device, folder)` on the CPU and on the GPU; return both folders."""
     folders = [tmp_path / "cpu", tmp_path / "cuda"]
     for folder in folders:
         folder.mkdir()

@@ -21,7 +21,7 @@ IMAGES = ("color", "depth", "alpha", "features")
 
 
 def off_center_camera(width: int, height: int, distance: float = 3.0) -> Camera:
-    """A view of the origin, a little turned and off-centre so that no symmetry hides an error."""
+    """A view of the origin, slightly turned and off-centre so that no symmetry hides an error."""
     turn = 0.3
     pose = np.eye(4)
     pose[:3, :3] = [[math.cos(turn), 0, math.sin(turn)], [0, 1, 0], [-math.sin(turn), 0, math.cos(turn)]]
@@ -44,7 +44,7 @@ def random_cloud(count: int, log_scale: float, seed: int = 0, degree: int = 3, s
 
 
 def differentiate(gaussians, view, impl, dtype, channels=3, sh_degree=None):
-    """Rendering, and the gradients of a fixed random linear function of everything rendered."""
+    """The rendering, and the gradients of a fixed random linear function of all its outputs."""
     generator = torch.Generator().manual_seed(1)
     random = lambda *shape: torch.randn(*shape, generator=generator).to(dtype)
     leaf = lambda tensor: tensor.detach().to(dtype).clone().requires_grad_()
@@ -290,7 +290,7 @@ def test_order_and_length_of_quaternions_do_not_matter_to_values():
 
 
 def extreme_gaussians() -> Gaussians:
-    """Behind the camera, at its centre, far aside, gigantic, vanishing, transparent, opaque."""
+    """Gaussians behind the camera, at its centre, far aside, huge, tiny, transparent and opaque."""
     center = torch.tensor(off_center_camera(20, 20).center, dtype=torch.float32)
     gaussians = random_cloud(10, -1.0)
     for array, row, value in (

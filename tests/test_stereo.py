@@ -25,7 +25,7 @@ CAMERAS = [
 
 
 def make_matches(places_there, here, seen=None) -> stereo.Matches:
-    """Of view a with the others."""
+    """Matches of view a with the other views."""
     there = np.array(places_there)
     names = tuple(view.name for view in CAMERAS[1:])
     return stereo.Matches("a", here, names, there, np.ones(there.shape[:2], bool) if seen is None else seen)

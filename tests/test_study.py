@@ -21,7 +21,7 @@ METHODS = ("full", "no_sds", "inpaint_2d")
 
 @pytest.fixture
 def comparison_folder(tmp_path):
-    """Two compared scenes of a wall: `full` shows it, `no_sds` the square before it; `inpaint_2d` made pictures."""
+    """Two compared scenes of a wall: `full` shows it, `no_sds` the square before it, `inpaint_2d` has only pictures."""
     everything, labels = wall_scene.wall_and_square(1.0)
     wall = everything.map(lambda part: part[~labels])
     runs = []
@@ -91,7 +91,7 @@ def test_images_where_no_encoder_is(comparison_folder, monkeypatch):
 
 
 def answer_trial(browser, key: dict, trial: dict) -> None:
-    """Answer a trial: `full` is better overall, the other more faithful; of a check the right one."""
+    """Answer a trial: `full` is better overall, the other more faithful; in a check the right one is better."""
     ours = key["pairs"].get(trial["id"], {}).get("full") or key["checks"][trial["id"]]["right"]
     left = browser.get_attribute("#left video", "src")
     place = int(left != ours)
@@ -140,8 +140,9 @@ def test_a_whole_session(comparison_folder, tmp_path, width):
 
 
 def simulate_votes(participants: int, truth: float, seed: int, spread: float = 0.15) -> tuple[list[dict], dict]:
-    """Votes on 12 pairs by people who prefer the method with probabilities around `truth`; every tenth of them fails a
-    check, and prefers the other always."""
+    """Votes on 12 pairs by participants who prefer the method with probabilities around `truth`. Every tenth of them
+    fails a check and always prefers the other method.
+    """
     draws = np.random.default_rng(seed)
     pairs = {f"p{n}": {"scene": str(n), "method": "other", "full": f"ours{n}"} for n in range(12)}
     key = {"study": "s", "pairs": pairs, "checks": {"c": {"right": "good"}}}

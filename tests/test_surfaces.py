@@ -34,7 +34,7 @@ def intersect_ground(view: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reflection(way: np.ndarray) -> np.ndarray:
-    """What is added to the ground's colour towards a camera in a direction: more from the right."""
+    """What is added to the ground's colour in a direction [..., 3] to the camera: more from the right."""
     return (0.5 * way[..., 0] / np.linalg.norm(way, axis=-1))[..., None]
 
 
@@ -59,7 +59,7 @@ def depth_views() -> list[DepthView]:
 
 
 def uneven_depth(depth: np.ndarray) -> np.ndarray:
-    """Depth as splats show it: uneven by 2 %, and 2 % too near."""
+    """Depth as splats render it: uneven by 2 %, and 2 % too near."""
     return depth * (0.98 + 0.02 * np.random.default_rng(0).standard_normal(depth.shape))
 
 
@@ -96,7 +96,7 @@ def test_a_plane_moves_onto_what_is_known_around_the_hole():
 
 
 def hole_gaussians(sh_degree: int) -> Gaussians:
-    """On the ground under the hole, of the colours that the first view shows there without shine."""
+    """Gaussians on the ground under the hole, in the colours of the first view without reflection."""
     view = CAMERAS[0]
     points, picture = intersect_ground(view)[1][HOLE], paint_ground(view, shines=True)[HOLE] / 255
     sh = np.zeros((len(points), (sh_degree + 1) ** 2, 3))

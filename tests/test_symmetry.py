@@ -29,7 +29,7 @@ def vase_camera(name: str, azimuth: float, height: float = 1.3, away: float = 3.
 
 
 def intersect_vase(rays: np.ndarray, center: np.ndarray, cut: bool) -> np.ndarray:
-    """[H, W] along the rays to the vase, an elliptic cylinder, inf beside it; cut: without its right, aslant."""
+    """[H, W], the distance along the rays to the vase, an elliptic cylinder; `cut` removes its right part aslant."""
     scale = np.array([1 / WIDE, 1 / DEEP])
     d, o = rays[..., :2] * scale, center[:2] * scale
     a, b, c = (d * d).sum(-1), (d * o).sum(-1), o @ o - 1
@@ -50,7 +50,7 @@ def intersect_vase(rays: np.ndarray, center: np.ndarray, cut: bool) -> np.ndarra
 
 
 def render_vase(view: Camera, cut: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth [H, W] without the box, where the box hides it, where the vase is shown without it."""
+    """Depth [H, W] without the box, the mask of the box, and the mask of the vase without the box."""
     rays = world_rays(view)
     ground = np.where(rays[..., 2] < 0, -view.center[2] / np.minimum(rays[..., 2], -1e-9), 50.0).clip(0, 50)
     vase = intersect_vase(rays, view.center, cut)
@@ -64,14 +64,14 @@ def vase_depth_view(view: Camera, cut: bool = False) -> DepthView:
 
 
 def vase_color(points: np.ndarray, halved: bool) -> np.ndarray:
-    """[..., 3]: bands that climb; in a vase that is halved, one half is of other colours than the other."""
+    """[..., 3]: rising bands; `halved` gives one half other colours than the other."""
     bands = 0.5 + 0.3 * np.sin(9 * points[..., 2])
     half = np.where(points[..., 0] > 0, 1 - bands, bands) if halved else bands
     return np.stack([half, 0.8 * half, 0.5 * bands], -1)
 
 
 def make_vase_scene(cut: bool = False, halved: bool = False):
-    """Witnesses, photographs, and Gaussians of all that they show of vase and ground."""
+    """Depth views, photographs, and Gaussians of all visible points of vase and ground."""
     views = [
         vase_depth_view(vase_camera(f"v{k}", azimuth), cut) for k, azimuth in enumerate(np.linspace(-150, -30, 11))
     ]
@@ -95,7 +95,7 @@ def make_vase_scene(cut: bool = False, halved: bool = False):
 
 
 def left_right_mirrors(mirrors: list[Mirror]) -> list[Mirror]:
-    """Those of left and right, not of front and back."""
+    """The mirrors that exchange left and right, not front and back."""
     return [mirror for mirror in mirrors if abs(mirror.normal[0]) > 0.8]
 
 

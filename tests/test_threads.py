@@ -11,7 +11,7 @@ STEPS = 12
 
 
 def record_parts(seconds, steps=MIN_STEPS, device="cpu", idle=time.perf_counter):
-    """The parts at once of each of `STEPS` steps, which take `seconds[parts]`; a core is idle, or as `idle` says."""
+    """The parts that run at once in each of `STEPS` steps, which take `seconds[parts]`; `idle`: idle time."""
     before, found = torch.get_num_threads(), []
     torch.set_num_threads(2)
     try:

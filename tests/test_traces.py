@@ -40,7 +40,7 @@ DISTILL = {"iterations": 8, "sds": OFF, "adversarial": OFF, "depth": OFF, "refer
 
 @pytest.fixture(scope="module")
 def stage_folders(tmp_path_factory):
-    """Folders of a small scene up to `initialize`, and of a random prior."""
+    """The folders of a small scene up to `initialize`, and of a random prior."""
     home = tmp_path_factory.mktemp("scene")
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(fill, "COMPLETION", Completion(planar_share=2.0))  # no planes: both solvers
@@ -50,7 +50,7 @@ def stage_folders(tmp_path_factory):
 
 
 def run_stage(stage: str, stage_folders, out: Path, **changed) -> Path:
-    """One of the iterative stages on the small scene; its folder."""
+    """Run one of the iterative stages on the small scene; return its folder."""
     out.mkdir(parents=True, exist_ok=True)
     if stage == "fit":
         fit.run(fit.Params().changed(FIT | changed), out, poses=stage_folders["poses"])
@@ -65,7 +65,7 @@ def run_stage(stage: str, stage_folders, out: Path, **changed) -> Path:
 
 
 def load_result(folder: Path) -> list[torch.Tensor]:
-    """The numbers a stage made; the header of a file of LoRA weights is not the same in every run."""
+    """The numbers of a stage's result; the header of a LoRA file differs between runs."""
     if (folder / "gaussians.ply").exists():
         gaussians = load_ply(folder / "gaussians.ply")
         return [getattr(gaussians, name) for name in PARAMETERS]
@@ -307,7 +307,7 @@ def test_betas_are_parts(made, betas):
 
 
 def points_of_baselines(baselines: dict) -> list[Diagram]:
-    """The committed baselines as if they had been measured now."""
+    """The committed baselines as new measurements."""
     return [
         Diagram(name, "", "", None, [Point(*key.rsplit(", ", 1), 0.0, *value) for key, value in points.items()])
         for name, points in baselines["diagrams"].items()

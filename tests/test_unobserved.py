@@ -38,8 +38,9 @@ def table_camera(name: str, azimuth: float, height: float, away: float = 3.5) ->
 
 
 def render_table(view: Camera, notched: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth [H, W] of table and floor, whether the ray meets the box first, whether the table shows without it; one
-    that is notched lacks a quarter, up to the middle of the box."""
+    """Depth [H, W] of table and floor, the mask of the box, and the mask of the table without the box; `notched`
+    removes a quarter of the table, up to the middle of the box.
+    """
     rays = world_rays(view)
     to = lambda z: (z - view.center[2]) / rays[..., 2]
     at = lambda t: view.center + rays * t[..., None]
@@ -136,7 +137,7 @@ def test_borders_that_are_visible_go_on_under_the_box():
 
 
 def plinth_depth_view(view: Camera) -> DepthView:
-    """Rough ground with a plinth's face upright behind the box, that ends where the box begins."""
+    """Rough ground with the upright face of a plinth behind the box, which ends where the box begins."""
     rays = world_rays(view)
     ground, face = -view.center[2] / rays[..., 2], (0.5 - view.center[1]) / rays[..., 1]
     place = view.center + rays * face[..., None]

@@ -73,7 +73,7 @@ def decide_stages(job: Job) -> dict[str, Decision]:
 
 @pytest.fixture(scope="module")
 def finished_capture(tmp_path_factory):
-    """A small scene, and runs/ as its own run would leave it, as far as the runner looks."""
+    """A small scene, and runs/ after its own run, as far as the runner looks."""
     home = tmp_path_factory.mktemp("variants")
     scene, runs = write_capture(home / "scene", "llff", make_truth()), home / "runs"
     job, said = resolve(Request(ROOT, runs, str(scene), profile="laptop")), {}
@@ -183,7 +183,7 @@ def has_moved(start, ended):
 
 @pytest.fixture
 def check_regions_every_step(monkeypatch):
-    """Gaussians that changed region are looked for after every step."""
+    """Look for Gaussians that changed region after every step."""
     monkeypatch.setattr(D, "REGION_EVERY", 1)
 
 

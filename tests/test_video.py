@@ -39,7 +39,7 @@ AAAQAGAAAAAAAA
 
 
 def render_walk(step=STEP):
-    """A camera that passes a wall of blocks."""
+    """Pictures of a camera that passes a wall of blocks."""
     draw = np.random.default_rng(1)
     wall = cv2.resize(draw.integers(0, 255, (40, 120, 3), np.uint8), None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
     return [wall[:HEIGHT, k * step : k * step + WIDTH] for k in range(SHOTS)]
@@ -55,7 +55,7 @@ def write_video(path, pictures):
 
 
 def blur_some(pictures):
-    """Of each: once blurred, as it is, again, and smeared."""
+    """Four pictures for each: blurred, unchanged twice, and smeared."""
     soft = lambda picture: cv2.GaussianBlur(picture, (0, 0), 4)
     return [way(picture) for picture in pictures for way in (soft, np.copy, np.copy, lambda p: cv2.blur(p, (25, 1)))]
 

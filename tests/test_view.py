@@ -25,7 +25,7 @@ NEEDS = {"poses": "a", "fit": "b", "masks": "c", "initialize": "d", "distill": "
 
 
 def write_finished_job(home, needs):
-    """A run whose result is the wall; before distillation the square stood before it, too."""
+    """Write a run whose result is the wall; before distillation the square stands in front of it."""
     gaussians, labels = wall_scene.wall_and_square(1.0)
     train = {name: wall_scene.CAMERAS[name] for name in wall_scene.TRAIN}
     points = gaussians.means.double().numpy()

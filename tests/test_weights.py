@@ -28,7 +28,7 @@ PARTS = ("unet", "vae", "text_encoder", "tokenizer", "scheduler")
 
 @pytest.fixture
 def empty_caches(tmp_path, monkeypatch):
-    """Empty caches, a working directory without anything, and no network."""
+    """Empty caches, an empty working directory, and no network."""
     for name in ("HF_HUB_CACHE", "HF_HUB_OFFLINE", "TORCH_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -54,7 +54,7 @@ def copy_prior(target: Path) -> Path:
 
 
 def write_hub_entry(tmp_path, name="acme/paint", state="0123abc", main=True) -> Path:
-    """An entry of the hub's cache."""
+    """Write an entry of the hub's cache."""
     entry = tmp_path / "hub" / "hub" / f"models--{name.replace('/', '--')}"
     copy_prior(entry / "snapshots" / state)
     if main:
@@ -233,10 +233,10 @@ def test_one_set_of_weights_a_part_is_chosen():
 
 
 class Hub(http.server.BaseHTTPRequestHandler):
-    """As much of a hub as fetching asks for: models, one that is gated, none else.
+    """The part of a hub that downloads use: models, one of them gated.
 
     `models`: name -> file -> bytes. `spoilt`: files that arrive with a byte flipped. `stalls`: files of which half is
-    sent, and then nothing. `ranges`: first bytes asked for, where not 0. Set by `hub`.
+    sent, and then nothing. `ranges`: the first bytes of range requests, where not 0. Set by `hub`.
     """
 
     STATE = "a" * 40
@@ -321,7 +321,7 @@ for name in sys.argv[1:]:
 
 
 def fetch_models(*names, **environment) -> list[str]:
-    """What fetching these models says, a line each; a fresh process, for the hub's address is read once."""
+    """The output of downloading these models, in lines; in a new process, which reads the hub's address."""
     variables = {k: v for k, v in os.environ.items() if not k.startswith("HF_")} | environment
     variables |= {"PYTHONPATH": str(ROOT), "HF_HUB_DISABLE_XET": "1", "HF_HUB_ETAG_TIMEOUT": "2"}
     done = subprocess.run(

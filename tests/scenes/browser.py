@@ -13,7 +13,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 
 @contextmanager
 def open_page(address: str, width: int = 1280) -> Iterator[object]:
-    """A page of that width at an address, which afterwards must have logged no error and asked no other machine."""
+    """Open a page of this width; it must log no error and make no request to another machine."""
     if not CHROMIUM:
         pytest.skip("no Chromium is installed")
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")

@@ -67,7 +67,7 @@ def write_masks(folder: Path, names, size=(WIDTH, HEIGHT), value=255) -> None:
 
 
 def write_model(folder: Path, truth: Truth, text=False, factor=1, ending=".jpg") -> None:
-    """A COLMAP model for pictures `factor` times larger than those written."""
+    """Write a COLMAP model for pictures `factor` times larger than those written."""
     at = truth.lens.resized(WIDTH * factor, HEIGHT * factor)
     single = truth.model[0].startswith(("SIMPLE", "RADIAL"))
     head = (at.fx, at.cx, at.cy) if single else (at.fx, at.fy, at.cx, at.cy)
@@ -133,7 +133,7 @@ def write_capture(folder: Path, layout: str, truth: Truth) -> Path:
 
 
 def write_spin_nerf(folder: Path, test=2, full=True, mask_value=1, label_size=(WIDTH, HEIGHT + 3)) -> Truth:
-    """A scene as SPIn-NeRF publishes its own, but 6 views of which the first `test` are test views."""
+    """Write 6 views in the layout of the SPIn-NeRF dataset; the first `test` are test views."""
     truth = make_truth(RADIAL)
     names = sorted(truth.world_to_camera)
     write_pictures(folder / "images_4", names)
@@ -187,7 +187,7 @@ def reprojection_error(scene, truth: Truth) -> float:
 
 
 def write_four_photos(folder: Path) -> None:
-    """Four photographs of 32 x 24 px from a row of cameras, and masks."""
+    """Write four photographs of 32 x 24 px from a row of cameras, and masks."""
     (folder / "images").mkdir(parents=True)
     (folder / "masks").mkdir()
     frames = []

@@ -72,7 +72,7 @@ def refusal_before_writing(folder: Path, **params) -> str:
 
 
 def assert_cameras(scene: Scene, truth: Truth) -> None:
-    """Poses and, of pinhole cameras, intrinsics are those of the truth."""
+    """Assert the true poses and, for pinhole cameras, the true intrinsics."""
     assert reprojection_error(scene, truth) < EXACT
     at = truth.lens
     for name in truth.world_to_camera:
@@ -92,7 +92,7 @@ def select_views(truth: Truth, first: int, last: int) -> Truth:
 
 
 def write_named_model(folder: Path, truth: Truth, names: Mapping[str, str], text: bool = False) -> None:
-    """A COLMAP model whose images are called `names`: view of the truth -> name."""
+    """Write a COLMAP model whose images are called `names`: view of the truth -> name."""
     at = truth.lens
     cameras = {1: colmap.ModelCamera("PINHOLE", WIDTH, HEIGHT, (at.fx, at.fy, at.cx, at.cy))}
     listed = enumerate(sorted(names.items(), reverse=True), start=3)

@@ -26,7 +26,7 @@ def wall_camera(name="a", shift=0.0):
 
 
 def random_wall(count=150, seed=0):
-    """Gaussians on a wall before the camera; those of its middle are masked."""
+    """Gaussians on a wall in front of the camera, and a mask [N] of those in its middle."""
     draw = generator(seed, "wall")
     means = torch.rand(count, 3, generator=draw) * torch.tensor([1.2, 0.9, 0.1]) - torch.tensor([0.6, 0.45, 0.0])
     sh = torch.zeros(count, 4, 3)
@@ -59,7 +59,7 @@ def as_leaves(gaussians):
 
 
 def has_gradient(gaussians):
-    """[N] bool: has any gradient at all."""
+    """[N] bool: Gaussians with any gradient."""
     columns = [getattr(gaussians, name).grad.flatten(1).ne(0).any(1) for name in PARAMETERS if name != "opacity_logits"]
     return torch.stack([*columns, gaussians.opacity_logits.grad != 0]).any(0)
 
@@ -77,13 +77,13 @@ PLAIN = with_changes(SETTINGS, adversarial=OFF, reference=OFF, densify={"every":
 
 
 def has_changed(before, after):
-    """[N] bool: any parameter."""
+    """[N] bool: Gaussians of which any parameter differs."""
     rows = [(getattr(before, n) != getattr(after, n)).reshape(len(before), -1) for n in PARAMETERS]
     return torch.cat(rows, 1).any(1)
 
 
 def write_initialized_run(home, invent):
-    """A wall in front of three views; `invent`: bool [H, W], the hole in each."""
+    """Write a wall in front of three views, each with the hole `invent`, bool [H, W]; return the folder."""
     draw = generator(0, "wall")
     means = torch.rand(80, 3, generator=draw) * torch.tensor([1.6, 1.2, 0.1]) - torch.tensor([0.8, 0.6, -1.5])
     wall = Gaussians(

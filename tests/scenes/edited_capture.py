@@ -20,7 +20,7 @@ def plane_with_ball(count=4000):
 
 
 def write_edited_capture(folder, scale=5.0, offset=(50.0, 0.0, 0.0)):
-    """A capture with its Gaussians, and those that an editor left: other properties, order and degree."""
+    """Write a capture with its Gaussians, and what an editor left: other properties, order and degree."""
     truth = make_truth(scale=scale, offset=offset)
     points, deleted = plane_with_ball()
     means = torch.from_numpy(points * scale + offset).float()

@@ -30,7 +30,7 @@ def paint_red(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def natural_noise(seed: int, size=(160, 120)) -> np.ndarray:
-    """uint8 [H, W, 3] with as much energy in each octave, as photographs have."""
+    """uint8 [H, W, 3] with equal energy in each octave, as in photographs."""
     rng, (width, height) = np.random.default_rng(seed), size
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None]).clip(1 / width)
     fields = [np.fft.ifft2(np.fft.fft2(rng.normal(size=(height, width))) / frequency).real for _ in range(3)]

@@ -60,7 +60,7 @@ def small_depth_model(kind="relative", seed=0):
 
 
 class MeanInpainter(torch.nn.Module):
-    """Stands in for LaMa: paints the mean of what it is shown outside the mask, half a unit apart by its size."""
+    """A stand-in for LaMa that fills the mask with the mean of the other pixels."""
 
     def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         assert image.size(2) % 8 == 0 and image.size(3) % 8 == 0

@@ -21,7 +21,7 @@ COMMON = {"inpainter": "exemplar"}
 
 
 def resize_and_compress(image: np.ndarray, scale=0.97, crop=5, quality=80, gain=0.92) -> np.ndarray:
-    """Resized, cropped at its upper left, darker, and saved as JPEG."""
+    """The picture resized, cropped at its upper left, darkened, and compressed as JPEG."""
     size = tuple(round(side * scale) for side in image.shape[1::-1])
     small_one = cv2.resize(image, size, interpolation=cv2.INTER_AREA)[crop:, crop:]
     file = io.BytesIO()
@@ -34,7 +34,7 @@ def reference_entry(view, image="ref.png", **more):
 
 
 def write_wall_stages(folder: Path) -> dict[str, Path]:
-    """The folders that the stage is handed, of the wall with a square before it; a2's hole is to be invented."""
+    """Write the input folders of the stage `reference`; the hole of view a2 is to be invented."""
     made_poses, fitted, labels = wall_scene.write_poses_and_fit(folder, 1.6)
     wall_scene.write_capture_photos(folder / "scene", made_poses, wall_scene.CAMERAS)
     sets = {}
@@ -50,14 +50,14 @@ def write_wall_stages(folder: Path) -> dict[str, Path]:
 
 
 def run_reference_stage(wall: dict[str, Path], out: Path, **params) -> dict[str, Reference]:
-    """View name -> reference, as the stage writes it."""
+    """Run the stage: view name -> reference."""
     out.mkdir()
     reference.run(reference.Params(**COMMON, **params), out, **wall)
     return {r.camera.name: r for r in load_references(out, load_scene(wall["poses"]))}
 
 
 def write_wall_capture(folder: Path) -> Path:
-    """A scene on disk: the wall with a red square before it, masks of the square."""
+    """Write a capture of the wall with a red square before it, and masks of the square."""
     cameras = {name: wall_scene.CAMERAS[name] for name in wall_scene.TRAIN}
     points = np.stack([*(a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 20), np.linspace(-0.7, 0.7, 14))),
                        np.full(280, wall_scene.WALL)], -1)  # fmt: skip

@@ -20,7 +20,7 @@ def room_textures(generator: np.random.Generator) -> np.ndarray:
 
 
 def render_room_corner(pose: np.ndarray, textures: np.ndarray, size=(200, 150), focal=170.0) -> np.ndarray:
-    """The corner of a room, planes x = 2, y = 1.5, z = 3, ray-cast; uint8 [H, W, 3]."""
+    """uint8 [H, W, 3]: the corner of a room with the planes x = 2, y = 1.5 and z = 3."""
     columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
     rays = np.stack([(columns - size[0] / 2) / focal, (rows - size[1] / 2) / focal, np.ones_like(rows)], -1)
     rays, center = rays @ pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
@@ -36,7 +36,7 @@ def render_room_corner(pose: np.ndarray, textures: np.ndarray, size=(200, 150), 
 
 
 def room_walk(count: int) -> dict[str, np.ndarray]:
-    """Views that face the corner, up and down by turns: centres on a line would leave the alignment free to turn."""
+    """Views that face the corner. They alternate in height, for centres on a line leave the alignment undetermined."""
     result = {}
     for k in range(count):
         t = k / (count - 1) - 0.5

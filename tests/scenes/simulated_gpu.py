@@ -30,7 +30,7 @@ INDEXING = (torch.Tensor.__getitem__, torch.Tensor.__setitem__)
 
 
 class GpuTensor(torch.Tensor):
-    """In disguise."""
+    """A CPU tensor that claims to be on the GPU."""
 
 
 def disguise(tensor: torch.Tensor) -> torch.Tensor:
@@ -95,7 +95,7 @@ class GpuMode(TorchFunctionMode):
 
 
 def has_gpu() -> bool:
-    """A GPU, and gsplat with its extension: without gsplat a machine with a GPU passes the tests all the same."""
+    """Whether there is a GPU, and gsplat with its extension."""
     try:
         cuda.require_gpu(torch.zeros(1, device="cuda" if torch.cuda.is_available() else "cpu"))
     except ValueError:
@@ -105,7 +105,7 @@ def has_gpu() -> bool:
 
 @contextmanager
 def simulated_gpu() -> Iterator[None]:
-    """The block's machine has a GPU."""
+    """A context with a GPU: the real one, or a simulation where there is none."""
     if has_gpu():
         yield
         return

@@ -42,5 +42,5 @@ def run_through_initialize(home: Path, square_at: float) -> dict[str, Path]:
 
 
 def trace_lines(folder: Path) -> list[dict]:
-    """What a stage logged, without run times."""
+    """The lines of a stage's trace, without run times."""
     return [{k: v for k, v in line.items() if k != "seconds"} for line in read_trace(folder / "trace.jsonl")]
