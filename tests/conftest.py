@@ -26,6 +26,14 @@ def generate():
 
 
 @pytest.fixture(scope="module")
+def mini_scene(generate, tmp_path_factory):
+    """The folder of the smallest synthetic scene; tests must not change it."""
+    folder = tmp_path_factory.mktemp("scene") / "mini"
+    generate.generate(folder, 0, generate.KINDS["mini"])
+    return folder
+
+
+@pytest.fixture(scope="module")
 def prior():
     """A small random inpainting prior, one for all tests of a module."""
     from scenes.networks import small_prior

@@ -5,6 +5,7 @@ import pytest
 import torch
 from scenes import wall_scene
 from scenes.cameras import make_camera, yaw
+from scenes.images import render_color
 
 from reffusion import geometry
 from reffusion.background import backdrop, training_coverage
@@ -23,11 +24,7 @@ def wall_gaussians() -> Gaussians:
     return wall_scene.rectangle_gaussians(wall_scene.WALL, 2.0, 1.4, wall_scene.wall_color)
 
 
-def render_color(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    return rasterizer.render(gaussians, camera).color.clamp(0, 1).numpy()
-
-
-def turned_camera(degrees: float) -> Camera:
+def panned_camera(degrees: float) -> Camera:
     """A camera in the middle, turned to the right about its vertical axis."""
     rotation = yaw(np.radians(degrees))
     return make_camera("t", (wall_scene.WIDTH, wall_scene.HEIGHT), wall_scene.FOCAL, rotation=rotation)
@@ -48,14 +45,14 @@ def test_the_backdrop_continues_the_picture_and_keeps_seen_pixels():
     scene = wall_gaussians()
     done = backdrop.complete_scene([scene], TRAIN)[0]
     for camera in TRAIN:
-        assert np.abs(render_color(done, camera) - render_color(scene, camera)).max() < 0.02
-    away = turned_camera(75)
+        assert np.abs(render_color(done, camera).clip(0, 1) - render_color(scene, camera).clip(0, 1)).max() < 0.02
+    away = panned_camera(75)
     assert rasterizer.render(scene, away).alpha.numpy().mean() < 0.5  # black, most of it
     drawn = rasterizer.render(done, away)
     assert drawn.alpha.min() > 0.95
     open_ = rasterizer.render(scene, away).alpha.numpy() < 0.01
     colors = drawn.color.numpy()[open_]
-    seen = np.concatenate([render_color(scene, camera).reshape(-1, 3) for camera in TRAIN])
+    seen = np.concatenate([render_color(scene, camera).clip(0, 1).reshape(-1, 3) for camera in TRAIN])
     assert (colors > seen.min(0) - 0.05).all() and (colors < seen.max(0) + 0.05).all()
     steps = np.abs(np.diff(drawn.color.numpy(), axis=1)).max(-1)[open_[:, 1:] & open_[:, :-1]]
     assert steps.max() < 0.03
@@ -65,16 +62,21 @@ def test_each_direction_takes_the_colours_that_lie_there():
     left, right = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
     color = lambda x, y: np.where(x[..., None] < 0, left, right)
     done = backdrop.complete_scene([wall_scene.rectangle_gaussians(wall_scene.WALL, 2.0, 1.4, color)], TRAIN)[0]
-    to_the_left, to_the_right = (render_color(done, turned_camera(angle)).mean((0, 1)) for angle in (-80, 80))
+    to_the_left, to_the_right = (
+        render_color(done, panned_camera(angle)).clip(0, 1).mean((0, 1)) for angle in (-80, 80)
+    )
     assert to_the_left[0] > 2 * to_the_left[2] and to_the_right[2] > 2 * to_the_right[0]
 
 
 def test_needles_outside_the_capture_are_removed():
     needle = add_gaussian(wall_gaussians(), [5.0, 0.0, 2.0], [0.8, 0.01, 0.01], [0.0, 1.0, 0.0])
-    away = turned_camera(65)
-    assert (render_color(needle, away)[..., 1] - render_color(wall_gaussians(), away)[..., 1]).max() > 0.5
+    away = panned_camera(65)
+    assert (
+        render_color(needle, away).clip(0, 1)[..., 1] - render_color(wall_gaussians(), away).clip(0, 1)[..., 1]
+    ).max() > 0.5
     with_it, without = (
-        render_color(backdrop.complete_scene([scene], TRAIN)[0], away) for scene in (needle, wall_gaussians())
+        render_color(backdrop.complete_scene([scene], TRAIN)[0], away).clip(0, 1)
+        for scene in (needle, wall_gaussians())
     )
     assert np.abs(with_it - without).max() < 0.05
 
@@ -82,7 +84,8 @@ def test_needles_outside_the_capture_are_removed():
 def test_what_one_training_view_shows_stays():
     spot = add_gaussian(wall_gaussians(), [0.9, 0.0, 1.9], [0.02, 0.02, 0.02], [0.0, 1.0, 0.0])
     assert any(
-        np.abs(render_color(spot, camera) - render_color(wall_gaussians(), camera)).max() > 0.3 for camera in TRAIN
+        np.abs(render_color(spot, camera).clip(0, 1) - render_color(wall_gaussians(), camera).clip(0, 1)).max() > 0.3
+        for camera in TRAIN
     )
     done = backdrop.complete_scene([spot], TRAIN)[0]
     assert (done.means == spot.means[-1]).all(1).any()
@@ -199,6 +202,6 @@ def test_evaluate_counts_the_unseen_apart_and_shows_no_black(tmp_path, monkeypat
     assert on["mean"]["psnr_outside_seen"] > off["mean"]["psnr_outside_seen"] - 0.05
     assert "unseen_share" in (tmp_path / "on" / "per_view.csv").read_text().splitlines()[0]
     assert "unseen_share" in on["protocol"]["seen"]
-    away = turned_camera(75)
+    away = panned_camera(75)
     covered = [rasterizer.render(load_ply(tmp_path / name / "scene.ply"), away).alpha.min() for name in ("on", "off")]
     assert covered[0] > 0.9 and covered[1] < 0.01

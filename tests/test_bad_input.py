@@ -143,7 +143,7 @@ def replace_by(name: str, kind: str) -> Change:
     return change
 
 
-def edit_transforms(change: Callable[[dict], object]) -> Change:
+def change_transforms(change: Callable[[dict], object]) -> Change:
     def edit(folder: Path) -> None:
         path = folder / "transforms.json"
         content = json.loads(path.read_text())
@@ -154,11 +154,11 @@ def edit_transforms(change: Callable[[dict], object]) -> Change:
 
 
 def set_key(name: str, value: object) -> Change:
-    return edit_transforms(lambda r: r.update({name: value}))
+    return change_transforms(lambda r: r.update({name: value}))
 
 
 def set_frame_key(name: str, value: object) -> Change:
-    return edit_transforms(lambda r: r["frames"][1].update({name: value}))
+    return change_transforms(lambda r: r["frames"][1].update({name: value}))
 
 
 def edit_bounds(change: Callable[[np.ndarray], np.ndarray]) -> Change:
@@ -394,26 +394,28 @@ TRANSFORMS: dict[str, Change] = {
     **{f"frame's {name} = 'x'": set_frame_key(name, "x") for name in NUMBERS},
     **{
         f"angle = {value!r}": do_all(
-            edit_transforms(lambda r: r.pop("fl_x") and None), set_key("camera_angle_x", value)
+            change_transforms(lambda r: r.pop("fl_x") and None), set_key("camera_angle_x", value)
         )
         for value in (0, -1, 3.2, 7, "wide", float("nan"))
     },
     "w of other proportions": set_key("w", 500),
     "model a mapping": set_key("camera_model", {"a": list(range(1000))}),
     "model unknown": set_key("camera_model", "OPENCV2"),
-    "no intrinsics": edit_transforms(lambda r: r.pop("fl_x") and None),
-    "a list": edit_transforms(lambda r: [r]),
-    "a number": edit_transforms(lambda r: 5),
-    "nothing": edit_transforms(lambda r: {}),
+    "no intrinsics": change_transforms(lambda r: r.pop("fl_x") and None),
+    "a list": change_transforms(lambda r: [r]),
+    "a number": change_transforms(lambda r: 5),
+    "nothing": change_transforms(lambda r: {}),
     "no frames": set_key("frames", []),
     "frames a mapping": set_key("frames", {"0": 1}),
     "frames of numbers": set_key("frames", [1, 2, 3]),
     "frames of null": set_key("frames", [None]),
-    "a frame without path": edit_transforms(lambda r: r["frames"][0].pop("file_path") and None),
-    "a frame without pose": edit_transforms(lambda r: r["frames"][0].pop("transform_matrix") and None),
+    "a frame without path": change_transforms(lambda r: r["frames"][0].pop("file_path") and None),
+    "a frame without pose": change_transforms(lambda r: r["frames"][0].pop("transform_matrix") and None),
     **{f"path {value!r}": set_frame_key("file_path", value) for value in (5, None, [], "", "a\0b", {}, True, "/", ".")},
-    "no picture is there": edit_transforms(lambda r: [f.update(file_path="none/x.png") for f in r["frames"]] and None),
-    "two of a name": edit_transforms(lambda r: r["frames"][0].update(file_path=r["frames"][1]["file_path"])),
+    "no picture is there": change_transforms(
+        lambda r: [f.update(file_path="none/x.png") for f in r["frames"]] and None
+    ),
+    "two of a name": change_transforms(lambda r: r["frames"][0].update(file_path=r["frames"][1]["file_path"])),
     **{
         f"pose {name}": set_frame_key("transform_matrix", value)
         for name, value in {

@@ -17,7 +17,7 @@ SIDE, WIDE = 64, 16
 
 
 @pytest.fixture(scope="module")
-def model_folder(tmp_path_factory):
+def sam_folder(tmp_path_factory):
     from transformers import SamConfig, SamModel
 
     vision = dict(hidden_size=WIDE, num_hidden_layers=2, num_attention_heads=2, image_size=SIDE, patch_size=8)
@@ -35,18 +35,18 @@ def noise_image(shape):
     return np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
 
 
-def test_loaded_from_a_folder_it_answers_as_the_model_saved(model_folder):
+def test_loaded_from_a_folder_it_answers_as_the_model_saved(sam_folder):
     from transformers import SamModel
 
     image, clicks = noise_image((40, 60)), Clicks(np.array([[20.0, 10.0], [50.0, 30.0]]), np.array([True, False]))
-    loaded, own = load_segmenter(model_folder), make_segmenter(SamModel.from_pretrained(model_folder))
+    loaded, own = load_segmenter(sam_folder), make_segmenter(SamModel.from_pretrained(sam_folder))
     found = predict_mask(loaded, encode_image(loaded, image), clicks)
     assert found.shape == (40, 60) and found.dtype == bool
     assert (found == predict_mask(own, encode_image(own, image), clicks)).all()
 
 
-def test_clicks_and_answers_are_in_the_pictures_pixels(model_folder):
-    segmenter = load_segmenter(model_folder)
+def test_clicks_and_answers_are_in_the_pictures_pixels(sam_folder):
+    segmenter = load_segmenter(sam_folder)
     asked = []
     segmenter.model.prompt_encoder.register_forward_pre_hook(lambda _, __, said: asked.append(said), with_kwargs=True)
 
@@ -63,13 +63,13 @@ def test_clicks_and_answers_are_in_the_pictures_pixels(model_folder):
         assert (found == (np.arange(48 * size) + 0.5 > 30 * size)).all()
 
 
-def test_no_click_on_the_object_is_no_mask(model_folder):
-    segmenter = load_segmenter(model_folder)
+def test_no_click_on_the_object_is_no_mask(sam_folder):
+    segmenter = load_segmenter(sam_folder)
     looked = encode_image(segmenter, noise_image((20, 20)))
     assert not predict_mask(segmenter, looked, Clicks(np.array([[3.0, 3.0]]), np.array([False]))).any()
 
 
-def test_weights_that_are_not_here_are_none_and_others_are_refused(model_folder, tmp_path, monkeypatch):
+def test_weights_that_are_not_here_are_none_and_others_are_refused(sam_folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -81,10 +81,10 @@ def test_weights_that_are_not_here_are_none_and_others_are_refused(model_folder,
         load_segmenter(tmp_path)
 
 
-def test_the_page_asks_the_network_and_takes_back_without_it(model_folder, tmp_path):
+def test_the_page_asks_the_network_and_takes_back_without_it(sam_folder, tmp_path):
     placed, fit, _ = wall_scene.write_poses_and_fit(tmp_path / "scene", 1.7, masks={})
     wall_scene.write_capture_photos(tmp_path / "scene/given", placed, wall_scene.CAMERAS)
-    segmenter = load_segmenter(model_folder)
+    segmenter = load_segmenter(sam_folder)
     session = Session(Capture(tmp_path, tmp_path / "masks", placed, fit, {}), lambda: False, segmenter)
     name, at = session.views[0], (10.0, 12.0)
     session.click(name, [(*at, True)])

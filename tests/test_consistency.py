@@ -31,7 +31,7 @@ def plane_view(view, mask=None, **scene):
     return RenderedView(view, picture, depth, np.ones((HEIGHT, WIDTH), bool) if mask is None else mask)
 
 
-def middle_mask():
+def inner_mask():
     return rectangle_mask((HEIGHT, WIDTH), (10, 40), (20, 44))
 
 
@@ -39,26 +39,26 @@ def test_views_of_one_plane_agree_to_the_rounding_of_their_pictures():
     for other in (turned_camera("b", 0.2), turned_camera("b", -0.1, 0.05)):
         for slope in (0.0, 0.3):
             value, share = consistency.color_difference(
-                plane_view(turned_camera("a"), middle_mask(), slope=slope), plane_view(other, slope=slope)
+                plane_view(turned_camera("a"), inner_mask(), slope=slope), plane_view(other, slope=slope)
             )
             assert value < 1.2 / 255 and share == 1.0
 
 
 def test_a_colour_that_changes_from_view_to_view_is_the_difference():
-    a, b = plane_view(turned_camera("a"), middle_mask()), plane_view(turned_camera("b", 0.2), shift=0.2)
+    a, b = plane_view(turned_camera("a"), inner_mask()), plane_view(turned_camera("b", 0.2), shift=0.2)
     value, share = consistency.color_difference(a, b)
     assert value == pytest.approx(0.2, abs=1.2 / 255) and share == 1.0
 
 
 def test_a_wrong_depth_shows_as_the_slope_of_the_picture_times_the_shift():
     """At half its depth a point lands 6 px off in a view 0.2 to the side; a pixel is worth 0.2 * 2 / 60 of red."""
-    a, b = plane_view(turned_camera("a"), middle_mask()), plane_view(turned_camera("b", 0.2))
+    a, b = plane_view(turned_camera("a"), inner_mask()), plane_view(turned_camera("b", 0.2))
     value, _ = consistency.color_difference(a._replace(depth=a.depth / 2), b._replace(depth=b.depth / 2))
     assert value == pytest.approx(6 * 0.2 * 2 / 60 / 3, abs=1.2 / 255)
 
 
 def test_what_the_neighbour_does_not_see_is_not_compared():
-    a, b = plane_view(turned_camera("a"), middle_mask()), plane_view(turned_camera("b", 0.2))
+    a, b = plane_view(turned_camera("a"), inner_mask()), plane_view(turned_camera("b", 0.2))
     half = np.where(np.arange(WIDTH) < WIDTH // 2, 0.5, b.depth)  # something nearer before its left half
     poisoned = np.where((half < 1)[..., None], np.uint8(255), b.picture)
     value, share = consistency.color_difference(a, b._replace(depth=half, picture=poisoned))
@@ -70,7 +70,7 @@ def test_what_the_neighbour_does_not_see_is_not_compared():
 
 
 def test_where_the_neighbour_shows_nothing_at_all_it_disagrees():
-    a, b = plane_view(turned_camera("a"), middle_mask()), plane_view(turned_camera("b", 0.2))
+    a, b = plane_view(turned_camera("a"), inner_mask()), plane_view(turned_camera("b", 0.2))
     empty = b._replace(depth=np.zeros_like(b.depth), picture=np.zeros_like(b.picture))
     value, share = consistency.color_difference(a, empty)
     assert share == 1.0 and value == pytest.approx(a.picture[a.mask].mean() / 255, abs=1e-9)
@@ -78,6 +78,6 @@ def test_where_the_neighbour_shows_nothing_at_all_it_disagrees():
 
 def test_depth_is_continued_through_a_mask():
     depth, _ = render_plane(turned_camera("a"), slope=0.3)
-    broken = np.where(middle_mask(), 0.7, depth)
-    assert np.abs(consistency.interpolate_depth(broken, middle_mask()) / depth - 1).max() < 1e-6
-    assert (consistency.interpolate_depth(broken, np.ones_like(middle_mask())) == 0).all()
+    broken = np.where(inner_mask(), 0.7, depth)
+    assert np.abs(consistency.interpolate_depth(broken, inner_mask()) / depth - 1).max() < 1e-6
+    assert (consistency.interpolate_depth(broken, np.ones_like(inner_mask())) == 0).all()

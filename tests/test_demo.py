@@ -14,13 +14,6 @@ from reffusion.io import colmap
 from reffusion.io.images import load_image, load_mask
 
 
-@pytest.fixture(scope="module")
-def mini_scene(generate, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("demo") / "mini"
-    generate.generate(folder, 0, generate.KINDS["mini"])
-    return folder
-
-
 def png_stems(folder: Path) -> list[str]:
     return sorted(path.stem for path in folder.glob("*.png"))
 

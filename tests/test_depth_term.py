@@ -52,13 +52,13 @@ def slanted_wall(moved: float = 1.0):
     return moved_ones, masked
 
 
-def train_view(hole=HOLE):
+def black_train_view(hole=HOLE):
     hole = torch.from_numpy(hole)
     return TrainView(VIEW, torch.zeros(HEIGHT, WIDTH, 3), ~hole, hole, False)
 
 
 def evaluate_term(gaussians, masked, estimator, prior=None, text=None, view=None, **more):
-    given = view or train_view(), prior, text, DEPTH, 7.5, generator(1), estimator
+    given = view or black_train_view(), prior, text, DEPTH, 7.5, generator(1), estimator
     return depth_term.evaluate_depth(gaussians, masked, *given, **more)
 
 
@@ -181,7 +181,7 @@ def test_the_gradient_agrees_with_finite_differences_in_float64():
     hole = (np.abs(COLUMNS + 0.5 - WIDTH / 2) < 4) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 4)
     estimator = DepthEstimator(replace(HOW, explained=0.2), lambda *_: WALL)
     gaussians = as_leaves(few)
-    loss, drawn = evaluate_term(gaussians, masked, estimator, view=train_view(hole))
+    loss, drawn = evaluate_term(gaussians, masked, estimator, view=black_train_view(hole))
     loss.backward()
     compared = torch.from_numpy(hole) & (drawn.alpha > 0.2)
     assert compared.sum() > 30
@@ -216,7 +216,7 @@ def test_estimates_that_fit_nothing_are_degenerate(estimate, reason, prior, text
 
 
 def test_views_without_known_or_rendered_pixels_are_degenerate(prior, text):
-    everywhere = train_view(np.ones_like(HOLE))
+    everywhere = black_train_view(np.ones_like(HOLE))
     for estimator, reason in (
         (constant_estimator(WALL), "few pixels"),
         (depth_estimator.continuation_estimator(NO_POINTS, HOW), "no plane"),
@@ -227,7 +227,7 @@ def test_views_without_known_or_rendered_pixels_are_degenerate(prior, text):
     gaussians, masked = slanted_wall()
     around = gaussians.map(lambda p: p[~masked])
     with pytest.raises(Degenerate) as caught:
-        inner = train_view((np.abs(COLUMNS + 0.5 - WIDTH / 2) < 2) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 2))
+        inner = black_train_view((np.abs(COLUMNS + 0.5 - WIDTH / 2) < 2) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 2))
         evaluate_term(around, masked[~masked], depth_estimator.continuation_estimator(NO_POINTS, HOW), view=inner)
     assert caught.value.reason == "nothing compared"
 
@@ -300,7 +300,7 @@ def run_depth_distill(folder, prior, text, estimator, settings=RUN):
     with torch.no_grad():
         image = render(gaussians, VIEW).color.clamp(0, 1)
     holes = [(VIEW, image, torch.from_numpy(HOLE))]
-    return D.distill(gaussians, masked, [train_view()], holes, prior, text, settings, folder, estimator)
+    return D.distill(gaussians, masked, [black_train_view()], holes, prior, text, settings, folder, estimator)
 
 
 def test_interrupted_distillation_with_the_depth_term_resumes_bit_for_bit(prior, text, tmp_path, monkeypatch):

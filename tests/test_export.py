@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
+from scenes.images import render_color
 from scenes.random_scene import random_gaussians, random_scene
 
 from reffusion.io.cameras import save_cameras
@@ -20,7 +21,6 @@ from reffusion.io.files import BadInput
 from reffusion.io.images import save_image
 from reffusion.io.ply import count_gaussians, load_ply, save_ply
 from reffusion.io.scene import save_scene
-from reffusion.splat import rasterizer
 from reffusion.types import Camera, Similarity
 from report import export
 
@@ -29,11 +29,6 @@ FRAME = Similarity(0.31, np.array([1.5, -20.0, 4.0]))
 
 def random_scene_in_frame():
     return replace(random_scene(), similarity=FRAME)
-
-
-def render_color(gaussians, camera: Camera) -> np.ndarray:
-    with torch.no_grad():
-        return rasterizer.render(gaussians, camera).color.numpy()
 
 
 def visible_gaussians(camera: Camera, degree: int = 2):

@@ -192,7 +192,7 @@ def test_a_further_view_adds_what_those_before_do_not_show():
     assert len(few_views.gaussians_on_surfaces(views[:1], images, *sample_wall_and_square(), hidden, params)) == 0
 
 
-def write_poses(folder, train):
+def write_room_poses(folder, train):
     """Write a `poses` folder with these training views; return all views."""
     views = {view.name: view for view in (front_camera(f"v{k}", x) for k, x in enumerate((0.0, -0.12, 0.06)))}
     points, colors = sample_wall_and_square()
@@ -204,7 +204,7 @@ def write_poses(folder, train):
 
 @pytest.mark.parametrize("train", [("v0",), ("v0", "v1")])
 def test_other_views_are_shown_better_than_by_a_fit_from_points(tmp_path, train, capsys):
-    view = write_poses(tmp_path / "poses", train)["v2"]
+    view = write_room_poses(tmp_path / "poses", train)["v2"]
     error = {}
     for way in ("fewer_harmonics", "surfaces"):
         (tmp_path / way).mkdir()
@@ -218,7 +218,7 @@ def test_other_views_are_shown_better_than_by_a_fit_from_points(tmp_path, train,
 
 
 def test_an_interrupted_fit_from_surfaces_goes_on_to_the_same_end(tmp_path, monkeypatch):
-    write_poses(tmp_path / "poses", ("v0", "v1"))
+    write_room_poses(tmp_path / "poses", ("v0", "v1"))
     params = Params(iterations=60, few_views="surfaces", checkpoint_seconds=0.001)
     for name in ("whole", "broken"):
         (tmp_path / name).mkdir()

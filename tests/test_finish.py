@@ -14,7 +14,7 @@ from stages import evaluate, finish
 
 
 @pytest.fixture
-def stage_folders(tmp_path):
+def fit_folders(tmp_path):
     poses, fit, _ = wall_scene.write_poses_and_fit(tmp_path, 1.0)
     return {"poses": poses, "raw_masks": poses.with_name("raw_masks"), "fit": fit}
 
@@ -28,17 +28,17 @@ def add_stages(folders, tmp_path):
     return folders
 
 
-def run_finish(out, stage_folders, **params):
+def run_finish(out, fit_folders, **params):
     out.mkdir()
-    finish.run(finish.Params(**params), out, **stage_folders)
+    finish.run(finish.Params(**params), out, **fit_folders)
     return load_json(out / "facts.json"), load_ply(out / "scene.ply")
 
 
-def test_the_last_stage_is_the_result(stage_folders, tmp_path):
-    count = len(load_ply(stage_folders["fit"] / "gaussians.ply"))
-    facts, scene = run_finish(tmp_path / "alone", stage_folders, backdrop=False)
+def test_the_last_stage_is_the_result(fit_folders, tmp_path):
+    count = len(load_ply(fit_folders["fit"] / "gaussians.ply"))
+    facts, scene = run_finish(tmp_path / "alone", fit_folders, backdrop=False)
     assert facts["result"] == "fit" and len(scene) == count
-    later = add_stages(stage_folders, tmp_path)
+    later = add_stages(fit_folders, tmp_path)
     facts, scene = run_finish(tmp_path / "two", later | {"distill": None}, backdrop=False)
     assert facts["result"] == "initialize" and len(scene) == count - 1
     facts, scene = run_finish(tmp_path / "three", later, backdrop=False)
@@ -47,9 +47,9 @@ def test_the_last_stage_is_the_result(stage_folders, tmp_path):
     assert facts["backdrop"] is False and not (tmp_path / "three" / "completed").exists()
 
 
-def test_result_and_initialization_get_the_same_backdrop(stage_folders, tmp_path, monkeypatch):
+def test_result_and_initialization_get_the_same_backdrop(fit_folders, tmp_path, monkeypatch):
     monkeypatch.setattr(finish, "MIN_UNSEEN_SHARE", 0.0)
-    later = add_stages(stage_folders, tmp_path)
+    later = add_stages(fit_folders, tmp_path)
     facts, scene = run_finish(tmp_path / "out", later)
     assert facts["backdrop"] and facts["unseen_in_other_views"] > 0
     completed = {stage: load_ply(tmp_path / f"out/completed/{stage}.ply") for stage in ("initialize", "distill")}
@@ -61,31 +61,31 @@ def test_result_and_initialization_get_the_same_backdrop(stage_folders, tmp_path
     assert len(loaded["fit"]) == facts["gaussians"]["fit"]
 
 
-def test_training_views_decide_and_not_test_views(stage_folders, tmp_path):
+def test_training_views_decide_and_not_test_views(fit_folders, tmp_path):
     """Views side by side leave a strip of the outermost unseen by all others; of one view, seen thrice, nothing."""
-    scene = load_scene(stage_folders["poses"])
+    scene = load_scene(fit_folders["poses"])
     found = {}
     for name, train in (("spread", scene.train), ("again", (scene.train[2],) * 3)):
         for test in (scene.test, ()):
-            save_scene(stage_folders["poses"], replace(scene, train=train, test=test))
-            found[name, test] = run_finish(tmp_path / f"{name}-{len(test)}", stage_folders)[0]
+            save_scene(fit_folders["poses"], replace(scene, train=train, test=test))
+            found[name, test] = run_finish(tmp_path / f"{name}-{len(test)}", fit_folders)[0]
     assert [facts["backdrop"] for facts in found.values()] == [True, True, False, False]
     shares = [facts["unseen_in_other_views"] for facts in found.values()]
     assert shares[0] == shares[1] > 0.01 and shares[2] == shares[3] < 0.01
 
 
-def test_a_scene_with_gaussians_keeps_them(stage_folders, tmp_path):
+def test_a_scene_with_gaussians_keeps_them(fit_folders, tmp_path):
     """They may know more than the views do."""
-    save_ply(stage_folders["poses"] / "gaussians.ply", load_ply(stage_folders["fit"] / "gaussians.ply"))
-    facts, scene = run_finish(tmp_path / "out", stage_folders)
+    save_ply(fit_folders["poses"] / "gaussians.ply", load_ply(fit_folders["fit"] / "gaussians.ply"))
+    facts, scene = run_finish(tmp_path / "out", fit_folders)
     assert facts["backdrop"] is False and facts["unseen_in_other_views"] is None
     assert len(scene) == facts["gaussians"]["fit"]
 
 
-def test_evaluate_copies_the_scene(stage_folders, tmp_path):
-    run_finish(tmp_path / "finish", stage_folders)
+def test_evaluate_copies_the_scene(fit_folders, tmp_path):
+    run_finish(tmp_path / "finish", fit_folders)
     (tmp_path / "evaluate").mkdir()
-    evaluate.run(evaluate.Params(), tmp_path / "evaluate", **stage_folders, finish=tmp_path / "finish")
+    evaluate.run(evaluate.Params(), tmp_path / "evaluate", **fit_folders, finish=tmp_path / "finish")
     assert (tmp_path / "evaluate/scene.ply").read_bytes() == (tmp_path / "finish/scene.ply").read_bytes()
     metrics, facts = (load_json(tmp_path / name) for name in ("evaluate/metrics.json", "finish/facts.json"))
     assert metrics["backdrop"] == facts["backdrop"] and metrics["result"] == "fit" and "seconds" not in metrics

@@ -298,7 +298,7 @@ def test_the_start_has_the_points_colours_and_spacing():
     assert torch.isfinite(coincident.log_scales).all()
 
 
-def write_poses(folder) -> None:
+def write_arc_poses(folder) -> None:
     cameras, pictures = arc_cameras(), render_photos(arc_cameras())
     names = [c.name for c in cameras]
     points = np.repeat(true_gaussians().means.numpy().astype(np.float64), 3, 0)
@@ -312,7 +312,7 @@ def write_poses(folder) -> None:
 
 def test_the_stage_writes_its_artifact_and_never_reads_test_views(tmp_path):
     poses, out = tmp_path / "poses", tmp_path / "out"
-    write_poses(poses)
+    write_arc_poses(poses)
     out.mkdir()
     params = stage.Params().changed({"iterations": 10, "densify.cap_max": 150, "sh.degree": 1, "holdout": 4})
     stage.run(params, out, poses=poses)
@@ -326,7 +326,7 @@ def test_the_stage_writes_its_artifact_and_never_reads_test_views(tmp_path):
 def test_the_stage_starts_from_flow_points_of_the_views_it_fits(tmp_path, capsys, monkeypatch):
     from reffusion.capture import stereo
 
-    write_poses(tmp_path / "poses")
+    write_arc_poses(tmp_path / "poses")
     seen, find = [], stereo.triangulate_points
     monkeypatch.setattr(
         stereo, "triangulate_points", lambda cameras, *rest: seen.append(cameras) or find(cameras, *rest)
@@ -356,7 +356,7 @@ def test_larger_pictures_have_room_for_more_gaussians():
 
 def test_the_stage_takes_over_a_scene_of_gaussians(tmp_path):
     poses, out = tmp_path / "poses", tmp_path / "out"
-    write_poses(poses)
+    write_arc_poses(poses)
     out.mkdir()
     save_ply(poses / "gaussians.ply", true_gaussians())
     stage.run(stage.Params(), out, poses=poses)

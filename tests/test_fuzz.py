@@ -136,7 +136,7 @@ def capture_reader(name: str, others: dict[str, bytes]) -> Callable[[Path], obje
     return read
 
 
-def convert_ply_to_text(data: bytes) -> bytes:
+def ply_as_text(data: bytes) -> bytes:
     from plyfile import PlyData
 
     with tempfile.TemporaryDirectory() as name:
@@ -178,7 +178,7 @@ def readers() -> list[Reader]:
         Reader(
             "g.ply",
             any_ply,
-            (*of("g.ply", "points.ply"), convert_ply_to_text(made["g.ply"]), convert_ply_to_text(made["points.ply"])),
+            (*of("g.ply", "points.ply"), ply_as_text(made["g.ply"]), ply_as_text(made["points.ply"])),
         ),
         Reader("g.splat", any_splats, of("g.splat")),
         Reader("g.spz", any_splats, of("g.spz")),

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 from scenes.capture import make_truth, write_capture
 from scenes.capture_checks import assert_message, run_with_messages
+from scenes.splat_tables import write_rows
 
 SH0 = 0.28209479177387814
 
@@ -34,12 +35,6 @@ def gaussian_table(count: int, rest: int = 0, scales: int = 3, more: tuple[str, 
         if not name.startswith("n") and name not in more:
             table[name] = generator.uniform(low, high, count)
     return table
-
-
-def write_gaussians(path: Path, table: np.ndarray, order: str = "<", text: bool = False) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    table = table if text else table.astype(table.dtype.newbyteorder(order))
-    PlyData([PlyElement.describe(table, "vertex")], text=text, byte_order="=" if text else order).write(str(path))
 
 
 def write_transforms_capture(folder: Path) -> Path:
@@ -90,7 +85,7 @@ def test_not_finite_and_zero_rows_of_big_endian_doubles(tmp_path):
     table["scale_1"][22] = -np.inf
     for name in ("scale_0", "scale_1", "scale_2"):
         table[name][59] = -np.inf
-    write_gaussians(folder / "edited.ply", table, ">")
+    write_rows(folder / "edited.ply", table, byte_order=">")
     columns, sentences = load_written_gaussians(folder, "edited.ply")
     kept = np.delete(np.arange(60), [3, 10, 11, 41, 55])
     assert len(columns["x"]) == 55
@@ -117,8 +112,8 @@ def test_deleted_splats_are_those_of_the_rows_that_stay(tmp_path):
     before[[17, 18]] = 0
     before["opacity"][100:140] = np.inf
     gone = np.arange(200, 230)
-    write_gaussians(folder / "before.ply", before)
-    write_gaussians(folder / "after.ply", np.delete(before, gone))
+    write_rows(folder / "before.ply", before)
+    write_rows(folder / "after.ply", np.delete(before, gone))
     columns, _ = load_written_gaussians(folder, "before.ply", cleaned="after.ply")
     deleted = np.load(tmp_path / "s_out" / "deleted.npy")
     kept = np.delete(np.arange(400), [5, 17, 18])
@@ -129,7 +124,7 @@ def test_deleted_splats_are_those_of_the_rows_that_stay(tmp_path):
 def test_text_file_with_words_for_what_is_not_finite(tmp_path):
     folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(20)
     table["opacity"][4], table["scale_2"][6], table["f_dc_1"][8] = np.inf, -np.inf, np.nan
-    write_gaussians(folder / "splats/scan.ply", table, text=True)
+    write_rows(folder / "splats/scan.ply", table, text=True)
     columns, sentences = load_written_gaussians(folder, "splats/scan.ply")
     assert_columns_equal(columns, np.delete(table, 8), [*PLACE_AND_COLOR, "scale_0", "rot_1"])
     assert sigmoid(columns["opacity"][4]) > 0.99 and np.isfinite(columns["scale_2"]).all()
@@ -157,7 +152,7 @@ def test_filter_of_some_splats_in_doubles(tmp_path):
         gaussian_table(30, rest=45, more=("filter_3D",), kind="f8"),
     )
     table["filter_3D"] = np.linspace(0, 0.4, 30)
-    write_gaussians(folder / "mip.ply", table)
+    write_rows(folder / "mip.ply", table)
     columns, _ = load_written_gaussians(folder, "mip.ply")
     assert_filter_folded(columns, table, 1e-5)
     assert_columns_equal(columns, table, ["f_rest_0", "f_rest_44"])
@@ -167,7 +162,7 @@ def test_filter_of_opaque_splats(tmp_path):
     """Infinite opacities become those of the filter."""
     folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(24, more=("filter_3D",))
     table["filter_3D"], table["opacity"][::3] = 0.05, np.inf
-    write_gaussians(folder / "mip.ply", table, text=True)
+    write_rows(folder / "mip.ply", table, text=True)
     columns, _ = load_written_gaussians(folder, "mip.ply")
     assert_filter_folded(columns, table, 5e-3)  # infinite ones may be clamped first
 
@@ -175,7 +170,7 @@ def test_filter_of_opaque_splats(tmp_path):
 @pytest.mark.parametrize("rest", [0, 24])
 def test_two_scales_are_flat_along_the_third_axis(tmp_path, rest):
     folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(25, rest=rest, scales=2)
-    write_gaussians(folder / "surfels.ply", table)
+    write_rows(folder / "surfels.ply", table)
     columns, _ = load_written_gaussians(folder, "surfels.ply")
     assert_columns_equal(columns, table, [*PLACE_AND_COLOR, "opacity", "scale_0", "scale_1", "rot_0", "rot_2"])
     assert np.isfinite(columns["scale_2"]).all()
@@ -185,7 +180,7 @@ def test_two_scales_are_flat_along_the_third_axis(tmp_path, rest):
 @pytest.mark.parametrize("text", [False, True])
 def test_fourth_degree_is_cut_channel_by_channel(tmp_path, text):
     folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(12, rest=72)
-    write_gaussians(folder / "four.ply", table, ">", text)
+    write_rows(folder / "four.ply", table, text, ">")
     columns, sentences = load_written_gaussians(folder, "four.ply")
     assert sum(name.startswith("f_rest_") for name in columns) == 45
     for channel in range(3):

@@ -14,7 +14,7 @@ def disk_tensor(height, width, radius):
     return torch.from_numpy(images.disk_mask((height, width), height / 2, width / 2, radius))[None, None].double()
 
 
-def random_images(*shape, seed=0):
+def signed_random_images(*shape, seed=0):
     return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 2 - 1
 
 
@@ -46,7 +46,7 @@ def solve_laplace(image, hole):
 
 @pytest.mark.parametrize("size", [(64, 64), (37, 51), (1, 9), (1, 1)])
 def test_known_pixels_stay_and_the_hole_lies_within_their_range(size):
-    images, hidden = random_images(3, 3, *size), (random_images(3, 1, *size, seed=1) > 0).double()
+    images, hidden = signed_random_images(3, 3, *size), (signed_random_images(3, 1, *size, seed=1) > 0).double()
     hidden[..., 0, 0] = 0
     filled = harmonic_extension(images, hidden)
     given = (hidden == 0).expand_as(images)
@@ -72,13 +72,13 @@ def test_it_is_close_to_the_solution_of_laplaces_equation(radius):
 
 
 def test_the_content_of_the_hole_does_not_matter():
-    images, hidden = random_images(1, 3, 32, 32), disk_tensor(32, 32, 9)
+    images, hidden = signed_random_images(1, 3, 32, 32), disk_tensor(32, 32, 9)
     other = torch.where(hidden > 0, torch.nan, images)
     assert torch.equal(harmonic_extension(images, hidden), harmonic_extension(other, hidden))
 
 
 def test_nothing_given_gives_grey_and_leaves_its_neighbours_in_the_batch_alone():
-    images, hidden = random_images(2, 3, 32, 32), disk_tensor(32, 32, 9).repeat(2, 1, 1, 1)
+    images, hidden = signed_random_images(2, 3, 32, 32), disk_tensor(32, 32, 9).repeat(2, 1, 1, 1)
     hidden[0] = 1
     both = harmonic_extension(images, hidden)
     assert torch.equal(both[0], torch.zeros_like(both[0]))
@@ -86,5 +86,5 @@ def test_nothing_given_gives_grey_and_leaves_its_neighbours_in_the_batch_alone()
 
 
 def test_no_hole_changes_nothing():
-    images = random_images(1, 3, 20, 30)
+    images = signed_random_images(1, 3, 20, 30)
     assert torch.equal(harmonic_extension(images, torch.zeros(1, 1, 20, 30, dtype=torch.float64)), images)

@@ -32,7 +32,7 @@ SHEETS = Sheets()
 
 
 @pytest.fixture(scope="module")
-def stage_folders(tmp_path_factory):
+def masks_folders(tmp_path_factory):
     return run_through_masks(tmp_path_factory.mktemp("scene"), NEAR)
 
 
@@ -138,13 +138,13 @@ def test_bad_depth_is_refused():
     assert len(none) == 0 and none.sh.shape == (0, 4, 3)
 
 
-def test_holes_left_by_faint_gaussians_are_filled(stage_folders, tmp_path):
+def test_holes_left_by_faint_gaussians_are_filled(masks_folders, tmp_path):
     """The rim of the hole that the mask leaves to the remaining Gaussians, with these taken away."""
     view = wall_scene.CAMERAS["a2"]
-    sets = load_mask_sets(stage_folders["masks"], ["a2"])["a2"]
+    sets = load_mask_sets(masks_folders["masks"], ["a2"])["a2"]
     gaussians, labels = (
-        load_ply(stage_folders["fit"] / "gaussians.ply"),
-        load_labels(stage_folders["masks"] / "labels.npy"),
+        load_ply(masks_folders["fit"] / "gaussians.ply"),
+        load_labels(masks_folders["masks"] / "labels.npy"),
     )
     remaining = gaussians.map(lambda p: p[~labels])
     reference = Reference(view, wall_scene.photo(view), np.zeros_like(sets.invent))
@@ -196,17 +196,17 @@ def test_a_hidden_gaussian_does_not_become_a_speck_of_another_colour():
     assert colors.min() > 110 / 255 - 0.11 and colors.max() < 140 / 255 + 0.11
 
 
-def test_refit_moves_the_gaussians_and_leaves_no_checkpoint(stage_folders, tmp_path):
+def test_refit_moves_the_gaussians_and_leaves_no_checkpoint(masks_folders, tmp_path):
     """Twice the same, as many as before, nearer to the photographs; what it needs to resume goes when it is done."""
     found = {}
     for name, steps in (("none", 0), ("first", 40), ("again", 40)):
         out = tmp_path / name
         out.mkdir()
-        given = write_true_references(out / "r", stage_folders["masks"], "a2")
+        given = write_true_references(out / "r", masks_folders["masks"], "a2")
         initialize.run(
             initialize.Params(refit_steps=steps, view_dependent_color=True, depth={"sweep": True}, extra_views=2),
             out,
-            **stage_folders,
+            **masks_folders,
             reference=given,
         )
         found[name] = load_ply(out / "gaussians.ply")

@@ -20,18 +20,18 @@ TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
 
 
 @pytest.fixture(scope="module")
-def model_folder(tmp_path_factory):
+def depth_model_folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("network")
     small_depth_model().save_pretrained(path)
     return path
 
 
 @pytest.fixture(scope="module")
-def network(model_folder):
-    return monocular.load_network(model_folder)
+def network(depth_model_folder):
+    return monocular.load_network(depth_model_folder)
 
 
-def smooth_image(height, width, seed=0):
+def random_smooth_image(height, width, seed=0):
     coarse = torch.rand(1, 3, 5, 7, generator=generator(seed, "picture"))
     smooth = torch.nn.functional.interpolate(coarse, (height, width), mode="bilinear")[0]
     return (smooth * 255).round() / 255
@@ -45,26 +45,26 @@ def test_a_picture_is_prepared_as_the_models_own_processor_does(network, size):
         size={"height": 56, "width": 56}, ensure_multiple_of=14, keep_aspect_ratio=True,
         image_mean=list(monocular.MEAN), image_std=list(monocular.DEVIATION),
     )  # fmt: skip
-    image = smooth_image(*size)
+    image = random_smooth_image(*size)
     wanted = own((image * 255).byte().numpy(), return_tensors="pt", input_data_format="channels_first").pixel_values
     prepared = monocular.preprocess(network, image)
     assert prepared.shape == wanted.shape
     assert (prepared - wanted).abs().max() < 0.02  # theirs is rounded to 8 bits: half a level is 0.009
 
 
-def test_disparity_has_the_pictures_size_and_repeats(network, model_folder):
-    image = smooth_image(48, 64)
+def test_disparity_has_the_pictures_size_and_repeats(network, depth_model_folder):
+    image = random_smooth_image(48, 64)
     first = monocular.predict_disparity(network, image)
     assert first.shape == (48, 64) and torch.isfinite(first).all() and first.std() > 0
-    assert (first == monocular.predict_disparity(monocular.load_network(model_folder), image)).all()
-    assert (first != monocular.predict_disparity(network, smooth_image(48, 64, 1))).any()
+    assert (first == monocular.predict_disparity(monocular.load_network(depth_model_folder), image)).all()
+    assert (first != monocular.predict_disparity(network, random_smooth_image(48, 64, 1))).any()
     with pytest.raises(ValueError, match=r"\[3, H, W\]"):
         monocular.predict_disparity(network, image[None])
 
 
 def test_a_metric_model_is_inverted(network):
     model = small_depth_model("metric")
-    image = smooth_image(48, 64)
+    image = random_smooth_image(48, 64)
     answer = model(pixel_values=monocular.preprocess(network, image)).predicted_depth
     found = monocular.predict_disparity(monocular.make_network(model), image)
     inverse = 1 / answer[None].clamp(1e-6, 1e6)
@@ -72,7 +72,7 @@ def test_a_metric_model_is_inverted(network):
     torch.testing.assert_close(found, wanted)
 
 
-def test_refusals_name_what_is_wrong(tmp_path, model_folder):
+def test_refusals_name_what_is_wrong(tmp_path, depth_model_folder):
     with pytest.raises(ValueError, match="no such folder"):
         monocular.load_network(tmp_path / "nothing")
     with pytest.raises(ValueError, match=r"lacks config\.json"):
@@ -82,7 +82,7 @@ def test_refusals_name_what_is_wrong(tmp_path, model_folder):
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(ValueError, match=r"leave `depth\.model` empty"):
         monocular.load_network(tmp_path)
-    shutil.copy(model_folder / "config.json", tmp_path)
+    shutil.copy(depth_model_folder / "config.json", tmp_path)
     with pytest.raises(ValueError, match=r"leave `depth\.model` empty"):
         monocular.load_network(tmp_path)  # a configuration without weights
     with pytest.raises(ValueError, match=r"leave `depth\.model` empty"):
@@ -121,13 +121,15 @@ def test_the_stage_shows_the_model_the_reference(network):
     assert _predict_disparity(None, reference) is None
 
 
-def test_the_depth_term_asks_the_model_of_its_parameter(model_folder, network):
+def test_the_depth_term_asks_the_model_of_its_parameter(depth_model_folder, network):
     """A scene whose disparity is the model's own answer, scaled and moved: that is what it finds in the hole."""
     from stages import distill
 
-    view, image = wall_scene.CAMERAS["a2"], smooth_image(wall_scene.HEIGHT, wall_scene.WIDTH)
+    view, image = wall_scene.CAMERAS["a2"], random_smooth_image(wall_scene.HEIGHT, wall_scene.WIDTH)
     true = 2.0 + 0.3 * monocular.predict_disparity(network, image).double().numpy()
     hole = wall_scene.true_mask(view, 1.7)
     seen = ViewDepth(view, np.where(hole, 0.0, 1 / true), ~hole, hole, hole, np.zeros_like(hole))
-    estimator = distill.build_depth_estimator(distill.Params(depth={"model": str(model_folder)}), np.zeros((0, 3)))
+    estimator = distill.build_depth_estimator(
+        distill.Params(depth={"model": str(depth_model_folder)}), np.zeros((0, 3))
+    )
     np.testing.assert_allclose(estimator.disparity(seen, lambda: image.permute(1, 2, 0).numpy()), true, rtol=1e-6)

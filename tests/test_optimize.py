@@ -20,7 +20,7 @@ from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 
-def random_gaussians(count: int, degree: int = 1, seed: int = 0, scale: float = 0.05) -> Gaussians:
+def gaussians_near_origin(count: int, degree: int = 1, seed: int = 0, scale: float = 0.05) -> Gaussians:
     draw = lambda *shape: torch.randn(*shape, generator=generator)
     generator = seeding.generator(seed, "test")
     return Gaussians(
@@ -139,7 +139,7 @@ def test_ssim_is_never_computed_in_tf32(monkeypatch):
 
 
 def test_confined_rows_receive_exactly_nothing():
-    leaves = random_gaussians(30).map(lambda p: p.requires_grad_())
+    leaves = gaussians_near_origin(30).map(lambda p: p.requires_grad_())
     select = torch.arange(30) % 3 == 0
     rendering = render(confine(leaves, select), unit_camera(), impl="reference")
     (rendering.color.square().sum() + rendering.depth.sum() + rendering.alpha.sum()).backward()
@@ -151,14 +151,14 @@ def test_confined_rows_receive_exactly_nothing():
 
 
 def test_confine_stops_even_nan():
-    leaves = random_gaussians(4).map(lambda p: p.requires_grad_())
+    leaves = gaussians_near_origin(4).map(lambda p: p.requires_grad_())
     select = torch.tensor([True, False, True, False])
     (confine(leaves, select).means * torch.tensor([[1.0], [float("nan")], [1.0], [float("inf")]])).sum().backward()
     assert torch.equal(leaves.means.grad, torch.tensor([[1.0], [0.0], [1.0], [0.0]]).expand(4, 3))
 
 
 def test_confine_leaves_the_picture_alone():
-    gaussians = random_gaussians(20)
+    gaussians = gaussians_near_origin(20)
     seen = render(gaussians, unit_camera(), impl="reference").color
     confined = confine(gaussians, torch.zeros(20, dtype=torch.bool))
     assert torch.equal(render(confined, unit_camera(), impl="reference").color, seen)
@@ -174,7 +174,7 @@ def set_random_gradients(optimizer: GaussianOptimizer, step: int) -> None:
 
 
 def test_adam_is_torch_adam_where_all_are_visible():
-    start, rates, steps = random_gaussians(17, degree=2), Rates(), 12
+    start, rates, steps = gaussians_near_origin(17, degree=2), Rates(), 12
     ours = GaussianOptimizer(start, rates=rates)
     theirs = {name: getattr(start, name).clone().requires_grad_() for name in PARAMETERS}
     dc, rest = start.sh[:, :1].clone().requires_grad_(), start.sh[:, 1:].clone().requires_grad_()
@@ -216,7 +216,7 @@ def test_plain_and_compiled_adam_agree():
 def test_against_epsilon_a_gradient_is_large_or_small():
     steps = []
     for size in (1e-3, 1e-9):
-        optimizer = GaussianOptimizer(random_gaussians(6), epsilon=1e-6)
+        optimizer = GaussianOptimizer(gaussians_near_origin(6), epsilon=1e-6)
         before = optimizer.gaussians.means.detach().clone()
         for name in PARAMETERS:
             getattr(optimizer.gaussians, name).grad = torch.full_like(getattr(optimizer.gaussians, name), size)
@@ -226,7 +226,7 @@ def test_against_epsilon_a_gradient_is_large_or_small():
 
 
 def test_unseen_gaussians_stay_and_late_ones_start_afresh():
-    optimizer = GaussianOptimizer(random_gaussians(6))
+    optimizer = GaussianOptimizer(gaussians_near_origin(6))
     visible = torch.tensor([True, True, True, False, False, False])
     before = optimizer.gaussians.map(lambda p: p.detach().clone())
     for i in range(5):
@@ -243,7 +243,7 @@ def test_unseen_gaussians_stay_and_late_ones_start_afresh():
 
 
 def test_a_gradient_that_is_not_finite_is_named_and_changes_nothing():
-    optimizer = GaussianOptimizer(random_gaussians(5))
+    optimizer = GaussianOptimizer(gaussians_near_origin(5))
     set_random_gradients(optimizer, 0)
     optimizer.gaussians.opacity_logits.grad[2] = float("nan")
     before = optimizer.state_dict()
@@ -254,11 +254,11 @@ def test_a_gradient_that_is_not_finite_is_named_and_changes_nothing():
 
 
 def test_state_continues_bit_for_bit():
-    unbroken = GaussianOptimizer(random_gaussians(9), masked=torch.arange(9) % 2 == 0)
+    unbroken = GaussianOptimizer(gaussians_near_origin(9), masked=torch.arange(9) % 2 == 0)
     for i in range(3):
         set_random_gradients(unbroken, i)
         unbroken.step(i / 6)
-    resumed = GaussianOptimizer(random_gaussians(2))
+    resumed = GaussianOptimizer(gaussians_near_origin(2))
     resumed.load_state_dict(unbroken.state_dict())
     for optimizer in (unbroken, resumed):
         for i in range(3, 6):
@@ -274,7 +274,7 @@ def test_state_continues_bit_for_bit():
 
 def test_the_mean_of_what_was_remembered():
     """It loses the rows that are lost, survives a checkpoint, and ends where Gaussians are added."""
-    optimizer, seen = GaussianOptimizer(random_gaussians(6)), []
+    optimizer, seen = GaussianOptimizer(gaussians_near_origin(6)), []
     optimizer.apply_mean()  # of nothing: nothing changes
     for step in range(4):
         set_random_gradients(optimizer, step)
@@ -284,14 +284,14 @@ def test_the_mean_of_what_was_remembered():
             seen.append(optimizer.gaussians.map(torch.clone))
     keep = torch.tensor([True, False, True, True, False, True])
     optimizer.select(keep)
-    other = GaussianOptimizer(random_gaussians(4))
+    other = GaussianOptimizer(gaussians_near_origin(4))
     other.load_state_dict(optimizer.state_dict())
     other.apply_mean()
     for name in PARAMETERS:
         mean = torch.stack([getattr(each, name).double() for each in seen]).mean(0)[keep]
         assert torch.allclose(getattr(other.gaussians, name).double(), mean, atol=1e-6), name
     last = optimizer.gaussians.means.detach().clone()
-    optimizer.append(random_gaussians(2), torch.zeros(2, dtype=torch.bool))
+    optimizer.append(gaussians_near_origin(2), torch.zeros(2, dtype=torch.bool))
     optimizer.apply_mean()
     assert torch.equal(optimizer.gaussians.means[:4], last)
 
@@ -304,7 +304,7 @@ def optimizer_with_slopes(gaussians: Gaussians, slopes: list[float], masked=None
 
 
 def test_labels_and_moments_follow_through_clone_split_and_prune():
-    start = random_gaussians(5, scale=0.005)
+    start = gaussians_near_origin(5, scale=0.005)
     start.log_scales[3:] += 3.0  # 3 and 4 are large: to be split
     masked = torch.tensor([True, False, True, True, False])
     optimizer = optimizer_with_slopes(start, [9e-4, 0.0, 0.0, 9e-4, 0.0], masked)
@@ -338,7 +338,7 @@ def test_labels_and_moments_follow_through_clone_split_and_prune():
 
 
 def test_the_budget_takes_the_steepest():
-    optimizer = optimizer_with_slopes(random_gaussians(4, scale=0.001), [3e-4, 9e-4, 1e-4, 5e-4])
+    optimizer = optimizer_with_slopes(gaussians_near_origin(4, scale=0.001), [3e-4, 9e-4, 1e-4, 5e-4])
     assert densify(optimizer, 2e-4, 0.01, 6, seeding.generator(0)) == 2
     assert torch.equal(optimizer.gaussians.means[4:], optimizer.gaussians.means[[1, 3]])
     optimizer.grad2d_sum += 1
@@ -347,7 +347,7 @@ def test_the_budget_takes_the_steepest():
 
 
 def test_split_keeps_the_picture_roughly():
-    parent = random_gaussians(12, seed=4, scale=0.1)
+    parent = gaussians_near_origin(12, seed=4, scale=0.1)
     parent.opacity_logits[:] = 0.0
     children = split(parent, seeding.generator(0, "split"))
     before = render(parent, unit_camera(48, 36), impl="reference")
@@ -359,7 +359,7 @@ def test_split_keeps_the_picture_roughly():
 
 def test_split_draws_from_the_gaussian_itself():
     """Children of one anisotropic Gaussian have its covariance about its mean."""
-    one = random_gaussians(1, seed=2)
+    one = gaussians_near_origin(1, seed=2)
     one.log_scales[0] = torch.log(torch.tensor([0.5, 0.1, 0.02]))
     many = one.map(lambda p: p.repeat(4000, *[1] * (p.ndim - 1)))
     offsets = split(many, seeding.generator(1)).means - one.means
@@ -373,7 +373,7 @@ def test_slopes_do_not_depend_on_the_image_size():
     """The same blurred picture at twice the size pulls at the same Gaussians equally hard."""
     slopes = []
     for width in (32, 64):
-        optimizer = GaussianOptimizer(random_gaussians(15, seed=7, scale=0.15))
+        optimizer = GaussianOptimizer(gaussians_near_origin(15, seed=7, scale=0.15))
         probe = torch.zeros(15, 2, requires_grad=True)
         seen = render(optimizer.gaussians, unit_camera(width, width * 3 // 4), impl="reference", probe=probe)
         (seen.color - 0.3).square().mean().backward()
@@ -383,7 +383,7 @@ def test_slopes_do_not_depend_on_the_image_size():
 
 
 def test_capped_opacities_start_over():
-    optimizer = GaussianOptimizer(random_gaussians(8))
+    optimizer = GaussianOptimizer(gaussians_near_origin(8))
     set_random_gradients(optimizer, 0)
     optimizer.step(0.0)
     optimizer.cap_opacity(0.01)
@@ -394,7 +394,7 @@ def test_capped_opacities_start_over():
 def test_masked_gaussians_go_at_their_own_pace():
     masked = torch.tensor([True, False, False])
     rates = Rates(means=0.5, sh_dc=0.5, sh_rest=0.5)  # large, for differences of float32
-    optimizer = GaussianOptimizer(random_gaussians(3), masked, rates, {"means": 0.25, "sh": 0.5})
+    optimizer = GaussianOptimizer(gaussians_near_origin(3), masked, rates, {"means": 0.25, "sh": 0.5})
     before = optimizer.gaussians.map(lambda p: p.detach().clone())
     for name in PARAMETERS:
         getattr(optimizer.gaussians, name).grad = torch.ones_like(getattr(optimizer.gaussians, name))

@@ -37,7 +37,7 @@ def sd2_prior():
     return F.build_prior(F.shrink(F.SD2), torch.float32)
 
 
-def random_normal(*shape, seed=0):
+def draw_normal(*shape, seed=0):
     return torch.randn(*shape, generator=generator(seed, "test"))
 
 
@@ -53,7 +53,7 @@ def test_sdxl_prompts_and_unet_are_those_of_the_stock_pipeline(sdxl_prior):
     assert torch.allclose(text[0, -1, : pooled.shape[1]], pooled[0], atol=1e-5)
     assert not text[1].any() and not empty.any() and not pooled_empty.any()
 
-    noisy, condition = random_normal(1, 4, 16, 16), random_normal(1, 5, 16, 16, seed=1)
+    noisy, condition = draw_normal(1, 4, 16, 16), draw_normal(1, 5, 16, 16, seed=1)
     sizes = torch.tensor([[32.0, 32, 0, 0, 32, 32]])
     added = {"text_embeds": pooled, "time_ids": sizes}
     at = torch.tensor([300])
@@ -83,13 +83,13 @@ def test_sdxl_is_refused_where_it_cannot_work(sdxl_prior):
 
 
 def test_a_batch_in_parts_gives_the_same_values_and_gradients(sd2_prior):
-    images = random_normal(3, 3, 32, 32).requires_grad_()
-    noisy, condition, at = random_normal(3, 4, 16, 16), random_normal(3, 5, 16, 16), torch.tensor([10, 500, 900])
+    images = draw_normal(3, 3, 32, 32).requires_grad_()
+    noisy, condition, at = draw_normal(3, 4, 16, 16), draw_normal(3, 5, 16, 16), torch.tensor([10, 500, 900])
     text = diffusion.embed_text(sd2_prior, list(crops.PROMPTS)).detach()
     found = []
     for prior in (sd2_prior, replace(sd2_prior, rows=1, rows_with_grad=2), enable_checkpointing(sd2_prior)):
         latents = diffusion.encode(prior, images)
-        (gradient,) = torch.autograd.grad((latents * random_normal(*latents.shape)).sum(), images)
+        (gradient,) = torch.autograd.grad((latents * draw_normal(*latents.shape)).sum(), images)
         with torch.no_grad():
             found.append((latents.detach(), gradient, diffusion.raw_prediction(prior, noisy, at, condition, text)))
     for other in found[1:]:
@@ -118,9 +118,9 @@ def test_half_precision_stays_near_and_leaves_the_vae_alone(sd2_prior):
     for name in ("unet", "text_encoder"):
         getattr(half, name).load_state_dict(getattr(sd2_prior, name).state_dict())
     half.vae.load_state_dict(sd2_prior.vae.state_dict())
-    images, noisy, at = random_normal(1, 3, 32, 32), random_normal(1, 4, 16, 16), torch.tensor([999])
+    images, noisy, at = draw_normal(1, 3, 32, 32), draw_normal(1, 4, 16, 16), torch.tensor([999])
     assert torch.equal(diffusion.encode(half, images), diffusion.encode(sd2_prior, images))
-    condition = random_normal(1, 5, 16, 16)
+    condition = draw_normal(1, 5, 16, 16)
     with torch.no_grad():
         answers = [
             diffusion.predict(p, noisy, at, condition, diffusion.embed_text(p, ["a"])) for p in (sd2_prior, half)
@@ -140,10 +140,10 @@ def test_a_small_lora_is_not_lost_in_half_precision(sd2_prior, dropout):
     half.unet.load_state_dict(sd2_prior.unet.state_dict())
     sd2_prior.unet.load_state_dict(half.unet.state_dict())  # the same rounded weights in float32
     noisy, condition, at, text = (
-        random_normal(1, 4, 16, 16),
-        random_normal(1, 5, 16, 16),
+        draw_normal(1, 4, 16, 16),
+        draw_normal(1, 5, 16, 16),
         torch.tensor([500]),
-        random_normal(1, 24, 64),
+        draw_normal(1, 24, 64),
     )
     changes = []
     for prior in (sd2_prior, half):
@@ -153,7 +153,7 @@ def test_a_small_lora_is_not_lost_in_half_precision(sd2_prior, dropout):
         for parameter in found["unet"]:
             parameter.data += 5e-4 * torch.randn(parameter.shape, generator=noise)
         layer = next(m for m in prior.unet.modules() if hasattr(m, "lora_A"))
-        x = random_normal(1, 8, layer.base_layer.in_features, seed=3).to(prior.dtype)
+        x = draw_normal(1, 8, layer.base_layer.in_features, seed=3).to(prior.dtype)
         changes.append((layer(x) - layer.base_layer(x)).float().flatten().detach())
         assert torch.isfinite(diffusion.raw_prediction(prior, noisy, at, condition, text) - before).all()
     exact, rounded = changes
@@ -200,7 +200,7 @@ def test_the_text_encoder_is_let_go():
     with pytest.raises(ValueError, match="text encoder was dropped"):
         diffusion.embed_text(prior, ["a"])
     answer = diffusion.raw_prediction(
-        prior, random_normal(3, 4, 16, 16), torch.tensor([1, 2, 3]), random_normal(3, 5, 16, 16), text
+        prior, draw_normal(3, 4, 16, 16), torch.tensor([1, 2, 3]), draw_normal(3, 5, 16, 16), text
     )
     assert torch.isfinite(answer).all()
 

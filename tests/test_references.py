@@ -60,7 +60,7 @@ def object_mask() -> np.ndarray:
     return rectangle_mask(SIZE[::-1], (40, 80), (60, 100))
 
 
-def paint_object(image: np.ndarray) -> np.ndarray:
+def whiten_object(image: np.ndarray) -> np.ndarray:
     return np.where(object_mask()[..., None], np.uint8(250), image)
 
 
@@ -70,7 +70,7 @@ def paint_object(image: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("how", [{}, {"crop": 0}, {"scale": 1.0, "quality": 95}, {"scale": 0.8, "crop": 12, "gain": 1}])
 def test_a_picture_from_another_tool_comes_back_onto_its_photograph(how):
     truth, size = natural_noise(0), SIZE
-    photo, changed = paint_object(truth), resize_and_compress(truth, **how)
+    photo, changed = whiten_object(truth), resize_and_compress(truth, **how)
     picture = cv2.resize(changed, size, interpolation=cv2.INTER_CUBIC)
     found = registration.register(picture, photo, object_mask())
     assert found.fits and found.inlier_ratio > 0.95
@@ -93,10 +93,10 @@ def test_a_picture_from_another_tool_comes_back_onto_its_photograph(how):
 
 def test_an_aligned_reference_comes_through_untouched():
     truth = natural_noise(0)
-    found = registration.register(truth, paint_object(truth), object_mask())
+    found = registration.register(truth, whiten_object(truth), object_mask())
     assert found.is_identical and found.affine is None and (found.gain == 1).all() and not found.offset.any()
     slightly = resize_and_compress(truth, scale=1.0, crop=0, quality=70, gain=1)
-    found = registration.register(slightly, paint_object(truth), object_mask())
+    found = registration.register(slightly, whiten_object(truth), object_mask())
     assert found.fits and found.affine is None and not found.is_identical, "not resampled, cut in only"
 
 
@@ -104,16 +104,16 @@ def test_what_was_repainted_elsewhere_moves_nothing():
     truth = natural_noise(0)
     picture = resize_and_compress(truth, scale=1.0, crop=0, quality=90, gain=0.9)
     picture[90:, :50] = natural_noise(1)[90:, :50]
-    found = registration.register(picture, paint_object(truth), object_mask())
+    found = registration.register(picture, whiten_object(truth), object_mask())
     assert found.fits and found.affine is None and found.gain == pytest.approx(1 / 0.9, abs=0.01)
 
 
 def test_another_picture_fits_badly_and_a_plain_one_cannot_be_told():
-    photo = paint_object(natural_noise(0))
+    photo = whiten_object(natural_noise(0))
     found = registration.register(natural_noise(1), photo, object_mask())
     assert not found.fits and found.inlier_ratio < 0.2 and f"shows {found.inlier_ratio:.0%} of" in found.mismatch
     plain = np.full_like(photo, 90)
-    found = registration.register(plain, paint_object(plain + 20), object_mask())
+    found = registration.register(plain, whiten_object(plain + 20), object_mask())
     assert found.fits and np.isnan(found.inlier_ratio) and "too plain" in str(found)
 
 

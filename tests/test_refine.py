@@ -15,7 +15,7 @@ from reffusion.types import Camera
 WIDTH, HEIGHT, FOCAL = 216, 162, 200.0
 
 
-def turned_camera(name: str, x: float, y: float, z: float, turn: float) -> Camera:
+def tilted_camera(name: str, x: float, y: float, z: float, turn: float) -> Camera:
     """At (x, y, -1 + z), turned about y."""
     rotation = Rotation.from_rotvec((0.3 * turn, turn, 0.0)).as_matrix()
     return make_camera(name, (WIDTH, HEIGHT), FOCAL, (x, y, z - 1.0), rotation)
@@ -23,7 +23,7 @@ def turned_camera(name: str, x: float, y: float, z: float, turn: float) -> Camer
 
 RNG = np.random.default_rng(4)
 EXACT = [
-    turned_camera(f"v{k}", 0.05 * (k % 3) - 0.05, 0.05 * (k // 3) - 0.05, z, turn)
+    tilted_camera(f"v{k}", 0.05 * (k % 3) - 0.05, 0.05 * (k // 3) - 0.05, z, turn)
     for k, (z, turn) in enumerate(zip(RNG.uniform(-0.03, 0.03, 9), RNG.uniform(-0.05, 0.05, 9), strict=True))
 ]
 WAVES = RNG.normal(0, 1, (80, 2)), RNG.uniform(0, 6.3, (80, 3))
@@ -93,7 +93,7 @@ def test_the_frame_stays_where_it_was():
 
 
 def test_a_view_that_shares_nothing_stays_and_hinders_nothing():
-    alone = replace(turned_camera("w", 0.0, 0.0, 0.0, np.pi), width=WIDTH)
+    alone = replace(tilted_camera("w", 0.0, 0.0, 0.0, np.pi), width=WIDTH)
     found = refine.refine_cameras([*perturb_cameras(1.5, 0.0), alone], PHOTOS | {"w": PHOTOS["v0"]})
     assert found.after < 0.12
     moved = found.cameras["w"]

@@ -30,7 +30,7 @@ def statuses(project: Path, **options) -> dict[str, str]:
     return {s: f"{d.status} {d.reason}".strip() for s, d in plan(job, job.pipeline.closure("all")).items()}
 
 
-def run_stages(capsys, project: Path, target: str = "all", **options) -> list[str]:
+def run_project(capsys, project: Path, target: str = "all", **options) -> list[str]:
     """Run the scene; return the stages that ran, in order."""
     capsys.readouterr()
     run_scene(make_request(project, **options), target)
@@ -106,7 +106,7 @@ def test_fresh_plan(empty_project):
 
 
 def test_a_second_call_runs_nothing(project, capsys):
-    assert run_stages(capsys, project) == []
+    assert run_project(capsys, project) == []
     assert set(statuses(project).values()) == {"cached"}
 
 
@@ -115,16 +115,16 @@ def test_parameter_reruns_its_stage_and_what_depends_on_it(project, capsys):
     assert said["poses"] == "cached" and said["fit"] == "run param iterations 3 -> 5"
     assert said["masks"].startswith("stale waits for fit") and said["evaluate"].startswith("stale")
     assert statuses(project, set="fit.iterations=5 masks.threshold=99")["masks"] == "run param threshold 100 -> 99"
-    assert run_stages(capsys, project, set="fit.iterations=5") == ["fit", "masks", "distill", "evaluate"]
+    assert run_project(capsys, project, set="fit.iterations=5") == ["fit", "masks", "distill", "evaluate"]
     assert read_score(project) == 14.0
 
 
 def test_identical_output_stops_a_rerun(project, capsys):
     """`masks` comes out the same, so `distill` and `evaluate` stay."""
-    assert run_stages(capsys, project, set="masks.threshold=99") == ["masks"]
+    assert run_project(capsys, project, set="masks.threshold=99") == ["masks"]
     (project / "data/toy/number.txt").write_text("-4")  # the stage takes its magnitude
     assert statuses(project, set="masks.threshold=99")["poses"] == "run need scene changed"
-    assert run_stages(capsys, project, set="masks.threshold=99") == ["poses"]
+    assert run_project(capsys, project, set="masks.threshold=99") == ["poses"]
 
 
 def test_a_stage_depends_on_those_files_of_the_scene_that_it_says_it_reads(project, capsys):
@@ -136,7 +136,7 @@ def test_a_stage_depends_on_those_files_of_the_scene_that_it_says_it_reads(proje
 
 def preview(""",
     )
-    run_stages(capsys, project)
+    run_project(capsys, project)
     write_files(project, {"data/toy/drafts/idea.txt": "?"})
     assert set(statuses(project).values()) == {"cached"}
     write_files(project, {"data/toy/notes/idea.txt": "?"})
@@ -155,10 +155,10 @@ def scene_facts(params, scene):
 
 def preview(""",
     )
-    run_stages(capsys, project)
+    run_project(capsys, project)
     write_files(project, {"data/toy/drafts/idea.txt": "?"})
     assert statuses(project)["poses"] == "run need scene: drafts changed"
-    run_stages(capsys, project)
+    run_project(capsys, project)
     write_files(project, {"data/toy/drafts/idea.txt": "!"})
     assert set(statuses(project).values()) == {"cached"}
 
@@ -173,10 +173,10 @@ def test_a_stage_reruns_once_an_optional_need_exists(project, capsys):
 
 def run(""",
     )
-    assert run_stages(capsys, project) == ["evaluate"] and set(statuses(project).values()) == {"cached"}
+    assert run_project(capsys, project) == ["evaluate"] and set(statuses(project).values()) == {"cached"}
     write_files(project, {"stages/metric.txt": ""})
     assert statuses(project)["evaluate"] == "run the metric is on this machine now"
-    assert run_stages(capsys, project) == ["evaluate"]
+    assert run_project(capsys, project) == ["evaluate"]
     (project / "stages/metric.txt").unlink()
     assert set(statuses(project).values()) == {"cached"}
 
@@ -215,14 +215,14 @@ def test_exported_files_outlive_their_artifact(project, capsys):
     invent = """,
     )
     given = lambda: {path.name: path.read_text() for path in (project / "runs/toy/drafts").iterdir()}
-    run_stages(capsys, project, set="masks.threshold=102")
+    run_project(capsys, project, set="masks.threshold=102")
     assert given() == {"a": "102", "b": "102"}
     (project / "runs/toy/drafts/a").write_text("drawn")
     (project / "runs/toy/drafts/mine").write_text("too")
     run_scene(make_request(project, set="masks.threshold=103"), "masks")
     assert given() == {"a": "drawn", "b": "103", "c": "103", "mine": "too"}
     assert "toy/drafts/a was changed by hand: kept" in capsys.readouterr().out
-    run_stages(capsys, project, set="masks.threshold=101")
+    run_project(capsys, project, set="masks.threshold=101")
     assert given() == {"a": "drawn", "mine": "too"}
 
 
@@ -232,14 +232,14 @@ def test_code_edits(project, capsys):
     replace_text(optimize, "One step.", "A step.")
     replace_text(project / "stages/fit.py", 'description="steps"', 'description="how many"')
     replace_text(project / "reffusion/unused.py", "1", "2")
-    assert run_stages(capsys, project) == []
+    assert run_project(capsys, project) == []
     replace_text(project / "reffusion/numbers.py", "a + b", "a + b + 1")
     assert statuses(project)["fit"] == "run code of reffusion/numbers.py changed"
     trusted = statuses(project, trust=True)
     assert trusted["fit"] == "cached trusted although code of reffusion/numbers.py changed"
     assert trusted["evaluate"] == "cached"
     assert statuses(project, trust=True, set="fit.rate=3")["fit"].startswith("run param rate 2 -> 3")
-    assert run_stages(capsys, project, "fit") == ["fit"]
+    assert run_project(capsys, project, "fit") == ["fit"]
 
 
 def test_fingerprint():
@@ -267,24 +267,24 @@ def test_weights_profile_and_hand_edits(project, capsys):
     assert statuses(project, profile=None) == statuses(project)  # pinned by the first run
     (project / "runs/toy/fit/gaussians.ply").write_text("11")
     assert statuses(project, keep=True)["fit"] == "cached gaussians.ply changed"
-    assert run_stages(capsys, project, keep=True) == ["masks", "distill", "evaluate"] and read_score(project) == 11.0
+    assert run_project(capsys, project, keep=True) == ["masks", "distill", "evaluate"] and read_score(project) == 11.0
     assert (
-        statuses(project)["fit"] == "cached gaussians.ply by hand" and run_stages(capsys, project) == []
+        statuses(project)["fit"] == "cached gaussians.ply by hand" and run_project(capsys, project) == []
     )  # from then on
-    assert run_stages(capsys, project, set="fit.rate=3") == ["fit", "masks", "distill", "evaluate"]
+    assert run_project(capsys, project, set="fit.rate=3") == ["fit", "masks", "distill", "evaluate"]
     assert (project / "runs/toy/kept/fit/gaussians.ply").read_text() == "11"
 
 
 def test_skipped_and_provided_stages(project, capsys):
-    assert run_stages(capsys, project, set="masks.threshold=1") == ["masks", "evaluate"]
+    assert run_project(capsys, project, set="masks.threshold=1") == ["masks", "evaluate"]
     assert statuses(project, set="masks.threshold=1")["distill"] == "skip nothing to invent"
     assert statuses(project, set="distill.gain=0")["distill"] == "skip no gain"
     write_files(project, {"data/toy/scene.yaml": "shift: 1\ngaussians: mine.ply\n", "data/toy/mine.ply": "50"})
     assert statuses(project)["fit"] == "provided the scene brings `gaussians`"
-    run_stages(capsys, project)
+    run_project(capsys, project)
     assert read_score(project) == 50.0
     write_files(project, {"data/toy/unmasked": ""})
-    run_stages(capsys, project)
+    run_project(capsys, project)
     said = statuses(project)
     assert said["masks"] == "skip the scene has no masks" and said["distill"].startswith("skip")
 
@@ -293,7 +293,7 @@ def test_the_scenes_own_file_stands_for_a_stage_only_while_its_parameter_allows(
     replace_text(project / "pipeline.yaml", "artifact: poses}", "artifact: poses, param: fit.rate, equals: 2}")
     write_files(project, {"data/toy/scene.yaml": "gaussians: mine.ply\n", "data/toy/mine.ply": "50"})
     assert statuses(project)["fit"] == "provided the scene brings `gaussians`"
-    run_stages(capsys, project, set="fit.rate=3")
+    run_project(capsys, project, set="fit.rate=3")
     assert (
         statuses(project, set="fit.rate=3")["fit"] == "cached" and read_score(project) == 13.0
     )  # 3 steps of 3, and the scene's 4
@@ -323,28 +323,28 @@ def test_a_condition_may_hold_for_some_parameters_only_and_name_facts(project, c
         "if nothing to gain: known after masks"
     )
     assert statuses(project, set=nothing + "distill.gain=3")["distill"].startswith("run")
-    run_stages(capsys, project, set=nothing + "distill.gain=2")
+    run_project(capsys, project, set=nothing + "distill.gain=2")
     assert statuses(project, set=nothing + "distill.gain=2")["distill"] == "skip nothing to gain: 0 of 9"
     assert statuses(project, set=nothing + "distill.gain=3")["distill"].startswith("run")
 
 
 def test_scene_yaml_stages_rerun_only_their_stage(project, capsys):
     write_files(project, {"data/toy/scene.yaml": "profile: laptop\nstages: {distill: {gain: 3}}\n"})
-    assert run_stages(capsys, project) == ["distill", "evaluate"]
-    assert run_stages(capsys, project, set="distill.gain=4") == ["distill", "evaluate"]
+    assert run_project(capsys, project) == ["distill", "evaluate"]
+    assert run_project(capsys, project, set="distill.gain=4") == ["distill", "evaluate"]
     assert read_score(project) == 40.0
 
 
 def test_files_outside_the_scene_count(project, capsys):
     write_files(project, {"data/toy/scene.yaml": "gaussians: ../../mine.ply\n", "mine.ply": "50"})
-    run_stages(capsys, project, "poses")
+    run_project(capsys, project, "poses")
     write_files(project, {"mine.ply": "60"})
-    assert run_stages(capsys, project, "poses") == ["poses"]
+    assert run_project(capsys, project, "poses") == ["poses"]
     assert (project / "runs/toy/poses/gaussians.ply").read_text() == "60"
 
 
 def test_variants_share_what_they_do_not_change(project, capsys):
-    assert run_stages(capsys, project, variant="strong") == ["distill", "evaluate"]
+    assert run_project(capsys, project, variant="strong") == ["distill", "evaluate"]
     assert sorted(p.name for p in (project / "runs/toy@strong").iterdir() if p.is_dir()) == ["distill", "evaluate"]
     assert read_score(project, "toy@strong") == 50.0 and read_score(project) == 10.0
     assert set(statuses(project, variant="same").values()) == {"cached shared with toy"}
@@ -375,7 +375,7 @@ def test_a_killed_run_leaves_the_old_artifact_and_resumes(project, capsys):
     assert code == -signal.SIGKILL
     assert (project / "runs/toy/fit/gaussians.ply").read_text() == "10"
     assert statuses(project, **options)["fit"].endswith("goes on where it stopped")
-    assert run_stages(capsys, project, "fit", **options) == ["fit"]
+    assert run_project(capsys, project, "fit", **options) == ["fit"]
     assert int((project / "runs/toy/fit/trace.jsonl").read_text()) > 0  # the step it went on from
     assert (project / "runs/toy/fit/gaussians.ply").read_text() == "20"
     assert not list((project / "runs/toy").glob(".partial*"))
@@ -405,7 +405,7 @@ def test_two_runners_on_one_scene(project):
 def test_killed_in_the_swap(project, finished_project, capsys, moment):
     """The next run finds one whole artifact at every moment, and does not repeat finished work."""
     home, five = project / "runs/toy", {"target": "fit", "set": "fit.iterations=5"}
-    assert run_stages(capsys, project, **five) == ["fit"]
+    assert run_project(capsys, project, **five) == ["fit"]
     shutil.copytree(home / "fit", home / "new")
     shutil.rmtree(home / "fit")
     if moment == "after the old is moved":
@@ -418,7 +418,7 @@ def test_killed_in_the_swap(project, finished_project, capsys, moment):
         (home / "new").rename(home / "fit")
         if moment == "while the old is deleted":
             (home / old / "receipt.json").unlink()
-    assert run_stages(capsys, project, **five) == []
+    assert run_project(capsys, project, **five) == []
     assert (home / "fit/gaussians.ply").read_text() == "14"
     assert not list(home.glob(".[gop]*")) and not (home / "kept").exists()
 
@@ -430,7 +430,7 @@ def test_a_failing_stage_keeps_the_rest(project, capsys):
     assert "Traceback" in (project / "runs/toy/poses.log").read_text()
     assert read_score(project) == 10.0
     (project / "data/toy/broken").unlink()
-    assert run_stages(capsys, project) == []
+    assert run_project(capsys, project) == []
 
 
 # ---------------------------------------------------------------------------------------------------------- refusals
@@ -525,7 +525,7 @@ def test_clean_and_a_rerun_leave_what_people_put_there(project, tmp_path, capsys
     write_files(tmp_path, {"elsewhere/fit/gaussians.ply": "4"})
     (project / "runs/toy/linked").symlink_to(tmp_path / "elsewhere")
     assert statuses(project)["fit"] == "cached notes.txt added"
-    assert run_stages(capsys, project, "fit", set="fit.rate=3") == ["fit"]
+    assert run_project(capsys, project, "fit", set="fit.rate=3") == ["fit"]
     assert (project / "runs/toy/fit/notes.txt").read_text() == "2"
     (project / "runs/toy/poses/number.txt").write_text("9")
     maintenance.clean(make_request(project))
@@ -534,7 +534,7 @@ def test_clean_and_a_rerun_leave_what_people_put_there(project, tmp_path, capsys
     left = {path.relative_to(home).as_posix() for path in home.rglob("*") if path.is_file()}
     assert left == {"notes.txt", "report/x.txt", "fit/notes.txt", "to_paint/a.png", "poses/number.txt"}
     assert (tmp_path / "elsewhere/fit/gaussians.ply").read_text() == "4"
-    assert run_stages(capsys, project, "fit") == ["poses", "fit"]
+    assert run_project(capsys, project, "fit") == ["poses", "fit"]
     assert (home / "fit/notes.txt").exists() and (home / "kept/poses/number.txt").read_text() == "9"
 
 
@@ -674,7 +674,7 @@ def test_groups_merge_layer_over_layer(empty_project):
 
 def test_nested_parameters_rerun_and_leave_out_by_their_dotted_names(empty_project, capsys):
     write_files(empty_project, NESTING)
-    run_stages(capsys, empty_project)
+    run_project(capsys, empty_project)
     said = statuses(empty_project, set="distill.sds.lora.rank=9 distill.sds.weight=3")
     assert said["distill"] == "run param sds.lora.rank 8 -> 9, param sds.weight 0.5 -> 3.0"
     assert statuses(empty_project, set="distill.sds.weight=0")["distill"] == "skip no gain"
@@ -714,7 +714,7 @@ def test_the_layer_that_asked_last_is_named(empty_project):
 
 def test_a_parameter_that_is_no_part_of_the_key_reruns_nothing(empty_project, capsys):
     write_files(empty_project, NESTING)
-    run_stages(capsys, empty_project)
+    run_project(capsys, empty_project)
     assert set(statuses(empty_project, set="distill.checkpoint_seconds=5").values()) == {"cached"}
     receipt = json.loads((empty_project / "runs/toy/distill/receipt.json").read_text())
     assert receipt["params"]["checkpoint_seconds"] == 60.0 and receipt["unkeyed"] == ["checkpoint_seconds"]
@@ -727,7 +727,7 @@ def test_profiles_that_set_the_same_share_artifacts_and_old_receipts_hold(projec
         found = json.loads(path.read_text())
         del found["unkeyed"]
         path.write_text(json.dumps(found | {"key": "0" * 20}))
-    assert run_stages(capsys, project, profile="paper") == []
+    assert run_project(capsys, project, profile="paper") == []
     assert statuses(project, set="fit.rate=3")["fit"] == "run param rate 2 -> 3"
 
 
@@ -771,7 +771,7 @@ def test_a_stage_is_described_in_its_plan_module_and_that_is_no_part_of_its_code
     job = resolve(make_request(empty_project))
     assert "3 steps" in plan_table(job, plan(job, ["poses", "fit"])) and not imported.exists()
     assert (
-        "fit" in run_stages(capsys, empty_project) and imported.read_text() == "x"
+        "fit" in run_project(capsys, empty_project) and imported.read_text() == "x"
     )  # by the process that does the work
     assert read_score(empty_project) == 10.0
     code = json.loads((empty_project / "runs/toy/fit/receipt.json").read_text())["code"]

@@ -21,7 +21,7 @@ import torch
 from scenes.capture import write_four_photos
 from scenes.processes import run_module, start_module, wait_until
 from scenes.toy_projects import RUNNER_FILES, make_request, write_files
-from test_runner import REPO, finished_project, project, read_score, run_stages, start_runner, statuses
+from test_runner import REPO, finished_project, project, read_score, run_project, start_runner, statuses
 
 from reffusion import trace
 from runner import Refused, compare, maintenance
@@ -193,7 +193,7 @@ def test_missing_and_changed_files_are_named_and_made_again(project, capsys):
     assert said["fit"] == "run gaussians.ply changed since (keep=1 keeps it)" and said["poses"] == "cached"
     assert said["masks"] == "run facts.json missing" and said["evaluate"] == "run metrics.json missing"
     flip_byte(project / "runs/toy/poses/masks/a.png")
-    assert run_stages(capsys, project) == [
+    assert run_project(capsys, project) == [
         "poses",
         "fit",
         "masks",
@@ -266,7 +266,7 @@ def test_a_lock_that_is_lost_while_a_stage_works(project):
 
 def test_another_machine(project, capsys):
     write_files(project, {"runs/.locks/toy": "77 elsewhere\n"})
-    run_stages(capsys, project)
+    run_project(capsys, project)
     run_scene(make_request(project), "all")
     assert "elsewhere" not in capsys.readouterr().out and not (project / "runs/.locks/toy").read_text()
     write_files(project, {"runs/.locks/toy": "77 elsewhere\n"})
@@ -390,8 +390,8 @@ def test_typed_names_are_never_run_as_commands(stub_environment, typed):
 def test_a_quote_in_a_scenes_name(short_project, capsys):
     name = 'anna\'s "room"'
     (short_project / "data/toy").rename(short_project / "data" / name)
-    assert run_stages(capsys, short_project, "fit", scene=name) == ["fit"]
-    assert run_stages(capsys, short_project, "fit", scene=str(short_project / "data" / name), variant="strong") == [
+    assert run_project(capsys, short_project, "fit", scene=name) == ["fit"]
+    assert run_project(capsys, short_project, "fit", scene=str(short_project / "data" / name), variant="strong") == [
         "fit"
     ]
     maintenance.clean(make_request(short_project, scene=name))

@@ -12,11 +12,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from plyfile import PlyData, PlyElement
 from scenes.cameras import make_camera
 from scenes.capture import make_truth, write_capture
 from scenes.edited_capture import write_edited_capture
+from scenes.images import render_color
 from scenes.random_scene import random_gaussians
+from scenes.splat_tables import read_rows, replace_columns, write_rows
 
 from reffusion.io.arrays import load_labels
 from reffusion.io.compressed import load_spz, save_spz
@@ -24,33 +25,13 @@ from reffusion.io.files import BadInput
 from reffusion.io.ply import count_gaussians, load_ply, load_points, save_ply
 from reffusion.io.quantized import save_splat
 from reffusion.io.splats import load_splats
-from reffusion.splat import rasterizer
 from reffusion.types import Gaussians
 from stages import poses
 from stages.plan import poses as planned
 
 SH0 = 0.28209479177387814
 COUNT = 40
-
-
-def read_rows(path) -> np.ndarray:
-    return PlyData.read(str(path), mmap=False)["vertex"].data
-
-
-def write_rows(path, table, text=False) -> None:
-    PlyData([PlyElement.describe(table, "vertex")], text=text, byte_order="<").write(str(path))
-
-
-def replace_columns(table: np.ndarray, columns: dict[str, np.ndarray], leave_out: tuple[str, ...] = ()) -> np.ndarray:
-    kept = [name for name in table.dtype.names if name not in (*columns, *leave_out)]
-    made = np.empty(
-        len(table), [(name, table.dtype[name]) for name in kept] + [(n, c.dtype) for n, c in columns.items()]
-    )
-    for name in kept:
-        made[name] = table[name]
-    for name, column in columns.items():
-        made[name] = column
-    return made
+VIEW = make_camera("v", (48, 36), 40.0, (0.0, 0.0, -6.0))
 
 
 @pytest.fixture
@@ -58,10 +39,6 @@ def splat_file(tmp_path):
     """A .ply of 40 splats of degree 2, and its rows."""
     save_ply(tmp_path / "g.ply", random_gaussians(COUNT, 2))
     return tmp_path / "g.ply", read_rows(tmp_path / "g.ply")
-
-
-def render_color(gaussians: Gaussians) -> np.ndarray:
-    return rasterizer.render(gaussians, make_camera("v", (48, 36), 40.0, (0.0, 0.0, -6.0))).color.numpy()
 
 
 # ---------------------------------------------------------------------------------------------- rows
@@ -81,7 +58,7 @@ def test_infinite_opacities_and_flat_scales_look_as_their_limits(splat_file):
     opaque[3], flat[5, 2], flat[6, 0] = 80.0, -60.0, -60.0
     limit = Gaussians(made.means, made.quaternions, flat, opaque, made.sh)
     kept = limit.map(lambda p: p[torch.arange(COUNT) != 4])  # transparent: as if it were not there
-    np.testing.assert_allclose(render_color(made), render_color(kept), atol=1e-6)
+    np.testing.assert_allclose(render_color(made, VIEW), render_color(kept, VIEW), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +92,7 @@ def test_padding_is_dropped_and_a_zero_quaternion_is_the_identity(splat_file):
     assert not made.quaternions[7].any()
     turned = made.quaternions.clone()
     turned[7] = torch.tensor([1.0, 0.0, 0.0, 0.0])
-    np.testing.assert_array_equal(render_color(made), render_color(replace(made, quaternions=turned)))
+    np.testing.assert_array_equal(render_color(made, VIEW), render_color(replace(made, quaternions=turned), VIEW))
 
 
 def test_a_file_of_mostly_invalid_rows_is_refused(splat_file):
@@ -165,7 +142,7 @@ def test_two_scales_are_a_flat_splat(splat_file):
     np.testing.assert_array_equal(made.log_scales[:, 1], table["scale_1"])
     thin = made.log_scales.clone()
     thin[:, 2] = made.log_scales[:, :2].min(1).values - 9
-    np.testing.assert_allclose(render_color(made), render_color(replace(made, log_scales=thin)), atol=1e-4)
+    np.testing.assert_allclose(render_color(made, VIEW), render_color(replace(made, log_scales=thin), VIEW), atol=1e-4)
 
 
 @pytest.mark.parametrize("degree", [4, 5])
@@ -237,9 +214,9 @@ def test_spz_is_read_in_the_frame_of_a_ply(tmp_path, version):
     again = load_ply(path)
     np.testing.assert_allclose(again.means, made.means, atol=3e-4)
     np.testing.assert_allclose(again.log_scales, made.log_scales, atol=1 / 32 + 1e-4)
-    assert np.abs(render_color(again) - render_color(made)).mean() < 0.01
+    assert np.abs(render_color(again, VIEW) - render_color(made, VIEW)).mean() < 0.01
     blind = replace(again, sh=torch.cat([again.sh[:, :1], -again.sh[:, 1:]], 1))
-    assert np.abs(render_color(blind) - render_color(made)).mean() > 0.03
+    assert np.abs(render_color(blind, VIEW) - render_color(made, VIEW)).mean() > 0.03
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(BadInput, match=r"s\.spz: not a \.spz file"):
         load_spz(path)

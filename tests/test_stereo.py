@@ -11,16 +11,16 @@ from reffusion.types import Camera
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 
 
-def turned_camera(name: str, x: float, y: float = 0.0, turn: float = 0.0) -> Camera:
+def rig_camera(name: str, x: float, y: float = 0.0, turn: float = 0.0) -> Camera:
     """At (x, y, -1), looking along z, turned about y."""
     return make_camera(name, (WIDTH, HEIGHT), FOCAL, (x, y, -1.0), yaw(turn))
 
 
 CAMERAS = [
-    turned_camera("a", 0.0),
-    turned_camera("b", 0.08),
-    turned_camera("c", -0.07, 0.03, 0.05),
-    turned_camera("d", 0.02, -0.09),
+    rig_camera("a", 0.0),
+    rig_camera("b", 0.08),
+    rig_camera("c", -0.07, 0.03, 0.05),
+    rig_camera("d", 0.02, -0.09),
 ]
 
 
@@ -123,7 +123,7 @@ def test_plain_pictures_give_nothing():
 def test_lonely_views_and_opposite_ones_give_nothing():
     shown = paint_slope(0.0)
     assert len(stereo.triangulate_points(CAMERAS[:1], shown, 3)[0]) == 0
-    opposite = [CAMERAS[0], turned_camera("b", 0.1, turn=np.pi)]
+    opposite = [CAMERAS[0], rig_camera("b", 0.1, turn=np.pi)]
     assert len(stereo.triangulate_points(opposite, shown, 3)[0]) == 0
 
 

@@ -51,7 +51,7 @@ WAVES = [(np.array([np.cos(a), np.sin(a)]) * f, a * 7) for f in (9.0, 17.0, 31.0
 
 
 @pytest.fixture(scope="module")
-def depth_views() -> list[DepthView]:
+def ground_views() -> list[DepthView]:
     depths = [intersect_ground(view)[0].astype(np.float32) for view in CAMERAS]
     return [
         DepthView.from_range(view, depth, depth_range(depth), HOLE) for view, depth in zip(CAMERAS, depths, strict=True)
@@ -63,16 +63,16 @@ def uneven_depth(depth: np.ndarray) -> np.ndarray:
     return depth * (0.98 + 0.02 * np.random.default_rng(0).standard_normal(depth.shape))
 
 
-def test_photographs_tell_the_depth_that_splats_show_too_near(depth_views):
+def test_photographs_tell_the_depth_that_splats_show_too_near(ground_views):
     view, photos = CAMERAS[0], {each.name: paint_ground(each) for each in CAMERAS}
     true, ring = intersect_ground(view)[0], dilate(HOLE, 0.1) & ~HOLE
-    found = sweep.sweep_depth(photos["v0"], uneven_depth(true), ring, view, depth_views, photos)
+    found = sweep.sweep_depth(photos["v0"], uneven_depth(true), ring, view, ground_views, photos)
     told = found > 0
     assert told[ring].mean() > 0.7 and not told[~ring].any()
     assert abs(np.median(found[told] / true[told]) - 1) < 0.003
     plain = {name: np.full_like(photo, 128) for name, photo in photos.items()}
-    assert not sweep.sweep_depth(plain["v0"], uneven_depth(true), ring, view, depth_views, plain).any()
-    assert not sweep.sweep_depth(photos["v0"], uneven_depth(true), ring, view, depth_views[:1], photos).any()
+    assert not sweep.sweep_depth(plain["v0"], uneven_depth(true), ring, view, ground_views, plain).any()
+    assert not sweep.sweep_depth(photos["v0"], uneven_depth(true), ring, view, ground_views[:1], photos).any()
 
 
 def tilted_plane(height: float, tilt: float) -> Plane:
@@ -106,14 +106,14 @@ def hole_gaussians(sh_degree: int) -> Gaussians:
     return Gaussians(*(torch.from_numpy(part).float() for part in parts))
 
 
-def test_new_gaussians_reflect_as_the_surface_around_them(depth_views):
+def test_new_gaussians_reflect_as_the_surface_around_them(ground_views):
     photos = {view.name: paint_ground(view, shines=True) for view in CAMERAS}
     fresh = hole_gaussians(1)
     every = torch.ones(len(fresh), dtype=torch.bool)
     around = view_dependent_color.measure_change(
-        photos["v0"], intersect_ground(CAMERAS[0])[0], HOLE, CAMERAS[0], depth_views, photos
+        photos["v0"], intersect_ground(CAMERAS[0])[0], HOLE, CAMERAS[0], ground_views, photos
     )
-    lit = view_dependent_color.transfer_sh(fresh, every, CAMERAS[0], around, depth_views)
+    lit = view_dependent_color.transfer_sh(fresh, every, CAMERAS[0], around, ground_views)
     torch.testing.assert_close(colors(lit, CAMERAS[0], 1), colors(fresh, CAMERAS[0], 1), atol=1e-4, rtol=0)
     for view in CAMERAS[1:]:
         means = lit.means.double().numpy()
@@ -123,44 +123,44 @@ def test_new_gaussians_reflect_as_the_surface_around_them(depth_views):
         assert after < 0.04 and (before < 0.06 or after < before / 3)
 
 
-def test_a_matte_surface_stays_matte(depth_views):
+def test_a_matte_surface_stays_matte(ground_views):
     photos = {view.name: paint_ground(view) for view in CAMERAS}
     fresh = hole_gaussians(1)
     around = view_dependent_color.measure_change(
-        photos["v0"], intersect_ground(CAMERAS[0])[0], HOLE, CAMERAS[0], depth_views, photos
+        photos["v0"], intersect_ground(CAMERAS[0])[0], HOLE, CAMERAS[0], ground_views, photos
     )
     lit = view_dependent_color.transfer_sh(
-        fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, depth_views
+        fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, ground_views
     )
     torch.testing.assert_close(lit.sh, fresh.sh, atol=0.01, rtol=0)
 
 
-def test_a_shadow_that_a_reference_does_not_show_is_no_shine(depth_views):
+def test_a_shadow_that_a_reference_does_not_show_is_no_shine(ground_views):
     light = {view.name: paint_ground(view) for view in CAMERAS}
     photos = {name: (photo * 0.6).astype(np.uint8) for name, photo in light.items()}
     fresh = hole_gaussians(1)
     around = view_dependent_color.measure_change(
-        light["v0"], intersect_ground(CAMERAS[0])[0], HOLE, CAMERAS[0], depth_views, photos
+        light["v0"], intersect_ground(CAMERAS[0])[0], HOLE, CAMERAS[0], ground_views, photos
     )
     lit = view_dependent_color.transfer_sh(
-        fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, depth_views
+        fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, ground_views
     )
     torch.testing.assert_close(lit.sh, fresh.sh, atol=0.01, rtol=0)
 
 
-def test_no_reflection_is_transferred_without_observations_or_harmonics(depth_views):
+def test_no_reflection_is_transferred_without_observations_or_harmonics(ground_views):
     photos = {view.name: paint_ground(view, shines=True) for view in CAMERAS}
     flat, fresh = hole_gaussians(0), hole_gaussians(1)
     around = view_dependent_color.measure_change(
-        photos["v0"], intersect_ground(CAMERAS[0])[0], HOLE, CAMERAS[0], depth_views, photos
+        photos["v0"], intersect_ground(CAMERAS[0])[0], HOLE, CAMERAS[0], ground_views, photos
     )
     every = torch.ones(len(fresh), dtype=torch.bool)
-    assert view_dependent_color.transfer_sh(flat, every, CAMERAS[0], around, depth_views) is flat
-    assert view_dependent_color.transfer_sh(fresh, ~every, CAMERAS[0], around, depth_views) is fresh
+    assert view_dependent_color.transfer_sh(flat, every, CAMERAS[0], around, ground_views) is flat
+    assert view_dependent_color.transfer_sh(fresh, ~every, CAMERAS[0], around, ground_views) is fresh
     blind = view_dependent_color.measure_change(
-        photos["v0"], np.zeros_like(HOLE, float), HOLE, CAMERAS[0], depth_views, photos
+        photos["v0"], np.zeros_like(HOLE, float), HOLE, CAMERAS[0], ground_views, photos
     )
-    assert view_dependent_color.transfer_sh(fresh, every, CAMERAS[0], blind, depth_views) is fresh
+    assert view_dependent_color.transfer_sh(fresh, every, CAMERAS[0], blind, ground_views) is fresh
 
 
 def test_harmonics_are_orthonormal():

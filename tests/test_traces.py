@@ -39,7 +39,7 @@ DISTILL = {"iterations": 8, "sds": OFF, "adversarial": OFF, "depth": OFF, "refer
 
 
 @pytest.fixture(scope="module")
-def stage_folders(tmp_path_factory):
+def initialized_folders(tmp_path_factory):
     """The folders of a small scene up to `initialize`, and of a random prior."""
     home = tmp_path_factory.mktemp("scene")
     with pytest.MonkeyPatch.context() as patched:
@@ -49,17 +49,17 @@ def stage_folders(tmp_path_factory):
     return folders | {"prior": home / "prior"}
 
 
-def run_stage(stage: str, stage_folders, out: Path, **changed) -> Path:
+def run_stage(stage: str, initialized_folders, out: Path, **changed) -> Path:
     """Run one of the iterative stages on the small scene; return its folder."""
     out.mkdir(parents=True, exist_ok=True)
     if stage == "fit":
-        fit.run(fit.Params().changed(FIT | changed), out, poses=stage_folders["poses"])
+        fit.run(fit.Params().changed(FIT | changed), out, poses=initialized_folders["poses"])
     elif stage == "personalize":
-        params = personalize.Params(**{**PERSONALIZE, "prior": str(stage_folders["prior"]), **changed})
-        poses, reference = stage_folders["poses"], stage_folders["reference"]
+        params = personalize.Params(**{**PERSONALIZE, "prior": str(initialized_folders["prior"]), **changed})
+        poses, reference = initialized_folders["poses"], initialized_folders["reference"]
         personalize.run(params, out, poses=poses, raw_masks=poses.with_name("raw_masks"), reference=reference)
     else:
-        needs = {name: folder for name, folder in stage_folders.items() if name != "prior"}
+        needs = {name: folder for name, folder in initialized_folders.items() if name != "prior"}
         distill.run(distill.Params(**{**DISTILL, **changed}), out, personalize=None, **needs)
     return out
 
@@ -82,8 +82,8 @@ def has_same_result(one: Path, other: Path) -> bool:
 
 
 @pytest.mark.parametrize("stage", ["fit", "personalize", "distill"])
-def test_a_stages_trace_follows_the_schema(stage_folders, tmp_path, stage):
-    series = load_trace(run_stage(stage, stage_folders, tmp_path / stage) / "trace.jsonl", stage)
+def test_a_stages_trace_follows_the_schema(initialized_folders, tmp_path, stage):
+    series = load_trace(run_stage(stage, initialized_folders, tmp_path / stage) / "trace.jsonl", stage)
     found = series.pop("")
     assert not series and found[0]["iteration"] == 0 and main_quantity(stage, found) == MAIN[stage][0]
     steps = {"fit": 40, "personalize": 10, "distill": 8}[stage]
@@ -92,13 +92,13 @@ def test_a_stages_trace_follows_the_schema(stage_folders, tmp_path, stage):
     assert len(found) >= 5 and all(MAIN[stage][0] in line for line in found)
 
 
-def test_fit_without_held_out_views_is_judged_by_views_before_their_step(stage_folders, tmp_path):
-    found = load_trace(run_stage("fit", stage_folders, tmp_path / "fit", holdout=0) / "trace.jsonl", "fit")[""]
+def test_fit_without_held_out_views_is_judged_by_views_before_their_step(initialized_folders, tmp_path):
+    found = load_trace(run_stage("fit", initialized_folders, tmp_path / "fit", holdout=0) / "trace.jsonl", "fit")[""]
     assert main_quantity("fit", found) == "psnr" and "psnr" not in found[0] and "psnr" in found[1]
 
 
-def test_the_solvers_of_initialize_are_traced_against_points_they_do_not_get(stage_folders):
-    series = load_trace(stage_folders["initialize"] / "trace.jsonl", "initialize")
+def test_the_solvers_of_initialize_are_traced_against_points_they_do_not_get(initialized_folders):
+    series = load_trace(initialized_folders["initialize"] / "trace.jsonl", "initialize")
     assert set(series) == {"planes a2", "completion a2", "bilateral a2"}
     steps = series["bilateral a2"]
     assert len(steps) > 3 and steps[-1]["reason"] == "converged"
@@ -184,7 +184,7 @@ def test_checkpoints_cost_under_two_percent(tmp_path, monkeypatch, saving, every
 
 
 @pytest.mark.parametrize("stage", ["fit", "personalize", "distill"])
-def test_a_slow_disk_does_not_hold_a_stage_up(stage_folders, tmp_path, monkeypatch, stage):
+def test_a_slow_disk_does_not_hold_a_stage_up(initialized_folders, tmp_path, monkeypatch, stage):
     """One checkpoint of 0.3 s, and none more in a run of less than 15: by a clock of the test's own."""
     now, saved = [0.0], []
 
@@ -198,16 +198,16 @@ def test_a_slow_disk_does_not_hold_a_stage_up(stage_folders, tmp_path, monkeypat
 
     monkeypatch.setattr(trace.time, "monotonic", monotonic)
     monkeypatch.setattr(trace, "save_checkpoint", slowly)
-    run_stage(stage, stage_folders, tmp_path, checkpoint_seconds=1e-9)
+    run_stage(stage, initialized_folders, tmp_path, checkpoint_seconds=1e-9)
     assert len(saved) == 1
 
 
 @pytest.mark.parametrize("stage", list(KILLED))
-def test_a_stage_gives_the_same_after_a_kill(stage_folders, tmp_path, monkeypatch, stage):
+def test_a_stage_gives_the_same_after_a_kill(initialized_folders, tmp_path, monkeypatch, stage):
     monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
     module, name, position = KILLED[stage]
     often = {"checkpoint_seconds": 1e-9}
-    whole = run_stage(stage, stage_folders, tmp_path / "whole", **often)
+    whole = run_stage(stage, initialized_folders, tmp_path / "whole", **often)
     real, moment = getattr(module, name), trace_lines(whole)[-1]["iteration"] // 2
 
     def killing(*given):
@@ -217,10 +217,10 @@ def test_a_stage_gives_the_same_after_a_kill(stage_folders, tmp_path, monkeypatc
 
     monkeypatch.setattr(module, name, killing)
     with pytest.raises(KeyboardInterrupt):
-        run_stage(stage, stage_folders, tmp_path / "broken", **often)
+        run_stage(stage, initialized_folders, tmp_path / "broken", **often)
     assert (tmp_path / "broken" / trace.CHECKPOINT).exists()
     monkeypatch.setattr(module, name, real)
-    broken = run_stage(stage, stage_folders, tmp_path / "broken", **often)
+    broken = run_stage(stage, initialized_folders, tmp_path / "broken", **often)
     assert has_same_result(broken, whole)
     assert not (broken / trace.CHECKPOINT).exists()
 
@@ -282,14 +282,14 @@ def test_steps_that_fit_are_counted_once(tmp_path):
 
 
 @pytest.mark.parametrize("stage", ["fit", "personalize", "distill"])
-def test_a_budget_shortens_a_stage_and_its_schedule(stage_folders, tmp_path, stage):
+def test_a_budget_shortens_a_stage_and_its_schedule(initialized_folders, tmp_path, stage):
     """A moment's budget: the fewest steps, a twentieth; the trial before them leaves no mark on the result."""
     steps = {"fit": 2, "personalize": 1, "distill": 1}[stage]
-    out = run_stage(stage, stage_folders, tmp_path / "short", seconds=1e-3)
+    out = run_stage(stage, initialized_folders, tmp_path / "short", seconds=1e-3)
     assert trace_lines(out)[-1]["iteration"] == steps
     assert json.loads((out / trace.LENGTH).read_text())["steps"] == steps
     asked = run_stage(
-        stage, stage_folders, tmp_path / "asked", **{"steps" if stage == "personalize" else "iterations": steps}
+        stage, initialized_folders, tmp_path / "asked", **{"steps" if stage == "personalize" else "iterations": steps}
     )
     assert has_same_result(out, asked)
 

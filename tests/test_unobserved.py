@@ -58,33 +58,33 @@ def table_depth_view(view: Camera, notched: bool = False) -> DepthView:
 
 
 @pytest.fixture(scope="module")
-def depth_views():
+def table_views():
     above = [table_depth_view(table_camera(f"a{k}", 30 * k, 1.6)) for k in range(12)]
     return above + [
         table_depth_view(table_camera(f"l{k}", 60 * k, -0.5)) for k in range(6)
     ]  # these look under the table
 
 
-def test_a_point_is_seen_on_its_surface_only(depth_views):
+def test_a_point_is_seen_on_its_surface_only(table_views):
     points = np.array([[0.7, 0.7, 0.0], [0.7, 0.7, 0.4], [0.7, 0.7, -0.5], [0.0, 0.0, 0.25], [0.0, 0.0, 0.0]])
-    said = count_views(points, depth_views)
+    said = count_views(points, table_views)
     assert said.seen[0] >= 6 and said.free[0] == 0, "the table's top"
     assert said.free[1] >= 6 and said.seen[1] == 0, "the air above it"
     assert said.seen[2] == 0 and said.free[2] >= 2, "under the table low views look through"
-    assert said.seen[3] == said.free[3] == 0 and said.masked[3] == len(depth_views), "within the box nobody knows"
-    above = count_views(points, depth_views, np.tile([0.0, 0.0, 1.0], (5, 1)))
+    assert said.seen[3] == said.free[3] == 0 and said.masked[3] == len(table_views), "within the box nobody knows"
+    above = count_views(points, table_views, np.tile([0.0, 0.0, 1.0], (5, 1)))
     assert above.seen[4] == 0 and above.free[4] == 0, "nor, from above, what it stands on"
 
 
-def test_a_surface_does_not_face_views_from_its_other_side(depth_views):
+def test_a_surface_does_not_face_views_from_its_other_side(table_views):
     point = np.array([[0.7, 0.7, 0.0]])
-    up, down = (count_views(point, depth_views, np.array([[0.0, 0.0, z]])).seen[0] for z in (1.0, -1.0))
-    assert up + down == count_views(point, depth_views).seen[0]
+    up, down = (count_views(point, table_views, np.array([[0.0, 0.0, z]])).seen[0] for z in (1.0, -1.0))
+    assert up + down == count_views(point, table_views).seen[0]
     assert up >= 6 and down >= 1, "the thin top is seen from both"
 
 
-def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(depth_views):
-    planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, depth_views, NO_POINTS)
+def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(table_views):
+    planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, table_views, NO_POINTS)
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.offset))
     assert abs(table.normal[2]) > 0.999 and abs(table.offset) < 0.01
     view = table_camera("new", 15.0, 1.6)
@@ -99,8 +99,8 @@ def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(depth_views):
     np.testing.assert_allclose(at[footprint], depth[footprint], rtol=0.01)
 
 
-def test_a_table_is_seen_from_above_though_what_stands_beside_it_is_lower(depth_views):
-    above = [view for view in depth_views if view.camera.name.startswith("a")]
+def test_a_table_is_seen_from_above_though_what_stands_beside_it_is_lower(table_views):
+    above = [view for view in table_views if view.camera.name.startswith("a")]
     planes = find_planes(np.array([0.0, 0.0, -0.2]), 0.45, above, NO_POINTS)
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.offset))
     assert table.contains(table.seen, np.array([[0.7, 0.7, 0.0]]))[0]
@@ -160,9 +160,9 @@ def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
     assert ground.continued[under].mean() > 0.95
 
 
-def test_gaussians_beneath_the_table_are_not_the_surface_behind_the_box(depth_views):
+def test_gaussians_beneath_the_table_are_not_the_surface_behind_the_box(table_views):
     """Left there by a fit that is wrong about the ground in one view."""
-    camera = depth_views[0].camera
+    camera = table_views[0].camera
     rays = world_rays(camera)
     beneath = np.clip((-0.2 - camera.center[2]) / np.minimum(rays[..., 2], -1e-3), 0, 20)
     grey = np.full((SIZE, SIZE, 3), 128, np.uint8)
@@ -174,7 +174,7 @@ def test_gaussians_beneath_the_table_are_not_the_surface_behind_the_box(depth_vi
         depth = (-0.2 - view.camera.center[2]) / np.minimum(rays[..., 2], -1e-3)
         return DepthView.from_range(view.camera, depth, (depth, depth), view.masked)
 
-    above = depth_views[:12]
+    above = table_views[:12]
     others = count_views(geometry.unproject(beneath, camera)[hidden], above[4:]).occluded
     asked = np.zeros_like(hidden)
     asked[hidden] = others > 3
@@ -207,12 +207,12 @@ def test_slivers_go_and_patches_stay():
     assert not found[:40].any() and found[52:78, 52:88].all() and not (found & ~mask).any()
 
 
-def test_an_object_that_hides_its_far_side_does_not_refute_it(depth_views):
+def test_an_object_that_hides_its_far_side_does_not_refute_it(table_views):
     """Half of the views look at the box's side from behind: something stands before it there."""
     exact = lambda depth: (depth, (depth, depth))
     whole = [
         DepthView.from_range(v.camera, *exact(render_box_depth(v.camera)), np.zeros_like(v.masked))
-        for v in depth_views[:12]
+        for v in table_views[:12]
     ]
     point, side = np.array([[BOX, 0.0, 0.25]]), np.array([[1.0, 0.0, 0.0]])
     plain, faced = count_views(point, whole), count_views(point, whole, side)
@@ -225,8 +225,8 @@ def render_box_depth(view: Camera) -> np.ndarray:
     return np.where(hidden, meet_box(view, *CORNERS)[0], depth)
 
 
-def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(depth_views):
-    view, other = depth_views[0], depth_views[1]
+def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(table_views):
+    view, other = table_views[0], table_views[1]
     depth, hidden, on_table = render_table(view.camera)
     place = geometry.unproject(depth, view.camera)
     shadow = on_table & ~hidden & (np.hypot(place[..., 0] - 0.5, place[..., 1] - 0.5) < 0.3)
@@ -265,15 +265,15 @@ def test_gaussians_of_other_colours_than_gravel_are_debris():
     assert not count_color_mismatches(Gaussians(*parts), [smooth], {"v": photo}).any()
 
 
-def test_visibility_of_points_follows_the_formulas(depth_views):
+def test_visibility_of_points_follows_the_formulas(table_views):
     """Points on both surfaces, before, behind and beside them, behind cameras and nowhere; with and without a side."""
     noise = np.random.default_rng(0)
     points = noise.uniform(-1.5, 1.5, (3000, 3)) * (1, 1, 0.7)
     points[:1000, 2], points[1000:1500, 2], points[-2], points[-1] = TOP, FLOOR, (9, 0, 0.5), np.nan
     normals = noise.normal(size=points.shape)
     for sides in (None, normals):
-        said, expected = count_views(points, depth_views, sides), np.zeros((4, len(points)), int)
-        for view in depth_views:
+        said, expected = count_views(points, table_views, sides), np.zeros((4, len(points)), int)
+        for view in table_views:
             uv, z = geometry.project(points, view.camera)
             maps = (view.masked, view.nearest, view.farthest)
             (hidden, inside), (nearest, _), (farthest, _) = (geometry.sample_nearest(each, uv) for each in maps)

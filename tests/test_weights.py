@@ -27,7 +27,7 @@ PARTS = ("unet", "vae", "text_encoder", "tokenizer", "scheduler")
 
 
 @pytest.fixture
-def empty_caches(tmp_path, monkeypatch):
+def isolated_machine(tmp_path, monkeypatch):
     """Empty caches, an empty working directory, and no network."""
     for name in ("HF_HUB_CACHE", "HF_HUB_OFFLINE", "TORCH_HOME"):
         monkeypatch.delenv(name, raising=False)
@@ -66,15 +66,15 @@ def write_hub_entry(tmp_path, name="acme/paint", state="0123abc", main=True) -> 
 # ------------------------------------------------------------------------------------------------------ where they lie
 
 
-def test_an_id_is_found_in_the_hub_cache_and_loaded_without_a_network(empty_caches):
-    entry = write_hub_entry(empty_caches)
+def test_an_id_is_found_in_the_hub_cache_and_loaded_without_a_network(isolated_machine):
+    entry = write_hub_entry(isolated_machine)
     assert local.locate("acme/paint") == entry / "snapshots" / "0123abc"
     prior = load_prior("acme/paint")
     assert prior.native_size == 64 and load_prior(entry).native_size == 64
 
 
-def test_the_state_that_main_names_is_taken(empty_caches):
-    entry = write_hub_entry(empty_caches, main=False)
+def test_the_state_that_main_names_is_taken(isolated_machine):
+    entry = write_hub_entry(isolated_machine, main=False)
     assert local.locate("acme/paint") == entry / "snapshots" / "0123abc"  # the only one
     (entry / "snapshots" / "0456def").mkdir()
     assert local.locate("acme/paint") is None
@@ -83,33 +83,33 @@ def test_the_state_that_main_names_is_taken(empty_caches):
     assert local.locate("acme/paint").name == "0456def"
 
 
-def test_an_id_is_found_as_a_folder_here_and_in_the_projects_cache(empty_caches):
-    mine = copy_prior(empty_caches / "cache" / "reffusion" / "acme" / "paint")
+def test_an_id_is_found_as_a_folder_here_and_in_the_projects_cache(isolated_machine):
+    mine = copy_prior(isolated_machine / "cache" / "reffusion" / "acme" / "paint")
     assert local.locate("acme/paint") == mine
-    here = copy_prior(empty_caches / "elsewhere" / "acme" / "paint")
+    here = copy_prior(isolated_machine / "elsewhere" / "acme" / "paint")
     assert local.locate("acme/paint").resolve() == here
 
 
-def test_the_hubs_own_variables_are_read(empty_caches, monkeypatch):
-    assert local.hub_cache() == empty_caches / "hub" / "hub"
-    monkeypatch.setenv("HF_HUB_CACHE", str(empty_caches / "other"))
-    assert local.hub_cache() == empty_caches / "other"
+def test_the_hubs_own_variables_are_read(isolated_machine, monkeypatch):
+    assert local.hub_cache() == isolated_machine / "hub" / "hub"
+    monkeypatch.setenv("HF_HUB_CACHE", str(isolated_machine / "other"))
+    assert local.hub_cache() == isolated_machine / "other"
 
 
-def test_missing_weights_are_reported_at_once_with_alternatives(empty_caches):
+def test_missing_weights_are_reported_at_once_with_alternatives(isolated_machine):
     with pytest.raises(
         ValueError, match=r"prior priors/tiny is not on this machine: no folder .*elsewhere/priors/tiny"
     ):
         load_prior("priors/tiny")
     with pytest.raises(ValueError, match=r"run `make weights`.*stable-diffusion-v1-5/stable-diffusion-inpainting"):
         load_prior(published.SD2)
-    for wrong in (empty_caches / "absent", "./absent", "three/part/name", "~/absent"):
+    for wrong in (isolated_machine / "absent", "./absent", "three/part/name", "~/absent"):
         with pytest.raises(ValueError, match="no such folder"):
             load_prior(wrong)
 
 
-def test_half_precision_files_alone_are_enough(empty_caches):
-    folder = copy_prior(empty_caches / "half")
+def test_half_precision_files_alone_are_enough(isolated_machine):
+    folder = copy_prior(isolated_machine / "half")
     (folder / "unet" / "diffusion_pytorch_model.safetensors").rename(
         folder / "unet" / "diffusion_pytorch_model.fp16.safetensors"
     )
@@ -124,7 +124,7 @@ def edit_json(path: Path, **changes) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
-def truncate_file(path: Path, keep: float) -> None:
+def truncate_to_share(path: Path, keep: float) -> None:
     path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
 
 
@@ -138,10 +138,10 @@ UNET, VAE, TEXT = "unet/config.json", "vae/config.json", "text_encoder/config.js
 WRONG = {
     "a part is missing": (lambda f: shutil.rmtree(f / "vae"), "lacks vae; it must be a diffusers pipeline folder"),
     "cut short": (
-        lambda f: truncate_file(f / "unet/diffusion_pytorch_model.safetensors", 0.9),
+        lambda f: truncate_to_share(f / "unet/diffusion_pytorch_model.safetensors", 0.9),
         r"unet/diffusion_pytorch_model.safetensors is cut short.*make weights",
     ),
-    "cut to nothing": (lambda f: truncate_file(f / "text_encoder/model.safetensors", 0), "no readable header"),
+    "cut to nothing": (lambda f: truncate_to_share(f / "text_encoder/model.safetensors", 0), "no readable header"),
     "a web page": (lambda f: (f / "text_encoder/model.safetensors").write_text("<html>" * 9), "no readable header"),
     "no safetensors": (lambda f: (f / "text_encoder/model.safetensors").unlink(), "no .safetensors file there"),
     "no configuration": (lambda f: (f / VAE).write_text("{"), r"vae/config.json cannot be read"),
@@ -175,31 +175,31 @@ WRONG = {
 
 
 @pytest.mark.parametrize("spoil, message", WRONG.values(), ids=WRONG)
-def test_each_fault_has_its_message(empty_caches, spoil, message):
-    folder = copy_prior(empty_caches / "faulty")
+def test_each_fault_has_its_message(isolated_machine, spoil, message):
+    folder = copy_prior(isolated_machine / "faulty")
     spoil(folder)
     with pytest.raises(ValueError, match=rf"prior (?s:.*){message}"):
         load_prior(folder)
 
 
-def test_a_lost_shard_is_named(empty_caches):
-    folder = copy_prior(empty_caches / "shards")
+def test_a_lost_shard_is_named(isolated_machine):
+    folder = copy_prior(isolated_machine / "shards")
     index = folder / "unet" / "diffusion_pytorch_model.safetensors.index.json"
     index.write_text(json.dumps({"weight_map": {"a": "diffusion_pytorch_model-00001-of-00002.safetensors"}}))
     with pytest.raises(ValueError, match=r"00001-of-00002.safetensors is missing"):
         local.check(folder)
 
 
-def test_weights_needed_by_a_stage(empty_caches):
+def test_weights_needed_by_a_stage(isolated_machine):
     need = local.model_need(published.SD2, "float16")
     assert "not on this machine" in need.problem and need.fetched and 2.5e9 < need.bytes < 2.7e9
-    folder = copy_prior(empty_caches / "good")
+    folder = copy_prior(isolated_machine / "good")
     assert local.model_need(str(folder), "float32").problem is None
     shutil.rmtree(folder / "unet")
     broken = local.model_need(str(folder), "float32")
     assert "lacks unet" in broken.problem and not broken.fetched
     assert "no weights of alex and vgg" in local.lpips_need().problem and local.lpips_need().optional
-    own = empty_caches / "cache" / "reffusion" / "lpips"
+    own = isolated_machine / "cache" / "reffusion" / "lpips"
     own.mkdir(parents=True)
     for name in ("alex.safetensors", "vgg.pth"):  # whole, and half of a pair
         (own / name).write_bytes(b"x")

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
+
+from reffusion.splat import rasterizer
+from reffusion.types import Camera, Gaussians
 
 
 def rectangle_mask(shape: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int]) -> np.ndarray:
@@ -40,3 +44,9 @@ def natural_noise(seed: int, size=(160, 120)) -> np.ndarray:
 
 def psnr(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / max(((a.astype(float) - b)[where] ** 2).mean(), 1e-3)))
+
+
+def render_color(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """float32 [H, W, 3]: the rendered colours, which may exceed [0, 1]."""
+    with torch.no_grad():
+        return rasterizer.render(gaussians, camera).color.numpy()
