@@ -1,14 +1,16 @@
 """The backdrop outside all training views: it has no holes or blobs, and is scored separately."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from scenes import wall_scene
 from scenes.cameras import make_camera, yaw
-from scenes.images import render_color
+from scenes.gaussians import join_gaussians, round_gaussians
 
 from reffusion import geometry
-from reffusion.background import backdrop, training_coverage
+from reffusion.background import training_coverage
 from reffusion.io.arrays import load_json
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
@@ -32,75 +34,8 @@ def panned_camera(degrees: float) -> Camera:
 
 def add_gaussian(gaussians: Gaussians, mean, sizes, color) -> Gaussians:
     """The Gaussians and one opaque Gaussian more."""
-    sh = torch.zeros(1, gaussians.sh.shape[1], 3)
-    sh[0, 0] = (torch.tensor(color) - 0.5) / 0.2820948
-    rows = torch.tensor([mean]), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([sizes]).log(), torch.tensor([4.0]), sh
-    return gaussians.zip_map(Gaussians(*rows), lambda a, b: torch.cat([a, b]))
-
-
-# --- what is shown there
-
-
-def test_the_backdrop_continues_the_picture_and_keeps_seen_pixels():
-    scene = wall_gaussians()
-    done = backdrop.complete_scene([scene], TRAIN)[0]
-    for camera in TRAIN:
-        assert np.abs(render_color(done, camera).clip(0, 1) - render_color(scene, camera).clip(0, 1)).max() < 0.02
-    away = panned_camera(75)
-    assert rasterizer.render(scene, away).alpha.numpy().mean() < 0.5  # black, most of it
-    drawn = rasterizer.render(done, away)
-    assert drawn.alpha.min() > 0.95
-    open_ = rasterizer.render(scene, away).alpha.numpy() < 0.01
-    colors = drawn.color.numpy()[open_]
-    seen = np.concatenate([render_color(scene, camera).clip(0, 1).reshape(-1, 3) for camera in TRAIN])
-    assert (colors > seen.min(0) - 0.05).all() and (colors < seen.max(0) + 0.05).all()
-    steps = np.abs(np.diff(drawn.color.numpy(), axis=1)).max(-1)[open_[:, 1:] & open_[:, :-1]]
-    assert steps.max() < 0.03
-
-
-def test_each_direction_takes_the_colours_that_lie_there():
-    left, right = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
-    color = lambda x, y: np.where(x[..., None] < 0, left, right)
-    done = backdrop.complete_scene([wall_scene.rectangle_gaussians(wall_scene.WALL, 2.0, 1.4, color)], TRAIN)[0]
-    to_the_left, to_the_right = (
-        render_color(done, panned_camera(angle)).clip(0, 1).mean((0, 1)) for angle in (-80, 80)
-    )
-    assert to_the_left[0] > 2 * to_the_left[2] and to_the_right[2] > 2 * to_the_right[0]
-
-
-def test_needles_outside_the_capture_are_removed():
-    needle = add_gaussian(wall_gaussians(), [5.0, 0.0, 2.0], [0.8, 0.01, 0.01], [0.0, 1.0, 0.0])
-    away = panned_camera(65)
-    assert (
-        render_color(needle, away).clip(0, 1)[..., 1] - render_color(wall_gaussians(), away).clip(0, 1)[..., 1]
-    ).max() > 0.5
-    with_it, without = (
-        render_color(backdrop.complete_scene([scene], TRAIN)[0], away).clip(0, 1)
-        for scene in (needle, wall_gaussians())
-    )
-    assert np.abs(with_it - without).max() < 0.05
-
-
-def test_what_one_training_view_shows_stays():
-    spot = add_gaussian(wall_gaussians(), [0.9, 0.0, 1.9], [0.02, 0.02, 0.02], [0.0, 1.0, 0.0])
-    assert any(
-        np.abs(render_color(spot, camera).clip(0, 1) - render_color(wall_gaussians(), camera).clip(0, 1)).max() > 0.3
-        for camera in TRAIN
-    )
-    done = backdrop.complete_scene([spot], TRAIN)[0]
-    assert (done.means == spot.means[-1]).all(1).any()
-
-
-def test_a_scene_without_training_views_or_gaussians_is_left_alone():
-    scene = wall_gaussians()
-    assert backdrop.complete_scene([scene], [])[0] is scene
-    nothing = scene.map(lambda p: p[:0])
-    assert len(backdrop.complete_scene([nothing], TRAIN)[0]) == 0
-    behind = Camera("b", 8, 8, 8.0, 8.0, 4.0, 4.0, np.diag([-1.0, 1.0, -1.0, 1.0]))
-    assert len(backdrop.complete_scene([scene], [behind])[0]) == len(scene)  # it sees none: nothing to continue
-
-
-# --- what was seen
+    one = round_gaussians([mean], [color], 1.0, 4.0, gaussians.sh.shape[1])
+    return join_gaussians(gaussians, replace(one, log_scales=torch.tensor([sizes]).log()))
 
 
 def coverage_views(scene: Gaussians, masks=None) -> list[training_coverage.CoverageView]:
@@ -132,7 +67,7 @@ def test_unseen_is_what_all_training_views_hide_behind_something_or_under_masks(
     square = wall_scene.rectangle_gaussians(
         at, wall_scene.HALF, wall_scene.HALF, lambda x, y: np.full((*x.shape, 3), 0.5)
     )
-    both = full.zip_map(square, lambda a, b: torch.cat([a, b]))
+    both = join_gaussians(full, square)
     aside = wall_scene.front_camera("aside", 0.9)
     points = wall_scene.wall_points(aside)
     framed = np.any([((uv >= 0) & (uv < (c.width, c.height))).all(-1) & ~wall_scene.is_behind_square(points, c, at)

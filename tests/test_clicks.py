@@ -10,6 +10,7 @@ import torch
 from scenes import capture as captures
 from scenes import wall_scene
 from scenes.browser import open_page
+from scenes.gaussians import round_gaussians
 from scenes.stage_runs import run_masks
 
 from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points
@@ -23,8 +24,6 @@ from reffusion.io.scene import load_mask_sets
 from reffusion.masks import voting
 from reffusion.params.poses import Params as Poses
 from reffusion.splat import rasterizer
-from reffusion.splat.conventions import SH0
-from reffusion.types import Gaussians
 from report.mask import Server
 from report.mask_session import Capture, Session
 from stages import masks, poses
@@ -173,15 +172,8 @@ def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
         sheet_points((-0.5, -0.5, 2.5), (0, 0, 0.8), (0, 1, 0), (0.5, 0.3, 0.12)),
         sheet_points((0.5, -0.5, 2.5), (0, 0, 0.8), (0, 1, 0), (0.5, 0.3, 0.12)),
     ]
-    means, colors = (torch.tensor(np.concatenate(each), dtype=torch.float32) for each in zip(*parts, strict=True))
-    count = len(means)
-    scene = Gaussians(
-        means,
-        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-        torch.full((count, 3), np.log(0.025)),
-        torch.full((count,), 4.0),
-        ((colors - 0.5) / SH0)[:, None],
-    )
+    means, colors = (np.concatenate(each) for each in zip(*parts, strict=True))
+    scene = round_gaussians(means, colors, 0.025, 4.0)
     cameras = {name: wall_scene.front_camera(name, x) for name, x in (("left", -1.6), ("middle", 0.0), ("right", 1.6))}
     with torch.no_grad():
         images = {n: to_uint8(rasterizer.render(scene, c).color.clamp(0, 1).numpy()) for n, c in cameras.items()}

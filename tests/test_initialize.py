@@ -7,6 +7,7 @@ import pytest
 import torch
 from scenes import wall_scene
 from scenes.cameras import look_at_camera, make_camera, orbit_camera, yaw
+from scenes.gaussians import join_gaussians
 from scenes.stage_runs import run_through_masks, write_true_references
 
 from reffusion import geometry
@@ -190,7 +191,7 @@ def test_a_hidden_gaussian_does_not_become_a_speck_of_another_colour():
     red = np.zeros_like(picture) + np.uint8([255, 0, 0])
     before = surface_gaussians(red, 0.9 * far, everything, view, sh_count=1, spread=0.4)
     new = surface_gaussians(picture, far, everything, view, sh_count=1, spread=0.4)
-    both = before.zip_map(new, lambda a, b: torch.cat([a, b]))
+    both = join_gaussians(before, new)
     labels = torch.arange(len(both)) >= len(before)
     colors = 0.5 + SH0 * rules.match_colors(both, labels, picture, everything, view, 5).sh[labels, 0]
     assert colors.min() > 110 / 255 - 0.11 and colors.max() < 140 / 255 + 0.11
@@ -275,7 +276,7 @@ def test_the_back_of_a_thing_is_drawn_though_its_front_shows_from_behind():
     depth = np.where(drawn, near, wall_scene.WALL)
     assert (coverage.pixels_in_front(wall, depth, reference, hidden) == drawn).all()
     front = wall_scene.rectangle_gaussians(near, wall_scene.HALF, wall_scene.HALF, wall_scene.wall_color)
-    both = wall.zip_map(front, lambda a, b: torch.cat([a, b]))
+    both = join_gaussians(wall, front)
     assert coverage.pixels_in_front(both, depth, reference, hidden).sum() < 0.2 * drawn.sum()  # the square's soft rim
     assert not coverage.pixels_in_front(wall, depth, reference, drawn).any()
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from scenes import wall_scene
+from scenes.gaussians import join_gaussians, round_gaussians
 from scenes.stage_runs import run_masks
 
 from reffusion import geometry, morphology
@@ -12,7 +13,6 @@ from reffusion.io.images import load_mask, save_mask
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets
 from reffusion.masks import consolidation, regions, voting
-from reffusion.types import Gaussians
 from stages.masks import Params
 
 NEAR, FAR = 1.7, 0.8  # a square close to the wall hides part of it from all views; a distant one next to nothing
@@ -26,15 +26,12 @@ def classify(tmp_path, square_at, params=None, **scene):
 
 
 def one_gaussian(z, opacity=0.9, scale=0.1):
-    return Gaussians(
-        torch.tensor([[0.0, 0.0, z]]), torch.zeros(1, 4), torch.full((1, 3), float(np.log(scale))),
-        torch.full((1,), float(np.log(opacity / (1 - opacity)))), torch.zeros(1, 1, 3),
-    )  # fmt: skip
+    return round_gaussians([[0.0, 0.0, z]], [[0.5, 0.5, 0.5]], scale, float(np.log(opacity / (1 - opacity))))
 
 
 def test_a_vote_is_the_blending_weight_inside_and_outside_the_mask():
     view, front, back = wall_scene.front_camera("v", 0.0), one_gaussian(1.0), one_gaussian(1.5)
-    both = front.zip_map(back, lambda a, b: torch.cat([a, b]))
+    both = join_gaussians(front, back)
     left = np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
     left[:, : wall_scene.WIDTH // 2] = True
     votes = voting.cast_votes(both, [view], {"v": left}, mode="weight")
@@ -258,7 +255,7 @@ def test_faint_gaussians_show_mostly_where_no_view_saw():
     inside = wall_scene.true_mask(view, 1.0)
     aside = blob.map(lambda p: p.clone())
     aside.means[0, 0] = 0.4
-    both = blob.zip_map(aside, lambda a, b: torch.cat([a, b]))
+    both = join_gaussians(blob, aside)
     assert voting.find_floaters(both, [view], {"v": inside}).tolist() == [True, False]
 
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 from scenes.cameras import look_at_camera, make_camera, world_rays
+from scenes.gaussians import round_gaussians
 
 from reffusion.background import continuation
 from reffusion.background.plane import CELLS, Plane, remove_reflected_depth
 from reffusion.background.visibility import DepthView, depth_range
 from reffusion.initialize import sweep, view_dependent_color
 from reffusion.morphology import dilate
-from reffusion.splat.conventions import SH0
 from reffusion.splat.reference import colors, harmonics
 from reffusion.types import Camera, Gaussians
 
@@ -99,11 +99,7 @@ def hole_gaussians(sh_degree: int) -> Gaussians:
     """Gaussians on the ground under the hole, in the colours of the first view without reflection."""
     view = CAMERAS[0]
     points, picture = intersect_ground(view)[1][HOLE], paint_ground(view, shines=True)[HOLE] / 255
-    sh = np.zeros((len(points), (sh_degree + 1) ** 2, 3))
-    sh[:, 0] = (picture - 0.5) / SH0
-    count = len(points)
-    parts = (points, np.tile([1.0, 0, 0, 0], (count, 1)), np.full((count, 3), -4.0), np.full(count, 2.0), sh)
-    return Gaussians(*(torch.from_numpy(part).float() for part in parts))
+    return round_gaussians(points, picture, np.exp(-4.0), 2.0, (sh_degree + 1) ** 2)
 
 
 def test_new_gaussians_reflect_as_the_surface_around_them(ground_views):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from scenes.cameras import meet_box, orbit_camera, uneven_depth_view, world_rays
+from scenes.gaussians import round_gaussians
 
 from reffusion import geometry
 from reffusion.background.continuation import find_planes
@@ -13,7 +14,6 @@ from reffusion.background.symmetry import find_mirrors
 from reffusion.background.unobserved import find_unobserved
 from reffusion.background.visibility import DepthView
 from reffusion.splat import rasterizer
-from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
 NO_POINTS = np.zeros((0, 3))
@@ -82,15 +82,7 @@ def make_vase_scene(cut: bool = False, halved: bool = False):
         seen.append(points[::2, ::2][(~view.masked & (view.depth < 6))[::2, ::2]])
     points = np.concatenate(seen)
     points = points[np.unique(np.floor(points / 0.02), axis=0, return_index=True)[1]]
-    count = len(points)
-    tensor = lambda values: torch.tensor(np.asarray(values), dtype=torch.float32)
-    gaussians = Gaussians(
-        tensor(points),
-        tensor(np.tile([1.0, 0, 0, 0], (count, 1))),
-        tensor(np.full((count, 3), np.log(0.012))),
-        tensor(np.full(count, 6.0)),
-        tensor((vase_color(points, halved) - 0.5) / SH0)[:, None],
-    )
+    gaussians = round_gaussians(points, vase_color(points, halved), 0.012, 6.0)
     return views, photos, gaussians
 
 

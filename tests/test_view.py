@@ -10,6 +10,7 @@ import torch
 from scenes import wall_scene
 from scenes.browser import open_page
 from scenes.cameras import make_scene
+from scenes.gaussians import join_gaussians
 from scenes.processes import wait_until
 
 from reffusion.io.arrays import save_json, save_labels
@@ -87,7 +88,7 @@ def test_the_backdrop_of_evaluate_counts_as_kept(tmp_path):
     """And what it leaves out is missing from either."""
     gaussians, labels = write_finished_job(tmp_path / "x", NEEDS)
     backdrop = gaussians.map(lambda p: p[:5] + 3)
-    fewer = gaussians.map(lambda p: p[1:]).zip_map(backdrop, lambda a, b: torch.cat([a, b]))
+    fewer = join_gaussians(gaussians.map(lambda p: p[1:]), backdrop)
     save_ply(tmp_path / "x/evaluate/scene.ply", fewer, similarity=SIMILARITY)
     kept, added = gaussian_layers.load_layers(tmp_path / "x", SIMILARITY).states["result"]
     assert len(kept) + len(added) == len(fewer) and len(added) == int(labels[1:].sum())

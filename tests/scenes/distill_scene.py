@@ -9,6 +9,7 @@ from reffusion.params.distill import Adversarial, Params, Sds
 from reffusion.seeding import generator
 from reffusion.types import PARAMETERS, Gaussians, MaskSet
 from scenes.cameras import make_camera, make_scene
+from scenes.gaussians import round_gaussians
 from scenes.settings import with_changes
 
 WIDTH, HEIGHT = 36, 28
@@ -86,9 +87,7 @@ def write_initialized_run(home, invent):
     """Write a wall in front of three views, each with the hole `invent`, bool [H, W]; return the folder."""
     draw = generator(0, "wall")
     means = torch.rand(80, 3, generator=draw) * torch.tensor([1.6, 1.2, 0.1]) - torch.tensor([0.8, 0.6, -1.5])
-    wall = Gaussians(
-        means, torch.zeros(80, 4), torch.full((80, 3), -2.0), torch.full((80,), 2.0), torch.zeros(80, 1, 3)
-    )
+    wall = round_gaussians(means, torch.full((80, 3), 0.5), math.exp(-2.0), 2.0)
     names, height, width = ("a", "b", "c"), *invent.shape
     cameras = {name: make_camera(name, (width, height), 40.0) for name in names}
     save_scene(home / "poses", make_scene(cameras, clean=("c",)))

@@ -3,16 +3,15 @@
 from pathlib import Path
 
 import torch
-from diffusers import UNet2DConditionModel
 
 from reffusion.prior.model import Prior, make_prior, pipeline
 
-TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
+TINY = Path(__file__).resolve().parents[2] / "priors" / "tiny"
 
 
 def small_prior(seed: int = 0) -> Prior:
     """The embedded prior's VAE, text encoder and schedule around a UNet of 16 and 16 channels, seeded."""
-    from diffusers import AutoencoderKL, DDIMScheduler
+    from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
     from transformers import CLIPTextModel, CLIPTokenizer
 
     torch.manual_seed(seed)

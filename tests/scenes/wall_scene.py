@@ -17,6 +17,7 @@ from reffusion.io.scene import save_scene
 from reffusion.types import Camera
 from reffusion.workspace import SURFACES, Workspace
 from scenes.cameras import make_camera, make_scene
+from scenes.gaussians import join_gaussians
 
 WALL, HALF, RIM = 2.0, 0.17, 0.015  # depth of the wall; half the side of the square, and its soft rim; scene units
 WIDTH, HEIGHT, FOCAL = 96, 72, 90.0
@@ -55,7 +56,7 @@ def wall_and_square(square_at: float):
     seen = torch.from_numpy(~is_hidden_everywhere(wall.means.numpy(), square_at))
     square = rectangle_gaussians(square_at, HALF, HALF, lambda x, y: np.broadcast_to((0.9, 0.1, 0.1), (*x.shape, 3)))
     labels = torch.cat([torch.zeros(int(seen.sum()), dtype=torch.bool), torch.ones(len(square), dtype=torch.bool)])
-    return wall.map(lambda p: p[seen]).zip_map(square, lambda a, b: torch.cat([a, b])), labels
+    return join_gaussians(wall.map(lambda p: p[seen]), square), labels
 
 
 def is_behind_square(points: np.ndarray, view: Camera, square_at: float) -> np.ndarray:
