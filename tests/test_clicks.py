@@ -177,7 +177,7 @@ def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
     cameras = {name: wall_scene.front_camera(name, x) for name, x in (("left", -1.6), ("middle", 0.0), ("right", 1.6))}
     with torch.no_grad():
         images = {n: to_uint8(rasterizer.render(scene, c).color.clamp(0, 1).numpy()) for n, c in cameras.items()}
-    box = torch.arange(count) >= len(parts[0][0])
+    box = torch.arange(len(means)) >= len(parts[0][0])
     near, mask = all_views.find_neighbours(scene), voting.render_labels(scene, box, cameras["middle"]) > 0.5
     found = all_views.label_gaussians(scene, near, cameras, {"middle": mask}, images.__getitem__)
     assert (found & box).sum() > 0.95 * box.sum() and (found & ~box).sum() < 0.01 * box.sum()

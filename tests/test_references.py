@@ -22,6 +22,7 @@ from scenes.capture import (
     write_capture,
     write_pictures,
 )
+from scenes.gaussians import join_gaussians
 from scenes.images import natural_noise, psnr, rectangle_mask
 from scenes.references import (
     SIZE,
@@ -513,9 +514,8 @@ def test_objects_in_front_of_a_scene_are_compared_at_their_own_depth():
     near, step = 1.4, 1.7
     floor = wall_scene.rectangle_gaussians(step, 2.0, 0.25, wall_scene.wall_color)
     floor = replace(floor, means=floor.means + torch.tensor([0.0, 0.6, 0.0]))
-    scene = wall_scene.rectangle_gaussians(wall_scene.WALL, 2.0, 1.4, wall_scene.wall_color).zip_map(
-        floor, lambda a, b: torch.cat([a, b])
-    )
+    wall = wall_scene.rectangle_gaussians(wall_scene.WALL, 2.0, 1.4, wall_scene.wall_color)
+    scene = join_gaussians(wall, floor)
     references = []
     for view in (wall_scene.front_camera("a", -0.2), wall_scene.front_camera("b", 0.2)):
         drawn = wall_scene.true_mask(view, near)

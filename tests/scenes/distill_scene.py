@@ -1,5 +1,7 @@
 """A small wall of random Gaussians whose middle is masked, and the views and settings that distill it."""
 
+import math
+
 import torch
 
 from reffusion.distill.train_view import TrainView
