@@ -15,11 +15,7 @@ from scenes.gaussians import round_gaussians
 from scenes.settings import with_changes
 
 WIDTH, HEIGHT = 36, 28
-
-
 SDS = Sds(weighting="x0", guidance=0.0)
-
-
 ADVERSARIAL = Adversarial(patches=4, size=8, width=4)
 
 
@@ -71,11 +67,7 @@ SETTINGS = Params(
     iterations=6, sds=SDS, depth={"weight": 0}, adversarial=ADVERSARIAL, reference={"weight": 0.5},
     densify={"every": 2, "stop": 1}, checkpoint_seconds=1e-9,
 )  # fmt: skip
-
-
 OFF = {"weight": 0}
-
-
 PLAIN = with_changes(SETTINGS, adversarial=OFF, reference=OFF, densify={"every": 0})
 
 
