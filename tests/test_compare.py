@@ -27,7 +27,6 @@ from runner.compare import compare
 
 REPO = Path(__file__).resolve().parent.parent
 
-
 PUBLISHED = 'method,metric,value,protocol\nsomebody,psnr_box,19.5,"ten scenes, 1600 px"\n'
 
 
