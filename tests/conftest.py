@@ -1,4 +1,4 @@
-"""What several tests are given."""
+"""Fixtures that several test files use."""
 
 import os
 import sys
@@ -15,7 +15,7 @@ DATA = Path(__file__).parents[1] / "data"
 
 @pytest.fixture(scope="module")
 def generate():
-    """data/generate.py, its neighbours importable."""
+    """The module data/generate.py, with its neighbours importable."""
     sys.path.insert(0, str(DATA))
     try:
         import generate
@@ -26,9 +26,17 @@ def generate():
 
 
 @pytest.fixture(scope="module")
+def mini_scene(generate, tmp_path_factory):
+    """The folder of the smallest synthetic scene; tests must not change it."""
+    folder = tmp_path_factory.mktemp("scene") / "mini"
+    generate.generate(folder, 0, generate.KINDS["mini"])
+    return folder
+
+
+@pytest.fixture(scope="module")
 def prior():
     """A small random inpainting prior, one for all tests of a module."""
-    from small_prior import small_prior
+    from scenes.networks import small_prior
 
     return small_prior()
 
@@ -45,6 +53,14 @@ def text(prior):
         return embed_text(prior, list(PROMPTS))
 
 
+@pytest.fixture
+def wall_folders(tmp_path):
+    """The folders before the stage `reference`, of the wall with a square before it."""
+    from scenes.references import write_wall_stages
+
+    return write_wall_stages(tmp_path)
+
+
 def pytest_collection_modifyitems(items):
-    """The file that takes longest first: at the end one process would be busy with it while the other waits."""
+    """Run the longest file first: with two processes it would otherwise run alone at the end."""
     items.sort(key=lambda item: item.path.name != "test_resume.py")

@@ -1,4 +1,4 @@
-"""The exact limits of the alignment of depth."""
+"""Alignment of disparity and depth: exact recovery, outliers and degenerate input."""
 
 import numpy as np
 import pytest
@@ -15,14 +15,18 @@ def test_alignment_recovers_scale_and_offset_in_any_unit(offset, unit):
     np.testing.assert_allclose(fitted.apply(x), -3.0 * x / unit + 7.0, rtol=1e-9, atol=1e-8)
 
 
-def test_alignment_minimises_squares_on_known_pixels_only():
-    rng = np.random.default_rng(0)
-    x, w = rng.normal(size=50), (rng.random(50) > 0.3).astype(float)
-    y = 2.0 * x + rng.normal(size=50)
-    fitted = align(x, np.where(w > 0, y, 1e9), w)
-    slope, intercept = np.polyfit(x[w > 0], y[w > 0], 1)
-    assert (fitted.scale, fitted.offset) == pytest.approx((slope, intercept))
-    assert fitted.residual == pytest.approx(np.sqrt(np.mean((y - fitted.apply(x))[w > 0] ** 2)))
+@pytest.mark.parametrize("weights", ["equal", "random", "known or not"])
+def test_alignment_solves_the_weighted_normal_equations(weights):
+    draw = np.random.default_rng(0)
+    x, noise = draw.normal(3, 2, 200), draw.normal(0, 0.3, 200)
+    y = 0.7 * x - 1.2 + noise
+    w = {"equal": np.ones(200), "random": draw.random(200), "known or not": draw.random(200) > 0.3}[weights] * 1.0
+    matrix = np.array([[(w * x * x).sum(), (w * x).sum()], [(w * x).sum(), w.sum()]])
+    scale, offset = np.linalg.inv(matrix) @ ((w * x * y).sum(), (w * y).sum())
+    found = align(x, np.where(w > 0, y, 1e9), w)
+    np.testing.assert_allclose((found.scale, found.offset), (scale, offset), rtol=1e-10)
+    misfit = np.sqrt((w * (y - scale * x - offset) ** 2).sum() / w.sum())
+    assert found.residual == pytest.approx(misfit, rel=1e-9)
 
 
 def test_robust_alignment_lets_go_of_outliers():

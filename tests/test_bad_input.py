@@ -1,6 +1,6 @@
-"""Bad input, a row each: one line that names the file or the key, at once, and nothing is touched.
+"""Bad input is refused at once, in one line that names the file or the key, and nothing is written.
 
-Most rows go through what the command does below its process start (`told`); some through the command itself.
+Most cases call what the command calls after it starts (`first_message`); some run the command itself.
 """
 
 from __future__ import annotations
@@ -9,8 +9,6 @@ import json
 import os
 import shutil
 import struct
-import subprocess
-import sys
 import time
 import zlib
 from collections.abc import Callable
@@ -19,7 +17,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from small_capture import HEIGHT, WIDTH, prepare, some_truth, write_masks, write_pictures
+from scenes.capture import HEIGHT, WIDTH, make_truth, write_capture, write_masks, write_pictures
+from scenes.processes import run_module
 
 from reffusion.capture.roles import capture_views
 from reffusion.capture.scene_folder import read_scene
@@ -44,16 +43,16 @@ Change = Callable[[Path], None]
 
 
 @pytest.fixture(scope="session")
-def captures(tmp_path_factory) -> Path:
-    """A good capture of each layout, to copy and to spoil."""
+def good_captures(tmp_path_factory) -> Path:
+    """A good capture of each layout, to copy and to corrupt."""
     home = tmp_path_factory.mktemp("good")
     for layout in ("llff", "colmap", "colmap txt", "transforms", "photos"):
-        prepare(home / layout, layout, some_truth())
+        write_capture(home / layout, layout, make_truth())
     return home
 
 
-def told(folder: Path, out: Path, set_: str = "") -> str | None:
-    """What the command says of a scene, or None where it goes through `poses`. Other errors than ours come out."""
+def first_message(folder: Path, out: Path, set_: str = "") -> str | None:
+    """The message of the command for a scene, or None where `poses` accepts it. Unexpected errors are raised."""
     try:
         scene = load_scene_file(folder, PIPELINE)
         profile, _ = choose_profile("laptop" if scene.profile is None else None, scene, [], PIPELINE)
@@ -85,14 +84,16 @@ def told(folder: Path, out: Path, set_: str = "") -> str | None:
     return None
 
 
-def refused(captures: Path, tmp_path: Path, layout: str, change: Change, names: str, set_: str = "") -> str:
-    """Spoil a copy of a good capture, and check what is said of it."""
+def assert_bad_input(
+    good_captures: Path, tmp_path: Path, layout: str, change: Change, names: str, set_: str = ""
+) -> str:
+    """Corrupt a copy of a good capture, and check the message."""
     folder, out = tmp_path / "s", tmp_path / "out"
-    shutil.copytree(captures / layout, folder)
+    shutil.copytree(good_captures / layout, folder)
     out.mkdir()
     change(folder)
     began = time.monotonic()
-    said = told(folder, out, set_)
+    said = first_message(folder, out, set_)
     assert said is not None, "accepted"
     assert time.monotonic() - began < LONGEST
     assert "\n" not in said and len(said) < 1000 and names in said, said
@@ -103,7 +104,7 @@ def refused(captures: Path, tmp_path: Path, layout: str, change: Change, names: 
 # ---------------------------------------------------------------------------------------------- what changes a capture
 
 
-def file(name: str, content: bytes | str) -> Change:
+def write_file(name: str, content: bytes | str) -> Change:
     def change(folder: Path) -> None:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).unlink(missing_ok=True)
@@ -112,16 +113,16 @@ def file(name: str, content: bytes | str) -> Change:
     return change
 
 
-def yaml(text: str) -> Change:
-    return file("scene.yaml", text)
+def write_yaml(text: str) -> Change:
+    return write_file("scene.yaml", text)
 
 
-def cut(name: str, keep: int) -> Change:
-    """The first bytes of a file; without its last ones where `keep` is negative."""
+def truncate_file(name: str, keep: int) -> Change:
+    """Keep the first bytes of a file; a negative `keep` drops the last ones."""
     return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:keep])
 
 
-def replaced(name: str, old: str, new: str) -> Change:
+def replace_in_file(name: str, old: str, new: str) -> Change:
     def change(folder: Path) -> None:
         text = (folder / name).read_text()
         assert old in text
@@ -130,8 +131,8 @@ def replaced(name: str, old: str, new: str) -> Change:
     return change
 
 
-def other_kind(name: str, kind: str) -> Change:
-    """A folder, a pipe, or a link to nothing where a file is expected."""
+def replace_by(name: str, kind: str) -> Change:
+    """Put a folder, a pipe, or a dangling link in place of a file."""
 
     def change(folder: Path) -> None:
         path = folder / name
@@ -142,7 +143,7 @@ def other_kind(name: str, kind: str) -> Change:
     return change
 
 
-def record(change: Callable[[dict], object]) -> Change:
+def change_transforms(change: Callable[[dict], object]) -> Change:
     def edit(folder: Path) -> None:
         path = folder / "transforms.json"
         content = json.loads(path.read_text())
@@ -152,19 +153,19 @@ def record(change: Callable[[dict], object]) -> Change:
     return edit
 
 
-def key(name: str, value: object) -> Change:
-    return record(lambda r: r.update({name: value}))
+def set_key(name: str, value: object) -> Change:
+    return change_transforms(lambda r: r.update({name: value}))
 
 
-def in_frame(name: str, value: object) -> Change:
-    return record(lambda r: r["frames"][1].update({name: value}))
+def set_frame_key(name: str, value: object) -> Change:
+    return change_transforms(lambda r: r["frames"][1].update({name: value}))
 
 
-def rows(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+def edit_bounds(change: Callable[[np.ndarray], np.ndarray]) -> Change:
     return lambda folder: np.save(folder / "poses_bounds.npy", change(np.load(folder / "poses_bounds.npy")))
 
 
-def pixel(row: int, column: int, value: float) -> Callable[[np.ndarray], np.ndarray]:
+def set_value(row: int, column: int, value: float) -> Callable[[np.ndarray], np.ndarray]:
     def change(array: np.ndarray) -> np.ndarray:
         array[row, column] = value
         return array
@@ -172,7 +173,7 @@ def pixel(row: int, column: int, value: float) -> Callable[[np.ndarray], np.ndar
     return change
 
 
-def both(*changes: Change) -> Change:
+def do_all(*changes: Change) -> Change:
     def change(folder: Path) -> None:
         for each in changes:
             each(folder)
@@ -180,8 +181,8 @@ def both(*changes: Change) -> Change:
     return change
 
 
-def png(width: int, height: int, kind: int = 2) -> bytes:
-    """A PNG file that declares a size, and holds hardly anything."""
+def png_header(width: int, height: int, kind: int = 2) -> bytes:
+    """A PNG file that declares a size and contains almost no data."""
     chunk = lambda tag, data: struct.pack(">I", len(data)) + tag + data + struct.pack(">I", zlib.crc32(tag + data))
     header = struct.pack(">IIBBBBB", width, height, 8, kind, 0, 0, 0)
     return (
@@ -189,7 +190,7 @@ def png(width: int, height: int, kind: int = 2) -> bytes:
     )
 
 
-def npy(shape: str, data: bytes = b"", descr: str = "'<f8'") -> bytes:
+def npy_header(shape: str, data: bytes = b"", descr: str = "'<f8'") -> bytes:
     header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}".encode().ljust(117) + b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + data
 
@@ -318,8 +319,8 @@ YAML = {
 
 
 @pytest.mark.parametrize("text", YAML.values(), ids=YAML.keys())
-def test_scene_yaml(captures, tmp_path, text):
-    refused(captures, tmp_path, "transforms", yaml(text), "")
+def test_scene_yaml(good_captures, tmp_path, text):
+    assert_bad_input(good_captures, tmp_path, "transforms", write_yaml(text), "")
 
 
 VALUES = {  # parameter -> values that it cannot have
@@ -340,12 +341,14 @@ VALUES = {  # parameter -> values that it cannot have
 
 
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in VALUES.items() for value in values])
-def test_values_of_parameters(captures, tmp_path, name, value):
+def test_values_of_parameters(good_captures, tmp_path, name, value):
     stage, *groups = name.split(".")
     text = "".join(f"{{{group}: " for group in groups) + value + "}" * len(groups)
-    refused(captures, tmp_path, "transforms", yaml(f"stages: {{{stage}: {text}}}"), f"{name}")
+    assert_bad_input(good_captures, tmp_path, "transforms", write_yaml(f"stages: {{{stage}: {text}}}"), f"{name}")
     if "[" not in value and "{" not in value and '"' not in value:
-        said = refused(captures, tmp_path / "typed", "transforms", lambda folder: None, name, f"{name}={value}")
+        said = assert_bad_input(
+            good_captures, tmp_path / "typed", "transforms", lambda folder: None, name, f"{name}={value}"
+        )
         assert said.startswith("set: ")
 
 
@@ -367,18 +370,18 @@ SET = {
 
 
 @pytest.mark.parametrize("text", SET.values(), ids=SET.keys())
-def test_what_is_typed_as_set(captures, tmp_path, text):
-    refused(captures, tmp_path, "transforms", lambda folder: None, "", text)
+def test_set_options_are_refused(good_captures, tmp_path, text):
+    assert_bad_input(good_captures, tmp_path, "transforms", lambda folder: None, "", text)
 
 
 @pytest.mark.parametrize("kind", ["folder", "pipe", "link"])
-def test_scene_yaml_that_is_no_file(captures, tmp_path, kind):
-    refused(captures, tmp_path, "transforms", other_kind("scene.yaml", kind), "scene.yaml")
+def test_scene_yaml_of_other_file_types(good_captures, tmp_path, kind):
+    assert_bad_input(good_captures, tmp_path, "transforms", replace_by("scene.yaml", kind), "scene.yaml")
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfei\0m\0", b"images: \xe4\xf6", b"\0\0\0", b"x" * 1_100_000])
-def test_scene_yaml_of_other_bytes(captures, tmp_path, content):
-    refused(captures, tmp_path, "transforms", file("scene.yaml", content), "scene.yaml")
+def test_scene_yaml_of_other_bytes(good_captures, tmp_path, content):
+    assert_bad_input(good_captures, tmp_path, "transforms", write_file("scene.yaml", content), "scene.yaml")
 
 
 # ---------------------------------------------------------------------------------------------- transforms.json
@@ -386,31 +389,35 @@ def test_scene_yaml_of_other_bytes(captures, tmp_path, content):
 NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "p1")
 NO_NUMBERS: tuple[object, ...] = ("640", float("nan"), float("inf"), None, True, [], {"a": 1}, 1e300)
 TRANSFORMS: dict[str, Change] = {
-    **{f"{name} = {value!r}": key(name, value) for name in NUMBERS for value in NO_NUMBERS},
-    **{f"{name} = {value!r}": key(name, value) for name in ("w", "h", "fl_x", "fl_y") for value in (0, -100)},
-    **{f"frame's {name} = 'x'": in_frame(name, "x") for name in NUMBERS},
+    **{f"{name} = {value!r}": set_key(name, value) for name in NUMBERS for value in NO_NUMBERS},
+    **{f"{name} = {value!r}": set_key(name, value) for name in ("w", "h", "fl_x", "fl_y") for value in (0, -100)},
+    **{f"frame's {name} = 'x'": set_frame_key(name, "x") for name in NUMBERS},
     **{
-        f"angle = {value!r}": both(record(lambda r: r.pop("fl_x") and None), key("camera_angle_x", value))
+        f"angle = {value!r}": do_all(
+            change_transforms(lambda r: r.pop("fl_x") and None), set_key("camera_angle_x", value)
+        )
         for value in (0, -1, 3.2, 7, "wide", float("nan"))
     },
-    "w of other proportions": key("w", 500),
-    "model a mapping": key("camera_model", {"a": list(range(1000))}),
-    "model unknown": key("camera_model", "OPENCV2"),
-    "no intrinsics": record(lambda r: r.pop("fl_x") and None),
-    "a list": record(lambda r: [r]),
-    "a number": record(lambda r: 5),
-    "nothing": record(lambda r: {}),
-    "no frames": key("frames", []),
-    "frames a mapping": key("frames", {"0": 1}),
-    "frames of numbers": key("frames", [1, 2, 3]),
-    "frames of null": key("frames", [None]),
-    "a frame without path": record(lambda r: r["frames"][0].pop("file_path") and None),
-    "a frame without pose": record(lambda r: r["frames"][0].pop("transform_matrix") and None),
-    **{f"path {value!r}": in_frame("file_path", value) for value in (5, None, [], "", "a\0b", {}, True, "/", ".")},
-    "no picture is there": record(lambda r: [f.update(file_path="none/x.png") for f in r["frames"]] and None),
-    "two of a name": record(lambda r: r["frames"][0].update(file_path=r["frames"][1]["file_path"])),
+    "w of other proportions": set_key("w", 500),
+    "model a mapping": set_key("camera_model", {"a": list(range(1000))}),
+    "model unknown": set_key("camera_model", "OPENCV2"),
+    "no intrinsics": change_transforms(lambda r: r.pop("fl_x") and None),
+    "a list": change_transforms(lambda r: [r]),
+    "a number": change_transforms(lambda r: 5),
+    "nothing": change_transforms(lambda r: {}),
+    "no frames": set_key("frames", []),
+    "frames a mapping": set_key("frames", {"0": 1}),
+    "frames of numbers": set_key("frames", [1, 2, 3]),
+    "frames of null": set_key("frames", [None]),
+    "a frame without path": change_transforms(lambda r: r["frames"][0].pop("file_path") and None),
+    "a frame without pose": change_transforms(lambda r: r["frames"][0].pop("transform_matrix") and None),
+    **{f"path {value!r}": set_frame_key("file_path", value) for value in (5, None, [], "", "a\0b", {}, True, "/", ".")},
+    "no picture is there": change_transforms(
+        lambda r: [f.update(file_path="none/x.png") for f in r["frames"]] and None
+    ),
+    "two of a name": change_transforms(lambda r: r["frames"][0].update(file_path=r["frames"][1]["file_path"])),
     **{
-        f"pose {name}": in_frame("transform_matrix", value)
+        f"pose {name}": set_frame_key("transform_matrix", value)
         for name, value in {
             "of words": [["a"] * 4] * 4,
             "of null": [[None] * 4] * 4,
@@ -430,24 +437,24 @@ TRANSFORMS: dict[str, Change] = {
         }.items()
     },
     **{
-        f"points file {value!r}": key("ply_file_path", value)
+        f"points file {value!r}": set_key("ply_file_path", value)
         for value in (5, [], "", "a\0b", "images", "transforms.json")
     },
-    **{f"cut at {keep}": cut("transforms.json", keep) for keep in (0, 1, 10, 100, 500, -1, -30)},
-    "deep": file("transforms.json", "[" * 100_000),
-    "deep mappings": file("transforms.json", '{"a":' * 100_000),
-    "long number": file("transforms.json", '{"frames": ' + "9" * 10_000 + "}"),
-    "latin": file("transforms.json", '{"frames": "é"}'.encode("latin-1")),
-    "zeros": file("transforms.json", b"\0" * 100),
-    "not JSON": file("transforms.json", "frames: []"),
-    "a picture": file("transforms.json", png(2, 2)),
-    **{f"a {kind}": other_kind("transforms.json", kind) for kind in ("folder", "pipe", "link")},
+    **{f"cut at {keep}": truncate_file("transforms.json", keep) for keep in (0, 1, 10, 100, 500, -1, -30)},
+    "deep": write_file("transforms.json", "[" * 100_000),
+    "deep mappings": write_file("transforms.json", '{"a":' * 100_000),
+    "long number": write_file("transforms.json", '{"frames": ' + "9" * 10_000 + "}"),
+    "latin": write_file("transforms.json", '{"frames": "é"}'.encode("latin-1")),
+    "zeros": write_file("transforms.json", b"\0" * 100),
+    "not JSON": write_file("transforms.json", "frames: []"),
+    "a picture": write_file("transforms.json", png_header(2, 2)),
+    **{f"a {kind}": replace_by("transforms.json", kind) for kind in ("folder", "pipe", "link")},
 }
 
 
 @pytest.mark.parametrize("change", TRANSFORMS.values(), ids=TRANSFORMS.keys())
-def test_transforms_json(captures, tmp_path, change):
-    said = refused(captures, tmp_path, "transforms", change, "")
+def test_transforms_json(good_captures, tmp_path, change):
+    said = assert_bad_input(good_captures, tmp_path, "transforms", change, "")
     assert "transforms.json" in said or ".png" in said or "images" in said
 
 
@@ -457,7 +464,7 @@ MODEL = "sparse/0"
 CAMERA = "1 SIMPLE_PINHOLE 96 72 90"  # begins the line in cameras.txt
 COLMAP_TEXT: dict[str, tuple[str, Change]] = {
     **{
-        f"camera: {line!r:.40}": ("cameras.txt", file(f"{MODEL}/cameras.txt", line + "\n"))
+        f"camera: {line!r:.40}": ("cameras.txt", write_file(f"{MODEL}/cameras.txt", line + "\n"))
         for line in (
             "1",
             "1 SIMPLE_PINHOLE",
@@ -481,16 +488,16 @@ COLMAP_TEXT: dict[str, tuple[str, Change]] = {
         )
     },
     **{
-        f"camera: {line!r:.40}": (names, file(f"{MODEL}/cameras.txt", line + "\n"))
+        f"camera: {line!r:.40}": (names, write_file(f"{MODEL}/cameras.txt", line + "\n"))
         for names, line in (
             ("SIMPLE_RADIAL", "1 SIMPLE_RADIAL 96 72 90 48 36 -9"),
             ("OPENCV_FISHEYE", "1 OPENCV_FISHEYE 96 72 10 10 48 36 0 0 0 0"),
             ("v00.png", "1 SIMPLE_PINHOLE 500 72 90 48 36"),
         )
     },
-    "no cameras": ("images", file(f"{MODEL}/cameras.txt", "")),
+    "no cameras": ("images", write_file(f"{MODEL}/cameras.txt", "")),
     **{
-        f"image: {line!r:.40}": ("images", file(f"{MODEL}/images.txt", line + "\n\n"))
+        f"image: {line!r:.40}": ("images", write_file(f"{MODEL}/images.txt", line + "\n\n"))
         for line in (
             "1 1 0 0 0",
             "x 1 0 0 0 0 0 0 1 v00.png",
@@ -505,10 +512,10 @@ COLMAP_TEXT: dict[str, tuple[str, Change]] = {
             "1 1 0 0 0 0 0 0 1 v00.png\n\n2 1 0 0 0 0 0 0 1 v00.png",
         )
     },
-    "one image": ("training view", file(f"{MODEL}/images.txt", "1 1 0 0 0 0 0 0 1 v00.png\n\n")),
-    "no images": ("images", file(f"{MODEL}/images.txt", "")),
+    "one image": ("training view", write_file(f"{MODEL}/images.txt", "1 1 0 0 0 0 0 0 1 v00.png\n\n")),
+    "no images": ("images", write_file(f"{MODEL}/images.txt", "")),
     **{
-        f"point: {line!r:.40}": ("points3D.txt", file(f"{MODEL}/points3D.txt", line + "\n"))
+        f"point: {line!r:.40}": ("points3D.txt", write_file(f"{MODEL}/points3D.txt", line + "\n"))
         for line in (
             "1",
             "1 0 0",
@@ -523,7 +530,7 @@ COLMAP_TEXT: dict[str, tuple[str, Change]] = {
         )
     },
     **{
-        f"{name} {kind}": (name, other_kind(f"{MODEL}/{name}", kind))
+        f"{name} {kind}": (name, replace_by(f"{MODEL}/{name}", kind))
         for name in ("cameras.txt", "images.txt", "points3D.txt")
         for kind in ("folder", "pipe", "link")
     },
@@ -531,12 +538,12 @@ COLMAP_TEXT: dict[str, tuple[str, Change]] = {
 
 
 @pytest.mark.parametrize(("names", "change"), COLMAP_TEXT.values(), ids=COLMAP_TEXT.keys())
-def test_colmap_text(captures, tmp_path, names, change):
-    refused(captures, tmp_path, "colmap txt", change, names)
+def test_colmap_text(good_captures, tmp_path, names, change):
+    assert_bad_input(good_captures, tmp_path, "colmap txt", change, names)
 
 
-def number(name: str, at: int, layout: str, value: float) -> Change:
-    """A number written over another in a binary file."""
+def overwrite_number(name: str, at: int, layout: str, value: float) -> Change:
+    """Overwrite a number in a binary file."""
 
     def change(folder: Path) -> None:
         data = bytearray((folder / name).read_bytes())
@@ -548,12 +555,12 @@ def number(name: str, at: int, layout: str, value: float) -> Change:
 
 COLMAP_BINARY: dict[str, tuple[str, Change]] = {
     **{
-        f"{name} cut at {keep}": (f"{name}.bin", cut(f"{MODEL}/{name}.bin", keep))
+        f"{name} cut at {keep}": (f"{name}.bin", truncate_file(f"{MODEL}/{name}.bin", keep))
         for name in ("cameras", "images", "points3D")
         for keep in (0, 1, 8, 20, 40, -1, -9)
     },
     **{
-        f"{name} of {count}": (f"{name}.bin", number(f"{MODEL}/{name}.bin", 0, "Q", count))
+        f"{name} of {count}": (f"{name}.bin", overwrite_number(f"{MODEL}/{name}.bin", 0, "Q", count))
         for name in ("cameras", "images", "points3D")
         for count in (10**6, 2**63, 2**64 - 1)
     },
@@ -564,95 +571,97 @@ COLMAP_BINARY: dict[str, tuple[str, Change]] = {
         )
         for name in ("cameras", "images", "points3D")
     },
-    "unknown model": ("cameras.bin", number(f"{MODEL}/cameras.bin", 12, "i", 99)),
-    "negative model": ("cameras.bin", number(f"{MODEL}/cameras.bin", 12, "i", -1)),
-    "no width": ("cameras.bin", number(f"{MODEL}/cameras.bin", 16, "Q", 0)),
-    "huge width": ("v00", number(f"{MODEL}/cameras.bin", 16, "Q", 2**63)),
-    "nan focal length": ("cameras.bin", number(f"{MODEL}/cameras.bin", 32, "d", float("nan"))),
-    "negative focal length": ("cameras.bin", number(f"{MODEL}/cameras.bin", 32, "d", -90.0)),
-    "nan pose": ("images.bin", number(f"{MODEL}/images.bin", 12, "d", float("nan"))),
-    "long track": ("points3D.bin", number(f"{MODEL}/points3D.bin", 8 + 43, "Q", 2**62)),
-    "nan point": ("points3D.bin", number(f"{MODEL}/points3D.bin", 16, "d", float("nan"))),
-    "text as binary": ("cameras.bin", file(f"{MODEL}/cameras.bin", CAMERA)),
+    "unknown model": ("cameras.bin", overwrite_number(f"{MODEL}/cameras.bin", 12, "i", 99)),
+    "negative model": ("cameras.bin", overwrite_number(f"{MODEL}/cameras.bin", 12, "i", -1)),
+    "no width": ("cameras.bin", overwrite_number(f"{MODEL}/cameras.bin", 16, "Q", 0)),
+    "huge width": ("v00", overwrite_number(f"{MODEL}/cameras.bin", 16, "Q", 2**63)),
+    "nan focal length": ("cameras.bin", overwrite_number(f"{MODEL}/cameras.bin", 32, "d", float("nan"))),
+    "negative focal length": ("cameras.bin", overwrite_number(f"{MODEL}/cameras.bin", 32, "d", -90.0)),
+    "nan pose": ("images.bin", overwrite_number(f"{MODEL}/images.bin", 12, "d", float("nan"))),
+    "long track": ("points3D.bin", overwrite_number(f"{MODEL}/points3D.bin", 8 + 43, "Q", 2**62)),
+    "nan point": ("points3D.bin", overwrite_number(f"{MODEL}/points3D.bin", 16, "d", float("nan"))),
+    "text as binary": ("cameras.bin", write_file(f"{MODEL}/cameras.bin", CAMERA)),
 }
 
 
 @pytest.mark.parametrize(("names", "change"), COLMAP_BINARY.values(), ids=COLMAP_BINARY.keys())
-def test_colmap_binary(captures, tmp_path, names, change):
-    refused(captures, tmp_path, "colmap", change, names)
+def test_colmap_binary(good_captures, tmp_path, names, change):
+    assert_bad_input(good_captures, tmp_path, "colmap", change, names)
 
 
 LLFF: dict[str, Change] = {
-    "empty": file("poses_bounds.npy", b""),
-    "text": file("poses_bounds.npy", "1 2 3"),
+    "empty": write_file("poses_bounds.npy", b""),
+    "text": write_file("poses_bounds.npy", "1 2 3"),
     "pickle": lambda f: np.save(f / "poses_bounds.npy", np.array([{}], object), allow_pickle=True),
     "archive": lambda f: np.savez(open(f / "poses_bounds.npy", "wb"), a=np.zeros((6, 17))),
     "words": lambda f: np.save(f / "poses_bounds.npy", np.full((6, 17), "a")),
     "complex": lambda f: np.save(f / "poses_bounds.npy", np.zeros((6, 17), complex)),
-    "16 columns": rows(lambda r: r[:, :16]),
-    "flat": rows(np.ravel),
-    "no rows": rows(lambda r: r[:0]),
-    "five rows": rows(lambda r: r[:5]),
-    "nan": rows(pixel(2, 0, np.nan)),
-    "infinite bound": rows(pixel(2, 16, np.inf)),
-    "negative focal length": rows(pixel(2, 14, -5)),
-    "no height": rows(pixel(2, 4, 0)),
-    "near is far": rows(pixel(2, 15, 1e9)),
-    "a pose of zeros": rows(lambda r: np.where(np.arange(17) % 5 < 3, 0 * r, r)),
-    "other proportions": rows(pixel(2, 4, 5000)),
-    "huge": file("poses_bounds.npy", npy("(1000000000000, 17)")),
-    "negative shape": file("poses_bounds.npy", npy("(-1, 17)")),
-    "a shape of words": file("poses_bounds.npy", npy("('a', 17)")),
-    "a broken header": file("poses_bounds.npy", npy("((((", b"")),
-    "an unknown type": file("poses_bounds.npy", npy("(6, 17)", b"\0" * 816, "'<q9'")),
-    **{f"cut at {keep}": cut("poses_bounds.npy", keep) for keep in (3, 6, 9, 60, 128, 200, -1)},
-    **{f"a {kind}": other_kind("poses_bounds.npy", kind) for kind in ("folder", "pipe", "link")},
+    "16 columns": edit_bounds(lambda r: r[:, :16]),
+    "flat": edit_bounds(np.ravel),
+    "no rows": edit_bounds(lambda r: r[:0]),
+    "five rows": edit_bounds(lambda r: r[:5]),
+    "nan": edit_bounds(set_value(2, 0, np.nan)),
+    "infinite bound": edit_bounds(set_value(2, 16, np.inf)),
+    "negative focal length": edit_bounds(set_value(2, 14, -5)),
+    "no height": edit_bounds(set_value(2, 4, 0)),
+    "near is far": edit_bounds(set_value(2, 15, 1e9)),
+    "a pose of zeros": edit_bounds(lambda r: np.where(np.arange(17) % 5 < 3, 0 * r, r)),
+    "other proportions": edit_bounds(set_value(2, 4, 5000)),
+    "huge": write_file("poses_bounds.npy", npy_header("(1000000000000, 17)")),
+    "negative shape": write_file("poses_bounds.npy", npy_header("(-1, 17)")),
+    "a shape of words": write_file("poses_bounds.npy", npy_header("('a', 17)")),
+    "a broken header": write_file("poses_bounds.npy", npy_header("((((", b"")),
+    "an unknown type": write_file("poses_bounds.npy", npy_header("(6, 17)", b"\0" * 816, "'<q9'")),
+    **{f"cut at {keep}": truncate_file("poses_bounds.npy", keep) for keep in (3, 6, 9, 60, 128, 200, -1)},
+    **{f"a {kind}": replace_by("poses_bounds.npy", kind) for kind in ("folder", "pipe", "link")},
 }
 
 
 @pytest.mark.parametrize("change", LLFF.values(), ids=LLFF.keys())
-def test_poses_bounds(captures, tmp_path, change):
-    said = refused(captures, tmp_path, "llff", change, "")
+def test_poses_bounds(good_captures, tmp_path, change):
+    said = assert_bad_input(good_captures, tmp_path, "llff", change, "")
     assert "poses_bounds.npy" in said or ".png" in said
 
 
 # ---------------------------------------------------------------------------------------------- pictures, masks
 
 
-def picture(name: str, array: np.ndarray, kind: str = "PNG") -> Change:
+def save_picture(name: str, array: np.ndarray, kind: str = "PNG") -> Change:
     return lambda folder: Image.fromarray(array).save(folder / name, kind)
 
 
 BROKEN: dict[str, Callable[[str], Change]] = {
-    "empty": lambda name: file(name, b""),
-    "text": lambda name: file(name, "no picture"),
-    "postscript": lambda name: file(name, "%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 72\n"),
-    "a bomb": lambda name: file(name, png(60_000, 60_000)),
-    "of no width": lambda name: file(name, png(0, 72)),
-    "of a little data": lambda name: file(name, png(WIDTH, HEIGHT)),
-    **{f"cut at {keep}": lambda name, keep=keep: cut(name, keep) for keep in (1, 8, 20, 33, 60, -30)},
-    **{f"a {kind}": lambda name, kind=kind: other_kind(name, kind) for kind in ("folder", "pipe", "link")},
+    "empty": lambda name: write_file(name, b""),
+    "text": lambda name: write_file(name, "no picture"),
+    "postscript": lambda name: write_file(name, "%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 72\n"),
+    "a bomb": lambda name: write_file(name, png_header(60_000, 60_000)),
+    "of no width": lambda name: write_file(name, png_header(0, 72)),
+    "of a little data": lambda name: write_file(name, png_header(WIDTH, HEIGHT)),
+    **{f"cut at {keep}": lambda name, keep=keep: truncate_file(name, keep) for keep in (1, 8, 20, 33, 60, -30)},
+    **{f"a {kind}": lambda name, kind=kind: replace_by(name, kind) for kind in ("folder", "pipe", "link")},
 }
 NOISE = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
 
 
 @pytest.mark.parametrize("layout", ["transforms", "colmap", "llff"])
 @pytest.mark.parametrize("broken", BROKEN.values(), ids=BROKEN.keys())
-def test_photographs(captures, tmp_path, broken, layout):
+def test_photographs(good_captures, tmp_path, broken, layout):
     name = f"{'images_4' if layout == 'llff' else 'images'}/v01.png"
-    change = both(picture(name, NOISE), broken(name), lambda folder: (folder / "masks/v01.png").unlink(missing_ok=True))
-    refused(captures, tmp_path, layout, change, "v01")
+    change = do_all(
+        save_picture(name, NOISE), broken(name), lambda folder: (folder / "masks/v01.png").unlink(missing_ok=True)
+    )
+    assert_bad_input(good_captures, tmp_path, layout, change, "v01")
 
 
 @pytest.mark.parametrize("broken", BROKEN.values(), ids=BROKEN.keys())
-def test_masks(captures, tmp_path, broken):
-    change = both(
-        picture("masks/v01.png", np.kron(NOISE[..., 0] > 127, np.ones((1, 1), bool))), broken("masks/v01.png")
+def test_masks(good_captures, tmp_path, broken):
+    change = do_all(
+        save_picture("masks/v01.png", np.kron(NOISE[..., 0] > 127, np.ones((1, 1), bool))), broken("masks/v01.png")
     )
-    refused(captures, tmp_path, "transforms", change, "v01")
+    assert_bad_input(good_captures, tmp_path, "transforms", change, "v01")
 
 
-def mask_of(value: int) -> Change:
+def constant_masks(value: int) -> Change:
     return lambda folder: write_masks(folder / "masks", [f"v{k:02d}" for k in range(6)], value=value)
 
 
@@ -661,56 +670,56 @@ WHITE[10:30, 20:40, 3] = 0
 NAMES_OF_ALL = [f"v{k:02d}" for k in range(6)]
 
 
-def all_full(folder: Path) -> None:
+def fill_masks(folder: Path) -> None:
     for path in (folder / "masks").iterdir():
         save_image(path, np.full((HEIGHT, WIDTH), 255, np.uint8))
 
 
-def masks_are_a_file(folder: Path) -> None:
+def masks_as_file(folder: Path) -> None:
     shutil.rmtree(folder / "masks")
     (folder / "masks").write_text("x")
 
 
-def only_two(folder: Path) -> None:
+def keep_two_views(folder: Path) -> None:
     for path in [*(folder / "images").iterdir(), *(folder / "masks").iterdir()]:
         if path.stem > "v01":
             path.unlink()
 
 
-def copied(old: str, new: str) -> Change:
+def copy_file(old: str, new: str) -> Change:
     return lambda folder: shutil.copy(folder / old, folder / new)
 
 
 OTHER_PICTURES: dict[str, tuple[str, Change]] = {
-    "floats": ("v01", picture("images/v01.png", np.zeros((HEIGHT, WIDTH), np.float32), "TIFF")),
+    "floats": ("v01", save_picture("images/v01.png", np.zeros((HEIGHT, WIDTH), np.float32), "TIFF")),
     "photograph of other proportions": ("v01", lambda f: write_pictures(f / "images", ["v01"], (HEIGHT, WIDTH))),
     "mask of other proportions": ("v01", lambda f: write_masks(f / "masks", ["v01"], (HEIGHT, WIDTH))),
     "mask of one pixel": ("v01", lambda f: write_masks(f / "masks", ["v01"], (1, 9))),
     "mask for no picture": ("zz", lambda f: write_masks(f / "masks", ["zz"])),
-    "two masks": ("v01", copied("masks/v01.png", "masks/v01.bmp")),
-    "mask in alpha": ("v01", picture("masks/v01.png", WHITE)),
-    "mask in alpha of black": ("v01", picture("masks/v01.png", WHITE * np.array([0, 0, 0, 1], np.uint8))),
+    "two masks": ("v01", copy_file("masks/v01.png", "masks/v01.bmp")),
+    "mask in alpha": ("v01", save_picture("masks/v01.png", WHITE)),
+    "mask in alpha of black": ("v01", save_picture("masks/v01.png", WHITE * np.array([0, 0, 0, 1], np.uint8))),
     "mask of sevens": ("masks", lambda f: write_masks(f / "masks", NAMES_OF_ALL, value=7)),
     "mask of a hundred": ("masks", lambda f: write_masks(f / "masks", NAMES_OF_ALL, value=100)),
     "empty masks": ("masks", lambda f: write_masks(f / "masks", NAMES_OF_ALL, value=0)),
-    "full masks": ("masks", all_full),
+    "full masks": ("masks", fill_masks),
     "no masks": ("masks", lambda f: shutil.rmtree(f / "masks")),
-    "masks a file": ("mask", masks_are_a_file),
+    "masks a file": ("mask", masks_as_file),
     "no pictures": ("images", lambda f: shutil.rmtree(f / "images")),
-    "two pictures": ("training views", only_two),
+    "two pictures": ("training views", keep_two_views),
 }
 
 
 @pytest.mark.parametrize("layout", ["transforms", "colmap"])
 @pytest.mark.parametrize(("names", "change"), OTHER_PICTURES.values(), ids=OTHER_PICTURES.keys())
-def test_other_pictures(captures, tmp_path, names, change, layout):
-    refused(captures, tmp_path, layout, change, names)
+def test_other_pictures(good_captures, tmp_path, names, change, layout):
+    assert_bad_input(good_captures, tmp_path, layout, change, names)
 
 
 # ---------------------------------------------------------------------------------------------- Gaussians
 
 
-def gaussians(folder: Path, count: int = 20) -> None:
+def write_gaussians(folder: Path, count: int = 20) -> None:
     import torch
 
     draw = lambda *shape: torch.rand(*shape, generator=torch.Generator().manual_seed(0))
@@ -719,7 +728,7 @@ def gaussians(folder: Path, count: int = 20) -> None:
     (folder / "scene.yaml").write_text("gaussians: g.ply\n")
 
 
-def as_text(folder: Path) -> None:
+def convert_ply_to_text(folder: Path) -> None:
     from plyfile import PlyData
 
     read = PlyData.read(str(folder / "g.ply"), mmap=False)
@@ -727,7 +736,7 @@ def as_text(folder: Path) -> None:
     read.write(str(folder / "g.ply"))
 
 
-def header(old: bytes, new: bytes) -> Change:
+def edit_header(old: bytes, new: bytes) -> Change:
     def change(folder: Path) -> None:
         data = (folder / "g.ply").read_bytes()
         assert old in data
@@ -736,57 +745,57 @@ def header(old: bytes, new: bytes) -> Change:
     return change
 
 
-def half(folder: Path) -> None:
+def halve_ply(folder: Path) -> None:
     data = (folder / "g.ply").read_bytes()
     (folder / "g.ply").write_bytes(data[: data.index(b"end_header") + (len(data) - data.index(b"end_header")) // 2])
 
 
 PLY: dict[str, Change] = {
-    "none": lambda folder: gaussians(folder, 0),
-    "none, as text": both(lambda folder: gaussians(folder, 0), as_text),
-    "half": half,
-    "half, as text": both(as_text, half),
-    "half a line, as text": both(as_text, cut("g.ply", -40)),
-    **{f"cut at {keep}": cut("g.ply", keep) for keep in (0, 3, 10, 50, 200, -1)},
-    "too many": header(b"vertex 20", b"vertex 21"),
-    "far too many": header(b"vertex 20", b"vertex 99999999999999"),
-    "fewer than none": header(b"vertex 20", b"vertex -20"),
-    "a word of them": header(b"vertex 20", b"vertex many"),
-    "no number of them": header(b"vertex 20", b"vertex"),
-    "no vertices": header(b"element vertex", b"element points"),
-    "no format": header(b"format binary_little_endian 1.0\n", b""),
-    "an unknown format": header(b"binary_little_endian", b"binary_middle_endian"),
-    "an unknown type": header(b"property float x", b"property quad x"),
-    "a list": header(b"property float x", b"property list uchar float x"),
-    "no opacity": header(b"property float opacity", b"property float opaque"),
-    "two of a property": header(b"property float y", b"property float x"),
-    "a property alone": header(b"property float y", b"property"),
-    "no end": header(b"end_header", b"endheader!"),
-    "other rest": header(b"property float nx", b"property float f_rest_7"),
-    "text with words": both(as_text, lambda folder: header(b"\n0.", b"\nx.")(folder)),
-    "a picture": file("g.ply", png(5, 5)),
-    **{f"a {kind}": other_kind("g.ply", kind) for kind in ("folder", "pipe", "link")},
+    "none": lambda folder: write_gaussians(folder, 0),
+    "none, as text": do_all(lambda folder: write_gaussians(folder, 0), convert_ply_to_text),
+    "half": halve_ply,
+    "half, as text": do_all(convert_ply_to_text, halve_ply),
+    "half a line, as text": do_all(convert_ply_to_text, truncate_file("g.ply", -40)),
+    **{f"cut at {keep}": truncate_file("g.ply", keep) for keep in (0, 3, 10, 50, 200, -1)},
+    "too many": edit_header(b"vertex 20", b"vertex 21"),
+    "far too many": edit_header(b"vertex 20", b"vertex 99999999999999"),
+    "fewer than none": edit_header(b"vertex 20", b"vertex -20"),
+    "a word of them": edit_header(b"vertex 20", b"vertex many"),
+    "no number of them": edit_header(b"vertex 20", b"vertex"),
+    "no vertices": edit_header(b"element vertex", b"element points"),
+    "no format": edit_header(b"format binary_little_endian 1.0\n", b""),
+    "an unknown format": edit_header(b"binary_little_endian", b"binary_middle_endian"),
+    "an unknown type": edit_header(b"property float x", b"property quad x"),
+    "a list": edit_header(b"property float x", b"property list uchar float x"),
+    "no opacity": edit_header(b"property float opacity", b"property float opaque"),
+    "two of a property": edit_header(b"property float y", b"property float x"),
+    "a property alone": edit_header(b"property float y", b"property"),
+    "no end": edit_header(b"end_header", b"endheader!"),
+    "other rest": edit_header(b"property float nx", b"property float f_rest_7"),
+    "text with words": do_all(convert_ply_to_text, lambda folder: edit_header(b"\n0.", b"\nx.")(folder)),
+    "a picture": write_file("g.ply", png_header(5, 5)),
+    **{f"a {kind}": replace_by("g.ply", kind) for kind in ("folder", "pipe", "link")},
 }
 
 
 @pytest.mark.parametrize("change", PLY.values(), ids=PLY.keys())
-def test_gaussians(captures, tmp_path, change):
-    refused(captures, tmp_path, "transforms", both(gaussians, change), "g.ply")
+def test_gaussians(good_captures, tmp_path, change):
+    assert_bad_input(good_captures, tmp_path, "transforms", do_all(write_gaussians, change), "g.ply")
 
 
 # ---------------------------------------------------------------------------------------------- references
 
 KINDS: dict[str, Callable[[str], Change]] = {
-    "empty": lambda name: file(name, b""),
-    "text": lambda name: file(name, "deep"),
-    "a folder": lambda name: other_kind(name, "folder"),
-    "a pipe": lambda name: other_kind(name, "pipe"),
-    "a link to nothing": lambda name: other_kind(name, "link"),
+    "empty": lambda name: write_file(name, b""),
+    "text": lambda name: write_file(name, "deep"),
+    "a folder": lambda name: replace_by(name, "folder"),
+    "a pipe": lambda name: replace_by(name, "pipe"),
+    "a link to nothing": lambda name: replace_by(name, "link"),
 }
 
 
-def exr(keep: int) -> Change:
-    return both(lambda folder: save_exr(folder / "d.exr", NOISE[..., 0]), cut("d.exr", keep))
+def write_truncated_exr(keep: int) -> Change:
+    return do_all(lambda folder: save_exr(folder / "d.exr", NOISE[..., 0]), truncate_file("d.exr", keep))
 
 
 DEPTH: dict[str, tuple[str, Change]] = {
@@ -795,8 +804,8 @@ DEPTH: dict[str, tuple[str, Change]] = {
         for ending in ("png", "exr", "npy", "tif")
         for kind, change in KINDS.items()
     },
-    "8-bit": ("d.png", picture("d.png", NOISE[..., 0])),
-    "colours": ("d.png", picture("d.png", NOISE)),
+    "8-bit": ("d.png", save_picture("d.png", NOISE[..., 0])),
+    "colours": ("d.png", save_picture("d.png", NOISE)),
     "constant": ("d.npy", lambda f: np.save(f / "d.npy", np.ones((HEIGHT, WIDTH)))),
     "nothing known": ("d.npy", lambda f: np.save(f / "d.npy", np.full((HEIGHT, WIDTH), np.nan))),
     "three channels": ("d.npy", lambda f: np.save(f / "d.npy", np.ones((HEIGHT, WIDTH, 3)))),
@@ -804,17 +813,17 @@ DEPTH: dict[str, tuple[str, Change]] = {
     "words": ("d.npy", lambda f: np.save(f / "d.npy", np.full((HEIGHT, WIDTH), "a"))),
     "complex": ("d.npy", lambda f: np.save(f / "d.npy", np.zeros((HEIGHT, WIDTH), complex))),
     "pickle": ("d.npy", lambda f: np.save(f / "d.npy", np.array([{}], object), allow_pickle=True)),
-    "huge npy": ("d.npy", file("d.npy", npy("(1000000, 1000000)"))),
-    "huge png": ("d.png", file("d.png", png(60_000, 60_000, 0))),
-    **{f"EXR cut at {keep}": ("d.exr", exr(keep)) for keep in (4, 20, 100, 300, -400)},
+    "huge npy": ("d.npy", write_file("d.npy", npy_header("(1000000, 1000000)"))),
+    "huge png": ("d.png", write_file("d.png", png_header(60_000, 60_000, 0))),
+    **{f"EXR cut at {keep}": ("d.exr", write_truncated_exr(keep)) for keep in (4, 20, 100, 300, -400)},
 }
 
 
 @pytest.mark.parametrize(("name", "change"), DEPTH.values(), ids=DEPTH.keys())
-def test_depth_maps(captures, tmp_path, name, change):
+def test_depth_maps(good_captures, tmp_path, name, change):
     """Of references: what `poses` lets pass by its header, `reference` refuses."""
     folder = tmp_path / "s"
-    shutil.copytree(captures / "transforms", folder)
+    shutil.copytree(good_captures / "transforms", folder)
     change(folder)
     began = time.monotonic()
     with pytest.raises(BadInput, match=name):
@@ -826,11 +835,11 @@ def test_depth_maps(captures, tmp_path, name, change):
 
 
 @pytest.mark.parametrize("broken", BROKEN.values(), ids=BROKEN.keys())
-def test_paintings(captures, tmp_path, broken):
+def test_paintings(good_captures, tmp_path, broken):
     folder = tmp_path / "s"
-    shutil.copytree(captures / "transforms", folder)
+    shutil.copytree(good_captures / "transforms", folder)
     (folder / "painted").mkdir()
-    both(picture("painted/v01.png", NOISE), broken("painted/v01.png"))(folder)
+    do_all(save_picture("painted/v01.png", NOISE), broken("painted/v01.png"))(folder)
     with pytest.raises(BadInput, match="v01"):
         capture, roles = read_scene(poses.Params(), folder)
         found = load_reference_files(folder, capture_views(capture, roles), None)
@@ -842,59 +851,57 @@ def test_paintings(captures, tmp_path, broken):
 NAMES = ["20220819_104425", "2022-08-19", "007", "1e3", "on", "null_"]
 
 
-def test_names_that_look_like_numbers_or_dates_are_names(captures, tmp_path):
+def test_names_that_look_like_numbers_or_dates_are_names(good_captures, tmp_path):
     folder, out = tmp_path / "s", tmp_path / "out"
-    shutil.copytree(captures / "transforms", folder)
+    shutil.copytree(good_captures / "transforms", folder)
     for old, new in zip([f"v{k:02d}" for k in range(6)], NAMES, strict=True):
         for kind in ("images", "masks"):
             (folder / kind / f"{old}.png").rename(folder / kind / f"{new}.png")
-        replaced("transforms.json", f"images/{old}.png", f"images/{new}.png")(folder)
+        replace_in_file("transforms.json", f"images/{old}.png", f"images/{new}.png")(folder)
     shutil.copy(folder / "images/20220819_104425.png", folder / "12.png")
-    yaml(
+    write_yaml(
         "test: [2022-08-19, 007]\nclean: [on]\nreference: {view: 20220819_104425, image: 12.png, undistorted: off}\n"
         "budget: 90\nregion: {center: [0, 1, 0.5], size: [1, 2, 3]}\nstages: {fit: {iterations: 20}}"
     )(folder)
-    assert told(folder, out) is None
+    assert first_message(folder, out) is None
     views = json.loads((out / "views.json").read_text())
     assert views["test"] == ["007", "2022-08-19"] and views["clean"] == ["on"] and "20220819_104425" in views["train"]
     shutil.rmtree(out)
-    assert told(folder, out, "poses.test=[1e3]") is None
+    assert first_message(folder, out, "poses.test=[1e3]") is None
     assert json.loads((out / "views.json").read_text())["test"] == ["1e3"]
 
 
 # ---------------------------------------------------------------------------------------------- the command itself
 
 QUICK = [  # refused before a stage is asked
-    ("scene.yaml", yaml(YAML["billion laughs"]), ""),
-    ("scene.yaml", yaml(YAML["python tag"]), ""),
-    ("scene.yaml", other_kind("scene.yaml", "pipe"), ""),
-    ("scene.yaml", yaml("profile: [laptop]"), ""),
+    ("scene.yaml", write_yaml(YAML["billion laughs"]), ""),
+    ("scene.yaml", write_yaml(YAML["python tag"]), ""),
+    ("scene.yaml", replace_by("scene.yaml", "pipe"), ""),
+    ("scene.yaml", write_yaml("profile: [laptop]"), ""),
     ("set", lambda folder: None, "fit.iterations='5"),
 ]
 ASKED = [
-    ("scene.yaml", yaml("stages: {fit: {iterations: true}}"), ""),
-    ("scene.yaml", yaml(YAML["region flat"]), ""),
-    ("transforms.json", key("fl_x", "640"), ""),
-    ("transforms.json", cut("transforms.json", 100), ""),
-    ("v01", file("images/v01.png", png(60_000, 60_000)), ""),
-    ("v01", other_kind("images/v01.png", "pipe"), ""),
-    ("g.ply", both(gaussians, half), ""),
-    ("v00", yaml(YAML["reference of a test view"]), ""),
+    ("scene.yaml", write_yaml("stages: {fit: {iterations: true}}"), ""),
+    ("scene.yaml", write_yaml(YAML["region flat"]), ""),
+    ("transforms.json", set_key("fl_x", "640"), ""),
+    ("transforms.json", truncate_file("transforms.json", 100), ""),
+    ("v01", write_file("images/v01.png", png_header(60_000, 60_000)), ""),
+    ("v01", replace_by("images/v01.png", "pipe"), ""),
+    ("g.ply", do_all(write_gaussians, halve_ply), ""),
+    ("v00", write_yaml(YAML["reference of a test view"]), ""),
 ]
 THROUGH_THE_COMMAND = [*QUICK, *(ASKED if SLOW else ASKED[:1])]
 
 
 @pytest.mark.parametrize(("names", "change", "set_"), THROUGH_THE_COMMAND)
-def test_the_command_says_one_line_and_ends_with_2(captures, tmp_path, names, change, set_):
+def test_the_command_says_one_line_and_ends_with_2(good_captures, tmp_path, names, change, set_):
     folder, runs = tmp_path / "s", tmp_path / "runs"
-    shutil.copytree(captures / "transforms", folder)
+    shutil.copytree(good_captures / "transforms", folder)
     (runs / "s" / "poses").mkdir(parents=True)
     (runs / "s" / "poses" / "kept.txt").write_text("earlier")
     change(folder)
-    command = [sys.executable, "-m", "runner", "run", "poses", "--profile", "laptop", "--scene", str(folder)]
-    ended = subprocess.run(
-        [*command, "--runs", str(runs), "--set", set_], cwd=ROOT, capture_output=True, text=True, timeout=60
-    )
+    command = ("run", "poses", "--profile", "laptop", "--scene", folder, "--runs", runs, "--set", set_)
+    ended = run_module("runner", *command, timeout=60)
     errors = [line for line in ended.stderr.splitlines() if line.startswith("error: ")]
     assert ended.returncode == 2 and len(errors) == 1 and names in errors[0], ended.stderr
     assert "Traceback" not in ended.stdout + ended.stderr

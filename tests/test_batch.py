@@ -1,4 +1,4 @@
-"""Several scenes at once on a toy pipeline: cores, memory, what is told, what a second call runs."""
+"""Several scenes at once on a toy pipeline: cores, memory, progress, and what a second call runs."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ import time
 from pathlib import Path
 
 import pytest
-from browser import visiting
-from test_compare import FILES, written
-from test_compare import request as asked
+from scenes.browser import open_page
+from scenes.toy_projects import COMPARE_FILES, make_request, write_project
 
 from report import batch as page
 from runner import Refused
@@ -25,7 +24,7 @@ from runner.progress import Progress
 from runner.resolve import Request
 
 REPO = Path(__file__).resolve().parent.parent
-STAGE = FILES["stages/distill.py"].replace(
+STAGE = COMPARE_FILES["stages/distill.py"].replace(
     "    time.sleep(params.pause)\n",
     """    import os
     begun = time.time()
@@ -41,9 +40,9 @@ STAGE = FILES["stages/distill.py"].replace(
 SCENES = ("a", "b", "c", "d")
 
 
-def toys(root: Path, pause: float = 0.0, memory: str = "", meet: int = 0) -> Path:
-    """Scenes a to d, of which c cannot be read. `distill` waits until `meet` of them are at it, and takes `pause` s."""
-    written(root)
+def write_projects(root: Path, pause: float = 0.0, memory: str = "", meet: int = 0) -> Path:
+    """Write scenes a to d; c is unreadable. `distill` waits until `meet` of them run, and takes `pause` s."""
+    write_project(root)
     (root / "stages/distill.py").write_text(
         STAGE.replace("pause: float = 0.0", f"pause: float = {pause}\n    meet: int = {meet}")
     )
@@ -56,29 +55,29 @@ def toys(root: Path, pause: float = 0.0, memory: str = "", meet: int = 0) -> Pat
     return root
 
 
-def spans(root: Path) -> list[list]:
+def read_spans(root: Path) -> list[list]:
     return [json.loads(line) for line in (root / "runs/spans.txt").read_text().splitlines()]
 
 
-def most_at_once(found: list[list]) -> int:
+def max_concurrent(found: list[list]) -> int:
     return max(sum(a <= begun < b for a, b, *_ in found) for begun, *_ in found)
 
 
-def machine(cores: int, memory_mb: int = 10_000) -> LocalEngine:
-    """One with so many cores, whatever this one has."""
+def local_engine(cores: int, memory_mb: int = 10_000) -> LocalEngine:
+    """An engine with this many cores, whatever the machine has."""
     real = sorted(os.sched_getaffinity(0))
     return LocalEngine([real[n % len(real)] for n in range(cores)], memory_mb, [])
 
 
 def test_several_at_once_and_a_second_call_runs_what_failed(tmp_path, capsys):
-    root = toys(tmp_path, meet=3)
-    assert batch(asked(root, ""), root / "many", Execution(machine(4))) == 1
+    root = write_projects(tmp_path, meet=3)
+    assert batch(make_request(root, ""), root / "many", Execution(local_engine(4))) == 1
     output = capsys.readouterr().out
     assert "4 scenes, 4 at once, 1 core each" in output
     assert re.search(r"^\d\d:\d\d:\d\d a: distill", output, re.MULTILINE)
     assert "failed: c: poses: ValueError" in output or "failed: c: poses: invalid literal" in output
-    found = spans(root)
-    assert len(found) == 3 and most_at_once(found) == 3
+    found = read_spans(root)
+    assert len(found) == 3 and max_concurrent(found) == 3
     assert {threads for _, _, threads, _ in found} == {"1"} and {len(cores) for *_, cores in found} == {1}
     runs = {run["scene"]: run for run in json.loads((root / "runs/results.json").read_text())["runs"]}
     assert runs["c"]["state"] == "failed" and "invalid literal" in runs["c"]["error"]
@@ -86,8 +85,8 @@ def test_several_at_once_and_a_second_call_runs_what_failed(tmp_path, capsys):
     assert "c,failed," in (root / "runs/results.csv").read_text()
     assert "poses: done in" in (root / "runs/a/output.log").read_text()
     (root / "many/c/number.txt").write_text("20")
-    assert batch(asked(root, ""), root / "many", Execution(machine(4))) == 0
-    assert len(spans(root)) == 4 and "failed" not in (root / "runs/results.md").read_text()
+    assert batch(make_request(root, ""), root / "many", Execution(local_engine(4))) == 0
+    assert len(read_spans(root)) == 4 and "failed" not in (root / "runs/results.md").read_text()
     (root / "alone").mkdir()
     for other in "ac":  # it waits for three
         (root / f"alone/begun-{other}").touch()
@@ -101,14 +100,14 @@ def test_several_at_once_and_a_second_call_runs_what_failed(tmp_path, capsys):
 @pytest.mark.parametrize("cores, memory_mb, most", [(2, 10_000, 2), (4, 1300, 2), (4, 100, 1)])
 def test_never_more_than_there_are_cores_or_memory(tmp_path, cores, memory_mb, most):
     """By pipeline.yaml 500 MB, and 100 for each MB of what poses wrote (next to nothing); then by what it last took."""
-    root = toys(tmp_path, 0.5, "memory: {distill: {mb: 600, each: 100}}\n")
-    batch(asked(root, ""), root / "many", Execution(machine(cores, memory_mb), 1))
-    assert len(spans(root)) == 3 and most_at_once(spans(root)) <= most
+    root = write_projects(tmp_path, 0.5, "memory: {distill: {mb: 600, each: 100}}\n")
+    batch(make_request(root, ""), root / "many", Execution(local_engine(cores, memory_mb), 1))
+    assert len(read_spans(root)) == 3 and max_concurrent(read_spans(root)) <= most
 
 
-def test_what_is_killed_beside_others_goes_on_alone(tmp_path):
+def test_a_stage_killed_beside_others_is_retried_alone(tmp_path):
     """As where memory runs out: the one whose number is highest is killed while others are at it."""
-    root = toys(tmp_path, meet=3)
+    root = write_projects(tmp_path, meet=3)
     stage = (root / "stages/distill.py").read_text()
     kill = """    if out.parent.name == "d" and not (out.parent.parent / "killed").exists():
         (out.parent.parent / "killed").touch()
@@ -118,21 +117,21 @@ def test_what_is_killed_beside_others_goes_on_alone(tmp_path):
     time.sleep(params.pause)
 """
     (root / "stages/distill.py").write_text(stage.replace("    time.sleep(params.pause)\n", kill))
-    assert batch(asked(root, ""), root / "many", Execution(machine(4))) == 1
-    assert len(spans(root)) == 3 and most_at_once(spans(root)[-1:]) == 1
+    assert batch(make_request(root, ""), root / "many", Execution(local_engine(4))) == 1
+    assert len(read_spans(root)) == 3 and max_concurrent(read_spans(root)[-1:]) == 1
 
 
 def test_cores_are_as_asked_for(tmp_path):
-    root = toys(tmp_path, 0.0)
-    batch(asked(root, "", variant="better"), root / "many", Execution(machine(4), 2))
-    assert {threads for _, _, threads, _ in spans(root)} == {"2"}
+    root = write_projects(tmp_path, 0.0)
+    batch(make_request(root, "", variant="better"), root / "many", Execution(local_engine(4), 2))
+    assert {threads for _, _, threads, _ in read_spans(root)} == {"2"}
     assert (root / "runs/results@better.csv").is_file()
 
 
 def test_variants_of_several_scenes_at_once(tmp_path):
-    root = toys(tmp_path, 0.1)
+    root = write_projects(tmp_path, 0.1)
     assert (
-        compare(asked(root, ""), "better,twin", data=root / "many", execution=Execution(machine(4))) == 3
+        compare(make_request(root, ""), "better,twin", data=root / "many", execution=Execution(local_engine(4))) == 3
     )  # of scene c
     lines = (root / "runs/ran.txt").read_text().splitlines()
     assert sorted(lines) == sorted(set(lines)), "what is equal is done once"
@@ -141,10 +140,10 @@ def test_variants_of_several_scenes_at_once(tmp_path):
 
 
 def test_stopped_while_several_run(tmp_path):
-    root = toys(tmp_path, 60)
+    root = write_projects(tmp_path, 60)
     code = "import sys; from test_batch import *; signal.signal(signal.SIGINT, signal.default_int_handler);"
-    code = f"{code} batch(asked(Path(sys.argv[1]), ''), Path(sys.argv[1]) / 'many',"
-    code = f"{code} Execution(machine(4)))"
+    code = f"{code} batch(make_request(Path(sys.argv[1]), ''), Path(sys.argv[1]) / 'many',"
+    code = f"{code} Execution(local_engine(4)))"
     environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO}/tests"}
     process = subprocess.Popen([sys.executable, "-c", code, str(root)], env=environment, stderr=subprocess.DEVNULL)
     until = time.monotonic() + 60
@@ -155,19 +154,19 @@ def test_stopped_while_several_run(tmp_path):
     assert process.wait(30) != 0
     assert not (root / "runs/spans.txt").exists()
     assert not subprocess.run(["pgrep", "-f", f"runner.worker run.*{root}"], capture_output=True).stdout
-    (root / "stages/distill.py").write_text(FILES["stages/distill.py"])
-    assert batch(asked(root, ""), root / "many", Execution(machine(4))) == 1
+    (root / "stages/distill.py").write_text(COMPARE_FILES["stages/distill.py"])
+    assert batch(make_request(root, ""), root / "many", Execution(local_engine(4))) == 1
     assert (root / "runs/ran.txt").read_text().count("poses") == 3
 
 
-def test_what_ended_when_the_runner_was_interrupted_is_not_done_again(tmp_path):
+def test_work_finished_at_an_interruption_is_not_repeated(tmp_path):
     """`distill` takes no notice of Ctrl-C; `evaluate` after it is not begun."""
-    root = toys(tmp_path, 0.0)
+    root = write_projects(tmp_path, 0.0)
     takes = "    import signal\n    signal.signal(2, signal.SIG_IGN)\n    (out / 'begun').touch()\n    time.sleep(2)\n"
-    stage = FILES["stages/distill.py"].replace("    time.sleep(params.pause)\n", takes)
+    stage = COMPARE_FILES["stages/distill.py"].replace("    time.sleep(params.pause)\n", takes)
     (root / "stages/distill.py").write_text(stage)
     code = "import sys; from test_batch import *; signal.signal(signal.SIGINT, signal.default_int_handler);"
-    code = f"{code} run_scene(asked(Path(sys.argv[1])), 'all')"
+    code = f"{code} run_scene(make_request(Path(sys.argv[1])), 'all')"
     environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO}/tests"}
     process = subprocess.Popen([sys.executable, "-c", code, str(root)], env=environment, stderr=subprocess.DEVNULL)
     until = time.monotonic() + 60
@@ -202,10 +201,10 @@ def test_the_live_table(tmp_path):
 
 
 def test_the_page_of_a_batch(tmp_path, capsys):
-    root = toys(tmp_path, 0.0)
-    batch(asked(root, ""), root / "many", Execution(machine(2)))
+    root = write_projects(tmp_path, 0.0)
+    batch(make_request(root, ""), root / "many", Execution(local_engine(2)))
     made = page.make(root / "runs/results.json")
-    with visiting(made.as_uri()) as browser:
+    with open_page(made.as_uri()) as browser:
         assert "3 of 4 scenes done, 1 failed" in browser.inner_text("body")
         assert "failed: poses: " in browser.inner_text("tr:has-text('c') td.text")
         assert browser.evaluate("[...document.images].every(i => i.naturalWidth == 240)")
@@ -218,6 +217,6 @@ def test_the_page_of_a_batch(tmp_path, capsys):
     "name, address, message",
     [("slrum", None, "unknown"), (None, "here:6379", "of which engine"), ("local", "here", "of which engine")],
 )
-def test_engines_that_are_not_there(tmp_path, name, address, message):
+def test_missing_engines_are_refused(tmp_path, name, address, message):
     with pytest.raises(Refused, match=message):
         make_engine(name, address, tmp_path, tmp_path)

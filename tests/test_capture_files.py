@@ -1,4 +1,4 @@
-"""Captures as other programs write them: each is read with the right cameras and masks, or refused in one line."""
+"""Captures of other programs are read with the right cameras and masks, or refused in one line."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from small_capture import (
+from scenes.capture import (
     HEIGHT,
     PINHOLE,
     WIDTH,
     Truth,
     load_test_masks,
-    prepare,
-    run,
-    some_truth,
+    make_truth,
+    run_stages,
+    write_capture,
     write_masks,
     write_model,
     write_pictures,
     write_poses_bounds,
     write_transforms,
 )
+from scenes.capture_checks import write_named_model
 
 from reffusion.capture.lens import sampling_map, undistorted_pinhole
 from reffusion.capture.scene_folder import read_scene
@@ -43,16 +44,16 @@ from stages.plan import poses as plan
 SHARE = 1 / 16  # of a picture that `write_masks` masks
 
 
-def read(folder: Path, **params) -> tuple[Scene, Path, str]:
-    """`poses` run on a folder: the scene, its artifact, and what it warns of."""
+def run_with_warnings(folder: Path, **params) -> tuple[Scene, Path, str]:
+    """Run the stages: the scene, its folder, and the warnings."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        scene, out = run(folder, **params)
+        scene, out = run_stages(folder, **params)
     return scene, out, "\n".join(str(each.message) for each in said)
 
 
-def assert_cameras(scene: Scene, truth: Truth, views: dict[str, str]) -> None:
-    """Poses and intrinsics of `views` (ours -> the truth's)."""
+def assert_view_cameras(scene: Scene, truth: Truth, views: dict[str, str]) -> None:
+    """Assert poses and intrinsics of `views`: our name -> name in the truth."""
     assert sorted(scene.cameras) == sorted(views)
     similarity, at = scene.similarity, undistorted_pinhole(truth.lens)
     for view, name in views.items():
@@ -71,19 +72,8 @@ def mask_shares(out: Path) -> dict[str, float]:
     }
 
 
-def write_named_model(folder: Path, truth: Truth, names: dict[str, str]) -> None:
-    """A COLMAP model whose images are called `names`: view -> name."""
-    at = truth.lens
-    cameras = {1: colmap.ModelCamera("SIMPLE_PINHOLE", WIDTH, HEIGHT, (at.fx, at.cx, at.cy))}
-    images = {
-        k: colmap.ModelImage(names[view], 1, pose)
-        for k, (view, pose) in enumerate(sorted(truth.world_to_camera.items()), start=1)
-    }
-    colmap.save_model(folder, cameras, images, truth.points, np.full((len(truth.points), 3), 99, np.uint8))
-
-
-def write_textured(folder: Path, truth: Truth, names: dict[str, str]) -> np.ndarray:
-    """Pictures of a plane with blobs of brightness, and the colours of the truth's points on it: view -> file name."""
+def write_textured_views(folder: Path, truth: Truth, names: dict[str, str]) -> np.ndarray:
+    """Write pictures of a textured plane (view -> file name); return the colours of the truth's points."""
     generator = np.random.default_rng(0)
     waves = generator.normal(size=(12, 3)) * 7
     phases = generator.uniform(0, 2 * np.pi, 12)
@@ -102,30 +92,30 @@ def write_textured(folder: Path, truth: Truth, names: dict[str, str]) -> np.ndar
 
 
 def flat_truth(views: int = 12, points: int = 400) -> Truth:
-    """The cameras of `some_truth` before points on the plane z = 0."""
+    """The cameras of `make_truth` in front of points on the plane z = 0."""
     places = np.random.default_rng(5).uniform(-0.9, 0.9, (points, 3)) * (1, 1, 0)
-    return replace(some_truth(views=views), points=places)
+    return replace(make_truth(views=views), points=places)
 
 
 # ---------------------------------------------------------------------------------------------- A: which model
 
 
 def test_the_model_with_most_images_is_taken(tmp_path):
-    truth = some_truth(views=9)
-    folder = prepare(tmp_path / "s", "colmap", truth)
+    truth = make_truth(views=9)
+    folder = write_capture(tmp_path / "s", "colmap", truth)
     (folder / "sparse/0").rename(folder / "sparse/1")
     write_model(folder / "sparse/0", replace(truth, world_to_camera=dict([*truth.world_to_camera.items()][:3])))
-    scene, _, said = read(folder)
-    assert_cameras(scene, truth, {view: view for view in truth.world_to_camera})
+    scene, _, said = run_with_warnings(folder)
+    assert_view_cameras(scene, truth, {view: view for view in truth.world_to_camera})
     assert "sparse/1 is taken, which has most images (9); not sparse/0 (3)" in said
 
 
 def test_a_lone_model_with_another_number_is_found(tmp_path):
-    truth = some_truth()
-    folder = prepare(tmp_path / "s", "colmap txt", truth)
+    truth = make_truth()
+    folder = write_capture(tmp_path / "s", "colmap txt", truth)
     (folder / "sparse/0").rename(folder / "sparse/1")
-    scene, _, said = read(folder)
-    assert_cameras(scene, truth, {view: view for view in truth.world_to_camera})
+    scene, _, said = run_with_warnings(folder)
+    assert_view_cameras(scene, truth, {view: view for view in truth.world_to_camera})
     assert "is taken" not in said
 
 
@@ -134,30 +124,30 @@ def test_a_lone_model_with_another_number_is_found(tmp_path):
 
 @pytest.mark.parametrize("name", ["day1/{}.png", "images/{}.png", "day1\\{}.png", "C:\\scans\\day1\\{}.PNG"])
 def test_names_of_the_model_with_folders(tmp_path, name):
-    truth = some_truth()
-    folder = prepare(tmp_path / "s", "transforms", truth)
+    truth = make_truth()
+    folder = write_capture(tmp_path / "s", "transforms", truth)
     (folder / "transforms.json").unlink()
     write_named_model(folder / "sparse/0", truth, {view: name.format(view) for view in truth.world_to_camera})
-    scene, out, _ = read(folder)
-    assert_cameras(scene, truth, {view: view for view in truth.world_to_camera})
+    scene, out, _ = run_with_warnings(folder)
+    assert_view_cameras(scene, truth, {view: view for view in truth.world_to_camera})
     assert len(mask_shares(out)) == 6
 
 
 @pytest.mark.parametrize("flat", [False, True], ids=["model with folders", "flat model"])
 def test_pictures_in_folders(tmp_path, flat):
-    truth, folder = some_truth(), tmp_path / "s"
+    truth, folder = make_truth(), tmp_path / "s"
     path = {view: f"day{k % 2}/{view}.png" for k, view in enumerate(sorted(truth.world_to_camera))}
     for view, each in path.items():
         write_pictures(folder / "images" / Path(each).parent, [view])
         write_masks(folder / "masks" / Path(each).parent, [view])
     write_named_model(folder / "sparse/0", truth, {view: f"{view}.png" if flat else path[view] for view in path})
-    scene, out, _ = read(folder)
-    assert_cameras(scene, truth, {view: view for view in path})
+    scene, out, _ = run_with_warnings(folder)
+    assert_view_cameras(scene, truth, {view: view for view in path})
     assert list_objects(out) == [] and len(load_raw_masks(out, scene.train)) == 6
 
 
 def test_equal_names_in_two_folders_are_called_by_their_paths(tmp_path):
-    truth, folder = some_truth(), tmp_path / "s"
+    truth, folder = make_truth(), tmp_path / "s"
     path = {view: f"cam{k % 2}/{k // 2:04d}.png" for k, view in enumerate(sorted(truth.world_to_camera))}
     for each in path.values():
         kind = "test_masks" if each == "cam0/0001.png" else "masks"
@@ -165,8 +155,8 @@ def test_equal_names_in_two_folders_are_called_by_their_paths(tmp_path):
         write_masks(folder / kind / Path(each).parent, [Path(each).stem])
         (folder / kind / each).rename(folder / kind / f"{each}.png")  # COLMAP's rule
     write_named_model(folder / "sparse/0", truth, path)
-    scene, out, _ = read(folder, test=["cam0/0001.png"], clean=["cam1-0002"], test_masks="test_masks")
-    assert_cameras(scene, truth, {each[:-4].replace("/", "-"): view for view, each in path.items()})
+    scene, out, _ = run_with_warnings(folder, test=["cam0/0001.png"], clean=["cam1-0002"], test_masks="test_masks")
+    assert_view_cameras(scene, truth, {each[:-4].replace("/", "-"): view for view, each in path.items()})
     assert scene.test == ("cam0-0001",) and scene.clean == {"cam1-0002"}
     assert set(mask_shares(out)) == {f"{view}.png" for view in scene.train}
     assert [*load_test_masks(out)] == ["cam0-0001"]
@@ -175,12 +165,12 @@ def test_equal_names_in_two_folders_are_called_by_their_paths(tmp_path):
 
 
 def test_folders_of_masks_are_objects_where_a_view_has_several(tmp_path):
-    truth = some_truth()
-    folder = prepare(tmp_path / "s", "colmap", truth)
+    truth = make_truth()
+    folder = write_capture(tmp_path / "s", "colmap", truth)
     shutil.rmtree(folder / "masks")
     for thing in ("box", "ball"):
         write_masks(folder / "masks" / thing, truth.world_to_camera)
-    _, out, _ = read(folder)
+    _, out, _ = run_with_warnings(folder)
     assert list_objects(out) == ["ball", "box"]
 
 
@@ -189,7 +179,7 @@ def test_folders_of_masks_are_objects_where_a_view_has_several(tmp_path):
 
 @pytest.mark.parametrize("splits", [("train", "test"), ("train", "val"), ("train", "test", "val")])
 def test_blenders_files_with_their_split(tmp_path, splits):
-    truth, folder = some_truth(views=8), tmp_path / "s"
+    truth, folder = make_truth(views=8), tmp_path / "s"
     views, flip = sorted(truth.world_to_camera), np.diag([1.0, -1, -1, 1])
     for k, split in enumerate(splits):
         mine = views[:4] if split == "train" else views[2 + 2 * k : 4 + 2 * k]
@@ -203,9 +193,9 @@ def test_blenders_files_with_their_split(tmp_path, splits):
         ]
         record = {"camera_angle_x": 2 * np.arctan(WIDTH / 2 / truth.lens.fx), "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(record))
-    scene, _, said = read(folder, masks="none")
+    scene, _, said = run_with_warnings(folder, masks="none")
     of = {f"train-r_{n}": views[n] for n in range(4)} | {f"{splits[1]}-r_{n}": views[4 + n] for n in range(2)}
-    assert_cameras(scene, truth, of)
+    assert_view_cameras(scene, truth, of)
     assert scene.test == tuple(sorted(view for view in of if not view.startswith("train")))
     assert ("transforms_val.json" in said) == (len(splits) == 3)
 
@@ -214,26 +204,26 @@ def test_blenders_files_with_their_split(tmp_path, splits):
 
 
 def test_a_palette_with_white_first(tmp_path):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     for path in (folder / "masks").iterdir():
         Image.open(path).convert("RGB").quantize(2).save(path)
         assert Image.open(path).getpalette()[:3] == [255, 255, 255]
-    assert np.allclose([*mask_shares(read(folder)[1]).values()], SHARE)
+    assert np.allclose([*mask_shares(run_with_warnings(folder)[1]).values()], SHARE)
 
 
 def test_maps_of_object_numbers_ask_for_the_number(tmp_path):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     for path in (folder / "masks").iterdir():
         numbers = np.full((HEIGHT, WIDTH), 30, np.uint8)
         numbers[40:], numbers[18:36, 24:48] = 200, 32
         Image.fromarray(numbers).save(path)
     with pytest.raises(BadInput, match=r"v00\.png: its values \(30, 32, 200\) are neither.*`masks: \{id: \.\.\.\}`"):
-        read(folder)
-    assert np.allclose([*mask_shares(read(folder, masks={"id": 32})[1]).values()], SHARE)
-    both = mask_shares(read(folder, masks={"folder": "masks", "id": [32, 200]})[1])
+        run_with_warnings(folder)
+    assert np.allclose([*mask_shares(run_with_warnings(folder, masks={"id": 32})[1]).values()], SHARE)
+    both = mask_shares(run_with_warnings(folder, masks={"folder": "masks", "id": [32, 200]})[1])
     assert np.allclose([*both.values()], SHARE + 32 / 72)
     with pytest.raises(BadInput, match=r"masks: all 6 masks are empty for the id 7; correct `masks: \{id: \.\.\.\}`"):
-        read(folder, masks={"id": 7})
+        run_with_warnings(folder, masks={"id": 7})
 
 
 def test_soft_edges_and_grey_objects_are_no_object_numbers(tmp_path):
@@ -258,7 +248,7 @@ def test_a_reference_among_bare_photographs_is_no_view(tmp_path):
 
 
 def test_a_reference_among_the_photographs_of_poses_bounds(tmp_path):
-    folder = prepare(tmp_path / "s", "llff", some_truth())
+    folder = write_capture(tmp_path / "s", "llff", make_truth())
     write_pictures(folder / "images_4", ["reference"])
     reference = {"view": "v01", "image": "images_4/reference.png"}
     assert read_scene(Params(reference=reference), folder)[1].train == tuple(f"v{k:02d}" for k in range(6))
@@ -266,16 +256,16 @@ def test_a_reference_among_the_photographs_of_poses_bounds(tmp_path):
 
 @pytest.mark.parametrize("masks", ["images", None])
 def test_masks_beside_their_photographs(tmp_path, masks):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     for path in (folder / "masks").iterdir():
         path.rename(folder / "images" / f"{path.stem}_mask.png")
-    scene, out, said = read(folder, masks=masks)
+    scene, out, said = run_with_warnings(folder, masks=masks)
     assert np.allclose([*mask_shares(out).values()], SHARE) and len(scene.train) == 6
     assert "not in the model" not in said
 
 
 def test_photographs_are_not_their_own_masks(tmp_path):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     with pytest.raises(
         BadInput, match=r"images: it holds photographs, and no mask beside one \(A_mask\.png beside A\.png\)"
     ):
@@ -286,7 +276,7 @@ def test_photographs_are_not_their_own_masks(tmp_path):
 
 
 def test_names_that_do_not_match_are_not_paired_by_order(tmp_path):
-    truth, folder = some_truth(views=12), tmp_path / "s"
+    truth, folder = make_truth(views=12), tmp_path / "s"
     write_pictures(folder / "images", [f"{k + 1:04d}" for k in range(12)])
     write_masks(folder / "masks", [f"{k + 1:04d}" for k in range(12)])
     views = sorted(truth.world_to_camera)
@@ -300,7 +290,9 @@ def test_renamed_copies_in_another_order_than_the_model_are_refused(tmp_path, nu
     """LLFF sorts names as text; a model whose names sort otherwise gives each copy another view's pose."""
     truth, folder = flat_truth(), tmp_path / "s"
     views = sorted(truth.world_to_camera)
-    colors = write_textured(folder / "images_4", truth, {view: f"image{k:03d}.png" for k, view in enumerate(views)})
+    colors = write_textured_views(
+        folder / "images_4", truth, {view: f"image{k:03d}.png" for k, view in enumerate(views)}
+    )
     write_masks(folder / "images_4/label", [f"image{k:03d}" for k in range(12)])
     at = truth.lens
     images = {
@@ -314,8 +306,8 @@ def test_renamed_copies_in_another_order_than_the_model_are_refused(tmp_path, nu
         with pytest.raises(BadInput, match=r"images_4: its pictures are not in the order of the images of"):
             plan.preview(Params(), folder)
     else:
-        scene, _, said = read(folder)
-        assert_cameras(scene, truth, {f"image{k:03d}": view for k, view in enumerate(views)})
+        scene, _, said = run_with_warnings(folder)
+        assert_view_cameras(scene, truth, {f"image{k:03d}": view for k, view in enumerate(views)})
         assert "paired with the images of images.bin in order of names" in said
 
 
@@ -323,7 +315,7 @@ def test_renamed_copies_in_another_order_than_the_model_are_refused(tmp_path, nu
 @pytest.mark.parametrize("change", ["none", "moved", "scaled", "turned"])
 def test_points_of_another_frame_are_not_used(tmp_path, layout, change):
     truth, folder = flat_truth(views=6), tmp_path / "s"
-    colors = write_textured(folder / "images", truth, {view: f"{view}.png" for view in truth.world_to_camera})
+    colors = write_textured_views(folder / "images", truth, {view: f"{view}.png" for view in truth.world_to_camera})
     write_masks(folder / "masks", truth.world_to_camera)
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     points = {
@@ -348,19 +340,19 @@ def test_points_of_another_frame_are_not_used(tmp_path, layout, change):
 
 
 def test_rows_of_poses_bounds_follow_the_file_names(tmp_path):
-    truth, folder = some_truth(), tmp_path / "s"
+    truth, folder = make_truth(), tmp_path / "s"
     times = ("104212", "104300", "104400")
     names = [name for time in times for name in (f"20220819_{time}(0)", f"20220819_{time}")]
     assert [f"{name}.jpg" for name in names] == sorted(f"{name}.jpg" for name in names)
     write_pictures(folder / "images_4", names, ending=".jpg")
     write_masks(folder / "images_4/label", names)
     write_poses_bounds(folder, truth)
-    scene, _, _ = read(folder)
-    assert_cameras(scene, truth, dict(zip(names, sorted(truth.world_to_camera), strict=True)))
+    scene, _, _ = run_with_warnings(folder)
+    assert_view_cameras(scene, truth, dict(zip(names, sorted(truth.world_to_camera), strict=True)))
 
 
 def test_nothing_matched_is_not_zero_pixels(tmp_path, capsys):
-    _, out, _ = read(prepare(tmp_path / "s", "colmap", some_truth()), refine=True)
+    _, out, _ = run_with_warnings(write_capture(tmp_path / "s", "colmap", make_truth()), refine=True)
     assert "cameras as given: optical flow matches nothing between the views" in capsys.readouterr().out
     assert load_json(out / "refine.json") == {"before": None, "after": None}
 
@@ -369,20 +361,20 @@ def test_nothing_matched_is_not_zero_pixels(tmp_path, capsys):
 
 
 def test_composed_and_decomposed_accents_are_one_name(tmp_path):
-    truth, folder = some_truth(), tmp_path / "s"
+    truth, folder = make_truth(), tmp_path / "s"
     views = {view: f"Küche {view}" for view in truth.world_to_camera}
     split = {view: unicodedata.normalize("NFD", name) for view, name in views.items()}
     write_pictures(folder / "images", split.values())
     write_masks(folder / "masks", split.values())
     whole = {view: unicodedata.normalize("NFC", name) for view, name in views.items()}
     write_named_model(folder / "sparse/0", truth, {view: f"{name}.png" for view, name in whole.items()})
-    scene, out, _ = read(folder, test=[split["v01"]])
-    assert_cameras(scene, truth, {name: view for view, name in whole.items()})
+    scene, out, _ = run_with_warnings(folder, test=[split["v01"]])
+    assert_view_cameras(scene, truth, {name: view for view, name in whole.items()})
     assert len(mask_shares(out)) == 6
 
 
-def test_what_is_no_picture_is_named(tmp_path, monkeypatch):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+def test_files_that_are_no_pictures_are_named(tmp_path, monkeypatch):
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     Image.init()  # every format registers now, not while the table is replaced
     monkeypatch.setattr(Image, "OPEN", {kind: opener for kind, opener in Image.OPEN.items() if kind != "HEIF"})
     (folder / "images/v01.png").write_text("<html>404</html>")
@@ -395,8 +387,8 @@ def test_what_is_no_picture_is_named(tmp_path, monkeypatch):
 )
 @pytest.mark.parametrize("text", [False, True])
 def test_colmaps_fisheyes_without_coefficients(tmp_path, model, params, text):
-    truth = some_truth((model, params))
-    folder = prepare(tmp_path / "s", "transforms", truth)
+    truth = make_truth((model, params))
+    folder = write_capture(tmp_path / "s", "transforms", truth)
     (folder / "transforms.json").unlink()
     cameras = {1: colmap.ModelCamera(model, WIDTH, HEIGHT, params)}
     images = {k: colmap.ModelImage(f"{v}.png", 1, pose) for k, (v, pose) in enumerate(truth.world_to_camera.items(), 1)}
@@ -404,8 +396,8 @@ def test_colmaps_fisheyes_without_coefficients(tmp_path, model, params, text):
     if text:
         (folder / "sparse/0/cameras.txt").write_text(f"1 {model} {WIDTH} {HEIGHT} {' '.join(map(str, params))}\n")
         (folder / "sparse/0/cameras.bin").unlink()
-    scene, _, _ = read(folder)
-    assert_cameras(scene, truth, {view: view for view in truth.world_to_camera})
+    scene, _, _ = run_with_warnings(folder)
+    assert_view_cameras(scene, truth, {view: view for view in truth.world_to_camera})
     pinhole = undistorted_pinhole(truth.lens)  # a pixel of it is read where an equidistant fisheye shows its direction
     at = sampling_map(truth.lens, pinhole)[10, 20]
     x, y = (20.5 - pinhole.cx) / pinhole.fx, (10.5 - pinhole.cy) / pinhole.fy
@@ -416,7 +408,7 @@ def test_colmaps_fisheyes_without_coefficients(tmp_path, model, params, text):
 
 @pytest.mark.parametrize("model", ["SIMPLE_DIVISION", "DIVISION", "EUCM", "EQUIRECTANGULAR"])
 def test_other_models_of_colmap_4_are_refused_by_name(tmp_path, model):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     params = (90.0, 90.0, 48.0, 36.0, 0.1, 1.0)[: colmap.MODELS[model]]
     images = colmap.load_images(folder / "sparse/0/images.bin")
     cameras = {1: colmap.ModelCamera(model, WIDTH, HEIGHT, params)}
@@ -426,8 +418,8 @@ def test_other_models_of_colmap_4_are_refused_by_name(tmp_path, model):
 
 
 def test_windows_paths_in_transforms(tmp_path):
-    truth = some_truth()
-    folder = prepare(tmp_path / "s", "transforms", truth)
+    truth = make_truth()
+    folder = write_capture(tmp_path / "s", "transforms", truth)
     save_points(folder / "sparse_pc.ply", truth.points, np.full((60, 3), 99, np.uint8))
     record = json.loads((folder / "transforms.json").read_text()) | {"ply_file_path": ".\\sparse_pc.ply"}
     for frame in record["frames"]:
@@ -442,7 +434,7 @@ def test_windows_paths_in_transforms(tmp_path):
 
 def test_mask_path_and_depth_file_path(tmp_path):
     truth, folder = flat_truth(views=6), tmp_path / "s"
-    write_textured(folder / "images", truth, {view: f"{view}.png" for view in truth.world_to_camera})
+    write_textured_views(folder / "images", truth, {view: f"{view}.png" for view in truth.world_to_camera})
     write_masks(folder / "keep", truth.world_to_camera)
     write_transforms(folder, truth)
     record = json.loads((folder / "transforms.json").read_text())
@@ -457,7 +449,7 @@ def test_mask_path_and_depth_file_path(tmp_path):
         Image.fromarray(np.round(1000 * depth).astype(np.uint16)).save(folder / f"depth/{view}.png")
         frame |= {"mask_path": f"keep/{view}.png", "depth_file_path": f"./depth/{view}.png"}
     (folder / "transforms.json").write_text(json.dumps(record))
-    scene, out, said = read(folder)
+    scene, out, said = run_with_warnings(folder)
     assert np.allclose([*mask_shares(out).values()], SHARE)
     assert "mask_path of transforms.json: black, which training ignores, is taken for the object" in said
     points = scene.similarity.invert(scene.points)
@@ -466,8 +458,8 @@ def test_mask_path_and_depth_file_path(tmp_path):
 
 
 def test_a_16_bit_grey_photograph(tmp_path):
-    folder = prepare(tmp_path / "s", "colmap", some_truth(PINHOLE))
+    folder = write_capture(tmp_path / "s", "colmap", make_truth(PINHOLE))
     levels = np.tile(np.linspace(0, 65535, WIDTH).astype(np.uint16), (HEIGHT, 1))
     Image.fromarray(levels).save(folder / "images/v02.png")
-    _, out, _ = read(folder)
+    _, out, _ = run_with_warnings(folder)
     assert np.array_equal(load_views(out, ["v02"])["v02"][..., 1], np.round(levels / 257).astype(np.uint8))

@@ -1,4 +1,4 @@
-"""Clicks become masks: in one photograph, in all views by the Gaussians, and in a browser."""
+"""Clicks become masks: in one photograph, in all views through the Gaussians, and in a browser."""
 
 import itertools
 import threading
@@ -6,10 +6,12 @@ import time
 
 import numpy as np
 import pytest
-import small_capture
-import small_scene as small
 import torch
-from browser import visiting
+from scenes import capture as captures
+from scenes import wall_scene
+from scenes.browser import open_page
+from scenes.gaussians import round_gaussians
+from scenes.stage_runs import run_masks
 
 from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points
 from reffusion.clicks import all_views
@@ -22,8 +24,6 @@ from reffusion.io.scene import load_mask_sets
 from reffusion.masks import voting
 from reffusion.params.poses import Params as Poses
 from reffusion.splat import rasterizer
-from reffusion.splat.conventions import SH0
-from reffusion.types import Gaussians
 from report.mask import Server
 from report.mask_session import Capture, Session
 from stages import masks, poses
@@ -31,8 +31,8 @@ from stages import masks, poses
 NEAR = 1.7
 
 
-def on(*points):
-    """Clicks on the object, (x, y) each; a third entry False: not on it."""
+def make_clicks(*points):
+    """Clicks at (x, y); a third entry False marks a click beside the object."""
     return Clicks(np.array([p[:2] for p in points], float), np.array([len(p) < 3 for p in points]))
 
 
@@ -52,8 +52,8 @@ def test_the_cut_is_the_cheapest_of_all():
         assert cost == pytest.approx(costs.min())
 
 
-def scenery(shape=(240, 320)):
-    """A picture: noise on a slope of blue, with a red disk that has a yellow stripe; and the disk."""
+def disk_picture(shape=(240, 320)):
+    """A noisy blue slope with a red disk that has a yellow stripe, and the mask of the disk."""
     rows, columns = np.mgrid[: shape[0], : shape[1]]
     disk = np.hypot(rows - 120, columns - 150) < 60
     noise = np.random.default_rng(1).normal(0, 6, (*shape, 3))
@@ -64,38 +64,41 @@ def scenery(shape=(240, 320)):
 
 
 def test_one_click_finds_what_is_of_one_colour_and_another_the_rest():
-    picture, disk = scenery()
+    picture, disk = disk_picture()
     rows = np.mgrid[:240, :320][0]
     red = disk & (abs(rows - 120) >= 12)
-    assert small.iou(segment_view(picture, on((150, 85), (150, 155))) & red, red) > 0.97
-    assert small.iou(segment_view(picture, on((150, 85), (150, 155), (150, 120))), disk) > 0.97
-    assert not segment_view(picture, on((10, 10, False))).any()
+    assert wall_scene.iou(segment_view(picture, make_clicks((150, 85), (150, 155))) & red, red) > 0.97
+    assert wall_scene.iou(segment_view(picture, make_clicks((150, 85), (150, 155), (150, 120))), disk) > 0.97
+    assert not segment_view(picture, make_clicks((10, 10, False))).any()
     assert not segment_view(picture, Clicks(np.zeros((0, 2)), np.zeros(0, bool))).any()
 
 
 def test_where_the_depth_is_known_a_click_goes_as_far_as_the_surface():
-    picture, disk = scenery()
+    picture, disk = disk_picture()
     picture[:, 180:] = picture[70:90, 140:160].mean((0, 1))  # what stands behind has the disk's colour, and touches it
     relief = np.where(disk, 0.0, 300.0)
-    alone, flat = segment_view(picture, on((150, 85))), segment_view(picture, on((150, 85)), 0 * relief)
-    assert small.iou(alone, disk) < 0.9 and (alone == flat).all()
-    assert small.iou(segment_view(picture, on((150, 85)), relief), disk) > 0.95
+    alone, flat = (
+        segment_view(picture, make_clicks((150, 85))),
+        segment_view(picture, make_clicks((150, 85)), 0 * relief),
+    )
+    assert wall_scene.iou(alone, disk) < 0.9 and (alone == flat).all()
+    assert wall_scene.iou(segment_view(picture, make_clicks((150, 85)), relief), disk) > 0.95
     half = disk & (np.mgrid[:240, :320][1] < 150)
-    assert small.iou(correct_mask(picture, half, on((165, 90)), relief), disk) > 0.9
+    assert wall_scene.iou(correct_mask(picture, half, make_clicks((165, 90)), relief), disk) > 0.9
 
 
 def test_a_click_takes_back_what_it_is_on():
-    picture, disk = scenery()
+    picture, disk = disk_picture()
     stripe = disk & (abs(np.mgrid[:240, :320][0] - 120) < 12)
-    without = correct_mask(picture, disk, on((150, 120, False)))
-    assert not without[115:125, 140:160].any() and small.iou(without, disk & ~stripe) > 0.9
-    again = correct_mask(picture, without, on((150, 120)))
-    assert small.iou(again, disk) > 0.95
+    without = correct_mask(picture, disk, make_clicks((150, 120, False)))
+    assert not without[115:125, 140:160].any() and wall_scene.iou(without, disk & ~stripe) > 0.9
+    again = correct_mask(picture, without, make_clicks((150, 120)))
+    assert wall_scene.iou(again, disk) > 0.95
 
 
 def test_a_plain_picture_of_any_size_is_no_error():
     for shape in ((1, 1, 3), (2, 300, 3), (40, 40, 3)):
-        found = segment_view(np.full(shape, 7, np.uint8), on((shape[1] / 2, shape[0] / 2)))
+        found = segment_view(np.full(shape, 7, np.uint8), make_clicks((shape[1] / 2, shape[0] / 2)))
         assert found.shape == shape[:2]
 
 
@@ -103,59 +106,56 @@ def test_a_plain_picture_of_any_size_is_no_error():
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """The wall with a square before it, photographed with the square; no masks."""
+def clicked_scene(tmp_path_factory):
+    """The wall with a square before it, photographed with the square, without masks."""
     folder = tmp_path_factory.mktemp("clicked")
-    placed, fit, _ = small.write(folder, NEAR, masks={})
-    everything, _ = small.gaussians(NEAR)
-    for name in small.TRAIN:
+    placed, fit, _ = wall_scene.write_poses_and_fit(folder, NEAR, masks={})
+    everything, _ = wall_scene.wall_and_square(NEAR)
+    for name in wall_scene.TRAIN:
         with torch.no_grad():
-            drawn = rasterizer.render(everything, small.CAMERAS[name]).color.clamp(0, 1).numpy()
+            drawn = rasterizer.render(everything, wall_scene.CAMERAS[name]).color.clamp(0, 1).numpy()
         save_image(placed / "images" / f"{name}.png", to_uint8(drawn))
-    small.write_photos(folder / "given", placed, small.CAMERAS)
+    wall_scene.write_capture_photos(folder / "given", placed, wall_scene.CAMERAS)
     return folder, placed, fit
 
 
-def truth(name):
-    return small.true_mask(small.CAMERAS[name], NEAR)
+def square_mask(name):
+    return wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR)
 
 
-def test_clicks_in_one_view_give_the_masks_of_all(scene, tmp_path):
-    _, placed, fit = scene
-    middle = np.argwhere(truth("a2")).mean(0)[::-1] + 0.5
+def test_clicks_in_one_view_give_the_masks_of_all(clicked_scene, tmp_path):
+    _, placed, fit = clicked_scene
+    middle = np.argwhere(square_mask("a2")).mean(0)[::-1] + 0.5
     params = masks.Params(clicks={"a2": [[*middle, "+"]]})
-    masks.run(params, tmp_path, poses=placed, raw_masks=placed.with_name("raw_masks"), fit=fit)
-    for name, found in load_mask_sets(tmp_path, small.CAMERAS).items():
-        if name in small.TRAIN:
-            assert small.iou(found.raw, truth(name)) > 0.9 and small.iou(found.consistent, truth(name)) > 0.85
+    run_masks(placed, fit, tmp_path, params)
+    for name, found in load_mask_sets(tmp_path, wall_scene.CAMERAS).items():
+        if name in wall_scene.TRAIN:
+            assert (
+                wall_scene.iou(found.raw, square_mask(name)) > 0.9
+                and wall_scene.iou(found.consistent, square_mask(name)) > 0.85
+            )
         else:
             assert not found.raw.any(), "test photographs do not show it"
 
 
-def test_clicks_on_nothing_are_refused(scene, tmp_path):
-    _, placed, fit = scene
+def test_clicks_on_nothing_are_refused(clicked_scene, tmp_path):
+    _, placed, fit = clicked_scene
     with pytest.raises(ValueError, match="click in the middle of the object"):
-        masks.run(
-            masks.Params(clicks={"a2": [[3, 3, "-"]]}),
-            tmp_path,
-            poses=placed,
-            raw_masks=placed.with_name("raw_masks"),
-            fit=fit,
-        )
+        run_masks(placed, fit, tmp_path, masks.Params(clicks={"a2": [[3, 3, "-"]]}))
 
 
-def test_a_mask_in_one_view_stays_as_it_was_given(scene):
-    _, placed, _ = scene
-    everything, _ = small.gaussians(NEAR)
+def test_a_mask_in_one_view_stays_as_it_was_given(clicked_scene):
+    _, placed, _ = clicked_scene
+    everything, _ = wall_scene.wall_and_square(NEAR)
     image_of = lambda name: load_image(placed / "images" / f"{name}.png")
     near = all_views.find_neighbours(everything)
-    found = all_views.segment_by_clicks(everything, near, small.CAMERAS, image_of, {}, {"a1": truth("a1")})
-    assert (found.masks["a1"] == truth("a1")).all()
-    shown = all_views.object_mask(everything, found.labels, small.CAMERAS["a4"], image_of("a4"))
-    assert small.iou(shown, truth("a4")) > 0.9
+    found = all_views.segment_by_clicks(everything, near, wall_scene.CAMERAS, image_of, {}, {"a1": square_mask("a1")})
+    assert (found.masks["a1"] == square_mask("a1")).all()
+    shown = all_views.object_mask(everything, found.labels, wall_scene.CAMERAS["a4"], image_of("a4"))
+    assert wall_scene.iou(shown, square_mask("a4")) > 0.9
 
 
-def sheet(origin, along, up, color, step=0.04):
+def sheet_points(origin, along, up, color, step=0.04):
     """Small round Gaussians on a parallelogram: means [n, 3] and colours [n, 3]."""
     origin, along, up = (np.array(each, float) for each in (origin, along, up))
     rows, columns = (np.arange(step / 2, np.linalg.norm(each), step) / np.linalg.norm(each) for each in (up, along))
@@ -165,24 +165,19 @@ def sheet(origin, along, up, color, step=0.04):
 
 def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
     parts = [
-        sheet((-4, -2, 4), (8, 0, 0), (0, 4, 0), (0.2, 0.3, 0.7)),  # the wall
-        sheet((-0.5, -0.5, 2.5), (1, 0, 0), (0, 1, 0), (0.8, 0.5, 0.2)),  # a box: its front, and its sides in shade
-        sheet((-0.5, -0.5, 2.5), (0, 0, 0.8), (0, 1, 0), (0.5, 0.3, 0.12)),
-        sheet((0.5, -0.5, 2.5), (0, 0, 0.8), (0, 1, 0), (0.5, 0.3, 0.12)),
+        sheet_points((-4, -2, 4), (8, 0, 0), (0, 4, 0), (0.2, 0.3, 0.7)),  # the wall
+        sheet_points(
+            (-0.5, -0.5, 2.5), (1, 0, 0), (0, 1, 0), (0.8, 0.5, 0.2)
+        ),  # a box: its front, and its sides in shade
+        sheet_points((-0.5, -0.5, 2.5), (0, 0, 0.8), (0, 1, 0), (0.5, 0.3, 0.12)),
+        sheet_points((0.5, -0.5, 2.5), (0, 0, 0.8), (0, 1, 0), (0.5, 0.3, 0.12)),
     ]
-    means, colors = (torch.tensor(np.concatenate(each), dtype=torch.float32) for each in zip(*parts, strict=True))
-    count = len(means)
-    scene = Gaussians(
-        means,
-        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-        torch.full((count, 3), np.log(0.025)),
-        torch.full((count,), 4.0),
-        ((colors - 0.5) / SH0)[:, None],
-    )
-    cameras = {name: small.camera(name, x) for name, x in (("left", -1.6), ("middle", 0.0), ("right", 1.6))}
+    means, colors = (np.concatenate(each) for each in zip(*parts, strict=True))
+    scene = round_gaussians(means, colors, 0.025, 4.0)
+    cameras = {name: wall_scene.front_camera(name, x) for name, x in (("left", -1.6), ("middle", 0.0), ("right", 1.6))}
     with torch.no_grad():
         images = {n: to_uint8(rasterizer.render(scene, c).color.clamp(0, 1).numpy()) for n, c in cameras.items()}
-    box = torch.arange(count) >= len(parts[0][0])
+    box = torch.arange(len(means)) >= len(parts[0][0])
     near, mask = all_views.find_neighbours(scene), voting.render_labels(scene, box, cameras["middle"]) > 0.5
     found = all_views.label_gaussians(scene, near, cameras, {"middle": mask}, images.__getitem__)
     assert (found & box).sum() > 0.95 * box.sum() and (found & ~box).sum() < 0.01 * box.sum()
@@ -192,7 +187,7 @@ def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
 
 
 def test_clicks_find_their_place_through_the_lens():
-    lens = small_capture.some_truth(small_capture.OPENCV).lens
+    lens = captures.make_truth(captures.OPENCV).lens
     points = np.array([[1.0, 2.0], [50.0, 30.0], [190.0, 140.0]])
     there = undistort_points(points, lens, (192, 144))
     assert np.abs(distort_points(there, lens, (192, 144)) - points).max() < 1e-3
@@ -205,12 +200,12 @@ def test_clicks_find_their_place_through_the_lens():
     assert abs(columns.min() - corners[0, 0]) <= 2 and abs(rows.max() + 1 - corners[1, 1]) <= 2
 
 
-def written(folder, with_masks=False):
-    some = small_capture.some_truth()
-    small_capture.write_pictures(folder / "images", sorted(some.world_to_camera))
-    small_capture.write_model(folder / "sparse/0", some, ending=".png")
+def write_small_capture(folder, with_masks=False):
+    some = captures.make_truth()
+    captures.write_pictures(folder / "images", sorted(some.world_to_camera))
+    captures.write_model(folder / "sparse/0", some, ending=".png")
     if with_masks:
-        small_capture.write_masks(folder / "masks", ["v01"])
+        captures.write_masks(folder / "masks", ["v01"])
     return folder
 
 
@@ -221,15 +216,15 @@ def written(folder, with_masks=False):
     ({"v01": [[1, 1]]}, "has a mask"),
     ({"v00": [[1, 1]], "v00.png": [[2, 2]]}, "named twice"),
 ])  # fmt: skip
-def test_clicks_that_cannot_be_right(tmp_path, clicks, said):
-    folder = written(tmp_path / "scene", with_masks="v01" in clicks)
+def test_contradicting_clicks_are_refused(tmp_path, clicks, said):
+    folder = write_small_capture(tmp_path / "scene", with_masks="v01" in clicks)
     (tmp_path / "out").mkdir()
     with pytest.raises(BadInput, match=said):
         poses.run(Poses(clicks=clicks), tmp_path / "out", scene=folder)
 
 
 @pytest.mark.parametrize("click", [[1], [1, 2, 3], [1, 2, "*"], [-1, 2], "1, 2", [1, 2, "+", 4], ["a", 2]])
-def test_what_is_no_click(click):
+def test_invalid_clicks_are_refused(click):
     with pytest.raises(ValueError):
         masks.Params(clicks={"v00": [click]})
 
@@ -238,8 +233,8 @@ def test_what_is_no_click(click):
 
 
 @pytest.fixture
-def page(scene, tmp_path):
-    _, placed, fit = scene
+def page_server(clicked_scene, tmp_path):
+    _, placed, fit = clicked_scene
     capture = Capture(tmp_path, tmp_path / "masks", placed, fit, {})
     server = Server(Session(capture, lambda: True), port=18090)
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -251,19 +246,19 @@ def page(scene, tmp_path):
 
 
 @pytest.mark.parametrize("width", [1280, 390])
-def test_clicks_in_a_browser_make_masks_that_are_saved(page, tmp_path, width):
-    with visiting(page.address, width) as tab:
+def test_clicks_in_a_browser_make_masks_that_are_saved(page_server, tmp_path, width):
+    with open_page(page_server.address, width) as tab:
         tab.wait_for_function("state && state.fit && view")
         name = tab.evaluate("view")
         box = tab.locator("#stage").bounding_box()
-        column, row = np.argwhere(truth(name)).mean(0)[::-1] / (small.WIDTH, small.HEIGHT)
+        column, row = np.argwhere(square_mask(name)).mean(0)[::-1] / (wall_scene.WIDTH, wall_scene.HEIGHT)
         at = (box["x"] + column * box["width"], box["y"] + row * box["height"])
         tab.mouse.click(*at)
         tab.wait_for_function("!pending && !state.busy && state.views.every(v => v.mask !== null)", timeout=60_000)
-        assert small.iou(page.session.masks[name], truth(name)) > 0.9
+        assert wall_scene.iou(page_server.session.masks[name], square_mask(name)) > 0.9
         tab.mouse.click(*at, button="right")
         tab.wait_for_function("!pending && !state.busy && of(view).clicks.length === 2")
-        assert not page.session.masks[name][round(row * small.HEIGHT), round(column * small.WIDTH)]
+        assert not page_server.session.masks[name][round(row * wall_scene.HEIGHT), round(column * wall_scene.WIDTH)]
         tab.keyboard.press("Control+z")
         tab.wait_for_function("!pending && !state.busy && of(view).clicks.length === 1")
         tab.keyboard.press("ArrowRight")
@@ -271,36 +266,36 @@ def test_clicks_in_a_browser_make_masks_that_are_saved(page, tmp_path, width):
         tab.locator("#save").click()
         tab.wait_for_function("document.getElementById('status').textContent.includes('saved')")
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
-    for each in small.TRAIN:
-        assert small.iou(load_mask(tmp_path / "masks" / f"{each}.png"), truth(each)) > 0.85
+    for each in wall_scene.TRAIN:
+        assert wall_scene.iou(load_mask(tmp_path / "masks" / f"{each}.png"), square_mask(each)) > 0.85
 
 
-def test_what_was_clicked_is_there_the_next_time(page, tmp_path):
-    page.session.click("a2", [(48.0, 36.0, True)])
-    page.session.save()
-    again = Session(page.session.capture, lambda: True)
+def test_clicks_are_restored_the_next_time(page_server, tmp_path):
+    page_server.session.click("a2", [(48.0, 36.0, True)])
+    page_server.session.save()
+    again = Session(page_server.session.capture, lambda: True)
     assert again.clicks == {"a2": [(48.0, 36.0, True)]}
     again.save()  # its own files it may write again
 
 
-def test_masks_of_others_are_never_overwritten(page, tmp_path):
-    save_mask(tmp_path / "masks/a3.png", truth("a3"))
+def test_masks_of_others_are_never_overwritten(page_server, tmp_path):
+    save_mask(tmp_path / "masks/a3.png", square_mask("a3"))
     before = load_image(tmp_path / "masks/a3.png")
-    page.session.click("a2", [(48.0, 36.0, True)])
+    page_server.session.click("a2", [(48.0, 36.0, True)])
     with pytest.raises(ValueError, match=r"a3\.png: not written by this page"):
-        page.session.save()
+        page_server.session.save()
     assert (load_image(tmp_path / "masks/a3.png") == before).all()
     assert sorted(p.name for p in (tmp_path / "masks").iterdir()) == ["a3.png"]
 
 
-def test_the_page_is_for_this_machine_only(page):
+def test_the_page_is_served_on_localhost_only(page_server):
     import urllib.error
     import urllib.request
 
     for headers in ({"Host": "elsewhere.example"}, {"Origin": "http://elsewhere.example"}):
-        request = urllib.request.Request(page.address + "save", b"{}", headers)
+        request = urllib.request.Request(page_server.address + "save", b"{}", headers)
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(request)
-    request = urllib.request.Request(page.address + "clicks", b'{"view": "a9", "clicks": [[1, 1, "+"]]}')
+    request = urllib.request.Request(page_server.address + "clicks", b'{"view": "a9", "clicks": [[1, 1, "+"]]}')
     with pytest.raises(urllib.error.HTTPError, match="400"):
         urllib.request.urlopen(request)

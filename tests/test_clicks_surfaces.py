@@ -1,16 +1,16 @@
-"""What a click means where the depth is known: the thing that stands for itself, however rough what is around it."""
+"""Clicks where the depth is known select the object that stands out, also on rough ground."""
 
 from __future__ import annotations
 
 import numpy as np
-import small_scene as small
+from scenes import wall_scene
 
 from reffusion.clicks.marks import Clicks
 from reffusion.clicks.single_view import segment_view
 
 
-def chequered_on_gravel():
-    """A chequered disk before gravel, whose depth and colours are noise; picture, relief, disk."""
+def checkered_disk_on_gravel():
+    """Picture, relief and mask of a checkered disk in front of noisy gravel."""
     draw, (rows, columns) = np.random.default_rng(3), np.mgrid[:256, :256]
     disk = np.hypot(rows - 150, columns - 110) < 26
     picture = np.repeat(draw.integers(60, 180, (256, 256, 1)), 3, 2)
@@ -21,17 +21,17 @@ def chequered_on_gravel():
 
 
 def test_one_click_finds_a_chequered_thing_on_rough_ground():
-    picture, relief, disk = chequered_on_gravel()
+    picture, relief, disk = checkered_disk_on_gravel()
     found = segment_view(picture, Clicks(np.array([[110.5, 150.5]]), np.array([True])), relief)
-    assert small.iou(found, disk) > 0.9
+    assert wall_scene.iou(found, disk) > 0.9
 
 
 def test_a_further_click_never_loses_what_was_clicked_before():
     """A second part is no reason to keep of the first only the pixel that was clicked."""
-    picture, relief, disk = chequered_on_gravel()
+    picture, relief, disk = checkered_disk_on_gravel()
     rows, columns = np.mgrid[:256, :256]
     other = np.hypot(rows - 80, columns - 200) < 20
     picture[other], relief[other] = (200, 40, 40), 0
     clicks = Clicks(np.array([[110.5, 150.5], [200.5, 80.5]]), np.array([True, True]))
     found = segment_view(picture, clicks, relief)
-    assert small.iou(found & disk, disk) > 0.9 and small.iou(found & other, other) > 0.9
+    assert wall_scene.iou(found & disk, disk) > 0.9 and wall_scene.iou(found & other, other) > 0.9

@@ -1,4 +1,4 @@
-"""Engines other than this machine: a local Ray cluster of three nodes, submitit's local executor; work that is lost."""
+"""Engines other than this machine: a local Ray cluster of three nodes, submitit's local executor, lost work."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ import time
 from pathlib import Path
 
 import pytest
-from test_batch import FILES, spans, toys, written
-from test_compare import request as asked
-from test_faults import assert_whole
+from scenes.processes import run_module
+from scenes.toy_projects import COMPARE_FILES, make_request, write_project
+from test_batch import read_spans, write_projects
+from test_runner_faults import assert_artifacts_complete
 
 from runner.compare import compare
 from runner.engine import LocalEngine, Resources, StageResult, Task, make_engine
@@ -27,15 +28,15 @@ REPO = Path(__file__).resolve().parent.parent
 slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
 
 
-def results(runs: Path) -> dict[str, str]:
-    """Every file of every artifact with its hash, as receipts have them."""
+def artifact_hashes(runs: Path) -> dict[str, str]:
+    """The hash of every file of every artifact, from the receipts."""
     receipts = {path.parent.relative_to(runs): json.loads(path.read_text()) for path in runs.glob("*/*/receipt.json")}
     return {f"{place}/{name}": file for place, each in receipts.items() for name, file in each["files"].items()}
 
 
 @pytest.fixture(scope="module")
-def cluster():
-    """Three nodes with a core each."""
+def ray_cluster():
+    """Three Ray nodes with a core each."""
     pytest.importorskip("ray", reason="ray is not installed")
     from ray.cluster_utils import Cluster
 
@@ -46,39 +47,39 @@ def cluster():
 
 
 @pytest.fixture
-def on_ray(cluster, tmp_path):
+def ray_engine(ray_cluster, tmp_path):
     import ray
 
-    yield make_engine("ray", cluster.address, tmp_path, tmp_path / "runs")
+    yield make_engine("ray", ray_cluster.address, tmp_path, tmp_path / "runs")
     ray.shutdown()
 
 
 # ------------------------------------------------------------------------------------------------------- what was lost
 
 
-def stage_task(root: Path) -> Task:
+def make_task(root: Path) -> Task:
     line = {"stage": "distill", "params": {"gain": 1, "pause": 0}, "out": str(root / "runs/toy/.partial-distill-1")}
     line |= {"needs": {"poses": str(root)}, "log": str(root / "distill.log")}
     return Task(root, line, root / "output.log")
 
 
 def test_an_attempt_works_in_a_folder_of_its_own_and_goes_on_from_the_one_before(tmp_path):
-    root = written(tmp_path)
+    root = write_project(tmp_path)
     out = root / "runs/toy/.partial-distill-1"
     lost = out.with_name(out.name + ".0abc")
     lost.mkdir(parents=True)
     (lost / "checkpoint.pt").write_text("half")
     (lost / "checkpoint.pt.writing").write_text("ha")
-    ended = run_attempt(stage_task(root))
+    ended = run_attempt(make_task(root))
     assert ended.code == 0 and ended.answer["seconds"] >= 0
     assert (out / "checkpoint.pt").read_text() == "half" and (out / "gain.txt").exists()
     assert not (out / "checkpoint.pt.writing").exists() and not lost.exists()
     assert [path.name for path in out.parent.iterdir()] == [out.name]
 
 
-def test_one_that_was_given_up_for_lost_writes_nowhere(tmp_path, monkeypatch):
+def test_an_attempt_given_up_as_lost_writes_nothing(tmp_path, monkeypatch):
     """While it works, another takes over and ends."""
-    root = written(tmp_path)
+    root = write_project(tmp_path)
     out = root / "runs/toy/.partial-distill-1"
 
     def work(task: Task, should_stop=None) -> StageResult:
@@ -91,13 +92,13 @@ def test_one_that_was_given_up_for_lost_writes_nowhere(tmp_path, monkeypatch):
         return StageResult({}, 0)
 
     monkeypatch.setattr("runner.retry.run_process", work)
-    run_attempt(stage_task(root))
+    run_attempt(make_task(root))
     assert [path.name for path in out.iterdir()] == ["theirs.txt"]
 
 
 @pytest.mark.parametrize("heeds", [True, False])
-def test_one_that_is_told_to_end_is_interrupted_and_one_that_had_finished_has(tmp_path, heeds):
-    root = written(tmp_path)
+def test_a_stopped_attempt_is_interrupted_unless_it_finished(tmp_path, heeds):
+    root = write_project(tmp_path)
     out = root / "runs/toy/.partial-distill-1"
     wait = """    try:
         (out / "checkpoint.pt").touch()
@@ -106,34 +107,36 @@ def test_one_that_is_told_to_end_is_interrupted_and_one_that_had_finished_has(tm
         if HEEDS:
             raise
 """
-    stage = FILES["stages/distill.py"].replace("    time.sleep(params.pause)\n", wait.replace("HEEDS", str(heeds)))
+    stage = COMPARE_FILES["stages/distill.py"].replace(
+        "    time.sleep(params.pause)\n", wait.replace("HEEDS", str(heeds))
+    )
     (root / "stages/distill.py").write_text(stage)
-    ended = run_attempt(stage_task(root), lambda: bool(list(out.parent.glob("*/checkpoint.pt"))))
+    ended = run_attempt(make_task(root), lambda: bool(list(out.parent.glob("*/checkpoint.pt"))))
     assert ended.code == (INTERRUPTED if heeds else 0) and bool(ended.answer) != heeds
     assert (out / "checkpoint.pt").exists() and (out / "gain.txt").exists() != heeds
 
 
 def test_this_machine_goes_on_with_what_a_cluster_left(tmp_path, capsys):
-    root = written(tmp_path)
-    run_scene(asked(root), "poses")
+    root = write_project(tmp_path)
+    run_scene(make_request(root), "poses")
     (root / "data/toy/scene.yaml").write_text("stages: {distill: {gain: -1}}")
     with pytest.raises(Exception, match="a gain below 0"):
-        run_scene(asked(root), "distill")
+        run_scene(make_request(root), "distill")
     (partial,) = (root / "runs/toy").glob(".partial-distill-*")
     partial.rename(partial.with_name(partial.name + ".77"))
     (partial.with_name(partial.name + ".77") / "left.txt").touch()
     (root / "stages/distill.py").touch()
     with pytest.raises(Exception, match="a gain below 0"):
-        run_scene(asked(root), "distill")
+        run_scene(make_request(root), "distill")
     assert (partial / "left.txt").exists() and not list((root / "runs/toy").glob(".partial-distill-*.77"))
 
 
 # ----------------------------------------------------------------------------------------------------------------- Ray
 
 
-def twelve(root: Path) -> Path:
+def write_twelve_scenes(root: Path) -> Path:
     """Twelve scenes of the toy pipeline."""
-    written(root)
+    write_project(root)
     for number in range(12):
         (root / f"many/s{number:02}").mkdir(parents=True)
         (root / f"many/s{number:02}/number.txt").write_text(str(10 * number))
@@ -141,41 +144,46 @@ def twelve(root: Path) -> Path:
 
 
 @slow
-def test_twelve_scenes_with_three_variants_on_ray_are_those_of_one_machine(tmp_path, on_ray, cluster):
+def test_twelve_scenes_with_three_variants_on_ray_are_those_of_one_machine(tmp_path, ray_engine, ray_cluster):
     """A node is killed while it works."""
-    root = twelve(tmp_path)
+    root = write_twelve_scenes(tmp_path)
     there = root / "runs"
 
     def kill() -> None:
         while len(list(there.glob("*/distill/receipt.json"))) < 3 or not list(there.glob("*/.partial-*.*")):
             time.sleep(0.01)
-        cluster.remove_node(cluster.others.pop(), allow_graceful=False)
+        ray_cluster.remove_node(ray_cluster.others.pop(), allow_graceful=False)
 
     killer = threading.Thread(target=kill, daemon=True)
     killer.start()
     assert (
-        compare(asked(root, "", cuda=on_ray.cuda), "better,none", data=root / "many", execution=Execution(on_ray, 1))
+        compare(
+            make_request(root, "", cuda=ray_engine.cuda),
+            "better,none",
+            data=root / "many",
+            execution=Execution(ray_engine, 1),
+        )
         == 0
     )
     killer.join()
-    cluster.others.append(cluster.add_node(num_cpus=1))
-    equals_one_machine(root, "better,none", 300)
+    ray_cluster.others.append(ray_cluster.add_node(num_cpus=1))
+    assert_same_as_one_machine(root, "better,none", 300)
 
 
-def equals_one_machine(root: Path, variants: str, least: int) -> None:
-    """runs/ holds what one machine makes, file by file; and nothing of it is run again by that machine."""
+def assert_same_as_one_machine(root: Path, variants: str, least: int) -> None:
+    """Assert that runs/ equals a local run file by file, and that a local run repeats nothing."""
     there = root / "runs"
-    local = type(asked(root, ""))(root, root / "alone", "", "laptop")
+    local = type(make_request(root, ""))(root, root / "alone", "", "laptop")
     assert compare(local, variants, data=root / "many", execution=Execution(LocalEngine(), 1)) == 0
-    here, away = results(root / "alone"), results(there)
+    here, away = artifact_hashes(root / "alone"), artifact_hashes(there)
     different = sorted(name for name in {*here, *away} if here.get(name) != away.get(name))
     assert len(here) >= least and not [name for name in different if not name.endswith("metrics.json")]
     for name in different:  # it holds the stages' seconds
         one, other = (json.loads((place / name).read_text()) for place in (root / "alone", there))
         assert one["mean"] == other["mean"] and one["gaussians"] == other["gaussians"]
-    assert_whole(there)
+    assert_artifacts_complete(there)
     times = {path: path.stat().st_mtime_ns for path in there.glob("*/*/receipt.json")}
-    assert compare(asked(root, ""), variants, data=root / "many", execution=Execution(LocalEngine(), 1)) == 0
+    assert compare(make_request(root, ""), variants, data=root / "many", execution=Execution(LocalEngine(), 1)) == 0
     assert {path: path.stat().st_mtime_ns for path in there.glob("*/*/receipt.json")} == times
 
 
@@ -186,16 +194,16 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 from runner.compare import batch
 root = Path(sys.argv[1])
 engine = make_engine("ray", sys.argv[2], root, root / "runs")
-sys.exit(batch(asked(root, "", cuda=engine.cuda), root / "many", Execution(engine, 1)))
+sys.exit(batch(make_request(root, "", cuda=engine.cuda), root / "many", Execution(engine, 1)))
 """
 
 
 @slow
 @pytest.mark.parametrize("send", [signal.SIGKILL, signal.SIGINT])
-def test_the_driver_killed_and_started_again(tmp_path, cluster, send):
-    root = toys(tmp_path, 5.0)
+def test_the_driver_killed_and_started_again(tmp_path, ray_cluster, send):
+    root = write_projects(tmp_path, 5.0)
     environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO}/tests"}
-    command = [sys.executable, "-c", DRIVER, str(root), cluster.address]
+    command = [sys.executable, "-c", DRIVER, str(root), ray_cluster.address]
     process = subprocess.Popen(command, env=environment)
     while len(list((root / "runs").glob("begun-*"))) < 3:  # `poses` of all three is in place
         assert process.poll() is None
@@ -208,15 +216,15 @@ def test_the_driver_killed_and_started_again(tmp_path, cluster, send):
     assert subprocess.run(command, env=environment, timeout=300).returncode == 1  # scene c
     lines = (root / "runs/ran.txt").read_text().splitlines()
     assert sorted(lines) == sorted(set(lines)) and len(lines) == 9
-    assert_whole(root / "runs")
+    assert_artifacts_complete(root / "runs")
 
 
 @slow
 @pytest.mark.parametrize("last", ["poses", "distill", "evaluate"])
-def test_what_ended_when_the_driver_was_interrupted_is_not_done_again(tmp_path, cluster, last):
-    root = toys(tmp_path)
+def test_work_finished_when_the_driver_is_interrupted_is_not_repeated(tmp_path, ray_cluster, last):
+    root = write_projects(tmp_path)
     environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO}/tests"}
-    command = [sys.executable, "-c", DRIVER, str(root), cluster.address]
+    command = [sys.executable, "-c", DRIVER, str(root), ray_cluster.address]
     process, ran = subprocess.Popen(command, env=environment), root / "runs/ran.txt"
     while not ran.exists() or last not in ran.read_text():
         assert process.poll() is None
@@ -226,20 +234,20 @@ def test_what_ended_when_the_driver_was_interrupted_is_not_done_again(tmp_path, 
     assert subprocess.run(command, env=environment, timeout=300).returncode == 1  # scene c
     lines = ran.read_text().splitlines()
     assert sorted(lines) == sorted(set(lines)) and len(lines) == 9
-    assert_whole(root / "runs")
+    assert_artifacts_complete(root / "runs")
 
 
 @slow
-def test_ray_adds_little_and_a_stage_has_the_cores_it_was_given(tmp_path, on_ray, capsys):
-    root = toys(tmp_path)
-    run_scene(asked(root, str(root / "many/a"), cuda=on_ray.cuda), "poses", None, Execution(on_ray, 1))
+def test_ray_adds_little_and_a_stage_has_the_cores_it_was_given(tmp_path, ray_engine, capsys):
+    root = write_projects(tmp_path)
+    run_scene(make_request(root, str(root / "many/a"), cuda=ray_engine.cuda), "poses", None, Execution(ray_engine, 1))
     begun = time.monotonic()
-    run_scene(asked(root, str(root / "many/a"), cuda=on_ray.cuda), "distill", None, Execution(on_ray, 1))
+    run_scene(make_request(root, str(root / "many/a"), cuda=ray_engine.cuda), "distill", None, Execution(ray_engine, 1))
     took = time.monotonic() - begun
     print(f"one stage by Ray, planning and all: {took:.2f} s")
-    assert [threads for _, _, threads, _ in spans(root)] == ["1"]
-    run_scene(asked(root, str(root / "many/a"), cuda=False), "all")
-    assert len(spans(root)) == 1
+    assert [threads for _, _, threads, _ in read_spans(root)] == ["1"]
+    run_scene(make_request(root, str(root / "many/a"), cuda=False), "all")
+    assert len(read_spans(root)) == 1
 
 
 # --------------------------------------------------------------------------------------------------------------- Slurm
@@ -247,22 +255,23 @@ def test_ray_adds_little_and_a_stage_has_the_cores_it_was_given(tmp_path, on_ray
 
 def test_slurm_by_submitits_local_executor(tmp_path, capsys):
     pytest.importorskip("submitit", reason="submitit is not installed")
-    root = written(tmp_path)
+    root = write_project(tmp_path)
     engine = make_engine("slurm", "local", root, root / "runs")
-    folders = run_scene(asked(root), "distill", None, Execution(engine, 1))
+    folders = run_scene(make_request(root), "distill", None, Execution(engine, 1))
     assert (folders["distill"] / "gain.txt").read_text() == "1"
-    (root / "stages/poses.py").write_text(FILES["stages/poses.py"].replace("    number =", "    boom\n    number ="))
+    (root / "stages/poses.py").write_text(
+        COMPARE_FILES["stages/poses.py"].replace("    number =", "    boom\n    number =")
+    )
     with pytest.raises(Exception, match="poses: NameError: name 'boom' is not defined"):
-        run_scene(asked(root), "poses", None, Execution(engine, 1))
+        run_scene(make_request(root), "poses", None, Execution(engine, 1))
     engine.stop()
     with pytest.raises(KeyboardInterrupt):
-        engine.run(stage_task(root), Resources(1, 0, 100), 0, lambda: None)
+        engine.run(make_task(root), Resources(1, 0, 100), 0, lambda: None)
 
 
-def test_a_cluster_that_is_not_there_is_told_in_a_line(tmp_path):
+def test_a_missing_cluster_is_reported_in_one_line(tmp_path):
     pytest.importorskip("submitit", reason="submitit is not installed")
-    command = [sys.executable, "-m", "runner", "run", "--scene", "x", "--engine", "slurm"]
-    done = subprocess.run(command, cwd=REPO, capture_output=True, text=True)
+    done = run_module("runner", "run", "--scene", "x", "--engine", "slurm")
     if shutil.which("srun"):
         pytest.skip("there is a Slurm here")
     assert done.returncode == 2 and "address=local tries it without a cluster" in done.stderr

@@ -1,4 +1,4 @@
-"""compare and report on a toy pipeline: resuming, failing variants, tables, intervals, the Pareto front, pages."""
+"""The commands compare and report on a toy pipeline: resuming, failures, tables, intervals, Pareto front, pages."""
 
 from __future__ import annotations
 
@@ -15,182 +15,74 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import visiting
+from scenes.browser import open_page
+from scenes.processes import run_module
+from scenes.toy_projects import COMPARE_FILES, make_request, write_files, write_project
 
 from report import compare as page
 from report import compare_pictures, job, job_data, results, scenes_page, trace_charts
 from report.paired_statistics import confidence_half_width, paired_difference, pareto_front
 from runner import Refused
 from runner.compare import compare
-from runner.resolve import Request
 
 REPO = Path(__file__).resolve().parent.parent
-FILES = {
-    "pipeline.yaml": """
-scene_keys: {}
-stages:
-  poses: {needs: [scene]}
-  distill:
-    needs: [poses]
-    skip_if: [{param: distill.gain, equals: 0, reason: no gain}]
-  evaluate: {needs: [poses], optional: [distill]}
-profiles: {laptop: {}}
-variants:
-  better: {distill: {gain: 3}}
-  twin: {distill: {gain: 3}}
-  bad: {distill: {gain: -1}}
-  none: {distill: {gain: 0}}
-""",
-    "stages/__init__.py": "",
-    "stages/common.py": """
-import json, time
-from pathlib import Path
-
-VIEWS = "abcd"
-
-def ran(out, name):
-    \"\"\"A line for each stage that came to its end.\"\"\"
-    with open(out.parent.parent / "ran.txt", "a") as file:
-        file.write(f"{out.parent.name} {name}\\n")
-""",
-    "stages/poses.py": """
-from pydantic import BaseModel
-from stages.common import *
-
-class Params(BaseModel, extra="forbid"):
-    pass
-
-def run(params, out, *, scene):
-    from PIL import Image
-    (out / "images").mkdir(exist_ok=True)
-    number = int((scene / "number.txt").read_text())
-    for view in VIEWS:
-        Image.new("RGB", (40, 30), (number, 200, 90)).save(out / "images" / f"{view}.png")
-    (out / "views.json").write_text(json.dumps({"train": [], "test": list(VIEWS), "number": number}))
-    ran(out, "poses")
-""",
-    "stages/distill.py": """
-from pydantic import BaseModel
-from stages.common import *
-
-class Params(BaseModel, extra="forbid"):
-    gain: int = 1
-    pause: float = 0.0
-
-def run(params, out, *, poses):
-    if params.gain < 0:
-        raise ValueError("a gain below 0 | cannot be")
-    time.sleep(params.pause)
-    lines = [{"seconds": 2.0 ** i, "iteration": i, "reference_psnr": 20.0 + i * params.gain} for i in range(4)]
-    lines[-1] |= {"reason": "finished"}
-    (out / "trace.jsonl").write_text("".join(json.dumps(line) + "\\n" for line in lines))
-    (out / "facts.json").write_text(json.dumps({"inpainter": "a brush", "perceptual": None}))
-    (out / "gain.txt").write_text(str(params.gain))
-    ran(out, "distill")
-""",
-    "stages/evaluate.py": """
-import csv
-from pydantic import BaseModel
-from stages.common import *
-
-class Params(BaseModel, extra="forbid"):
-    pass
-
-def run(params, out, *, poses, distill):
-    from PIL import Image
-    number = json.loads((poses / "views.json").read_text())["number"]
-    gain = int((distill / "gain.txt").read_text()) if distill else 0
-    (out / "renders").mkdir()
-    rows = []
-    for index, view in enumerate(VIEWS):
-        Image.new("RGB", (40, 30), (number, 10 * gain, 90)).save(out / "renders" / f"{view}.png")
-        row = {"view": view, "left": 10, "top": 8, "right": 30, "bottom": 22}
-        row |= {"psnr_box": 20 + index + gain * (1 + 0.1 * index) + number / 10, "lpips_vgg_box": None}
-        row |= {"flip_box": 0.3 / (1 + gain), "ssim_box": 0.5 + gain / 10}
-        rows.append(row)
-    with open(out / "per_view.csv", "w") as file:
-        writer = csv.DictWriter(file, rows[0].keys())
-        writer.writeheader()
-        writer.writerows(rows)
-    mean = lambda name: sum(row[name] for row in rows) / len(rows)
-    metrics = {"mean": {name: mean(name) for name in ("psnr_box", "ssim_box", "flip_box")} | {"lpips_vgg_box": None}}
-    metrics |= {"result": "distill", "gaussians": {"distill": 100 + gain}, "lpips_unavailable": "no weights"}
-    metrics |= {"consistency": {"consistency": 0.01 * gain}}
-    (out / "metrics.json").write_text(json.dumps(metrics))
-    ran(out, "evaluate")
-""",
-    "reffusion/__init__.py": "",
-    **{f"data/{name}/number.txt": text for name, text in (("toy", "10"), ("toy-1", "30"))},
-}
-
-
-def request(root: Path, scene: str = "toy", **options) -> Request:
-    return Request(root, root / "runs", scene, **{"profile": "laptop", **options})
-
 
 PUBLISHED = 'method,metric,value,protocol\nsomebody,psnr_box,19.5,"ten scenes, 1600 px"\n'
 
 
-def write(root: Path, files: dict[str, str]) -> None:
-    for name, text in files.items():
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_text(text)
-
-
-def written(root: Path) -> Path:
-    write(root, FILES)
-    return root
-
-
-def ran(root: Path) -> list[str]:
+def finished_stages(root: Path) -> list[str]:
     return sorted((root / "runs/ran.txt").read_text().splitlines())
 
 
-def by_method(home: Path) -> dict[str, dict]:
-    return {row["method"]: row for row in results.summarize_methods(results.load_comparison(home))}
+def methods_by_name(job_folder: Path) -> dict[str, dict]:
+    return {row["method"]: row for row in results.summarize_methods(results.load_comparison(job_folder))}
 
 
 @pytest.fixture(scope="module")
-def compared(tmp_path_factory) -> Path:
+def compared_project(tmp_path_factory) -> Path:
     """All variants on the toy scene, one of which fails."""
-    root = written(tmp_path_factory.mktemp("compared"))
-    assert compare(request(root)) == 1
+    root = write_project(tmp_path_factory.mktemp("compared"))
+    assert compare(make_request(root)) == 1
     return root
 
 
 @pytest.fixture(scope="module")
-def pages(compared) -> dict[str, Path]:
-    return page.make(compared / "runs/toy")
+def pages(compared_project) -> dict[str, Path]:
+    return page.make(compared_project / "runs/toy")
 
 
 @pytest.fixture
-def home(compared, tmp_path) -> Path:
-    """A copy of its runs; the scene's folder."""
-    shutil.copytree(compared / "runs", tmp_path / "runs")
+def job_folder(compared_project, tmp_path) -> Path:
+    """The scene's folder in a copy of the compared runs."""
+    shutil.copytree(compared_project / "runs", tmp_path / "runs")
     return tmp_path / "runs/toy"
 
 
 # -------------------------------------------------------------------------------------------------------- the runs
 
 
-def test_every_variant_once_and_what_is_equal_is_shared(compared):
+def test_every_variant_once_and_what_is_equal_is_shared(compared_project):
     own = ["toy distill", "toy evaluate", "toy poses"]
-    assert ran(compared) == sorted([*own, "toy@better distill", "toy@better evaluate", "toy@none evaluate"])
-    copy = compared / "runs/toy@twin/distill"  # copied from the variant that did the same
+    assert finished_stages(compared_project) == sorted(
+        [*own, "toy@better distill", "toy@better evaluate", "toy@none evaluate"]
+    )
+    copy = compared_project / "runs/toy@twin/distill"  # copied from the variant that did the same
     assert (copy / "gain.txt").read_text() == "3" and (copy / "receipt.json").exists()
-    assert not list((compared / "runs").glob("*/.copying*")) and not list((compared / "runs").glob("toy@twin/.*"))
+    assert not list((compared_project / "runs").glob("*/.copying*")) and not list(
+        (compared_project / "runs").glob("toy@twin/.*")
+    )
 
 
-def test_a_failed_variant_shows_and_stops_no_other(compared, pages):
-    table = by_method(compared / "runs/toy")
+def test_a_failed_variant_shows_and_stops_no_other(compared_project, pages):
+    table = methods_by_name(compared_project / "runs/toy")
     assert [name for name, row in table.items() if row["state"] == "failed"] == ["bad"]
     assert table["bad"]["psnr_box"] is None and table["bad"]["seconds"] is None and table["none"]["psnr_box"] == 22.5
     assert "| bad (failed) |" in pages["md"].read_text()
     assert all("a gain below 0 | cannot be" in pages[kind].read_text() for kind in ("md", "html"))
 
 
-def test_the_same_job_is_no_row_of_figures(compared, pages):
-    twin = by_method(compared / "runs/toy")["twin"]
+def test_the_same_job_is_no_row_of_figures(compared_project, pages):
+    twin = methods_by_name(compared_project / "runs/toy")["twin"]
     assert twin["same_as"] == "better" and twin["psnr_box"] is None and twin["seconds"] is None
     text = pages["md"].read_text()
     assert "| twin = better |" in text and "twin is the very same job as better here." in text
@@ -199,39 +91,39 @@ def test_the_same_job_is_no_row_of_figures(compared, pages):
 
 def test_methods_are_compared_in_a_profile_of_their_own(tmp_path):
     """The scene's own run is a method beside the others."""
-    root = written(tmp_path)
-    pipeline = FILES["pipeline.yaml"].replace(
+    root = write_project(tmp_path)
+    pipeline = COMPARE_FILES["pipeline.yaml"].replace(
         "profiles: {laptop: {}}", "profiles: {laptop: {}, terms: {distill: {gain: 2}}}"
     )
     pipeline = pipeline.replace("variants:\n", "comparisons: {laptop: terms}\nvariants:\n  full: {}\n")
-    write(root, {"pipeline.yaml": pipeline})
-    assert compare(request(root), only="better default") == 0
-    table = by_method(root / "runs/toy")
+    write_files(root, {"pipeline.yaml": pipeline})
+    assert compare(make_request(root), only="better default") == 0
+    table = methods_by_name(root / "runs/toy")
     assert list(table) == ["full", "better", "default"]
     assert [table[name]["gaussians"] for name in table] == [102, 103, 101]
     assert (root / "runs/toy/profile").read_text() == "laptop\n"
     assert not (root / "runs/toy@full/poses").exists(), "shared with the scene's own run"
     assert (root / "runs/toy@full/profile").read_text() == "terms\n"
-    write(root, {"pipeline.yaml": pipeline.replace("{laptop: terms}", "{laptop: nothing}")})
+    write_files(root, {"pipeline.yaml": pipeline.replace("{laptop: terms}", "{laptop: nothing}")})
     with pytest.raises(Refused, match="comparisons names unknown profile 'nothing'"):
-        compare(request(root))
+        compare(make_request(root))
 
 
-def test_the_best_in_lpips_comes_first_and_ties_are_ties(home):
+def test_the_best_in_lpips_comes_first_and_ties_are_ties(job_folder):
     for method, value in (("toy", 0.2), ("toy@better", 0.1), ("toy@none", 0.10001)):
-        path = home.parent / method / "evaluate/metrics.json"
+        path = job_folder.parent / method / "evaluate/metrics.json"
         metrics = json.loads(path.read_text())
         metrics["mean"]["lpips_vgg_box"] = value
         path.write_text(json.dumps(metrics))
-    assert list(by_method(home)) == ["better", "none", "full", "bad", "twin"]
-    text = page.make(home)["md"].read_text()
+    assert list(methods_by_name(job_folder)) == ["better", "none", "full", "bad", "twin"]
+    text = page.make(job_folder)["md"].read_text()
     assert "best in LPIPS (vgg): better and none;" in text and text.count("**0.1000**") == 2
 
 
 def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path):
     """Three scenes, `better` too; the second scene is slow at first."""
-    root = written(tmp_path)
-    write(root, {"data/toy-2/number.txt": "20", "data/published.csv": PUBLISHED})
+    root = write_project(tmp_path)
+    write_files(root, {"data/toy-2/number.txt": "20", "data/published.csv": PUBLISHED})
     slow = root / "data/toy-1/scene.yaml"
     slow.write_text("stages: {distill: {pause: 60}}")
     command = [sys.executable, "-m", "runner", "compare", "--data", str(root / "data"), "--root", str(root)]
@@ -246,17 +138,17 @@ def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path
     process.send_signal(signal.SIGKILL)
     process.wait(30)
     before = [f"toy{end}" for end in (" distill", " evaluate", " poses", "@better distill", "@better evaluate")]
-    assert ran(root) == sorted([*before, "toy-1 poses"])
+    assert finished_stages(root) == sorted([*before, "toy-1 poses"])
     home = root / "runs/compare"
     partial = (home / "compare-runs.md").read_text().splitlines()  # written after each run
     assert "| full | toy | done | 23.6500 | 0.6000 |" in partial[2] and "not run yet" in partial[4]
     assert "| full | mean of 1 |  | 23.6500 |" in partial[-2]
-    assert by_method(home)["full"]["state"] == "1 of 3 done"  # the page can be drawn at any moment
+    assert methods_by_name(home)["full"]["state"] == "1 of 3 done"  # the page can be drawn at any moment
     slow.unlink()
-    assert compare(request(root, ""), "better", data=root / "data") == 0
+    assert compare(make_request(root, ""), "better", data=root / "data") == 0
     ends = (" distill", " evaluate", " poses", "@better distill", "@better evaluate")
-    assert ran(root) == sorted(f"{scene}{end}" for scene in ("toy", "toy-1", "toy-2") for end in ends)
-    row = by_method(home)["full"]
+    assert finished_stages(root) == sorted(f"{scene}{end}" for scene in ("toy", "toy-1", "toy-2") for end in ends)
+    row = methods_by_name(home)["full"]
     assert row["scenes"] == 3 and row["psnr_box"] == pytest.approx(21.5 + 1.15 + (1 + 2 + 3) / 3)
     assert row["psnr_box_interval"] == pytest.approx(4.302653 / np.sqrt(3), rel=1e-6)  # deviation 1, Student's t of 2
     made = page.make(home)
@@ -303,16 +195,16 @@ def test_three_made_scenes_of_spin_nerfs_layout_by_the_real_stages(tmp_path, gen
     process.wait(30)
     dates = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").glob("1*/*/receipt.json")}
     home = tmp_path / "runs/compare"
-    assert len(dates) > 8 and by_method(home)["full"]["state"] == "1 of 3 done"
+    assert len(dates) > 8 and methods_by_name(home)["full"]["state"] == "1 of 3 done"
     subprocess.run(command, cwd=REPO, check=True)
     assert {path: path.stat().st_mtime_ns for path in dates} == dates
-    table = by_method(home)
+    table = methods_by_name(home)
     assert all(row["scenes"] == 3 and row["psnr_box_interval"] > 0 for row in table.values())
     assert table["full"]["psnr_box"] > table["masked"]["psnr_box"] and page.make(home)["html"].is_file()
 
 
 def test_refused_before_any_work(tmp_path):
-    root = written(tmp_path)
+    root = write_project(tmp_path)
     for arguments, options, message in [
         (("beter",), {}, "variants: unknown variant 'beter'; did you mean 'better'"),
         (("", 4), {}, "seeds=4 asks for the scenes toy to toy-3: unknown scene 'toy-2'"),
@@ -323,10 +215,10 @@ def test_refused_before_any_work(tmp_path):
         (("", 1, root / "stages/none"), {"scene": ""}, "no folders of scenes there"),
     ]:
         with pytest.raises(Refused, match=re.escape(message)):
-            compare(request(root, **{"scene": "toy", **options}), *arguments)
-    (root / "pipeline.yaml").write_text(FILES["pipeline.yaml"].replace("{gain: 3}", "{gain: much}"))
+            compare(make_request(root, **{"scene": "toy", **options}), *arguments)
+    (root / "pipeline.yaml").write_text(COMPARE_FILES["pipeline.yaml"].replace("{gain: 3}", "{gain: much}"))
     with pytest.raises(Refused, match=r"variant better: distill.gain = 'much'"):
-        compare(request(root))
+        compare(make_request(root))
     assert not list((root / "runs").glob("*/*/receipt.json"))
     with pytest.raises(ValueError, match="make scene=toy compare"):
         page.make(root / "runs/toy")
@@ -335,8 +227,8 @@ def test_refused_before_any_work(tmp_path):
 # ------------------------------------------------------------------------------------------------- tables and pages
 
 
-def test_the_table_survives_its_csv(compared, pages):
-    home = compared / "runs/toy"
+def test_the_table_survives_its_csv(compared_project, pages):
+    home = compared_project / "runs/toy"
     table = results.summarize_methods(results.load_comparison(home))
     with open(pages["csv"], newline="") as file:
         saved = list(csv.DictReader(file))
@@ -362,55 +254,55 @@ def test_the_page_needs_no_other_file(pages):
     assert len(linked) == 5 and all((pages["md"].parent / name).stat().st_size > 1000 for name in linked)
 
 
-def test_without_ground_truth(home):
-    for evaluate in home.parent.glob("*/evaluate"):
+def test_without_ground_truth(job_folder):
+    for evaluate in job_folder.parent.glob("*/evaluate"):
         metrics = json.loads((evaluate / "metrics.json").read_text())
         (evaluate / "metrics.json").write_text(json.dumps(metrics | {"mean": dict.fromkeys(metrics["mean"])}))
         rows = [line.split(",")[:5] for line in (evaluate / "per_view.csv").read_text().splitlines()]
         (evaluate / "per_view.csv").write_text("".join(",".join(row) + "\n" for row in rows))
-    html = page.make(home)["html"].read_text()
+    html = page.make(job_folder)["html"].read_text()
     assert "No box metrics: the scene has no ground truth." in html and "minus full" not in html
-    row = by_method(home)["better"]
+    row = methods_by_name(job_folder)["better"]
     assert row["psnr_box"] is None and row["psnr_box_minus_full"] is None and row["consistency"] == 0.03
-    assert (home / "compare/tradeoff.png").exists() and not (home / "compare/differences.png").exists()
+    assert (job_folder / "compare/tradeoff.png").exists() and not (job_folder / "compare/differences.png").exists()
     assert row["psnr_outside"] is None and "outside" not in html
 
 
-def test_without_ground_truth_held_out_views_are_compared_outside_their_masks(home):
-    for evaluate in home.parent.glob("*/evaluate"):
+def test_without_ground_truth_held_out_views_are_compared_outside_their_masks(job_folder):
+    for evaluate in job_folder.parent.glob("*/evaluate"):
         gain = 2.0 if "@better" in str(evaluate.resolve()) or "@twin" in str(evaluate.resolve()) else 1.0
         metrics = json.loads((evaluate / "metrics.json").read_text())
         mean = dict.fromkeys(metrics["mean"]) | {"psnr_outside": 30 + gain, "ssim_outside": 0.9, "flip_outside": 0.1}
         (evaluate / "metrics.json").write_text(json.dumps(metrics | {"mean": mean}))
         lines = [f"{view},10,8,30,22,{30 + gain + 0.1 * gain * k}" for k, view in enumerate("abcd")]
         (evaluate / "per_view.csv").write_text("\n".join(["view,left,top,right,bottom,psnr_outside", *lines, ""]))
-    made = page.make(home)
-    row = by_method(home)["better"]
+    made = page.make(job_folder)
+    row = methods_by_name(job_folder)["better"]
     assert row["psnr_outside"] == 32 and row["psnr_box"] is None
     assert row["psnr_outside_minus_full"] == pytest.approx(1.15) and row["psnr_outside_interval_views"] > 0
     text = made["md"].read_text()
     assert "outside: PSNR ↑" in text and "| +1.15 ± 0.21 |" in text and "best in PSNR outside: better" in text
     assert "should leave as they are" in made["html"].read_text()
-    runs = results.load_comparison(home)
+    runs = results.load_comparison(job_folder)
     title = lambda: compare_pictures._cells([runs.runs["full", "toy"]], runs.runs["full", "toy"], "a")[0][0]
     assert title() == "ground truth"
-    (home / "raw_masks/masks").mkdir(parents=True)
-    (home / "raw_masks/masks/a.png").touch()  # of a test view that shows the object
-    runs.runs["full", "toy"].folders["raw_masks"] = home / "raw_masks"
+    (job_folder / "raw_masks/masks").mkdir(parents=True)
+    (job_folder / "raw_masks/masks/a.png").touch()  # of a test view that shows the object
+    runs.runs["full", "toy"].folders["raw_masks"] = job_folder / "raw_masks"
     assert title() == "photograph, with the object"
-    assert (home / "compare/differences.png").exists()
+    assert (job_folder / "compare/differences.png").exists()
 
 
-def test_several_scenes(home):
+def test_several_scenes(job_folder):
     """`better` gains 2.0, 2.2, 2.4 and 2.6 dB in the views of one scene, and 1 dB more in those of the other."""
     for name in ("toy", "toy@better"):
-        shutil.copytree(home.parent / name, home.parent / name.replace("toy", "toy-1"))
-    path = home.parent / "toy-1@better/evaluate/per_view.csv"
+        shutil.copytree(job_folder.parent / name, job_folder.parent / name.replace("toy", "toy-1"))
+    path = job_folder.parent / "toy-1@better/evaluate/per_view.csv"
     header, *lines = [line.split(",") for line in path.read_text().splitlines()]
     for line in lines:
         line[header.index("psnr_box")] = str(float(line[header.index("psnr_box")]) + 1)
     path.write_text("".join(",".join(line) + "\n" for line in [header, *lines]))
-    record = json.loads((home / "compare.json").read_text()) | {
+    record = json.loads((job_folder / "compare.json").read_text()) | {
         "scenes": ["toy", "toy-1"],
         "methods": ["full", "better"],
     }
@@ -418,13 +310,13 @@ def test_several_scenes(home):
     for run in runs.copy():
         there = {stage: folder.replace("toy", "toy-1") for stage, folder in run["stages"].items()}
         runs.append(run | {"scene": "toy-1", "stages": there})
-    (home / "compare.json").write_text(json.dumps(record | {"runs": runs}))
-    row = by_method(home)["better"]
+    (job_folder / "compare.json").write_text(json.dumps(record | {"runs": runs}))
+    row = methods_by_name(job_folder)["better"]
     views = np.array([2.0, 2.2, 2.4, 2.6, 3.0, 3.2, 3.4, 3.6])
     assert row["scenes"] == 2 and row["psnr_box_minus_full"] == pytest.approx(2.8)
     assert row["psnr_box_interval_views"] == pytest.approx(2.364624 * views.std(ddof=1) / np.sqrt(8), rel=1e-6)
     assert row["psnr_box_interval_scenes"] == pytest.approx(12.706205 * 0.5, rel=1e-6)
-    assert "+2.80 ± 0.49 (± 6.35)" in page.make(home)["md"].read_text()
+    assert "+2.80 ± 0.49 (± 6.35)" in page.make(job_folder)["md"].read_text()
 
 
 # ------------------------------------------------------------------------------------------------------- statistics
@@ -466,17 +358,16 @@ def test_the_median_of_curves():
 # --------------------------------------------------------------------------------------------------- a job's report
 
 
-def plan_of(root: Path, runs: Path, *options: str) -> None:
-    command = [sys.executable, "-m", "runner", "plan", "--record", "--scene", "toy", "--root", str(root)]
-    environment = {**os.environ, "PYTHONPATH": str(REPO)}
-    subprocess.run([*command, "--runs", str(runs), *options], cwd=REPO, env=environment, check=True)
+def record_plan(root: Path, runs: Path, *options: str) -> None:
+    command = ("plan", "--record", "--scene", "toy", "--root", root, "--runs", runs, *options)
+    assert run_module("runner", *command).returncode == 0
 
 
-def test_report_of_a_job(compared, home):
-    plan_of(compared, home.parent)
-    path = job.make(home)
+def test_report_of_a_job(compared_project, job_folder):
+    record_plan(compared_project, job_folder.parent)
+    path = job.make(job_folder)
     html = path.read_text()
-    assert path == home / "report.html" and not list(home.glob("report*/*"))
+    assert path == job_folder / "report.html" and not list(job_folder.glob("report*/*"))
     sources = re.findall(r'src="([^"]*)"', html)
     assert len(sources) == 4 * 2 + 2 and all(source.startswith("data:image/") for source in sources)
     assert html.count("data:image/png") == 2, "the whole job, and the trace of distill"
@@ -486,39 +377,42 @@ def test_report_of_a_job(compared, home):
     assert "What was left out or taken over, and why" in html
     assert "http" not in re.sub(r'src="[^"]*"', "", html), "whose letters may hold any word"
     assert "make scene=" in html and "profile=laptop all" in html and "set by hand" not in html
-    receipt = json.loads((home / "distill/receipt.json").read_text())
+    receipt = json.loads((job_folder / "distill/receipt.json").read_text())
     receipt["params"]["gain"] = 2  # as set="distill.gain=2" would have left it
-    (home / "distill/receipt.json").write_text(json.dumps(receipt))
-    html = job.make(home).read_text()
+    (job_folder / "distill/receipt.json").write_text(json.dumps(receipt))
+    html = job.make(job_folder).read_text()
     assert "set by hand" in html and "profile=laptop set=distill.gain=2 all" in html
 
 
-def test_report_of_a_variant_says_what_was_left_out(compared, home):
-    plan_of(compared, home.parent, "--variant", "none")
-    html = job.make(home.with_name("toy@none")).read_text()
+def test_report_of_a_variant_says_what_was_left_out(compared_project, job_folder):
+    record_plan(compared_project, job_folder.parent, "--variant", "none")
+    html = job.make(job_folder.with_name("toy@none")).read_text()
     assert re.search(r"<td>distill</td><td[^>]*>left.out</td><td[^>]*>no gain</td>", html)
     assert "shared with toy" in html and "distill: error against seconds" not in html
     assert "profile=laptop variant=none all" in html
 
 
-def test_report_with_pieces_missing(home):
-    shutil.rmtree(home / "evaluate")
-    with open(home / "distill/trace.jsonl", "a") as file:
+def test_report_with_pieces_missing(job_folder):
+    shutil.rmtree(job_folder / "evaluate")
+    with open(job_folder / "distill/trace.jsonl", "a") as file:
         file.write('{"seconds": 1.0, "iteration": 9}\n')
-    html = job.make(home).read_text()
+    html = job.make(job_folder).read_text()
     assert "It is not evaluated yet." in html and "None yet: " in html and "Not drawn: " in html
     assert "Still to run, or to run again: fit, evaluate." in html
-    (home / "distill/trace.jsonl").unlink()
-    assert "Not drawn" not in job.make(home).read_text()
+    (job_folder / "distill/trace.jsonl").unlink()
+    assert "Not drawn" not in job.make(job_folder).read_text()
     for stage in ("distill", "poses"):
-        shutil.rmtree(home / stage)
+        shutil.rmtree(job_folder / stage)
     with pytest.raises(ValueError, match="no stage has been done; run `make scene=toy all`"):
-        job.make(home)
+        job.make(job_folder)
 
 
-def test_report_of_many_scenes(home):
-    jobs = [job_data.load_job(path) for path in (home, home.with_name("toy@better"), home.with_name("toy@twin"))]
-    path = scenes_page.make(jobs, home.parent / "report")
+def test_report_of_many_scenes(job_folder):
+    jobs = [
+        job_data.load_job(path)
+        for path in (job_folder, job_folder.with_name("toy@better"), job_folder.with_name("toy@twin"))
+    ]
+    path = scenes_page.make(jobs, job_folder.parent / "report")
     rows = [line.split(",") for line in (path.parent / "stages.csv").read_text().splitlines()]
     found = {(stage, quantity): [float(value) for value in values] for stage, quantity, *values in rows[1:]}
     assert found["distill", "reference_psnr"] == [3, 26, 29, 29]
@@ -526,17 +420,17 @@ def test_report_of_many_scenes(home):
     assert (path.parent / "stages.png").exists() and "29 [26, 29]" in path.read_text()
 
 
-def test_a_job_that_failed_is_still_reported(home):
+def test_a_job_that_failed_is_still_reported(job_folder):
     """Without a plan: the stages of the scene's own run are taken for the variant's, as far as they are there."""
     for stage in ("distill", "evaluate"):
-        shutil.rmtree(home / stage)
-    assert "in 1 stages. It is not evaluated yet." in job.make(home.with_name("toy@bad")).read_text()
+        shutil.rmtree(job_folder / stage)
+    assert "in 1 stages. It is not evaluated yet." in job.make(job_folder.with_name("toy@bad")).read_text()
 
 
 @pytest.mark.parametrize("width", [1280, 390])
-def test_the_report_is_walked_through_in_a_browser(compared, home, width):
-    plan_of(compared, home.parent)
-    with visiting(job.make(home).as_uri(), width) as page:
+def test_the_report_is_walked_through_in_a_browser(compared_project, job_folder, width):
+    record_plan(compared_project, job_folder.parent)
+    with open_page(job.make(job_folder).as_uri(), width) as page:
         view, left, right = page.locator(".compare select").all()
         names = [option.inner_text() for option in view.locator("option").all()]
         shown = lambda: [pair.get_attribute("data-view") for pair in page.locator(".pair:visible").all()]

@@ -1,4 +1,4 @@
-"""Composites of real captures: where the object stands, what its drawing touches, the table."""
+"""Composites of real captures: where the object stands, which pixels it changes, and the table."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from scenes.cameras import rotation_along
 
 from benchmarks.studies import composites, compositing, placement, scoring
 from reffusion.capture import lens
@@ -24,25 +25,22 @@ LENS = {"fl_x": 80.0, "fl_y": 82.0, "cx": 47.0, "cy": 36.5, "k1": 0.05, "k2": -0
 PLACE = placement.Place("here", "small", "v03", (48.0, 40.0), 0.25, 60.0, train=5, test=2, near=14.0)
 
 
-def camera_at(angle: float) -> np.ndarray:
+def arc_pose(angle: float) -> np.ndarray:
     """[4, 4] camera-to-world, on an arc 3 away from the origin and 2 above the ground y = 0."""
     center = np.array([3 * np.sin(angle), 2.0, 3 * np.cos(angle)])
-    forward = -center / np.linalg.norm(center)
-    right = np.cross(forward, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
     camera = np.eye(4)
-    camera[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    camera[:3, :3] = rotation_along(-center, (0.0, 1.0, 0.0)).T
     camera[:3, 3] = center
     return camera
 
 
 @pytest.fixture(scope="module")
-def captures(tmp_path_factory) -> Path:
+def captures_folder(tmp_path_factory) -> Path:
     """A folder with one capture: 8 noisy photographs of a flat ground with a bent lens; one has no file."""
     folder, random = tmp_path_factory.mktemp("captures"), np.random.default_rng(0)
     frames = []
     for k, angle in enumerate(np.radians(np.linspace(-40, 40, 8))):
-        matrix = camera_at(angle) @ placement.OPENGL
+        matrix = arc_pose(angle) @ placement.OPENGL
         frames.append({"file_path": f"images/v{k:02d}.png", "transform_matrix": matrix.tolist()})
         photo = random.integers(60, 200, (HEIGHT, WIDTH, 3), np.uint8)
         save_image(folder / f"small/images/v{k:02d}.png", photo)
@@ -54,19 +52,19 @@ def captures(tmp_path_factory) -> Path:
     return folder
 
 
-def scene_of(captures: Path, out: Path, place=PLACE, **options) -> Path:
+def write_composite(captures_folder: Path, out: Path, place=PLACE, **options) -> Path:
     compositing.write_scene(
-        place, placement.load_photographs(captures / place.capture), compositing.Options(**options), out
+        place, placement.load_photographs(captures_folder / place.capture), compositing.Options(**options), out
     )
     return out
 
 
-def masks(scene: Path, folder: str = "masks") -> dict[str, np.ndarray]:
+def load_masks(scene: Path, folder: str = "masks") -> dict[str, np.ndarray]:
     return {path.stem: load_mask(path) for path in sorted((scene / folder).glob("*.png"))}
 
 
-def through_lens(capture: placement.Photographs, name: str, points: np.ndarray) -> np.ndarray:
-    """Image points [P, 2] by the project's own lens."""
+def project_through_lens(capture: placement.Photographs, name: str, points: np.ndarray) -> np.ndarray:
+    """Image points [P, 2], projected by the project's own lens."""
     of = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
     bent = lens.from_colmap("OPENCV", WIDTH, HEIGHT, tuple(LENS[key] for key in of))
     camera = capture.cameras[name]
@@ -74,8 +72,8 @@ def through_lens(capture: placement.Photographs, name: str, points: np.ndarray) 
     return lens.to_pixels(lens.distort(seen[:, :2] / seen[:, 2:], bent), bent)
 
 
-def test_the_object_stands_on_the_ground_where_it_was_pointed_at(captures):
-    capture = placement.load_photographs(captures / "small")
+def test_the_object_stands_on_the_ground_where_it_was_pointed_at(captures_folder):
+    capture = placement.load_photographs(captures_folder / "small")
     assert sorted(capture.cameras) == [f"v{k:02d}" for k in range(8)]
     thing = placement.place_object(capture, PLACE)
     np.testing.assert_allclose(thing.normal, [0, 1, 0], atol=1e-9)
@@ -87,15 +85,15 @@ def test_the_object_stands_on_the_ground_where_it_was_pointed_at(captures):
 
 
 @pytest.mark.parametrize("shape", ["box", "ellipsoid"])
-def test_masks_are_the_projected_object(captures, tmp_path, shape):
+def test_masks_are_the_projected_object(captures_folder, tmp_path, shape):
     """The hull of the object's projected surface covers the mask, and the mask covers it, but for a pixel."""
-    place, capture = replace(PLACE, shape=shape), placement.load_photographs(captures / "small")
-    thing, scene = placement.place_object(capture, place), scene_of(captures, tmp_path / "scene", place)
+    place, capture = replace(PLACE, shape=shape), placement.load_photographs(captures_folder / "small")
+    thing, scene = placement.place_object(capture, place), write_composite(captures_folder, tmp_path / "scene", place)
     unit = np.random.default_rng(1).normal(size=(4000, 3))
     unit /= np.linalg.norm(unit, axis=1, keepdims=True) if shape == "ellipsoid" else np.abs(unit).max(1, keepdims=True)
     surface = thing.middle + (unit * thing.half) @ thing.axes
-    for name, mask in {**masks(scene), **masks(scene, "test_masks")}.items():
-        outline = cv2.convexHull(np.round(16 * (through_lens(capture, name, surface) - 0.5)).astype(np.int32))
+    for name, mask in {**load_masks(scene), **load_masks(scene, "test_masks")}.items():
+        outline = cv2.convexHull(np.round(16 * (project_through_lens(capture, name, surface) - 0.5)).astype(np.int32))
         hull = np.zeros(mask.shape, np.uint8)
         cv2.fillConvexPoly(hull, outline, 1, shift=4)
         ring = np.ones((3, 3), np.uint8)
@@ -103,16 +101,16 @@ def test_masks_are_the_projected_object(captures, tmp_path, shape):
         assert not ((cv2.erode(hull, ring) > 0) & ~mask).any()
 
 
-def test_only_masked_pixels_of_training_photographs_change(captures, tmp_path):
-    scene = scene_of(captures, tmp_path / "scene")
+def test_only_masked_pixels_of_training_photographs_change(captures_folder, tmp_path):
+    scene = write_composite(captures_folder, tmp_path / "scene")
     yes = yaml.safe_load((scene / "scene.yaml").read_text())
-    train, test = masks(scene), masks(scene, "test_masks")
+    train, test = load_masks(scene), load_masks(scene, "test_masks")
     assert len(train) == 5 and sorted(test) == sorted(yes["test"]) and not set(train) & set(test)
     assert yes["reference"]["view"] in train
     for name in (*train, *test):
         photo, truth, before = (
             load_image(folder / f"{name}.png")
-            for folder in (scene / "images", scene / "truth", captures / "small/images")
+            for folder in (scene / "images", scene / "truth", captures_folder / "small/images")
         )
         assert np.array_equal(truth, before)
         drawn = train.get(name, np.zeros(photo.shape[:2], bool))
@@ -120,56 +118,59 @@ def test_only_masked_pixels_of_training_photographs_change(captures, tmp_path):
         assert name in test or (photo[drawn] != before[drawn]).any(1).mean() > 0.9
 
 
-def test_a_shadow_darkens_the_ground_outside_the_masks(captures, tmp_path):
-    plain = scene_of(captures, tmp_path / "plain")
-    shaded = scene_of(captures, tmp_path / "shaded", shadow=0.6)
-    for name, mask in masks(plain).items():
-        assert np.array_equal(mask, masks(shaded)[name])
+def test_a_shadow_darkens_the_ground_outside_the_masks(captures_folder, tmp_path):
+    plain = write_composite(captures_folder, tmp_path / "plain")
+    shaded = write_composite(captures_folder, tmp_path / "shaded", shadow=0.6)
+    for name, mask in load_masks(plain).items():
+        assert np.array_equal(mask, load_masks(shaded)[name])
         before, after = (load_image(s / f"images/{name}.png")[~mask].astype(int) for s in (plain, shaded))
         assert (after <= before).all()
         assert (after < 0.6 * before).any(1).sum() > 10
-    for name in masks(plain, "test_masks"):
+    for name in load_masks(plain, "test_masks"):
         assert np.array_equal(*(load_image(s / f"images/{name}.png") for s in (plain, shaded)))
 
 
-def test_rough_masks_are_wrong_by_no_more_than_they_may(captures, tmp_path):
+def test_rough_masks_are_wrong_by_no_more_than_they_may(captures_folder, tmp_path):
     """Grown or shrunk by at most 3 px, and shifted by at most 3: no border is more than 6 px away along an axis."""
-    plain, rough = scene_of(captures, tmp_path / "plain"), scene_of(captures, tmp_path / "rough", rough=3)
+    plain, rough = (
+        write_composite(captures_folder, tmp_path / "plain"),
+        write_composite(captures_folder, tmp_path / "rough", rough=3),
+    )
     far, wrong = np.ones((13, 13), np.uint8), 0
-    for name, mask in masks(plain).items():
-        found = masks(rough)[name]
+    for name, mask in load_masks(plain).items():
+        found = load_masks(rough)[name]
         assert not (found & (cv2.dilate(mask.astype(np.uint8), far) == 0)).any()
         assert not ((cv2.erode(mask.astype(np.uint8), far) > 0) & ~found).any()
         wrong += (found != mask).any()
         assert np.array_equal(*(load_image(s / f"images/{name}.png") for s in (plain, rough)))
     assert wrong >= 4
-    exact = masks(plain, "test_masks")
-    assert all(np.array_equal(mask, exact[name]) for name, mask in masks(rough, "test_masks").items())
+    exact = load_masks(plain, "test_masks")
+    assert all(np.array_equal(mask, exact[name]) for name, mask in load_masks(rough, "test_masks").items())
 
 
-def test_the_untouched_scene_has_the_same_views_and_nothing_to_remove(captures, tmp_path):
+def test_the_untouched_scene_has_the_same_views_and_nothing_to_remove(captures_folder, tmp_path):
     options = compositing.Options()
-    scene, untouched = composites.make_scenes(PLACE, captures, options, tmp_path)
+    scene, untouched = composites.make_scenes(PLACE, captures_folder, options, tmp_path)
     told = (untouched / "scene.yaml").stat().st_mtime_ns
     assert yaml.safe_load((untouched / "scene.yaml").read_text())["masks"] == "none"
     assert (untouched / "transforms.json").read_text() == (scene / "transforms.json").read_text()
-    for name in masks(scene):
+    for name in load_masks(scene):
         same = load_image(untouched / f"images/{name}.png"), load_image(scene / f"truth/{name}.png")
         assert np.array_equal(*same)
-    composites.make_scenes(PLACE, captures, options, tmp_path)
+    composites.make_scenes(PLACE, captures_folder, options, tmp_path)
     assert (untouched / "scene.yaml").stat().st_mtime_ns == told
-    alone, _ = composites.make_scenes(PLACE, captures, replace(options, reference=False), tmp_path)
+    alone, _ = composites.make_scenes(PLACE, captures_folder, replace(options, reference=False), tmp_path)
     assert alone != scene and "reference" not in yaml.safe_load((alone / "scene.yaml").read_text())
 
 
-def test_a_place_without_a_surface_is_an_error(captures):
-    capture = placement.load_photographs(captures / "small")
+def test_a_place_without_a_surface_is_an_error(captures_folder):
+    capture = placement.load_photographs(captures_folder / "small")
     with pytest.raises(ValueError, match="points within"):
         placement.place_object(capture, replace(PLACE, near=0.1))
     with pytest.raises(ValueError, match="no photograph"):
         placement.place_object(capture, replace(PLACE, view="lost"))
     with pytest.raises(ValueError, match="no transforms"):
-        placement.load_photographs(captures)
+        placement.load_photographs(captures_folder)
 
 
 def test_without_captures_it_is_skipped(tmp_path, monkeypatch, capsys):

@@ -1,29 +1,24 @@
-"""Consistency of neighbouring views against scenes whose warp is known in closed form."""
+"""Consistency of neighbouring views, on scenes whose warp is known in closed form."""
 
 import numpy as np
 import pytest
+from scenes.cameras import make_camera, world_rays, yaw
+from scenes.images import rectangle_mask
 
 from reffusion.metrics import consistency
 from reffusion.metrics.consistency import RenderedView
-from reffusion.types import Camera
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 
 
-def camera(name, x=0.0, turned=0.0):
-    """At (x, 0, 0), turned about the vertical by so many radians."""
-    pose = np.eye(4)
-    pose[0, 0] = pose[2, 2] = np.cos(turned)
-    pose[0, 2], pose[2, 0] = -np.sin(turned), np.sin(turned)
-    pose[:3, 3] = -pose[:3, :3] @ (x, 0.0, 0.0)
-    return Camera(name, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose)
+def turned_camera(name, x=0.0, angle=0.0):
+    """At (x, 0, 0), turned about the vertical by `angle` radians."""
+    return make_camera(name, (WIDTH, HEIGHT), FOCAL, (x, 0.0, 0.0), yaw(angle))
 
 
-def plane(view, slope=0.0, shift=0.0):
-    """The view of the plane z = 2 + slope x, painted with colours that are linear in x and y: depth and picture."""
-    x = (np.arange(WIDTH) + 0.5 - view.cx) / view.fx
-    y = (np.arange(HEIGHT) + 0.5 - view.cy) / view.fy
-    rays = np.stack([*np.meshgrid(x, y), np.ones((HEIGHT, WIDTH))], -1) @ view.world_to_camera[:3, :3]
+def render_plane(view, slope=0.0, shift=0.0):
+    """Depth and picture of the plane z = 2 + slope x, whose colours are linear in x and y."""
+    rays = world_rays(view)
     start = view.center
     depth = (2 + slope * start[0] - start[2]) / (rays[..., 2] - slope * rays[..., 0])
     points = start + depth[..., None] * rays
@@ -31,60 +26,58 @@ def plane(view, slope=0.0, shift=0.0):
     return depth, np.round(color * 255).astype(np.uint8)
 
 
-def rendered(view, mask=None, **scene):
-    depth, picture = plane(view, **scene)
+def plane_view(view, mask=None, **scene):
+    depth, picture = render_plane(view, **scene)
     return RenderedView(view, picture, depth, np.ones((HEIGHT, WIDTH), bool) if mask is None else mask)
 
 
-def middle():
-    mask = np.zeros((HEIGHT, WIDTH), bool)
-    mask[10:40, 20:44] = True
-    return mask
+def inner_mask():
+    return rectangle_mask((HEIGHT, WIDTH), (10, 40), (20, 44))
 
 
 def test_views_of_one_plane_agree_to_the_rounding_of_their_pictures():
-    for other in (camera("b", 0.2), camera("b", -0.1, 0.05)):
+    for other in (turned_camera("b", 0.2), turned_camera("b", -0.1, 0.05)):
         for slope in (0.0, 0.3):
             value, share = consistency.reprojected_color_difference(
-                rendered(camera("a"), middle(), slope=slope), rendered(other, slope=slope)
+                plane_view(turned_camera("a"), inner_mask(), slope=slope), plane_view(other, slope=slope)
             )
             assert value < 1.2 / 255 and share == 1.0
 
 
 def test_a_colour_that_changes_from_view_to_view_is_the_difference():
-    a, b = rendered(camera("a"), middle()), rendered(camera("b", 0.2), shift=0.2)
+    a, b = plane_view(turned_camera("a"), inner_mask()), plane_view(turned_camera("b", 0.2), shift=0.2)
     value, share = consistency.reprojected_color_difference(a, b)
     assert value == pytest.approx(0.2, abs=1.2 / 255) and share == 1.0
 
 
 def test_a_wrong_depth_shows_as_the_slope_of_the_picture_times_the_shift():
     """At half its depth a point lands 6 px off in a view 0.2 to the side; a pixel is worth 0.2 * 2 / 60 of red."""
-    a, b = rendered(camera("a"), middle()), rendered(camera("b", 0.2))
+    a, b = plane_view(turned_camera("a"), inner_mask()), plane_view(turned_camera("b", 0.2))
     value, _ = consistency.reprojected_color_difference(a._replace(depth=a.depth / 2), b._replace(depth=b.depth / 2))
     assert value == pytest.approx(6 * 0.2 * 2 / 60 / 3, abs=1.2 / 255)
 
 
 def test_what_the_neighbour_does_not_see_is_not_compared():
-    a, b = rendered(camera("a"), middle()), rendered(camera("b", 0.2))
+    a, b = plane_view(turned_camera("a"), inner_mask()), plane_view(turned_camera("b", 0.2))
     half = np.where(np.arange(WIDTH) < WIDTH // 2, 0.5, b.depth)  # something nearer before its left half
     poisoned = np.where((half < 1)[..., None], np.uint8(255), b.picture)
     value, share = consistency.reprojected_color_difference(a, b._replace(depth=half, picture=poisoned))
     # The plane's pixels land 6 px to the left: those of columns 38 to 43 stay in the right half.
     assert share == pytest.approx(6 / 24) and value < 1.2 / 255 + 1 / 255
-    assert consistency.reprojected_color_difference(a, rendered(camera("b", 50.0))) == (None, 0.0)
+    assert consistency.reprojected_color_difference(a, plane_view(turned_camera("b", 50.0))) == (None, 0.0)
     assert consistency.reprojected_color_difference(a._replace(mask=np.zeros_like(a.mask)), b) == (None, None)
     assert consistency.reprojected_color_difference(a._replace(depth=np.zeros_like(a.depth)), b) == (None, 0.0)
 
 
 def test_where_the_neighbour_shows_nothing_at_all_it_disagrees():
-    a, b = rendered(camera("a"), middle()), rendered(camera("b", 0.2))
+    a, b = plane_view(turned_camera("a"), inner_mask()), plane_view(turned_camera("b", 0.2))
     empty = b._replace(depth=np.zeros_like(b.depth), picture=np.zeros_like(b.picture))
     value, share = consistency.reprojected_color_difference(a, empty)
     assert share == 1.0 and value == pytest.approx(a.picture[a.mask].mean() / 255, abs=1e-9)
 
 
 def test_depth_is_continued_through_a_mask():
-    depth, _ = plane(camera("a"), slope=0.3)
-    broken = np.where(middle(), 0.7, depth)
-    assert np.abs(consistency.continue_surrounding_depth(broken, middle()) / depth - 1).max() < 1e-6
-    assert (consistency.continue_surrounding_depth(broken, np.ones_like(middle())) == 0).all()
+    depth, _ = render_plane(turned_camera("a"), slope=0.3)
+    broken = np.where(inner_mask(), 0.7, depth)
+    assert np.abs(consistency.continue_surrounding_depth(broken, inner_mask()) / depth - 1).max() < 1e-6
+    assert (consistency.continue_surrounding_depth(broken, np.ones_like(inner_mask())) == 0).all()

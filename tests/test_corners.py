@@ -1,35 +1,27 @@
-"""A wall that comes forward: its side, narrow in all photographs, goes on behind what stands before it."""
+"""A step in a wall continues behind an object, although its side is narrow in all photographs."""
 
 import numpy as np
 import pytest
+from scenes.cameras import look_at_camera, meet_box, world_rays
 
-from reffusion import geometry
 from reffusion.background.continuation import find_planes
 from reffusion.background.corners import find_third_faces
 from reffusion.background.visibility import DepthView, depth_range
-from reffusion.types import Camera
 
 NO_POINTS = np.zeros((0, 3))
 SIZE, DEEP = 160, 0.35  # px; how far the wall comes forward of the one behind it
 LOW, HIGH = np.array([-0.25, -0.45, 0.0]), np.array([0.35, -0.15, 0.45])  # what stands before the edge
 
 
-def camera(turn):
-    """Looks at the edge from before the wall and from the left, from where its side shows."""
-    place = np.array([-2.2 * np.sin(turn), -2.2 * np.cos(turn), 0.9])
-    ahead = np.array([0.0, 0.0, 0.3]) - place
-    ahead /= np.linalg.norm(ahead)
-    right = np.cross(ahead, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
-    pose[:3, 3] = -pose[:3, :3] @ place
-    return Camera(f"v{turn:.2f}", SIZE, SIZE, 170.0, 170.0, SIZE / 2, SIZE / 2, pose)
+def edge_camera(turn):
+    """Looks at the edge from before the wall and from the left, where its side is visible."""
+    center = (-2.2 * np.sin(turn), -2.2 * np.cos(turn), 0.9)
+    return look_at_camera(f"v{turn:.2f}", center, (0.0, 0.0, 0.3), (SIZE, SIZE), 170.0)
 
 
-def witness(view, step=0.0):
-    """Args: step: height of every second board of the floor."""
-    rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
+def edge_depth_view(view, step=0.0):
+    """Floor and wall, masked where the box hides them; `step`: height of every second board of the floor."""
+    rays = world_rays(view)
     with np.errstate(divide="ignore", invalid="ignore"):
         floor, front, behind, side = (
             (value - view.center[axis]) / rays[..., axis] for axis, value in ((2, 0.0), (1, 0.0), (1, DEEP), (0, 0.0))
@@ -41,19 +33,17 @@ def witness(view, step=0.0):
         beside = place(side)[..., 1]
         side = np.where((side > 0) & (beside > 0) & (beside < DEEP), side, np.inf)
         depth = np.min([np.where(each > 0, each, np.inf) for each in (floor, front, behind, side)], axis=0)
-        bounds = np.stack([(LOW - view.center) / rays, (HIGH - view.center) / rays])
-    enter, leave = bounds.min(0).max(-1), bounds.max(0).min(-1)
-    return DepthView.from_range(view, depth, depth_range(depth.astype(np.float32)), (enter < leave) & (leave > 0))
+    return DepthView.from_range(view, depth, depth_range(depth.astype(np.float32)), meet_box(view, LOW, HIGH)[1])
 
 
 @pytest.fixture(scope="module")
-def planes():
-    views = [witness(camera(turn)) for turn in np.linspace(0.1, 0.6, 12)]
+def wall_planes():
+    views = [edge_depth_view(edge_camera(turn)) for turn in np.linspace(0.1, 0.6, 12)]
     return find_planes((LOW + HIGH) / 2, 0.3, views, NO_POINTS)
 
 
-def test_the_side_of_a_wall_goes_on_behind_a_thing_down_to_the_floor_and_not_into_the_wall(planes):
-    sides = [plane for plane in planes if abs(plane.normal[0]) > 0.99]
+def test_the_side_of_a_wall_goes_on_behind_a_thing_down_to_the_floor_and_not_into_the_wall(wall_planes):
+    sides = [plane for plane in wall_planes if abs(plane.normal[0]) > 0.99]
     assert len(sides) == 1 and abs(sides[0].offset) < 0.01
     _, y, z = np.moveaxis(sides[0].cell_centers, -1, 0)
     known = sides[0].continued | sides[0].seen
@@ -78,7 +68,7 @@ def test_leaves_have_no_third_face():
 def test_sparse_points_tell_where_planes_lie_that_are_drawn_too_near():
     views = []
     for turn in np.linspace(0.1, 0.6, 12):
-        true = witness(camera(turn))
+        true = edge_depth_view(edge_camera(turn))
         rows = np.linspace(0, 0.02, SIZE)[:, None]  # haze: the farther up, so farther off, the nearer it is drawn
         depth = true.depth * (1 - rows[::-1])
         views.append(DepthView.from_range(true.camera, depth, depth_range(depth.astype(np.float32)), true.masked))
@@ -103,7 +93,7 @@ def test_sparse_points_tell_where_planes_lie_that_are_drawn_too_near():
 
 def test_a_floor_that_is_drawn_twice_is_one_unless_points_tell_a_step():
     step = 0.033
-    views = [witness(camera(turn), step) for turn in np.linspace(0.1, 0.6, 12)]
+    views = [edge_depth_view(edge_camera(turn), step) for turn in np.linspace(0.1, 0.6, 12)]
     draws, count = np.random.default_rng(0), 300
     floor = np.stack([*draws.uniform(-0.5, 0.3, (2, count)), draws.normal(0, 5e-4, count)], 1)
     boards = floor[:, :1] % 0.3 < 0.15

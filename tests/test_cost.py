@@ -1,14 +1,14 @@
-"""What a plan says that a stage takes on a GPU: from counted operations; longer for more work, less on a faster GPU;
-and what that rests on."""
+"""The cost forecast on a GPU: it counts operations, grows with the work, and falls with a faster GPU."""
 
 from __future__ import annotations
 
 import os
 import re
+from pathlib import Path
 
 import pytest
-from test_installed import ROOT, write_capture
-from test_machine import with_nvidia_smi
+from scenes.capture import write_four_photos
+from scenes.processes import fake_nvidia_smi
 
 from benchmarks.gpu import counts
 from reffusion.cost import estimate
@@ -20,6 +20,7 @@ from runner.plan import plan, plan_table
 from runner.resolve import Request, resolve
 from runner.text import format_seconds
 
+ROOT = Path(__file__).resolve().parent.parent
 HALF = {"device": "cuda", "dtype": "float16"}
 WORK = {
     "fit": (estimate.fit, fit.Params(device="cuda"), ["iterations"]),
@@ -76,8 +77,8 @@ def test_cards_by_any_name():
 
 def test_what_a_plan_prints(tmp_path, monkeypatch):
     """On a machine with a small GPU, an old driver and, as it may be, no gsplat and a torch without CUDA."""
-    write_capture(tmp_path / "row")
-    monkeypatch.setattr(os, "environ", with_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 440.10"))
+    write_four_photos(tmp_path / "row")
+    monkeypatch.setattr(os, "environ", fake_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 440.10"))
     monkeypatch.setattr("runner.plan.has_cuda", lambda: True)
     job = resolve(Request(ROOT, tmp_path / "runs", str(tmp_path / "row"), profile="paper"))
     decisions = plan(job, job.pipeline.closure("all"))

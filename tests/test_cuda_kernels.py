@@ -1,4 +1,4 @@
-"""Triton's kernels give what the formulas give; on a GPU, or without one by its interpreter (TRITON_INTERPRET=1)."""
+"""Triton kernels agree with the formulas, on a GPU or in Triton's interpreter (TRITON_INTERPRET=1)."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import os
 
 import pytest
 import torch
-from other_device import there_is_one
+from scenes.simulated_gpu import has_gpu
 
 from reffusion.gaussians import adam, optimize
 from reffusion.gaussians.ssim import C1, C2, dssim_torch, window
 from reffusion.seeding import generator
 from reffusion.types import PARAMETERS, Gaussians
 
-DEVICE = "cuda" if there_is_one() else "cpu"
+DEVICE = "cuda" if has_gpu() else "cpu"
 if DEVICE == "cpu" and os.environ.get("TRITON_INTERPRET") != "1":
     pytest.skip("needs a CUDA GPU, or Triton's interpreter", allow_module_level=True)
 pytest.importorskip("triton")

@@ -1,4 +1,4 @@
-"""The generator of synthetic scenes: layout, poses, lens, and above all its truth."""
+"""The generator of synthetic scenes: layout, poses, lens and ground truth."""
 
 from __future__ import annotations
 
@@ -14,23 +14,16 @@ from reffusion.io import colmap
 from reffusion.io.images import load_image, load_mask
 
 
-@pytest.fixture(scope="module")
-def mini(generate, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("demo") / "mini"
-    generate.generate(folder, 0, generate.KINDS["mini"])
-    return folder
-
-
-def stems(folder: Path) -> list[str]:
+def png_stems(folder: Path) -> list[str]:
     return sorted(path.stem for path in folder.glob("*.png"))
 
 
-def files(folder: Path) -> dict[str, bytes]:
+def read_files(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def through_lens(truth: dict, view: str, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Image points [P, 2] and camera z of scene points, from truth/cameras.json alone."""
+def project_by_truth(truth: dict, view: str, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Image points [P, 2] and camera z of scene points, by truth/cameras.json alone."""
     pose = np.array(truth["world_to_camera"][view])
     x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).T
     x, y = x / z, y / z
@@ -38,15 +31,15 @@ def through_lens(truth: dict, view: str, points: np.ndarray) -> tuple[np.ndarray
     return np.stack([bend * x + truth["cx"], bend * y + truth["cy"]], 1), z
 
 
-def test_same_seed_same_bytes_and_old_files_go(generate, mini, tmp_path):
+def test_same_seed_same_bytes_and_old_files_go(generate, mini_scene, tmp_path):
     again = tmp_path / "again"
     generate.generate(again, 1, generate.KINDS["mini"])
-    other = files(again)
+    other = read_files(again)
     (again / "images_4" / "stale.png").write_bytes(b"")
     generate.generate(again, 0, generate.KINDS["mini"])
-    assert files(again) == files(mini)
+    assert read_files(again) == read_files(mini_scene)
     name = "images_4/IMG_2005.png"
-    assert other[name] != files(mini)[name]
+    assert other[name] != read_files(mini_scene)[name]
 
 
 def test_foreign_files_are_never_overwritten(generate, tmp_path):
@@ -56,30 +49,30 @@ def test_foreign_files_are_never_overwritten(generate, tmp_path):
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
-def test_layout_is_spin_nerfs(generate, mini):
+def test_layout_is_spin_nerfs(generate, mini_scene):
     kind = generate.KINDS["mini"]
-    names = stems(mini / "images_4")
+    names = png_stems(mini_scene / "images_4")
     train = names[kind.test :]
     assert len(names) == kind.test + kind.train
-    assert stems(mini / "images_4/label") == train
-    assert stems(mini / "images_4/test_label") == [f"out_{k:05d}" for k in range(kind.test)]
-    label = load_image(mini / f"images_4/label/{train[0]}.png")
+    assert png_stems(mini_scene / "images_4/label") == train
+    assert png_stems(mini_scene / "images_4/test_label") == [f"out_{k:05d}" for k in range(kind.test)]
+    label = load_image(mini_scene / f"images_4/label/{train[0]}.png")
     assert label.shape[:2] == (kind.height, kind.width)
     assert set(np.unique(label)) == {0, 1}
-    scene = yaml.safe_load((mini / "scene.yaml").read_text())
+    scene = yaml.safe_load((mini_scene / "scene.yaml").read_text())
     assert set(scene) == {"reference", "profile"} and scene["profile"] == "laptop"
     assert scene["reference"]["view"] in train
-    assert load_image(mini / scene["reference"]["image"]).shape == (kind.height, kind.width, 3)
+    assert load_image(mini_scene / scene["reference"]["image"]).shape == (kind.height, kind.width, 3)
     demo = generate.KINDS["demo"]
     assert (demo.test, demo.train) == (40, 60)
 
 
-def test_poses_bounds_model_and_truth_agree(mini, generate):
+def test_poses_bounds_model_and_truth_agree(mini_scene, generate):
     kind = generate.KINDS["mini"]
-    truth = json.loads((mini / "truth/cameras.json").read_text())
-    llff = np.load(mini / "poses_bounds.npy")
-    model = {Path(image.name).stem: image for image in colmap.load_images(mini / "sparse/0/images.bin").values()}
-    names = stems(mini / "images_4")
+    truth = json.loads((mini_scene / "truth/cameras.json").read_text())
+    llff = np.load(mini_scene / "poses_bounds.npy")
+    model = {Path(image.name).stem: image for image in colmap.load_images(mini_scene / "sparse/0/images.bin").values()}
+    names = png_stems(mini_scene / "images_4")
     assert llff.shape == (len(names), 17)
     assert sorted(model) == names
     for row, name in zip(llff, names, strict=True):
@@ -89,22 +82,22 @@ def test_poses_bounds_model_and_truth_agree(mini, generate):
         np.testing.assert_allclose(-pose[:3, :3].T @ pose[:3, 3], center, atol=1e-12)
         np.testing.assert_allclose(size, [4 * kind.height, 4 * kind.width, 4 * truth["f"]])
         np.testing.assert_allclose(model[name].world_to_camera, pose, atol=1e-12)
-    (camera,) = colmap.load_cameras(mini / "sparse/0/cameras.bin").values()
+    (camera,) = colmap.load_cameras(mini_scene / "sparse/0/cameras.bin").values()
     assert (camera.width, camera.height) == (4 * kind.width, 4 * kind.height)
-    points = colmap.load_model_points(mini / "sparse/0/points3D.bin").positions
-    depths = np.concatenate([through_lens(truth, name, points)[1] for name in names])
+    points = colmap.load_model_points(mini_scene / "sparse/0/points3D.bin").positions
+    depths = np.concatenate([project_by_truth(truth, name, points)[1] for name in names])
     assert llff[:, 15].min() > 0
     assert llff[:, 16].max() <= depths.max()
 
 
-def test_sparse_points_lie_on_what_the_training_views_show(mini):
+def test_sparse_points_lie_on_what_the_training_views_show(mini_scene):
     """Half a pixel away colours agree far better than six pixels away: poses, lens and tracks are one system."""
-    truth = json.loads((mini / "truth/cameras.json").read_text())
-    model = colmap.load_model_points(mini / "sparse/0/points3D.bin")
+    truth = json.loads((mini_scene / "truth/cameras.json").read_text())
+    model = colmap.load_model_points(mini_scene / "sparse/0/points3D.bin")
     errors = {0: [], 6: []}
-    for name in stems(mini / "images_4/label"):
-        image = load_image(mini / f"images_4/{name}.png").astype(float)
-        uv, _ = through_lens(truth, name, model.positions)
+    for name in png_stems(mini_scene / "images_4/label"):
+        image = load_image(mini_scene / f"images_4/{name}.png").astype(float)
+        uv, _ = project_by_truth(truth, name, model.positions)
         for shift, found in errors.items():
             column, row = np.floor(uv + np.array([shift, 0])).astype(int).T
             inside = (column >= 0) & (row >= 0) & (column < image.shape[1]) & (row < image.shape[0])
@@ -113,15 +106,15 @@ def test_sparse_points_lie_on_what_the_training_views_show(mini):
     assert near < 0.6 * far
 
 
-def test_only_masked_pixels_change_when_the_object_goes(generate, mini):
-    view = yaml.safe_load((mini / "scene.yaml").read_text())["reference"]["view"]
-    photo, reference = load_image(mini / f"images_4/{view}.png"), load_image(mini / "reference.png")
-    mask = load_mask(mini / f"images_4/label/{view}.png")
+def test_only_masked_pixels_change_when_the_object_goes(generate, mini_scene):
+    view = yaml.safe_load((mini_scene / "scene.yaml").read_text())["reference"]["view"]
+    photo, reference = load_image(mini_scene / f"images_4/{view}.png"), load_image(mini_scene / "reference.png")
+    mask = load_mask(mini_scene / f"images_4/label/{view}.png")
     assert np.array_equal(photo[~mask], reference[~mask])
     assert (photo[mask] != reference[mask]).any(1).mean() > 0.9
 
 
-def test_test_views_are_without_the_object(generate, mini):
+def test_test_views_are_without_the_object(generate, mini_scene):
     """Rendering with the object changes the test views inside their masks and nowhere else."""
     import photographs
 
@@ -133,35 +126,37 @@ def test_test_views_are_without_the_object(generate, mini):
     )
     middle = np.argmin(np.linalg.norm(train[:, 13:] - train[:, 13:].mean(0), axis=1))
     world = photographs.set_exposure(world, train[middle], kind)
-    for k, name in enumerate(stems(mini / "images_4")[: kind.test]):
-        photo = load_image(mini / f"images_4/{name}.png")
-        mask = load_mask(mini / f"images_4/test_label/out_{k:05d}.png")
+    for k, name in enumerate(png_stems(mini_scene / "images_4")[: kind.test]):
+        photo = load_image(mini_scene / f"images_4/{name}.png")
+        mask = load_mask(mini_scene / f"images_4/test_label/out_{k:05d}.png")
         with_object, _ = photographs.shoot(world, test[k], kind, True)
         assert np.array_equal(photo[~mask], with_object[~mask])
         assert (photo[mask] != with_object[mask]).any(1).mean() > 0.9
 
 
-def test_never_seen_pixels_are_never_seen(generate, mini):
+def test_never_seen_pixels_are_never_seen(generate, mini_scene):
     """Checked with another projection: every training view hides such a pixel's background, or a mask covers it."""
     import photographs
     import raycast
 
     kind = generate.KINDS["mini"]
-    truth = json.loads((mini / "truth/cameras.json").read_text())
+    truth = json.loads((mini_scene / "truth/cameras.json").read_text())
     furniture, target = generate.furnish(0, kind)
     world, frame = generate.bake(furniture, 0, kind), generate.scene_frame(0)
     cameras = photographs.path(0, kind, target, kind.test, "test")
-    training = {name: load_mask(mini / f"images_4/label/{name}.png") for name in stems(mini / "images_4/label")}
-    for k, name in enumerate(stems(mini / "images_4")[: kind.test]):
-        mask = load_mask(mini / f"images_4/test_label/out_{k:05d}.png")
-        never = load_mask(mini / f"truth/never_seen/{name}.png")
+    training = {
+        name: load_mask(mini_scene / f"images_4/label/{name}.png") for name in png_stems(mini_scene / "images_4/label")
+    }
+    for k, name in enumerate(png_stems(mini_scene / "images_4")[: kind.test]):
+        mask = load_mask(mini_scene / f"images_4/test_label/out_{k:05d}.png")
+        never = load_mask(mini_scene / f"truth/never_seen/{name}.png")
         assert not (never & ~mask).any()
         points, _ = raycast.surface_points(world.solids, cameras[k], photographs.pixel_centers(mask), False)
-        back, _ = through_lens(truth, name, frame.points(points))
+        back, _ = project_by_truth(truth, name, frame.points(points))
         np.testing.assert_allclose(back, photographs.pixel_centers(mask), atol=1e-6)
         shown = np.zeros(len(points), bool)
         for view, covered in training.items():
-            uv, _ = through_lens(truth, view, frame.points(points))
+            uv, _ = project_by_truth(truth, view, frame.points(points))
             column, row = np.floor(uv).astype(int).T
             inside = (column >= 0) & (row >= 0) & (column < kind.width) & (row < kind.height)
             shown[inside] |= ~covered[row[inside], column[inside]]
@@ -181,7 +176,7 @@ def test_two_fifths_of_the_mask_are_never_seen(generate, tmp_path, name):
         assert 0.06 < facts["mask_share"]["train"] < 0.25
 
 
-def test_what_hangs_hides_nothing_that_other_views_miss(generate, tmp_path):
+def test_floating_objects_hide_nothing_from_all_views(generate, tmp_path):
     kind = replace(
         generate.KINDS["seen"], width=48, height=36, samples=1, train=20, test=6, texture=256, node=0.4, points=60
     )
@@ -214,8 +209,8 @@ def test_insertion_and_outpainting_are_asked_for_by_scene_files(generate, tmp_pa
     assert said["outpaint"]["region"]["outside"]
 
 
-def test_photos_bring_no_poses(generate, tmp_path):
+def test_the_photos_layout_has_no_poses(generate, tmp_path):
     kind = replace(generate.KINDS["photos"], width=48, height=36, train=4, texture=256, node=0.4)
     generate.generate(tmp_path / "photos", 7, kind)
-    assert stems(tmp_path / "photos/images") == stems(tmp_path / "photos/masks")
+    assert png_stems(tmp_path / "photos/images") == png_stems(tmp_path / "photos/masks")
     assert sorted(p.name for p in (tmp_path / "photos").iterdir()) == ["images", "masks", "truth"]

@@ -1,4 +1,4 @@
-"""The generator's harder places: before the object something stays, a table's edge, a wall's corner, foliage."""
+"""The generator's harder scenes: an object in front that stays, the edge of a table, a corner of walls, foliage."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from reffusion.io.images import load_mask
 )
 def test_harder_places_have_masks_of_the_demos_size(generate, tmp_path, name, mask, share):
     for seed in (0, 11):
-        facts = generate.generate(tmp_path / f"{name}{seed}", seed, small(generate.KINDS[name]))
+        facts = generate.generate(tmp_path / f"{name}{seed}", seed, shrink_kind(generate.KINDS[name]))
         assert share <= min(facts["never_seen_share"].values()) < 0.9
         assert mask < facts["mask_share"]["train"] < 0.25
 
 
-def small(kind):
-    """A kind at the size of a stamp."""
+def shrink_kind(kind):
+    """The kind at a tiny size."""
     return replace(kind, width=48, height=36, samples=1, train=24, test=6, texture=256, node=0.4, points=60)
 
 
-def shot(generate, kind, seed: int):
-    """(solids, cameras of the training views, what `photographs.take_photographs` makes) of a scene."""
+def photograph_scene(generate, kind, seed: int):
+    """Solids, cameras of the training views, and the photographs of a scene."""
     import photographs
 
     furniture, target = generate.furnish(seed, kind)
@@ -41,9 +41,9 @@ def test_what_stays_hides_a_part_of_the_hole_from_the_reference_only(generate):
     import photographs
     import raycast
 
-    kind = small(generate.KINDS["behind"])
+    kind = shrink_kind(generate.KINDS["behind"])
     for seed in (0, 1, 2):
-        solids, cameras, session = shot(generate, kind, seed)
+        solids, cameras, session = photograph_scene(generate, kind, seed)
         without = solids._replace(**{f: v[~solids.removable] for f, v in solids._asdict().items()})
         unseen = [
             raycast.surface_points(solids, session.cameras[k], photographs.pixel_centers(session.hidden[k]), False)[0]
@@ -59,8 +59,8 @@ def test_what_stays_hides_a_part_of_the_hole_from_the_reference_only(generate):
 
 def test_the_table_stands_in_free_space(generate):
     """Under its top low cameras see what high ones do not, and the object reaches beyond its edge."""
-    kind = small(generate.KINDS["table"])
-    solids, cameras, session = shot(generate, kind, 0)
+    kind = shrink_kind(generate.KINDS["table"])
+    solids, cameras, session = photograph_scene(generate, kind, 0)
     top = next(n for n in range(len(solids.kind)) if solids.half[n, 1] == 0.02 and not solids.removable[n])
     chest = np.flatnonzero(solids.removable)[0]
     (_, y, z), (_, thick, deep) = solids.center[top], solids.half[top]
@@ -75,8 +75,8 @@ def test_behind_the_object_a_corner_makes_a_step(generate):
     import photographs
     import raycast
 
-    kind = small(generate.KINDS["corner"])
-    solids, cameras, session = shot(generate, kind, 0)
+    kind = shrink_kind(generate.KINDS["corner"])
+    solids, cameras, session = photograph_scene(generate, kind, 0)
     pixels = photographs.pixel_centers(session.masks[session.middle])
     points, which = raycast.surface_points(solids, cameras[session.middle - kind.test], pixels, False)
     wall = next(n for n in range(len(solids.kind)) if solids.half[n, 1] == 1.35 and n > 0)
@@ -88,7 +88,7 @@ def test_behind_the_object_a_corner_makes_a_step(generate):
 def test_a_pair_has_masks_for_each_object_that_make_up_the_hole(generate, tmp_path):
     """And two references; what hides the other object is in its own mask only."""
     folder = tmp_path / "pair"
-    facts = generate.generate(folder, 0, small(generate.KINDS["pair"]))
+    facts = generate.generate(folder, 0, shrink_kind(generate.KINDS["pair"]))
     assert 0.2 <= min(facts["never_seen_share"].values()) and facts["mask_share"]["train"] > 0.05
     boxes, balls = (sorted((folder / f"masks/{name}").iterdir()) for name in ("box", "ball"))
     assert [path.name for path in boxes] == [path.name for path in balls] and len(boxes) == 24

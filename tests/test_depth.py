@@ -1,4 +1,4 @@
-"""Completion continues planes and creases; the bilateral solver smooths within edges."""
+"""Depth completion continues planes and creases; the bilateral solver smooths within edges."""
 
 import numpy as np
 import pytest
@@ -12,14 +12,14 @@ PLANE = 0.4 + 0.003 * COLUMNS - 0.002 * ROWS
 INNER = (ROWS > 14) & (ROWS < 34) & (COLUMNS > 20) & (COLUMNS < 45)
 
 
-def corner():
-    """Disparity of a floor below a wall, and a picture that tells them apart."""
+def room_corner():
+    """Disparity of a floor below a wall, and a picture in which their colours differ."""
     floor, wall = 0.5 + 0.02 * (ROWS - 24.0), 0.5 + 0.001 * (COLUMNS - 32)
     picture = np.where((floor > wall)[..., None], (0.8, 0.5, 0.2), (0.3, 0.4, 0.6))
     return np.maximum(floor, wall), picture
 
 
-def hidden(disparity, hole, filler=9.0):
+def hide_hole(disparity, hole, filler=9.0):
     return np.where(hole, filler, disparity)
 
 
@@ -27,7 +27,7 @@ def hidden(disparity, hole, filler=9.0):
 @pytest.mark.parametrize("hole", [INNER, INNER | ((ROWS < 20) & (COLUMNS > 30)), COLUMNS > 10])
 def test_a_plane_is_continued_to_rounding(hole, textured):
     guide = np.random.default_rng(0).random((48, 64, 3)) if textured else None
-    completed = completion.complete(hidden(PLANE, hole), ~hole, guide)
+    completed = completion.complete(hide_hole(PLANE, hole), ~hole, guide)
     np.testing.assert_allclose(completed, PLANE, rtol=1e-12)
 
 
@@ -39,9 +39,9 @@ def test_known_pixels_are_returned_as_they_are():
 
 
 def test_a_crease_that_the_guide_shows_is_continued():
-    disparity, picture = corner()
-    with_guide = np.abs(completion.complete(hidden(disparity, INNER), ~INNER, picture) - disparity)[INNER]
-    without = np.abs(completion.complete(hidden(disparity, INNER), ~INNER) - disparity)[INNER]
+    disparity, picture = room_corner()
+    with_guide = np.abs(completion.complete(hide_hole(disparity, INNER), ~INNER, picture) - disparity)[INNER]
+    without = np.abs(completion.complete(hide_hole(disparity, INNER), ~INNER) - disparity)[INNER]
     assert with_guide.max() < 2e-3 < 0.02 < without.max()
 
 
@@ -50,7 +50,7 @@ def test_two_holes_do_not_disturb_each_other():
     hole = left & (COLUMNS > 6) & (ROWS > 10) & (ROWS < 30) | right
     disparity = np.where(COLUMNS > 40, 1.0 + 0.01 * ROWS, PLANE)
     np.testing.assert_allclose(
-        completion.complete(hidden(disparity, hole), ~hole, plate=Plate(ring=0.04)), disparity, rtol=1e-10
+        completion.complete(hide_hole(disparity, hole), ~hole, plate=Plate(ring=0.04)), disparity, rtol=1e-10
     )
 
 
@@ -103,19 +103,19 @@ def test_the_solver_keeps_constants_and_fills_unreached_cells_with_the_mean():
 
 def test_refine_keeps_an_estimate_without_misfit_and_spreads_a_constant_one():
     guide = np.repeat((COLUMNS * 2)[..., None], 3, -1).astype(np.uint8)
-    np.testing.assert_allclose(bilateral.refine(PLANE, hidden(PLANE, INNER), ~INNER, guide), PLANE, rtol=1e-12)
-    shifted = bilateral.refine(PLANE - 0.1, hidden(PLANE, INNER), (~INNER).astype(float), guide)
+    np.testing.assert_allclose(bilateral.refine(PLANE, hide_hole(PLANE, INNER), ~INNER, guide), PLANE, rtol=1e-12)
+    shifted = bilateral.refine(PLANE - 0.1, hide_hole(PLANE, INNER), (~INNER).astype(float), guide)
     np.testing.assert_allclose(shifted, PLANE, rtol=1e-9)
 
 
-def samples(disparity, keep):
+def sample_disparity(disparity, keep):
     rows, columns = np.nonzero(keep)
     return np.stack([columns, rows], 1) + 0.5, disparity[rows, columns]
 
 
 def test_planes_of_a_room_meet_in_their_crease():
-    disparity, _ = corner()
-    pixels, values = samples(disparity, ~INNER)
+    disparity, _ = room_corner()
+    pixels, values = sample_disparity(disparity, ~INNER)
     model = planes.planar_model(pixels, values, disparity.shape, generator(0))
     np.testing.assert_allclose(model.disparity, disparity, rtol=1e-9)
     assert model.planes == 2 and model.explained == 1.0
@@ -123,13 +123,13 @@ def test_planes_of_a_room_meet_in_their_crease():
 
 def test_a_convex_edge_is_continued_too():
     disparity = np.minimum(0.4 + 0.01 * COLUMNS, 1.2 - 0.012 * COLUMNS)
-    model = planes.planar_model(*samples(disparity, ~INNER), disparity.shape, generator(0))
+    model = planes.planar_model(*sample_disparity(disparity, ~INNER), disparity.shape, generator(0))
     np.testing.assert_allclose(model.disparity, disparity, rtol=1e-9)
 
 
 def test_a_plane_before_the_wall_does_not_cut_through_the_hole():
     disparity = np.where(COLUMNS > 50, PLANE + 0.3, PLANE) + 1e-4 * np.random.default_rng(0).normal(size=PLANE.shape)
-    model = planes.planar_model(*samples(disparity, ~INNER), disparity.shape, generator(0))
+    model = planes.planar_model(*sample_disparity(disparity, ~INNER), disparity.shape, generator(0))
     np.testing.assert_allclose(model.disparity[INNER], PLANE[INNER], rtol=1e-3)
     assert model.explained < 0.9
 

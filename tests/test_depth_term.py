@@ -1,15 +1,17 @@
-"""The depth term: alignment, target, gradient and whom it reaches, convergence, views that tell nothing, resume."""
+"""The depth term: alignment, target, gradients, convergence, degenerate views, resume."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from small_params import altered
+from scenes.cameras import make_camera
+from scenes.distill_scene import as_leaves
+from scenes.settings import with_changes
+from scenes.stage_runs import trace_lines
 
 from reffusion import trace
 from reffusion.depth import background_depth, estimates
-from reffusion.depth.alignment import align
 from reffusion.depth.background_depth import Completion
 from reffusion.distill import depth_estimator
 from reffusion.distill import loop as D
@@ -24,11 +26,11 @@ from reffusion.params.distill import DepthTerm, Params
 from reffusion.prior import inpaint
 from reffusion.seeding import generator
 from reffusion.splat.rasterizer import render
-from reffusion.trace import load_checkpoint, read_trace
-from reffusion.types import PARAMETERS, Camera, Gaussians
+from reffusion.trace import load_checkpoint
+from reffusion.types import PARAMETERS, Gaussians
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 30.0
-VIEW = Camera("a", WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, np.eye(4))
+VIEW = make_camera("a", (WIDTH, HEIGHT), FOCAL)
 ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
 WALL = 0.5 + 0.004 * (COLUMNS + 0.5 - WIDTH / 2) - 0.002 * (ROWS + 0.5 - HEIGHT / 2)  # disparity of a slanted wall
 HOLE = (np.abs(COLUMNS + 0.5 - WIDTH / 2) < 7) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 6)
@@ -37,9 +39,9 @@ HOW = Completion(ring=0.2)
 DEPTH = DepthTerm(steps=2)
 
 
-def wall(moved: float = 1.0):
-    """The wall as Gaussians; those of its middle, masked, stand `moved` times as far from the camera as they should."""
-    wide = Camera("sheet", 52, 44, FOCAL, FOCAL, 26, 22, np.eye(4))
+def slanted_wall(moved: float = 1.0):
+    """The wall as Gaussians; the masked ones in its middle stand `moved` times as far away as they should."""
+    wide = make_camera("sheet", (52, 44), FOCAL)
     rows, columns = np.mgrid[:44, :52] + 0.5
     disparity = 0.5 + 0.004 * (columns - 26) - 0.002 * (rows - 22)
     picture = 0.5 + 0.3 * np.stack([np.sin(columns / 3), np.cos(rows / 4), np.sin((rows + columns) / 5)], -1)
@@ -51,52 +53,34 @@ def wall(moved: float = 1.0):
     return moved_ones, masked
 
 
-def train_view(hole=HOLE):
+def black_train_view(hole=HOLE):
     hole = torch.from_numpy(hole)
     return TrainView(VIEW, torch.zeros(HEIGHT, WIDTH, 3), ~hole, hole, False)
 
 
-def leaves(gaussians):
-    return gaussians.map(lambda p: p.clone().requires_grad_())
-
-
-def term(gaussians, masked, estimator, prior=None, text=None, view=None, **more):
-    given = view or train_view(), prior, text, DEPTH, 7.5, generator(1), estimator
+def evaluate_term(gaussians, masked, estimator, prior=None, text=None, view=None, **more):
+    given = view or black_train_view(), prior, text, DEPTH, 7.5, generator(1), estimator
     return depth_term.evaluate_depth(gaussians, masked, *given, **more)
 
 
-def shown(moved=1.0, how=HOW):
-    """What the view shows of the wall's depth."""
+def wall_depth(moved=1.0, how=HOW):
+    """The depth of the wall that the view renders."""
     with torch.no_grad():
-        return background_depth.extract_depth(render(wall(moved)[0], VIEW), VIEW, HOLE, HOLE, how)
+        return background_depth.extract_depth(render(slanted_wall(moved)[0], VIEW), VIEW, HOLE, HOLE, how)
 
 
-def giving(estimate):
-    """The paper's estimator with a network that says `estimate`, whatever it is shown."""
+def constant_estimator(estimate):
+    """The paper's estimator with a network that always returns `estimate`."""
     return depth_estimator.network_estimator(lambda image: torch.as_tensor(np.asarray(estimate)), HOW)
 
 
 # ------------------------------------------------------------------------------------------ alignment and target
 
 
-@pytest.mark.parametrize("weighted", [False, True])
-def test_alignment_solves_the_normal_equations(weighted):
-    draw = np.random.default_rng(0)
-    x, noise = draw.normal(3, 2, 200), draw.normal(0, 0.3, 200)
-    y = 0.7 * x - 1.2 + noise
-    w = draw.random(200) if weighted else np.ones(200)
-    matrix = np.array([[(w * x * x).sum(), (w * x).sum()], [(w * x).sum(), w.sum()]])
-    scale, offset = np.linalg.inv(matrix) @ ((w * x * y).sum(), (w * y).sum())
-    found = align(x, y, w)
-    np.testing.assert_allclose((found.scale, found.offset), (scale, offset), rtol=1e-10)
-    misfit = np.sqrt((w * (y - scale * x - offset) ** 2).sum() / w.sum())
-    assert found.residual == pytest.approx(misfit, rel=1e-9)
-
-
 @pytest.mark.parametrize("unit", [1e-8, 1.0, 1e8])
 def test_the_target_does_not_depend_on_the_estimates_unit(unit):
     """An estimate that is right but for scale and offset gives the wall, in whatever unit it comes."""
-    view = replace(shown(), depth=1 / WALL)
+    view = replace(wall_depth(), depth=1 / WALL)
     guide = np.full((HEIGHT, WIDTH, 3), 0.5)
     disparity, _ = estimates.align_estimate(view, guide, unit * (40 * WALL - 7), HOW)
     target, compared = depth_term.depth_target(view, disparity, np.ones_like(HOLE))
@@ -105,7 +89,7 @@ def test_the_target_does_not_depend_on_the_estimates_unit(unit):
 
 
 def test_a_robust_alignment_lets_go_of_what_is_wrong():
-    view = replace(shown(), depth=1 / WALL)
+    view = replace(wall_depth(), depth=1 / WALL)
     estimate, guide = 40 * WALL - 7, np.random.default_rng(0).random((HEIGHT, WIDTH, 3))
     estimate += 0.05 * np.random.default_rng(1).normal(size=WALL.shape)
     estimate[:, :4] += 3.0
@@ -117,7 +101,7 @@ def test_a_robust_alignment_lets_go_of_what_is_wrong():
 
 
 def test_nothing_is_compared_where_depth_is_unknown():
-    view = replace(shown(), depth=1 / WALL)
+    view = replace(wall_depth(), depth=1 / WALL)
     beyond, thin = COLUMNS > 18, COLUMNS < 12
     disparity = np.where(beyond, -0.1, WALL)
     target, compared = depth_term.depth_target(view, disparity, ~thin)
@@ -135,11 +119,11 @@ def test_nothing_is_compared_where_depth_is_unknown():
 
 def test_a_surface_that_is_right_has_no_loss_and_one_that_is_not_is_pulled_the_right_way():
     estimator = depth_estimator.continuation_estimator(NO_POINTS, HOW)
-    right = float(term(*wall(), estimator)[0])
+    right = float(evaluate_term(*slanted_wall(), estimator)[0])
     for moved, sign in ((0.9, -1), (1.1, 1)):
-        gaussians, masked = wall(moved)
-        gaussians = leaves(gaussians)
-        loss, _ = term(gaussians, masked, estimator)
+        gaussians, masked = slanted_wall(moved)
+        gaussians = as_leaves(gaussians)
+        loss, _ = evaluate_term(gaussians, masked, estimator)
         loss.backward()
         whole = float((0.1 / WALL[HOLE].mean()) ** 2)  # part of the hole is the wall around the masked ones
         assert 0.4 * whole < float(loss.detach()) < whole and right < 1e-3 * whole
@@ -148,18 +132,18 @@ def test_a_surface_that_is_right_has_no_loss_and_one_that_is_not_is_pulled_the_r
 
 
 def test_the_loss_is_in_units_of_the_extent():
-    gaussians, masked = wall(0.9)
+    gaussians, masked = slanted_wall(0.9)
     estimator = depth_estimator.continuation_estimator(NO_POINTS, HOW)
-    once, thrice = (float(term(gaussians, masked, estimator, extent=e)[0]) for e in (1, 3))
+    once, thrice = (float(evaluate_term(gaussians, masked, estimator, extent=e)[0]) for e in (1, 3))
     assert once == pytest.approx(9 * thrice)
 
 
 def test_a_displaced_surface_converges_to_the_wall():
-    gaussians, masked = wall(0.92)
+    gaussians, masked = slanted_wall(0.92)
     optimizer = GaussianOptimizer(gaussians, masked, Rates(means=1.2e-2, means_last=1e-3))
     estimator, losses = depth_estimator.continuation_estimator(NO_POINTS, HOW), []
     for step in range(36):
-        loss, rendering = term(optimizer.gaussians, optimizer.masked, estimator)
+        loss, rendering = evaluate_term(optimizer.gaussians, optimizer.masked, estimator)
         loss.backward()
         losses.append(float(loss.detach()))
         optimizer.step(step / 36, visible=masked & (rendering.radii > 0))
@@ -173,9 +157,9 @@ def test_a_displaced_surface_converges_to_the_wall():
 
 
 def test_the_gradient_reaches_the_geometry_of_masked_gaussians_only(prior, text):
-    gaussians, masked = wall(0.9)
-    gaussians = leaves(gaussians)
-    loss, rendering = term(gaussians, masked, giving(WALL), prior, text)
+    gaussians, masked = slanted_wall(0.9)
+    gaussians = as_leaves(gaussians)
+    loss, rendering = evaluate_term(gaussians, masked, constant_estimator(WALL), prior, text)
     loss.backward()
     assert gaussians.sh.grad is None or (gaussians.sh.grad == 0).all()
     for name in ("means", "quaternions", "log_scales", "opacity_logits"):
@@ -197,8 +181,8 @@ def test_the_gradient_agrees_with_finite_differences_in_float64():
     masked = torch.arange(count) % 3 > 0
     hole = (np.abs(COLUMNS + 0.5 - WIDTH / 2) < 4) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 4)
     estimator = DepthEstimator(replace(HOW, explained=0.2), lambda *_: WALL)
-    gaussians = leaves(few)
-    loss, drawn = term(gaussians, masked, estimator, view=train_view(hole))
+    gaussians = as_leaves(few)
+    loss, drawn = evaluate_term(gaussians, masked, estimator, view=black_train_view(hole))
     loss.backward()
     compared = torch.from_numpy(hole) & (drawn.alpha > 0.2)
     assert compared.sum() > 30
@@ -228,29 +212,31 @@ def test_the_gradient_agrees_with_finite_differences_in_float64():
 )
 def test_estimates_that_fit_nothing_are_degenerate(estimate, reason, prior, text):
     with pytest.raises(Degenerate) as caught:
-        term(*wall(), giving(estimate), prior, text)
+        evaluate_term(*slanted_wall(), constant_estimator(estimate), prior, text)
     assert caught.value.reason == reason
 
 
-def test_views_without_known_or_drawn_pixels_are_degenerate(prior, text):
-    everywhere = train_view(np.ones_like(HOLE))
+def test_views_without_known_or_rendered_pixels_are_degenerate(prior, text):
+    everywhere = black_train_view(np.ones_like(HOLE))
     for estimator, reason in (
-        (giving(WALL), "few pixels"),
+        (constant_estimator(WALL), "few pixels"),
         (depth_estimator.continuation_estimator(NO_POINTS, HOW), "no plane"),
     ):
         with pytest.raises(Degenerate) as caught:
-            term(*wall(), estimator, prior, text, view=everywhere)
+            evaluate_term(*slanted_wall(), estimator, prior, text, view=everywhere)
         assert caught.value.reason == reason
-    gaussians, masked = wall()
+    gaussians, masked = slanted_wall()
     around = gaussians.map(lambda p: p[~masked])
     with pytest.raises(Degenerate) as caught:
-        inner = train_view((np.abs(COLUMNS + 0.5 - WIDTH / 2) < 2) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 2))
-        term(around, masked[~masked], depth_estimator.continuation_estimator(NO_POINTS, HOW), view=inner)
+        inner = black_train_view((np.abs(COLUMNS + 0.5 - WIDTH / 2) < 2) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 2))
+        evaluate_term(around, masked[~masked], depth_estimator.continuation_estimator(NO_POINTS, HOW), view=inner)
     assert caught.value.reason == "nothing compared"
 
 
 def test_a_view_larger_than_asked_for_is_rendered_smaller():
-    _, drawn = term(*wall(), depth_estimator.continuation_estimator(NO_POINTS, HOW), max_side=WIDTH // 2)
+    _, drawn = evaluate_term(
+        *slanted_wall(), depth_estimator.continuation_estimator(NO_POINTS, HOW), max_side=WIDTH // 2
+    )
     assert drawn.depth.shape == (HEIGHT // 2, WIDTH // 2)
 
 
@@ -276,13 +262,13 @@ def test_the_picture_is_painted_only_where_planes_do_not_explain(prior, text):
         asked.append(1)
         return np.full((HEIGHT, WIDTH, 3), 0.5)
 
-    view = replace(shown(), depth=1 / WALL)
+    view = replace(wall_depth(), depth=1 / WALL)
     for share, times in ((0.7, 0), (2.0, 1)):
         found, _ = background_depth.continue_depth(view, guide, NO_POINTS, replace(HOW, planar_share=share))
         np.testing.assert_allclose(found[HOLE], WALL[HOLE], rtol=1e-3)
         assert len(asked) == times
     smooth = depth_estimator.continuation_estimator(NO_POINTS, replace(HOW, planar_share=2.0))
-    assert float(term(*wall(), smooth, prior, text)[0]) < 1e-3
+    assert float(evaluate_term(*slanted_wall(), smooth, prior, text)[0]) < 1e-3
 
 
 def test_the_estimator_sees_the_repainted_view(prior, text):
@@ -292,9 +278,9 @@ def test_the_estimator_sees_the_repainted_view(prior, text):
         seen.append(image)
         return torch.from_numpy(WALL)
 
-    term(*wall(), depth_estimator.network_estimator(network, HOW), prior, text)
+    evaluate_term(*slanted_wall(), depth_estimator.network_estimator(network, HOW), prior, text)
     with torch.no_grad():
-        color = render(wall()[0], VIEW).color.clamp(0, 1).permute(2, 0, 1)
+        color = render(slanted_wall()[0], VIEW).color.clamp(0, 1).permute(2, 0, 1)
     hole = torch.from_numpy(HOLE)
     assert torch.allclose(seen[0][:, ~hole], color[:, ~hole], atol=1e-6)
     assert (seen[0] - color)[:, hole].abs().mean() > 0.01 and seen[0].min() >= 0 and seen[0].max() <= 1
@@ -304,28 +290,24 @@ def test_the_estimator_sees_the_repainted_view(prior, text):
 
 
 RUN = Params(
-    iterations=6, sds={"weight": 0}, depth=altered(DEPTH, weight=0.5, every=2), adversarial={"weight": 0},
+    iterations=6, sds={"weight": 0}, depth=with_changes(DEPTH, weight=0.5, every=2), adversarial={"weight": 0},
     reconstruction={"every": 0}, checkpoint_seconds=1e-9,
 )  # fmt: skip
 
 
-def distilled(folder, prior, text, estimator, settings=RUN):
+def run_depth_distill(folder, prior, text, estimator, settings=RUN):
     folder.mkdir(exist_ok=True)
-    gaussians, masked = wall(0.95)
+    gaussians, masked = slanted_wall(0.95)
     with torch.no_grad():
         image = render(gaussians, VIEW).color.clamp(0, 1)
     holes = [ReferenceHole(VIEW, image, torch.from_numpy(HOLE))]
-    inputs = TermInputs([train_view()], holes, gaussians.means[masked], prior, text, estimator)
+    inputs = TermInputs([black_train_view()], holes, gaussians.means[masked], prior, text, estimator)
     return D.distill(gaussians, masked, inputs, settings, folder)
-
-
-def lines(folder):
-    return [{k: v for k, v in line.items() if k != "seconds"} for line in read_trace(folder / "trace.jsonl")]
 
 
 def test_interrupted_distillation_with_the_depth_term_resumes_bit_for_bit(prior, text, tmp_path, monkeypatch):
     monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
-    whole, _ = distilled(tmp_path / "whole", prior, text, giving(WALL))
+    whole, _ = run_depth_distill(tmp_path / "whole", prior, text, constant_estimator(WALL))
     real = D.take_step
 
     def interrupted(optimizer, step, *others):
@@ -335,32 +317,32 @@ def test_interrupted_distillation_with_the_depth_term_resumes_bit_for_bit(prior,
 
     monkeypatch.setattr(D, "take_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        distilled(tmp_path / "broken", prior, text, giving(WALL))
+        run_depth_distill(tmp_path / "broken", prior, text, constant_estimator(WALL))
     assert load_checkpoint(tmp_path / "broken")["step"] == 3
     monkeypatch.setattr(D, "take_step", real)
-    resumed, _ = distilled(tmp_path / "broken", prior, text, giving(WALL))
+    resumed, _ = run_depth_distill(tmp_path / "broken", prior, text, constant_estimator(WALL))
     for name in PARAMETERS:
         assert (getattr(whole, name) == getattr(resumed, name)).all(), name
-    assert lines(tmp_path / "whole") == lines(tmp_path / "broken")
-    assert 0 < lines(tmp_path / "whole")[-1]["depth"] < lines(tmp_path / "whole")[1]["depth"]
+    assert trace_lines(tmp_path / "whole") == trace_lines(tmp_path / "broken")
+    assert 0 < trace_lines(tmp_path / "whole")[-1]["depth"] < trace_lines(tmp_path / "whole")[1]["depth"]
 
 
 def test_skipped_views_are_counted_by_reason_and_move_nothing(prior, text, tmp_path):
-    ended, _ = distilled(tmp_path, prior, text, giving(np.full(WALL.shape, 2.0)))
-    assert lines(tmp_path)[-1]["depth_skipped_constant"] == 3 and "depth" not in lines(tmp_path)[-1]
+    ended, _ = run_depth_distill(tmp_path, prior, text, constant_estimator(np.full(WALL.shape, 2.0)))
+    assert trace_lines(tmp_path)[-1]["depth_skipped_constant"] == 3 and "depth" not in trace_lines(tmp_path)[-1]
     for name in PARAMETERS:
-        assert (getattr(ended, name) == getattr(wall(0.95)[0], name)).all(), name
+        assert (getattr(ended, name) == getattr(slanted_wall(0.95)[0], name)).all(), name
 
 
 def test_an_estimate_that_is_not_finite_names_step_and_view(prior, text, tmp_path):
     nowhere = DepthEstimator(HOW, lambda view, picture: np.full(WALL.shape, np.nan))
     with pytest.raises(FloatingPointError, match="step 0, depth, view 'a'"):
-        distilled(tmp_path, prior, text, nowhere)
+        run_depth_distill(tmp_path, prior, text, nowhere)
     with pytest.raises(ValueError, match="estimator"):
-        distilled(tmp_path, prior, text, None)
+        run_depth_distill(tmp_path, prior, text, None)
 
 
-def test_both_stages_find_depth_alike():
+def test_initialize_and_distill_complete_depth_alike():
     from reffusion.initialize import fill
 
     assert fill.COMPLETION == Completion() == build_estimator(Params(), NO_POINTS).how

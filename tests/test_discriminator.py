@@ -1,9 +1,9 @@
-"""The patch critic against closed forms, float64 and finite differences; that it learns, and pulls the right way."""
+"""The patch critic against closed forms, float64 and finite differences, and what it learns."""
 
 import numpy as np
 import pytest
 import torch
-from small_params import altered
+from scenes.settings import with_changes
 
 from reffusion.distill.adversary import Adversary
 from reffusion.distill.discriminator import (
@@ -23,7 +23,7 @@ from reffusion.seeding import generator
 SMALL, RATE = AdversarialTerm(patches=16, size=8, width=8), 3e-3
 
 
-def noise(*shape, label=0, dtype=torch.float32):
+def random_normal(*shape, label=0, dtype=torch.float32):
     return torch.randn(*shape, generator=generator(9, label), dtype=dtype)
 
 
@@ -32,15 +32,15 @@ def noise(*shape, label=0, dtype=torch.float32):
 LOGITS = torch.tensor([-1e4, -100.0, -30.0, -3.0, -1e-3, 0.0, 0.5, 20.5, 90.0, 1e4])
 
 
-def slow(x):
+def log_sigmoid_loss(x):
     """f(x) = -log(1 + exp(-x)) and its slope in float64, without overflow."""
     x = np.asarray(x, np.float64)
     return -np.logaddexp(0, -x), np.exp(-np.logaddexp(0, x))
 
 
 def test_losses_are_the_papers_at_any_logit():
-    f, slope = slow(LOGITS)
-    g, back = slow(-LOGITS)
+    f, slope = log_sigmoid_loss(LOGITS)
+    g, back = log_sigmoid_loss(-LOGITS)
     forms = {
         "critic, real": (lambda x: critic_loss(x, torch.full_like(x, -1e9)), -f, -slope),
         "critic, fake": (lambda x: critic_loss(torch.full_like(x, 1e9), x), -g, back),
@@ -58,16 +58,16 @@ def test_losses_are_the_papers_at_any_logit():
 
 
 def test_losses_are_means_and_an_unknown_form_is_refused():
-    x = noise(7)
-    assert critic_loss(x, -x).item() == pytest.approx(-2 * slow(x)[0].mean(), rel=1e-5)
-    assert generator_loss(x).item() == pytest.approx(-slow(x)[0].mean(), rel=1e-5)
+    x = random_normal(7)
+    assert critic_loss(x, -x).item() == pytest.approx(-2 * log_sigmoid_loss(x)[0].mean(), rel=1e-5)
+    assert generator_loss(x).item() == pytest.approx(-log_sigmoid_loss(x)[0].mean(), rel=1e-5)
     with pytest.raises(ValueError, match="hinge"):
         generator_loss(x, "hinge")
 
 
 def test_penalty_of_a_linear_critic_is_its_weights_square():
-    weight = noise(3 * 4 * 4, label="w", dtype=torch.float64).requires_grad_()
-    patches = noise(5, 3, 4, 4, dtype=torch.float64).requires_grad_()
+    weight = random_normal(3 * 4 * 4, label="w", dtype=torch.float64).requires_grad_()
+    patches = random_normal(5, 3, 4, 4, dtype=torch.float64).requires_grad_()
     penalty = gradient_penalty(patches.flatten(1) @ weight + 0.3, patches)
     assert penalty.item() == pytest.approx(float(weight.detach().square().sum()))
     penalty.backward()
@@ -76,17 +76,17 @@ def test_penalty_of_a_linear_critic_is_its_weights_square():
 
 def test_penalty_of_the_critic_and_its_slope_by_finite_differences():
     critic = Critic(8, 4, generator(0)).double()
-    patches = (0.5 * noise(4, 3, 8, 8, dtype=torch.float64)).requires_grad_()
+    patches = (0.5 * random_normal(4, 3, 8, 8, dtype=torch.float64)).requires_grad_()
     direct, step = gradient_penalty(critic(patches), patches), 1e-5
     (slope,) = torch.autograd.grad(critic(patches).sum(), patches)
     for k in range(10):
-        bump = noise(*patches.shape, label=k, dtype=torch.float64)
+        bump = random_normal(*patches.shape, label=k, dtype=torch.float64)
         with torch.no_grad():
             by_hand = (critic(patches + step * bump) - critic(patches - step * bump)).sum() / (2 * step)
         assert (slope * bump).sum().item() == pytest.approx(by_hand.item(), rel=1e-4)
     assert direct.item() == pytest.approx(slope.flatten(1).norm(dim=1).square().mean().item())
     (second,) = torch.autograd.grad(direct, critic.mixed.weight)
-    direction = noise(*second.shape, label="d", dtype=torch.float64)
+    direction = random_normal(*second.shape, label="d", dtype=torch.float64)
     values = []
     for sign in (1, -1):
         with torch.no_grad():
@@ -112,13 +112,13 @@ def test_scores_at_the_start_are_of_one_size_whatever_the_width():
             )
             assert (stds - 1).abs().max() < 0.25
             with torch.no_grad():
-                scores.append(critic(noise(8, 3, 16, 16)))
+                scores.append(critic(random_normal(8, 3, 16, 16)))
         sizes.append(torch.stack(scores).square().mean().sqrt().item())
     assert max(sizes) < 2 * min(sizes) and 0.2 < min(sizes) and max(sizes) < 2, sizes
 
 
 def test_minibatch_deviation_against_numpy():
-    features = noise(12, 5, 3, 3)
+    features = random_normal(12, 5, 3, 3)
     out = append_minibatch_std(features, group=4)
     assert (out[:, :5] == features).all() and out.shape == (12, 6, 3, 3)
     for i in range(12):
@@ -129,7 +129,7 @@ def test_minibatch_deviation_against_numpy():
     append_minibatch_std(same)[:, 2].sum().backward()
     assert torch.isfinite(same.grad).all(), "equal patches"
     with pytest.raises(ValueError, match="6 patches"):
-        append_minibatch_std(noise(6, 2, 3, 3))
+        append_minibatch_std(random_normal(6, 2, 3, 3))
 
 
 def test_the_filter_keeps_constants_and_removes_what_halving_would_alias():
@@ -138,14 +138,14 @@ def test_the_filter_keeps_constants_and_removes_what_halving_would_alias():
     assert torch.allclose((binomial_filter(16, 1) @ line)[1:-1], torch.ones(13))
     fastest = torch.tensor([1.0, -1.0]).repeat(8)
     assert (binomial_filter(16, 2) @ fastest)[2:-2].abs().max() < 1e-6
-    values = noise(16)
+    values = random_normal(16)
     expected = np.convolve(values.numpy(), np.array([1, 3, 3, 1]) / 8)
     assert np.allclose((binomial_filter(16, 2) @ values).numpy(), expected[1:-1], atol=1e-6)
 
 
 @pytest.mark.parametrize("size", [8, 16, 32])
 def test_shapes_and_seeds(size):
-    patches = noise(4, 3, size, size)
+    patches = random_normal(4, 3, size, size)
     one, same, other = (Critic(size, 2, generator(seed))(patches) for seed in (0, 0, 1))
     assert one.shape == (4,) and (one == same).all() and (one != other).all()
 
@@ -160,7 +160,7 @@ def test_sizes_that_cannot_be_halved_are_refused(size):
 
 
 def test_gathering_is_slicing_and_its_gradient_is_the_finite_differences():
-    image = noise(3, 11, 13, dtype=torch.float64).requires_grad_()
+    image = random_normal(3, 11, 13, dtype=torch.float64).requires_grad_()
     windows = torch.tensor([[0, 0], [3, 5], [3, 5], [7, 9], [4, 4]])
     patches = gather_patches(image, windows, 4)
     for patch, (top, left) in zip(patches, windows.tolist(), strict=True):
@@ -201,22 +201,25 @@ def test_patches_lie_between_black_at_minus_one_and_white_at_one():
 # ------------------------------------------------------------------------------------------ learning
 
 
-def textures(count, fine, label):
-    """Patches of one mean and deviation: checkered by single pixels, or by blocks of four."""
+def checker_patches(count, fine, label):
+    """Checkered patches of equal mean and deviation, with cells of one pixel or of four."""
     period = 1 if fine else 4
     cells = torch.arange(8) // period
     board = ((cells[:, None] + cells) % 2).float() * 2 - 1
     signs = torch.randint(2, (count, 1, 1, 1), generator=generator(label)).float() * 2 - 1
-    return 0.5 * signs * board + 0.05 * noise(count, 3, 8, 8, label=label)
+    return 0.5 * signs * board + 0.05 * random_normal(count, 3, 8, 8, label=label)
 
 
 @pytest.mark.parametrize("penalized", ["real", "fake"])
 @pytest.mark.parametrize("form", ["non-saturating", "saturating"])
 def test_the_critic_separates_two_textures_and_its_slope_leads_to_the_real_one(penalized, form):
-    adversary = Adversary(altered(SMALL, form=form, penalized=penalized), seed=0, rate=RATE)
-    said = [adversary.train_step(textures(16, True, (step, 0)), textures(16, False, (step, 1))) for step in range(20)]
+    adversary = Adversary(with_changes(SMALL, form=form, penalized=penalized), seed=0, rate=RATE)
+    said = [
+        adversary.train_step(checker_patches(16, True, (step, 0)), checker_patches(16, False, (step, 1)))
+        for step in range(20)
+    ]
     assert said[-1]["critic_loss"] < 0.3 < 1 < said[0]["critic_loss"] and said[-1]["critic_slope"] > 0
-    real, fake = textures(16, True, "r"), textures(16, False, "f")
+    real, fake = checker_patches(16, True, "r"), checker_patches(16, False, "f")
     with torch.no_grad():
         assert (adversary.critic(real) > 0).all() and (adversary.critic(fake) < 0).all()
     fake.requires_grad_()
@@ -233,29 +236,31 @@ def test_the_critic_separates_two_textures_and_its_slope_leads_to_the_real_one(p
 def test_the_penalty_holds_the_critics_slope_down():
     slopes = {}
     for penalty in (0.0, 10.0):
-        adversary = Adversary(altered(SMALL, penalty=penalty, penalized="real"), seed=0, rate=RATE)
+        adversary = Adversary(with_changes(SMALL, penalty=penalty, penalized="real"), seed=0, rate=RATE)
         for step in range(15):
-            said = adversary.train_step(textures(16, True, (step, 0)), textures(16, False, (step, 1)))
+            said = adversary.train_step(checker_patches(16, True, (step, 0)), checker_patches(16, False, (step, 1)))
         assert ("critic_slope" in said) == (penalty > 0)
-        patches = textures(16, True, "r").requires_grad_()
+        patches = checker_patches(16, True, "r").requires_grad_()
         slopes[penalty] = gradient_penalty(adversary.critic(patches), patches).item()
     assert slopes[10.0] < 0.3 * slopes[0.0]
 
 
 def test_generator_loss_leaves_the_critics_weights_alone_and_learning_leaves_the_patches():
-    adversary, fake = Adversary(SMALL, seed=0, rate=RATE), noise(16, 3, 8, 8).requires_grad_()
+    adversary, fake = Adversary(SMALL, seed=0, rate=RATE), random_normal(16, 3, 8, 8).requires_grad_()
     before = [weights.detach().clone() for weights in adversary.critic.parameters()]
     adversary.generator_loss(fake).backward()
     assert fake.grad.ne(0).any() and all(weights.grad is None for weights in adversary.critic.parameters())
     fake.grad = None
-    adversary.train_step(noise(16, 3, 8, 8, label=1), fake)
+    adversary.train_step(random_normal(16, 3, 8, 8, label=1), fake)
     assert fake.grad is None
     assert all((a != b).any() for a, b in zip(before, adversary.critic.parameters(), strict=True))
 
 
 def test_an_adversary_continues_from_its_state_bit_for_bit():
     def trained(adversary, steps):
-        return [adversary.train_step(textures(16, True, (s, 0)), textures(16, False, (s, 1))) for s in steps]
+        return [
+            adversary.train_step(checker_patches(16, True, (s, 0)), checker_patches(16, False, (s, 1))) for s in steps
+        ]
 
     whole = Adversary(SMALL, seed=3, rate=RATE)
     said = trained(whole, range(6))
@@ -267,9 +272,9 @@ def test_an_adversary_continues_from_its_state_bit_for_bit():
         assert (a == b).all()
 
 
-def test_a_patch_that_is_no_number_stops_the_critic_before_it_changes():
+def test_a_nan_patch_stops_the_critic_before_it_changes():
     adversary = Adversary(SMALL, seed=0, rate=RATE)
     before = [weights.detach().clone() for weights in adversary.critic.parameters()]
     with pytest.raises(FloatingPointError, match="critic's loss"):
-        adversary.train_step(noise(16, 3, 8, 8), torch.full((16, 3, 8, 8), float("nan")))
+        adversary.train_step(random_normal(16, 3, 8, 8), torch.full((16, 3, 8, 8), float("nan")))
     assert all((a == b).all() for a, b in zip(before, adversary.critic.parameters(), strict=True))

@@ -1,4 +1,4 @@
-"""Distillation: confinement to the bit, the region, resume, guards; the reference by hand and by the prior."""
+"""Distillation: bit-exact confinement, regions, resume, guards, and references by hand and by the prior."""
 
 import json
 from dataclasses import replace
@@ -6,9 +6,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from small_params import altered
-from small_prior import save_small_prior
-from small_scene import write_background, write_photos
+from scenes.cameras import make_scene
+from scenes.distill_scene import (
+    ADVERSARIAL,
+    HEIGHT,
+    OFF,
+    PLAIN,
+    SDS,
+    SETTINGS,
+    WIDTH,
+    as_leaves,
+    has_changed,
+    has_gradient,
+    random_wall,
+    square_hole,
+    train_view,
+    wall_camera,
+)
+from scenes.networks import save_small_prior
+from scenes.settings import with_changes
+from scenes.wall_scene import write_background, write_capture_photos
 
 from reffusion import trace
 from reffusion.distill import densification
@@ -20,7 +37,7 @@ from reffusion.distill.terms.reconstruction import evaluate_reconstruction
 from reffusion.distill.terms.reference import evaluate_reference
 from reffusion.distill.terms.sds import evaluate_sds, views_near_references
 from reffusion.distill.terms.term import TermInputs
-from reffusion.distill.train_view import ReferenceHole, TrainView
+from reffusion.distill.train_view import ReferenceHole
 from reffusion.gaussians.optimize import Rates, reconstruction_loss
 from reffusion.inpaint.exemplar import RIM_WIDTH
 from reffusion.io.arrays import load_labels, save_json, save_labels
@@ -28,70 +45,21 @@ from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_references, load_scene, save_mask_sets, save_scene
 from reffusion.morphology import dilate
-from reffusion.params.distill import AdversarialTerm, Params, SdsTerm
+from reffusion.params.distill import Params
 from reffusion.prior import inpaint
 from reffusion.seeding import generator
 from reffusion.splat import rasterizer
 from reffusion.splat.rasterizer import render
 from reffusion.trace import load_checkpoint, read_trace
-from reffusion.types import PARAMETERS, Camera, Gaussians, MaskSet, Scene, Similarity
-
-WIDTH, HEIGHT = 36, 28
-SDS = SdsTerm(weighting="x0", guidance=0.0)
-ADVERSARIAL = AdversarialTerm(patches=4, size=8, width=4)
-
-
-def camera(name="a", shift=0.0):
-    pose = np.eye(4)
-    pose[:3, 3] = shift, 0.0, 1.0
-    return Camera(name, WIDTH, HEIGHT, 30.0, 30.0, WIDTH / 2, HEIGHT / 2, pose)
-
-
-def wall(count=150, seed=0):
-    """Gaussians on a wall before the camera; those of its middle are masked."""
-    draw = generator(seed, "wall")
-    means = torch.rand(count, 3, generator=draw) * torch.tensor([1.2, 0.9, 0.1]) - torch.tensor([0.6, 0.45, 0.0])
-    sh = torch.zeros(count, 4, 3)
-    sh[:, 0] = torch.randn(count, 3, generator=draw)
-    sh[:, 1:] = 0.1 * torch.randn(count, 3, 3, generator=draw)
-    gaussians = Gaussians(
-        means,
-        torch.randn(count, 4, generator=draw),
-        torch.full((count, 3), -3.2) + 0.2 * torch.randn(count, 3, generator=draw),
-        torch.randn(count, generator=draw) + 1,
-        sh,
-    )
-    return gaussians, (means[:, 0].abs() < 0.25) & (means[:, 1].abs() < 0.2)
-
-
-def hole():
-    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-    mask[8:20, 11:25] = True
-    return mask
-
-
-def train_view(name="a", shift=0.0, clean=False):
-    photo = torch.rand(HEIGHT, WIDTH, 3, generator=generator(3, name))
-    supervises = torch.ones_like(hole()) if clean else ~hole()
-    return TrainView(camera(name, shift), photo, supervises, hole() & (not clean), clean)
-
-
-def leaves(gaussians):
-    return gaussians.map(lambda p: p.clone().requires_grad_())
-
-
-def reached(gaussians):
-    """[N] bool: has any gradient at all."""
-    columns = [getattr(gaussians, name).grad.flatten(1).ne(0).any(1) for name in PARAMETERS if name != "opacity_logits"]
-    return torch.stack([*columns, gaussians.opacity_logits.grad != 0]).any(0)
+from reffusion.types import PARAMETERS, MaskSet
 
 
 def gradients_of(term, gaussians, masked, prior, text, view=None):
-    gaussians, view = leaves(gaussians), view or train_view()
+    gaussians, view = as_leaves(gaussians), view or train_view()
     if term == "sds":
         loss, rendering = evaluate_sds(gaussians, masked, view, prior, text, SDS, generator(1))
     elif term == "reference":
-        loss, rendering = evaluate_reference(gaussians, masked, view.camera, view.photo, hole())
+        loss, rendering = evaluate_reference(gaussians, masked, view.camera, view.photo, square_hole())
     else:
         reached = torch.ones_like(masked) if view.clean else ~masked
         loss, rendering = evaluate_reconstruction(gaussians, reached, view)
@@ -101,10 +69,10 @@ def gradients_of(term, gaussians, masked, prior, text, view=None):
 
 @pytest.mark.parametrize("term", ["sds", "reference", "reconstruction"])
 def test_forbidden_gradients_are_exactly_zero(term, prior, text):
-    gaussians, masked = wall()
+    gaussians, masked = random_wall()
     allowed = ~masked if term == "reconstruction" else masked
     gaussians, drawn = gradients_of(term, gaussians, masked, prior, text)
-    got = reached(gaussians)
+    got = has_gradient(gaussians)
     assert not got[~allowed].any(), "a forbidden Gaussian has a gradient"
     assert (got & allowed).sum() > 0.5 * (drawn & allowed).sum(), "hardly any allowed Gaussian has a gradient"
     for name in PARAMETERS:
@@ -112,14 +80,14 @@ def test_forbidden_gradients_are_exactly_zero(term, prior, text):
 
 
 def test_a_clean_view_reconstructs_all_gaussians(prior, text):
-    gaussians, masked = wall()
+    gaussians, masked = random_wall()
     gaussians, drawn = gradients_of("reconstruction", gaussians, masked, prior, text, train_view(clean=True))
-    assert reached(gaussians)[masked & drawn].float().mean() > 0.5
+    assert has_gradient(gaussians)[masked & drawn].float().mean() > 0.5
 
 
 @pytest.mark.parametrize("term", ["sds", "reconstruction"])
-def test_the_photo_where_it_is_not_trusted_changes_nothing(term, prior, text):
-    gaussians, masked = wall()
+def test_unsupervised_pixels_of_a_photograph_change_nothing(term, prior, text):
+    gaussians, masked = random_wall()
     view = train_view()
     poisoned = replace(view, photo=torch.where(view.supervises[..., None], view.photo, float("nan")))
     a, _ = gradients_of(term, gaussians, masked, prior, text, view)
@@ -129,26 +97,30 @@ def test_the_photo_where_it_is_not_trusted_changes_nothing(term, prior, text):
 
 
 def test_densification_probe_of_unmasked_gaussians_stays_zero(prior, text):
-    gaussians, masked = wall()
+    gaussians, masked = random_wall()
     probe = torch.zeros(len(gaussians), 2, requires_grad=True)
-    evaluate_sds(leaves(gaussians), masked, train_view(), prior, text, SDS, generator(1), probe)[0].backward()
+    evaluate_sds(as_leaves(gaussians), masked, train_view(), prior, text, SDS, generator(1), probe)[0].backward()
     assert (probe.grad[~masked] == 0).all() and (probe.grad[masked] != 0).any()
 
 
 def test_sds_without_patches_and_with_guidance(prior, text):
-    gaussians, masked = wall()
+    gaussians, masked = random_wall()
     for settings in ({"patches": 0}, {"guidance": 2.0}, {"hole_only": True}):
-        moved = leaves(gaussians)
-        evaluate_sds(moved, masked, train_view(), prior, text, altered(SDS, **settings), generator(1))[0].backward()
+        moved = as_leaves(gaussians)
+        evaluate_sds(moved, masked, train_view(), prior, text, with_changes(SDS, **settings), generator(1))[
+            0
+        ].backward()
         assert torch.isfinite(moved.means.grad).all() and moved.means.grad[masked].ne(0).any()
 
 
 @pytest.mark.parametrize("reaches", ["masked", "all"])
 def test_the_critic_reaches_spherical_harmonics_only(reaches):
-    gaussians, masked = wall()
-    moved, view = leaves(gaussians), train_view()
+    gaussians, masked = random_wall()
+    moved, view = as_leaves(gaussians), train_view()
     adversary, chosen = Adversary(ADVERSARIAL, seed=0), masked | (reaches == "all")
-    loss, rendering, said = evaluate_adversarial(moved, chosen, view, view.photo, hole(), adversary, generator(1))
+    loss, rendering, said = evaluate_adversarial(
+        moved, chosen, view, view.photo, square_hole(), adversary, generator(1)
+    )
     loss.backward()
     assert all(getattr(moved, name).grad is None for name in PARAMETERS if name != "sh")
     got, drawn = moved.sh.grad.flatten(1).ne(0).any(1), rendering.radii > 0
@@ -159,10 +131,10 @@ def test_the_critic_reaches_spherical_harmonics_only(reaches):
 
 
 def test_the_adversarial_gradient_is_that_of_the_patches_by_finite_differences():
-    gaussians, masked = wall()
-    moved, view = leaves(gaussians), train_view()
+    gaussians, masked = random_wall()
+    moved, view = as_leaves(gaussians), train_view()
     adversary = Adversary(ADVERSARIAL, seed=0, rate=1e-12)  # the critic stands still
-    term = lambda g: evaluate_adversarial(g, masked, view, view.photo, hole(), adversary, generator(1))[0]
+    term = lambda g: evaluate_adversarial(g, masked, view, view.photo, square_hole(), adversary, generator(1))[0]
     term(moved).backward()
     direction = torch.randn(gaussians.sh.shape, generator=generator(8)) * masked[:, None, None]
     step = 2e-3
@@ -171,8 +143,8 @@ def test_the_adversarial_gradient_is_that_of_the_patches_by_finite_differences()
     assert (moved.sh.grad * direction).sum().item() == pytest.approx(by_hand, rel=0.02)
 
 
-def test_region_changers_are_found_and_no_one_else():
-    gaussians, masked = wall(600)
+def test_only_gaussians_that_changed_region_are_found():
+    gaussians, masked = random_wall(600)
     region = build_region(gaussians.means, masked)
     assert not has_changed_region(region, gaussians.means, masked).any(), "an initialization is in its regions"
     moved = gaussians.means.clone()
@@ -188,20 +160,14 @@ def test_region_changers_are_found_and_no_one_else():
     assert not has_changed_region(single, gaussians.means[:1], torch.tensor([True])).any()
 
 
-SETTINGS = Params(
-    iterations=6, sds=SDS, depth={"weight": 0}, adversarial=ADVERSARIAL, reference={"weight": 0.5},
-    densify={"every": 2, "stop": 1}, checkpoint_seconds=1e-9,
-)  # fmt: skip
-OFF = {"weight": 0}
 # Neither critic nor reference; no Gaussian is added.
-PLAIN = altered(SETTINGS, adversarial=OFF, reference=OFF, densify={"every": 0})
 
 
-def run(folder, prior, text, settings=SETTINGS, views=None, gaussians=None):
+def run_distill(folder, prior, text, settings=SETTINGS, views=None, gaussians=None):
     folder.mkdir(exist_ok=True)
-    start, masked = wall()
+    start, masked = random_wall()
     views = views or [train_view("a"), train_view("b", 0.1), train_view("c", -0.1, clean=True)]
-    initial, holes = gaussians or start, [ReferenceHole(camera(), train_view().photo, hole())]
+    initial, holes = gaussians or start, [ReferenceHole(wall_camera(), train_view().photo, square_hole())]
     inputs = TermInputs(views, holes, initial.means[masked], prior, text)
     return D.distill(initial, masked, inputs, settings, folder)
 
@@ -212,7 +178,7 @@ def test_any_number_of_threads_gives_the_same_bits(prior, text, tmp_path, off):
     for threads in (1, 2):
         torch.set_num_threads(threads)
         try:
-            found.append(run(tmp_path / str(threads), prior, text, altered(SETTINGS, **off))[0])
+            found.append(run_distill(tmp_path / str(threads), prior, text, with_changes(SETTINGS, **off))[0])
             assert torch.get_num_threads() == threads
         finally:
             torch.set_num_threads(before)
@@ -223,8 +189,8 @@ def test_any_number_of_threads_gives_the_same_bits(prior, text, tmp_path, off):
 def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp_path, monkeypatch):
     monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
     monkeypatch.setattr(D, "REGION_EVERY", 2)
-    whole, labels = run(tmp_path / "whole", prior, text)
-    assert labels.sum() > wall()[1].sum(), "densification added no masked Gaussian"
+    whole, labels = run_distill(tmp_path / "whole", prior, text)
+    assert labels.sum() > random_wall()[1].sum(), "densification added no masked Gaussian"
     real = D.take_step
 
     def interrupted(optimizer, step, *others):
@@ -234,10 +200,10 @@ def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp
 
     monkeypatch.setattr(D, "take_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "broken", prior, text)
+        run_distill(tmp_path / "broken", prior, text)
     assert load_checkpoint(tmp_path / "broken")["step"] == 3
     monkeypatch.setattr(D, "take_step", real)
-    resumed, resumed_labels = run(tmp_path / "broken", prior, text)
+    resumed, resumed_labels = run_distill(tmp_path / "broken", prior, text)
     assert (labels == resumed_labels).all()
     for name in PARAMETERS:
         assert (getattr(whole, name) == getattr(resumed, name)).all(), name
@@ -257,26 +223,26 @@ def test_densification_takes_a_share_whatever_the_weight(prior, text, tmp_path, 
 
     def grown(name, weight, every):
         densify = {"every": every}
-        settings = altered(PLAIN, iterations=2, confined=False, sds={"weight": weight}, densify=densify)
-        _, labels = run(tmp_path / name, prior, text, settings)
-        return int(labels.sum() - wall()[1].sum())
+        settings = with_changes(PLAIN, iterations=2, confined=False, sds={"weight": weight}, densify=densify)
+        _, labels = run_distill(tmp_path / name, prior, text, settings)
+        return int(labels.sum() - random_wall()[1].sum())
 
-    masked = int(wall()[1].sum())
+    masked = int(random_wall()[1].sum())
     shares = [grown(f"{w:g}", w, 2) for w in (1e-6, 1e-2)]
     assert shares[0] == shares[1] and abs(shares[0] - 0.25 * masked) <= 2
     assert grown("never", 1e-3, 0) == 0
 
 
 def test_each_set_of_gaussians_moves_by_its_own_terms_only(prior, text, tmp_path):
-    start, masked = wall()
+    start, masked = random_wall()
     views, never = [train_view("a"), train_view("b", 0.1)], {"every": 0}
-    one, labels = run(tmp_path / "sds", prior, text, altered(PLAIN, reconstruction=never), views)
+    one, labels = run_distill(tmp_path / "sds", prior, text, with_changes(PLAIN, reconstruction=never), views)
     assert (labels == masked).all() and (one.means[~masked] == start.means[~masked]).all()
     assert (one.sh[masked] != start.sh[masked]).any()
-    two, _ = run(tmp_path / "reconstruction", None, None, altered(PLAIN, sds=OFF), views)
+    two, _ = run_distill(tmp_path / "reconstruction", None, None, with_changes(PLAIN, sds=OFF), views)
     assert (two.means[masked] == start.means[masked]).all() and (two.sh[~masked] != start.sh[~masked]).any()
-    alone = altered(PLAIN, adversarial=ADVERSARIAL.model_dump(), sds=OFF, reconstruction=never)
-    three, _ = run(tmp_path / "adversarial", None, None, alone, views)
+    alone = with_changes(PLAIN, adversarial=ADVERSARIAL.model_dump(), sds=OFF, reconstruction=never)
+    three, _ = run_distill(tmp_path / "adversarial", None, None, alone, views)
     for name in PARAMETERS:
         still = ~masked if name == "sh" else torch.ones_like(masked)
         assert (getattr(three, name)[still] == getattr(start, name)[still]).all(), name
@@ -284,60 +250,56 @@ def test_each_set_of_gaussians_moves_by_its_own_terms_only(prior, text, tmp_path
 
 
 def test_distillation_may_reach_the_background_too_but_not_what_does_not_show(prior, text, tmp_path):
-    start, masked = wall()
-    settings = altered(PLAIN, iterations=2, reconstruction={"every": 0}, sds={"reaches": "all"})
+    start, masked = random_wall()
+    settings = with_changes(PLAIN, iterations=2, reconstruction={"every": 0}, sds={"reaches": "all"})
     view = train_view("a")
-    moved = changed(start, run(tmp_path / "all", prior, text, settings, [view])[0])
-    shown = rasterizer.accumulate(start, view.camera, torch.ones(*hole().shape, 1))[:, 0] > 0
+    moved = has_changed(start, run_distill(tmp_path / "all", prior, text, settings, [view])[0])
+    shown = rasterizer.accumulate(start, view.camera, torch.ones(*square_hole().shape, 1))[:, 0] > 0
     assert (moved & masked).any() and (moved & ~masked).any() and not (moved & ~shown).any()
 
 
 def test_views_far_from_every_reference_are_not_distilled(prior, text, tmp_path):
-    start, masked = wall()
+    start, masked = random_wall()
     near, far = train_view("a"), train_view("b", 0.5)  # 26 degrees aside
-    distilled = lambda degrees: views_near_references([near, far], [camera()], start.means[masked], degrees)
+    distilled = lambda degrees: views_near_references([near, far], [wall_camera()], start.means[masked], degrees)
     assert [distilled(x) for x in (1, 20, 35, 180)] == [{"a"}, {"a"}, {"a", "b"}, {"a", "b"}]
     for degrees in (20, 35):
-        settings = altered(PLAIN, iterations=3, reconstruction={"every": 0}, sds={"max_angle": degrees})
-        ended, _ = run(tmp_path / str(degrees), prior, text, settings, [far])
-        assert changed(start, ended).any() == (degrees == 35)
+        settings = with_changes(PLAIN, iterations=3, reconstruction={"every": 0}, sds={"max_angle": degrees})
+        ended, _ = run_distill(tmp_path / str(degrees), prior, text, settings, [far])
+        assert has_changed(start, ended).any() == (degrees == 35)
         logged = ["sds_gradient_mean" in line for line in read_trace(tmp_path / str(degrees) / "trace.jsonl")[1:]]
         assert logged == [degrees == 35] * len(logged)
 
 
 def test_photographs_may_reach_the_masked_gaussians_that_show_outside_the_hole(tmp_path):
     """Those that show inside it only lie still."""
-    start, masked = wall()
+    start, masked = random_wall()
     view = train_view("a")
-    outside = rasterizer.accumulate(start, view.camera, (~hole())[..., None].float())[:, 0] > 0
+    outside = rasterizer.accumulate(start, view.camera, (~square_hole())[..., None].float())[:, 0] > 0
     assert (masked & outside).any() and (masked & ~outside).any()
     for reaches in ("unmasked", "shown"):
-        settings = altered(PLAIN, iterations=2, sds=OFF, reconstruction={"reaches": reaches})
-        moved = changed(start, run(tmp_path / reaches, None, None, settings, [view])[0])
+        settings = with_changes(PLAIN, iterations=2, sds=OFF, reconstruction={"reaches": reaches})
+        moved = has_changed(start, run_distill(tmp_path / reaches, None, None, settings, [view])[0])
         assert not (moved & ~outside).any() and (moved & ~masked).any()
         assert (moved & masked).any() == (reaches == "shown")
 
 
-def changed(before, after):
-    """[N] bool: any parameter."""
-    rows = [(getattr(before, n) != getattr(after, n)).reshape(len(before), -1) for n in PARAMETERS]
-    return torch.cat(rows, 1).any(1)
-
-
 def test_the_critic_waits_for_its_part_of_the_run(tmp_path):
-    run(tmp_path / "late", None, None, altered(SETTINGS, sds=OFF, iterations=8, adversarial={"start": 0.5}))
+    run_distill(
+        tmp_path / "late", None, None, with_changes(SETTINGS, sds=OFF, iterations=8, adversarial={"start": 0.5})
+    )
     judged = {r["iteration"]: "critic_loss" in r for r in read_trace(tmp_path / "late" / "trace.jsonl")}
     assert judged == {step: step > 4 for step in judged} and len(set(judged.values())) == 2
 
 
 def test_the_reference_term_draws_the_reference(prior, text, tmp_path):
-    start, masked = wall()
+    start, masked = random_wall()
     alone = {"sds": OFF, "reference": {"weight": 1.0}, "reconstruction": {"every": 0}}
-    settings, views = altered(PLAIN, iterations=40, checkpoint_seconds=1e9, **alone), [train_view()]
-    target, _ = wall()
+    settings, views = with_changes(PLAIN, iterations=40, checkpoint_seconds=1e9, **alone), [train_view()]
+    target, _ = random_wall()
     with torch.no_grad():
-        image = render(replace(target, sh=target.sh + 0.5), camera()).color.clamp(0, 1)
-    inputs = TermInputs(views, [ReferenceHole(camera(), image, hole())], start.means[masked])
+        image = render(replace(target, sh=target.sh + 0.5), wall_camera()).color.clamp(0, 1)
+    inputs = TermInputs(views, [ReferenceHole(wall_camera(), image, square_hole())], start.means[masked])
     ended, _ = D.distill(start, masked, inputs, settings, tmp_path, Rates(sh_dc=0.03))
     records = read_trace(tmp_path / "trace.jsonl")
     assert records[-1]["reference_psnr"] > records[0]["reference_psnr"] + 1
@@ -345,42 +307,42 @@ def test_the_reference_term_draws_the_reference(prior, text, tmp_path):
 
 
 def test_the_reference_term_is_that_of_the_whole_view():
-    start, masked = wall()
+    start, masked = random_wall()
     image, chosen = torch.rand(HEIGHT, WIDTH, 3, generator=generator(3)), torch.ones_like(masked)
-    part, whole = leaves(start), leaves(start)
-    loss, _ = evaluate_reference(part, chosen, camera(), image, hole())
-    expected = reconstruction_loss(render(whole, camera()).color, image, hole())
+    part, whole = as_leaves(start), as_leaves(start)
+    loss, _ = evaluate_reference(part, chosen, wall_camera(), image, square_hole())
+    expected = reconstruction_loss(render(whole, wall_camera()).color, image, square_hole())
     loss.backward()
     expected.backward()
     assert float(loss) == pytest.approx(float(expected), rel=1e-3)  # slopes are clamped at another border
     for name in PARAMETERS:
         apart = (getattr(part, name).grad - getattr(whole, name).grad).norm()
         assert apart < 0.01 * getattr(whole, name).grad.norm(), name
-    nothing, _ = evaluate_reference(part, chosen, camera(), image, torch.zeros_like(hole()))
+    nothing, _ = evaluate_reference(part, chosen, wall_camera(), image, torch.zeros_like(square_hole()))
     assert float(nothing) == 0
 
 
-def test_a_number_that_is_none_names_step_term_and_view(prior, text, tmp_path):
+def test_nan_names_step_term_and_view(prior, text, tmp_path):
     broken = replace(prior, alphas_cumprod=torch.full_like(prior.alphas_cumprod, float("nan")))
     with pytest.raises(FloatingPointError, match=r"step 0, SDS, view 'a'"):
-        run(tmp_path / "x", broken, text, views=[train_view()])
+        run_distill(tmp_path / "x", broken, text, views=[train_view()])
     bad = replace(train_view(), photo=torch.full((HEIGHT, WIDTH, 3), float("nan")))
     with pytest.raises(FloatingPointError, match=r"step 0, reconstruction, view 'a'"):
-        run(tmp_path / "y", None, None, altered(PLAIN, sds=OFF), [bad])
-    alone = altered(SETTINGS, sds=OFF, reference=OFF)
+        run_distill(tmp_path / "y", None, None, with_changes(PLAIN, sds=OFF), [bad])
+    alone = with_changes(SETTINGS, sds=OFF, reference=OFF)
     (tmp_path / "z").mkdir()
     beside = torch.where(
-        hole()[..., None], train_view().photo, float("nan")
+        square_hole()[..., None], train_view().photo, float("nan")
     )  # the patches of the critic reach that far
-    start, masked = wall()
-    holes = [ReferenceHole(camera(), beside, each) for each in (hole(), torch.zeros_like(hole()))]
+    start, masked = random_wall()
+    holes = [ReferenceHole(wall_camera(), beside, each) for each in (square_hole(), torch.zeros_like(square_hole()))]
     full, empty = (TermInputs([train_view()], [each], start.means[masked]) for each in holes)
     with pytest.raises(FloatingPointError, match=r"step 0, adversarial, view 'a': the critic's loss"):
         D.distill(start, masked, full, alone, tmp_path / "z")
     with pytest.raises(ValueError, match="reference's hole"):
         D.distill(start, masked, empty, alone, tmp_path / "z")
     with pytest.raises(ValueError, match="prior"):
-        run(tmp_path / "z", None, None)
+        run_distill(tmp_path / "z", None, None)
 
 
 # ------------------------------------------------------------------------------------------ the reference
@@ -389,13 +351,13 @@ def test_a_number_that_is_none_names_step_term_and_view(prior, text, tmp_path):
 def test_painting_keeps_known_pixels_and_a_candidates_picture_is_its_seeds(prior):
     image = torch.rand(3, HEIGHT, WIDTH, generator=generator(5)) * 2 - 1
     options = {"prompt": "", "steps": 2, "start": 0.6, "guidance": 0.0}
-    pair = inpaint.paint(prior, image, hole(), seeds=[0, 1], **options)
+    pair = inpaint.paint(prior, image, square_hole(), seeds=[0, 1], **options)
     assert pair.shape == (2, 3, HEIGHT, WIDTH) and torch.isfinite(pair).all()
-    assert (pair[:, :, ~hole()] == image[:, ~hole()]).all()
+    assert (pair[:, :, ~square_hole()] == image[:, ~square_hole()]).all()
     assert (pair[0] != pair[1]).any()
-    assert (inpaint.paint(prior, image, hole(), seeds=[1], **options)[0] == pair[1]).all()
-    other = torch.where(hole(), torch.rand(HEIGHT, WIDTH, generator=generator(6)), image)
-    assert (inpaint.paint(prior, other, hole(), seeds=[1], **options)[0] == pair[1])[:, hole()].all()
+    assert (inpaint.paint(prior, image, square_hole(), seeds=[1], **options)[0] == pair[1]).all()
+    other = torch.where(square_hole(), torch.rand(HEIGHT, WIDTH, generator=generator(6)), image)
+    assert (inpaint.paint(prior, other, square_hole(), seeds=[1], **options)[0] == pair[1])[:, square_hole()].all()
 
 
 def test_painting_works_on_views_smaller_and_larger_than_the_prior(prior):
@@ -427,20 +389,19 @@ def test_levels_double_up_to_the_view():
 
 def test_the_seam_prefers_the_candidate_that_continues_its_surroundings():
     ramp = torch.linspace(-1, 1, WIDTH).expand(3, HEIGHT, WIDTH)
-    wrong = torch.where(hole(), torch.tensor(0.9), ramp)
-    assert int(inpaint.seam_score(torch.stack([wrong, ramp, wrong]), hole()).argmin()) == 1
+    wrong = torch.where(square_hole(), torch.tensor(0.9), ramp)
+    assert int(inpaint.seam_score(torch.stack([wrong, ramp, wrong]), square_hole()).argmin()) == 1
 
 
 # ------------------------------------------------------------------------------------------ the stages
 
 
 @pytest.fixture
-def folders(tmp_path):
-    """The artifacts of a miniature scene: poses, fit, masks, initialize, and a prior."""
-    gaussians, masked = wall()
-    cameras = {name: camera(name, shift) for name, shift in (("a", 0.0), ("b", 0.1), ("t", 0.05))}
-    here = Similarity(1.0, np.zeros(3))
-    scene = Scene(cameras, ("a", "b"), ("t",), frozenset(), np.zeros((4, 3)), np.zeros((4, 3), np.uint8), here)
+def stage_folders(tmp_path):
+    """The folders of a small scene: poses, fit, masks, initialize, and a prior."""
+    gaussians, masked = random_wall()
+    cameras = {name: wall_camera(name, shift) for name, shift in (("a", 0.0), ("b", 0.1), ("t", 0.05))}
+    scene = make_scene(cameras, ("t",), points=np.zeros((4, 3)))
     names = ("scene", "poses", "raw_masks", "fit", "masks", "initialize", "reference", "personalize", "distill")
     paths = {name: tmp_path / name for name in names}
     for path in paths.values():
@@ -448,8 +409,8 @@ def folders(tmp_path):
     save_scene(paths["poses"], scene)
     for name, view in cameras.items():
         save_image(paths["poses"] / "images" / f"{name}.png", render(gaussians, view).color.clamp(0, 1).numpy())
-    write_photos(paths["scene"], paths["poses"], cameras)
-    pixels = hole().numpy()
+    write_capture_photos(paths["scene"], paths["poses"], cameras)
+    pixels = square_hole().numpy()
     save_mask_sets(paths["masks"], {name: MaskSet(pixels, pixels, pixels, pixels) for name in cameras})
     save_json(paths["masks"] / "facts.json", {"best_reference": "b"})
     save_labels(paths["masks"] / "labels.npy", masked)
@@ -461,71 +422,81 @@ def folders(tmp_path):
     return paths | {"prior": str(tmp_path / "prior")}
 
 
-def pick(folders, *names):
-    return {name: folders[name] for name in names}
+def select_folders(stage_folders, *names):
+    return {name: stage_folders[name] for name in names}
 
 
-def test_stages_chain_through_files_with_the_scenes_own_reference(folders):
+def test_stages_chain_through_files_with_the_scenes_own_reference(stage_folders):
     from stages import distill, personalize, reference
     from stages.plan import reference as plan
 
-    given = load_image(folders["poses"] / "images" / "a.png")
-    save_image(folders["scene"] / "done" / "a.png", given)
+    given = load_image(stage_folders["poses"] / "images" / "a.png")
+    save_image(stage_folders["scene"] / "done" / "a.png", given)
     params = reference.Params(prior="nowhere/at-all", reference={"view": "a", "image": "done/a.png"})
-    assert "reference a:" in plan.preview(params, **pick(folders, "scene", "poses"))[0]
-    reference.run(params, folders["reference"], **pick(folders, "scene", "poses", "fit", "masks"))
-    assert (load_image(folders["reference"] / "references" / "a.png") == given).all()
-    assert (load_mask(folders["reference"] / "masks" / "a.png") == hole().numpy()).all()
+    assert "reference a:" in plan.preview(params, **select_folders(stage_folders, "scene", "poses"))[0]
+    reference.run(params, stage_folders["reference"], **select_folders(stage_folders, "scene", "poses", "fit", "masks"))
+    assert (load_image(stage_folders["reference"] / "references" / "a.png") == given).all()
+    assert (load_mask(stage_folders["reference"] / "masks" / "a.png") == square_hole().numpy()).all()
 
-    learning = personalize.Params(prior=folders["prior"], steps=2, optimizer={"batch": 2}, samples={"size": 8})
-    personalize.run(learning, folders["personalize"], **pick(folders, "poses", "raw_masks", "reference"))
-    assert (folders["personalize"] / "pytorch_lora_weights.safetensors").exists()
+    learning = personalize.Params(prior=stage_folders["prior"], steps=2, optimizer={"batch": 2}, samples={"size": 8})
+    personalize.run(
+        learning, stage_folders["personalize"], **select_folders(stage_folders, "poses", "raw_masks", "reference")
+    )
+    assert (stage_folders["personalize"] / "pytorch_lora_weights.safetensors").exists()
 
-    needs = pick(folders, "poses", "fit", "masks", "reference", "personalize", "initialize")
+    needs = select_folders(stage_folders, "poses", "fit", "masks", "reference", "personalize", "initialize")
     critic = {"patches": 4, "size": 8, "width": 4}
-    distill.run(distill.Params(prior=folders["prior"], iterations=2, adversarial=critic), folders["distill"], **needs)
-    result = load_ply(folders["distill"] / "gaussians.ply")
-    labels = load_labels(folders["distill"] / "labels.npy")
+    distill.run(
+        distill.Params(prior=stage_folders["prior"], iterations=2, adversarial=critic),
+        stage_folders["distill"],
+        **needs,
+    )
+    result = load_ply(stage_folders["distill"] / "gaussians.ply")
+    labels = load_labels(stage_folders["distill"] / "labels.npy")
     assert len(result) == len(labels) and labels.any()
     for stage in ("personalize", "distill"):
-        assert read_trace(folders[stage] / "trace.jsonl") and not (folders[stage] / "checkpoint.pt").exists()
+        assert (
+            read_trace(stage_folders[stage] / "trace.jsonl") and not (stage_folders[stage] / "checkpoint.pt").exists()
+        )
 
 
-def test_reference_inpaints_the_best_view_and_keeps_all_else(folders):
+def test_reference_inpaints_the_best_view_and_keeps_all_else(stage_folders):
     from stages import reference
 
-    params = reference.Params(prior=folders["prior"], candidates=2, sampler={"steps": 2})
-    reference.run(params, folders["reference"], **pick(folders, "scene", "poses", "fit", "masks"))
-    (found,) = load_references(folders["reference"], load_scene(folders["poses"]))
-    photo = load_image(folders["poses"] / "images" / "b.png")
+    params = reference.Params(prior=stage_folders["prior"], candidates=2, sampler={"steps": 2})
+    reference.run(params, stage_folders["reference"], **select_folders(stage_folders, "scene", "poses", "fit", "masks"))
+    (found,) = load_references(stage_folders["reference"], load_scene(stage_folders["poses"]))
+    photo = load_image(stage_folders["poses"] / "images" / "b.png")
     assert found.camera.name == "b" and (found.image[~found.mask] == photo[~found.mask]).all()
-    assert load_image(folders["reference"] / "candidates.png").shape == (HEIGHT, 2 * WIDTH, 3)
-    record = json.loads((folders["reference"] / "candidates.json").read_text())
+    assert load_image(stage_folders["reference"] / "candidates.png").shape == (HEIGHT, 2 * WIDTH, 3)
+    record = json.loads((stage_folders["reference"] / "candidates.json").read_text())
     assert record["chosen"] == int(np.argmin(record["seams"]))
     with pytest.raises(ValueError, match="choose"):
         third = params.model_copy(update={"choose": 2})
-        reference.run(third, folders["reference"], **pick(folders, "scene", "poses", "fit", "masks"))
+        reference.run(
+            third, stage_folders["reference"], **select_folders(stage_folders, "scene", "poses", "fit", "masks")
+        )
 
 
-def test_a_reference_made_of_pieces_of_itself_needs_no_prior(folders, tmp_path):
+def test_a_reference_made_of_pieces_of_itself_needs_no_prior(stage_folders, tmp_path):
     from stages import reference
     from stages.plan import reference as plan
 
     params = reference.Params(inpainter="exemplar", prior="no/such-model", prompt="a vase")
     assert not plan.needed_weights(params, frozenset())
-    (note,) = plan.preview(params, scene=folders["scene"])
+    (note,) = plan.preview(params, scene=stage_folders["scene"])
     assert "a vase" in note and "not read" in note
-    reference.run(params, folders["reference"], **pick(folders, "scene", "poses", "fit", "masks"))
-    (found,) = load_references(folders["reference"], load_scene(folders["poses"]))
-    photo = load_image(folders["poses"] / "images" / "b.png")
-    rim = dilate(load_mask_sets(folders["masks"], ["b"])["b"].consistent, RIM_WIDTH)
+    reference.run(params, stage_folders["reference"], **select_folders(stage_folders, "scene", "poses", "fit", "masks"))
+    (found,) = load_references(stage_folders["reference"], load_scene(stage_folders["poses"]))
+    photo = load_image(stage_folders["poses"] / "images" / "b.png")
+    rim = dilate(load_mask_sets(stage_folders["masks"], ["b"])["b"].consistent, RIM_WIDTH)
     assert found.mask.any() and (found.image[~found.mask & ~rim] == photo[~found.mask & ~rim]).all()
 
 
 def test_weights_are_asked_for_by_the_terms_that_use_them():
     from stages.plan import distill as plan
 
-    names = lambda **changes: [n.name for n in plan.needed_weights(altered(plan.Params(), **changes), frozenset())]
+    names = lambda **changes: [n.name for n in plan.needed_weights(with_changes(plan.Params(), **changes), frozenset())]
     prior = Params().prior
     assert names() == names(sds=OFF) == names(depth=OFF) == [prior] and names(sds=OFF, depth=OFF) == []
     assert names(depth={"model": "a/network"}) == [prior, "a/network"]

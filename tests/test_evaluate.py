@@ -1,4 +1,4 @@
-"""`evaluate` on folders written to disk: what it leaves behind must be recomputable from its own pictures."""
+"""The stage `evaluate` on written folders: its scores can be recomputed from its own pictures."""
 
 import csv
 import json
@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scenes.cameras import make_camera, make_scene
 
 from reffusion import seeding
 from reffusion.background import training_coverage
@@ -19,7 +20,7 @@ from reffusion.io.scene import load_scene, save_mask_sets, save_scene
 from reffusion.metrics import image_metrics, rows
 from reffusion.morphology import dilate
 from reffusion.splat.rasterizer import render
-from reffusion.types import Camera, Gaussians, MaskSet, Scene, Similarity
+from reffusion.types import Gaussians, MaskSet, Scene, Similarity
 from report import sheet
 from stages import evaluate, finish
 
@@ -27,13 +28,7 @@ SIMILARITY = Similarity(0.02, np.array([500_000.0, -3.0, 40.0]))
 WIDTH, HEIGHT = 48, 36
 
 
-def camera(name, shift):
-    pose = np.eye(4)
-    pose[0, 3] = shift
-    return Camera(name, WIDTH, HEIGHT, 40.0, 40.0, WIDTH / 2, HEIGHT / 2, pose)
-
-
-def blobs(count, seed=0):
+def random_blobs(count, seed=0):
     generator = seeding.generator(seed, "blobs")
     draw = lambda *shape: torch.rand(*shape, generator=generator)
     means = torch.cat([draw(count, 2) * 1.6 - 0.8, 1.5 + draw(count, 1)], 1)
@@ -41,18 +36,12 @@ def blobs(count, seed=0):
 
 
 def write_stages(home):
-    """Folders of the stages before: views 0-2 test (2 without a mask of its own), 3-7 training."""
+    """Write the folders of earlier stages: views 0-2 are test views (2 without a mask), 3-7 training views."""
     names = [f"view{i}" for i in range(8)]
-    cameras = {name: camera(name, 0.1 * i - 0.3) for i, name in enumerate(names)}
-    scene = Scene(
-        cameras,
-        tuple(names[3:]),
-        tuple(names[:3]),
-        frozenset(),
-        np.zeros((1, 3)),
-        np.zeros((1, 3), np.uint8),
-        SIMILARITY,
-    )
+    cameras = {
+        name: make_camera(name, (WIDTH, HEIGHT), 40.0, (0.3 - 0.1 * i, 0.0, 0.0)) for i, name in enumerate(names)
+    }
+    scene = make_scene(cameras, names[:3], similarity=SIMILARITY)
     made = {name: home / name for name in ("poses", "raw_masks", "fit", "masks", "initialize", "distill")}
     rng = np.random.default_rng(0)
     save_scene(made["poses"], scene)
@@ -67,51 +56,51 @@ def write_stages(home):
     save_mask_sets(made["masks"], {name: MaskSet(empty, other, empty, empty) for name in names})
     save_json(made["masks"] / "facts.json", {"kept": []})
     for stage, count in (("fit", 60), ("initialize", 40), ("distill", 50)):
-        save_ply(made[stage] / "gaussians.ply", blobs(count))
+        save_ply(made[stage] / "gaussians.ply", random_blobs(count))
     return made
 
 
-def run(out, folders, **params):
-    """The stages `finish`, beside `out`, and `evaluate`: metrics.json."""
+def run_finish_and_evaluate(out, stage_folders, **params):
+    """Run `finish`, in a folder beside `out`, and `evaluate`; return metrics.json."""
     finished = out.with_name(f"finish-{out.name}")
     for folder in (finished, out):
         folder.mkdir()
-    finish.run(finish.Params(), finished, **folders)
-    evaluate.run(evaluate.Params(**params), out, **folders, finish=finished)
+    finish.run(finish.Params(), finished, **stage_folders)
+    evaluate.run(evaluate.Params(**params), out, **stage_folders, finish=finished)
     return json.loads((out / "metrics.json").read_text())
 
 
-def test_while_an_object_is_kept_nothing_is_scored(tmp_path, folders):
+def test_while_an_object_is_kept_nothing_is_scored(tmp_path, stage_folders):
     """Test photographs show none."""
-    save_json(folders["masks"] / "facts.json", {"kept": ["ball"]})
-    found = run(tmp_path / "out", folders)
+    save_json(stage_folders["masks"] / "facts.json", {"kept": ["ball"]})
+    found = run_finish_and_evaluate(tmp_path / "out", stage_folders)
     assert found["mean"].get("psnr_box") is None and (tmp_path / "out/renders/view0.png").exists()
 
 
-def test_test_views_that_contradict_their_poses_are_named(tmp_path, folders, done):
-    save_scene(folders["poses"], replace(load_scene(folders["poses"]), suspects=("view1", "view5")))
-    assert run(tmp_path / "out", folders)["suspects"] == ["view1"]
-    assert load_json(done / "evaluate" / "metrics.json")["suspects"] is None
+def test_test_views_that_contradict_their_poses_are_named(tmp_path, stage_folders, finished_job):
+    save_scene(stage_folders["poses"], replace(load_scene(stage_folders["poses"]), suspects=("view1", "view5")))
+    assert run_finish_and_evaluate(tmp_path / "out", stage_folders)["suspects"] == ["view1"]
+    assert load_json(finished_job / "evaluate" / "metrics.json")["suspects"] is None
 
 
-def test_views_are_drawn_as_bright_as_photographs_are(folders, tmp_path):
+def test_views_are_drawn_as_bright_as_photographs_are(stage_folders, tmp_path):
     """As their own outside the mask, or else as those next to them; and they are as consistent as without."""
     names = [f"view{k}" for k in range(3, 8)]
     dark = np.diag([0.5, 0.6, 0.7]) @ np.eye(3, 4)
-    (folders["poses"] / "images/view2.png").unlink()
-    many = blobs(400)
+    (stage_folders["poses"] / "images/view2.png").unlink()
+    many = random_blobs(400)
     many = replace(many, log_scales=many.log_scales + 1.0, opacity_logits=torch.full_like(many.opacity_logits, 3.0))
-    save_ply(folders["fit"] / "gaussians.ply", many)
+    save_ply(stage_folders["fit"] / "gaussians.ply", many)
     for name, gain in (("view0", [0.3, 0.4, 0.8]), ("view1", [1.0, 1.0, 1.0])):
-        drawn = render(many, load_scene(folders["poses"]).cameras[name])
+        drawn = render(many, load_scene(stage_folders["poses"]).cameras[name])
         own, shown = 255 * drawn.color.detach().numpy() * gain, drawn.alpha.detach().numpy() > 0.9
         own[~shown] = 240  # where the fit shows nothing it tells nothing, nor do the mask's pixels
         own[10:30, 5:35] = 255
         assert 0.05 < (~shown).mean() < 0.5
-        save_image(folders["poses"] / f"images/{name}.png", own.clip(0, 255).round().astype(np.uint8))
-    plain = run(tmp_path / "plain", folders)
-    save_json(folders["fit"] / "exposures.json", {name: dark.tolist() for name in names})
-    found = run(tmp_path / "out", folders)
+        save_image(stage_folders["poses"] / f"images/{name}.png", own.clip(0, 255).round().astype(np.uint8))
+    plain = run_finish_and_evaluate(tmp_path / "plain", stage_folders)
+    save_json(stage_folders["fit"] / "exposures.json", {name: dark.tolist() for name in names})
+    found = run_finish_and_evaluate(tmp_path / "out", stage_folders)
     for name, gain in (("view0", [0.3, 0.4, 0.8]), ("view2", [0.5, 0.6, 0.7])):
         shown, before = (load_image(tmp_path / f"{k}/renders/{name}.png") for k in ("out", "plain"))
         assert np.abs(shown - before * gain).max() < 2.5, name
@@ -120,37 +109,39 @@ def test_views_are_drawn_as_bright_as_photographs_are(folders, tmp_path):
 
 
 @pytest.fixture
-def folders(tmp_path):
+def stage_folders(tmp_path):
     return write_stages(tmp_path)
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory):
-    """A scene's folder with every stage done, not to be changed; as on a machine without LPIPS weights."""
+def finished_job(tmp_path_factory):
+    """The folder of a finished scene without LPIPS weights; tests must not change it."""
     home = tmp_path_factory.mktemp("scene")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(home / "nothing"))
         patch.setenv("TORCH_HOME", str(home / "nothing"))
-        run(home / "evaluate", write_stages(home))
+        run_finish_and_evaluate(home / "evaluate", write_stages(home))
     return home
 
 
-def test_scores_are_those_of_the_saved_pictures(done):
-    out = done / "evaluate"
+def test_scores_are_those_of_the_saved_pictures(finished_job):
+    out = finished_job / "evaluate"
     summary = load_json(out / "metrics.json")
-    cameras = load_scene(done / "poses").cameras
+    cameras = load_scene(finished_job / "poses").cameras
     boxes = {"view0": image_metrics.Box(2, 8, 38, 32), "view1": None, "view2": image_metrics.Box(17, 2, 48, 26)}
-    train = [cameras[name] for name in load_scene(done / "poses").train]
-    fit = load_ply(done / "fit" / "gaussians.ply")
-    hidden = {camera.name: load_object_mask(camera, done / "raw_masks", done / "masks") for camera in train}
+    train = [cameras[name] for name in load_scene(finished_job / "poses").train]
+    fit = load_ply(finished_job / "fit" / "gaussians.ply")
+    hidden = {
+        camera.name: load_object_mask(camera, finished_job / "raw_masks", finished_job / "masks") for camera in train
+    }
     seen_by = training_coverage.render_coverage_views(fit, train, hidden)
     for kind, renders in (("mean", "renders"), ("initialize", "renders_initialize")):
         scored = [
             image_metrics.score_view(
                 load_image(out / renders / f"{name}.png"),
-                load_image(done / "poses" / "images" / f"{name}.png"),
+                load_image(finished_job / "poses" / "images" / f"{name}.png"),
                 box,
-                mask=dilate(load_object_mask(cameras[name], done / "raw_masks", done / "masks"), 0.01),
+                mask=dilate(load_object_mask(cameras[name], finished_job / "raw_masks", finished_job / "masks"), 0.01),
                 unseen=training_coverage.unseen_pixels(fit, cameras[name], seen_by),
             )
             for name, box in boxes.items()
@@ -171,9 +162,12 @@ def test_scores_are_those_of_the_saved_pictures(done):
     assert load_image(out / "side_by_side" / "view0.png").shape == (HEIGHT, 3 * WIDTH + 8, 3)
 
 
-def test_the_scene_is_exported_in_its_own_frame(done):
-    exported, result = load_ply(done / "evaluate" / "scene.ply"), load_ply(done / "distill" / "gaussians.ply")
-    if (completed := done / "finish-evaluate" / "completed" / "distill.ply").exists():
+def test_the_scene_is_exported_in_its_own_frame(finished_job):
+    exported, result = (
+        load_ply(finished_job / "evaluate" / "scene.ply"),
+        load_ply(finished_job / "distill" / "gaussians.ply"),
+    )
+    if (completed := finished_job / "finish-evaluate" / "completed" / "distill.ply").exists():
         result = load_ply(completed)
     back = SIMILARITY.apply(exported.means.double().numpy())
     # 500 km away a float of the scene's own frame is worth 0.03 units, 6e-4 of the normalised frame.
@@ -182,38 +176,40 @@ def test_the_scene_is_exported_in_its_own_frame(done):
     assert torch.allclose(sizes, torch.full_like(sizes, -np.log(0.02)), atol=1e-5)
 
 
-def test_an_identical_view_is_infinite_in_the_table_and_capped_in_the_mean(done, tmp_path, folders):
+def test_an_identical_view_is_infinite_in_the_table_and_capped_in_the_mean(finished_job, tmp_path, stage_folders):
     for view in ("view0", "view1", "view2"):
-        picture = load_image(done / "evaluate" / "renders" / f"{view}.png")
-        save_image(folders["poses"] / "images" / f"{view}.png", picture)
-    summary = run(tmp_path / "again", folders)
+        picture = load_image(finished_job / "evaluate" / "renders" / f"{view}.png")
+        save_image(stage_folders["poses"] / "images" / f"{view}.png", picture)
+    summary = run_finish_and_evaluate(tmp_path / "again", stage_folders)
     assert summary["mean"]["psnr_full"] == summary["mean"]["psnr_box"] == image_metrics.PSNR_CAP
     assert summary["mean"]["flip_full"] == 0.0 and summary["mean"]["ssim_box"] == pytest.approx(1.0)
     assert "inf" in (tmp_path / "again" / "per_view.csv").read_text()
 
 
-def test_without_distill_the_initialization_is_the_result(tmp_path, folders):
+def test_without_distill_the_initialization_is_the_result(tmp_path, stage_folders):
     out = tmp_path / "out"
-    summary = run(out, folders | {"distill": None})
+    summary = run_finish_and_evaluate(out, stage_folders | {"distill": None})
     assert summary["result"] == "initialize" and summary["mean"] == summary["initialize"]
     assert (out / "renders" / "view0.png").read_bytes() == (out / "renders_initialize" / "view0.png").read_bytes()
 
 
-def test_nothing_removed_scores_the_fit_on_the_full_image(tmp_path, folders):
-    for path in (folders["raw_masks"] / "test_masks").iterdir():
+def test_nothing_removed_scores_the_fit_on_the_full_image(tmp_path, stage_folders):
+    for path in (stage_folders["raw_masks"] / "test_masks").iterdir():
         path.unlink()
-    summary = run(tmp_path / "out", {stage: folders[stage] for stage in ("poses", "raw_masks", "fit")})
+    summary = run_finish_and_evaluate(
+        tmp_path / "out", {stage: stage_folders[stage] for stage in ("poses", "raw_masks", "fit")}
+    )
     assert summary["result"] == "fit" and summary["mean"]["psnr_box"] is None
     assert summary["mean"]["psnr_full"] > 0 and set(summary["initialize"].values()) == {None}
 
 
-def test_without_test_views_the_training_cameras_are_rendered_and_not_scored(tmp_path, folders):
-    scene = load_scene(folders["poses"])
+def test_without_test_views_the_training_cameras_are_rendered_and_not_scored(tmp_path, stage_folders):
+    scene = load_scene(stage_folders["poses"])
     every = tuple(scene.cameras)
     untested = Scene(scene.cameras, every, (), scene.clean, scene.points, scene.point_colors, scene.similarity)
-    save_scene(folders["poses"], untested)
+    save_scene(stage_folders["poses"], untested)
     out = tmp_path / "out"
-    summary = run(out, folders)
+    summary = run_finish_and_evaluate(out, stage_folders)
     assert summary["rendered"] == "8 training views"
     assert set(summary["mean"].values()) == {None} and set(summary["views"].values()) == {0}
     assert sorted(path.stem for path in (out / "renders").iterdir()) == list(every)
@@ -227,50 +223,52 @@ def test_of_many_training_views_every_eighth():
     assert evaluate.views_to_render(scene) == (names[::8], "training, every 8th")
 
 
-def test_a_test_view_without_picture_is_rendered_and_one_of_another_size_refused(tmp_path, folders):
-    picture = folders["poses"] / "images" / "view1.png"
+def test_a_test_view_without_picture_is_rendered_and_one_of_another_size_refused(tmp_path, stage_folders):
+    picture = stage_folders["poses"] / "images" / "view1.png"
     picture.unlink()
-    summary = run(tmp_path / "out", folders)
+    summary = run_finish_and_evaluate(tmp_path / "out", stage_folders)
     assert summary["views"]["psnr_full"] == 2 and (tmp_path / "out" / "renders" / "view1.png").exists()
     save_image(picture, np.zeros((HEIGHT, WIDTH + 1, 3)))
     with pytest.raises(ValueError, match=r"view1.png: 49x36 px, its camera 48x36"):
-        run(tmp_path / "again", folders)
+        run_finish_and_evaluate(tmp_path / "again", stage_folders)
 
 
-def test_a_held_out_view_that_shows_the_object_is_scored_outside_its_mask_only(tmp_path, monkeypatch, folders):
-    shutil.copytree(folders["raw_masks"] / "test_masks", folders["raw_masks"] / "masks")
-    (folders["raw_masks"] / "masks" / "view1.png").unlink()
+def test_a_held_out_view_that_shows_the_object_is_scored_outside_its_mask_only(tmp_path, monkeypatch, stage_folders):
+    shutil.copytree(stage_folders["raw_masks"] / "test_masks", stage_folders["raw_masks"] / "masks")
+    (stage_folders["raw_masks"] / "masks" / "view1.png").unlink()
     monkeypatch.setattr(rows, "OUTSIDE_MARGIN", 0.05)
-    summary = run(tmp_path / "out", folders)
+    summary = run_finish_and_evaluate(tmp_path / "out", stage_folders)
     assert summary["views"]["psnr_outside"] == 3 and summary["views"]["psnr_full"] == 2  # view0 shows the object
     with open(tmp_path / "out" / "per_view.csv") as file:
         row = next(csv.DictReader(file))
     assert row["view"] == "view0" and row["psnr_box"] == "" and row["left"] == "2"
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[8:32, 3:37] = True  # 2 px wider, a disk at its corners
-    picture, truth = (load_image(p / "view0.png") for p in (tmp_path / "out/renders", folders["poses"] / "images"))
+    picture, truth = (
+        load_image(p / "view0.png") for p in (tmp_path / "out/renders", stage_folders["poses"] / "images")
+    )
     nearly = image_metrics.score_outside(picture, truth, mask)
     assert float(row["psnr_outside"]) == pytest.approx(nearly["psnr_outside"], abs=0.05)
     assert summary["protocol"]["outside_margin"] == 0.05
 
 
-def test_the_contact_sheet_shows_each_picture_enlarged_without_blur(done, tmp_path):
-    path = sheet.make(done, tmp_path / "sheet.png", views=["view0", "view2"], scale=3)
+def test_the_contact_sheet_shows_each_picture_enlarged_without_blur(finished_job, tmp_path):
+    path = sheet.make(finished_job, tmp_path / "sheet.png", views=["view0", "view2"], scale=3)
     picture = load_image(path)
-    ours = np.kron(load_image(done / "evaluate" / "renders" / "view2.png"), np.ones((3, 3, 1), np.uint8))
+    ours = np.kron(load_image(finished_job / "evaluate" / "renders" / "view2.png"), np.ones((3, 3, 1), np.uint8))
     bottom, right = (size - sheet.GAP for size in picture.shape[:2])
     assert (picture[bottom - 3 * HEIGHT : bottom, right - 3 * WIDTH : right] == ours).all()
 
 
-def test_the_contact_sheet_of_a_variant_takes_shared_stages_from_the_scene(done, tmp_path):
-    shutil.copytree(done / "evaluate", tmp_path / "scene@variant" / "evaluate")
-    shutil.copytree(done / "poses", tmp_path / "scene" / "poses")
+def test_the_contact_sheet_of_a_variant_takes_shared_stages_from_the_scene(finished_job, tmp_path):
+    shutil.copytree(finished_job / "evaluate", tmp_path / "scene@variant" / "evaluate")
+    shutil.copytree(finished_job / "poses", tmp_path / "scene" / "poses")
     path = sheet.make(tmp_path / "scene@variant", tmp_path / "variant.png")
-    assert path.read_bytes() == sheet.make(done, tmp_path / "own.png").read_bytes()
+    assert path.read_bytes() == sheet.make(finished_job, tmp_path / "own.png").read_bytes()
 
 
-def test_the_sheet_names_what_is_missing(done, tmp_path):
+def test_the_sheet_names_what_is_missing(finished_job, tmp_path):
     with pytest.raises(ValueError, match="no pictures; run `make scene=nowhere evaluate` first"):
         sheet.make(tmp_path / "nowhere", tmp_path / "sheet.png")
     with pytest.raises(ValueError, match=r"has no view9; it has view0 ... view2"):
-        sheet.make(done, tmp_path / "sheet.png", views=["view0", "view9"])
+        sheet.make(finished_job, tmp_path / "sheet.png", views=["view0", "view9"])

@@ -1,4 +1,4 @@
-"""A finished scene as other tools read it: each file read back by what is not ours."""
+"""Exported scenes, read back by other libraries."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
-from test_io import some_gaussians, some_scene
+from scenes.images import render_color
+from scenes.random_scene import random_gaussians, random_scene
 
 from reffusion.io.cameras import save_cameras
 from reffusion.io.compressed import save_compressed
@@ -21,25 +22,19 @@ from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import save_scene
 from reffusion.io.splats import summarize_splats
-from reffusion.splat import rasterizer
 from reffusion.types import Camera, Similarity
 from report import export
 
 FRAME = Similarity(0.31, np.array([1.5, -20.0, 4.0]))
 
 
-def scene():
-    return replace(some_scene(), similarity=FRAME)
+def random_scene_in_frame():
+    return replace(random_scene(), similarity=FRAME)
 
 
-def seen(gaussians, camera: Camera) -> np.ndarray:
-    with torch.no_grad():
-        return rasterizer.render(gaussians, camera).color.numpy()
-
-
-def gaussians_before(camera: Camera, degree: int = 2):
-    """Some that a camera sees, in the normalised frame."""
-    made = some_gaussians(300, degree)
+def visible_gaussians(camera: Camera, degree: int = 2):
+    """Gaussians in front of a camera, in the normalised frame."""
+    made = random_gaussians(300, degree)
     at = torch.tensor([0.0, 0.0, 4.0]) + made.means
     pose = torch.from_numpy(camera.world_to_camera).float()
     means = (at - pose[:3, 3]) @ pose[:3, :3]
@@ -50,7 +45,7 @@ def test_colmap_and_nerfstudio_see_the_scene_as_we_do(tmp_path):
     """Renders of the exported .ply by the exported cameras, in the scene's own frame, are those of the normalised."""
     import pycolmap
 
-    given = scene()
+    given = random_scene_in_frame()
     save_cameras(tmp_path, given, "images")
     model = pycolmap.Reconstruction(str(tmp_path / "sparse/0"))
     frames = {f["file_path"]: f for f in json.loads((tmp_path / "transforms.json").read_text())["frames"]}
@@ -61,7 +56,7 @@ def test_colmap_and_nerfstudio_see_the_scene_as_we_do(tmp_path):
     assert len(model.images) == len(frames) == len(given.cameras)
     for image in model.images.values():
         camera = given.cameras[image.name.removesuffix(".png")]
-        made = gaussians_before(camera)
+        made = visible_gaussians(camera)
         save_ply(tmp_path / "scene.ply", made, FRAME)
         own = load_ply(tmp_path / "scene.ply")
         pinhole, frame = model.cameras[image.camera_id], frames[f"images/{image.name}"]
@@ -70,14 +65,14 @@ def test_colmap_and_nerfstudio_see_the_scene_as_we_do(tmp_path):
         to_world = np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])
         lens = [frame[key] for key in ("fl_x", "fl_y", "cx", "cy")]
         by_nerfstudio = Camera("n", frame["w"], frame["h"], *lens, np.linalg.inv(to_world))
-        assert seen(made, camera).max() > 0.1
+        assert render_color(made, camera).max() > 0.1
         for other in (by_colmap, by_nerfstudio):
-            np.testing.assert_allclose(seen(own, other), seen(made, camera), atol=2e-4)
+            np.testing.assert_allclose(render_color(own, other), render_color(made, camera), atol=2e-4)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_the_compressed_file_holds_the_same_by_gsply(tmp_path, degree):
-    gsply, made = pytest.importorskip("gsply"), some_gaussians(700, degree)
+    gsply, made = pytest.importorskip("gsply"), random_gaussians(700, degree)
     path = tmp_path / "scene.compressed.ply"
     save_compressed(path, made, FRAME)
     read = gsply.plyread(str(path))
@@ -100,7 +95,7 @@ def test_the_compressed_file_holds_the_same_by_gsply(tmp_path, degree):
 def test_a_compressed_file_that_is_cut_off_is_refused(tmp_path):
     pytest.importorskip("gsply")
     path = tmp_path / "scene.compressed.ply"
-    save_compressed(path, some_gaussians(300, 1), FRAME)
+    save_compressed(path, random_gaussians(300, 1), FRAME)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(BadInput, match=r"scene\.compressed\.ply: cut off"):
         load_ply(path)
@@ -111,7 +106,7 @@ def test_a_compressed_file_that_is_cut_off_is_refused(tmp_path):
 def test_splat_transform_reads_both_files(tmp_path, degree):
     if not (npx := shutil.which("npx")):
         pytest.skip("there is no npm")
-    made = some_gaussians(700, degree)
+    made = random_gaussians(700, degree)
     save_compressed(tmp_path / "scene.compressed.ply", made, FRAME)
     save_ply(tmp_path / "scene.ply", made, FRAME)
     for name, within in (("scene.ply", 1e-5), ("scene.compressed.ply", 0.02)):
@@ -133,15 +128,15 @@ def test_splat_transform_reads_both_files(tmp_path, degree):
 # ---------------------------------------------------------------------------------------------- the command
 
 
-def test_export_writes_all_and_says_what_is_there(tmp_path):
+def test_export_writes_and_lists_all_files(tmp_path):
     pytest.importorskip("gsply")
     home = tmp_path / "s"
     with pytest.raises(ValueError, match=r"scene\.ply is missing; `make scene=s export`"):
         export.make(home)
-    save_scene(home / "poses", scene())
+    save_scene(home / "poses", random_scene_in_frame())
     for name in ("a", "b"):
         save_image(home / "poses" / "images" / f"{name}.png", np.zeros((8, 12, 3), np.uint8))
-    save_ply(home / "evaluate" / "scene.ply", replace(some_gaussians(300, 1), antialiased=True), FRAME)
+    save_ply(home / "evaluate" / "scene.ply", replace(random_gaussians(300, 1), antialiased=True), FRAME)
     said = export.make(home)
     assert "300 Gaussians of degree 1" in said[0] and "Mip-Splatting" in said[0]
     assert "3 pinholes" in said[2] and "2 undistorted photographs" in said[2] and len(said) == 3
@@ -151,8 +146,8 @@ def test_export_writes_all_and_says_what_is_there(tmp_path):
     assert (home / "export/cameras/note.txt").read_text() == "mine"
 
 
-def test_far_away_positions_stay_exact_and_are_said(tmp_path):
+def test_far_away_positions_stay_exact_and_are_reported(tmp_path):
     far = Similarity(0.5, np.array([4e6, 5e5, 0.0]))
-    save_ply(tmp_path / "scene.ply", some_gaussians(20, 0), far)
+    save_ply(tmp_path / "scene.ply", random_gaussians(20, 0), far)
     assert "many editors read floats only" in export.viewer_caveats(tmp_path / "scene.ply", False)
     assert export.viewer_caveats(tmp_path / "scene.ply", False).count(";") == 1

@@ -1,20 +1,22 @@
-"""LaMa and MI-GAN from files: what they are shown, what of it is taken, and which files are refused.
+"""LaMa and MI-GAN from files: their input, their output, and which files are refused.
 
-Stand-ins for the published files, of the same inputs and outputs, are built here; they fill a hole with the mean of
-what lies around it.
+The tests build stand-ins with the inputs and outputs of the published files; they fill a hole with the mean of its
+surroundings.
 """
 
 import json
 import shutil
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
 from pydantic import ValidationError
-from test_paint2d import Mean
-from test_references import ROOT, capture, wall  # noqa: F401 (a fixture)
+from scenes.images import gradient_image, rectangle_mask
+from scenes.networks import MeanInpainter
+from scenes.references import write_wall_capture
 
 from reffusion.inpaint import exemplar, feedforward
 from reffusion.inpaint.onnx_model import Network
@@ -32,31 +34,26 @@ from runner.resolve import resolve as prepare_job
 from stages import reference
 from stages.plan import reference as plan_reference
 
+ROOT = Path(__file__).resolve().parent.parent
 HEIGHT, WIDTH = 96, 136  # multiples of 8: the means are of these pixels alone
 SIDE = 32
+PICTURE = gradient_image((HEIGHT, WIDTH), 2, 1)
 
 
-def picture() -> np.ndarray:
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    return np.stack([2 * rows, columns, 100 + 0 * rows], -1).astype(np.uint8)
-
-
-def hole() -> np.ndarray:
-    mask = np.zeros((HEIGHT, WIDTH), bool)
-    mask[20:40, 25:65] = True
-    mask[30:50, 50:60] = True
-    return mask
+def two_part_hole() -> np.ndarray:
+    shape = (HEIGHT, WIDTH)
+    return rectangle_mask(shape, (20, 40), (25, 65)) | rectangle_mask(shape, (30, 50), (50, 60))
 
 
 # ------------------------------------------------------------------------------------------------------- the stand-ins
 
 
-def model(path, kind="lama", side=None, answer=None, **changes):
-    """An ONNX file of the inputs and outputs of LaMa's ("lama") or MI-GAN's.
+def write_onnx_model(path, kind="lama", side=None, answer=None, **changes):
+    """Write an ONNX file with the inputs and outputs of LaMa ("lama") or MI-GAN.
 
     Args:
-        side: fixed size, None: any.
-        answer: factor of the answer, another than its kind's.
+        side: fixed size; None: any.
+        answer: factor of the output, if not the kind's own.
         changes: "names" of the inputs, channels of the "mask", "size" (height, width) of the image, "batch", "outputs".
     """
     onnx = pytest.importorskip("onnx", reason="needs onnx and onnxruntime")
@@ -97,17 +94,17 @@ def model(path, kind="lama", side=None, answer=None, **changes):
     return path
 
 
-def script(path):
-    torch.jit.script(Mean()).save(path)
+def write_torchscript_model(path):
+    torch.jit.script(MeanInpainter()).save(path)
     return path
 
 
-def setting(kind, weights=None) -> dict:
+def inpainter_setting(kind, weights=None) -> dict:
     return {"kind": kind, "weights": weights and str(weights)}
 
 
-def load(kind, weights=None):
-    return feedforward.load_inpainter(Inpainter(**setting(kind, weights)))
+def load_inpainter(kind, weights=None):
+    return feedforward.load_inpainter(Inpainter(**inpainter_setting(kind, weights)))
 
 
 # ----------------------------------------------------------------------------------------- what is shown, what is taken
@@ -116,9 +113,9 @@ def load(kind, weights=None):
 @pytest.mark.parametrize("kind", ["lama", "migan"])
 @pytest.mark.parametrize("side", [None, SIDE, 512])
 def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path, kind, side):
-    painter = load(kind, model(tmp_path / "net.onnx", kind, side))
+    painter = load_inpainter(kind, write_onnx_model(tmp_path / "net.onnx", kind, side))
     assert painter.name == {"lama": "LaMa (net.onnx)", "migan": "MI-GAN (net.onnx)"}[kind]
-    image, inner = picture(), hole()
+    image, inner = PICTURE, two_part_hole()
     painted = painter.paint(image, inner)
     assert painted.dtype == np.uint8 and (painted[~inner] == image[~inner]).all()
     place = feedforward.crop_around(inner, side) if side else (slice(None), slice(None))
@@ -132,13 +129,13 @@ def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path, kind, si
 
 
 def test_a_torchscript_lama_is_read_as_by_the_baselines(tmp_path):
-    painter = load("lama", script(tmp_path / "big.pt").parent)
-    painted = painter.paint(picture(), hole())
-    assert painter.name == "LaMa (big.pt)" and (painted[hole()] == painted[hole()][0]).all()
+    painter = load_inpainter("lama", write_torchscript_model(tmp_path / "big.pt").parent)
+    painted = painter.paint(PICTURE, two_part_hole())
+    assert painter.name == "LaMa (big.pt)" and (painted[two_part_hole()] == painted[two_part_hole()][0]).all()
 
 
-def recording_network(side, inner):
-    """What a network of this size is shown: (picture, hole)."""
+def record_network_input(side, inner):
+    """The input (picture, hole) of a network of this size."""
     shown = []
 
     def paint(image, mask):
@@ -161,10 +158,10 @@ def test_a_fixed_size_sees_a_square_around_the_hole_with_as_much_again():
     inner[10, :] = True
     assert feedforward.crop_around(inner, 64) == (slice(0, 300), slice(0, 400)), "longer than the picture is high"
     for side in (64, 512):
-        image, mask = recording_network(side, inner)
+        image, mask = record_network_input(side, inner)
         assert image.shape == (side, side, 3) and mask.shape == (side, side) and (abs(image.astype(int) - 77) < 5).all()
         assert mask[int(10.5 * side / 400)].all(), "a line of one pixel is not lost"
-    image, mask = recording_network(None, inner[:, :397])
+    image, mask = record_network_input(None, inner[:, :397])
     assert image.shape == (304, 400, 3) and mask.shape == (304, 400), "any size: multiples of 8"
 
 
@@ -174,76 +171,76 @@ def test_a_fixed_size_sees_a_square_around_the_hole_with_as_much_again():
 def test_other_models_are_refused_in_one_line(tmp_path):
     def refusal(kind, path):
         with pytest.raises(ValueError) as told:
-            load(kind, path)
+            load_inpainter(kind, path)
         assert "\n" not in str(told.value) and path.name in str(told.value)
         return str(told.value)
 
     file = tmp_path / "net.onnx"
     wanted = "expected image float32 [1, 3, H, W], mask float32 [1, 1, H, W], of any or one square size"
-    said = refusal("lama", model(file, "migan"))
+    said = refusal("lama", write_onnx_model(file, "migan"))
     assert wanted in said and "it takes image uint8 [batch_size, 3, height, width]" in said
-    assert "expected image uint8" in refusal("migan", model(file, "lama", 512))
-    assert "it takes input float" in refusal("lama", model(file, names=("input", "mask")))
+    assert "expected image uint8" in refusal("migan", write_onnx_model(file, "lama", 512))
+    assert "it takes input float" in refusal("lama", write_onnx_model(file, names=("input", "mask")))
     for other in ({"mask": 3}, {"size": (512, 256)}, {"size": (512, "width")}, {"batch": 4}):
-        assert wanted in refusal("lama", model(file, **other))
-    assert "one float32 picture" in refusal("lama", model(file, outputs=["result", "mean"]))
+        assert wanted in refusal("lama", write_onnx_model(file, **other))
+    assert "one float32 picture" in refusal("lama", write_onnx_model(file, outputs=["result", "mean"]))
     file.write_text("<html>")
     assert "is no ONNX model that onnxruntime reads" in refusal("lama", file)
-    fraction = load("lama", model(file, answer=1.0))
+    fraction = load_inpainter("lama", write_onnx_model(file, answer=1.0))
     with pytest.raises(ValueError, match=r"net\.onnx: answers in \[0, 1\]; expected 0\.\.255"):
-        fraction.paint(picture(), hole())
-    poisoned = load("lama", model(file, answer=float("inf")))
+        fraction.paint(PICTURE, two_part_hole())
+    poisoned = load_inpainter("lama", write_onnx_model(file, answer=float("inf")))
     with pytest.raises(ValueError, match="not finite"):
-        poisoned.paint(picture(), hole())
+        poisoned.paint(PICTURE, two_part_hole())
 
 
 def test_without_onnxruntime_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     (tmp_path / "lama_fp32.onnx").write_bytes(b"x")
     with pytest.raises(ValueError, match=r"lama_fp32.onnx needs onnxruntime: `pip install onnxruntime`"):
-        load("lama", tmp_path)
-    (need,) = needs("lama", tmp_path)
+        load_inpainter("lama", tmp_path)
+    (need,) = needed_weights("lama", tmp_path)
     assert "pip install onnxruntime" in need.problem and not need.fetched
 
 
 # --------------------------------------------------------------------------------------------- the parameter, the stage
 
 
-def needs(kind, weights=None):
-    return plan_reference.needed_weights(Params(inpainter=setting(kind, weights)), frozenset())
+def needed_weights(kind, weights=None):
+    return plan_reference.needed_weights(Params(inpainter=inpainter_setting(kind, weights)), frozenset())
 
 
 @pytest.fixture
-def own_cache(tmp_path, monkeypatch):
-    """A cache of weights with nothing in it; its folder of models by owner/name."""
+def empty_weight_cache(tmp_path, monkeypatch):
+    """An empty cache of weights; its folder of models by owner/name."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("HF_HOME", str(tmp_path / "hub"))
     monkeypatch.delenv("HF_HUB_CACHE", raising=False)
     return tmp_path / "cache" / "reffusion"
 
 
-def publish(own_cache, kind):
-    """The stand-in where `make weights` leaves the published file."""
-    folder = own_cache / PAINTERS[kind].repo
+def write_published_model(empty_weight_cache, kind):
+    """Write the stand-in where `make weights` puts the published file."""
+    folder = empty_weight_cache / PAINTERS[kind].repo
     folder.mkdir(parents=True)
-    return model(folder / PAINTERS[kind].file, kind)
+    return write_onnx_model(folder / PAINTERS[kind].file, kind)
 
 
-def test_auto_takes_the_best_that_is_here(own_cache):
+def test_auto_takes_the_best_available_model(empty_weight_cache):
     auto, exemplar, diffusion = (Inpainter(kind=kind) for kind in ("auto", "exemplar", "diffusion"))
-    assert painters.resolve_inpainter(auto) == exemplar and load("auto") is None
+    assert painters.resolve_inpainter(auto) == exemplar and load_inpainter("auto") is None
     assert painters.inpainter_facts(auto) == {"inpainter": "exemplar"}
-    publish(own_cache, "migan")
+    write_published_model(empty_weight_cache, "migan")
     assert painters.resolve_inpainter(auto).kind == "migan" and painters.resolve_inpainter(exemplar) == exemplar
     before = painters.inpainter_facts(auto)
-    file = publish(own_cache, "lama")
+    file = write_published_model(empty_weight_cache, "lama")
     assert painters.resolve_inpainter(auto).kind == "lama" and painters.inpainter_facts(auto) != before
-    assert load("lama").name == load("auto").name == "LaMa (lama_fp32.onnx)"
+    assert load_inpainter("lama").name == load_inpainter("auto").name == "LaMa (lama_fp32.onnx)"
     assert painters.find_file(Inpainter(kind="lama")) == file
     assert painters.inpainter_facts(exemplar) == painters.inpainter_facts(diffusion) == {}, (
         "the default depends on no cache"
     )
-    assert not needs("auto") and load("exemplar") is None and load("diffusion") is None
+    assert not needed_weights("auto") and load_inpainter("exemplar") is None and load_inpainter("diffusion") is None
 
 
 @pytest.mark.parametrize(
@@ -270,43 +267,43 @@ def test_a_plain_string_is_the_kind():
     assert Params().changed({"inpainter": "auto"}).inpainter.kind == "auto"
 
 
-def test_the_key_of_scene_yaml_reaches_references_and_further_views(own_cache, tmp_path):
-    scene = capture(tmp_path / "wall")
+def test_the_key_of_scene_yaml_reaches_references_and_further_views(empty_weight_cache, tmp_path):
+    scene = write_wall_capture(tmp_path / "wall")
     (scene / "scene.yaml").write_text("inpainter: auto\n")
 
     def machine():
         job = prepare_job(Request(ROOT, tmp_path / "runs", str(scene), profile="laptop"))
-        assert all(job.params[stage]["inpainter"] == setting("auto") for stage in ("reference", "initialize"))
+        assert all(job.params[stage]["inpainter"] == inpainter_setting("auto") for stage in ("reference", "initialize"))
         return [job.stages[stage].machine for stage in ("reference", "initialize")]
 
     assert machine() == [{"inpainter": "exemplar"}] * 2
-    publish(own_cache, "lama")
+    write_published_model(empty_weight_cache, "lama")
     first, second = machine()
     assert first == second and first["inpainter"].startswith("lama ")
 
 
-def test_the_file_is_found_or_the_plan_says_where_people_get_it(own_cache, tmp_path):
-    (need,) = needs("lama")
+def test_the_file_is_found_or_the_plan_says_where_people_get_it(empty_weight_cache, tmp_path):
+    (need,) = needed_weights("lama")
     assert (need.name, need.file, need.fetched) == ("Carve/LaMa-ONNX", "lama_fp32.onnx", True)
     assert "Carve/LaMa-ONNX is not on this machine" in need.problem and "make weights" in need.problem
-    (need,) = needs("lama", tmp_path / "nowhere.onnx")
+    (need,) = needed_weights("lama", tmp_path / "nowhere.onnx")
     assert not need.fetched and "is not on this machine; get lama_fp32.onnx (208 MB" in need.problem
-    (need,) = needs("migan", script(tmp_path / "big.pt"))
+    (need,) = needed_weights("migan", write_torchscript_model(tmp_path / "big.pt"))
     assert "is no .onnx file; get migan_pipeline_v2.onnx" in need.problem
-    (need,) = needs("lama", tmp_path)
+    (need,) = needed_weights("lama", tmp_path)
     assert need.problem is None and need.name == str(tmp_path / "big.pt") and need.bytes > 0
-    assert painters.find_file(Inpainter(**setting("lama", tmp_path))) == tmp_path / "big.pt"
+    assert painters.find_file(Inpainter(**inpainter_setting("lama", tmp_path))) == tmp_path / "big.pt"
     shutil.copy(tmp_path / "big.pt", tmp_path / "other.pt")
-    (need,) = needs("lama", tmp_path)
+    (need,) = needed_weights("lama", tmp_path)
     assert r"holds 2 .pt or .onnx files (big.pt, other.pt); name one" in need.problem
-    params = Params(inpainter=setting("lama", tmp_path), prompt="a vase")
+    params = Params(inpainter=inpainter_setting("lama", tmp_path), prompt="a vase")
     (note,) = plan_reference.preview(params, scene=tmp_path)
     assert "by LaMa, one picture" in note and "'a vase' is not read" in note
     assert not plan_reference.needed_weights(params, frozenset({"painted"}))
 
 
-def test_a_job_is_told_before_any_work_and_keyed_by_the_files_content(own_cache, tmp_path):
-    scene, file = capture(tmp_path / "wall"), tmp_path / "big.pt"
+def test_a_model_file_is_checked_before_any_work_and_keyed_by_content(empty_weight_cache, tmp_path):
+    scene, file = write_wall_capture(tmp_path / "wall"), tmp_path / "big.pt"
 
     def planned(inpainter):
         asked = f"'reference.inpainter={inpainter}'"
@@ -319,7 +316,7 @@ def test_a_job_is_told_before_any_work_and_keyed_by_the_files_content(own_cache,
     assert word == "missing" and f"reference.inpainter.weights: no weights at {file}; name a folder, a file" in reason
     word, reason = planned("lama")
     assert word == "missing" and "Carve/LaMa-ONNX is not on this machine" in reason and "(208 MB)" in reason
-    script(file)
+    write_torchscript_model(file)
     assert planned(f"{{kind: lama, weights: {file}}}")[0] == "pending", "it waits for masks"
     hashes = Hashes(tmp_path / "hashes.json")
     before = hashes.weights(file)
@@ -328,18 +325,22 @@ def test_a_job_is_told_before_any_work_and_keyed_by_the_files_content(own_cache,
 
 
 @pytest.mark.parametrize("kind", ["lama", "migan"])
-def test_the_stage_paints_the_hole_in_one_pass(wall, tmp_path, kind):  # noqa: F811
-    file = script(tmp_path / "big.pt") if kind == "lama" else model(tmp_path / "pipeline.onnx", "migan")
+def test_the_stage_paints_the_hole_in_one_pass(wall_folders, tmp_path, kind):
+    file = (
+        write_torchscript_model(tmp_path / "big.pt")
+        if kind == "lama"
+        else write_onnx_model(tmp_path / "pipeline.onnx", "migan")
+    )
     out = tmp_path / "out"
     out.mkdir()
-    reference.run(Params(inpainter=setting(kind, file)), out, **wall)
-    (found,) = load_references(out, load_scene(wall["poses"]))
-    pixels = load_mask_sets(wall["masks"], ["a2"])["a2"]
+    reference.run(Params(inpainter=inpainter_setting(kind, file)), out, **wall_folders)
+    (found,) = load_references(out, load_scene(wall_folders["poses"]))
+    pixels = load_mask_sets(wall_folders["masks"], ["a2"])["a2"]
     inner = exemplar.mask_to_paint(pixels.consistent, pixels.invent)
     assert found.camera.name == "a2" and np.array_equal(found.mask, pixels.invent)
     assert np.ptp(found.image[inner].astype(int), axis=0).max() <= 1, "the stand-in's mean"
     outside = ~inner & ~pixels.consistent
-    assert np.array_equal(found.image[outside], load_image(wall["poses"] / "images" / "a2.png")[outside])
+    assert np.array_equal(found.image[outside], load_image(wall_folders["poses"] / "images" / "a2.png")[outside])
     assert np.array_equal(load_image(out / "candidates.png"), found.image)
     name = {"lama": "LaMa (big.pt)", "migan": "MI-GAN (pipeline.onnx)"}[kind]
     record = json.loads((out / "candidates.json").read_text())

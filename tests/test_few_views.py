@@ -1,11 +1,12 @@
-"""Few photographs: depth between sparse points has edges, and a fit on it shows other views."""
+"""Few photographs: depth between sparse points keeps edges, and a fit on it generalizes to other views."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from small_scene import camera
+from scenes.cameras import world_rays
+from scenes.wall_scene import front_camera
 
 from reffusion import geometry
 from reffusion.depth import patchmatch, sparse_to_dense
@@ -24,13 +25,13 @@ WALL, NEAR, HALF = 2.0, 1.5, 0.2  # depth of the wall and of a square before it;
 NONE: dict[str, np.ndarray] = {}
 
 
-def depth_between(points, view, picture):
+def interpolate_depth(points, view, picture):
     return sparse_to_dense.interpolate_depth(visible_samples(points, view, picture), view, picture)
 
 
-def shown(view):
-    """Depth [H, W] and picture uint8 [H, W, 3] of the wall, with the square before it."""
-    rays = (geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]).reshape(view.height, view.width, 3)
+def render_wall_and_square(view):
+    """Depth [H, W] and picture uint8 [H, W, 3] of the wall with the square before it."""
+    rays = (world_rays(view)).reshape(view.height, view.width, 3)
     at = lambda z: view.center + rays * ((z - view.center[2]) / rays[..., 2:])
     square = (np.abs(at(NEAR)[..., :2]) < HALF).all(-1)
     points = at(WALL)
@@ -40,8 +41,8 @@ def shown(view):
     return np.where(square, NEAR, WALL) - view.center[2], (255 * picture).round().astype(np.uint8)
 
 
-def sparse(count=700, seed=0):
-    """Points of the wall, those behind the square too, as other cameras saw them, and of the square."""
+def sample_wall_and_square(count=700, seed=0):
+    """Points of the square and of the whole wall, also behind the square, and their colours."""
     draw = np.random.default_rng(seed)
     wall = np.column_stack([draw.uniform(-1.2, 1.2, count), draw.uniform(-0.9, 0.9, count), np.full(count, WALL)])
     square = np.column_stack([draw.uniform(-HALF, HALF, (60, 2)) * 0.97, np.full(60, NEAR)])
@@ -52,56 +53,63 @@ def sparse(count=700, seed=0):
 
 
 def test_depth_steps_where_the_picture_does_and_hidden_points_are_silent():
-    points, view = SparsePoints.of(*sparse()), camera("a", 0.1)
-    depth, picture = shown(view)
-    found = depth_between(points, view, picture)
+    points, view = SparsePoints.of(*sample_wall_and_square()), front_camera("a", 0.1)
+    depth, picture = render_wall_and_square(view)
+    found = interpolate_depth(points, view, picture)
     wrong = np.abs(found / depth - 1) > 0.01
     assert wrong.mean() < 0.02  # at the very edge, by the median
     assert np.abs(points.normals[:700, 2]).min() > 0.7 and np.allclose(np.linalg.norm(points.normals, axis=1), 1)
 
 
 def test_a_slanted_plane_is_met_between_and_beyond_its_points():
-    draw, view = np.random.default_rng(1), camera("a", 0.0)
+    draw, view = np.random.default_rng(1), front_camera("a", 0.0)
     positions = np.column_stack([draw.uniform(-0.5, 0.5, 300), draw.uniform(-0.4, 0.4, 300), np.zeros(300)])
     positions[:, 2] = 2 + 0.5 * positions[:, 0] - 0.3 * positions[:, 1]
     grey = np.full((view.height, view.width, 3), 128, np.uint8)
-    found = depth_between(SparsePoints.of(positions, np.full((300, 3), 128, np.uint8)), view, grey)
+    found = interpolate_depth(SparsePoints.of(positions, np.full((300, 3), 128, np.uint8)), view, grey)
     rays = geometry.pixel_rays(view).reshape(view.height, view.width, 3)
     true = 2 / (1 - 0.5 * rays[..., 0] + 0.3 * rays[..., 1])
     assert np.abs(found / true - 1)[2:-2, 2:-2].max() < 2e-3
 
 
 def test_too_few_points_tell_nothing():
-    positions, colors = sparse()
-    view = camera("a", 0.0)
-    assert depth_between(SparsePoints.of(positions[:20], colors[:20]), view, shown(view)[1]) is None
+    positions, colors = sample_wall_and_square()
+    view = front_camera("a", 0.0)
+    assert (
+        interpolate_depth(SparsePoints.of(positions[:20], colors[:20]), view, render_wall_and_square(view)[1]) is None
+    )
     params = Params(sh={"degree": 0})
     assert (
-        few_views.gaussians_on_surfaces([view], {"a": shown(view)[1]}, positions[:10], colors[:10], NONE, params)
+        few_views.gaussians_on_surfaces(
+            [view], {"a": render_wall_and_square(view)[1]}, positions[:10], colors[:10], NONE, params
+        )
         is None
     )
     behind = positions * (1, 1, -1)
-    assert few_views.gaussians_on_surfaces([view], {"a": shown(view)[1]}, behind, colors, NONE, params) is None
+    assert (
+        few_views.gaussians_on_surfaces([view], {"a": render_wall_and_square(view)[1]}, behind, colors, NONE, params)
+        is None
+    )
 
 
-def rough(points):
-    """uint8 [..., 3]: a pattern in space that never repeats itself."""
+def aperiodic_color(points):
+    """uint8 [..., 3]: a pattern in space without period."""
     x, y, z = np.moveaxis(points, -1, 0)
     waves = [np.sin(31 * x + 17 * y + 9 * z), np.sin(23 * y - 29 * x + 5), np.sin(41 * x * y + 37 * y), np.cos(53 * x)]
     return (127 + 30 * np.stack([waves[0] + waves[2], waves[1] + waves[3], waves[2] + waves[3]], -1)).astype(np.uint8)
 
 
-def slanted(view):
+def render_slanted_plane(view):
     """Depth [H, W] and picture uint8 [H, W, 3] of the plane z = 2 + 0.5 x - 0.3 y."""
-    rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
+    rays = world_rays(view)
     normal = np.array([0.5, -0.3, -1.0])
     depth = -(view.center @ normal + 2) / (rays @ normal)
-    return depth, rough(view.center + rays * depth[..., None])
+    return depth, aperiodic_color(view.center + rays * depth[..., None])
 
 
 def test_photographs_tell_a_slanted_plane_within_a_thousandth():
-    views = [camera(name, x, y) for name, x, y in (("a", 0.0, 0.0), ("b", 0.5, 0.05), ("c", -0.4, 0.1))]
-    (true, picture), *others = map(slanted, views)
+    views = [front_camera(name, x, y) for name, x, y in (("a", 0.0, 0.0), ("b", 0.5, 0.05), ("c", -0.4, 0.1))]
+    (true, picture), *others = map(render_slanted_plane, views)
     seen = [(view, image) for view, (_, image) in zip(views[1:], others, strict=True)]
     rays, draw = geometry.pixel_rays(views[0]), np.random.default_rng(0)
     planes = patchmatch.estimate_planes(views[0], picture, seen, 1.06 * true, draw)
@@ -109,20 +117,24 @@ def test_photographs_tell_a_slanted_plane_within_a_thousandth():
     assert np.median(error) < 1e-3 and (error < 5e-3).mean() > 0.97, (np.median(error), (error < 5e-3).mean())
 
 
-def test_where_photographs_show_nothing_what_is_believed_stays():
-    views, grey = [camera("a", 0.0), camera("b", 0.2)], np.full((72, 96, 3), 90, np.uint8)
+def test_depth_stays_where_photographs_have_no_texture():
+    views, grey = [front_camera("a", 0.0), front_camera("b", 0.2)], np.full((72, 96, 3), 90, np.uint8)
     believed = np.full((72, 96), 2.0)
     planes = patchmatch.estimate_planes(views[0], grey, [(views[1], grey)], believed, np.random.default_rng(0))
     depth = 1 / (planes * geometry.pixel_rays(views[0])).sum(-1)
     assert np.abs(depth / believed - 1).max() < 1e-6
-    away = camera("away", 50.0)  # shows nothing of it
+    away = front_camera("away", 50.0)  # shows nothing of it
     planes = patchmatch.estimate_planes(views[0], grey, [(away, grey)], believed, np.random.default_rng(0))
     assert np.abs((planes * geometry.pixel_rays(views[0])).sum(-1) - 0.5).max() < 1e-6
 
 
 def test_other_photographs_may_be_of_another_size_and_threads_do_not_matter():
-    views = [camera("a", 0.0), camera("b", 0.5), replace(camera("c", -0.4), width=60, height=72, cx=30.0)]
-    (true, picture), *others = map(slanted, views)
+    views = [
+        front_camera("a", 0.0),
+        front_camera("b", 0.5),
+        replace(front_camera("c", -0.4), width=60, height=72, cx=30.0),
+    ]
+    (true, picture), *others = map(render_slanted_plane, views)
     seen = [(view, image) for view, (_, image) in zip(views[1:], others, strict=True)]
     found, before = [], torch.get_num_threads()
     for count in (1, 2):
@@ -134,31 +146,31 @@ def test_other_photographs_may_be_of_another_size_and_threads_do_not_matter():
     assert np.median(np.abs(depth / true - 1)) < 1e-3
 
 
-def before_wall(view):
-    """Depth [H, W] and picture of a wall and a square before it, both of one pattern."""
-    rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
+def render_aperiodic_square(view):
+    """Depth [H, W] and picture of a wall and a square before it, both with an aperiodic pattern."""
+    rays = world_rays(view)
     at = lambda z: view.center + rays * ((z - view.center[2]) / rays[..., 2:])
     square = (np.abs(at(NEAR)[..., :2]) < HALF).all(-1)
     depth = np.where(square, NEAR, WALL) - view.center[2]
-    return depth, rough(view.center + rays * depth[..., None])
+    return depth, aperiodic_color(view.center + rays * depth[..., None])
 
 
-def test_points_that_lie_behind_what_is_seen_are_refuted_by_the_photographs():
+def test_points_behind_the_visible_surface_are_refuted():
     draw = np.random.default_rng(0)
     wall = np.column_stack([draw.uniform(-1.2, 1.2, 900), draw.uniform(-0.9, 0.9, 900), np.full(900, WALL)])
     square = np.column_stack([draw.uniform(-HALF, HALF, (25, 2)), np.full(25, NEAR)])
-    views = [camera("a", 0.0), camera("b", 0.3), camera("c", -0.25, 0.05)]
-    pictures = {view.name: before_wall(view)[1] for view in views}
+    views = [front_camera("a", 0.0), front_camera("b", 0.3), front_camera("c", -0.25, 0.05)]
+    pictures = {view.name: render_aperiodic_square(view)[1] for view in views}
     positions = np.concatenate([wall, square])
-    colors = rough(positions)
+    colors = aperiodic_color(positions)
     uv, _ = geometry.project(wall, views[0])  # of the colour of what hides them, and more than there are before them
     behind = (np.abs(wall[:, :2]) < HALF * WALL / NEAR).all(1)
     colors[: len(wall)][behind] = geometry.sample_nearest(pictures["a"], uv)[0][behind]
     points = SparsePoints.of(positions, colors)
     told = estimate_multiview_depth(points, views, pictures, NONE, seed=0)
-    true, inner = before_wall(views[0])[0], (slice(22, 50), slice(34, 62))
+    true, inner = render_aperiodic_square(views[0])[0], (slice(22, 50), slice(34, 62))
     wrong = lambda depth: (np.abs(depth / true - 1) > 0.02)[inner].mean()
-    assert wrong(told["a"].depth) < 0.2 < 0.4 < wrong(depth_between(points, views[0], pictures["a"]))
+    assert wrong(told["a"].depth) < 0.2 < 0.4 < wrong(interpolate_depth(points, views[0], pictures["a"]))
     assert (np.abs(told["a"].depth / true - 1) < 0.01)[told["a"].confirmed].mean() > 0.97
     alone = estimate_multiview_depth(points, views[:1], pictures, NONE, seed=0)["a"]
     assert not alone.confirmed.any() and not alone.refuted.any(), "one photograph alone is sure of nothing"
@@ -167,30 +179,32 @@ def test_points_that_lie_behind_what_is_seen_are_refuted_by_the_photographs():
 
 
 def test_a_further_view_adds_what_those_before_do_not_show():
-    views = [camera("a", 0.0), camera("b", 0.1)]
-    images = {view.name: shown(view)[1] for view in views}
+    views = [front_camera("a", 0.0), front_camera("b", 0.1)]
+    images = {view.name: render_wall_and_square(view)[1] for view in views}
     params = Params(sh={"degree": 0})
-    one, both = (few_views.gaussians_on_surfaces(views[:k], images, *sparse(), NONE, params) for k in (1, 2))
+    one, both = (
+        few_views.gaussians_on_surfaces(views[:k], images, *sample_wall_and_square(), NONE, params) for k in (1, 2)
+    )
     pixels = views[0].width * views[0].height
     assert 1.9 * pixels < len(one) < 2 * pixels, "but for what is beside the square"
     assert len(one) < len(both) < 2.4 * pixels
     hidden = {"a": np.ones((views[0].height, views[0].width), bool)}
-    assert len(few_views.gaussians_on_surfaces(views[:1], images, *sparse(), hidden, params)) == 0
+    assert len(few_views.gaussians_on_surfaces(views[:1], images, *sample_wall_and_square(), hidden, params)) == 0
 
 
-def written(folder, train):
-    """A `poses` folder of the room, these views given; the views to look from."""
-    views = {view.name: view for view in (camera(f"v{k}", x) for k, x in enumerate((0.0, -0.12, 0.06)))}
-    points, colors = sparse()
+def write_room_poses(folder, train):
+    """Write a `poses` folder with these training views; return all views."""
+    views = {view.name: view for view in (front_camera(f"v{k}", x) for k, x in enumerate((0.0, -0.12, 0.06)))}
+    points, colors = sample_wall_and_square()
     save_scene(folder, Scene(views, train, ("v2",), frozenset(train), points, colors, Similarity(1.0, np.zeros(3))))
     for name in train:
-        save_image(folder / "images" / f"{name}.png", shown(views[name])[1])
+        save_image(folder / "images" / f"{name}.png", render_wall_and_square(views[name])[1])
     return views
 
 
 @pytest.mark.parametrize("train", [("v0",), ("v0", "v1")])
 def test_other_views_are_shown_better_than_by_a_fit_from_points(tmp_path, train, capsys):
-    view = written(tmp_path / "poses", train)["v2"]
+    view = write_room_poses(tmp_path / "poses", train)["v2"]
     error = {}
     for way in ("fewer_harmonics", "surfaces"):
         (tmp_path / way).mkdir()
@@ -198,13 +212,13 @@ def test_other_views_are_shown_better_than_by_a_fit_from_points(tmp_path, train,
         stage.run(params, tmp_path / way, poses=tmp_path / "poses")
         with torch.no_grad():
             drawn = rasterizer.render(load_ply(tmp_path / way / "gaussians.ply"), view).color.numpy()
-        error[way] = np.abs(drawn - shown(view)[1] / 255)[8:-8, 16:-16].mean()
+        error[way] = np.abs(drawn - render_wall_and_square(view)[1] / 255)[8:-8, 16:-16].mean()
     assert error["surfaces"] < 0.5 * error["fewer_harmonics"]
     assert "Gaussians on surfaces between 760 points" in capsys.readouterr().out
 
 
 def test_an_interrupted_fit_from_surfaces_goes_on_to_the_same_end(tmp_path, monkeypatch):
-    written(tmp_path / "poses", ("v0", "v1"))
+    write_room_poses(tmp_path / "poses", ("v0", "v1"))
     params = Params(iterations=60, few_views="surfaces", checkpoint_seconds=0.001)
     for name in ("whole", "broken"):
         (tmp_path / name).mkdir()

@@ -1,10 +1,10 @@
-"""`finish`: which result becomes scene.ply, and when it gets a backdrop; test views decide nothing."""
+"""The stage `finish`: which result becomes scene.ply, and when it gets a backdrop; test views have no influence."""
 
 from dataclasses import replace
 
 import pytest
-import small_scene as small
 import torch
+from scenes import wall_scene
 
 from reffusion.background.backdrop import DISKS
 from reffusion.io.arrays import load_json
@@ -14,13 +14,13 @@ from stages import evaluate, finish
 
 
 @pytest.fixture
-def folders(tmp_path):
-    poses, fit, _ = small.write(tmp_path, 1.0)
+def fit_folders(tmp_path):
+    poses, fit, _ = wall_scene.write_poses_and_fit(tmp_path, 1.0)
     return {"poses": poses, "raw_masks": poses.with_name("raw_masks"), "fit": fit}
 
 
 def add_stages(folders, tmp_path):
-    """`initialize` and `distill` whose Gaussians differ from the fit's in number."""
+    """Add `initialize` and `distill`, whose Gaussians differ from the fit's in number."""
     gaussians = load_ply(folders["fit"] / "gaussians.ply")
     for count, stage in enumerate(("initialize", "distill"), start=1):
         folders = folders | {stage: tmp_path / stage}
@@ -28,29 +28,29 @@ def add_stages(folders, tmp_path):
     return folders
 
 
-def run(out, folders, **params):
+def run_finish(out, fit_folders, **params):
     out.mkdir()
-    finish.run(finish.Params(**params), out, **folders)
+    finish.run(finish.Params(**params), out, **fit_folders)
     return load_json(out / "facts.json"), load_ply(out / "scene.ply")
 
 
-def test_the_last_stage_is_the_result(folders, tmp_path):
-    count = len(load_ply(folders["fit"] / "gaussians.ply"))
-    facts, scene = run(tmp_path / "alone", folders, backdrop=False)
+def test_the_last_stage_is_the_result(fit_folders, tmp_path):
+    count = len(load_ply(fit_folders["fit"] / "gaussians.ply"))
+    facts, scene = run_finish(tmp_path / "alone", fit_folders, backdrop=False)
     assert facts["result"] == "fit" and len(scene) == count
-    later = add_stages(folders, tmp_path)
-    facts, scene = run(tmp_path / "two", later | {"distill": None}, backdrop=False)
+    later = add_stages(fit_folders, tmp_path)
+    facts, scene = run_finish(tmp_path / "two", later | {"distill": None}, backdrop=False)
     assert facts["result"] == "initialize" and len(scene) == count - 1
-    facts, scene = run(tmp_path / "three", later, backdrop=False)
+    facts, scene = run_finish(tmp_path / "three", later, backdrop=False)
     assert facts["result"] == "distill" and len(scene) == count - 2
     assert facts["gaussians"] == {"fit": count, "initialize": count - 1, "distill": count - 2}
     assert facts["backdrop"] is False and not (tmp_path / "three" / "completed").exists()
 
 
-def test_result_and_initialization_get_the_same_backdrop(folders, tmp_path, monkeypatch):
+def test_result_and_initialization_get_the_same_backdrop(fit_folders, tmp_path, monkeypatch):
     monkeypatch.setattr(finish, "MIN_UNSEEN_SHARE", 0.0)
-    later = add_stages(folders, tmp_path)
-    facts, scene = run(tmp_path / "out", later)
+    later = add_stages(fit_folders, tmp_path)
+    facts, scene = run_finish(tmp_path / "out", later)
     assert facts["backdrop"] and facts["unseen_in_other_views"] > 0
     completed = {stage: load_ply(tmp_path / f"out/completed/{stage}.ply") for stage in ("initialize", "distill")}
     assert sorted(path.stem for path in (tmp_path / "out/completed").iterdir()) == sorted(completed)
@@ -61,31 +61,31 @@ def test_result_and_initialization_get_the_same_backdrop(folders, tmp_path, monk
     assert len(loaded["fit"]) == facts["gaussians"]["fit"]
 
 
-def test_training_views_decide_and_not_test_views(folders, tmp_path):
+def test_training_views_decide_and_not_test_views(fit_folders, tmp_path):
     """Views side by side leave a strip of the outermost unseen by all others; of one view, seen thrice, nothing."""
-    scene = load_scene(folders["poses"])
+    scene = load_scene(fit_folders["poses"])
     found = {}
     for name, train in (("spread", scene.train), ("again", (scene.train[2],) * 3)):
         for test in (scene.test, ()):
-            save_scene(folders["poses"], replace(scene, train=train, test=test))
-            found[name, test] = run(tmp_path / f"{name}-{len(test)}", folders)[0]
+            save_scene(fit_folders["poses"], replace(scene, train=train, test=test))
+            found[name, test] = run_finish(tmp_path / f"{name}-{len(test)}", fit_folders)[0]
     assert [facts["backdrop"] for facts in found.values()] == [True, True, False, False]
     shares = [facts["unseen_in_other_views"] for facts in found.values()]
     assert shares[0] == shares[1] > 0.01 and shares[2] == shares[3] < 0.01
 
 
-def test_a_scene_that_brings_its_gaussians_keeps_them(folders, tmp_path):
+def test_a_scene_with_gaussians_keeps_them(fit_folders, tmp_path):
     """They may know more than the views do."""
-    save_ply(folders["poses"] / "gaussians.ply", load_ply(folders["fit"] / "gaussians.ply"))
-    facts, scene = run(tmp_path / "out", folders)
+    save_ply(fit_folders["poses"] / "gaussians.ply", load_ply(fit_folders["fit"] / "gaussians.ply"))
+    facts, scene = run_finish(tmp_path / "out", fit_folders)
     assert facts["backdrop"] is False and facts["unseen_in_other_views"] is None
     assert len(scene) == facts["gaussians"]["fit"]
 
 
-def test_evaluate_copies_the_scene(folders, tmp_path):
-    run(tmp_path / "finish", folders)
+def test_evaluate_copies_the_scene(fit_folders, tmp_path):
+    run_finish(tmp_path / "finish", fit_folders)
     (tmp_path / "evaluate").mkdir()
-    evaluate.run(evaluate.Params(), tmp_path / "evaluate", **folders, finish=tmp_path / "finish")
+    evaluate.run(evaluate.Params(), tmp_path / "evaluate", **fit_folders, finish=tmp_path / "finish")
     assert (tmp_path / "evaluate/scene.ply").read_bytes() == (tmp_path / "finish/scene.ply").read_bytes()
     metrics, facts = (load_json(tmp_path / name) for name in ("evaluate/metrics.json", "finish/facts.json"))
     assert metrics["backdrop"] == facts["backdrop"] and metrics["result"] == "fit" and "seconds" not in metrics

@@ -1,4 +1,4 @@
-"""The fit of a whole scene: it learns, resumes, ignores masked pixels, and fails by name."""
+"""The fit of a whole scene: it improves, resumes, ignores masked pixels, and names what fails."""
 
 import json
 import re
@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from scenes.cameras import make_camera, make_scene, yaw
 
 from reffusion import seeding, trace
 from reffusion.fit import exposure, step, view_loader
@@ -21,7 +22,7 @@ from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_views, save_scene
 from reffusion.params.fit import Densify, Init, LearningRates, Params, SphericalHarmonics
 from reffusion.splat.rasterizer import render
-from reffusion.types import PARAMETERS, Camera, Gaussians, Scene, Similarity
+from reffusion.types import PARAMETERS, Camera, Gaussians, Similarity
 from stages import fit as stage
 from stages.plan import fit as plan
 
@@ -34,54 +35,51 @@ SETTINGS = Params(
 )
 
 
-def ring_of_cameras(count: int = 5, scale: float = 1.0, offset=(0.0, 0.0, 0.0)) -> list[Camera]:
-    """Views of the origin from distance 1, in a frame where a point p of the normalised one is p / scale + offset."""
+def arc_cameras(count: int = 5, scale: float = 1.0, offset=(0.0, 0.0, 0.0)) -> list[Camera]:
+    """Views of the origin from distance 1, in a frame where the normalised point p is p / scale + offset."""
     cameras = []
     for k in range(count):
         angle = 0.8 * (k / (count - 1) - 0.5)
-        rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-        pose = np.eye(4)
-        pose[:3, :3] = rotation
+        rotation = yaw(-angle)
         center = rotation.T @ np.array([0, 0, -1.0]) / scale + np.asarray(offset)
-        pose[:3, 3] = -rotation @ center
-        cameras.append(Camera(f"view{k}", WIDTH, HEIGHT, WIDTH, WIDTH, WIDTH / 2, HEIGHT / 2, pose))
+        cameras.append(make_camera(f"view{k}", (WIDTH, HEIGHT), WIDTH, center, rotation))
     return cameras
 
 
-def normalised(camera: Camera, similarity: Similarity) -> Camera:
+def normalize_camera(camera: Camera, similarity: Similarity) -> Camera:
     pose = camera.world_to_camera.copy()
     pose[:3, 3] = -pose[:3, :3] @ similarity.apply(camera.center)
     return replace(camera, world_to_camera=pose)
 
 
-def truth() -> Gaussians:
+def true_gaussians() -> Gaussians:
     draw = lambda *shape: torch.randn(*shape, generator=generator)
     generator = seeding.generator(5, "truth")
     return Gaussians(draw(40, 3) * 0.2, draw(40, 4), -2.5 + 0.3 * draw(40, 3), 2 + draw(40), draw(40, 1, 3))
 
 
-def photos(cameras) -> dict[str, np.ndarray]:
-    pictures = {c.name: render(truth(), c, impl="reference").color.clamp(0, 1) for c in cameras}
+def render_photos(cameras) -> dict[str, np.ndarray]:
+    pictures = {c.name: render(true_gaussians(), c, impl="reference").color.clamp(0, 1) for c in cameras}
     return {name: (picture * 255).round().byte().numpy() for name, picture in pictures.items()}
 
 
-def start(points=None, degree: int = 1) -> Gaussians:
-    points = truth().means.numpy().astype(np.float64) if points is None else points
+def initial_model(points=None, degree: int = 1) -> Gaussians:
+    points = true_gaussians().means.numpy().astype(np.float64) if points is None else points
     colors = np.full((len(points), 3), 128, np.uint8)
     return initial_gaussians(points, colors, degree, 1000, seeding.generator(0))
 
 
-def run(folder, cameras=None, initial=None, settings=SETTINGS, **given) -> Gaussians:
+def run_fit(folder, cameras=None, initial=None, settings=SETTINGS, **given) -> Gaussians:
     folder.mkdir(exist_ok=True)
-    cameras = cameras or ring_of_cameras()
-    return fit(cameras, photos(ring_of_cameras()), initial or start(), settings, folder=folder, **given)
+    cameras = cameras or arc_cameras()
+    return fit(cameras, render_photos(arc_cameras()), initial or initial_model(), settings, folder=folder, **given)
 
 
-def test_it_learns_and_says_so(tmp_path):
-    held = ring_of_cameras()[2:3]
-    cameras = [c for c in ring_of_cameras() if c.name != held[0].name]
+def test_a_fit_improves_and_logs_it(tmp_path):
+    held = arc_cameras()[2:3]
+    cameras = [c for c in arc_cameras() if c.name != held[0].name]
     settings = SETTINGS.changed({"iterations": 240, "densify.reset_every": 0, "random_background": False})
-    fitted = run(tmp_path, cameras, settings=settings, held_out=held)
+    fitted = run_fit(tmp_path, cameras, settings=settings, held_out=held)
     lines = [json.loads(line) for line in (tmp_path / "trace.jsonl").read_text().splitlines()]
     assert lines[-1]["iteration"] == 240 and lines[-1]["gaussians"] == len(fitted)
     assert lines[-1]["psnr_held_out"] > lines[0]["psnr_held_out"] + 2
@@ -91,28 +89,28 @@ def test_it_learns_and_says_so(tmp_path):
     assert seconds == sorted(seconds)
 
 
-class Killed(Exception):
+class Interruption(Exception):
     pass
 
 
 @pytest.mark.parametrize("gains", [None, np.linspace(0.8, 1.2, 15).reshape(5, 3)], ids=["plain", "exposure"])
 def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, gains):
     monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
-    unbroken = run(tmp_path / "unbroken", gains=gains)
+    unbroken = run_fit(tmp_path / "unbroken", gains=gains)
     adapt, folder = fitting.control_density, tmp_path / "resumed"
     for moment in (3, 4, 13, 18):  # before the first checkpoint of a run, twice in a row, around densifications
 
         def killing(optimizer, centers, started_with, settings, done, moment=moment):
             adapt(optimizer, centers, started_with, settings, done)
             if done == moment:
-                raise Killed
+                raise Interruption
 
         monkeypatch.setattr(fitting, "control_density", killing)
-        with pytest.raises(Killed):
-            run(folder, settings=SETTINGS.changed({"checkpoint_seconds": 1e-9}), gains=gains)
+        with pytest.raises(Interruption):
+            run_fit(folder, settings=SETTINGS.changed({"checkpoint_seconds": 1e-9}), gains=gains)
         assert trace.load_checkpoint(folder)["iteration"] == moment - 1
     monkeypatch.setattr(fitting, "control_density", adapt)
-    resumed = run(folder, initial=start(truth().means.numpy()[:5].astype(np.float64)), gains=gains)
+    resumed = run_fit(folder, initial=initial_model(true_gaussians().means.numpy()[:5].astype(np.float64)), gains=gains)
     for name in PARAMETERS:
         assert torch.equal(getattr(unbroken, name), getattr(resumed, name)), name
     broken, whole = (trace.read_trace(tmp_path / k / "trace.jsonl") for k in ("resumed", "unbroken"))
@@ -126,8 +124,8 @@ def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, ga
 def test_exposures_are_found_and_taken_out_again(tmp_path):
     """Photographs of which each has another exposure: where it is fitted the held-out view, exposed as on average, is
     right; where not, it is not; and the photographs come back as if none had differed."""
-    held, cameras = ring_of_cameras(9)[4], [c for k, c in enumerate(ring_of_cameras(9)) if k != 4]
-    pictures, gains = photos([*cameras, held]), (0.7, 1.2, 0.8, 1.25, 1.1, 0.85, 1.15, 0.95)
+    held, cameras = arc_cameras(9)[4], [c for k, c in enumerate(arc_cameras(9)) if k != 4]
+    pictures, gains = render_photos([*cameras, held]), (0.7, 1.2, 0.8, 1.25, 1.1, 0.85, 1.15, 0.95)
     poses = tmp_path / "poses"
     for camera, gain in zip(cameras, gains, strict=True):
         changed = (pictures[camera.name] * np.array([gain, 1.0, 2 - gain]) + 8 * (gain - 1)).clip(0, 255)
@@ -139,7 +137,15 @@ def test_exposures_are_found_and_taken_out_again(tmp_path):
     for on in (False, True):
         folder = tmp_path / str(on)
         folder.mkdir()
-        fit(cameras, shown, start(), settings, folder=folder, held_out=[held], gains=np.ones((8, 3)) if on else None)
+        fit(
+            cameras,
+            shown,
+            initial_model(),
+            settings,
+            folder=folder,
+            held_out=[held],
+            gains=np.ones((8, 3)) if on else None,
+        )
         scores.append(trace.read_trace(folder / "trace.jsonl")[-1]["psnr_held_out"])
     assert scores[1] > scores[0] + 2
     away = lambda views: np.mean([np.abs(v.astype(float) - pictures[n]).mean() for n, v in views.items()])
@@ -152,7 +158,7 @@ def test_exposures_are_found_and_taken_out_again(tmp_path):
 
 def test_a_view_is_exposed_as_the_photographs_next_to_it(tmp_path):
     """Where neighbours are alike the nearest tell; where they are not, all do."""
-    cameras = ring_of_cameras(12)
+    cameras = arc_cameras(12)
     seen = [camera for k, camera in enumerate(cameras) if k % 3 != 1]
 
     def told(gain_of) -> dict[str, float]:
@@ -202,8 +208,8 @@ def test_exposures_stay_the_identity_on_average():
 
 
 def test_seeds_matter_and_repeat(tmp_path):
-    first, again = run(tmp_path / "a"), run(tmp_path / "b")
-    other = run(tmp_path / "c", settings=SETTINGS.changed({"seed": 1}))
+    first, again = run_fit(tmp_path / "a"), run_fit(tmp_path / "b")
+    other = run_fit(tmp_path / "c", settings=SETTINGS.changed({"seed": 1}))
     assert torch.equal(first.means, again.means)
     assert len(other) != len(first) or not torch.equal(first.means, other.means)
 
@@ -211,15 +217,15 @@ def test_seeds_matter_and_repeat(tmp_path):
 def test_gaussians_whose_places_are_known_move_a_tenth_as_far(tmp_path):
     settings = SETTINGS.changed({"iterations": 1, "densify.stop": 0.0, "densify.start": 0.0})
     known = torch.arange(40) % 2 == 0
-    free, held = run(tmp_path / "a", settings=settings), run(tmp_path / "b", settings=settings, placed=known)
-    moved, hardly = free.means - start().means, held.means - start().means
+    free, held = run_fit(tmp_path / "a", settings=settings), run_fit(tmp_path / "b", settings=settings, placed=known)
+    moved, hardly = free.means - initial_model().means, held.means - initial_model().means
     assert moved.abs().max() > 1e-3 and torch.equal(hardly[~known], moved[~known])
     torch.testing.assert_close(hardly[known], PLACED_RATE_FACTOR * moved[known], rtol=1e-3, atol=1e-7)
     assert torch.equal(free.sh, held.sh) and torch.equal(free.log_scales, held.log_scales)
 
 
 def test_masked_pixels_do_not_matter_to_the_fit(tmp_path):
-    cameras, pictures = ring_of_cameras(), photos(ring_of_cameras())
+    cameras, pictures = arc_cameras(), render_photos(arc_cameras())
     weights = {c.name: np.ones((HEIGHT, WIDTH), bool) for c in cameras[1:]}
     for mask in weights.values():
         mask[3:10, 5:12] = False
@@ -229,7 +235,7 @@ def test_masked_pixels_do_not_matter_to_the_fit(tmp_path):
     fitted = []
     for k, images in enumerate((pictures, spoilt)):
         (tmp_path / str(k)).mkdir()
-        fitted.append(fit(cameras, images, start(), SETTINGS, folder=tmp_path / str(k), weights=weights))
+        fitted.append(fit(cameras, images, initial_model(), SETTINGS, folder=tmp_path / str(k), weights=weights))
     assert torch.equal(fitted[0].means, fitted[1].means) and torch.equal(fitted[0].sh, fitted[1].sh)
 
 
@@ -237,23 +243,23 @@ def test_a_scene_a_thousand_times_larger_and_far_away_fits_alike(tmp_path):
     """Cameras and points in metres of a national grid, through their similarity, give the fit of the unit scene."""
     scale, offset = 1e-3, np.array([4.5e5, -3.2e4, 120.0])
     far = Similarity(scale, offset)
-    cameras = [normalised(c, far) for c in ring_of_cameras(scale=scale, offset=offset)]
-    points = truth().means.numpy().astype(np.float64)
-    plain = run(tmp_path / "plain")
-    moved = run(tmp_path / "far", cameras, start(far.apply(far.invert(points))))
+    cameras = [normalize_camera(c, far) for c in arc_cameras(scale=scale, offset=offset)]
+    points = true_gaussians().means.numpy().astype(np.float64)
+    plain = run_fit(tmp_path / "plain")
+    moved = run_fit(tmp_path / "far", cameras, initial_model(far.apply(far.invert(points))))
     assert len(plain) == len(moved)
-    for camera in ring_of_cameras():
+    for camera in arc_cameras():
         a, b = (render(g, camera, impl="reference").color for g in (plain, moved))
         assert (a - b).abs().max() < 0.01
 
 
 @pytest.mark.parametrize("broken", ["picture", "parameter"])
-def test_what_is_not_finite_stops_and_is_named(tmp_path, monkeypatch, broken):
-    initial = start()
+def test_a_value_that_is_not_finite_stops_the_fit_and_is_named(tmp_path, monkeypatch, broken):
+    initial = initial_model()
     if broken == "parameter":
         initial.sh[3, 0, 0] = float("nan")
         with pytest.raises(FloatingPointError, match=r"step 0, view 'view\d'"):
-            run(tmp_path, initial=initial)
+            run_fit(tmp_path, initial=initial)
         return
 
     def burst(image, target, weights=None, share=0.2):
@@ -261,20 +267,20 @@ def test_what_is_not_finite_stops_and_is_named(tmp_path, monkeypatch, broken):
 
     monkeypatch.setattr(step, "reconstruction_loss", burst)
     with pytest.raises(FloatingPointError, match=r"step 0, view 'view\d': the reconstruction loss"):
-        run(tmp_path)
+        run_fit(tmp_path)
 
 
 def test_wrong_input_is_refused_before_any_work(tmp_path):
-    cameras, pictures = ring_of_cameras(), photos(ring_of_cameras())
+    cameras, pictures = arc_cameras(), render_photos(arc_cameras())
     with pytest.raises(ValueError, match="view 'view1': image is 10x16, camera is 22x16"):
-        fit(cameras, pictures | {"view1": pictures["view1"][:, :10]}, start(), SETTINGS, folder=tmp_path)
+        fit(cameras, pictures | {"view1": pictures["view1"][:, :10]}, initial_model(), SETTINGS, folder=tmp_path)
     with pytest.raises(ValueError, match="view 'view2': mask"):
         weights = {"view2": np.ones((3, 3), bool)}
-        fit(cameras, pictures, start(), SETTINGS, folder=tmp_path, weights=weights)
+        fit(cameras, pictures, initial_model(), SETTINGS, folder=tmp_path, weights=weights)
     with pytest.raises(ValueError, match="'view0': no image"):
-        fit(cameras, {}, start(), SETTINGS, folder=tmp_path)
+        fit(cameras, {}, initial_model(), SETTINGS, folder=tmp_path)
     with pytest.raises(ValueError, match="at least one view"):
-        fit([], {}, start(), SETTINGS, folder=tmp_path)
+        fit([], {}, initial_model(), SETTINGS, folder=tmp_path)
     assert not list(tmp_path.iterdir())
 
 
@@ -293,16 +299,13 @@ def test_the_start_has_the_points_colours_and_spacing():
     assert torch.isfinite(coincident.log_scales).all()
 
 
-def write_scene(folder) -> None:
-    cameras, pictures = ring_of_cameras(), photos(ring_of_cameras())
+def write_arc_poses(folder) -> None:
+    cameras, pictures = arc_cameras(), render_photos(arc_cameras())
     names = [c.name for c in cameras]
-    points = np.repeat(truth().means.numpy().astype(np.float64), 3, 0)
+    points = np.repeat(true_gaussians().means.numpy().astype(np.float64), 3, 0)
     points += np.random.default_rng(0).normal(0, 0.01, points.shape)
-    scene = Scene(
-        cameras={c.name: c for c in cameras}, train=tuple(names[1:]), test=(names[0],), clean=frozenset(),
-        points=points, point_colors=np.full((len(points), 3), 128, np.uint8),
-        similarity=Similarity(1.0, np.zeros(3)),
-    )  # fmt: skip
+    colors = np.full((len(points), 3), 128, np.uint8)
+    scene = make_scene({c.name: c for c in cameras}, names[:1], points=points, colors=colors)
     save_scene(folder, scene)
     for name in scene.train:  # the test view has no picture here: reading it would fail
         save_image(folder / "images" / f"{name}.png", pictures[name])
@@ -310,7 +313,7 @@ def write_scene(folder) -> None:
 
 def test_the_stage_writes_its_artifact_and_never_reads_test_views(tmp_path):
     poses, out = tmp_path / "poses", tmp_path / "out"
-    write_scene(poses)
+    write_arc_poses(poses)
     out.mkdir()
     params = stage.Params().changed({"iterations": 10, "densify.cap_max": 150, "sh.degree": 1, "holdout": 4})
     stage.run(params, out, poses=poses)
@@ -324,7 +327,7 @@ def test_the_stage_writes_its_artifact_and_never_reads_test_views(tmp_path):
 def test_the_stage_starts_from_flow_points_of_the_views_it_fits(tmp_path, capsys, monkeypatch):
     from reffusion.capture import stereo
 
-    write_scene(tmp_path / "poses")
+    write_arc_poses(tmp_path / "poses")
     seen, find = [], stereo.triangulate_points
     monkeypatch.setattr(
         stereo, "triangulate_points", lambda cameras, *rest: seen.append(cameras) or find(cameras, *rest)
@@ -340,7 +343,7 @@ def test_the_stage_starts_from_flow_points_of_the_views_it_fits(tmp_path, capsys
 
 
 def test_larger_pictures_have_room_for_more_gaussians():
-    cameras = ring_of_cameras()
+    cameras = arc_cameras()
     pixels = cameras[0].width * cameras[0].height
     budget = lambda cameras, **densify: (
         limit_gaussians(stage.Params(densify=Densify(**densify)), cameras).densify.cap_max
@@ -354,16 +357,16 @@ def test_larger_pictures_have_room_for_more_gaussians():
 
 def test_the_stage_takes_over_a_scene_of_gaussians(tmp_path):
     poses, out = tmp_path / "poses", tmp_path / "out"
-    write_scene(poses)
+    write_arc_poses(poses)
     out.mkdir()
-    save_ply(poses / "gaussians.ply", truth())
+    save_ply(poses / "gaussians.ply", true_gaussians())
     stage.run(stage.Params(), out, poses=poses)
-    assert torch.equal(load_ply(out / "gaussians.ply").means, truth().means)
+    assert torch.equal(load_ply(out / "gaussians.ply").means, true_gaussians().means)
     assert "no optimisation" in plan.preview(stage.Params(), poses=poses)[0]
 
 
 def test_a_dense_start_looks_at_half_the_size_first():
-    camera = Camera("v", 7, 4, 5.0, 5.0, 3.5, 2.0, np.eye(4))
+    camera = make_camera("v", (7, 4), 5.0)
     image, counts = np.arange(84, dtype=np.uint8).reshape(4, 7, 3), np.ones((4, 7), np.float32)
     counts[0, 0] = 0
     given = [camera], {"v": image}, {"v": counts}, range(3), 0
@@ -379,7 +382,7 @@ def test_a_dense_start_looks_at_half_the_size_first():
 
 
 def test_sparse_steps_look_at_every_pixel_in_four_turns(monkeypatch):
-    camera = Camera("v", 7, 5, 5.0, 5.0, 3.5, 2.5, np.eye(4))
+    camera = make_camera("v", (7, 5), 5.0)
     image, counts = np.zeros((5, 7, 3), np.uint8), np.arange(35, dtype=np.float32).reshape(5, 7)
     image[..., 0] = counts
     given = [camera], {"v": image}, {"v": counts}, range(5), 0

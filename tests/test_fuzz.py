@@ -1,7 +1,7 @@
-"""Every reader of what people hand over, on spoilt files: only our own errors come out.
+"""All readers of user files, on corrupted files: they raise only their own errors.
 
-`REFFUSION_SLOW=1` spends `REFFUSION_FUZZ_SECONDS` (600) on each reader; `python -m tests.test_fuzz` likewise, without
-pytest. What was found once stays in `FOUND`.
+`REFFUSION_SLOW=1` spends `REFFUSION_FUZZ_SECONDS` (600) on each reader; so does `python -m tests.test_fuzz`, without
+pytest. Files that once broke a reader stay in `FOUND`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ LONGEST = 10.0  # seconds that a file may take
 
 @dataclass(frozen=True)
 class Reader:
-    """What reads a file of that name, and good files to spoil."""
+    """A reader of files of this name, and good files to corrupt."""
 
     name: str
     read: Callable[[Path], object]
@@ -56,8 +56,8 @@ class Reader:
 # ---------------------------------------------------------------------------------------------- good files
 
 
-def _files() -> dict[str, bytes]:
-    """File name -> content, of every kind."""
+def good_files() -> dict[str, bytes]:
+    """File name -> content, of every kind of file."""
     import torch
 
     draw = np.random.default_rng(0)
@@ -123,8 +123,8 @@ stages:
 """
 
 
-def _capture(name: str, others: dict[str, bytes]) -> Callable[[Path], object]:
-    """Reads the folder of a file as a capture, pictures and other files beside it."""
+def capture_reader(name: str, others: dict[str, bytes]) -> Callable[[Path], object]:
+    """A reader of the file's folder as a capture, with pictures and other files beside it."""
 
     def read(path: Path) -> object:
         folder = path.parent
@@ -136,7 +136,7 @@ def _capture(name: str, others: dict[str, bytes]) -> Callable[[Path], object]:
     return read
 
 
-def _ascii(data: bytes) -> bytes:
+def ply_as_text(data: bytes) -> bytes:
     from plyfile import PlyData
 
     with tempfile.TemporaryDirectory() as name:
@@ -149,21 +149,21 @@ def _ascii(data: bytes) -> bytes:
 
 
 def readers() -> list[Reader]:
-    made = _files()
+    made = good_files()
     of = lambda *names: tuple(made[name] for name in names)
     pictures = of("p.png", "p.jpg", "p.bmp", "p.webp", "p.tif", "p.gif", "alpha.png", "bit.png")
 
     def any_ply(path: Path) -> None:
         for read in (summarize_splats, load_points, load_ply):
-            _tried(read, path)
+            try_read(read, path)
 
     def any_splats(path: Path) -> None:
         for read in (summarize_splats, load_ply):
-            _tried(read, path)
+            try_read(read, path)
 
     def any_picture(path: Path) -> None:
         for read in (image_size, load_image, load_mask, lambda p: image_size(p, True), lambda p: load_image(p, True)):
-            _tried(read, path)
+            try_read(read, path)
 
     return [
         Reader("cameras.bin", load_cameras, of("cameras.bin")),
@@ -172,10 +172,14 @@ def readers() -> list[Reader]:
         Reader("cameras.txt", load_cameras, (CAMERAS_TXT,)),
         Reader("images.txt", load_images, (IMAGES_TXT,)),
         Reader("points3D.txt", load_model_points, (POINTS_TXT,)),
-        Reader("transforms.json", _capture("transforms", made), (TRANSFORMS,)),
-        Reader("poses_bounds.npy", _capture("llff", made), of("poses_bounds.npy")),
+        Reader("transforms.json", capture_reader("transforms", made), (TRANSFORMS,)),
+        Reader("poses_bounds.npy", capture_reader("llff", made), of("poses_bounds.npy")),
         Reader("scene.yaml", lambda path: read_user_yaml(path, ("stages",)), (SCENE,)),
-        Reader("g.ply", any_ply, (*of("g.ply", "points.ply"), _ascii(made["g.ply"]), _ascii(made["points.ply"]))),
+        Reader(
+            "g.ply",
+            any_ply,
+            (*of("g.ply", "points.ply"), ply_as_text(made["g.ply"]), ply_as_text(made["points.ply"])),
+        ),
         Reader("g.splat", any_splats, of("g.splat")),
         Reader("g.spz", any_splats, of("g.spz")),
         Reader("p.png", any_picture, pictures),
@@ -204,8 +208,8 @@ WORDS = [word.encode() for word in (
 
 
 @st.composite
-def spoilt(draw: st.DrawFn, seeds: tuple[bytes, ...]) -> bytes:
-    """A good file with some changes: cut, bytes and numbers and words put in or over, pieces doubled or taken out."""
+def corrupted_bytes(draw: st.DrawFn, seeds: tuple[bytes, ...]) -> bytes:
+    """A good file with random changes: cut, overwritten, inserted, repeated and removed parts."""
     data = bytearray(draw(st.sampled_from(seeds)))
     for _ in range(draw(st.integers(1, 6))):
         at = draw(st.integers(0, max(len(data), 1)))
@@ -231,11 +235,11 @@ def spoilt(draw: st.DrawFn, seeds: tuple[bytes, ...]) -> bytes:
         elif at < len(data):
             data[at] ^= 1 << draw(st.integers(0, 7))
     data = bytes(data)
-    return repaired(data) if draw(st.booleans()) else data
+    return fix_png_checksums(data) if draw(st.booleans()) else data
 
 
-def repaired(data: bytes) -> bytes:
-    """A PNG with its checksums made right again, so that what lies behind them is reached."""
+def fix_png_checksums(data: bytes) -> bytes:
+    """A PNG with correct checksums, so that the reader gets past them."""
     if not data.startswith(b"\x89PNG\r\n\x1a\n"):
         return data
     out, at = bytearray(data[:8]), 8
@@ -249,7 +253,7 @@ def repaired(data: bytes) -> bytes:
     return bytes(out) + data[at:]
 
 
-def _tried(read: Callable[[Path], object], path: Path) -> None:
+def try_read(read: Callable[[Path], object], path: Path) -> None:
     began = time.monotonic()
     try:
         read(path)
@@ -260,23 +264,23 @@ def _tried(read: Callable[[Path], object], path: Path) -> None:
     assert time.monotonic() - began < LONGEST, "too long"
 
 
-def tried(reader: Reader, data: bytes) -> None:
-    """Only our own errors come out, of one line, that name the file."""
+def try_reader(reader: Reader, data: bytes) -> None:
+    """Only the project's own errors are raised, in one line that names the file."""
     with tempfile.TemporaryDirectory() as name, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         path = Path(name) / reader.name
         path.write_bytes(data)
-        _tried(reader.read, path)
+        try_read(reader.read, path)
 
 
 def fuzz(reader: Reader, files: int | None, seconds: float = 0.0) -> int:
-    """Try so many files, always the same; or ever new ones for so many seconds. How many were tried."""
+    """Try a number of fixed files, or new ones for some seconds; return how many."""
     count = 0
 
     def one(data: bytes) -> None:
         nonlocal count
         count += 1
-        tried(reader, data)
+        try_reader(reader, data)
 
     began, most = time.monotonic(), files or 500
     while True:
@@ -288,7 +292,7 @@ def fuzz(reader: Reader, files: int | None, seconds: float = 0.0) -> int:
             phases=(Phase.generate,) if files else (Phase.generate, Phase.shrink),
             suppress_health_check=list(HealthCheck),
         )
-        chosen(given(spoilt(reader.seeds))(one))()
+        chosen(given(corrupted_bytes(reader.seeds))(one))()
         if time.monotonic() - began >= seconds:
             return count
 
@@ -299,7 +303,7 @@ READERS = {reader.name: reader for reader in readers()}
 @pytest.mark.parametrize("name", READERS)
 def test_good_files_are_read(name):
     for seed in READERS[name].seeds:
-        tried(READERS[name], seed)
+        try_reader(READERS[name], seed)
 
 
 @pytest.mark.parametrize("name", READERS)
@@ -325,7 +329,7 @@ FOUND: dict[str, tuple[str, ...]] = {
 
 @pytest.mark.parametrize(("name", "data"), [(name, data) for name, each in FOUND.items() for data in each])
 def test_what_was_found_once(name, data):
-    tried(READERS[name], base64.b64decode(data))
+    try_reader(READERS[name], base64.b64decode(data))
 
 
 if __name__ == "__main__":

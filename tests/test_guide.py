@@ -1,5 +1,4 @@
-"""docs/guide.md: every command in it is run as it stands there, on a small scene; with REFFUSION_SLOW=1 the longer
-ones, too."""
+"""Every command of docs/guide.md runs as written on a small scene; the longer ones with REFFUSION_SLOW=1."""
 
 from __future__ import annotations
 
@@ -25,20 +24,20 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.fixture(scope="module")
-def mine(generate, tmp_path_factory) -> Path:
+def photo_folder(generate, tmp_path_factory) -> Path:
     """A folder with photographs, and masks of them."""
     folder = tmp_path_factory.mktemp("guide") / "my-photos"
     generate.generate(folder, 0, generate.KINDS["mini"])
     return folder
 
 
-def as_typed(command: str, mine: Path) -> list[str]:
-    words = [f"scene={mine}" if word.startswith("scene=") else word for word in command.split()]
-    return [*words, f"runs={mine.parent / 'runs'}", "profile=laptop", f"set={LITTLE}", f"VENV={sys.prefix}"]
+def make_command(command: str, photo_folder: Path) -> list[str]:
+    words = [f"scene={photo_folder}" if word.startswith("scene=") else word for word in command.split()]
+    return [*words, f"runs={photo_folder.parent / 'runs'}", "profile=laptop", f"set={LITTLE}", f"VENV={sys.prefix}"]
 
 
-def ran(command: str, mine: Path) -> str:
-    done = subprocess.run(as_typed(command, mine), cwd=ROOT, capture_output=True, text=True)
+def run_make(command: str, photo_folder: Path) -> str:
+    done = subprocess.run(make_command(command, photo_folder), cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -48,16 +47,16 @@ def test_the_guide_names_these_commands():
     assert all(command.split()[1] == "scene=my-photos" for command in COMMANDS)
 
 
-def test_before_any_long_work(mine):
-    assert "fit" in ran(*(c for c in COMMANDS if c.endswith("plan")), mine)
-    ran(*(c for c in COMMANDS if c.endswith("check")), mine)
-    assert (mine.parent / "runs/my-photos/check.png").is_file()
+def test_short_commands_run(photo_folder):
+    assert "fit" in run_make(*(c for c in COMMANDS if c.endswith("plan")), photo_folder)
+    run_make(*(c for c in COMMANDS if c.endswith("check")), photo_folder)
+    assert (photo_folder.parent / "runs/my-photos/check.png").is_file()
 
 
-def test_the_mask_page(mine):
+def test_the_mask_page(photo_folder):
     (command,) = (c for c in COMMANDS if c.endswith("mask"))
     group = {"start_new_session": True, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
-    with subprocess.Popen([*as_typed(command, mine), "port=18390"], cwd=ROOT, **group) as serving:
+    with subprocess.Popen([*make_command(command, photo_folder), "port=18390"], cwd=ROOT, **group) as serving:
         try:
             address = next(found[0] for line in serving.stdout if (found := re.findall(r"http://127\S+", line)))
             assert "What should be removed?" in urllib.request.urlopen(address, timeout=20).read().decode()
@@ -66,10 +65,10 @@ def test_the_mask_page(mine):
 
 
 @pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="a minute; set REFFUSION_SLOW=1")
-def test_to_the_end(mine):
+def test_long_commands_run(photo_folder):
     for goal, made in (("reference", "to_paint"), ("all", "evaluate/scene.ply"), ("report", "report.html")):
-        ran(*(c for c in COMMANDS if c.endswith(goal)), mine)
-        assert goal == "reference" or (mine.parent / "runs/my-photos" / made).exists()
+        run_make(*(c for c in COMMANDS if c.endswith(goal)), photo_folder)
+        assert goal == "reference" or (photo_folder.parent / "runs/my-photos" / made).exists()
 
 
 def test_pictures_are_there_and_small():

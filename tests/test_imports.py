@@ -1,4 +1,4 @@
-"""Who may import whom, who may open files: read from the sources."""
+"""The structure of the code: which package imports which, and which modules open files."""
 
 from __future__ import annotations
 
@@ -81,19 +81,19 @@ def _nodes(tree: ast.AST, top_only: bool) -> Iterator[ast.AST]:
         yield from _nodes(child, top_only)
 
 
-def outsiders(path: Path, allowed: set[str], top_only: bool = False) -> set[str]:
+def foreign_packages(path: Path, allowed: set[str], top_only: bool = False) -> set[str]:
     """Top-level packages that `path` imports, other than the standard library and `allowed`."""
     return {name.split(".")[0] for name in imports(path, top_only)} - allowed - set(sys.stdlib_module_names)
 
 
-def named(path: Path) -> str:
+def relative_path(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
-@pytest.mark.parametrize("path", sources("runner"), ids=named)
+@pytest.mark.parametrize("path", sources("runner"), ids=relative_path)
 def test_runner_knows_nothing_of_3d(path):
-    clusters = {name for name, doors in DOORS.items() if named(path) in doors}
-    assert outsiders(path, {"runner", "reffusion", "pydantic", "yaml"} | clusters) == set()
+    clusters = {name for name, doors in DOORS.items() if relative_path(path) in doors}
+    assert foreign_packages(path, {"runner", "reffusion", "pydantic", "yaml"} | clusters) == set()
     own = {name for name in imports(path) if name.split(".")[0] == "reffusion"}
     assert own <= {
         "reffusion.command",
@@ -102,22 +102,22 @@ def test_runner_knows_nothing_of_3d(path):
     }
 
 
-@pytest.mark.parametrize("path", sources("stages"), ids=named)
+@pytest.mark.parametrize("path", sources("stages"), ids=relative_path)
 def test_stages_import_the_library_only(path):
     names = imports(path)
-    assert outsiders(path, {"reffusion", "numpy", "torch"}) == set() and "argparse" not in names
+    assert foreign_packages(path, {"reffusion", "numpy", "torch"}) == set() and "argparse" not in names
     assert imports(path, top_only=True) == names, "imports stand at the top"
 
 
 @pytest.mark.parametrize("stage", [path.stem for path in sources("stages/plan") if path.stem != "__init__"])
-def test_what_is_told_before_a_stage_runs_needs_nothing_heavy(stage):
+def test_plan_modules_import_nothing_heavy(stage):
     """So that `plan` answers at once."""
     code = f"import sys, stages.plan.{stage}; print(*sorted(set(sys.argv[1:]) & set(sys.modules)))"
     command = [sys.executable, "-c", code, "torch", "scipy", "numba", "cv2", "diffusers", "transformers"]
     assert subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip() == ""
 
 
-def test_no_module_imports_itself_by_a_detour():
+def test_there_are_no_import_cycles():
     """Neither do the packages of the library: what lies below knows nothing of what lies above."""
     paths = sources("reffusion", "stages", "runner", "report")
     modules = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in paths}
@@ -132,25 +132,25 @@ def test_no_module_imports_itself_by_a_detour():
     tuple(graphlib.TopologicalSorter(rooms).static_order())
 
 
-def test_package_faces_are_empty():
+def test_init_files_are_empty():
     """What a stage depends on is what it imports."""
     for folder in {path.parent for path in sources("reffusion")}:
         assert folder.name == "reffusion" or not (folder / "__init__.py").read_text().strip(), folder
 
 
-@pytest.mark.parametrize("path", sources("reffusion"), ids=named)
-def test_library(path):
+@pytest.mark.parametrize("path", sources("reffusion"), ids=relative_path)
+def test_library_imports_no_upper_layer(path):
     names = {name.split(".")[0] for name in imports(path)}
     assert not names & {"stages", "runner", "report", "yaml", "argparse"}
     for package, doors in DOORS.items():
-        assert package not in names or named(path) in doors, f"only {' and '.join(doors)} import {package}"
+        assert package not in names or relative_path(path) in doors, f"only {' and '.join(doors)} import {package}"
 
 
-def test_the_command_starts_at_once():
-    assert outsiders(ROOT / "reffusion" / "command.py", set()) == set()
+def test_command_imports_only_the_standard_library():
+    assert foreign_packages(ROOT / "reffusion" / "command.py", set()) == set()
 
 
-@pytest.mark.parametrize("path", sources("report"), ids=named)
+@pytest.mark.parametrize("path", sources("report"), ids=relative_path)
 def test_report_reads_through_io(path):
     own = {name for name in imports(path) if name.split(".")[0] in OWN - {"report"}}
     draws = ("camera_path", "turntable", "view", "job_pictures", "gaussian_layers", "unseen_overlay", "study")
@@ -165,9 +165,9 @@ def test_report_reads_through_io(path):
     assert all(name.startswith(("reffusion.io", *chance, *drawing, *making)) for name in own), own
 
 
-@pytest.mark.parametrize("path", sources("reffusion"), ids=named)
+@pytest.mark.parametrize("path", sources("reffusion"), ids=relative_path)
 def test_files_are_opened_in_io_and_trace(path):
-    if named(path).startswith((*MAY_OPEN, *OWN_FILES)):
+    if relative_path(path).startswith((*MAY_OPEN, *OWN_FILES)):
         return
     calls = [n.func for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.Call)]
     opened = {f.attr if isinstance(f, ast.Attribute) else getattr(f, "id", "") for f in calls} & OPENERS
@@ -176,8 +176,8 @@ def test_files_are_opened_in_io_and_trace(path):
     assert opened == set()
 
 
-@pytest.mark.parametrize("path", sources("reffusion"), ids=named)
+@pytest.mark.parametrize("path", sources("reffusion"), ids=relative_path)
 def test_pure_modules_take_no_paths_and_no_params(path):
-    inside = named(path).removeprefix("reffusion/")
-    if inside.startswith(PURE) and named(path) != COMPILER:
+    inside = relative_path(path).removeprefix("reffusion/")
+    if inside.startswith(PURE) and relative_path(path) != COMPILER:
         assert not {name.split(".")[0] for name in imports(path)} & {"pathlib", "pydantic", "os", "io"}

@@ -1,103 +1,45 @@
-"""New Gaussians lie on the hidden surface, show the reference, and leave no holes."""
+"""New Gaussians lie on the hidden surface, reproduce the reference, and leave no holes."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import small_scene as small
 import torch
+from scenes import wall_scene
+from scenes.cameras import look_at_camera, make_camera, orbit_camera, yaw
+from scenes.gaussians import join_gaussians
+from scenes.stage_runs import run_through_masks, write_true_references
 
 from reffusion import geometry
 from reffusion.background.model import Background
 from reffusion.depth import background_depth
-from reffusion.depth.background_depth import Completion
 from reffusion.gaussians.optimize import reconstruction_loss
 from reffusion.gaussians.sheets import Sheets, sheet_gaussians
 from reffusion.gaussians.surfels import surface_gaussians, surface_normals
-from reffusion.initialize import coverage, fill
+from reffusion.initialize import coverage
 from reffusion.initialize import unprojection as rules
 from reffusion.initialize.draft import Draft
 from reffusion.initialize.refit import Supervision, crop_to_mask, repetitions
-from reffusion.io.arrays import load_json, load_labels, save_labels
-from reffusion.io.images import load_exr
+from reffusion.io.arrays import load_labels
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_mask_sets, save_references
+from reffusion.io.scene import load_mask_sets
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Reference
-from stages import initialize, masks
+from stages import initialize
 
 NEAR = 1.7
 SHEETS = Sheets()
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene")
-    poses, fit, _ = small.write(folder, NEAR)
-    (folder / "masks").mkdir()
-    masks.run(masks.Params(), folder / "masks", poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
-    return {"poses": poses, "fit": fit, "masks": folder / "masks"}
+def masks_folders(tmp_path_factory):
+    return run_through_masks(tmp_path_factory.mktemp("scene"), NEAR)
 
 
-def references(scene, folder, *names):
-    sets = load_mask_sets(scene["masks"], names)
-    save_references(folder, [Reference(small.CAMERAS[n], small.photo(small.CAMERAS[n]), sets[n].invent) for n in names])
-    return folder
-
-
-@pytest.mark.parametrize("how", [{}, {"planar_share": 2.0}], ids=["planes", "smooth"])
-def test_the_hidden_wall_is_rebuilt_where_it_was(scene, tmp_path, monkeypatch, how):
-    monkeypatch.setattr(fill, "COMPLETION", Completion(**how))
-    initialize.run(initialize.Params(), tmp_path, **scene, reference=references(scene, tmp_path / "r", "a2"))
-    gaussians, new = load_ply(tmp_path / "gaussians.ply"), load_labels(tmp_path / "labels.npy")
-    before, removed = load_ply(scene["fit"] / "gaussians.ply"), load_labels(scene["masks"] / "labels.npy")
-    haze = load_json(tmp_path / "facts.json")["floaters"]
-    assert len(gaussians) == len(new) and int((~new).sum()) == len(before) - int(removed.sum()) - haze
-    sheet = small.WALL / small.FOCAL * SHEETS.offset_px  # the second one lies so far behind the wall
-    distance = gaussians.means[new][:, 2] - small.WALL
-    assert (torch.minimum(distance.abs(), (distance - sheet).abs()) < 0.03).all() and (distance.abs() < 0.03).any()
-    depth = load_exr(tmp_path / "depth" / "a2.exr")
-    assert np.abs(depth - small.WALL).max() < 0.04
-    for name in small.TEST:
-        view = small.CAMERAS[name]
-        drawn = rasterizer.render(gaussians, view)
-        inner = small.true_mask(view, NEAR)
-        error = np.abs(drawn.color.numpy() - small.photo(view) / 255)[inner]
-        assert error.mean() < 0.03 and drawn.alpha.numpy()[inner].min() > 0.85
-    assert load_json(tmp_path / "facts.json")["uncovered_share"] < 0.15
-
-
-def test_without_references_it_only_removes(scene, tmp_path):
-    initialize.run(initialize.Params(), tmp_path, **scene, reference=None)
-    labels = load_labels(scene["masks"] / "labels.npy")
-    before, after = load_ply(scene["fit"] / "gaussians.ply"), load_ply(tmp_path / "gaussians.ply")
-    haze = load_json(tmp_path / "facts.json")["floaters"]
-    assert len(after) == len(before) - int(labels.sum()) - haze and haze < 0.01 * len(before)
-    assert not load_labels(tmp_path / "labels.npy").any()
-
-
-def test_a_second_reference_fills_only_what_the_first_left(scene, tmp_path):
-    counts = []
-    for names in (("a2",), ("a2", "a4")):
-        out = tmp_path / "".join(names)
-        out.mkdir()
-        initialize.run(initialize.Params(), out, **scene, reference=references(scene, out / "r", *names))
-        counts.append(int(load_labels(out / "labels.npy").sum()))
-    assert counts[0] <= counts[1] < 1.5 * counts[0]
-
-
-def test_labels_of_another_fit_are_refused(scene, tmp_path):
-    wrong = tmp_path / "masks"
-    wrong.mkdir()
-    save_labels(wrong / "labels.npy", np.zeros(3, bool))
-    with pytest.raises(ValueError, match="3 labels for"):
-        initialize.run(initialize.Params(), tmp_path, **(scene | {"masks": wrong}), reference=None)
-
-
-def slanted(degrees: float):
-    """Disparity of a plane through (0, 0, 2), turned about the vertical, and the view that sees it."""
-    view = small.camera("v", 0.0)
+def slanted_disparity(degrees: float):
+    """Disparity of a plane through (0, 0, 2) turned about the vertical, its view, and its normal."""
+    view = wall_scene.front_camera("v", 0.0)
     rays = geometry.pixel_rays(view)
     normal = np.array([np.sin(np.radians(degrees)), 0.0, -np.cos(np.radians(degrees))])
     return rays @ normal / (normal[2] * 2.0), view, normal
@@ -105,14 +47,14 @@ def slanted(degrees: float):
 
 @pytest.mark.parametrize("degrees", [0.0, 40.0, -60.0])
 def test_normals_of_a_plane_are_exact(degrees):
-    disparity, view, normal = slanted(degrees)
+    disparity, view, normal = slanted_disparity(degrees)
     found = surface_normals(1 / disparity, view)
     np.testing.assert_allclose(found, np.broadcast_to(normal, found.shape), atol=1e-9)
 
 
 def test_normals_beside_a_crease_belong_to_their_own_plane():
-    left, view, _ = slanted(30.0)
-    right = slanted(-30.0)[0]
+    left, view, _ = slanted_disparity(30.0)
+    right = slanted_disparity(-30.0)[0]
     normals = surface_normals(1 / np.maximum(left, right), view)
     sides = np.sort(normals[36, :, 0])
     assert (np.abs(np.abs(sides) - 0.5) < 1e-9).all()
@@ -122,20 +64,18 @@ def test_normals_beside_a_crease_belong_to_their_own_plane():
 @pytest.mark.parametrize("closer", [1.0, 1.5])
 @pytest.mark.parametrize("turn", [0.0, 65.0])
 def test_the_new_surface_shows_no_holes_nearer_by_or_from_the_side(degrees, closer, turn):
-    disparity, view, _ = slanted(degrees)
+    disparity, view, _ = slanted_disparity(degrees)
     black, whole = np.zeros((*disparity.shape, 3), np.uint8), np.ones(disparity.shape, bool)
     surface = sheet_gaussians(black, 1 / disparity, whole, view, 4, SHEETS)
-    a = np.radians(turn)
-    pose = np.eye(4)
-    pose[:3, :3] = [[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]]
-    pose[:3, 3] = np.array([0, 0, 2 / closer]) - pose[:3, :3] @ (0, 0, 2.0)
-    other = Camera("w", 16, 16, small.FOCAL, small.FOCAL, 8, 8, pose)
+    rotation = yaw(np.radians(turn))
+    center = (0, 0, 2.0) - rotation.T @ (0, 0, 2 / closer)
+    other = make_camera("w", (16, 16), wall_scene.FOCAL, center, rotation)
     assert rasterizer.render(surface, other).alpha.min() > 0.8
 
 
 @pytest.mark.parametrize("degrees", [0.0, 40.0, 60.0])
 def test_no_grid_shows_from_four_times_nearer(degrees):
-    disparity, view, _ = slanted(degrees)
+    disparity, view, _ = slanted_disparity(degrees)
     white, whole = np.full((*disparity.shape, 3), 255, np.uint8), np.ones(disparity.shape, bool)
     near = view.cropped(view.width // 2 - 8, view.height // 2 - 8, 16, 16).resized(64, 64)
     alpha = rasterizer.render(sheet_gaussians(white, 1 / disparity, whole, view, 1, SHEETS), near).alpha
@@ -143,18 +83,14 @@ def test_no_grid_shows_from_four_times_nearer(degrees):
 
 
 def floor_view(turn: float) -> Camera:
-    """A point of the floor y = 0 seen from 30 degrees above it, `turn` degrees around the vertical."""
+    """The origin of the floor y = 0, seen from 2 away and 30 degrees above it, `turn` degrees around the vertical."""
     a, b = np.radians(turn), np.radians(30)
     forward = np.array([np.sin(a) * np.cos(b), np.sin(b), np.cos(a) * np.cos(b)])  # y points down
-    right = np.array([np.cos(a), 0, -np.sin(a)])
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = pose[:3, :3] @ (2 * forward)  # the camera stands 2 away from the origin
-    return Camera(f"from {turn}", 48, 36, 60, 60, 24, 18, pose)
+    return look_at_camera(f"from {turn}", -2 * forward, (0.0, 0.0, 0.0), (48, 36), 60.0, up=(0.0, -1.0, 0.0))
 
 
-def floor(view: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Depth of the floor and a soft chequered picture of it."""
+def render_floor(view: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Depth of the floor and a smooth checkered picture of it."""
     rays, up = geometry.pixel_rays(view), view.world_to_camera[:3, 1]
     depth = (up @ view.world_to_camera[:3, 3]) / (rays @ up)
     points = geometry.unproject(depth, view)
@@ -165,7 +101,7 @@ def floor(view: Camera) -> tuple[np.ndarray, np.ndarray]:
 def test_no_view_is_completed_from_behind_where_nobody_photographed():
     at = np.array([0.0, 0.0, 0.2])
     turns = {"photographed": 0, "beside": 40, "before the other": 205, "behind": 110, "the other": 180}
-    cameras = [small.looking(name, angle, 0.5, 2.0, at, 32, 40.0) for name, angle in turns.items()]
+    cameras = [orbit_camera(name, angle, 0.5, 2.0, at, 32, 40.0) for name, angle in turns.items()]
     blank = frozenset({"beside", "before the other", "behind"})
     views = [type("View", (), {"camera": camera}) for camera in cameras]
     background = Background(views, {}, without_photo=blank)
@@ -179,7 +115,7 @@ def test_no_view_is_completed_from_behind_where_nobody_photographed():
 def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side():
     """Opaque neighbours hide each other: colours that are right in the reference slide away in the opposite view."""
     view, opposite = floor_view(0.0), floor_view(180.0)
-    depth, picture = floor(view)
+    depth, picture = render_floor(view)
     reference = Reference(view, (picture * 255).round().astype(np.uint8), np.ones(depth.shape, bool))
     nothing = surface_gaussians(picture, depth, np.zeros(depth.shape, bool), view, sh_count=1)
     errors = []
@@ -187,15 +123,15 @@ def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side()
         background = Background([], {})
         drawn = rules.add_surface(Draft.start(nothing), reference, depth, reference.mask, background, how).gaussians
         inner = (slice(14, 26), slice(14, 34))
-        here, there = (rasterizer.render(drawn, v).color.numpy() - floor(v)[1] for v in (view, opposite))
+        here, there = (rasterizer.render(drawn, v).color.numpy() - render_floor(v)[1] for v in (view, opposite))
         assert np.abs(here[inner]).mean() < 0.02
         errors.append(np.sqrt((there[inner] ** 2).mean()))
     assert errors[1] < 0.6 * errors[0]
 
 
 def test_bad_depth_is_refused():
-    view = small.camera("v", 0.0)
-    depth = np.ones((small.HEIGHT, small.WIDTH))
+    view = wall_scene.front_camera("v", 0.0)
+    depth = np.ones((wall_scene.HEIGHT, wall_scene.WIDTH))
     depth[3, 3] = np.nan
     with pytest.raises(ValueError, match="not positive and finite"):
         surface_gaussians(np.zeros((*depth.shape, 3)), depth, np.ones(depth.shape, bool), view, sh_count=1)
@@ -203,31 +139,37 @@ def test_bad_depth_is_refused():
     assert len(none) == 0 and none.sh.shape == (0, 4, 3)
 
 
-def test_what_haze_left_open_is_filled_too(scene, tmp_path):
+def test_holes_left_by_faint_gaussians_are_filled(masks_folders, tmp_path):
     """The rim of the hole that the mask leaves to the remaining Gaussians, with these taken away."""
-    view = small.CAMERAS["a2"]
-    sets = load_mask_sets(scene["masks"], ["a2"])["a2"]
-    gaussians, labels = load_ply(scene["fit"] / "gaussians.ply"), load_labels(scene["masks"] / "labels.npy")
+    view = wall_scene.CAMERAS["a2"]
+    sets = load_mask_sets(masks_folders["masks"], ["a2"])["a2"]
+    gaussians, labels = (
+        load_ply(masks_folders["fit"] / "gaussians.ply"),
+        load_labels(masks_folders["masks"] / "labels.npy"),
+    )
     remaining = gaussians.map(lambda p: p[~labels])
-    reference = Reference(view, small.photo(view), np.zeros_like(sets.invent))
+    reference = Reference(view, wall_scene.photo(view), np.zeros_like(sets.invent))
     asked = rules.find_hole(Draft.start(remaining), reference, sets.consistent, 0.9)
-    assert (asked & sets.unobserved).sum() > 0.9 * small.true_never_seen(view, NEAR).sum()
+    assert (asked & sets.unobserved).sum() > 0.9 * wall_scene.true_unobserved(view, NEAR).sum()
     assert not (asked & ~sets.consistent).any()
 
 
 def test_sparse_points_count_where_they_are_visible():
-    view = small.camera("v", 0.0)
+    view = wall_scene.front_camera("v", 0.0)
     points = np.array([[0, 0, 2.0], [0, 0, 3.0], [0.9, 0, 2.0], [5, 0, 2.0], [0, 0, -2.0]])
-    wall, left = np.full((small.HEIGHT, small.WIDTH), 0.5), np.zeros((small.HEIGHT, small.WIDTH), bool)
+    wall, left = (
+        np.full((wall_scene.HEIGHT, wall_scene.WIDTH), 0.5),
+        np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool),
+    )
     left[:, :60] = True
     pixels, values = background_depth.visible_points(points, view, left, wall)
-    np.testing.assert_allclose(pixels, [[small.WIDTH / 2, small.HEIGHT / 2]])
+    np.testing.assert_allclose(pixels, [[wall_scene.WIDTH / 2, wall_scene.HEIGHT / 2]])
     assert values.tolist() == [0.5]
 
 
 def test_the_reference_is_reproduced_by_matched_colors():
-    view = small.camera("v", 0.0)
-    picture, depth = small.photo(view), np.full((small.HEIGHT, small.WIDTH), small.WALL)
+    view = wall_scene.front_camera("v", 0.0)
+    picture, depth = wall_scene.photo(view), np.full((wall_scene.HEIGHT, wall_scene.WIDTH), wall_scene.WALL)
     everything = np.ones(depth.shape, bool)
     new = surface_gaussians(picture, depth, everything, view, sh_count=1, spread=0.4)
     labels = torch.ones(len(new), dtype=torch.bool)
@@ -240,29 +182,32 @@ def test_the_reference_is_reproduced_by_matched_colors():
 
 def test_a_hidden_gaussian_does_not_become_a_speck_of_another_colour():
     """Behind a red sheet it cannot show the picture; from elsewhere it would be seen as what it had been made."""
-    view = small.camera("v", 0.0)
-    picture = np.random.default_rng(0).integers(110, 140, (small.HEIGHT, small.WIDTH, 3)).astype(np.uint8)
-    far, everything = np.full((small.HEIGHT, small.WIDTH), small.WALL), np.ones((small.HEIGHT, small.WIDTH), bool)
+    view = wall_scene.front_camera("v", 0.0)
+    picture = np.random.default_rng(0).integers(110, 140, (wall_scene.HEIGHT, wall_scene.WIDTH, 3)).astype(np.uint8)
+    far, everything = (
+        np.full((wall_scene.HEIGHT, wall_scene.WIDTH), wall_scene.WALL),
+        np.ones((wall_scene.HEIGHT, wall_scene.WIDTH), bool),
+    )
     red = np.zeros_like(picture) + np.uint8([255, 0, 0])
     before = surface_gaussians(red, 0.9 * far, everything, view, sh_count=1, spread=0.4)
     new = surface_gaussians(picture, far, everything, view, sh_count=1, spread=0.4)
-    both = before.zip_map(new, lambda a, b: torch.cat([a, b]))
+    both = join_gaussians(before, new)
     labels = torch.arange(len(both)) >= len(before)
     colors = 0.5 + SH0 * rules.match_colors(both, labels, picture, everything, view, 5).sh[labels, 0]
     assert colors.min() > 110 / 255 - 0.11 and colors.max() < 140 / 255 + 0.11
 
 
-def test_settling_moves_the_gaussians_and_leaves_no_checkpoint(scene, tmp_path):
+def test_refit_moves_the_gaussians_and_leaves_no_checkpoint(masks_folders, tmp_path):
     """Twice the same, as many as before, nearer to the photographs; what it needs to resume goes when it is done."""
     found = {}
     for name, steps in (("none", 0), ("first", 40), ("again", 40)):
         out = tmp_path / name
         out.mkdir()
-        given = references(scene, out / "r", "a2")
+        given = write_true_references(out / "r", masks_folders["masks"], "a2")
         initialize.run(
             initialize.Params(refit_steps=steps, view_dependent_color=True, depth={"sweep": True}, extra_views=2),
             out,
-            **scene,
+            **masks_folders,
             reference=given,
         )
         found[name] = load_ply(out / "gaussians.ply")
@@ -270,18 +215,18 @@ def test_settling_moves_the_gaussians_and_leaves_no_checkpoint(scene, tmp_path):
         assert not list(out.rglob("checkpoint*")) and "settle" not in visible
     assert len(found["none"]) == len(found["first"])
     assert torch.equal(found["first"].means, found["again"].means)
-    view = small.CAMERAS["a4"]
+    view = wall_scene.CAMERAS["a4"]
     error = {
-        name: float((rasterizer.render(g, view).color - torch.from_numpy(small.photo(view)) / 255).abs().mean())
+        name: float((rasterizer.render(g, view).color - torch.from_numpy(wall_scene.photo(view)) / 255).abs().mean())
         for name, g in found.items()
     }
     assert error["first"] < error["none"]
 
 
-def test_a_few_pixels_of_a_further_view_do_not_cost_the_reference_its_turns():
-    view = small.CAMERAS["a4"]
+def test_an_extra_view_with_few_pixels_is_sampled_less_than_the_reference():
+    view = wall_scene.CAMERAS["a4"]
     picture, large, few = (
-        small.photo(view),
+        wall_scene.photo(view),
         np.zeros((view.height, view.width), bool),
         np.zeros((view.height, view.width), bool),
     )
@@ -303,8 +248,11 @@ def test_a_gap_is_narrow_and_a_hole_is_not():
 
 def test_a_completed_view_pulls_by_its_window_as_by_the_whole():
     """The same loss and gradient within, whichever is drawn."""
-    view, wall = small.camera("v", 0.0), small.plane(small.WALL, 2.0, 1.4, small.texture)
-    noise, mask = np.random.default_rng(0), np.zeros((small.HEIGHT, small.WIDTH), bool)
+    view, wall = (
+        wall_scene.front_camera("v", 0.0),
+        wall_scene.rectangle_gaussians(wall_scene.WALL, 2.0, 1.4, wall_scene.wall_color),
+    )
+    noise, mask = np.random.default_rng(0), np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
     mask[10:20, 12:30] = True
     picture = noise.integers(0, 256, (*mask.shape, 3), dtype=np.uint8)
     window, part, counts = crop_to_mask(Reference(view, picture, mask))
@@ -321,14 +269,14 @@ def test_a_completed_view_pulls_by_its_window_as_by_the_whole():
 
 def test_the_back_of_a_thing_is_drawn_though_its_front_shows_from_behind():
     """What a reference draws before all that the Gaussians show, and not where they show it already."""
-    view, near = small.camera("v", 0.0), 1.4
-    wall = small.plane(small.WALL, 2.0, 1.4, small.texture)
-    drawn, hidden = small.true_mask(view, near), np.zeros((small.HEIGHT, small.WIDTH), bool)
+    view, near = wall_scene.front_camera("v", 0.0), 1.4
+    wall = wall_scene.rectangle_gaussians(wall_scene.WALL, 2.0, 1.4, wall_scene.wall_color)
+    drawn, hidden = wall_scene.true_mask(view, near), np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
     reference = Reference(view, np.zeros((*drawn.shape, 3), np.uint8), drawn)
-    depth = np.where(drawn, near, small.WALL)
+    depth = np.where(drawn, near, wall_scene.WALL)
     assert (coverage.pixels_in_front(wall, depth, reference, hidden) == drawn).all()
-    front = small.plane(near, small.HALF, small.HALF, small.texture)
-    both = wall.zip_map(front, lambda a, b: torch.cat([a, b]))
+    front = wall_scene.rectangle_gaussians(near, wall_scene.HALF, wall_scene.HALF, wall_scene.wall_color)
+    both = join_gaussians(wall, front)
     assert coverage.pixels_in_front(both, depth, reference, hidden).sum() < 0.2 * drawn.sum()  # the square's soft rim
     assert not coverage.pixels_in_front(wall, depth, reference, drawn).any()
 

@@ -1,9 +1,7 @@
-"""The wheel: one package, that works from any folder as a checkout does."""
+"""The wheel is one package that works from any folder as a checkout does."""
 
 from __future__ import annotations
 
-import json
-import os
 import re
 import shutil
 import subprocess
@@ -12,7 +10,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from PIL import Image
+from scenes.capture import write_four_photos
+from scenes.processes import run_module
 
 from runner.keys import Hashes, code_fingerprints
 from runner.pipeline import load_pipeline
@@ -23,8 +22,8 @@ BUILD = "import sys, setuptools.build_meta as build; build.build_wheel(sys.argv[
 
 
 @pytest.fixture(scope="module")
-def unpacked(tmp_path_factory) -> Path:
-    """A folder with what the wheel would put among Python's packages."""
+def wheel_folder(tmp_path_factory) -> Path:
+    """A folder with the contents of the wheel."""
     pytest.importorskip("setuptools", "77", reason="building a wheel needs setuptools 77 or later")
     copy, out = tmp_path_factory.mktemp("copy"), tmp_path_factory.mktemp("out")  # building leaves folders behind
     for name in (*FOLDERS, "priors"):
@@ -43,44 +42,28 @@ def unpacked(tmp_path_factory) -> Path:
     return out
 
 
-def write_capture(folder: Path) -> None:
-    """Four photographs of 32 x 24 px from a row of cameras, and masks."""
-    (folder / "images").mkdir(parents=True)
-    (folder / "masks").mkdir()
-    frames = []
-    for k in range(4):
-        pose = [[1, 0, 0, 0.1 * k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-        frames.append({"file_path": f"images/v{k}.png", "transform_matrix": pose})
-        Image.new("RGB", (32, 24), (40 + k, 80, 120)).save(folder / "images" / f"v{k}.png")
-        Image.new("L", (32, 24), 255).save(folder / "masks" / f"v{k}.png")
-    lens = {"w": 32, "h": 24, "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 12.0}
-    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+def run_command(wheel_folder: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """`reffusion <arguments>` in a folder outside the project."""
+    return run_module("reffusion.command", *arguments, cwd=folder, env={"PYTHONPATH": str(wheel_folder)})
 
 
-def command(unpacked: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """`reffusion <arguments>` in a folder that has nothing to do with the project."""
-    environment = {**os.environ, "PYTHONPATH": str(unpacked)}
-    whole = [sys.executable, "-m", "reffusion.command", *arguments]
-    return subprocess.run(whole, cwd=folder, env=environment, capture_output=True, text=True)
-
-
-def test_all_is_in_one_package(unpacked):
-    assert sorted(path.suffix or path.name for path in unpacked.iterdir()) == [".dist-info", "reffusion"]
-    app = unpacked / "reffusion" / "app"
+def test_all_is_in_one_package(wheel_folder):
+    assert sorted(path.suffix or path.name for path in wheel_folder.iterdir()) == [".dist-info", "reffusion"]
+    app = wheel_folder / "reffusion" / "app"
     assert {path.name for path in app.iterdir()} == {"pipeline.yaml", "priors", *FOLDERS[1:]}
     ours = [path for name in FOLDERS for path in (ROOT / name).rglob("*") if path.suffix in (".py", ".yaml")]
     ours += [path for path in (ROOT / "priors" / "tiny").rglob("*") if path.suffix in (".json", ".safetensors")]
     for path in ours:
         inside = path.relative_to(ROOT)
-        there = unpacked if inside.parts[0] == "reffusion" else app
+        there = wheel_folder if inside.parts[0] == "reffusion" else app
         assert (there / inside).read_bytes() == path.read_bytes()
-    entries = next(unpacked.glob("*.dist-info/entry_points.txt")).read_text()
+    entries = next(wheel_folder.glob("*.dist-info/entry_points.txt")).read_text()
     assert "reffusion = reffusion.command:main" in entries
 
 
-def test_stages_depend_on_the_same_code(unpacked, tmp_path):
+def test_stages_depend_on_the_same_code(wheel_folder, tmp_path):
     """So that what a checkout made is taken, and what a new version does differently is made again."""
-    app, hashes = unpacked / "reffusion" / "app", Hashes(tmp_path / "hashes.json")
+    app, hashes = wheel_folder / "reffusion" / "app", Hashes(tmp_path / "hashes.json")
     for stage in load_pipeline(ROOT).stages:
         for folder in ("stages", "stages/plan"):
             code = code_fingerprints(ROOT, stage, hashes, folder)
@@ -88,33 +71,33 @@ def test_stages_depend_on_the_same_code(unpacked, tmp_path):
             assert code_fingerprints(app, stage, hashes, folder) == code
 
 
-def test_plan_in_any_folder(unpacked, tmp_path):
+def test_plan_in_any_folder(wheel_folder, tmp_path):
     """data/ and runs/ are in the folder where the command is given."""
-    write_capture(tmp_path / "data" / "row")
-    done = command(unpacked, tmp_path, "plan", "--scene", "row", "--profile", "laptop")
+    write_four_photos(tmp_path / "data" / "row")
+    done = run_command(wheel_folder, tmp_path, "plan", "--scene", "row", "--profile", "laptop")
     assert done.returncode == 0, done.stderr
     assert "run       poses" in done.stdout and "run       fit" in done.stdout and "4 masks" in done.stdout
-    assert (tmp_path / "runs").is_dir() and not (unpacked / "reffusion" / "app" / "runs").exists()
+    assert (tmp_path / "runs").is_dir() and not (wheel_folder / "reffusion" / "app" / "runs").exists()
 
 
-def test_help_lists_every_command_and_version_says_which(unpacked, tmp_path):
-    listed = command(unpacked, tmp_path, "--help")
-    assert listed.returncode == 0 and command(unpacked, tmp_path).stdout == listed.stdout
+def test_help_lists_every_command_and_version_says_which(wheel_folder, tmp_path):
+    listed = run_command(wheel_folder, tmp_path, "--help")
+    assert listed.returncode == 0 and run_command(wheel_folder, tmp_path).stdout == listed.stdout
     for name in ("plan", "run", "mask", "check", "patch", "export", "report", "view", "compare", "batch", "weights"):
         assert f"\n  {name} " in listed.stdout
-    assert re.fullmatch(r"reffusion \d+\.\d+\S*\n", command(unpacked, tmp_path, "--version").stdout)
-    wrong = command(unpacked, tmp_path, "masks")
+    assert re.fullmatch(r"reffusion \d+\.\d+\S*\n", run_command(wheel_folder, tmp_path, "--version").stdout)
+    wrong = run_command(wheel_folder, tmp_path, "masks")
     assert (
         wrong.returncode == 2 and wrong.stderr == "error: there is no command 'masks'; `reffusion --help` lists them\n"
     )
 
 
-def test_a_demo_scene_needs_a_checkout(unpacked, tmp_path):
-    done = command(unpacked, tmp_path, "run", "--scene", "demo")
+def test_a_demo_scene_needs_a_checkout(wheel_folder, tmp_path):
+    done = run_command(wheel_folder, tmp_path, "run", "--scene", "demo")
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
     assert "no folder data/demo" in done.stderr and "`make demo` makes one, in a checkout" in done.stderr
 
 
-def test_reports_are_commands_too(unpacked, tmp_path):
-    done = command(unpacked, tmp_path, "report", "--scene", "nothing")
+def test_reports_are_commands_too(wheel_folder, tmp_path):
+    done = run_command(wheel_folder, tmp_path, "report", "--scene", "nothing")
     assert done.returncode == 2 and "no stage has been done" in done.stderr and "Traceback" not in done.stderr

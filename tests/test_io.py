@@ -1,4 +1,4 @@
-"""Round trips of every file format, and the refusals."""
+"""Round trips of every file format, and what is refused."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import pytest
 import torch
 from PIL import Image
 from plyfile import PlyData
-from small_capture import load_test_masks
+from scenes.capture import load_test_masks
+from scenes.random_scene import random_gaussians, random_rotation, random_scene
 
 from reffusion.io import rotations
 from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
@@ -28,36 +29,7 @@ from reffusion.io.scene import (
     save_references,
     save_scene,
 )
-from reffusion.types import Camera, Gaussians, MaskSet, Reference, Scene, Similarity
-
-
-def some_gaussians(count: int, degree: int, seed: int = 0) -> Gaussians:
-    generator = torch.Generator().manual_seed(seed)
-    draw = lambda *shape: torch.randn(*shape, generator=generator)
-    return Gaussians(draw(count, 3), draw(count, 4), draw(count, 3), draw(count), draw(count, (degree + 1) ** 2, 3))
-
-
-def some_rotation(generator: np.random.Generator) -> np.ndarray:
-    q, r = np.linalg.qr(generator.normal(size=(3, 3)))
-    q = q * np.sign(np.diag(r))
-    return q if np.linalg.det(q) > 0 else -q
-
-
-def some_scene(names=("b", "a", "c")) -> Scene:
-    generator, cameras = np.random.default_rng(0), {}
-    for name in sorted(names):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = some_rotation(generator), generator.normal(size=3)
-        cameras[name] = Camera(name, 12, 8, 10.5, 11.25, 6.1, 3.9, pose)
-    return Scene(
-        cameras,
-        ("a", "b"),
-        ("c",),
-        frozenset({"b"}),
-        generator.normal(size=(7, 3)),
-        generator.integers(0, 256, (7, 3)).astype(np.uint8),
-        Similarity(1.0 / 3.0, np.array([1e6 / 7, -2e6 / 3, 0.1])),
-    )
+from reffusion.types import MaskSet, Reference, Similarity
 
 
 def test_io_costs_no_torch():
@@ -67,7 +39,7 @@ def test_io_costs_no_torch():
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_a_ply_says_how_it_is_meant_to_be_drawn(tmp_path, antialiased):
-    save_ply(tmp_path / "g.ply", replace(some_gaussians(3, 1), antialiased=antialiased))
+    save_ply(tmp_path / "g.ply", replace(random_gaussians(3, 1), antialiased=antialiased))
     assert load_ply(tmp_path / "g.ply").antialiased == antialiased
     header = (tmp_path / "g.ply").read_bytes().split(b"end_header")[0]
     assert (b"comment antialiased" in header) == antialiased
@@ -173,14 +145,14 @@ def test_json_and_labels(tmp_path):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_ply_round_trip_is_exact(tmp_path, degree):
-    gaussians = some_gaussians(5, degree)
+    gaussians = random_gaussians(5, degree)
     save_ply(tmp_path / "g.ply", gaussians)
     again = load_ply(tmp_path / "g.ply")
     again.zip_map(gaussians, lambda a, b: torch.testing.assert_close(a, b, rtol=0, atol=0))
 
 
 def test_ply_is_the_layout_that_viewers_expect(tmp_path):
-    gaussians = some_gaussians(4, 3)
+    gaussians = random_gaussians(4, 3)
     save_ply(tmp_path / "g.ply", gaussians)
     vertex = PlyData.read(str(tmp_path / "g.ply"))["vertex"]
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -195,7 +167,7 @@ def test_ply_is_the_layout_that_viewers_expect(tmp_path):
 
 
 def test_ply_goes_back_to_the_scenes_frame(tmp_path):
-    gaussians, near = some_gaussians(50, 1), Similarity(0.25, np.array([1.0, -2.0, 3.0]))
+    gaussians, near = random_gaussians(50, 1), Similarity(0.25, np.array([1.0, -2.0, 3.0]))
     save_ply(tmp_path / "g.ply", gaussians, near)
     vertex = PlyData.read(str(tmp_path / "g.ply"))["vertex"]
     assert vertex["x"].dtype == np.float32
@@ -208,7 +180,7 @@ def test_ply_goes_back_to_the_scenes_frame(tmp_path):
 
 
 def test_ply_of_a_geo_referenced_scene_loses_nothing(tmp_path):
-    gaussians, far = some_gaussians(50, 0), Similarity(1.0, np.array([4e6, 5e6, 300.0]))
+    gaussians, far = random_gaussians(50, 0), Similarity(1.0, np.array([4e6, 5e6, 300.0]))
     save_ply(tmp_path / "g.ply", gaussians, far)
     torch.testing.assert_close(load_ply(tmp_path / "g.ply", far).means, gaussians.means, rtol=0, atol=1e-6)
 
@@ -216,7 +188,7 @@ def test_ply_of_a_geo_referenced_scene_loses_nothing(tmp_path):
 def test_wrong_ply_files_are_named(tmp_path):
     save_points(tmp_path / "points.ply", np.zeros((3, 3)), np.zeros((3, 3), np.uint8))
     (tmp_path / "text.ply").write_text("hello")
-    nan = some_gaussians(3, 0)
+    nan = random_gaussians(3, 0)
     nan.means[1:] = float("nan")
     save_ply(tmp_path / "nan.ply", nan)
     for name, why in (
@@ -238,7 +210,7 @@ def test_points_round_trip(tmp_path):
 
 
 def test_scene_round_trip_in_full_precision(tmp_path):
-    scene = some_scene()
+    scene = random_scene()
     save_scene(tmp_path, scene)
     again = load_scene(tmp_path)
     assert list(again.cameras) == ["a", "b", "c"] and (again.train, again.test) == (scene.train, scene.test)
@@ -261,7 +233,7 @@ def test_quaternions_survive_half_turns():
         )
     generator = np.random.default_rng(1)
     for _ in range(50):
-        rotation = some_rotation(generator)
+        rotation = random_rotation(generator)
         again = rotations.quaternion_to_pose(rotations.rotation_to_quaternion(rotation), np.zeros(3))[:3, :3]
         np.testing.assert_allclose(again, rotation, atol=1e-15)
 
@@ -269,7 +241,7 @@ def test_quaternions_survive_half_turns():
 def test_our_model_is_read_by_colmap(tmp_path):
     import pycolmap
 
-    scene = some_scene()
+    scene = random_scene()
     save_scene(tmp_path, scene)
     model = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
     assert {i.name for i in model.images.values()} == {"a.png", "b.png", "c.png"}
@@ -281,7 +253,7 @@ def test_our_model_is_read_by_colmap(tmp_path):
 
 
 def test_mask_sets_and_references(tmp_path):
-    generator, scene = np.random.default_rng(0), some_scene()
+    generator, scene = np.random.default_rng(0), random_scene()
     draw = lambda: generator.random((8, 12)) < 0.5
     sets = {name: MaskSet(draw(), draw(), draw(), draw()) for name in scene.cameras}
     save_mask_sets(tmp_path, sets)

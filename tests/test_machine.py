@@ -1,4 +1,4 @@
-"""What a machine lacks for CUDA is said beforehand, a line each, with what mends it; nothing heavy is imported."""
+"""Missing requirements of CUDA are reported beforehand, a line and a remedy each, without heavy imports."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from scenes.processes import fake_nvidia_smi
 
 from benchmarks.gpu import ready
 from reffusion.io import machine
@@ -34,14 +35,14 @@ POOR = {
 
 
 @pytest.mark.parametrize("name", list(POOR))
-def test_what_is_lacking_is_one_line_that_mends_it(name):
+def test_each_missing_requirement_is_one_line_with_a_remedy(name):
     changes, said = POOR[name]
     (line,) = find_missing(replace(GOOD, **changes), 16.0, memory_param="distill.memory_gb")
     assert "\n" not in line
     assert re.search(said, line), line
 
 
-def test_nothing_is_lacking():
+def test_a_complete_machine_has_no_warning():
     assert find_missing(GOOD, 16.0) == []
     assert find_missing(replace(GOOD, extension=False, nvcc="13.0")) == [], "it is built when it is first needed"
     assert find_missing(replace(GOOD, extension=False, nvcc="")) == [], "nvcc does not say its version"
@@ -82,17 +83,9 @@ def test_torch_is_asked_without_importing_it(tmp_path, monkeypatch, line, built)
     assert machine._torch_cuda() == built
 
 
-def with_nvidia_smi(folder: Path, said: str) -> dict[str, str]:
-    """An environment whose nvidia-smi says this."""
-    tool = folder / "nvidia-smi"
-    tool.write_text(f"#!/bin/sh\necho '{said}'\n")
-    tool.chmod(0o755)
-    return {**os.environ, "PATH": f"{folder}:{os.environ['PATH']}"}
-
-
-def test_a_stage_says_what_it_lacks_at_once(tmp_path, monkeypatch):
+def test_a_stage_reports_missing_requirements_first(tmp_path, monkeypatch):
     """Asked as the plan asks, on a machine with an old driver, a small GPU and torch without CUDA."""
-    monkeypatch.setattr(os, "environ", with_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 535.183.01"))
+    monkeypatch.setattr(os, "environ", fake_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 535.183.01"))
     monkeypatch.chdir(ROOT)
     machine.detect.cache_clear()
     asked = lambda **params: {"stage": "distill", "params": params, "takes": TAKES, "brings": []}
@@ -108,7 +101,7 @@ def test_a_stage_says_what_it_lacks_at_once(tmp_path, monkeypatch):
 TAKES = ["poses", "fit", "masks", "reference", "initialize", "personalize", "lift"]
 
 
-def test_it_imports_nothing_heavy():
+def test_the_check_imports_nothing_heavy():
     code = "import sys; from reffusion.io import machine; machine.detect(); print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True).stdout == "False\n"
 

@@ -1,9 +1,11 @@
-"""Votes, labels and pixel classes on a scene whose truth is known by hand."""
+"""Votes, labels and pixel classes on a scene with known truth."""
 
 import numpy as np
 import pytest
-import small_scene as small
 import torch
+from scenes import wall_scene
+from scenes.gaussians import join_gaussians, round_gaussians
+from scenes.stage_runs import run_masks
 
 from reffusion import geometry, morphology
 from reffusion.io.arrays import load_json, load_labels, save_json
@@ -11,33 +13,27 @@ from reffusion.io.images import load_mask, save_mask
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets
 from reffusion.masks import consolidation, regions, voting
-from reffusion.types import Gaussians
-from stages.masks import Params, run
+from stages.masks import Params
 
 NEAR, FAR = 1.7, 0.8  # a square close to the wall hides part of it from all views; a distant one next to nothing
 
 
 def classify(tmp_path, square_at, params=None, **scene):
-    poses, fit, labels = small.write(tmp_path, square_at, **scene)
-    out = tmp_path / "masks"
-    out.mkdir()
-    run(params or Params(), out, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
+    poses, fit, labels = wall_scene.write_poses_and_fit(tmp_path, square_at, **scene)
+    out = run_masks(poses, fit, tmp_path / "masks", params)
     found = load_labels(out / "labels.npy")
-    return load_mask_sets(out, small.CAMERAS), load_json(out / "facts.json"), found, labels
+    return load_mask_sets(out, wall_scene.CAMERAS), load_json(out / "facts.json"), found, labels
 
 
-def ball(z, opacity=0.9, scale=0.1):
-    return Gaussians(
-        torch.tensor([[0.0, 0.0, z]]), torch.zeros(1, 4), torch.full((1, 3), float(np.log(scale))),
-        torch.full((1,), float(np.log(opacity / (1 - opacity)))), torch.zeros(1, 1, 3),
-    )  # fmt: skip
+def one_gaussian(z, opacity=0.9, scale=0.1):
+    return round_gaussians([[0.0, 0.0, z]], [[0.5, 0.5, 0.5]], scale, float(np.log(opacity / (1 - opacity))))
 
 
 def test_a_vote_is_the_blending_weight_inside_and_outside_the_mask():
-    view, front, back = small.camera("v", 0.0), ball(1.0), ball(1.5)
-    both = front.zip_map(back, lambda a, b: torch.cat([a, b]))
-    left = np.zeros((small.HEIGHT, small.WIDTH), bool)
-    left[:, : small.WIDTH // 2] = True
+    view, front, back = wall_scene.front_camera("v", 0.0), one_gaussian(1.0), one_gaussian(1.5)
+    both = join_gaussians(front, back)
+    left = np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
+    left[:, : wall_scene.WIDTH // 2] = True
     votes = voting.cast_votes(both, [view], {"v": left}, mode="weight")
     np.testing.assert_allclose(votes.masked, votes.unmasked, rtol=1e-4)  # symmetric about the middle
     alone = voting.cast_votes(front, [view], {"v": left}, mode="weight")
@@ -56,28 +52,39 @@ def test_the_label_needs_a_ratio_above_tau(tau):
 
 
 def test_views_without_a_mask_do_not_vote_and_empty_masks_do():
-    views = [small.camera("v", 0.0), small.camera("w", 0.0)]
-    full, empty = np.ones((small.HEIGHT, small.WIDTH), bool), np.zeros((small.HEIGHT, small.WIDTH), bool)
-    alone = voting.cast_votes(ball(1.0), views, {"v": full})
+    views = [wall_scene.front_camera("v", 0.0), wall_scene.front_camera("w", 0.0)]
+    full, empty = (
+        np.ones((wall_scene.HEIGHT, wall_scene.WIDTH), bool),
+        np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool),
+    )
+    alone = voting.cast_votes(one_gaussian(1.0), views, {"v": full})
     assert voting.label_gaussians(alone).all() and alone.unmasked == 0
-    both = voting.cast_votes(ball(1.0), views, {"v": full, "w": empty})
+    both = voting.cast_votes(one_gaussian(1.0), views, {"v": full, "w": empty})
     assert both.masked == both.unmasked > 0 and not voting.label_gaussians(both).any()  # a tie is no majority
 
 
 def test_wrong_masks_are_refused():
     with pytest.raises(ValueError, match="none of the training views has a mask"):
-        voting.cast_votes(ball(1.0), [small.camera("v", 0.0)], {"other": np.ones((small.HEIGHT, small.WIDTH), bool)})
+        voting.cast_votes(
+            one_gaussian(1.0),
+            [wall_scene.front_camera("v", 0.0)],
+            {"other": np.ones((wall_scene.HEIGHT, wall_scene.WIDTH), bool)},
+        )
     with pytest.raises(ValueError, match="mask of view v"):
-        voting.cast_votes(ball(1.0), [small.camera("v", 0.0)], {"v": np.ones((4, 4), bool)})
+        voting.cast_votes(one_gaussian(1.0), [wall_scene.front_camera("v", 0.0)], {"v": np.ones((4, 4), bool)})
 
 
-def test_gaussians_that_nobody_sees_go_with_what_surrounds_them():
-    views = [small.camera("v", -0.2), small.camera("w", 0.2)]
-    ballots = {view.name: small.true_mask(view, 1.0) for view in views}
-    aside = ball(1.0).map(lambda p: p.clone())
+def test_unseen_gaussians_take_the_label_of_their_neighbours():
+    views = [wall_scene.front_camera("v", -0.2), wall_scene.front_camera("w", 0.2)]
+    ballots = {view.name: wall_scene.true_mask(view, 1.0) for view in views}
+    aside = one_gaussian(1.0).map(lambda p: p.clone())
     aside.means[0, 0] = 0.5
-    nowhere = ball(-1.0)
-    assert [bool(voting.hidden_inside(g, views, ballots)) for g in (ball(1.0), aside, nowhere)] == [True, False, False]
+    nowhere = one_gaussian(-1.0)
+    assert [bool(voting.hidden_inside(g, views, ballots)) for g in (one_gaussian(1.0), aside, nowhere)] == [
+        True,
+        False,
+        False,
+    ]
 
 
 def test_tidy_removes_specks_and_closes_gaps():
@@ -92,43 +99,45 @@ def test_tidy_removes_specks_and_closes_gaps():
     assert not morphology.remove_small_parts(mask, 3, 3)[15, 15]
 
 
-def test_consistent_and_undecided_masks_match_the_truth(tmp_path):
+def test_consistent_and_unobserved_masks_match_the_truth(tmp_path):
     sets, facts, found, labels = classify(tmp_path, NEAR)
     assert (found == labels).float().mean() > 0.99
-    for name, view in small.CAMERAS.items():
-        assert small.iou(sets[name].consistent, small.true_mask(view, NEAR)) > 0.9
-        assert small.iou(sets[name].unobserved, small.true_never_seen(view, NEAR)) > 0.75
+    for name, view in wall_scene.CAMERAS.items():
+        assert wall_scene.iou(sets[name].consistent, wall_scene.true_mask(view, NEAR)) > 0.9
+        assert wall_scene.iou(sets[name].unobserved, wall_scene.true_unobserved(view, NEAR)) > 0.75
         assert not (sets[name].unobserved & ~sets[name].consistent).any()
         assert (sets[name].invent == sets[name].unobserved).all()
-    assert facts["best_reference"] in small.TRAIN and facts["invent_views"] == list(small.TRAIN)
+    assert facts["best_reference"] in wall_scene.TRAIN and facts["invent_views"] == list(wall_scene.TRAIN)
     assert facts["masked_gaussians"] == int(found.sum())
-    assert facts["invent_pixels"] == sum(int(sets[name].invent.sum()) for name in small.TRAIN)
+    assert facts["invent_pixels"] == sum(int(sets[name].invent.sum()) for name in wall_scene.TRAIN)
 
 
-def test_what_other_views_saw_is_not_invented(tmp_path):
+def test_pixels_seen_by_other_views_are_not_invented(tmp_path):
     sets, facts, _, _ = classify(tmp_path, FAR)
-    assert all(small.iou(sets[n].consistent, small.true_mask(v, FAR)) > 0.9 for n, v in small.CAMERAS.items())
+    assert all(
+        wall_scene.iou(sets[n].consistent, wall_scene.true_mask(v, FAR)) > 0.9 for n, v in wall_scene.CAMERAS.items()
+    )
     # Some is: a band of half a footprint, whose Gaussians the masks' rim outvotes.
     assert facts["unobserved_share"] < 0.1
 
 
 def test_a_missing_and_a_contradicting_mask_are_outvoted(tmp_path):
-    given = {name: small.true_mask(small.CAMERAS[name], NEAR) for name in small.TRAIN[1:]}
+    given = {name: wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR) for name in wall_scene.TRAIN[1:]}
     given["a3"] = np.zeros_like(given["a3"])
     sets, facts, _, _ = classify(tmp_path, NEAR, masks=given)
     assert facts["voting_views"] == 4
-    assert small.iou(sets["a0"].consistent, small.true_mask(small.CAMERAS["a0"], NEAR)) > 0.9
+    assert wall_scene.iou(sets["a0"].consistent, wall_scene.true_mask(wall_scene.CAMERAS["a0"], NEAR)) > 0.9
     assert not sets["a0"].raw.any()
 
 
-def test_what_stands_inside_every_mask_is_the_object_although_it_was_outvoted(tmp_path, monkeypatch):
+def test_gaussians_inside_every_mask_are_the_object_even_if_outvoted(tmp_path, monkeypatch):
     """All masks leave out the same spot of the object, as a bright reflection is left out: C closes over it."""
-    rows, columns = np.mgrid[: small.HEIGHT, : small.WIDTH] + 0.5
+    rows, columns = np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH] + 0.5
     given = {}
-    for name in small.TRAIN:
-        (at,), _ = geometry.project(np.array([[0.0, 0.0, NEAR]]), small.CAMERAS[name])
+    for name in wall_scene.TRAIN:
+        (at,), _ = geometry.project(np.array([[0.0, 0.0, NEAR]]), wall_scene.CAMERAS[name])
         spot = np.hypot(columns - at[0], rows - at[1]) < 2.5
-        given[name] = small.true_mask(small.CAMERAS[name], NEAR) & ~spot
+        given[name] = wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR) & ~spot
     monkeypatch.setattr(consolidation, "GAP", 0.1)
     found = {}
     for hull in (0.9, 1.0):
@@ -142,7 +151,7 @@ def test_what_stands_inside_every_mask_is_the_object_although_it_was_outvoted(tm
 
 
 def test_a_clean_view_shows_what_the_object_hid(tmp_path):
-    given = {name: small.true_mask(small.CAMERAS[name], NEAR) for name in small.TRAIN if name != "a2"}
+    given = {name: wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR) for name in wall_scene.TRAIN if name != "a2"}
     sets, facts, _, _ = classify(tmp_path, NEAR, masks=given, clean=("a2",))
     assert facts["voting_views"] == 5
     assert not sets["a2"].unobserved.any()
@@ -152,53 +161,53 @@ def test_a_clean_view_shows_what_the_object_hid(tmp_path):
 
 @pytest.mark.parametrize("value", [False, True])
 def test_empty_and_full_masks_are_handled(tmp_path, value):
-    given = np.full((small.HEIGHT, small.WIDTH), value)
-    sets, facts, found, _ = classify(tmp_path, NEAR, masks=dict.fromkeys(small.TRAIN, given))
+    given = np.full((wall_scene.HEIGHT, wall_scene.WIDTH), value)
+    sets, facts, found, _ = classify(tmp_path, NEAR, masks=dict.fromkeys(wall_scene.TRAIN, given))
     assert bool(found.any()) == value
     assert all(each.consistent.mean() == (1.0 if value else 0.0) for each in sets.values())
     assert (facts["best_reference"] is None) == (not value)
 
 
 def test_a_region_alone_marks_and_fills(tmp_path):
-    poses, fit, labels = small.write(tmp_path, NEAR, masks={})
+    poses, fit, labels = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})
     with pytest.raises(ValueError, match="neither masks nor a region"):
-        run(Params(), tmp_path, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
+        run_masks(poses, fit, tmp_path)
     save_json(tmp_path / "raw_masks/region.json", {"center": [0, 0, NEAR], "size": [0.5, 0.5, 0.1]})
-    run(Params(), tmp_path, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
-    sets = load_mask_sets(tmp_path, small.CAMERAS)
+    run_masks(poses, fit, tmp_path)
+    sets = load_mask_sets(tmp_path, wall_scene.CAMERAS)
     assert (load_labels(tmp_path / "labels.npy") == labels).all()
     rows, columns = np.nonzero(sets["a2"].invent)
-    half = 0.25 / (NEAR - 0.05) * small.FOCAL
+    half = 0.25 / (NEAR - 0.05) * wall_scene.FOCAL
     assert all(abs((side.max() - side.min() + 1) / 2 - half) <= 1 for side in (rows, columns))
 
 
 @pytest.mark.parametrize("invent", ["auto", "consistent"])
 def test_a_region_to_be_filled_removes_nothing_and_is_a_part_of_m(tmp_path, invent):
-    poses, fit, _ = small.write(tmp_path, NEAR, masks={})
+    poses, fit, _ = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})
     save_json(
         tmp_path / "raw_masks/region.json", {"center": [0, 0, NEAR], "size": [0.5] * 3, "round": True, "holds": False}
     )
-    run(Params(invent=invent), tmp_path, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
-    sets = load_mask_sets(tmp_path, small.CAMERAS)
+    run_masks(poses, fit, tmp_path, Params(invent=invent))
+    sets = load_mask_sets(tmp_path, wall_scene.CAMERAS)
     assert not load_labels(tmp_path / "labels.npy").any()
     assert not any(each.consistent.any() for each in sets.values())
-    assert all(sets[name].invent.any() for name in small.TRAIN)
+    assert all(sets[name].invent.any() for name in wall_scene.TRAIN)
 
 
 def test_masks_say_what_is_to_be_filled(tmp_path):
     """As they are, whatever stands there; beside them nothing is."""
-    poses, fit, _ = small.write(tmp_path, NEAR, masks={})
-    wanted = np.zeros((small.HEIGHT, small.WIDTH), bool)
+    poses, fit, _ = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})
+    wanted = np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
     wanted[10:30, 5:40] = True
-    for name in small.TRAIN:
+    for name in wall_scene.TRAIN:
         save_mask(tmp_path / "raw_masks/fill" / f"{name}.png", wanted)
-    run(Params(), tmp_path, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
-    sets = load_mask_sets(tmp_path, small.CAMERAS)
+    run_masks(poses, fit, tmp_path)
+    sets = load_mask_sets(tmp_path, wall_scene.CAMERAS)
     assert not load_labels(tmp_path / "labels.npy").any()
-    assert all((sets[name].invent == wanted).all() and not sets[name].consistent.any() for name in small.TRAIN)
+    assert all((sets[name].invent == wanted).all() and not sets[name].consistent.any() for name in wall_scene.TRAIN)
 
 
-def test_of_a_region_what_was_drawn_is_repainted_and_its_rim():
+def test_the_drawn_part_of_a_region_and_its_rim_are_repainted():
     """Within C all of it is, whatever was drawn there; what is thin or faint was not drawn."""
     invent, consistent, shown = np.zeros((60, 100), bool), np.zeros((60, 100), bool), np.zeros((60, 100))
     invent[10:50, 10:90], consistent[10:50, 10:20], shown[20:40, 40:60] = True, True, 0.9
@@ -210,8 +219,8 @@ def test_of_a_region_what_was_drawn_is_repainted_and_its_rim():
 
 
 def test_a_box_behind_the_surface_has_no_silhouette():
-    view = small.camera("v", 0.0)
-    wall = np.full((small.HEIGHT, small.WIDTH), 1 / small.WALL)
+    view = wall_scene.front_camera("v", 0.0)
+    wall = np.full((wall_scene.HEIGHT, wall_scene.WIDTH), 1 / wall_scene.WALL)
     box = regions.Region([0, 0, 1.5], [0.2] * 3)
     visible = regions.silhouette(box, view, wall)
     assert visible[36, 48] and not visible[2, 2]
@@ -219,9 +228,9 @@ def test_a_box_behind_the_surface_has_no_silhouette():
     assert not regions.silhouette(regions.Region([0, 0, -1.5], [0.2] * 3), view, wall).any()
 
 
-def test_what_lies_beyond_a_sphere_on_the_optical_axis():
+def test_masks_of_a_sphere_cover_what_lies_beyond_it():
     """A sphere of radius r at distance d shows as a disc of tan(asin(r / d)), and the rest of the view is beyond it."""
-    view = small.camera("v", 0.0)
+    view = wall_scene.front_camera("v", 0.0)
     ahead, radius = view.center + 1.0 * view.world_to_camera[2, :3], 0.25
     np.testing.assert_allclose(regions.point_on_axis(view, 1.0), ahead)
     beyond = regions.outside_sphere(ahead, radius, view)
@@ -241,21 +250,21 @@ def test_the_best_view_has_the_largest_mask_clear_of_the_border():
     assert voting.best_view({"s": blank}, ["s"]) is None
 
 
-def test_haze_shows_mostly_where_nobody_saw():
-    view, blob = small.camera("v", 0.0), ball(1.0)
-    inside = small.true_mask(view, 1.0)
+def test_faint_gaussians_show_mostly_where_no_view_saw():
+    view, blob = wall_scene.front_camera("v", 0.0), one_gaussian(1.0)
+    inside = wall_scene.true_mask(view, 1.0)
     aside = blob.map(lambda p: p.clone())
     aside.means[0, 0] = 0.4
-    both = blob.zip_map(aside, lambda a, b: torch.cat([a, b]))
+    both = join_gaussians(blob, aside)
     assert voting.find_floaters(both, [view], {"v": inside}).tolist() == [True, False]
 
 
 def test_any_subset_of_the_objects_goes_and_the_others_stay(tmp_path):
     """Two squares side by side with masks of their own, and one set of Gaussians."""
-    poses, fit, labels = small.write(tmp_path, NEAR)
+    poses, fit, labels = wall_scene.write_poses_and_fit(tmp_path, NEAR)
     first = labels & (load_ply(fit / "gaussians.ply").means[:, 0] < 0)
     for path in sorted((tmp_path / "raw_masks/masks").glob("*.png")):
-        mask, half = load_mask(path), split_at(path.stem)
+        mask, half = load_mask(path), left_of_square(path.stem)
         for name, part in (("left", half), ("right", ~half)):
             save_mask(tmp_path / "raw_masks/masks" / name / path.name, mask & part)
         path.unlink()
@@ -263,7 +272,7 @@ def test_any_subset_of_the_objects_goes_and_the_others_stay(tmp_path):
     for remove in (None, ["left"], ["right"], ["left", "right"]):
         out = tmp_path / f"masks-{remove}"
         out.mkdir()
-        run(Params(remove=remove), out, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
+        run_masks(poses, fit, out, Params(remove=remove))
         found[str(remove)] = load_labels(out / "labels.npy"), load_json(out / "facts.json")["kept"]
     everything, left, right, both = found.values()
     assert torch.equal(everything[0], both[0]) and everything[1] == both[1] == []
@@ -275,8 +284,8 @@ def test_any_subset_of_the_objects_goes_and_the_others_stay(tmp_path):
     assert across[left[0] & right[0] & labels].abs().max() < 1.5 * apart  # a column at the seam, which both show
 
 
-def split_at(name: str) -> np.ndarray:
-    """bool [H, W]: left of where the view shows the middle of the square."""
-    camera = small.CAMERAS[name]
+def left_of_square(name: str) -> np.ndarray:
+    """bool [H, W]: the pixels left of the middle of the square."""
+    camera = wall_scene.CAMERAS[name]
     column = geometry.project(np.array([[0.0, 0.0, NEAR]]), camera)[0][0, 0]
-    return np.broadcast_to(np.arange(small.WIDTH) + 0.5 < column, (small.HEIGHT, small.WIDTH))
+    return np.broadcast_to(np.arange(wall_scene.WIDTH) + 0.5 < column, (wall_scene.HEIGHT, wall_scene.WIDTH))

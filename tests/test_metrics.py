@@ -1,4 +1,4 @@
-"""Metrics against their definitions, written out again here, and at the edges: one pixel, constant, identical."""
+"""Metrics against independent implementations, and at the limits: one pixel, constant, identical."""
 
 import math
 
@@ -11,7 +11,7 @@ from reffusion.metrics import image_metrics, lpips
 from reffusion.metrics.image_metrics import Box, mask_box
 
 
-def pair(height, width, seed=0, noise=0.1):
+def noisy_pair(height, width, seed=0, noise=0.1):
     rng = np.random.default_rng(seed)
     truth = rng.random((height, width, 3))
     return np.clip(truth + noise * rng.standard_normal(truth.shape), 0, 1), truth
@@ -94,12 +94,12 @@ def ssim_by_definition(x, y):
 
 
 def test_ssim_equals_its_definition_over_the_valid_region():
-    image, truth = pair(17, 14)
+    image, truth = noisy_pair(17, 14)
     assert image_metrics.ssim(image, truth) == pytest.approx(ssim_by_definition(image, truth), abs=1e-10)
 
 
 def test_ssim_edges():
-    image, truth = pair(11, 11)
+    image, truth = noisy_pair(11, 11)
     assert image_metrics.ssim(image, truth) == pytest.approx(ssim_by_definition(image, truth), abs=1e-10)
     assert image_metrics.ssim(truth, truth) == pytest.approx(1.0)
     black, white = np.zeros((12, 12, 3)), np.ones((12, 12, 3))
@@ -112,7 +112,7 @@ def test_ssim_edges():
 
 
 def test_outside_a_mask_only_what_lies_outside_counts():
-    image, truth = pair(40, 50)
+    image, truth = noisy_pair(40, 50)
     mask = np.zeros((40, 50), bool)
     mask[10:25, 15:35] = True
     found = image_metrics.score_outside(image, truth, mask)
@@ -125,7 +125,7 @@ def test_outside_a_mask_only_what_lies_outside_counts():
 
 
 def test_outside_nothing_is_the_whole_picture_and_outside_all_is_nothing():
-    image, truth = pair(20, 30)
+    image, truth = noisy_pair(20, 30)
     found, whole = (
         image_metrics.score_outside(image, truth, np.zeros((20, 30), bool)),
         image_metrics.score(image, truth),
@@ -137,7 +137,7 @@ def test_outside_nothing_is_the_whole_picture_and_outside_all_is_nothing():
 
 
 def test_where_the_truth_shows_the_object_only_the_outside_is_scored():
-    image, truth = pair(40, 50)
+    image, truth = noisy_pair(40, 50)
     mask = np.zeros((40, 50), bool)
     mask[10:25, 15:35] = True
     found = image_metrics.score_view(image, truth, mask_box(mask), mask=mask, shows_object=True)
@@ -149,8 +149,8 @@ def test_where_the_truth_shows_the_object_only_the_outside_is_scored():
 
 
 def test_flip_is_zero_for_identical_one_for_the_worst_and_grows_between():
-    image, truth = pair(32, 32, noise=0.02)
-    worse, _ = pair(32, 32, noise=0.3)
+    image, truth = noisy_pair(32, 32, noise=0.02)
+    worse, _ = noisy_pair(32, 32, noise=0.3)
     assert image_metrics.flip(truth, truth) == 0.0
     assert 0 < image_metrics.flip(image, truth) < image_metrics.flip(worse, truth) < 1
     black, white = np.zeros((40, 40, 3)), np.ones((40, 40, 3))
@@ -175,7 +175,7 @@ def test_flip_is_that_of_its_authors():
 def test_flip_of_one_pixel_and_of_a_view_into_a_larger_array():
     black, white = np.zeros((1, 1, 3), np.uint8), np.full((1, 1, 3), 255, np.uint8)
     assert image_metrics.flip(black, black) == 0.0 < image_metrics.flip(white, black)
-    image, truth = pair(40, 40)
+    image, truth = noisy_pair(40, 40)
     window = Box(5, 7, 30, 22)
     copies = window.crop(image).copy(), window.crop(truth).copy()
     assert image_metrics.flip(window.crop(image), window.crop(truth)) == image_metrics.flip(*copies)
@@ -186,7 +186,7 @@ def test_flip_of_one_pixel_and_of_a_view_into_a_larger_array():
 
 @pytest.mark.parametrize("metric", [image_metrics.psnr, image_metrics.ssim, image_metrics.flip])
 def test_bad_images_are_refused(metric):
-    image, truth = pair(16, 16)
+    image, truth = noisy_pair(16, 16)
     for wrong, message in [
         (image[:, :15], "one size"),
         (image[..., :1], "one size"),
@@ -201,7 +201,7 @@ def test_bad_images_are_refused(metric):
 
 
 def test_bytes_and_floats_score_alike():
-    image, truth = ((255 * x).round().astype(np.uint8) for x in pair(20, 20))
+    image, truth = ((255 * x).round().astype(np.uint8) for x in noisy_pair(20, 20))
     for metric in (image_metrics.psnr, image_metrics.ssim, image_metrics.flip):
         assert metric(image, truth) == pytest.approx(metric(image / 255, truth / 255), rel=1e-6)
 
@@ -210,7 +210,7 @@ def test_bytes_and_floats_score_alike():
 
 
 def test_score_view_leaves_out_what_is_too_small():
-    image, truth = pair(40, 50)
+    image, truth = noisy_pair(40, 50)
     targets = image_metrics.lpips_targets(truth[4:34, 3:13], {"vgg": lpips.Lpips("vgg")})
     row = image_metrics.score_view(image, truth, Box(3, 4, 13, 34), targets)  # 10 px wide
     assert tuple(row) == image_metrics.COLUMNS

@@ -1,4 +1,4 @@
-"""The depth network: loaded from a folder, fed as its own processor would feed it; clear refusals."""
+"""The monocular depth network: loading, preprocessing as in its own processor, and refusals."""
 
 import shutil
 from dataclasses import replace
@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import small_scene as small
 import torch
+from scenes import wall_scene
+from scenes.networks import small_depth_model
 
 from reffusion.depth import monocular
 from reffusion.depth.background_depth import Completion, ViewDepth
@@ -18,35 +19,19 @@ from reffusion.types import Reference
 TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
 
 
-def small_model(kind="relative", seed=0):
-    """Depth Anything's architecture with random weights, 4 layers of 16 channels, for pictures of 56 px."""
-    from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
-
-    backbone = Dinov2Config(
-        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, image_size=56, patch_size=14,
-        out_features=["stage1", "stage2", "stage3", "stage4"], reshape_hidden_states=False,
-    )  # fmt: skip
-    torch.manual_seed(seed)
-    config = DepthAnythingConfig(
-        backbone_config=backbone, reassemble_hidden_size=16, neck_hidden_sizes=[8, 8, 16, 16], fusion_hidden_size=8,
-        head_hidden_size=8, depth_estimation_type=kind, initializer_range=0.2,
-    )  # fmt: skip
-    return DepthAnythingForDepthEstimation(config)
-
-
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def depth_model_folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("network")
-    small_model().save_pretrained(path)
+    small_depth_model().save_pretrained(path)
     return path
 
 
 @pytest.fixture(scope="module")
-def network(folder):
-    return monocular.load_network(folder)
+def network(depth_model_folder):
+    return monocular.load_network(depth_model_folder)
 
 
-def picture(height, width, seed=0):
+def random_smooth_image(height, width, seed=0):
     coarse = torch.rand(1, 3, 5, 7, generator=generator(seed, "picture"))
     smooth = torch.nn.functional.interpolate(coarse, (height, width), mode="bilinear")[0]
     return (smooth * 255).round() / 255
@@ -60,26 +45,26 @@ def test_a_picture_is_prepared_as_the_models_own_processor_does(network, size):
         size={"height": 56, "width": 56}, ensure_multiple_of=14, keep_aspect_ratio=True,
         image_mean=list(monocular.MEAN), image_std=list(monocular.DEVIATION),
     )  # fmt: skip
-    image = picture(*size)
+    image = random_smooth_image(*size)
     wanted = own((image * 255).byte().numpy(), return_tensors="pt", input_data_format="channels_first").pixel_values
     prepared = monocular.preprocess(network, image)
     assert prepared.shape == wanted.shape
     assert (prepared - wanted).abs().max() < 0.02  # theirs is rounded to 8 bits: half a level is 0.009
 
 
-def test_disparity_has_the_pictures_size_and_repeats(network, folder):
-    image = picture(48, 64)
+def test_disparity_has_the_pictures_size_and_repeats(network, depth_model_folder):
+    image = random_smooth_image(48, 64)
     first = monocular.predict_disparity(network, image)
     assert first.shape == (48, 64) and torch.isfinite(first).all() and first.std() > 0
-    assert (first == monocular.predict_disparity(monocular.load_network(folder), image)).all()
-    assert (first != monocular.predict_disparity(network, picture(48, 64, 1))).any()
+    assert (first == monocular.predict_disparity(monocular.load_network(depth_model_folder), image)).all()
+    assert (first != monocular.predict_disparity(network, random_smooth_image(48, 64, 1))).any()
     with pytest.raises(ValueError, match=r"\[3, H, W\]"):
         monocular.predict_disparity(network, image[None])
 
 
 def test_a_metric_model_is_inverted(network):
-    model = small_model("metric")
-    image = picture(48, 64)
+    model = small_depth_model("metric")
+    image = random_smooth_image(48, 64)
     answer = model(pixel_values=monocular.preprocess(network, image)).predicted_depth
     found = monocular.predict_disparity(monocular.make_network(model), image)
     inverse = 1 / answer[None].clamp(1e-6, 1e6)
@@ -87,7 +72,7 @@ def test_a_metric_model_is_inverted(network):
     torch.testing.assert_close(found, wanted)
 
 
-def test_refusals_name_what_is_wrong(tmp_path, folder):
+def test_refusals_name_what_is_wrong(tmp_path, depth_model_folder):
     with pytest.raises(ValueError, match="no such folder"):
         monocular.load_network(tmp_path / "nothing")
     with pytest.raises(ValueError, match=r"lacks config\.json"):
@@ -97,7 +82,7 @@ def test_refusals_name_what_is_wrong(tmp_path, folder):
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(ValueError, match=r"leave `depth\.model` empty"):
         monocular.load_network(tmp_path)
-    shutil.copy(folder / "config.json", tmp_path)
+    shutil.copy(depth_model_folder / "config.json", tmp_path)
     with pytest.raises(ValueError, match=r"leave `depth\.model` empty"):
         monocular.load_network(tmp_path)  # a configuration without weights
     with pytest.raises(ValueError, match=r"leave `depth\.model` empty"):
@@ -106,16 +91,16 @@ def test_refusals_name_what_is_wrong(tmp_path, folder):
 
 def test_the_references_depth_is_the_estimate_aligned():
     """initialize: an estimate that is right but for scale and offset gives the hidden wall."""
-    view = small.CAMERAS["a2"]
-    gaussians, labels = small.gaussians(1.7)
-    hole = small.true_mask(view, 1.7)
-    reference = Reference(view, small.photo(view), hole)
+    view = wall_scene.CAMERAS["a2"]
+    gaussians, labels = wall_scene.wall_and_square(1.7)
+    hole = wall_scene.true_mask(view, 1.7)
+    reference = Reference(view, wall_scene.photo(view), hole)
     remaining = gaussians.map(lambda p: p[~labels])
     # A wall parallel to the view has one disparity, which fixes no scale: this one is tilted about the image's middle.
     means = remaining.means.clone()
-    means *= 1 / (1 - 0.2 * means[:, 1:2] / small.WALL)
-    height = (np.mgrid[: small.HEIGHT, : small.WIDTH][0] + 0.5 - small.HEIGHT / 2) / small.FOCAL
-    true = (1 - 0.2 * height) / small.WALL
+    means *= 1 / (1 - 0.2 * means[:, 1:2] / wall_scene.WALL)
+    height = (np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH][0] + 0.5 - wall_scene.HEIGHT / 2) / wall_scene.FOCAL
+    true = (1 - 0.2 * height) / wall_scene.WALL
     behind_it = lambda estimate: unprojection.estimate_depth(
         replace(remaining, means=means), reference, hole, hole, np.zeros((0, 3)), Completion(), estimate
     )
@@ -129,21 +114,21 @@ def test_the_references_depth_is_the_estimate_aligned():
 def test_the_stage_shows_the_model_the_reference(network):
     from reffusion.initialize.fill import _predict_disparity
 
-    view = small.CAMERAS["a2"]
-    reference = Reference(view, small.photo(view), np.zeros((small.HEIGHT, small.WIDTH), bool))
+    view = wall_scene.CAMERAS["a2"]
+    reference = Reference(view, wall_scene.photo(view), np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool))
     image = torch.from_numpy(reference.image).permute(2, 0, 1) / 255
     assert (_predict_disparity(network, reference) == monocular.predict_disparity(network, image).numpy()).all()
     assert _predict_disparity(None, reference) is None
 
 
-def test_the_depth_term_asks_the_model_of_its_parameter(folder, network):
+def test_the_depth_term_asks_the_model_of_its_parameter(depth_model_folder, network):
     """A scene whose disparity is the model's own answer, scaled and moved: that is what it finds in the hole."""
     from reffusion.distill.depth_estimator import build_estimator
     from reffusion.params.distill import Params
 
-    view, image = small.CAMERAS["a2"], picture(small.HEIGHT, small.WIDTH)
+    view, image = wall_scene.CAMERAS["a2"], random_smooth_image(wall_scene.HEIGHT, wall_scene.WIDTH)
     true = 2.0 + 0.3 * monocular.predict_disparity(network, image).double().numpy()
-    hole = small.true_mask(view, 1.7)
+    hole = wall_scene.true_mask(view, 1.7)
     seen = ViewDepth(view, np.where(hole, 0.0, 1 / true), ~hole, hole, hole, np.zeros_like(hole))
-    estimator = build_estimator(Params(depth={"model": str(folder)}), np.zeros((0, 3)))
+    estimator = build_estimator(Params(depth={"model": str(depth_model_folder)}), np.zeros((0, 3)))
     np.testing.assert_allclose(estimator.disparity(seen, lambda: image.permute(1, 2, 0).numpy()), true, rtol=1e-6)

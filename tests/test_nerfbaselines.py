@@ -1,4 +1,4 @@
-"""The plug-in for nerfbaselines, in the environment that $NERFBASELINES_PYTHON names, on a run of a made scene.
+"""The plug-in for nerfbaselines on a synthetic scene, in the environment that $NERFBASELINES_PYTHON names.
 
 python3 -m venv nb && nb/bin/pip install ./plugins/nerfbaselines
 NERFBASELINES_PYTHON=nb/bin/python pytest tests/test_nerfbaselines.py
@@ -16,7 +16,7 @@ from pathlib import Path
 from threading import Thread
 
 import pytest
-from browser import CHROMIUM
+from scenes.browser import CHROMIUM
 
 REPO = Path(__file__).resolve().parent.parent
 PYTHON = os.environ.get("NERFBASELINES_PYTHON", "")
@@ -25,58 +25,61 @@ SMALL = "fit.iterations=200 personalize.steps=4 personalize.optimizer.batch=1 di
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory, generate) -> Path:
+def finished_demo(tmp_path_factory, generate) -> Path:
     """A folder with a scene in data/book, run in runs/book, and what the plug-in made of it in out/."""
     root = tmp_path_factory.mktemp("finished")
     generate.generate(root / "data/book", 3, generate.KINDS["mini"])
     command = [sys.executable, "-m", "reffusion.command", "run", "all", "--scene", str(root / "data/book")]
     command += ["--runs", str(root / "runs"), "--profile", "laptop", "--set", SMALL]
     subprocess.run(command, cwd=REPO, check=True, stdout=subprocess.DEVNULL)
-    asked(root, "reffusion_nerfbaselines", str(root / "runs/book"), "--output", str(root / "out"), "--page")
+    run_in_nerfbaselines(
+        root, "reffusion_nerfbaselines", str(root / "runs/book"), "--output", str(root / "out"), "--page"
+    )
     return root
 
 
-def asked(root: Path, module: str, *words: str) -> str:
+def run_in_nerfbaselines(root: Path, module: str, *words: str) -> str:
     home = {**os.environ, "REFFUSION_PYTHON": sys.executable, "HOME": str(root)}
     command = [PYTHON, "-m", module, *words]
     done = subprocess.run(command, cwd=root, env=home, stdout=subprocess.PIPE, text=True, check=True)
     return done.stdout
 
 
-def scores(root: Path, out: str = "out") -> dict[str, float]:
+def load_scores(root: Path, out: str = "out") -> dict[str, float]:
     said = json.loads((root / out / "results/book.json").read_text())
     assert said["evaluation_protocol"] == "spinnerf-box" and said["nb_info"]["method"] == "reffusion"
     return said["metrics"]
 
 
-def equal_ours(root: Path, theirs: dict[str, float]) -> None:
+def assert_equal_to_metrics(root: Path, theirs: dict[str, float]) -> None:
     ours = json.loads((root / "runs/book/evaluate/metrics.json").read_text())["mean"]
     for name in ("psnr", "ssim", "flip"):
         assert theirs[name] == pytest.approx(ours[f"{name}_box"], abs=1e-3), name
 
 
-def test_its_evaluation_gives_our_own_figures(finished):
-    equal_ours(finished, scores(finished))
-    assert len(list((finished / "out/predictions/color").glob("*.png"))) == 3
+def test_its_evaluation_gives_our_own_figures(finished_demo):
+    assert_equal_to_metrics(finished_demo, load_scores(finished_demo))
+    assert len(list((finished_demo / "out/predictions/color").glob("*.png"))) == 3
 
 
-def test_the_scene_itself_can_be_scored_on(finished):
+def test_the_scene_itself_can_be_scored_on(finished_demo):
     """Read anew, as other methods see it: here with cameras as given, which the run has adjusted."""
-    asked(finished, "reffusion_nerfbaselines", str(finished / "runs/book"), "--data", str(finished / "data/book"),
-          "--output", str(finished / "anew"))  # fmt: skip
-    assert scores(finished, "anew")["psnr"] == pytest.approx(scores(finished)["psnr"], abs=1)
+    words = ("runs/book", "--data", "data/book", "--output", "anew")
+    paths = [word if word.startswith("--") else str(finished_demo / word) for word in words]
+    run_in_nerfbaselines(finished_demo, "reffusion_nerfbaselines", *paths)
+    assert load_scores(finished_demo, "anew")["psnr"] == pytest.approx(load_scores(finished_demo)["psnr"], abs=1)
 
 
-def test_nerfbaselines_own_table(finished):
-    table = asked(finished, "nerfbaselines", "generate-dataset-results", "--results", str(finished / "out/results"),
-                  "--dataset", "spinnerf", "--scenes", "book")  # fmt: skip
-    assert "RefFusion" in table and f"{scores(finished)['psnr']:.3f}" in table
+def test_nerfbaselines_own_table(finished_demo):
+    command = ("generate-dataset-results", "--results", str(finished_demo / "out/results"), "--dataset", "spinnerf")
+    table = run_in_nerfbaselines(finished_demo, "nerfbaselines", *command, "--scenes", "book")
+    assert "RefFusion" in table and f"{load_scores(finished_demo)['psnr']:.3f}" in table
 
 
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium is installed")
-def test_its_page_opens(finished):
+def test_its_page_opens(finished_demo):
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    serve = partial(SimpleHTTPRequestHandler, directory=str(finished / "out/page"))
+    serve = partial(SimpleHTTPRequestHandler, directory=str(finished_demo / "out/page"))
     with ThreadingHTTPServer(("127.0.0.1", 0), serve) as server:
         Thread(target=server.serve_forever, daemon=True).start()
         home, wrong = f"http://127.0.0.1:{server.server_port}/", []
@@ -89,8 +92,10 @@ def test_its_page_opens(finished):
             )
             page.goto(f"{home}spinnerf.html")
             assert "RefFusion" in page.inner_text("body")
-            page.screenshot(path=str(finished / "page.png"))
+            page.screenshot(path=str(finished_demo / "page.png"))
             page.goto(f"{home}m-reffusion.html")
-            assert "SPIn-NeRF" in page.inner_text("body") and f"{scores(finished)['psnr']:.2f}" in page.content()
+            assert (
+                "SPIn-NeRF" in page.inner_text("body") and f"{load_scores(finished_demo)['psnr']:.2f}" in page.content()
+            )
         server.shutdown()
     assert not wrong

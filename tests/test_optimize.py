@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scenes.cameras import make_camera
 
 from reffusion import seeding
 from reffusion.gaussians import ssim
@@ -19,7 +20,7 @@ from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 
-def random_gaussians(count: int, degree: int = 1, seed: int = 0, scale: float = 0.05) -> Gaussians:
+def gaussians_near_origin(count: int, degree: int = 1, seed: int = 0, scale: float = 0.05) -> Gaussians:
     draw = lambda *shape: torch.randn(*shape, generator=generator)
     generator = seeding.generator(seed, "test")
     return Gaussians(
@@ -31,13 +32,12 @@ def random_gaussians(count: int, degree: int = 1, seed: int = 0, scale: float = 
     )
 
 
-def camera(width: int = 24, height: int = 18) -> Camera:
-    pose = np.eye(4)
-    pose[2, 3] = 1.0
-    return Camera("view", width, height, width * 1.0, width * 1.0, width / 2, height / 2, pose)
+def unit_camera(width: int = 24, height: int = 18) -> Camera:
+    """Looks at the origin from 1 away, with a focal length of its width."""
+    return make_camera("view", (width, height), float(width), (0.0, 0.0, -1.0))
 
 
-def pictures(height: int = 23, width: int = 31, channels: int = 3):
+def noisy_images(height: int = 23, width: int = 31, channels: int = 3):
     generator = seeding.generator(1, "pictures")
     image = torch.rand(height, width, channels, generator=generator)
     target = (image + 0.2 * torch.randn(image.shape, generator=generator)).clamp(0, 1)
@@ -51,7 +51,7 @@ def test_ssim_is_the_formula_of_wang_et_al():
     """scikit-image's value, for pictures that differ in the middle only, so that no window meets a border."""
     from skimage.metrics import structural_similarity
 
-    image, target, _ = pictures(40, 44)
+    image, target, _ = noisy_images(40, 44)
     differs = torch.zeros(40, 44, 1, dtype=torch.bool)
     differs[10:-10, 10:-10] = True
     target = torch.where(differs, target, image)
@@ -65,7 +65,7 @@ def test_ssim_is_the_formula_of_wang_et_al():
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("kind", ["all", "mask", "soft"])
 def test_kernel_agrees_with_plain_torch_in_float64(channels, kind):
-    image, target, mask = pictures(channels=channels)
+    image, target, mask = noisy_images(channels=channels)
     weights = {"all": None, "mask": mask, "soft": mask * torch.rand(mask.shape)}[kind]
     fast, exact = image.clone().requires_grad_(), image.double().requires_grad_()
     value = dssim(fast, target, weights)
@@ -77,7 +77,7 @@ def test_kernel_agrees_with_plain_torch_in_float64(channels, kind):
 
 
 def test_loss_gradient_by_finite_differences():
-    image, target, mask = pictures(7, 6, 1)
+    image, target, mask = noisy_images(7, 6, 1)
     for weights in (None, mask, mask.double() * 0.7):
         loss = lambda x, w=weights: reconstruction_loss(x, target.double(), w)
         assert torch.autograd.gradcheck(loss, image.double().requires_grad_())
@@ -85,7 +85,7 @@ def test_loss_gradient_by_finite_differences():
 
 @pytest.mark.parametrize("junk", [0.0, 1.0, 1e30, float("nan"), float("inf")])
 def test_masked_pixels_have_no_influence_at_all(junk):
-    image, target, mask = pictures()
+    image, target, mask = noisy_images()
     clean, dirty = image.clone(), image.clone()
     dirty[~mask] = junk
     values, gradients = [], []
@@ -102,7 +102,7 @@ def test_masked_pixels_have_no_influence_at_all(junk):
 
 
 def test_wholly_masked_and_perfect_views_give_zero():
-    image, target, mask = pictures()
+    image, target, mask = noisy_images()
     leaf = image.clone().requires_grad_()
     loss = reconstruction_loss(leaf, target, torch.zeros_like(mask))
     loss.backward()
@@ -139,9 +139,9 @@ def test_ssim_is_never_computed_in_tf32(monkeypatch):
 
 
 def test_confined_rows_receive_exactly_nothing():
-    leaves = random_gaussians(30).map(lambda p: p.requires_grad_())
+    leaves = gaussians_near_origin(30).map(lambda p: p.requires_grad_())
     select = torch.arange(30) % 3 == 0
-    rendering = render(confine(leaves, select), camera(), impl="reference")
+    rendering = render(confine(leaves, select), unit_camera(), impl="reference")
     (rendering.color.square().sum() + rendering.depth.sum() + rendering.alpha.sum()).backward()
     for name in PARAMETERS:
         gradient = getattr(leaves, name).grad
@@ -151,30 +151,30 @@ def test_confined_rows_receive_exactly_nothing():
 
 
 def test_confine_stops_even_nan():
-    leaves = random_gaussians(4).map(lambda p: p.requires_grad_())
+    leaves = gaussians_near_origin(4).map(lambda p: p.requires_grad_())
     select = torch.tensor([True, False, True, False])
     (confine(leaves, select).means * torch.tensor([[1.0], [float("nan")], [1.0], [float("inf")]])).sum().backward()
     assert torch.equal(leaves.means.grad, torch.tensor([[1.0], [0.0], [1.0], [0.0]]).expand(4, 3))
 
 
 def test_confine_leaves_the_picture_alone():
-    gaussians = random_gaussians(20)
-    seen = render(gaussians, camera(), impl="reference").color
+    gaussians = gaussians_near_origin(20)
+    seen = render(gaussians, unit_camera(), impl="reference").color
     confined = confine(gaussians, torch.zeros(20, dtype=torch.bool))
-    assert torch.equal(render(confined, camera(), impl="reference").color, seen)
+    assert torch.equal(render(confined, unit_camera(), impl="reference").color, seen)
 
 
 # ---------------------------------------------------------------------------------------------- Adam
 
 
-def pretend_gradients(optimizer: GaussianOptimizer, step: int) -> None:
+def set_random_gradients(optimizer: GaussianOptimizer, step: int) -> None:
     for name in PARAMETERS:
         parameter = getattr(optimizer.gaussians, name)
         parameter.grad = torch.randn(parameter.shape, generator=seeding.generator(step, name))
 
 
 def test_adam_is_torch_adam_where_all_are_visible():
-    start, rates, steps = random_gaussians(17, degree=2), Rates(), 12
+    start, rates, steps = gaussians_near_origin(17, degree=2), Rates(), 12
     ours = GaussianOptimizer(start, rates=rates)
     theirs = {name: getattr(start, name).clone().requires_grad_() for name in PARAMETERS}
     dc, rest = start.sh[:, :1].clone().requires_grad_(), start.sh[:, 1:].clone().requires_grad_()
@@ -182,7 +182,7 @@ def test_adam_is_torch_adam_where_all_are_visible():
     groups += [{"params": [dc], "lr": rates.sh_dc}, {"params": [rest], "lr": rates.sh_rest}]
     reference = torch.optim.Adam(groups, eps=1e-15)
     for i in range(steps):
-        pretend_gradients(ours, i)
+        set_random_gradients(ours, i)
         for name in PARAMETERS[:-1]:
             theirs[name].grad = getattr(ours.gaussians, name).grad.clone()
         dc.grad, rest.grad = ours.gaussians.sh.grad[:, :1].clone(), ours.gaussians.sh.grad[:, 1:].clone()
@@ -216,7 +216,7 @@ def test_plain_and_compiled_adam_agree():
 def test_against_epsilon_a_gradient_is_large_or_small():
     steps = []
     for size in (1e-3, 1e-9):
-        optimizer = GaussianOptimizer(random_gaussians(6), epsilon=1e-6)
+        optimizer = GaussianOptimizer(gaussians_near_origin(6), epsilon=1e-6)
         before = optimizer.gaussians.means.detach().clone()
         for name in PARAMETERS:
             getattr(optimizer.gaussians, name).grad = torch.full_like(getattr(optimizer.gaussians, name), size)
@@ -226,15 +226,15 @@ def test_against_epsilon_a_gradient_is_large_or_small():
 
 
 def test_unseen_gaussians_stay_and_late_ones_start_afresh():
-    optimizer = GaussianOptimizer(random_gaussians(6))
+    optimizer = GaussianOptimizer(gaussians_near_origin(6))
     visible = torch.tensor([True, True, True, False, False, False])
     before = optimizer.gaussians.map(lambda p: p.detach().clone())
     for i in range(5):
-        pretend_gradients(optimizer, i)
+        set_random_gradients(optimizer, i)
         optimizer.step(0.0, visible)
     assert torch.equal(optimizer.gaussians.means[3:], before.means[3:])
     assert not torch.equal(optimizer.gaussians.means[:3], before.means[:3])
-    pretend_gradients(optimizer, 9)
+    set_random_gradients(optimizer, 9)
     sign = optimizer.gaussians.means.grad.sign()
     optimizer.step(0.0)
     # Adam's first step is the step size along the gradient's sign, whenever it is taken.
@@ -243,8 +243,8 @@ def test_unseen_gaussians_stay_and_late_ones_start_afresh():
 
 
 def test_a_gradient_that_is_not_finite_is_named_and_changes_nothing():
-    optimizer = GaussianOptimizer(random_gaussians(5))
-    pretend_gradients(optimizer, 0)
+    optimizer = GaussianOptimizer(gaussians_near_origin(5))
+    set_random_gradients(optimizer, 0)
     optimizer.gaussians.opacity_logits.grad[2] = float("nan")
     before = optimizer.state_dict()
     with pytest.raises(FloatingPointError, match="opacity_logits"):
@@ -254,15 +254,15 @@ def test_a_gradient_that_is_not_finite_is_named_and_changes_nothing():
 
 
 def test_state_continues_bit_for_bit():
-    unbroken = GaussianOptimizer(random_gaussians(9), masked=torch.arange(9) % 2 == 0)
+    unbroken = GaussianOptimizer(gaussians_near_origin(9), masked=torch.arange(9) % 2 == 0)
     for i in range(3):
-        pretend_gradients(unbroken, i)
+        set_random_gradients(unbroken, i)
         unbroken.step(i / 6)
-    resumed = GaussianOptimizer(random_gaussians(2))
+    resumed = GaussianOptimizer(gaussians_near_origin(2))
     resumed.load_state_dict(unbroken.state_dict())
     for optimizer in (unbroken, resumed):
         for i in range(3, 6):
-            pretend_gradients(optimizer, i)
+            set_random_gradients(optimizer, i)
             optimizer.step(i / 6, torch.arange(9) < 7)
     for name in PARAMETERS:
         assert torch.equal(getattr(unbroken.gaussians, name), getattr(resumed.gaussians, name))
@@ -274,29 +274,29 @@ def test_state_continues_bit_for_bit():
 
 def test_the_mean_of_what_was_remembered():
     """It loses the rows that are lost, survives a checkpoint, and ends where Gaussians are added."""
-    optimizer, seen = GaussianOptimizer(random_gaussians(6)), []
+    optimizer, seen = GaussianOptimizer(gaussians_near_origin(6)), []
     optimizer.apply_mean()  # of nothing: nothing changes
     for step in range(4):
-        pretend_gradients(optimizer, step)
+        set_random_gradients(optimizer, step)
         optimizer.step(0.0)
         if step != 1:
             optimizer.remember()
             seen.append(optimizer.gaussians.map(torch.clone))
     keep = torch.tensor([True, False, True, True, False, True])
     optimizer.select(keep)
-    other = GaussianOptimizer(random_gaussians(4))
+    other = GaussianOptimizer(gaussians_near_origin(4))
     other.load_state_dict(optimizer.state_dict())
     other.apply_mean()
     for name in PARAMETERS:
         mean = torch.stack([getattr(each, name).double() for each in seen]).mean(0)[keep]
         assert torch.allclose(getattr(other.gaussians, name).double(), mean, atol=1e-6), name
     last = optimizer.gaussians.means.detach().clone()
-    optimizer.append(random_gaussians(2), torch.zeros(2, dtype=torch.bool))
+    optimizer.append(gaussians_near_origin(2), torch.zeros(2, dtype=torch.bool))
     optimizer.apply_mean()
     assert torch.equal(optimizer.gaussians.means[:4], last)
 
 
-def observed(gaussians: Gaussians, slopes: list[float], masked=None) -> GaussianOptimizer:
+def optimizer_with_slopes(gaussians: Gaussians, slopes: list[float], masked=None) -> GaussianOptimizer:
     optimizer = GaussianOptimizer(gaussians, masked)
     optimizer.grad2d_sum = torch.tensor(slopes) * 4
     optimizer.grad2d_count = torch.full((len(slopes),), 4, dtype=torch.int32)
@@ -304,11 +304,11 @@ def observed(gaussians: Gaussians, slopes: list[float], masked=None) -> Gaussian
 
 
 def test_labels_and_moments_follow_through_clone_split_and_prune():
-    start = random_gaussians(5, scale=0.005)
+    start = gaussians_near_origin(5, scale=0.005)
     start.log_scales[3:] += 3.0  # 3 and 4 are large: to be split
     masked = torch.tensor([True, False, True, True, False])
-    optimizer = observed(start, [9e-4, 0.0, 0.0, 9e-4, 0.0], masked)
-    pretend_gradients(optimizer, 0)
+    optimizer = optimizer_with_slopes(start, [9e-4, 0.0, 0.0, 9e-4, 0.0], masked)
+    set_random_gradients(optimizer, 0)
     optimizer.step(0.0)
     kept = optimizer.state_dict()
     grown = densify(optimizer, 2e-4, 0.02, 100, seeding.generator(0, "split"))
@@ -338,7 +338,7 @@ def test_labels_and_moments_follow_through_clone_split_and_prune():
 
 
 def test_the_budget_takes_the_steepest():
-    optimizer = observed(random_gaussians(4, scale=0.001), [3e-4, 9e-4, 1e-4, 5e-4])
+    optimizer = optimizer_with_slopes(gaussians_near_origin(4, scale=0.001), [3e-4, 9e-4, 1e-4, 5e-4])
     assert densify(optimizer, 2e-4, 0.01, 6, seeding.generator(0)) == 2
     assert torch.equal(optimizer.gaussians.means[4:], optimizer.gaussians.means[[1, 3]])
     optimizer.grad2d_sum += 1
@@ -347,11 +347,11 @@ def test_the_budget_takes_the_steepest():
 
 
 def test_split_keeps_the_picture_roughly():
-    parent = random_gaussians(12, seed=4, scale=0.1)
+    parent = gaussians_near_origin(12, seed=4, scale=0.1)
     parent.opacity_logits[:] = 0.0
     children = split(parent, seeding.generator(0, "split"))
-    before = render(parent, camera(48, 36), impl="reference")
-    after = render(children, camera(48, 36), impl="reference")
+    before = render(parent, unit_camera(48, 36), impl="reference")
+    after = render(children, unit_camera(48, 36), impl="reference")
     error = (before.color - after.color).square().mean()
     assert error < 0.25 * before.color.square().mean()
     assert abs(after.alpha.mean() / before.alpha.mean() - 1) < 0.25
@@ -359,7 +359,7 @@ def test_split_keeps_the_picture_roughly():
 
 def test_split_draws_from_the_gaussian_itself():
     """Children of one anisotropic Gaussian have its covariance about its mean."""
-    one = random_gaussians(1, seed=2)
+    one = gaussians_near_origin(1, seed=2)
     one.log_scales[0] = torch.log(torch.tensor([0.5, 0.1, 0.02]))
     many = one.map(lambda p: p.repeat(4000, *[1] * (p.ndim - 1)))
     offsets = split(many, seeding.generator(1)).means - one.means
@@ -373,9 +373,9 @@ def test_slopes_do_not_depend_on_the_image_size():
     """The same blurred picture at twice the size pulls at the same Gaussians equally hard."""
     slopes = []
     for width in (32, 64):
-        optimizer = GaussianOptimizer(random_gaussians(15, seed=7, scale=0.15))
+        optimizer = GaussianOptimizer(gaussians_near_origin(15, seed=7, scale=0.15))
         probe = torch.zeros(15, 2, requires_grad=True)
-        seen = render(optimizer.gaussians, camera(width, width * 3 // 4), impl="reference", probe=probe)
+        seen = render(optimizer.gaussians, unit_camera(width, width * 3 // 4), impl="reference", probe=probe)
         (seen.color - 0.3).square().mean().backward()
         optimizer.observe(probe.grad, seen.radii, width, width * 3 // 4)
         slopes.append(optimizer.grad2d_sum)
@@ -383,8 +383,8 @@ def test_slopes_do_not_depend_on_the_image_size():
 
 
 def test_capped_opacities_start_over():
-    optimizer = GaussianOptimizer(random_gaussians(8))
-    pretend_gradients(optimizer, 0)
+    optimizer = GaussianOptimizer(gaussians_near_origin(8))
+    set_random_gradients(optimizer, 0)
     optimizer.step(0.0)
     optimizer.cap_opacity(0.01)
     assert optimizer.gaussians.opacity_logits.sigmoid().max() < 0.01 + 1e-6
@@ -394,7 +394,7 @@ def test_capped_opacities_start_over():
 def test_masked_gaussians_go_at_their_own_pace():
     masked = torch.tensor([True, False, False])
     rates = Rates(means=0.5, sh_dc=0.5, sh_rest=0.5)  # large, for differences of float32
-    optimizer = GaussianOptimizer(random_gaussians(3), masked, rates, {"means": 0.25, "sh": 0.5})
+    optimizer = GaussianOptimizer(gaussians_near_origin(3), masked, rates, {"means": 0.25, "sh": 0.5})
     before = optimizer.gaussians.map(lambda p: p.detach().clone())
     for name in PARAMETERS:
         getattr(optimizer.gaussians, name).grad = torch.ones_like(getattr(optimizer.gaussians, name))

@@ -1,4 +1,4 @@
-"""docs/paper.md, `pipeline.yaml` and the paper agree, value by value."""
+"""docs/paper.md, `pipeline.yaml` and the paper agree on every value."""
 
 import re
 from fractions import Fraction
@@ -104,77 +104,83 @@ ABSENT = {
 OTHERWISE = {"fit.densify.cap_max", "fit.densify.prune_scale3d", "distill.densify.every"}
 
 
-def flat(params, above=""):
+def flatten(params, above=""):
     """Dotted name -> value."""
     found = {}
     for name, value in params.items():
-        found |= flat(value, f"{above}{name}.") if isinstance(value, dict) else {above + name: value}
+        found |= flatten(value, f"{above}{name}.") if isinstance(value, dict) else {above + name: value}
     return found
 
 
-def meant(cell, paper=None):
+def parse_cell(cell, paper=None):
     """The value that a cell of the table stands for; `=`: the profile paper's."""
     if cell == "=":
         return paper
     if cell in SHORT:
         return SHORT[cell]
     if ", " in cell:
-        return [meant(part) for part in cell.split(", ")]
+        return [parse_cell(part) for part in cell.split(", ")]
     return float(Fraction(cell)) if re.fullmatch(r"[-+.\de/]+", cell) else cell
 
 
-def rows(text):
-    """Dotted name -> (what the paper says, the values of the profiles)."""
+def parse_rows(text):
+    """Dotted name -> (the paper's column, the values of the profiles)."""
     found = {}
     for line in text.splitlines():
         if line.startswith("|`"):
             name, says, paper, best, laptop, _ = line.replace("`", "").split("|")[1:-1]
             assert name not in found, f"{name} twice"
-            found[name] = says, (meant(paper), meant(best, meant(paper)), meant(laptop, meant(paper)))
+            found[name] = (
+                says,
+                (parse_cell(paper), parse_cell(best, parse_cell(paper)), parse_cell(laptop, parse_cell(paper))),
+            )
     return found
 
 
-def same(a, b):
+def is_same(a, b):
     if isinstance(b, list | tuple):
-        return len(a) == len(b) and all(map(same, a, b))
+        return len(a) == len(b) and all(map(is_same, a, b))
     return a == (pytest.approx(b) if isinstance(b, float) else b)
 
 
-def wrong(name, row, values):
-    """What is wrong with a row: against the profiles, and against what the paper says."""
-    (says, stated), found = row, [values[profile].get(name) for profile in PROFILES]
-    if not all(map(same, stated, found)):
+def row_errors(name, row, profile_values):
+    """The errors of a row against the profiles and against the paper."""
+    (says, stated), found = row, [profile_values[profile].get(name) for profile in PROFILES]
+    if not all(map(is_same, stated, found)):
         return [f"{name}: {stated}, the profiles have {found}"]
-    fixed, absent = name in FIXED and same(stated[0], FIXED[name]), name in ABSENT and same(stated[0], ABSENT[name])
+    fixed, absent = (
+        name in FIXED and is_same(stated[0], FIXED[name]),
+        name in ABSENT and is_same(stated[0], ABSENT[name]),
+    )
     kinds = {"=": fixed, "no": absent, "open": name not in FIXED | ABSENT}
     return (
         [] if kinds.get(says, name in OTHERWISE) else [f"{name}: '{says}' and {stated[0]} is not what the paper says"]
     )
 
 
-def without_row(table, values):
-    """Parameters that the paper has a word on, or the profiles differ in, and the table does not name."""
-    paper = values["paper"]
-    differing = {name for name in paper if any(not same(values[p][name], paper[name]) for p in PROFILES)}
+def missing_rows(table, profile_values):
+    """Parameters that the paper mentions, or in which the profiles differ, and that have no row."""
+    paper = profile_values["paper"]
+    differing = {name for name in paper if any(not is_same(profile_values[p][name], paper[name]) for p in PROFILES)}
     differing = {name for name in differing if not name.endswith(MACHINE) and name not in BASELINES}
     return {*differing, *FIXED, *ABSENT, *OTHERWISE} - table.keys()
 
 
 @pytest.fixture(scope="module")
-def values():
+def profile_values():
     """Profile -> dotted name -> value, without a scene."""
     requests = [Request(ROOT, ROOT / "runs", "", profile=name) for name in PROFILES]
     jobs = resolve_all(requests, Hashes(ROOT / "runs" / HASHES), scene=False)
-    return {job.profile: flat(job.params) for job in jobs}
+    return {job.profile: flatten(job.params) for job in jobs}
 
 
-def test_table_profiles_and_paper_agree(values):
-    table = rows(DOC.read_text())
-    assert [line for name, row in table.items() for line in wrong(name, row, values)] == []
-    assert without_row(table, values) == set()
+def test_table_profiles_and_paper_agree(profile_values):
+    table = parse_rows(DOC.read_text())
+    assert [line for name, row in table.items() for line in row_errors(name, row, profile_values)] == []
+    assert missing_rows(table, profile_values) == set()
 
 
-def other(value):
+def another_value(value):
     """A value of the same kind."""
     if isinstance(value, bool):
         return not value
@@ -183,30 +189,32 @@ def other(value):
     return [*value, 1] if isinstance(value, list | tuple) else f"not {value}"
 
 
-def test_a_changed_value_is_found_wherever_it_stands(values):
-    table = rows(DOC.read_text())
+def test_a_changed_value_is_found_wherever_it_stands(profile_values):
+    table = parse_rows(DOC.read_text())
     for name, (says, stated) in table.items():
-        with_other = lambda profile, name=name: values | {profile: {name: other(values[profile][name])}}
+        with_other = lambda profile, name=name: (
+            profile_values | {profile: {name: another_value(profile_values[profile][name])}}
+        )
         for k, profile in enumerate(PROFILES):
-            changed = (*stated[:k], other(stated[k]), *stated[k + 1 :])
-            assert wrong(name, (says, changed), values), f"{name} of {profile} in the table"
-            assert wrong(name, (says, stated), with_other(profile)), f"{name} of {profile} in pipeline.yaml"
+            changed = (*stated[:k], another_value(stated[k]), *stated[k + 1 :])
+            assert row_errors(name, (says, changed), profile_values), f"{name} of {profile} in the table"
+            assert row_errors(name, (says, stated), with_other(profile)), f"{name} of {profile} in pipeline.yaml"
         if says in ("=", "no"):  # the same change in both is found by what stands here
-            assert wrong(name, (says, (other(stated[0]), *stated[1:])), with_other("paper")), name
+            assert row_errors(name, (says, (another_value(stated[0]), *stated[1:])), with_other("paper")), name
     left_out = [name for name, (says, _) in table.items() if says != "open"]
-    assert without_row({}, values) >= {*left_out}
+    assert missing_rows({}, profile_values) >= {*left_out}
 
 
-def test_best_is_paper_with_other_values_of_the_same_keys(values):
+def test_best_is_paper_with_other_values_of_the_same_keys(profile_values):
     profiles = read_yaml(ROOT / "pipeline.yaml")["profiles"]
-    assert flat(profiles["paper"]).keys() == flat(profiles["best"]).keys()
-    for name in values["paper"]:
+    assert flatten(profiles["paper"]).keys() == flatten(profiles["best"]).keys()
+    for name in profile_values["paper"]:
         if name.endswith((*MACHINE, "prior", "model")):
-            assert values["best"][name] == values["paper"][name], name
+            assert profile_values["best"][name] == profile_values["paper"][name], name
 
 
-def test_work_is_on_the_gpu_within_24_gb_in_half_precision(values):
-    paper = values["paper"]
+def test_work_is_on_the_gpu_within_24_gb_in_half_precision(profile_values):
+    paper = profile_values["paper"]
     for stage in ("reference", "personalize", "distill"):
         assert paper[f"{stage}.device"] == "cuda" and paper[f"{stage}.dtype"] in ("float16", "bfloat16")
         assert 0 < paper[f"{stage}.memory_gb"] <= 22

@@ -1,4 +1,4 @@
-"""The profile `paper` from masks to scores, every term on, with small random models of the real architectures."""
+"""The profile `paper` from masks to scores with all terms, on small random models of the real architectures."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import small_scene as small
 import torch
-from other_device import there_is_one
-from test_monocular import small_model
+from scenes import wall_scene
+from scenes.networks import small_depth_model
+from scenes.simulated_gpu import has_gpu
 
 from benchmarks.gpu import full_size
 from reffusion.depth import monocular
@@ -57,35 +57,36 @@ WEIGHTS = {
 }
 STANDS_FOR = {"sd2": published.SD2, "sdxl": published.SDXL, "depth": "depth-anything/Depth-Anything-V2-Small-hf"}
 # On a GPU nothing differs: bfloat16 is trained, float16 paints and distils.
-HERE = {} if there_is_one() else {"device": "cpu", "dtype": "float32"}
+HERE = {} if has_gpu() else {"device": "cpu", "dtype": "float32"}
 
 
-def picture(view) -> torch.Tensor:
-    return torch.from_numpy(small.photo(view)).permute(2, 0, 1) / 255
+def photo_tensor(view) -> torch.Tensor:
+    return torch.from_numpy(wall_scene.photo(view)).permute(2, 0, 1) / 255
 
 
-def network_of_the_tilt() -> torch.nn.Module:
-    """A random Depth Anything that happens to say how the wall leans; one that says the opposite is refused."""
-    wanted = -np.mgrid[: small.HEIGHT, : small.WIDTH][0].ravel()
+def network_that_sees_the_tilt() -> torch.nn.Module:
+    """A random Depth Anything whose output correlates with the tilt of the wall; others are refused."""
+    wanted = -np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH][0].ravel()
     for seed in (28, *range(200)):
-        model = small_model(seed=seed)
+        model = small_depth_model(seed=seed)
         network = monocular.make_network(model)
         said = [
-            monocular.predict_disparity(network, picture(small.CAMERAS[n])).numpy().ravel() for n in ("a0", "a2", "a4")
+            monocular.predict_disparity(network, photo_tensor(wall_scene.CAMERAS[n])).numpy().ravel()
+            for n in ("a0", "a2", "a4")
         ]
         if min(np.corrcoef(answer, wanted)[0, 1] for answer in said) > 0.5:
             return model
     raise AssertionError("no such network among 200")
 
 
-def tilted(fit: Path) -> None:
-    """The wall leans, as seen from the middle: a wall parallel to the views would not fix the scale of a depth."""
+def tilt_wall(fit: Path) -> None:
+    """Tilt the wall: parallel to the views it would leave the scale of a depth undetermined."""
     gaussians = load_ply(fit / "gaussians.ply")
-    means = gaussians.means / (1 - 0.2 * gaussians.means[:, 1:2] / small.WALL)
+    means = gaussians.means / (1 - 0.2 * gaussians.means[:, 1:2] / wall_scene.WALL)
     save_ply(fit / "gaussians.ply", replace(gaussians, means=means))
 
 
-def parameters(weights: Path) -> dict[str, Settings]:
+def small_paper_params(weights: Path) -> dict[str, Settings]:
     """stage -> the profile's parameters but for `SIZES`, `WEIGHTS` and `HERE`."""
     said = resolve(Request(ROOT, ROOT / "runs", "", profile="paper"), scene=False).params
     found = {}
@@ -99,18 +100,18 @@ def parameters(weights: Path) -> dict[str, Settings]:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """Every stage's folder."""
+def stage_outputs(tmp_path_factory):
+    """Stage -> its folder after the run."""
     home = tmp_path_factory.mktemp("paper")
     paths = {name: home / name for name in ("scene", "poses", "raw_masks", "fit", *STAGES)}
     for name, shape in (("sd2", full_size.SD2), ("sdxl", full_size.SDXL)):
         prior = full_size.build_prior(full_size.shrink(shape), torch.float32)
         pipeline(replace(prior, zero_empty=True)).save_pretrained(home / name)
-    network_of_the_tilt().save_pretrained(home / "depth")
-    small.write(home, 1.5)
-    small.write_photos(paths["scene"], paths["poses"], small.CAMERAS)
-    tilted(paths["fit"])
-    params = parameters(home)
+    network_that_sees_the_tilt().save_pretrained(home / "depth")
+    wall_scene.write_poses_and_fit(home, 1.5)
+    wall_scene.write_capture_photos(paths["scene"], paths["poses"], wall_scene.CAMERAS)
+    tilt_wall(paths["fit"])
+    params = small_paper_params(home)
     for stage, needs in STAGES.items():
         paths[stage].mkdir(exist_ok=True)
         module = importlib.import_module(f"stages.{stage}")
@@ -118,20 +119,20 @@ def made(tmp_path_factory):
     return paths
 
 
-def test_the_consistent_mask_is_the_mask_of_every_term(made):
-    sets = load_mask_sets(made["masks"], small.CAMERAS)
+def test_the_consistent_mask_is_the_mask_of_every_term(stage_outputs):
+    sets = load_mask_sets(stage_outputs["masks"], wall_scene.CAMERAS)
     assert all((each.invent == each.consistent).all() and each.invent.any() for each in sets.values())
-    scene = load_scene(made["poses"])
-    (reference,) = load_references(made["reference"], scene)
-    name = load_json(made["masks"] / "facts.json")["best_reference"]
+    scene = load_scene(stage_outputs["poses"])
+    (reference,) = load_references(stage_outputs["reference"], scene)
+    name = load_json(stage_outputs["masks"] / "facts.json")["best_reference"]
     assert reference.camera.name == name and (reference.mask == sets[name].consistent).all()
-    photo = load_image(made["poses"] / "images" / f"{name}.png")
+    photo = load_image(stage_outputs["poses"] / "images" / f"{name}.png")
     outside = ~reference.mask
     assert (reference.image[outside] == photo[outside]).all() and (reference.image != photo).any()
 
 
-def test_personalization_leaves_the_papers_lora(made):
-    header = (made["personalize"] / "pytorch_lora_weights.safetensors").read_bytes()
+def test_personalization_leaves_the_papers_lora(stage_outputs):
+    header = (stage_outputs["personalize"] / "pytorch_lora_weights.safetensors").read_bytes()
     facts = json.loads(header[8 : 8 + int.from_bytes(header[:8], "little")])
     shapes = {name.rpartition(".lora")[0]: each["shape"] for name, each in facts.items() if "lora_A" in name}
     assert {shape[0] for shape in shapes.values()} == {8} and any("text_encoder" in name for name in shapes)
@@ -139,8 +140,8 @@ def test_personalization_leaves_the_papers_lora(made):
     assert [said[f"{part}.{name}"] for part in ("unet", "text_encoder") for name in ("r", "lora_alpha")] == [8, 16] * 2
 
 
-def test_every_term_works_and_masked_gaussians_multiply(made):
-    lines = read_trace(made["distill"] / "trace.jsonl")
+def test_every_term_works_and_masked_gaussians_multiply(stage_outputs):
+    lines = read_trace(stage_outputs["distill"] / "trace.jsonl")
     last, first = lines[-1], lines[0]
     assert last["iteration"] == 9 and last["reason"] == "finished"
     assert last["sds_gradient_max"] > 0 and last["depth"] > 0 and last["reconstruction"] > 0
@@ -148,11 +149,14 @@ def test_every_term_works_and_masked_gaussians_multiply(made):
     assert not [name for name in last if name.startswith("depth_skipped")]
     assert last["masked_gaussians"] > first["masked_gaussians"]
     assert last["gaussians"] - last["masked_gaussians"] == first["gaussians"] - first["masked_gaussians"]
-    assert load_json(made["initialize"] / "facts.json")["floaters"] == 0
-    assert not (made["initialize"] / "extra_views").exists() and not (made["initialize"] / "shadows").exists()
+    assert load_json(stage_outputs["initialize"] / "facts.json")["floaters"] == 0
+    assert (
+        not (stage_outputs["initialize"] / "extra_views").exists()
+        and not (stage_outputs["initialize"] / "shadows").exists()
+    )
 
 
-def test_the_scores_are_those_of_a_scene_with_noise_in_its_hole(made):
-    mean = load_json(made["evaluate"] / "metrics.json")["mean"]
+def test_the_scores_are_those_of_a_scene_with_noise_in_its_hole(stage_outputs):
+    mean = load_json(stage_outputs["evaluate"] / "metrics.json")["mean"]
     assert mean["psnr_outside"] > 30 > 20 > mean["psnr_box"] > 5
-    assert {path.stem for path in (made["evaluate"] / "renders").iterdir()} == set(small.TEST)
+    assert {path.stem for path in (stage_outputs["evaluate"] / "renders").iterdir()} == set(wall_scene.TEST)

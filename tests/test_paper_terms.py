@@ -1,4 +1,4 @@
-"""Where code and paper once parted: what supervises, what stands for what, prompts, masks, step sizes, colours."""
+"""Details in which the code follows the paper: supervision, references, prompts, masks, step sizes, colours."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import small_scene as small
 import torch
-from small_params import altered
-from small_prior import small_prior
-from test_distill import camera, train_view, wall
+from scenes import wall_scene
+from scenes.distill_scene import random_wall, train_view, wall_camera
+from scenes.networks import small_prior
+from scenes.settings import with_changes
+from scenes.stage_runs import run_masks
 
 from reffusion.background.model import Background
 from reffusion.capture import image_detail
@@ -45,34 +46,29 @@ ROOT = Path(__file__).resolve().parent.parent
 NEAR = 1.6
 
 
-@pytest.fixture(scope="module")
-def prior():
-    return small_prior()
-
-
 # ------------------------------------------------------------------------------------------------ what supervises
 
 
 @pytest.fixture(scope="module")
-def views_of(tmp_path_factory):
-    """(parameters) -> the training views of a scene where I lies beside C, and view a3 has no I."""
+def load_views_with(tmp_path_factory):
+    """A function from parameters to training views (I lies beside C, and view a3 has no I), and both masks."""
     home = tmp_path_factory.mktemp("insertion")
-    poses, fitted, _ = small.write(home, NEAR, clean=("a4",))
-    hidden, drawn, none = (np.zeros((small.HEIGHT, small.WIDTH), bool) for _ in range(3))
+    poses, fitted, _ = wall_scene.write_poses_and_fit(home, NEAR, clean=("a4",))
+    hidden, drawn, none = (np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool) for _ in range(3))
     hidden[20:40, 10:30], drawn[20:40, 50:70] = True, True
-    sets = {name: MaskSet(none, hidden, none, none if name == "a3" else drawn) for name in small.CAMERAS}
+    sets = {name: MaskSet(none, hidden, none, none if name == "a3" else drawn) for name in wall_scene.CAMERAS}
     save_mask_sets(home / "masks", sets)
     space = Workspace(poses, fitted, home / "masks")
 
     def made(**changes):
-        views = inputs.load_train_views(altered(Params(), **changes), space)
+        views = inputs.load_train_views(with_changes(Params(), **changes), space)
         return {view.camera.name: view for view in views}
 
     return made, torch.from_numpy(hidden), torch.from_numpy(drawn)
 
 
-def test_photographs_do_not_supervise_where_an_object_is_drawn(views_of):
-    made, hidden, drawn = views_of
+def test_photographs_do_not_supervise_where_an_object_is_drawn(load_views_with):
+    made, hidden, drawn = load_views_with
     views = made()
     assert torch.equal(views["a0"].supervises, ~(hidden | drawn)) and torch.equal(views["a3"].supervises, ~hidden)
     assert views["a4"].clean and views["a4"].supervises.all()
@@ -80,8 +76,8 @@ def test_photographs_do_not_supervise_where_an_object_is_drawn(views_of):
     assert torch.equal(not_seen, hidden | drawn)
 
 
-def test_a_view_without_invented_pixels_is_distilled_where_c_is_repainted(views_of):
-    made, hidden, _ = views_of
+def test_a_view_without_invented_pixels_is_distilled_where_c_is_repainted(load_views_with):
+    made, hidden, _ = load_views_with
     assert not made(repaint="invent")["a3"].repaint.any()
     views = made(repaint="consistent")
     assert torch.equal(views["a3"].repaint, hidden) and not views["a4"].repaint.any()
@@ -91,7 +87,7 @@ def test_the_refit_is_not_supervised_where_an_object_is_drawn(tmp_path, monkeypa
     found = {}
     monkeypatch.setattr(draft_steps, "refit", lambda scene, exact, known, *_: found.update(known.hidden) or scene)
     masked, invent = np.eye(4, dtype=bool), np.eye(4, dtype=bool)[::-1]
-    background = Background([type("View", (), {"camera": camera(), "masked": masked})], {})
+    background = Background([type("View", (), {"camera": wall_camera(), "masked": masked})], {})
     scene = type("Scene", (), {"clean": (), "blank": ()})
     sets = {"a": MaskSet(masked, masked, invent, invent)}
     draft = Draft(None, torch.zeros(0, dtype=torch.bool))
@@ -102,17 +98,11 @@ def test_the_refit_is_not_supervised_where_an_object_is_drawn(tmp_path, monkeypa
 def test_a_clean_view_can_be_a_reference(tmp_path):
     """The stages on it: its hole is C, and what is behind the object lies where the wall is."""
     paths = {name: tmp_path / name for name in ("scene", "poses", "fit", "masks", "reference", "initialize")}
-    poses, fitted, _ = small.write(tmp_path, NEAR, clean=("a2",))
-    small.write_photos(paths["scene"], poses, small.CAMERAS)
-    for name in ("masks", "reference", "initialize"):
+    poses, fitted, _ = wall_scene.write_poses_and_fit(tmp_path, NEAR, clean=("a2",))
+    wall_scene.write_capture_photos(paths["scene"], poses, wall_scene.CAMERAS)
+    for name in ("reference", "initialize"):
         paths[name].mkdir()
-    masks.run(
-        masks.Params(invent="consistent"),
-        paths["masks"],
-        poses=poses,
-        raw_masks=poses.with_name("raw_masks"),
-        fit=fitted,
-    )
+    run_masks(poses, fitted, paths["masks"], masks.Params(invent="consistent"))
     given = {"view": "a2", "image": "images/a2.png"}
     asked = reference.Params(reference=given)
     reference.run(asked, paths["reference"], **{k: paths[k] for k in ("scene", "poses", "fit", "masks")})
@@ -135,7 +125,7 @@ def test_an_unadapted_prior_is_not_prompted_unless_asked():
     assert [job.params["distill"]["prompts"] for job in jobs] == ["sks", "empty", "sks", "empty", "sks"]
 
 
-def test_what_the_prior_is_told(prior, monkeypatch):
+def test_prompts_of_the_prior(prior, monkeypatch):
     monkeypatch.setattr(inputs, "load_prior", lambda *_, **__: prior)
     _, told = inputs.load_adapted_prior(Params(), None)
     _, nothing = inputs.load_adapted_prior(Params(prompts="empty"), None)
@@ -165,7 +155,7 @@ def test_colours_above_1_are_shown_as_1_and_may_only_come_back():
 
 
 def test_no_term_shows_a_prior_or_a_critic_colours_above_1(prior, monkeypatch):
-    gaussians, masked = wall()
+    gaussians, masked = random_wall()
     bright = replace(gaussians, sh=gaussians.sh + 3)
     seen = []
     encode, patches = diffusion.encode, adversarial.draw_patches
@@ -208,7 +198,7 @@ def test_output_projections_are_adapted_or_not(layers):
 
 
 def test_positions_step_by_the_cameras_extent_as_3dgs_has_it():
-    cameras = [camera("a", -0.3), camera("b", 0.3), camera("c", 0.0)]
+    cameras = [wall_camera("a", -0.3), wall_camera("b", 0.3), wall_camera("c", 0.0)]
     assert cameras_extent(cameras) == pytest.approx(1.1 * 0.3)
     for unit, factor in (("distance", 1.0), ("cameras", 1.1 * 0.3)):
         rates = step.learning_rates(LearningRates(means_unit=unit), cameras)

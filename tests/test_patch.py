@@ -1,4 +1,4 @@
-"""A scene from which someone deleted splats: found, filled without masks, and given back to the editor."""
+"""A scene from which splats were deleted in an editor: detected, filled without masks, and returned to the editor."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import json
 
 import numpy as np
 import pytest
-import small_scene as small
 import torch
 from plyfile import PlyData
-from small_capture import prepare, some_truth
+from scenes import wall_scene
+from scenes.capture import make_truth
+from scenes.edited_capture import EDITOR, FIELDS, plane_with_ball, remove_pictures, write_edited_capture
+from scenes.stage_runs import run_masks
 
 from reffusion.capture.layouts import ring
 from reffusion.fit import exposure
@@ -22,26 +24,16 @@ from reffusion.io.scene import load_mask_sets, load_scene
 from reffusion.splat import rasterizer
 from reffusion.types import Gaussians, Similarity
 from report import patch
-from stages import masks, poses
+from stages import poses
 from stages.plan import poses as planned
 
 NEAR = 1.7  # of the square before the wall, small_scene's
-EDITOR = ("x", "y", "z", "scale_0", "scale_1", "scale_2", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "rot_0", "rot_1",
-          "rot_2", "rot_3")  # fmt: skip
 HERE = Similarity(1.0, np.zeros(3))
-
-
-def cloud(count=4000):
-    """Positions on a plane and above it, and which of them are in a ball."""
-    draws = np.random.default_rng(0)
-    points = draws.uniform(-1, 1, (count, 3)) * (1, 1, 0.02)
-    points[: count // 4] = 0.1 * draws.normal(size=(count // 4, 3)) + (0.2, 0.1, 0.5)
-    return points, np.linalg.norm(points - (0.2, 0.1, 0.5), axis=1) < 0.3
 
 
 @pytest.mark.parametrize("turn", matching.AXIS_FLIPS)
 def test_deleted_splats_are_found_in_any_order_quantised_and_turned(turn):
-    points, deleted = cloud()
+    points, deleted = plane_with_ball()
     draws = np.random.default_rng(1)
     left = points[~deleted][draws.permutation(np.count_nonzero(~deleted))] * turn
     found = matching.match_gaussians(points, left.astype(np.float16).astype(np.float64))
@@ -52,38 +44,20 @@ def test_deleted_splats_are_found_in_any_order_quantised_and_turned(turn):
 
 
 def test_splats_on_each_other_are_matched_one_to_one():
-    points = np.repeat(cloud(500)[0], 2, axis=0)
+    points = np.repeat(plane_with_ball(500)[0], 2, axis=0)
     assert matching.match_gaussians(points, np.delete(points, 7, axis=0)).deleted.nonzero()[0].tolist() in ([6], [7])
 
 
 @pytest.mark.parametrize("moved", [lambda p: p + 0.3, lambda p: 1.3 * p, lambda p: p[:, [1, 2, 0]]])
-def test_what_was_moved_scaled_or_turned_otherwise_is_not_matched(moved):
-    points, deleted = cloud()
+def test_splats_with_changed_pose_or_size_are_not_matched(moved):
+    points, deleted = plane_with_ball()
     assert matching.match_gaussians(points, moved(points[~deleted])).found < matching.MIN_MATCHED_SHARE
 
 
 # ---------------------------------------------------------------------------------------------- the stage `poses`
 
 
-def edited(folder, scale=5.0, offset=(50.0, 0.0, 0.0)):
-    """A capture with its Gaussians, and those that an editor left: other properties, order and degree."""
-    truth = some_truth(scale=scale, offset=offset)
-    points, deleted = cloud()
-    means = torch.from_numpy(points * scale + offset).float()
-    draw = lambda *shape: torch.rand(*shape, generator=torch.Generator().manual_seed(0))
-    count = len(points)
-    whole = Gaussians(means, draw(count, 4), draw(count, 3) - 3, draw(count) + 1, draw(count, 4, 3))
-    prepare(folder, "transforms", truth)
-    save_ply(folder / "scene.ply", whole, properties=EDITOR)
-    left = whole.map(lambda p: p[torch.from_numpy(~deleted)].flip(0))
-    save_ply(folder / "cleaned.ply", Gaussians(*(getattr(left, n) for n in FIELDS[:4]), left.sh[:, :1]))
-    return whole, deleted
-
-
-FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
-
-
-def placed(folder, **params):
+def run_poses_after_edit(folder, **params):
     out = folder.parent / f"{folder.name}_out"
     out.mkdir(exist_ok=True)
     given = poses.Params(gaussians="scene.ply", cleaned="cleaned.ply", **params)
@@ -94,11 +68,11 @@ def placed(folder, **params):
 
 @pytest.mark.parametrize("compressed", [False, True])
 def test_poses_says_which_splats_were_deleted(tmp_path, compressed, capsys):
-    whole, deleted = edited(tmp_path / "s")
+    whole, deleted = write_edited_capture(tmp_path / "s")
     if compressed:
         left = whole.map(lambda p: p[torch.from_numpy(~deleted)])
         save_compressed(tmp_path / "s" / "cleaned.ply", left, HERE)
-    out = placed(tmp_path / "s", masks="none")
+    out = run_poses_after_edit(tmp_path / "s", masks="none")
     assert np.count_nonzero(load_labels(out / "deleted.npy").numpy() != deleted) <= 2 * compressed
     assert f"{deleted.sum()} of 4000 splats were deleted" in capsys.readouterr().out
     brought = load_ply(out / "gaussians.ply", None)
@@ -108,27 +82,27 @@ def test_poses_says_which_splats_were_deleted(tmp_path, compressed, capsys):
     assert load_property_names(out / "gaussians.ply")[: len(EDITOR)] == EDITOR
 
 
-def refused(folder, message, **params):
+def assert_refusal(folder, message, **params):
     with pytest.raises(ValueError, match=message) as told:
-        placed(folder, **params)
+        run_poses_after_edit(folder, **params)
     assert "\n" not in str(told.value)
 
 
 def test_refusals_say_what_is_wrong_with_the_cleaned_scene(tmp_path):
     folder = tmp_path / "s"
-    whole, _ = edited(folder)
+    whole, _ = write_edited_capture(folder)
     left = load_ply(folder / "cleaned.ply")
     change = lambda made: save_ply(folder / "cleaned.ply", made)
     change(whole)
-    refused(folder, r"cleaned\.ply: 4000 splats, and .*scene\.ply has 4000: nothing was deleted")
+    assert_refusal(folder, r"cleaned\.ply: 4000 splats, and .*scene\.ply has 4000: nothing was deleted")
     change(left.map(lambda p: p[:0]))
-    refused(folder, r"cleaned\.ply: it holds no Gaussians: everything was deleted")
+    assert_refusal(folder, r"cleaned\.ply: it holds no Gaussians: everything was deleted")
     change(Gaussians(1.2 * left.means, *(getattr(left, name) for name in FIELDS[1:])))
-    refused(folder, r"cleaned\.ply: of its splats \d+% are where scene\.ply has one: .* moved, turned or scaled")
+    assert_refusal(folder, r"cleaned\.ply: of its splats \d+% are where scene\.ply has one: .* moved, turned or scaled")
     twice = whole.map(lambda p: torch.cat([p, p[:1]]))
     save_ply(folder / "scene.ply", twice)
     (folder / "cleaned.ply").unlink()
-    refused(folder, r"cleaned\.ply: no such file; correct `cleaned`")
+    assert_refusal(folder, r"cleaned\.ply: no such file; correct `cleaned`")
     change(left)
     with pytest.raises(ValueError, match="cleaned: name the scene before"):
         planned.preview(poses.Params(cleaned="cleaned.ply"), folder)
@@ -137,18 +111,13 @@ def test_refusals_say_what_is_wrong_with_the_cleaned_scene(tmp_path):
 # ---------------------------------------------------------------------------------------------- without photographs
 
 
-def without_pictures(folder):
-    for path in (*(folder / "images").iterdir(), *(folder / "masks").iterdir()):
-        path.unlink()
-
-
 def test_cameras_of_a_capture_look_at_renders(tmp_path):
     folder = tmp_path / "s"
-    edited(folder)
-    without_pictures(folder)
+    write_edited_capture(folder)
+    remove_pictures(folder)
     with pytest.warns(UserWarning, match=r"no photographs: the 6 cameras of .*transforms\.json look at"):
-        out = placed(folder)
-    scene, truth = load_scene(out), some_truth(scale=5.0, offset=(50.0, 0.0, 0.0))
+        out = run_poses_after_edit(folder)
+    scene, truth = load_scene(out), make_truth(scale=5.0, offset=(50.0, 0.0, 0.0))
     assert scene.train == tuple(sorted(truth.world_to_camera)) and not scene.test
     for name, pose in truth.world_to_camera.items():
         mine = scene.cameras[name].world_to_camera
@@ -158,20 +127,20 @@ def test_cameras_of_a_capture_look_at_renders(tmp_path):
     seen = exposure.load_normalized_views(out, out, ["v02"])["v02"]
     drawn = rasterizer.render(load_ply(out / "gaussians.ply"), scene.cameras["v02"]).color.numpy()
     np.testing.assert_allclose(seen / 255, drawn.clip(0, 1), atol=0.5 / 255 + 1e-6)
-    refused(folder, "scene.yaml: test: the scene has no photographs", test="every 8")
+    assert_refusal(folder, "scene.yaml: test: the scene has no photographs", test="every 8")
     record = json.loads((folder / "transforms.json").read_text())
     del record["w"]
     (folder / "transforms.json").write_text(json.dumps(record))
-    refused(folder, r"transforms\.json: neither pictures nor w and h")
+    assert_refusal(folder, r"transforms\.json: neither pictures nor w and h")
 
 
 def test_a_ring_of_cameras_sees_the_hole_from_above_what_it_stands_on(tmp_path):
     folder = tmp_path / "s"
-    _, deleted = edited(folder)
-    without_pictures(folder)
+    _, deleted = write_edited_capture(folder)
+    remove_pictures(folder)
     (folder / "transforms.json").unlink()
     with pytest.warns(UserWarning, match=r"no photographs: \d+ cameras around the hole"):
-        out = placed(folder, longest=64)
+        out = run_poses_after_edit(folder, longest=64)
     scene, means = load_scene(out), load_ply(out / "gaussians.ply").means.double().numpy()
     hole = means[deleted].mean(0)
     assert len(scene.train) > 5 and len(load_labels(out / "deleted.npy")) == len(means)
@@ -197,36 +166,35 @@ def test_a_walled_in_hole_is_in_sight_from_nowhere():
 # ---------------------------------------------------------------------------------------------- the stage `masks`
 
 
-def test_what_was_deleted_stands_for_votes(tmp_path):
-    folder, fit, labels = small.write(tmp_path, NEAR, masks={})
+def test_deleted_splats_replace_votes(tmp_path):
+    folder, fit, labels = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})
     save_labels(folder / "deleted.npy", labels)
-    (out := tmp_path / "masks").mkdir()
-    masks.run(masks.Params(), out, poses=folder, raw_masks=folder.with_name("raw_masks"), fit=fit)
+    out = run_masks(folder, fit, tmp_path / "masks")
     assert (load_labels(out / "labels.npy") | ~labels).all()
-    found = load_mask_sets(out, small.CAMERAS)
-    for name in small.TRAIN:
-        assert small.iou(found[name].consistent, small.true_mask(small.CAMERAS[name], NEAR)) > 0.9
-    assert load_json(out / "facts.json")["best_reference"] in small.TRAIN
+    found = load_mask_sets(out, wall_scene.CAMERAS)
+    for name in wall_scene.TRAIN:
+        assert wall_scene.iou(found[name].consistent, wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR)) > 0.9
+    assert load_json(out / "facts.json")["best_reference"] in wall_scene.TRAIN
 
 
 @pytest.mark.parametrize("moved", [(0.0, 0.0, -9.0), (0.9, 0.3, 0.0)])
 def test_gaussians_in_another_frame_than_the_cameras_are_refused(tmp_path, moved):
-    folder, fit, labels = small.write(tmp_path, NEAR, masks={})
+    folder, fit, labels = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})
     given = load_ply(fit / "gaussians.ply")
     shifted = Gaussians(given.means + torch.tensor(moved), *(getattr(given, name) for name in FIELDS[1:]))
     for path in (folder, fit):
         save_ply(path / "gaussians.ply", shifted)
     save_labels(folder / "deleted.npy", labels)
     with pytest.raises(ValueError, match=r"`gaussians` of scene\.yaml: .* in another frame"):
-        masks.run(masks.Params(), tmp_path, poses=folder, raw_masks=folder.with_name("raw_masks"), fit=fit)
+        run_masks(folder, fit, tmp_path)
 
 
 # ---------------------------------------------------------------------------------------------- what is given back
 
 
 def test_the_patch_is_given_back_as_the_editor_wrote_the_scene(tmp_path):
-    edited(tmp_path / "s")
-    out = placed(tmp_path / "s", masks="none")
+    write_edited_capture(tmp_path / "s")
+    out = run_poses_after_edit(tmp_path / "s", masks="none")
     home = tmp_path / "runs" / "s"
     home.mkdir(parents=True)
     out.rename(home / "poses")
@@ -254,14 +222,14 @@ def test_the_patch_is_given_back_as_the_editor_wrote_the_scene(tmp_path):
 def test_exported_cameras_are_a_capture_without_photographs(tmp_path):
     """What `export` wrote is what `patch` takes."""
     folder = tmp_path / "s"
-    edited(folder)
-    out = placed(folder, masks="none")
+    write_edited_capture(folder)
+    out = run_poses_after_edit(folder, masks="none")
     for name in ("transforms.json", "images", "masks"):
         (folder / name).rename(tmp_path / name)
     save_cameras(folder, load_scene(out), "images")
     (folder / "transforms.json").unlink()
     with pytest.warns(UserWarning, match=r"no photographs: the 6 cameras of .*sparse/0"):
-        again = load_scene(placed(folder))
+        again = load_scene(run_poses_after_edit(folder))
     was = load_scene(out)
     for name, camera in was.cameras.items():
         place = was.similarity.invert(camera.center)

@@ -1,20 +1,19 @@
-"""`reffusion patch before.ply after.ply --out patched.ply`: refusals, the folder it works in, what it writes, and the
-cameras that it finds around a hole."""
+"""The command `reffusion patch before.ply after.ply --out patched.ply`: refusals, its folder, its output, and cameras
+around a hole."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from test_io import some_gaussians
-from test_patch import edited, without_pictures
+from scenes.edited_capture import remove_pictures, write_edited_capture
+from scenes.processes import run_module
+from scenes.random_scene import random_gaussians
 
 from reffusion.capture.layouts import ring
 from reffusion.gaussians import matching
@@ -31,28 +30,23 @@ ROOT = Path(__file__).resolve().parent.parent
 FRAME = Similarity(0.31, np.array([1.5, -20.0, 4.0]))
 
 
-def command(*words: object, cwd: Path = ROOT, **options) -> subprocess.CompletedProcess:
-    line = [sys.executable, "-m", "reffusion.command", "patch", *map(str, words)]
-    return subprocess.run(line, cwd=cwd, capture_output=True, text=True, **options)
-
-
 @pytest.fixture
-def files(tmp_path):
+def splat_files(tmp_path):
     """before.ply and after.ply, 300 splats and 250."""
-    made = some_gaussians(300, 1)
+    made = random_gaussians(300, 1)
     save_ply(tmp_path / "before.ply", made)
     save_ply(tmp_path / "after.ply", made.map(lambda p: p[50:]))
     return tmp_path / "before.ply", tmp_path / "after.ply"
 
 
-def arguments(before, after, out, **others) -> argparse.Namespace:
+def parse_arguments(before, after, out, **others) -> argparse.Namespace:
     given = {"scene": None, "variant": "", "runs": Path(before).parent / "runs", "cameras": None, "profile": "laptop"}
     given |= {"budget": None, "set": "", **others}
     return argparse.Namespace(files=[before, after], out=out, **given)
 
 
-def test_what_is_wrong_is_said_in_one_line(files, tmp_path):
-    before, after = files
+def test_errors_are_one_line(splat_files, tmp_path):
+    before, after = splat_files
     out = tmp_path / "patched.ply"
     (tmp_path / "s.ksplat").write_bytes(bytes(4096))
     for given, message in (
@@ -70,14 +64,25 @@ def test_what_is_wrong_is_said_in_one_line(files, tmp_path):
         ((before, after, "--out", out, "--cameras", tmp_path / "no"), f"{tmp_path / 'no'}: no such folder; --cameras "
          "names one with transforms.json or sparse/0"),
     ):  # fmt: skip
-        ended = command(*given)
+        ended = run_module("reffusion.command", "patch", *given)
         assert (ended.returncode, ended.stderr) == (2, f"error: {message}\n")
         assert not (tmp_path / "runs").exists()
 
 
-def test_a_stage_that_refuses_ends_the_command(files, tmp_path):
-    before, after = files
-    ended = command(after, before, "--out", tmp_path / "x.ply", "--runs", tmp_path / "runs", "--profile", "laptop")
+def test_a_stage_that_refuses_ends_the_command(splat_files, tmp_path):
+    before, after = splat_files
+    ended = run_module(
+        "reffusion.command",
+        "patch",
+        after,
+        before,
+        "--out",
+        tmp_path / "x.ply",
+        "--runs",
+        tmp_path / "runs",
+        "--profile",
+        "laptop",
+    )
     errors = [line for line in ended.stderr.splitlines() if line.startswith("error: ")]
     assert ended.returncode == 2 and len(errors) == 1 and "nothing was deleted" in errors[0]
     assert "Traceback" not in ended.stderr and not (tmp_path / "x.ply").exists()
@@ -86,9 +91,9 @@ def test_a_stage_that_refuses_ends_the_command(files, tmp_path):
 def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
     """Two files alone, then with their cameras: the same folder."""
     made = tmp_path / "made"
-    _, deleted = edited(made)
-    without_pictures(made)
-    asked = arguments(made / "scene.ply", made / "cleaned.ply", tmp_path / "out.ply")
+    _, deleted = write_edited_capture(made)
+    remove_pictures(made)
+    asked = parse_arguments(made / "scene.ply", made / "cleaned.ply", tmp_path / "out.ply")
     patch_files.check_arguments(asked)
     folder = patch_files.write_scene_folder(asked)
     assert folder == patch_files.find_folder(asked.runs, *asked.files) and folder.name.startswith("scene-patch-")
@@ -101,7 +106,7 @@ def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
     (made / "cameras").mkdir()
     (made / "transforms.json").rename(made / "cameras" / "transforms.json")
     time = (folder / "scene.yaml").stat().st_mtime_ns
-    again = patch_files.write_scene_folder(arguments(*asked.files, asked.out, cameras=made / "cameras"))
+    again = patch_files.write_scene_folder(parse_arguments(*asked.files, asked.out, cameras=made / "cameras"))
     assert again == folder and (folder / "painted" / "around_00.png").read_text() == "mine"
     assert (folder / "scene.yaml").stat().st_mtime_ns == time
     assert "no photographs: 6 cameras of transforms.json" in planned.preview(params, folder)[0]
@@ -117,10 +122,10 @@ def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
 @pytest.mark.parametrize(
     ("ending", "within"), [(".ply", 1e-6), (".splat", 1e-6), (".spz", 2e-5), (".compressed.ply", 0.2)]
 )
-def test_the_ending_says_the_format(tmp_path, ending, within):
+def test_the_suffix_chooses_the_format(tmp_path, ending, within):
     if ending in (".spz", ".compressed.ply"):
         pytest.importorskip("gsply")
-    made, path = some_gaussians(300, 1), tmp_path / f"out{ending}"
+    made, path = random_gaussians(300, 1), tmp_path / f"out{ending}"
     check_can_save(path)
     save_splats(path, made, FRAME, ("x", "y", "z", "opacity"))
     read, means = load_ply(path), torch.from_numpy(FRAME.invert(made.means.double().numpy())).float()
@@ -135,13 +140,14 @@ def test_the_ending_says_the_format(tmp_path, ending, within):
 
 def test_export_writes_the_scene_with_the_object_too(tmp_path):
     pytest.importorskip("gsply")
-    from test_export import scene
+
+    from test_export import random_scene_in_frame
 
     from reffusion.io.scene import save_scene
 
-    home, given = tmp_path / "s", some_gaussians(200, 1)
-    save_scene(home / "poses", scene())
-    save_ply(home / "evaluate" / "scene.ply", some_gaussians(300, 1), FRAME)
+    home, given = tmp_path / "s", random_gaussians(200, 1)
+    save_scene(home / "poses", random_scene_in_frame())
+    save_ply(home / "evaluate" / "scene.ply", random_gaussians(300, 1), FRAME)
     save_ply(home / "fit" / "gaussians.ply", given)
     said = export.make(home)
     before, cameras = home / "export/with_object.ply", home / "export/cameras"
@@ -186,8 +192,8 @@ def test_some_splats_that_moved_a_little_are_still_found():
 # ---------------------------------------------------------------------------------------------- cameras
 
 
-def room(*walls: str) -> tuple[np.ndarray, np.ndarray]:
-    """Splats of a floor and of walls, and of a ball on the floor in front of the wall at the back; bool, the ball's."""
+def sample_room(*walls: str) -> tuple[np.ndarray, np.ndarray]:
+    """Splats of a floor, of walls, and of a ball on the floor before the back wall; bool [N]: the ball."""
     draws = np.random.default_rng(0)
     sheets = [draws.uniform((-1, -1, 0), (1, 1, 0), (6000, 3))]
     sheets += [draws.uniform((-1, 1, 0), (1, 1, 1), (6000, 3))] if "back" in walls else []
@@ -200,7 +206,7 @@ def room(*walls: str) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("walls", [(), ("back",), ("back", "left")])
 def test_cameras_of_an_open_room_stand_in_it(walls):
-    means, deleted = room(*walls)
+    means, deleted = sample_room(*walls)
     found = ring.place_cameras(means, np.full(len(means), 0.02), np.ones(len(means), bool), deleted, 96)
     assert len(found.lenses) >= 3
     for pose in found.world_to_camera.values():
@@ -216,10 +222,10 @@ def test_cameras_of_an_open_room_stand_in_it(walls):
 
 @pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="minutes; set REFFUSION_SLOW=1")
 def test_the_command_fills_a_hole_and_goes_on(tmp_path):
-    means, deleted = room("back")
+    means, deleted = sample_room("back")
     count = len(means)
     draw = lambda *shape: torch.rand(*shape, generator=torch.Generator().manual_seed(0))
-    made = some_gaussians(count, 0)
+    made = random_gaussians(count, 0)
     whole = type(made)(
         torch.from_numpy(means).float(), made.quaternions, torch.full((count, 3), np.log(0.03)).float(),
         torch.full((count,), 4.0), draw(count, 1, 3) - 0.5,
@@ -235,11 +241,11 @@ def test_the_command_fills_a_hole_and_goes_on(tmp_path):
         tmp_path / "runs",
     ]
     words += ["--profile", "laptop", "--set", "poses.longest=96 initialize.refit_steps=20 distill.iterations=4"]
-    first = command(*words)
+    first = run_module("reffusion.command", "patch", *words)
     assert first.returncode == 0, first.stdout + first.stderr
     assert f"{tmp_path / 'out.ply'}: the whole scene" in first.stdout and "painted" in first.stdout
     assert len(load_ply(tmp_path / "out.ply")) > np.count_nonzero(~deleted)
-    again = command(*words)
+    again = run_module("reffusion.command", "patch", *words)
     assert again.returncode == 0 and "no artifact yet" not in again.stdout
     with pytest.raises(BadInput):
         load_ply(tmp_path)

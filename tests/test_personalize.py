@@ -1,11 +1,11 @@
-"""Personalization: which pixels a sample may show, what the loss measures, that training learns, resumes and stops."""
+"""Personalization: the pixels of a sample, the loss, learning, resume and early stops."""
 
 from dataclasses import replace
 
 import pytest
 import torch
-from small_params import altered
-from small_prior import small_prior
+from scenes.networks import small_prior
+from scenes.settings import with_changes
 
 from reffusion import trace
 from reffusion.params.personalize import Params, TrainingSamples
@@ -22,11 +22,11 @@ TRAINING = Params(
 
 
 @pytest.fixture
-def tiny():
+def fresh_prior():
     return small_prior()
 
 
-def striped(height=70, width=90):
+def striped_reference(height=70, width=90):
     """A reference of diagonal stripes, its hole in the middle."""
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     image = torch.stack([128 + 100 * torch.sin((rows + k * columns) / 4) for k in (1, 2, 3)], 2)
@@ -69,7 +69,7 @@ def test_global_samples_lose_a_thin_border_only():
 @pytest.mark.parametrize("size", [SIZE, NATIVE])
 def test_samples_masked_by_the_hole_show_it_where_it_is(local_share, size, monkeypatch):
     """The striped picture with its hole painted white: mask and white pixels must be the same."""
-    source = striped()
+    source = striped_reference()
     source = crops.Picture(torch.where(source.region, 1.0, source.image.clamp(max=0)), source.region)
     chosen = TrainingSamples(local_share=local_share, hole_share=1.0)
     monkeypatch.setattr(crops, "EMPTY_SHARE", 0.0)
@@ -82,7 +82,7 @@ def test_samples_masked_by_the_hole_show_it_where_it_is(local_share, size, monke
 
 
 def test_local_samples_show_the_hole_in_full_resolution_and_prompts_follow(monkeypatch):
-    view = striped()
+    view = striped_reference()
 
     def draw_samples(count, size, share, empty):
         monkeypatch.setattr(crops, "EMPTY_SHARE", empty)
@@ -100,9 +100,9 @@ def test_local_samples_show_the_hole_in_full_resolution_and_prompts_follow(monke
 
 
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction"])
-def test_loss_is_the_priors_own_and_its_clean_latent_error_is_predicts(tiny, kind):
-    prior, draw = replace(tiny, prediction_type=kind), generator(4)
-    samples = crops.draw_samples([striped()], NATIVE, SIZE, 3, TrainingSamples(), draw)
+def test_loss_is_the_priors_own_and_its_clean_latent_error_is_predicts(fresh_prior, kind):
+    prior, draw = replace(fresh_prior, prediction_type=kind), generator(4)
+    samples = crops.draw_samples([striped_reference()], NATIVE, SIZE, 3, TrainingSamples(), draw)
     t, noise = torch.tensor([10, 500, 950]), torch.randn(3, 4, SIZE, SIZE, generator=draw)
     with torch.no_grad():
         words = diffusion.embed_text(prior, list(crops.PROMPTS))
@@ -116,19 +116,19 @@ def test_loss_is_the_priors_own_and_its_clean_latent_error_is_predicts(tiny, kin
         torch.testing.assert_close(error, (eps - noise).square().mean((1, 2, 3)))
 
 
-def test_what_a_mask_leaves_to_be_seen_counts_by_its_weight(tiny):
+def test_what_a_mask_leaves_to_be_seen_counts_by_its_weight(fresh_prior):
     draw = generator(5)
-    samples = crops.draw_samples([striped()], NATIVE, SIZE, 3, TrainingSamples(), draw)
+    samples = crops.draw_samples([striped_reference()], NATIVE, SIZE, 3, TrainingSamples(), draw)
     t, noise = torch.tensor([10, 500, 950]), torch.randn(3, 4, SIZE, SIZE, generator=draw)
     with torch.no_grad():
-        latents = diffusion.encode(tiny, samples.images)
-        condition = diffusion.conditioning(tiny, samples.images, samples.masks)
-        noisy = diffusion.add_noise(tiny, latents, noise, t)
-        words = diffusion.embed_text(tiny, list(crops.PROMPTS))
-        wrong = diffusion.raw_prediction(tiny, noisy, t, condition, words[samples.prompts])
-        wrong = (wrong - diffusion.training_target(tiny, latents, noise, t)).square().mean(1, keepdim=True)
+        latents = diffusion.encode(fresh_prior, samples.images)
+        condition = diffusion.conditioning(fresh_prior, samples.images, samples.masks)
+        noisy = diffusion.add_noise(fresh_prior, latents, noise, t)
+        words = diffusion.embed_text(fresh_prior, list(crops.PROMPTS))
+        wrong = diffusion.raw_prediction(fresh_prior, noisy, t, condition, words[samples.prompts])
+        wrong = (wrong - diffusion.training_target(fresh_prior, latents, noise, t)).square().mean(1, keepdim=True)
         for weight in (1.0, 0.2, 1e-6):
-            error, _ = denoising.denoising_error(tiny, samples, words, t, noise, weight)
+            error, _ = denoising.denoising_error(fresh_prior, samples, words, t, noise, weight)
             of_each = samples.masks + weight * (1 - samples.masks)
             torch.testing.assert_close(error, (of_each * wrong).sum((1, 2, 3)) / of_each.sum((1, 2, 3)))
 
@@ -140,20 +140,20 @@ def test_learning_rate_warms_up_and_falls():
     assert P.learning_rate_factor(0, 100, 0, "constant") == 1
 
 
-def test_training_learns_the_reference_and_logs_it(tiny, tmp_path):
-    trained = lora.attach(tiny, 8, 16, 0.1, "attention+conv", 0)
-    training = altered(TRAINING, steps=60, optimizer={"batch": 4, "lr_unet": 4e-3})
-    P.personalize(tiny, trained, [striped()], training, tmp_path)
+def test_training_learns_the_reference_and_logs_it(fresh_prior, tmp_path):
+    trained = lora.attach(fresh_prior, 8, 16, 0.1, "attention+conv", 0)
+    training = with_changes(TRAINING, steps=60, optimizer={"batch": 4, "lr_unet": 4e-3})
+    P.personalize(fresh_prior, trained, [striped_reference()], training, tmp_path)
     records = read_trace(tmp_path / "trace.jsonl")
     assert [records[0]["iteration"], records[-1]["iteration"]] == [0, 60]
     assert records[-1]["target_mse"] < 0.9 * records[0]["target_mse"]
     assert records[-1]["clean_latent_mse"] < records[0]["clean_latent_mse"]
-    assert not tiny.unet.training
+    assert not fresh_prior.unet.training
 
 
-def test_photographs_are_measured_by_and_not_learnt_from(tiny, tmp_path):
+def test_photographs_are_measured_by_and_not_learnt_from(fresh_prior, tmp_path):
     """Its hole lies beside the object; what is painted there, and nothing else, counts."""
-    reference = striped()
+    reference = striped_reference()
     thing = torch.zeros(70, 90, dtype=torch.bool)
     thing[:, :45] = True
     photograph = reference.image.flip(2)
@@ -180,8 +180,8 @@ def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch)
     def trained(folder):
         prior = small_prior()
         trained = lora.attach(prior, 4, 8, 0.1, "attention", 0)
-        training = altered(TRAINING, optimizer={"schedule": "cosine", "warm_up": 2}, checkpoint_seconds=1e-9)
-        P.personalize(prior, trained, [striped()], training, folder)
+        training = with_changes(TRAINING, optimizer={"schedule": "cosine", "warm_up": 2}, checkpoint_seconds=1e-9)
+        P.personalize(prior, trained, [striped_reference()], training, folder)
         return lora.state(prior)
 
     (tmp_path / "whole").mkdir()
@@ -206,11 +206,13 @@ def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch)
     assert errors("whole") == errors("broken")
 
 
-def test_a_number_that_is_none_stops_the_training_and_names_the_step(tiny, tmp_path):
-    trained = lora.attach(tiny, 4, 8, 0.0, "attention", 0)
-    broken = replace(striped(), image=torch.full((3, 70, 90), float("nan")))
+def test_nan_stops_the_training_and_names_the_step(fresh_prior, tmp_path):
+    trained = lora.attach(fresh_prior, 4, 8, 0.0, "attention", 0)
+    broken = replace(striped_reference(), image=torch.full((3, 70, 90), float("nan")))
     with pytest.raises(FloatingPointError, match="step 0"):
-        P.personalize(tiny, trained, [broken], TRAINING, tmp_path)
-    assert all(torch.isfinite(w).all() for w in lora.state(tiny).values())
+        P.personalize(fresh_prior, trained, [broken], TRAINING, tmp_path)
+    assert all(torch.isfinite(w).all() for w in lora.state(fresh_prior).values())
     with pytest.raises(ValueError, match="native 16 px"):
-        P.personalize(tiny, trained, [striped()], altered(TRAINING, samples={"size": 128}), tmp_path)
+        P.personalize(
+            fresh_prior, trained, [striped_reference()], with_changes(TRAINING, samples={"size": 128}), tmp_path
+        )

@@ -14,7 +14,7 @@ import pytest
 import torch
 import yaml
 from PIL import Image
-from small_capture import (
+from scenes.capture import (
     FISHEYE,
     HEIGHT,
     OPENCV,
@@ -23,11 +23,12 @@ from small_capture import (
     WIDTH,
     Truth,
     load_test_masks,
-    prepare,
+    make_truth,
+    real_capture,
     reprojection_error,
-    run,
     run_stages,
-    some_truth,
+    run_stages_into,
+    write_capture,
     write_masks,
     write_model,
     write_pictures,
@@ -51,14 +52,12 @@ from stages import fit, poses, raw_masks
 from stages.plan import poses as plan
 from stages.plan import raw_masks as raw_masks_plan
 
-CAPTURES = Path(__file__).parents[2] / "shared" / "data"
-
 
 @pytest.mark.parametrize("model", [PINHOLE, RADIAL, OPENCV, FISHEYE], ids=lambda m: m[0])
 @pytest.mark.parametrize("layout", ["llff+bin", "llff+txt", "colmap", "colmap txt", "transforms", "transforms each"])
 def test_every_layout_keeps_the_projection(tmp_path, layout, model):
-    truth = some_truth(model, scale=7.0, offset=(100.0, -30.0, 5.0))
-    scene, out = run(prepare(tmp_path / "s", layout, truth))
+    truth = make_truth(model, scale=7.0, offset=(100.0, -30.0, 5.0))
+    scene, out = run_stages(write_capture(tmp_path / "s", layout, truth))
     assert reprojection_error(scene, truth) < 1e-3
     assert sorted(scene.cameras) == sorted(truth.world_to_camera) == list(scene.train) and not scene.test
     assert len(load_raw_masks(out, scene.train)) == 6
@@ -67,54 +66,54 @@ def test_every_layout_keeps_the_projection(tmp_path, layout, model):
 
 
 def test_llff_alone_keeps_the_projection(tmp_path):
-    truth = some_truth()
-    scene, _ = run(prepare(tmp_path / "s", "llff", truth))
+    truth = make_truth()
+    scene, _ = run_stages(write_capture(tmp_path / "s", "llff", truth))
     assert reprojection_error(scene, truth) < 1e-3
     assert len(scene.points) == 10_000  # drawn between the bounds
 
 
 def test_the_models_poses_win_over_poses_bounds(tmp_path):
-    truth = some_truth(RADIAL)
-    folder = prepare(tmp_path / "s", "llff+bin", truth)
+    truth = make_truth(RADIAL)
+    folder = write_capture(tmp_path / "s", "llff+bin", truth)
     rows = np.load(folder / "poses_bounds.npy")
     rows[:, 3] += 0.1
     np.save(folder / "poses_bounds.npy", rows)
-    assert reprojection_error(run(folder)[0], truth) < 1e-3
+    assert reprojection_error(run_stages(folder)[0], truth) < 1e-3
 
 
 def test_llff_copies_renamed_by_number_are_matched_in_order(tmp_path):
-    truth = some_truth()
+    truth = make_truth()
     write_pictures(tmp_path / "s" / "images_4", [f"image{k:03d}" for k in range(6)])
     write_masks(tmp_path / "s" / "images_4" / "label", [f"image{k:03d}" for k in range(6)])
     write_model(tmp_path / "s" / "sparse" / "0", truth, factor=4)
     write_poses_bounds(tmp_path / "s", truth)
-    scene, _ = run(tmp_path / "s")
+    scene, _ = run_stages(tmp_path / "s")
     renamed = {f"image{k:03d}": truth.world_to_camera[f"v{k:02d}"] for k in range(6)}
     assert reprojection_error(scene, replace(truth, world_to_camera=renamed)) < 1e-3
 
 
 @pytest.mark.parametrize("shifted", [False, True])
 def test_points_without_images_bin_are_taken_only_in_the_right_frame(tmp_path, monkeypatch, shifted):
-    truth = some_truth()
-    folder = prepare(tmp_path / "s", "llff+bin", truth)
+    truth = make_truth()
+    folder = write_capture(tmp_path / "s", "llff+bin", truth)
     (folder / "sparse/0/images.bin").unlink()
     if shifted:
         records = replace(truth, points=truth.points + np.array([30.0, 0.0, 0.0]))
         write_model(folder / "sparse" / "0", records, factor=4)
         (folder / "sparse/0/images.bin").unlink()
         with pytest.warns(UserWarning, match=r"points3D\.bin.*not in the frame"):
-            scene, _ = run(folder)
+            scene, _ = run_stages(folder)
         assert len(scene.points) == 10_000
     else:
         monkeypatch.setattr(poses, "LEAST_POINTS", 1)
-        scene, _ = run(folder)
+        scene, _ = run_stages(folder)
         np.testing.assert_allclose(scene.similarity.invert(scene.points), truth.points, atol=1e-9)
 
 
 @pytest.mark.parametrize("mask_value", [1, 255])
 def test_spin_nerf_split_and_masks(tmp_path, mask_value):
     write_spin_nerf(tmp_path / "s", mask_value=mask_value)
-    scene, out = run(tmp_path / "s", longest=WIDTH)
+    scene, out = run_stages(tmp_path / "s", longest=WIDTH)
     assert scene.test == ("v00", "v01") and scene.train == ("v02", "v03", "v04", "v05")
     assert sorted(load_raw_masks(out, scene.cameras)) == list(scene.train)
     labels = load_test_masks(out)
@@ -126,12 +125,12 @@ def test_spin_nerf_split_and_masks(tmp_path, mask_value):
 
 def test_cameras_without_pixels_stay(tmp_path):
     """Their pictures are no part of what is read, and one training view is enough beside them."""
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
-    everyone, out = run(folder)
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
+    everyone, out = run_stages(folder)
     for path in (folder / "masks", out):
         shutil.rmtree(path)
     asked = {"train": ["v01"], "test": ["v04"], "clean": ["v01"], "cameras_only": "others"}
-    scene, out = run(folder, **asked)
+    scene, out = run_stages(folder, **asked)
     assert scene.blank == ("v00", "v02", "v03", "v05") and scene.train == ("v01",)
     assert sorted(path.stem for path in (out / "images").iterdir()) == ["v01", "v04"]
     for name, camera in scene.cameras.items():
@@ -144,19 +143,19 @@ def test_cameras_without_pixels_stay(tmp_path):
         plan.preview(poses.Params(**asked | {"cameras_only": ["v04"]}), folder)
 
 
-def test_objects_that_are_told_apart(tmp_path):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+def test_object_numbers_make_separate_masks(tmp_path):
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     usual = folder / "masks"
     for name in ("box", "ball"):
         (usual / name).mkdir()
         for path in usual.glob("*.png"):
             shutil.copy(path, usual / name)
     with pytest.raises(BadInput, match="holds masks and folders of masks"):
-        run(folder)
+        run_stages(folder)
     for path in usual.glob("*.png"):
         path.unlink()
     (usual / "ball/v03.png").unlink()
-    scene, out = run(folder)
+    scene, out = run_stages(folder)
     assert list_objects(out) == ["ball", "box"]
     assert "v03" in load_raw_masks(out, scene.train, ["box"]) and "v03" not in load_raw_masks(out, scene.train)
     with pytest.raises(BadInput, match="no object 'cat'; masks tell apart ball, box"):
@@ -164,10 +163,10 @@ def test_objects_that_are_told_apart(tmp_path):
 
 
 def test_masks_of_what_is_to_be_filled(tmp_path):
-    folder = prepare(tmp_path / "s", "colmap", some_truth(RADIAL))
+    folder = write_capture(tmp_path / "s", "colmap", make_truth(RADIAL))
     (folder / "masks").rename(folder / "new")
     asked = {"fill": "new", "train": ["v00", "v01", "v02", "v03"]}
-    scene, out = run(folder, **asked)
+    scene, out = run_stages(folder, **asked)
     assert sorted(load_fill_masks(out)) == list(scene.train) and not load_raw_masks(out, scene.train)
     params, files = raw_masks.Params(**asked), sorted(folder.rglob("*.*"))
     assert folder / "new/v02.png" in raw_masks_plan.scene_files(params, folder, files)
@@ -180,7 +179,7 @@ def test_spin_nerf_with_a_missing_training_mask(tmp_path):
     write_spin_nerf(tmp_path / "s")
     (tmp_path / "s/images_4/label/v04.png").unlink()
     with pytest.warns(UserWarning, match="1 training views have no mask: v04"):
-        scene, out = run(tmp_path / "s")
+        scene, out = run_stages(tmp_path / "s")
     assert scene.test == ("v00", "v01") and "v04" in scene.train
     assert "v04" not in load_raw_masks(out, scene.train)
 
@@ -189,7 +188,7 @@ def test_spin_nerf_with_a_missing_training_mask(tmp_path):
 def test_spin_nerf_at_the_size_that_is_asked_for(tmp_path, longest, taken):
     """Pictures of images_4 or of the full size, the cameras with them, distortion too; the masks of images_4."""
     truth = write_spin_nerf(tmp_path / "s")
-    scene, out = run(tmp_path / "s", longest=longest)
+    scene, out = run_stages(tmp_path / "s", longest=longest)
     width = min(longest, taken * WIDTH)
     assert image_size(out / "images/v00.png") == (width, round(width * HEIGHT / WIDTH))
     at_quarter = replace(scene, cameras={n: c.resized(WIDTH, HEIGHT) for n, c in scene.cameras.items()})
@@ -205,7 +204,7 @@ def test_spin_nerf_at_the_size_that_is_asked_for(tmp_path, longest, taken):
 def test_spin_nerf_the_folder_that_is_named_wins(tmp_path):
     write_spin_nerf(tmp_path / "s")
     for named, width in (("images_4", WIDTH), ("images", 4 * WIDTH)):
-        scene, out = run(tmp_path / "s", longest=4 * WIDTH, images=named)
+        scene, out = run_stages(tmp_path / "s", longest=4 * WIDTH, images=named)
         assert image_size(out / "images/v00.png")[0] == width and len(load_raw_masks(out, scene.train)) == 4
 
 
@@ -213,11 +212,11 @@ def test_spin_nerf_full_size_pictures_of_other_names_are_not_taken(tmp_path):
     write_spin_nerf(tmp_path / "s")
     (tmp_path / "s/images/v03.jpg").rename(tmp_path / "s/images/other.jpg")
     with pytest.warns(UserWarning, match="images: not the pictures of images_4 under the same names"):
-        _, out = run(tmp_path / "s", longest=4 * WIDTH)
+        _, out = run_stages(tmp_path / "s", longest=4 * WIDTH)
     assert image_size(out / "images/v00.png") == (WIDTH, HEIGHT)
 
 
-def test_spin_nerf_folders_are_told_in_a_line_each(tmp_path):
+def test_spin_nerf_folders_are_named_in_a_line_each(tmp_path):
     for name in ("1", "2", "3", "book"):
         write_spin_nerf(tmp_path / name, full=name != "2")
     shutil.rmtree(tmp_path / "2/images_4/test_label")
@@ -230,28 +229,28 @@ def test_spin_nerf_folders_are_told_in_a_line_each(tmp_path):
     assert "lacks images_4/test_label (no test views" in lines["2"] and "images (full size" in lines["2"]
     assert lines["3"].startswith("cannot be run: lacks poses_bounds.npy") and "4 training" in lines["book"]
     assert [name for name, said in lines.items() if said == "not there"] == ["4", "7", "9", "10", "12", "trash"]
-    run(tmp_path / "book", longest=4 * WIDTH)  # the model stands for poses_bounds.npy
+    run_stages(tmp_path / "book", longest=4 * WIDTH)  # the model stands for poses_bounds.npy
     assert image_size(tmp_path / "book_out/images/v00.png")[0] == 4 * WIDTH
     with pytest.raises(ValueError, match="no scenes of SPIn-NeRF"):
         spinnerf.summarize_scenes(tmp_path / "notes")
 
 
 def test_splits_from_scene_yaml(tmp_path):
-    prepare(tmp_path / "s", "transforms", some_truth(views=9))
-    scene, out = run(tmp_path / "s", test="every 4", clean=["v01"])
+    write_capture(tmp_path / "s", "transforms", make_truth(views=9))
+    scene, out = run_stages(tmp_path / "s", test="every 4", clean=["v01"])
     assert scene.test == ("v00", "v04", "v08") and len(scene.train) == 6 and scene.clean == {"v01"}
     assert sorted(load_test_masks(out)) == list(scene.test)
     assert sorted(load_raw_masks(out, scene.test)) == list(scene.test)  # the object is in these views
-    scene, _ = run(tmp_path / "s", train=["v03", "v01", "v02.png"], test=["v05"])
+    scene, _ = run_stages(tmp_path / "s", train=["v03", "v01", "v02.png"], test=["v05"])
     assert scene.train == ("v01", "v02", "v03") and scene.test == ("v05",) and len(scene.cameras) == 4
 
 
 def test_frames_without_a_picture_are_named_in_one_warning(tmp_path):
-    prepare(tmp_path / "s", "transforms", some_truth())
+    write_capture(tmp_path / "s", "transforms", make_truth())
     for name in ("v01", "v03"):
         (tmp_path / "s" / "images" / f"{name}.png").unlink()
     with pytest.warns(UserWarning) as caught:
-        scene, _ = run(tmp_path / "s")
+        scene, _ = run_stages(tmp_path / "s")
     assert [str(w.message) for w in caught if "no picture" in str(w.message)] == [
         "2 of the 6 frames in transforms.json have no picture: images/v01.png, images/v03.png"
     ]
@@ -259,8 +258,8 @@ def test_frames_without_a_picture_are_named_in_one_warning(tmp_path):
 
 
 def test_transforms_variants(tmp_path, monkeypatch):
-    truth = some_truth()
-    folder = prepare(tmp_path / "s", "transforms", truth)
+    truth = make_truth()
+    folder = write_capture(tmp_path / "s", "transforms", truth)
     record = json.loads((folder / "transforms.json").read_text())
     for key in ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model"):
         del record[key]
@@ -271,15 +270,15 @@ def test_transforms_variants(tmp_path, monkeypatch):
     (folder / "transforms.json").write_text(json.dumps(record))
     save_points(folder / "some.ply", truth.points, np.zeros((60, 3), np.uint8))
     monkeypatch.setattr(poses, "LEAST_POINTS", 1)
-    scene, _ = run(folder)
+    scene, _ = run_stages(folder)
     assert reprojection_error(scene, truth) < 1e-3
     np.testing.assert_allclose(scene.similarity.invert(scene.points), truth.points, atol=1e-9)
 
 
 def test_large_pictures_are_brought_to_the_longest_side(tmp_path):
-    truth = some_truth(OPENCV)
-    folder = prepare(tmp_path / "s", "colmap", truth)
-    scene, out = run(folder, longest=48)
+    truth = make_truth(OPENCV)
+    folder = write_capture(tmp_path / "s", "colmap", truth)
+    scene, out = run_stages(folder, longest=48)
     assert image_size(out / "images" / "v00.png") == (48, 36)
     big = replace(scene, cameras={n: c.resized(WIDTH, HEIGHT) for n, c in scene.cameras.items()})
     assert reprojection_error(big, truth) < 1e-3
@@ -290,7 +289,7 @@ SIZES = {"v00": (1.0, 0), "v01": (0.5, 0), "v02": (1.0, 20), "v03": (1.5, 0), "v
 
 
 def write_several_sizes(folder: Path, truth: Truth, layout: str) -> dict[str, tuple[int, int]]:
-    """Pictures of noise enlarged by a factor after columns were cut off left and right, each with its own camera."""
+    """Write resized pictures of noise, some cropped left and right, each with its own camera; return their sizes."""
     (folder / "images").mkdir(parents=True)
     noise, flip, frames, cameras, images, sizes = np.random.default_rng(0), np.diag([1.0, -1, -1, 1]), [], {}, {}, {}
     for k, (name, (factor, left)) in enumerate(SIZES.items(), start=1):
@@ -313,9 +312,9 @@ def write_several_sizes(folder: Path, truth: Truth, layout: str) -> dict[str, tu
 
 @pytest.mark.parametrize("layout", ["transforms", "colmap"])
 def test_pictures_of_several_sizes_each_with_its_camera(tmp_path, layout):
-    truth = some_truth()
+    truth = make_truth()
     sizes = write_several_sizes(tmp_path / "s", truth, layout)
-    scene, out = run(tmp_path / "s", refine=True, test=["v04"])
+    scene, out = run_stages(tmp_path / "s", refine=True, test=["v04"])
     assert {name: (camera.width, camera.height) for name, camera in scene.cameras.items()} == sizes
     for name, camera in scene.cameras.items():
         expected = truth.world_to_camera[name] @ np.append(truth.points[0], 1)
@@ -335,9 +334,9 @@ def test_normalisation_knows_no_units_and_no_offset(tmp_path, monkeypatch, bring
     monkeypatch.setattr(poses, "LEAST_POINTS", 1)
     found = []
     for k, (scale, offset) in enumerate([(1.0, (0.0, 0.0, 0.0)), (1000.0, (4e9, -3e9, 1e9))]):
-        truth = some_truth(scale=scale, offset=offset)
+        truth = make_truth(scale=scale, offset=offset)
         layout = {"points": "colmap", "bounds": "llff", "nothing": "transforms"}[brings]
-        found.append(run(prepare(tmp_path / f"s{k}", layout, truth))[0])
+        found.append(run_stages(write_capture(tmp_path / f"s{k}", layout, truth))[0])
     for name, camera in found[0].cameras.items():
         np.testing.assert_allclose(found[1].cameras[name].world_to_camera, camera.world_to_camera, atol=2e-6)
     centers = np.stack([camera.center for camera in found[0].cameras.values()])
@@ -345,7 +344,7 @@ def test_normalisation_knows_no_units_and_no_offset(tmp_path, monkeypatch, bring
     assert found[0].similarity.scale == pytest.approx(1000 * found[1].similarity.scale, rel=1e-6)
 
 
-def test_depth_falls_back_where_nothing_tells_it():
+def test_depth_has_a_fallback_without_points():
     poses_along = np.stack([np.eye(4)] * 4)
     poses_along[:, 0, 3] = np.arange(4.0)
     pinholes = [lens.Lens(10, 10, 10.0, 10.0, 5.0, 5.0)] * 4
@@ -357,12 +356,12 @@ def test_depth_falls_back_where_nothing_tells_it():
 
 
 def test_random_points_are_seen_seeded_and_coloured(tmp_path, monkeypatch):
-    truth = some_truth()
-    folder = prepare(tmp_path / "s", "transforms", truth)
+    truth = make_truth()
+    folder = write_capture(tmp_path / "s", "transforms", truth)
     monkeypatch.setattr(poses, "MORE_POINTS", 500)
-    (scene, _), (again, _) = run(folder), run(folder)
+    (scene, _), (again, _) = run_stages(folder), run_stages(folder)
     monkeypatch.setattr(poses, "SEED", 1)
-    other, _ = run(folder)
+    other, _ = run_stages(folder)
     assert np.array_equal(scene.points, again.points) and not np.array_equal(scene.points, other.points)
     seen = np.zeros(500, int)
     for camera in scene.cameras.values():
@@ -374,8 +373,8 @@ def test_random_points_are_seen_seeded_and_coloured(tmp_path, monkeypatch):
 
 
 def test_what_the_scene_brings_comes_into_the_normalised_frame(tmp_path):
-    truth = some_truth(OPENCV, scale=5.0, offset=(50.0, 0.0, 0.0))
-    folder = prepare(tmp_path / "s", "colmap", truth)
+    truth = make_truth(OPENCV, scale=5.0, offset=(50.0, 0.0, 0.0))
+    folder = write_capture(tmp_path / "s", "colmap", truth)
     means = torch.from_numpy(truth.points).float()
     gaussians = Gaussians(means, torch.ones(60, 4), torch.zeros(60, 3), torch.zeros(60), torch.zeros(60, 4, 3))
     save_ply(folder / "given.ply", gaussians)
@@ -385,7 +384,7 @@ def test_what_the_scene_brings_comes_into_the_normalised_frame(tmp_path):
         region: {center: [50, 0, 0], size: [1, 2, 3]}
         """
     )
-    scene, out = run(folder, **given)
+    scene, out = run_stages(folder, **given)
     similarity = scene.similarity
     np.testing.assert_allclose(load_ply(out / "gaussians.ply").means, similarity.apply(truth.points), atol=1e-5)
     region = load_json(out / "region.json")
@@ -397,37 +396,37 @@ def test_what_the_scene_brings_comes_into_the_normalised_frame(tmp_path):
 
 
 def test_a_sphere_on_an_optical_axis_is_filled_or_masks_what_lies_beyond(tmp_path):
-    folder = prepare(tmp_path / "s", "transforms", some_truth(scale=5.0, offset=(50.0, 0.0, 0.0)))
-    name = sorted(some_truth().world_to_camera)[0]
+    folder = write_capture(tmp_path / "s", "transforms", make_truth(scale=5.0, offset=(50.0, 0.0, 0.0)))
+    name = sorted(make_truth().world_to_camera)[0]
     sphere = {"view": name, "distance": 4.0, "radius": 0.5}
-    scene, out = run(folder, masks="none", region=sphere)
+    scene, out = run_stages(folder, masks="none", region=sphere)
     region, camera, scale = load_json(out / "region.json"), scene.cameras[name], scene.similarity.scale
     np.testing.assert_allclose(region["size"], [scale] * 3)
     assert region["round"] and not region["holds"]
     np.testing.assert_allclose(camera.world_to_camera[:3, :3] @ (region["center"] - camera.center), [0, 0, 4 * scale],
                                atol=1e-9)  # fmt: skip
-    folder = prepare(tmp_path / "t", "transforms", some_truth(scale=5.0, offset=(50.0, 0.0, 0.0)))
-    scene, out = run(folder, masks="none", region={**sphere, "outside": True})
+    folder = write_capture(tmp_path / "t", "transforms", make_truth(scale=5.0, offset=(50.0, 0.0, 0.0)))
+    scene, out = run_stages(folder, masks="none", region={**sphere, "outside": True})
     masks = load_raw_masks(out, scene.train)
     assert set(masks) == set(scene.train) and not (out / "region.json").exists()
     row, column = int(camera.cy), int(camera.cx)
     assert not masks[name][row, column] and masks[name][0, 0]
     for wrong in ({"view": name}, {**sphere, "center": [0, 0, 0]}, {**sphere, "size": [1, 1, 1]}, {"radius": 1.0}):
         with pytest.raises(ValueError, match="give either"):
-            run(folder, region=wrong)
+            run_stages(folder, region=wrong)
     with pytest.raises(ValueError, match="outside needs a sphere"):
-        run(folder, region={"center": [0, 0, 0], "size": [1, 1, 1], "outside": True})
+        run_stages(folder, region={"center": [0, 0, 0], "size": [1, 1, 1], "outside": True})
     with pytest.raises(ValueError, match="region: there is no view 'nobody'"):
-        run(folder, region={**sphere, "view": "nobody"})
+        run_stages(folder, region={**sphere, "view": "nobody"})
 
 
-def test_preview_is_light_and_says_what_will_happen(tmp_path):
+def test_preview_is_fast_and_describes_the_run(tmp_path):
     write_spin_nerf(tmp_path / "s", full=False)
     notes = plan.preview(poses.Params(), tmp_path / "s")
     assert notes[0] == "4 training and 2 test views"
     assert notes[1] == f"SfM left out: {Path('sparse/0/images.bin')} brings poses"
     assert notes[2].startswith("undistortion: SIMPLE_RADIAL k1=0.05 moves the border by up to ")
-    prepare(tmp_path / "t", "transforms", some_truth())
+    write_capture(tmp_path / "t", "transforms", make_truth())
     assert "undistortion left out: the lens is a pinhole" in plan.preview(poses.Params(), tmp_path / "t")
     write_pictures(tmp_path / "p", ["a", "b", "c"])
     write_masks(tmp_path / "p" / "masks", ["a", "b", "c"])
@@ -443,26 +442,20 @@ def test_preview_is_light_and_says_what_will_happen(tmp_path):
 # ------------------------------------------------------------------------------------------------- real captures
 
 
-def capture(name: str) -> Path:
-    if not (CAPTURES / name).is_dir():
-        pytest.skip(f"the capture {name} is not in ../shared/data")
-    return CAPTURES / name
-
-
-def real(tmp_path: Path, name: str, **params):
+def run_on_real_capture(tmp_path: Path, name: str, **params):
     (tmp_path / "out").mkdir(parents=True)
-    run_stages(capture(name), tmp_path / "out", **params)
+    run_stages_into(real_capture(name), tmp_path / "out", **params)
     return load_scene(tmp_path / "out"), tmp_path / "out"
 
 
 def test_statue(tmp_path):
-    found = load_capture(capture("statue"))
+    found = load_capture(real_capture("statue"))
     assert (
         len(found.pictures) == 29 and found.pose_source.name == "poses_bounds.npy" and len(found.poses.points) == 15881
     )
     assert next(iter(found.poses.lenses.values())).model == "PINHOLE" and not found.warnings
     names = ["IMG_2707", "IMG_2716", "IMG_2736"]
-    scene, out = real(tmp_path, "statue", train=names, longest=504)  # images_2, whose masks these are
+    scene, out = run_on_real_capture(tmp_path, "statue", train=names, longest=504)  # images_2, whose masks these are
     masks = load_raw_masks(out, names)
     assert all(0.03 < mask.mean() < 0.3 and mask.shape == (378, 504) for mask in masks.values())
     # The statue's points, by the masks, agree from view to view: the poses and the points share a frame.
@@ -482,9 +475,9 @@ def test_statue(tmp_path):
 
 def test_bear(tmp_path):
     with pytest.raises(ValueError, match="no mask at all"):
-        load_roles(capture("bear"), load_capture(capture("bear")))
+        load_roles(real_capture("bear"), load_capture(real_capture("bear")))
     names = ["frame_00001", "frame_00030", "frame_00060", "frame_00090"]
-    scene, out = real(tmp_path, "bear", masks="none", train=names[:3], test=names[3:])
+    scene, out = run_on_real_capture(tmp_path, "bear", masks="none", train=names[:3], test=names[3:])
     assert len(scene.points) == 34174 and scene.test == ("frame_00090",)
     shares = []
     for name, image in load_views(out, names).items():
@@ -500,19 +493,19 @@ def test_bear(tmp_path):
 
 def test_fox(tmp_path):
     with pytest.warns(UserWarning, match=r"17 of the 67 frames.*images/0005\.jpg.*images/0113\.jpg"):
-        scene, _ = real(tmp_path, "fox", masks="none", train=["0001", "0002", "0003"], longest=240)
+        scene, _ = run_on_real_capture(tmp_path, "fox", masks="none", train=["0001", "0002", "0003"], longest=240)
     camera = scene.cameras["0001"]
     assert (camera.width, camera.height) == (135, 240)
     assert 100 < len(scene.points) <= 10_000, "it brings none, these are of flow"
-    notes = plan.preview(poses.Params(masks="none", test="every 8"), capture("fox"))
+    notes = plan.preview(poses.Params(masks="none", test="every 8"), real_capture("fox"))
     assert "43 training and 7 test views" in notes and any("OPENCV k1=0.05784" in n for n in notes)
 
 
 def test_statue_has_its_cameras_adjusted(tmp_path, monkeypatch):
     """Its phone's stabiliser moved the lens: far things miss near ones by a third of a pixel at 252 x 189."""
     monkeypatch.setattr("reffusion.capture.refine.TRACKS", 4000)
-    plain, _ = real(tmp_path / "plain", "statue", longest=252)
-    scene, out = real(tmp_path / "adjusted", "statue", longest=252, refine=True)
+    plain, _ = run_on_real_capture(tmp_path / "plain", "statue", longest=252)
+    scene, out = run_on_real_capture(tmp_path / "adjusted", "statue", longest=252, refine=True)
     said = load_json(out / "refine.json")
     assert said["before"] > 0.15 and said["after"] < 0.6 * said["before"]
     shifts = [scene.cameras[n].cy - plain.cameras[n].cy for n in scene.train]

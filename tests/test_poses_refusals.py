@@ -1,4 +1,4 @@
-"""Captures that `poses` refuses: each time with the file and the remedy, and before any work."""
+"""Captures that `poses` refuses before any work; each message names the file and a remedy."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_capture import HEIGHT, WIDTH, prepare, run, some_truth, write_masks, write_pictures
+from scenes.capture import HEIGHT, WIDTH, make_truth, run_stages, write_capture, write_masks, write_pictures
 
 
 def edit_transforms(change):
@@ -19,20 +19,20 @@ def edit_transforms(change):
     return edit
 
 
-def nan_pose(record):
+def set_nan_pose(record):
     record["frames"][2]["transform_matrix"][0][3] = float("nan")
 
 
-def mirrored_pose(record):
+def mirror_pose(record):
     record["frames"][2]["transform_matrix"][0][:3] = [-v for v in record["frames"][2]["transform_matrix"][0][:3]]
 
 
-def same_stem(folder: Path) -> None:
+def share_stem(folder: Path) -> None:
     write_pictures(folder / "images", ["v00"], ending=".bmp")
     edit_transforms(lambda r: r["frames"][0].update(file_path="images/v00.bmp"))(folder)
 
 
-def mask_of_two(folder: Path) -> None:
+def share_mask(folder: Path) -> None:
     write_pictures(folder / "other", ["v00"])
     edit_transforms(lambda r: r["frames"][0].update(file_path="other/v00.png"))(folder)
 
@@ -57,10 +57,10 @@ REFUSALS = [
     ("two training views", drop_views, {}, "2 training views.*at least 3"),
     ("all views are test views", None, {"test": "every 1"}, "0 training views.*at least 3"),
     ("unreadable picture", lambda f: (f / "images" / "v01.png").write_text("x"), {}, r"v01\.png.*readable image"),
-    ("NaN pose", edit_transforms(nan_pose), {}, r"transforms\.json.*'v03' is not finite"),
-    ("mirrored pose", edit_transforms(mirrored_pose), {}, "'v03' is no rotation"),
-    ("two views of a name", same_stem, {}, "view name 'v00' is also"),
-    ("a mask of two views", mask_of_two, {}, r"masks/v00\.png: images-v00 and other-v00 are called so"),
+    ("NaN pose", edit_transforms(set_nan_pose), {}, r"transforms\.json.*'v03' is not finite"),
+    ("mirrored pose", edit_transforms(mirror_pose), {}, "'v03' is no rotation"),
+    ("two views of a name", share_stem, {}, "view name 'v00' is also"),
+    ("a mask of two views", share_mask, {}, r"masks/v00\.png: images-v00 and other-v00 are called so"),
     ("no intrinsics", edit_transforms(lambda r: r.pop("fl_x")), {}, "neither fl_x nor camera_angle_x"),
     ("unknown camera model", edit_transforms(lambda r: r.update(camera_model="X")), {}, "camera_model X"),
     ("other proportions than the camera", edit_transforms(lambda r: r.update(w=50)), {}, "other proportions"),
@@ -78,40 +78,40 @@ REFUSALS = [
 
 @pytest.mark.parametrize(("change", "params", "message"), [r[1:] for r in REFUSALS], ids=[r[0] for r in REFUSALS])
 def test_refusals_name_file_and_remedy(tmp_path, change, params, message):
-    folder = prepare(tmp_path / "s", "transforms", some_truth())
+    folder = write_capture(tmp_path / "s", "transforms", make_truth())
     if change is not None:
         change(folder)
     with pytest.raises(ValueError, match=message):
-        run(folder, **params)
+        run_stages(folder, **params)
     assert not list((tmp_path / "s_out").rglob("*.*"))  # nothing was done before
 
 
 def test_llff_refusals(tmp_path):
-    folder = prepare(tmp_path / "s", "llff", some_truth())
+    folder = write_capture(tmp_path / "s", "llff", make_truth())
     rows = np.load(folder / "poses_bounds.npy")
     np.save(folder / "poses_bounds.npy", rows[:-1])
     with pytest.raises(ValueError, match=r"5 poses.*6 pictures"):
-        run(folder)
+        run_stages(folder)
     rows[2, 3] = np.nan
     np.save(folder / "poses_bounds.npy", rows)
     with pytest.raises(ValueError, match=r"poses_bounds\.npy: rows \[2\]"):
-        run(folder)
+        run_stages(folder)
 
 
 def test_cut_off_model_is_named(tmp_path):
-    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    folder = write_capture(tmp_path / "s", "colmap", make_truth())
     for name in ("images.bin", "points3D.bin", "cameras.bin"):
         path = folder / "sparse" / "0" / name
         whole = path.read_bytes()
         path.write_bytes(whole[:-10])
         with pytest.raises(ValueError, match=rf"{name}.*cut off"):
-            run(folder)
+            run_stages(folder)
         path.write_bytes(whole)
 
 
 def test_masks_none_is_a_scene_to_fit_only(tmp_path):
-    folder = prepare(tmp_path / "s", "transforms", some_truth())
-    scene, out = run(folder, masks="none", test="every 3")
+    folder = write_capture(tmp_path / "s", "transforms", make_truth())
+    scene, out = run_stages(folder, masks="none", test="every 3")
     assert not (out / "masks").exists() and len(scene.test) == 2
     drop_masks(folder)
-    run(folder, region={"center": (0, 0, 0), "size": (1, 1, 1)})
+    run_stages(folder, region={"center": (0, 0, 0), "size": (1, 1, 1)})

@@ -1,4 +1,4 @@
-"""The prior: exact VAE, conversions between eps, v and z_0, sampling, and LoRA files that diffusers reads."""
+"""The prior: VAE, conversions between eps, v and z_0, sampling, and LoRA files that diffusers reads."""
 
 import json
 import shutil
@@ -18,11 +18,11 @@ TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
 
 
 @pytest.fixture
-def tiny():
+def tiny_prior():
     return load_prior(TINY)
 
 
-def pictures(count=2, side=32, seed=0):
+def random_images(count=2, side=32, seed=0):
     return torch.rand(count, 3, side, side, generator=generator(seed, "pictures")) * 2 - 1
 
 
@@ -32,31 +32,31 @@ def half_masks(count=2, side=32):
     return masks
 
 
-def test_sizes_are_read_from_the_folder(tiny):
-    assert (tiny.factor, tiny.native_size, tiny.prediction_type) == (1, 64, "v_prediction")
+def test_sizes_are_read_from_the_folder(tiny_prior):
+    assert (tiny_prior.factor, tiny_prior.native_size, tiny_prior.prediction_type) == (1, 64, "v_prediction")
 
 
-def test_vae_round_trip_is_exact(tiny):
-    images = pictures(2, 48)
-    assert (diffusion.decode(tiny, diffusion.encode(tiny, images)) - images).abs().max() < 3e-3
+def test_vae_round_trip_is_exact(tiny_prior):
+    images = random_images(2, 48)
+    assert (diffusion.decode(tiny_prior, diffusion.encode(tiny_prior, images)) - images).abs().max() < 3e-3
 
 
-def test_encoding_is_linear(tiny):
-    a, b = pictures(1, 24, 1), pictures(1, 24, 2)
-    middle = diffusion.encode(tiny, (a + b) / 2)
-    assert torch.allclose(middle, (diffusion.encode(tiny, a) + diffusion.encode(tiny, b)) / 2, atol=3e-3)
+def test_encoding_is_linear(tiny_prior):
+    a, b = random_images(1, 24, 1), random_images(1, 24, 2)
+    middle = diffusion.encode(tiny_prior, (a + b) / 2)
+    assert torch.allclose(middle, (diffusion.encode(tiny_prior, a) + diffusion.encode(tiny_prior, b)) / 2, atol=3e-3)
 
 
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction"])
-def test_predictions_reproduce_the_noisy_latents(tiny, kind):
+def test_predictions_reproduce_the_noisy_latents(tiny_prior, kind):
     from dataclasses import replace
 
-    prior = replace(tiny, prediction_type=kind)
+    prior = replace(tiny_prior, prediction_type=kind)
     t, noise = torch.tensor([0, 999]), torch.randn(2, 4, 32, 32, generator=generator(0))
-    clean = diffusion.encode(prior, pictures())
+    clean = diffusion.encode(prior, random_images())
     noisy = diffusion.add_noise(prior, clean, noise, t)
     text = diffusion.embed_text(prior, ["A photo of sks", ""])
-    condition = diffusion.conditioning(prior, pictures(), half_masks())
+    condition = diffusion.conditioning(prior, random_images(), half_masks())
     eps, x0 = diffusion.predict(prior, noisy, t, condition, text)
     assert torch.allclose(diffusion.add_noise(prior, x0, eps, t), noisy, atol=1e-4)
     target = diffusion.training_target(prior, clean, noise, t)
@@ -69,67 +69,71 @@ def test_predictions_reproduce_the_noisy_latents(tiny, kind):
     assert torch.allclose(recovered, clean, atol=2e-4)
 
 
-def test_conditioning_hides_what_lies_under_the_mask(tiny):
-    images, masks = pictures(), half_masks()
+def test_conditioning_hides_what_lies_under_the_mask(tiny_prior):
+    images, masks = random_images(), half_masks()
     other = torch.where(masks > 0, torch.ones(()), images)
-    assert torch.equal(diffusion.conditioning(tiny, images, masks), diffusion.conditioning(tiny, other, masks))
+    assert torch.equal(
+        diffusion.conditioning(tiny_prior, images, masks), diffusion.conditioning(tiny_prior, other, masks)
+    )
     images.requires_grad_(True)
-    assert not diffusion.conditioning(tiny, images, masks).requires_grad
+    assert not diffusion.conditioning(tiny_prior, images, masks).requires_grad
 
 
-def test_a_folder_says_what_the_hole_shows(tiny, tmp_path):
-    images, masks = pictures(), half_masks()
+def test_a_folder_says_what_the_hole_shows(tiny_prior, tmp_path):
+    images, masks = random_images(), half_masks()
     filled = harmonic_fill.harmonic_extension(images, masks)
-    assert tiny.fills
-    expected = torch.cat([masks, diffusion.encode(tiny, filled)], 1)
-    assert torch.equal(diffusion.conditioning(tiny, images, masks), expected)
+    assert tiny_prior.fills
+    expected = torch.cat([masks, diffusion.encode(tiny_prior, filled)], 1)
+    assert torch.equal(diffusion.conditioning(tiny_prior, images, masks), expected)
     folder = tmp_path / "prior"
     shutil.copytree(TINY, folder)
     said = folder / CONDITIONING
     for text in ('{"hole": "grey"}', None):
         said.write_text(text) if text else said.unlink()
         grey = diffusion.conditioning(load_prior(folder), images, masks)
-        assert torch.equal(grey, torch.cat([masks, diffusion.encode(tiny, images * (1 - masks))], 1))
+        assert torch.equal(grey, torch.cat([masks, diffusion.encode(tiny_prior, images * (1 - masks))], 1))
     for text in ('{"hole": "blue"}', "{}", "[", "3"):
         said.write_text(text)
         with pytest.raises(ValueError, match=CONDITIONING):
             load_prior(folder)
 
 
-def test_sampling_repeats_with_its_seed_and_is_finite(tiny):
-    text = diffusion.embed_text(tiny, ["A photo of sks"] * 2)
-    run = lambda seed: diffusion.sample(tiny, pictures(), half_masks(), text, 3, generator(seed))
+def test_sampling_repeats_with_its_seed_and_is_finite(tiny_prior):
+    text = diffusion.embed_text(tiny_prior, ["A photo of sks"] * 2)
+    run = lambda seed: diffusion.sample(tiny_prior, random_images(), half_masks(), text, 3, generator(seed))
     first, again, other = run(0), run(0), run(1)
     assert torch.equal(first, again) and not torch.equal(first, other)
     assert torch.isfinite(first).all() and first.abs().max() <= 1
 
 
-def test_guidance_zero_is_the_conditional_prediction(tiny):
-    text, empty = diffusion.embed_text(tiny, ["A photo of sks"]), diffusion.embed_text(tiny, [""])
+def test_guidance_zero_is_the_conditional_prediction(tiny_prior):
+    text, empty = diffusion.embed_text(tiny_prior, ["A photo of sks"]), diffusion.embed_text(tiny_prior, [""])
     noisy, t = torch.randn(1, 4, 16, 16, generator=generator(3)), torch.tensor([500])
-    condition = diffusion.conditioning(tiny, pictures(1, 16), half_masks(1, 16))
-    plain, _ = diffusion.predict(tiny, noisy, t, condition, text)
-    without, _ = diffusion.predict(tiny, noisy, t, condition, empty)
-    guided, _ = diffusion.guided(tiny, noisy, t, condition, text, empty, 2.0)
+    condition = diffusion.conditioning(tiny_prior, random_images(1, 16), half_masks(1, 16))
+    plain, _ = diffusion.predict(tiny_prior, noisy, t, condition, text)
+    without, _ = diffusion.predict(tiny_prior, noisy, t, condition, empty)
+    guided, _ = diffusion.guided(tiny_prior, noisy, t, condition, text, empty, 2.0)
     assert torch.allclose(guided, 3 * plain - 2 * without, atol=1e-5)
     with pytest.raises(ValueError, match="empty prompt"):
-        diffusion.guided(tiny, noisy, t, condition, text, None, 1.0)
+        diffusion.guided(tiny_prior, noisy, t, condition, text, None, 1.0)
 
 
 @pytest.mark.parametrize("dropout", [0.1, 0.0], ids=["beside the weights", "added to them"])
 @pytest.mark.parametrize("layers", ["attention", "attention+conv"])
-def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny, tmp_path, layers, dropout):
-    found = lora.attach(tiny, rank=4, alpha=12.0, dropout=dropout, layers=layers, seed=0)
+def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny_prior, tmp_path, layers, dropout):
+    found = lora.attach(tiny_prior, rank=4, alpha=12.0, dropout=dropout, layers=layers, seed=0)
     noise = generator(0, "lora")
     for parameter in found["unet"] + found["text"]:
         parameter.data += 0.1 * torch.randn(parameter.shape, generator=noise)
     noisy, t = torch.randn(1, 4, 16, 16, generator=noise), torch.tensor([400])
-    condition = diffusion.conditioning(tiny, pictures(1, 16), half_masks(1, 16))
-    trained = diffusion.raw_prediction(tiny, noisy, t, condition, diffusion.embed_text(tiny, ["A photo of sks"]))
-    lora.save(tiny, tmp_path)
+    condition = diffusion.conditioning(tiny_prior, random_images(1, 16), half_masks(1, 16))
+    trained = diffusion.raw_prediction(
+        tiny_prior, noisy, t, condition, diffusion.embed_text(tiny_prior, ["A photo of sks"])
+    )
+    lora.save(tiny_prior, tmp_path)
     written = (tmp_path / lora.LORA_FILE).read_bytes()
     for _ in range(5):
-        lora.save(tiny, tmp_path)
+        lora.save(tiny_prior, tmp_path)
         assert (tmp_path / lora.LORA_FILE).read_bytes() == written, "equal weights, another file"
     with safe_open(tmp_path / lora.LORA_FILE, "pt") as file:
         text = [key for key in file.keys() if key.startswith("text_encoder.")]
@@ -172,7 +176,7 @@ def test_lora_added_to_the_weights_has_the_gradients_of_lora_beside_them():
             parameter.data += 0.02 * torch.randn(parameter.shape, generator=noise)
         noisy, condition = (
             torch.randn(2, 4, 16, 16, generator=noise),
-            diffusion.conditioning(prior, pictures(2, 16), half_masks(2, 16)),
+            diffusion.conditioning(prior, random_images(2, 16), half_masks(2, 16)),
         )
         text = diffusion.embed_text(prior, ["", "a"])
         output = diffusion.raw_prediction(prior, noisy, torch.tensor([100, 700]), condition, text)
@@ -182,13 +186,13 @@ def test_lora_added_to_the_weights_has_the_gradients_of_lora_beside_them():
         assert torch.allclose(beside, added, rtol=1e-3, atol=1e-4 * float(beside.abs().max()))
 
 
-def test_lora_state_round_trip(tiny):
-    found = lora.attach(tiny, 2, 4.0, 0.0, "attention", 0)
-    state = lora.state(tiny)
+def test_lora_state_round_trip(tiny_prior):
+    found = lora.attach(tiny_prior, 2, 4.0, 0.0, "attention", 0)
+    state = lora.state(tiny_prior)
     for parameter in found["unet"] + found["text"]:
         parameter.data += 1
-    lora.load_state(tiny, state)
-    assert all(torch.equal(a, b) for a, b in zip(state.values(), lora.state(tiny).values(), strict=True))
+    lora.load_state(tiny_prior, state)
+    assert all(torch.equal(a, b) for a, b in zip(state.values(), lora.state(tiny_prior).values(), strict=True))
 
 
 def test_the_stock_pipeline_inpaints():

@@ -1,4 +1,4 @@
-"""The prior's report: scores inside a hole, a held-out set that was never trained on, the page that is drawn."""
+"""The report on a prior: scores inside a hole, a held-out set outside the training data, and the page."""
 
 import argparse
 import json
@@ -19,12 +19,12 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture(scope="module")
-def cases():
+def hole_cases():
     return holes.make_cases(16)
 
 
-def test_a_perfect_picture_a_blurred_one_and_a_flat_one_are_told_apart(cases):
-    for case in cases[:6]:
+def test_a_perfect_picture_a_blurred_one_and_a_flat_one_are_told_apart(hole_cases):
+    for case in hole_cases[:6]:
         perfect = holes.hole_scores(case.truth, case.truth, case.hole)
         assert perfect == {"psnr": image_metrics.PSNR_CAP, "ssim": 1, "flip": 0, "energy": 1}
         soft, softer = (holes.hole_scores(cv2.GaussianBlur(case.truth, (0, 0), s), case.truth, case.hole)
@@ -34,8 +34,8 @@ def test_a_perfect_picture_a_blurred_one_and_a_flat_one_are_told_apart(cases):
             assert better["flip"] < worse["flip"] and better["energy"] > worse["energy"]
 
 
-def test_only_the_hole_counts(cases):
-    case = cases[0]
+def test_only_the_hole_counts(hole_cases):
+    case = hole_cases[0]
     spoilt = np.where(case.hole[..., None], case.truth, 255 - case.truth)
     assert holes.hole_scores(spoilt, case.truth, case.hole)["psnr"] == image_metrics.PSNR_CAP
     inside = case.truth.copy()
@@ -48,10 +48,10 @@ def test_only_the_hole_counts(cases):
         holes.hole_scores(case.truth, case.truth, case.hole & False)
 
 
-def test_the_held_out_set_is_fixed_and_shares_no_picture_with_training(cases):
+def test_the_held_out_set_is_fixed_and_shares_no_picture_with_training(hole_cases):
     again = holes.make_cases(3)
-    assert all(np.array_equal(a.truth, b.truth) and np.array_equal(a.hole, b.hole) for a, b in zip(again, cases))  # noqa: B905
-    kinds = [case.kind for case in cases]
+    assert all(np.array_equal(a.truth, b.truth) and np.array_equal(a.hole, b.hole) for a, b in zip(again, hole_cases))  # noqa: B905
+    kinds = [case.kind for case in hole_cases]
     assert 0 < kinds.count("photograph") < len(kinds)
     trained = {images.image(seed, index)[0].tobytes() for seed in (0, 1, holes.SEED) for index in range(10)}
     fresh = {images.image(holes.SEED, index, held_out=True)[0].tobytes() for index in range(10)}
@@ -60,8 +60,8 @@ def test_the_held_out_set_is_fixed_and_shares_no_picture_with_training(cases):
     assert captions & set(images.PHOTOS) and not captions & set(images.HELD_OUT_PHOTOS)
 
 
-def test_holes_are_objects_of_a_fair_size(cases):
-    for case in cases:
+def test_holes_are_objects_of_a_fair_size(hole_cases):
+    for case in hole_cases:
         assert holes.COVER[0] <= case.hole.mean() <= holes.COVER[1]
         parts, _ = cv2.connectedComponents(case.hole.astype(np.uint8))
         assert parts - 1 <= 3 + 2  # three outlines; a self-crossing one may fall into pieces
@@ -86,8 +86,8 @@ def test_settings_are_checked_and_come_last():
         benchmark.parse_setting("steps")
 
 
-def measured(folder: Path) -> None:
-    """A small result of the benchmark, made up."""
+def write_benchmark_result(folder: Path) -> None:
+    """Write a small synthetic result of the benchmark."""
     row = {"psnr": 20.0, "ssim": 0.5, "flip": 0.2, "energy": 0.7, "psnr_error": 0.3, "pictures": 2}
     better, scales = row | {"psnr": 22.0}, ("reference", "whole", "window")
     sampler = {"4": row | {"seconds": 0.05}}
@@ -115,7 +115,7 @@ def measured(folder: Path) -> None:
 def test_the_page_holds_every_table_and_picture(tmp_path):
     for name in ("inpainting", "reference", "whole", "window"):
         (tmp_path / name).mkdir()
-    measured(tmp_path)
+    write_benchmark_result(tmp_path)
     text = page.make(tmp_path).read_text()
     assert "| all: Telea | 2 | 20.00 ± 0.30 | 0.500 | 0.200 | 0.700 |" in text
     assert "| window, after | 0.2500 | 0.2500 | 20.00 ± 0.30 |" in text

@@ -1,4 +1,4 @@
-"""Training the embedded prior: pictures and steps depend on the seed alone; the code is exact, resumes are too."""
+"""Training of the embedded prior: pictures and steps depend on the seed alone, and runs resume exactly."""
 
 import subprocess
 import sys
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from small_prior import save_small_prior
+from scenes.networks import save_small_prior
 
 from priors.tiny import build, images, train
 
@@ -66,7 +66,7 @@ def pool():
     return train.Pool(0, 0, size=12)
 
 
-def steps(pool, count, start=0, state=None):
+def train_steps(pool, count, start=0, state=None):
     torch.set_num_threads(1)
     model, alphas = train.Model(0), build.scheduler().alphas_cumprod
     optimiser = train.make_optimiser(model)
@@ -78,16 +78,16 @@ def steps(pool, count, start=0, state=None):
 
 
 def test_training_repeats_and_resumes_exactly(pool):
-    losses, weights, _ = steps(pool, 4)
-    again, same, _ = steps(pool, 4)
+    losses, weights, _ = train_steps(pool, 4)
+    again, same, _ = train_steps(pool, 4)
     assert losses == again and all(torch.equal(a, b) for a, b in zip(weights.values(), same.values(), strict=True))
-    _, half, moments = steps(pool, 2)
-    tail, resumed, _ = steps(pool, 4, 2, (half, moments))
+    _, half, moments = train_steps(pool, 2)
+    tail, resumed, _ = train_steps(pool, 4, 2, (half, moments))
     assert tail == losses[2:]
     assert all(torch.equal(a, b) for a, b in zip(weights.values(), resumed.values(), strict=True))
 
 
-def weights_of(folder):
+def load_weights(folder):
     return {
         part.name: safetensors.torch.load_file(next(part.glob("*.safetensors")))
         for part in (folder / "unet", folder / "text_encoder")
@@ -95,8 +95,8 @@ def weights_of(folder):
 
 
 @pytest.fixture
-def command(monkeypatch, tmp_path):
-    """`train.py` with small batches; gives back the exported weights."""
+def train_command(monkeypatch, tmp_path):
+    """`train.py` with small batches, as a function that returns the exported weights."""
     for name, value in (
         ("POOL", 6),
         ("SMALL", (16, 2)),
@@ -111,13 +111,13 @@ def command(monkeypatch, tmp_path):
         options = ["--steps", str(count), "--threads", "1", "--work", str(tmp_path / work), "--out", str(out), *more]
         monkeypatch.setattr(sys, "argv", ["train.py", *options])
         train.main()
-        return weights_of(out)
+        return load_weights(out)
 
     return run
 
 
-def test_a_run_that_was_killed_and_resumed_equals_the_unbroken_one(command, monkeypatch):
-    unbroken, once = command("one", 6), train.step_once
+def test_a_run_that_was_killed_and_resumed_equals_the_unbroken_one(train_command, monkeypatch):
+    unbroken, once = train_command("one", 6), train.step_once
 
     def killed(*values):
         if values[-2] == 4:  # one step after a checkpoint, an odd number of steps: a new image falls into the gap
@@ -126,16 +126,16 @@ def test_a_run_that_was_killed_and_resumed_equals_the_unbroken_one(command, monk
 
     monkeypatch.setattr(train, "step_once", killed)
     with pytest.raises(KeyboardInterrupt):
-        command("two", 8)  # more steps than it will get: the first half of a run does not depend on their number
+        train_command("two", 8)  # more steps than it will get: the first half of a run does not depend on their number
     monkeypatch.setattr(train, "step_once", once)
-    resumed = command("two", 6)
+    resumed = train_command("two", 6)
     for part, tensors in unbroken.items():
         assert all(torch.equal(value, resumed[part][name]) for name, value in tensors.items()), part
 
 
-def test_start_begins_with_a_folders_weights(command):
-    given, after = weights_of(TINY), command("start", 1, "--start", str(TINY))
-    fresh = command("anew", 1)
+def test_start_begins_with_a_folders_weights(train_command):
+    given, after = load_weights(TINY), train_command("start", 1, "--start", str(TINY))
+    fresh = train_command("anew", 1)
     for part, tensors in given.items():
         # The first step of the warm-up moves each weight by about its rate, 5e-6; half precision rounds to 1e-3 of it.
         moved = max(float((after[part][name] - value).abs().max()) for name, value in tensors.items())
@@ -144,9 +144,9 @@ def test_start_begins_with_a_folders_weights(command):
 
 
 @pytest.mark.parametrize("lacks", ["all", "other"])
-def test_start_refuses_what_does_not_fit(command, tmp_path, lacks):
+def test_start_refuses_what_does_not_fit(train_command, tmp_path, lacks):
     folder = tmp_path / "given"
     if lacks == "other":
         save_small_prior(folder)
     with pytest.raises(ValueError, match="--start"):
-        command("refused", 1, "--start", str(folder))
+        train_command("refused", 1, "--start", str(folder))

@@ -1,4 +1,4 @@
-"""The production path at a small size: SDXL, parts of a batch, half precision, memory budgets, the two benchmarks."""
+"""The production path at a small size: SDXL, parts of a batch, half precision, memory budgets, two benchmarks."""
 
 import gc
 import json
@@ -25,71 +25,71 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture(scope="module")
-def sdxl(tmp_path_factory):
-    """An SDXL-shaped prior as `load_prior` gives it, from a folder that diffusers wrote."""
+def sdxl_prior(tmp_path_factory):
+    """A prior in the shape of SDXL, loaded from a folder that diffusers wrote."""
     folder = tmp_path_factory.mktemp("sdxl")
     pipeline(replace(F.build_prior(F.shrink(F.SDXL), torch.float32), zero_empty=True)).save_pretrained(folder)
     return load_prior(folder)
 
 
 @pytest.fixture
-def sd2():
+def sd2_prior():
     return F.build_prior(F.shrink(F.SD2), torch.float32)
 
 
-def draw(*shape, seed=0):
+def draw_normal(*shape, seed=0):
     return torch.randn(*shape, generator=generator(seed, "test"))
 
 
 # ----------------------------------------------------------------------------------------------------------------- SDXL
 
 
-def test_sdxl_prompts_and_unet_are_those_of_the_stock_pipeline(sdxl):
-    assert sdxl.text_encoder_2 is not None and sdxl.zero_empty and sdxl.native_size == 32
-    pipe = pipeline(sdxl)
+def test_sdxl_prompts_and_unet_are_those_of_the_stock_pipeline(sdxl_prior):
+    assert sdxl_prior.text_encoder_2 is not None and sdxl_prior.zero_empty and sdxl_prior.native_size == 32
+    pipe = pipeline(sdxl_prior)
     hidden, empty, pooled, pooled_empty = pipe.encode_prompt("a red chair", device="cpu")
-    text = diffusion.embed_text(sdxl, ["a red chair", ""])
+    text = diffusion.embed_text(sdxl_prior, ["a red chair", ""])
     assert torch.allclose(text[0, :-1], hidden[0], atol=1e-5)
     assert torch.allclose(text[0, -1, : pooled.shape[1]], pooled[0], atol=1e-5)
     assert not text[1].any() and not empty.any() and not pooled_empty.any()
 
-    noisy, condition = draw(1, 4, 16, 16), draw(1, 5, 16, 16, seed=1)
+    noisy, condition = draw_normal(1, 4, 16, 16), draw_normal(1, 5, 16, 16, seed=1)
     sizes = torch.tensor([[32.0, 32, 0, 0, 32, 32]])
     added = {"text_embeds": pooled, "time_ids": sizes}
     at = torch.tensor([300])
     stock = pipe.unet(torch.cat([noisy, condition], 1), at, encoder_hidden_states=hidden, added_cond_kwargs=added)
-    assert torch.allclose(diffusion.raw_prediction(sdxl, noisy, at, condition, text[:1]), stock.sample, atol=1e-5)
-    other = diffusion.raw_prediction(sdxl, noisy, at, condition, text[1:])
+    assert torch.allclose(diffusion.raw_prediction(sdxl_prior, noisy, at, condition, text[:1]), stock.sample, atol=1e-5)
+    other = diffusion.raw_prediction(sdxl_prior, noisy, at, condition, text[1:])
     assert (other - stock.sample).abs().max() > 1e-4
 
 
-def test_sdxl_paints_a_reference(sdxl):
+def test_sdxl_paints_a_reference(sdxl_prior):
     image, hole = torch.rand(3, 40, 50, generator=generator(0, "image")) * 2 - 1, torch.zeros(40, 50, dtype=torch.bool)
     hole[10:30, 15:40] = True
     options = {"prompt": "a red chair", "seeds": [0], "steps": 2, "start": 0.5, "guidance": 1.0}
-    painted = inpaint.paint(sdxl, image, hole, **options)
+    painted = inpaint.paint(sdxl_prior, image, hole, **options)
     assert painted.shape == (1, 3, 40, 50) and torch.isfinite(painted).all()
     assert torch.equal(painted[0][:, ~hole], image[:, ~hole])
-    other = inpaint.paint(sdxl, image, hole, **options | {"prompt": "a table"})
+    other = inpaint.paint(sdxl_prior, image, hole, **options | {"prompt": "a table"})
     assert not torch.equal(other, painted)
 
 
-def test_sdxl_is_refused_where_it_cannot_work(sdxl):
+def test_sdxl_is_refused_where_it_cannot_work(sdxl_prior):
     with pytest.raises(ValueError, match=r"reference.prior"):
-        lora.attach(sdxl, 4, 4.0, 0.0, "attention", 0)
+        lora.attach(sdxl_prior, 4, 4.0, 0.0, "attention", 0)
 
 
 # ----------------------------------------------------------------------------------------------------- parts of a batch
 
 
-def test_a_batch_in_parts_gives_the_same_values_and_gradients(sd2):
-    images = draw(3, 3, 32, 32).requires_grad_()
-    noisy, condition, at = draw(3, 4, 16, 16), draw(3, 5, 16, 16), torch.tensor([10, 500, 900])
-    text = diffusion.embed_text(sd2, list(crops.PROMPTS)).detach()
+def test_a_batch_in_parts_gives_the_same_values_and_gradients(sd2_prior):
+    images = draw_normal(3, 3, 32, 32).requires_grad_()
+    noisy, condition, at = draw_normal(3, 4, 16, 16), draw_normal(3, 5, 16, 16), torch.tensor([10, 500, 900])
+    text = diffusion.embed_text(sd2_prior, list(crops.PROMPTS)).detach()
     found = []
-    for prior in (sd2, replace(sd2, rows=1, rows_with_grad=2), enable_checkpointing(sd2)):
+    for prior in (sd2_prior, replace(sd2_prior, rows=1, rows_with_grad=2), enable_checkpointing(sd2_prior)):
         latents = diffusion.encode(prior, images)
-        (gradient,) = torch.autograd.grad((latents * draw(*latents.shape)).sum(), images)
+        (gradient,) = torch.autograd.grad((latents * draw_normal(*latents.shape)).sum(), images)
         with torch.no_grad():
             found.append((latents.detach(), gradient, diffusion.raw_prediction(prior, noisy, at, condition, text)))
     for other in found[1:]:
@@ -113,55 +113,62 @@ def test_a_training_step_in_parts_is_the_same_step():
     assert min(close) > 0.97
 
 
-def test_half_precision_stays_near_and_leaves_the_vae_alone(sd2):
+def test_half_precision_stays_near_and_leaves_the_vae_alone(sd2_prior):
     half = F.build_prior(F.shrink(F.SD2), torch.bfloat16)
     for name in ("unet", "text_encoder"):
-        getattr(half, name).load_state_dict(getattr(sd2, name).state_dict())
-    half.vae.load_state_dict(sd2.vae.state_dict())
-    images, noisy, at = draw(1, 3, 32, 32), draw(1, 4, 16, 16), torch.tensor([999])
-    assert torch.equal(diffusion.encode(half, images), diffusion.encode(sd2, images))
-    condition = draw(1, 5, 16, 16)
+        getattr(half, name).load_state_dict(getattr(sd2_prior, name).state_dict())
+    half.vae.load_state_dict(sd2_prior.vae.state_dict())
+    images, noisy, at = draw_normal(1, 3, 32, 32), draw_normal(1, 4, 16, 16), torch.tensor([999])
+    assert torch.equal(diffusion.encode(half, images), diffusion.encode(sd2_prior, images))
+    condition = draw_normal(1, 5, 16, 16)
     with torch.no_grad():
-        answers = [diffusion.predict(p, noisy, at, condition, diffusion.embed_text(p, ["a"])) for p in (sd2, half)]
+        answers = [
+            diffusion.predict(p, noisy, at, condition, diffusion.embed_text(p, ["a"])) for p in (sd2_prior, half)
+        ]
     (eps, clean), (eps_half, clean_half) = answers
     assert eps_half.dtype == clean_half.dtype == torch.float32
     error = (eps_half - eps).abs().max()
     assert 0 < error < 0.1
     # x0 = (z - s eps) / a itself loses nothing: its error is that of eps, times s / a.
-    a = diffusion.alpha_bar(sd2, at)
+    a = diffusion.alpha_bar(sd2_prior, at)
     assert torch.allclose(clean_half - clean, -((1 - a) / a).sqrt() * (eps_half - eps), atol=1e-4)
 
 
 @pytest.mark.parametrize("dropout", [0.0, 0.1])
-def test_a_small_lora_is_not_lost_in_half_precision(sd2, dropout):
+def test_a_small_lora_is_not_lost_in_half_precision(sd2_prior, dropout):
     half = F.build_prior(F.shrink(F.SD2), torch.bfloat16)
-    half.unet.load_state_dict(sd2.unet.state_dict())
-    sd2.unet.load_state_dict(half.unet.state_dict())  # the same rounded weights in float32
-    noisy, condition, at, text = draw(1, 4, 16, 16), draw(1, 5, 16, 16), torch.tensor([500]), draw(1, 24, 64)
+    half.unet.load_state_dict(sd2_prior.unet.state_dict())
+    sd2_prior.unet.load_state_dict(half.unet.state_dict())  # the same rounded weights in float32
+    noisy, condition, at, text = (
+        draw_normal(1, 4, 16, 16),
+        draw_normal(1, 5, 16, 16),
+        torch.tensor([500]),
+        draw_normal(1, 24, 64),
+    )
     changes = []
-    for prior in (sd2, half):
+    for prior in (sd2_prior, half):
         found = lora.attach(prior, 4, 4.0, dropout, "attention", 0)
         before = diffusion.raw_prediction(prior, noisy, at, condition, text).detach()
         noise = generator(0, "lora")
         for parameter in found["unet"]:
             parameter.data += 5e-4 * torch.randn(parameter.shape, generator=noise)
         layer = next(m for m in prior.unet.modules() if hasattr(m, "lora_A"))
-        x = draw(1, 8, layer.base_layer.in_features, seed=3).to(prior.dtype)
+        x = draw_normal(1, 8, layer.base_layer.in_features, seed=3).to(prior.dtype)
         changes.append((layer(x) - layer.base_layer(x)).float().flatten().detach())
         assert torch.isfinite(diffusion.raw_prediction(prior, noisy, at, condition, text) - before).all()
     exact, rounded = changes
     assert torch.dot(exact, rounded) / exact.norm() / rounded.norm() > 0.65  # 0.41 where it is added to the weights
 
 
-def test_a_lora_loads_into_diffusers_own_pipeline_of_sd2(sd2, tmp_path):
+def test_a_lora_loads_into_diffusers_own_pipeline_of_sd2(sd2_prior, tmp_path):
     """Its UNet's and its text encoder's part, by `load_lora_weights`, into models of the same weights."""
-    before = F.epsilon(sd2)
-    found = lora.attach(sd2, 4, 8.0, 0.1, "attention", 0)
+    before = F.epsilon(sd2_prior)
+    found = lora.attach(sd2_prior, 4, 8.0, 0.1, "attention", 0)
     noise = generator(0, "lora")
     for parameter in found["unet"] + found["text"]:
         parameter.data += 0.1 * torch.randn(parameter.shape, generator=noise)
-    trained, words = F.epsilon(sd2), diffusion.embed_text(sd2, [crops.PROMPTS[0]])
-    lora.save(sd2, tmp_path)
+    trained, words = F.epsilon(sd2_prior), diffusion.embed_text(sd2_prior, [crops.PROMPTS[0]])
+    lora.save(sd2_prior, tmp_path)
     fresh = F.build_prior(F.shrink(F.SD2), torch.float32)
     pipe = pipeline(fresh)
     pipe.load_lora_weights(tmp_path)
@@ -170,12 +177,12 @@ def test_a_lora_loads_into_diffusers_own_pipeline_of_sd2(sd2, tmp_path):
     assert (diffusion.embed_text(fresh, [crops.PROMPTS[0]]) - words).abs().max() < 1e-5
 
 
-def test_the_order_of_weights_in_memory_changes_nothing(sd2, tmp_path):
+def test_the_order_of_weights_in_memory_changes_nothing(sd2_prior, tmp_path):
     """What a UNet on CUDA is laid out like: the same answer, with LoRA that is trained, saved and merged."""
-    lora.attach(sd2, 4, 8.0, 0.0, "attention+conv", 0)
-    before = F.epsilon(sd2)
-    sd2.unet.to(memory_format=torch.channels_last)
-    assert (F.epsilon(sd2) - before).abs().max() < 1e-5
+    lora.attach(sd2_prior, 4, 8.0, 0.0, "attention+conv", 0)
+    before = F.epsilon(sd2_prior)
+    sd2_prior.unet.to(memory_format=torch.channels_last)
+    assert (F.epsilon(sd2_prior) - before).abs().max() < 1e-5
     F.personalization_step(F.build_prior(F.shrink(F.SD2), torch.float32), F.reference(32), 1, tmp_path)
     fresh = F.build_prior(F.shrink(F.SD2), torch.float32)
     fresh.unet.to(memory_format=torch.channels_last)
@@ -192,7 +199,9 @@ def test_the_text_encoder_is_let_go():
     assert encoder() is None and prior.bytes < whole
     with pytest.raises(ValueError, match="text encoder was dropped"):
         diffusion.embed_text(prior, ["a"])
-    answer = diffusion.raw_prediction(prior, draw(3, 4, 16, 16), torch.tensor([1, 2, 3]), draw(3, 5, 16, 16), text)
+    answer = diffusion.raw_prediction(
+        prior, draw_normal(3, 4, 16, 16), torch.tensor([1, 2, 3]), draw_normal(3, 5, 16, 16), text
+    )
     assert torch.isfinite(answer).all()
 
 
@@ -212,23 +221,24 @@ def test_living_tensors_are_counted():
     assert memory.peak_bytes(lambda: kept.add_(1), "cpu") == 0
 
 
-def test_a_budget_chooses_the_parts(sd2):
-    assert memory.fit_to_memory(sd2, 0.0, "distill.memory_gb", memory.encode_one_sample) is sd2
+def test_a_budget_chooses_the_parts(sd2_prior):
+    assert memory.fit_to_memory(sd2_prior, 0.0, "distill.memory_gb", memory.encode_one_sample) is sd2_prior
     one, answer = (
-        memory.peak_bytes(lambda w=w: w(sd2), "cpu") for w in (memory.encode_one_sample, memory.inpaint_one_sample)
+        memory.peak_bytes(lambda w=w: w(sd2_prior), "cpu")
+        for w in (memory.encode_one_sample, memory.inpaint_one_sample)
     )
-    budget = (sd2.bytes + 3.5 * one) / memory.USABLE_SHARE / 1e9
-    chosen = memory.fit_to_memory(sd2, budget, "distill.memory_gb", memory.encode_one_sample)
+    budget = (sd2_prior.bytes + 3.5 * one) / memory.USABLE_SHARE / 1e9
+    chosen = memory.fit_to_memory(sd2_prior, budget, "distill.memory_gb", memory.encode_one_sample)
     assert chosen.rows_with_grad == 3 and chosen.rows == int(3.5 * one // answer)
     with pytest.raises(ValueError, match=r"distill.memory_gb is 0.001, but the prior takes .* raise it to"):
-        memory.fit_to_memory(sd2, 1e-3, "distill.memory_gb", memory.encode_one_sample)
-    assert memory.peak_bytes(lambda: memory.encode_one_sample(enable_checkpointing(sd2)), "cpu") < one
+        memory.fit_to_memory(sd2_prior, 1e-3, "distill.memory_gb", memory.encode_one_sample)
+    assert memory.peak_bytes(lambda: memory.encode_one_sample(enable_checkpointing(sd2_prior)), "cpu") < one
 
 
-def test_measuring_a_training_sample_leaves_no_gradient(sd2):
-    trained, _, _ = F.trainer(sd2, 1)
+def test_measuring_a_training_sample_leaves_no_gradient(sd2_prior):
+    trained, _, _ = F.trainer(sd2_prior, 1)
     row = lambda prior: denoising.backward_one_sample(prior, [F.reference(32)], 0)
-    assert memory.fit_to_memory(sd2, 1.0, "personalize.memory_gb", row).rows_with_grad > 1
+    assert memory.fit_to_memory(sd2_prior, 1.0, "personalize.memory_gb", row).rows_with_grad > 1
     assert all(p.grad is None and p.requires_grad for part in trained.values() for p in part)
 
 

@@ -1,14 +1,14 @@
-"""References whose texture was redrawn everywhere: accepted where they show their view, else refused with numbers."""
+"""References with a redrawn texture are accepted if they show their view, and else refused with numbers."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-import small_scene as small
-from small_references import completed, named, pattern, psnr, write_wall
+from scenes import wall_scene
+from scenes.capture import real_capture
+from scenes.images import natural_noise, paint_red, psnr, rectangle_mask
+from scenes.references import reference_entry, run_reference_stage
 
 from benchmarks.studies import redrawn
 from reffusion.capture.views import load_placed_views
@@ -20,22 +20,19 @@ from reffusion.params.reference import ReferenceSpec
 from reffusion.references import color, registration
 from reffusion.references.files import load_reference_files
 
-CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "data"
 SIZE = (480, 360)
 
 
-def hole_at(shape) -> np.ndarray:
-    hole = np.zeros(shape[:2], bool)
-    hole[120:220, 150:290] = True
-    return hole
+def hole_mask(shape) -> np.ndarray:
+    return rectangle_mask(shape[:2], (120, 220), (150, 290))
 
 
-def with_object(image: np.ndarray) -> np.ndarray:
-    return np.where(hole_at(image.shape)[..., None], np.uint8([230, 26, 26]), image)
+def paint_object(image: np.ndarray) -> np.ndarray:
+    return paint_red(image, hole_mask(image.shape))
 
 
-def other_view(image: np.ndarray, parallax: float) -> np.ndarray:
-    """The picture with depth in it, from beside: bands displaced by 4 px, and every second one by so many px more."""
+def shift_bands(image: np.ndarray, parallax: float) -> np.ndarray:
+    """The picture from beside: bands displaced by 4 px, and every second one by `parallax` px more."""
     rows, columns = (grid.astype(np.float32) for grid in np.mgrid[: image.shape[0], : image.shape[1]])
     displaced = 4 + parallax * ((columns // 80).astype(int) % 2)
     return cv2.remap(
@@ -45,8 +42,8 @@ def other_view(image: np.ndarray, parallax: float) -> np.ndarray:
 
 @pytest.mark.parametrize("variant", redrawn.VARIANTS)
 def test_a_redrawn_picture_of_the_view_is_accepted(variant):
-    truth = pattern(0, SIZE)
-    photo, hole = with_object(truth), hole_at(truth.shape)
+    truth = natural_noise(0, SIZE)
+    photo, hole = paint_object(truth), hole_mask(truth.shape)
     picture = redrawn.fit_size(redrawn.VARIANTS[variant](redrawn.redraw(truth)), photo)
     found = registration.register(picture, photo, hole)
     assert found.fits and found.inlier_ratio > 0.9 and not found.is_identical
@@ -64,20 +61,20 @@ def test_a_redrawn_picture_of_the_view_is_accepted(variant):
 
 @pytest.mark.parametrize("parallax", [2.0, 5.0])
 def test_another_view_of_the_scene_is_refused(parallax):
-    truth = pattern(0, SIZE)
-    photo, hole = with_object(truth), hole_at(truth.shape)
-    for picture in (other_view(truth, parallax), redrawn.redraw(other_view(truth, parallax))):
+    truth = natural_noise(0, SIZE)
+    photo, hole = paint_object(truth), hole_mask(truth.shape)
+    for picture in (shift_bands(truth, parallax), redrawn.redraw(shift_bands(truth, parallax))):
         found = registration.register(picture, photo, hole)
         assert not found.fits and found.inlier_ratio < 0.55
-    same = registration.register(other_view(truth, 0.0), photo, hole)
+    same = registration.register(shift_bands(truth, 0.0), photo, hole)
     assert same.fits and same.max_shift == pytest.approx(4, abs=0.2), (
         "displaced by 4 px everywhere, it would be accepted"
     )
 
 
 def test_another_scene_and_a_plain_picture_are_refused():
-    photo, hole = with_object(pattern(0, SIZE)), hole_at(SIZE[::-1])
-    for picture in (redrawn.redraw(pattern(1, SIZE)), np.zeros_like(photo), photo[::-1, ::-1].copy()):
+    photo, hole = paint_object(natural_noise(0, SIZE)), hole_mask(SIZE[::-1])
+    for picture in (redrawn.redraw(natural_noise(1, SIZE)), np.zeros_like(photo), photo[::-1, ::-1].copy()):
         found = registration.register(picture, photo, hole)
         assert not found.fits and found.inlier_ratio < 0.1
     plain = np.full_like(photo, 120)
@@ -87,7 +84,7 @@ def test_another_scene_and_a_plain_picture_are_refused():
 @pytest.mark.parametrize("size", [(8, 6), (64, 48), (480, 360)])
 @pytest.mark.parametrize("kind", ["equal", "black", "plain", "hole over all", "hole over nearly all"])
 def test_what_cannot_be_compared_is_accepted_and_says_so(size, kind):
-    photo = pattern(0, size)
+    photo = natural_noise(0, size)
     hole = np.full(photo.shape[:2], kind == "hole over all")
     if kind == "hole over nearly all":
         hole[:, : -max(2, size[0] // 40)] = True
@@ -101,7 +98,7 @@ def test_what_cannot_be_compared_is_accepted_and_says_so(size, kind):
 
 def test_the_nearest_photograph_tells_views_of_a_plane_apart():
     """Views of a plane are displaced alike: only the photograph that the picture shows tells it from a crop."""
-    views = {name: small.photo(small.CAMERAS[name]) for name in ("a2", "a3")}
+    views = {name: wall_scene.photo(wall_scene.CAMERAS[name]) for name in ("a2", "a3")}
     nothing = np.zeros(views["a2"].shape[:2], bool)
     picture = redrawn.redraw(views["a3"])
     found = registration.register(picture, views["a2"], nothing)
@@ -113,72 +110,70 @@ def test_the_nearest_photograph_tells_views_of_a_plane_apart():
 # ------------------------------------------------------------------------------------------------------- the stage
 
 
-@pytest.fixture
-def wall(tmp_path):
-    return write_wall(tmp_path)
-
-
-def test_only_the_hole_of_a_redrawn_reference_is_taken(wall, tmp_path):
-    truth, mask = small.photo(small.CAMERAS["a2"]), small.true_mask(small.CAMERAS["a2"], 1.6)
+def test_only_the_hole_of_a_redrawn_reference_is_taken(wall_folders, tmp_path):
+    truth, mask = wall_scene.photo(wall_scene.CAMERAS["a2"]), wall_scene.true_mask(wall_scene.CAMERAS["a2"], 1.6)
     picture = redrawn.darken(redrawn.redraw(truth))
     noise = np.random.default_rng(0).normal(0, 6, truth.shape)
-    save_image(wall["scene"] / "ref.png", np.clip(picture + noise, 0, 255).astype(np.uint8))
-    found = completed(wall, tmp_path / "out", **named("a2"))["a2"]
+    save_image(wall_folders["scene"] / "ref.png", np.clip(picture + noise, 0, 255).astype(np.uint8))
+    found = run_reference_stage(wall_folders, tmp_path / "out", **reference_entry("a2"))["a2"]
     away = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) == 0
     assert np.array_equal(found.image[away], truth[away]), "the photograph elsewhere"
     low = lambda image: cv2.GaussianBlur(image, (0, 0), 3)
     assert psnr(low(found.image), low(truth), mask) > 33, "its colours are the photograph's"
 
 
-def test_a_refusal_gives_numbers_the_better_view_and_the_way_out(wall, tmp_path):
-    save_image(wall["scene"] / "ref.png", small.photo(small.CAMERAS["a3"]))
+def test_a_refusal_gives_numbers_the_better_view_and_the_way_out(wall_folders, tmp_path):
+    save_image(wall_folders["scene"] / "ref.png", wall_scene.photo(wall_scene.CAMERAS["a3"]))
     with pytest.raises(ValueError, match=r"ref\.png: does not fit its view 'a2'.*view 'a3' better \(\d+%\)"):
-        completed(wall, tmp_path / "near", **named("a2"))
-    save_image(wall["scene"] / "ref.png", pattern(5, (small.WIDTH, small.HEIGHT)))
+        run_reference_stage(wall_folders, tmp_path / "near", **reference_entry("a2"))
+    save_image(wall_folders["scene"] / "ref.png", natural_noise(5, (wall_scene.WIDTH, wall_scene.HEIGHT)))
     expected = (
         r"ref\.png: does not fit its view 'a2': as it lies, it shows \d+% of \d+ places around the hole where the "
         r"photograph has them \(at least \d+% must; .*\); is it of another view, or of another scene\? "
         r"If it is right, write `trust: true` beside it in scene\.yaml$"
     )
     with pytest.raises(ValueError, match=expected):
-        completed(wall, tmp_path / "other", **named("a2"))
+        run_reference_stage(wall_folders, tmp_path / "other", **reference_entry("a2"))
 
 
-def test_a_picture_of_the_undistorted_view_asks_for_its_key(wall, tmp_path):
-    file = wall["poses"] / "lenses.json"
+def test_a_picture_of_the_undistorted_view_asks_for_its_key(wall_folders, tmp_path):
+    file = wall_folders["poses"] / "lenses.json"
     record = load_json(file)
     record["views"]["a2"]["radial"] = [-0.25]
     save_json(file, record)
-    save_image(wall["scene"] / "ref.png", small.photo(small.CAMERAS["a2"]))
+    save_image(wall_folders["scene"] / "ref.png", wall_scene.photo(wall_scene.CAMERAS["a2"]))
     with pytest.raises(BadInput, match=r"ref\.png: fits the undistorted picture.*write `undistorted: true` beside it"):
-        completed(wall, tmp_path / "refused", **named("a2"))
-    assert "a2" in completed(wall, tmp_path / "out", **named("a2", undistorted=True))
+        run_reference_stage(wall_folders, tmp_path / "refused", **reference_entry("a2"))
+    assert "a2" in run_reference_stage(wall_folders, tmp_path / "out", **reference_entry("a2", undistorted=True))
 
 
-def test_a_person_overrules_a_refusal(wall, tmp_path):
-    other, mask = pattern(5, (small.WIDTH, small.HEIGHT)), small.true_never_seen(small.CAMERAS["a2"], 1.6)
-    save_image(wall["scene"] / "ref.png", other)
+def test_a_person_overrules_a_refusal(wall_folders, tmp_path):
+    other, mask = (
+        natural_noise(5, (wall_scene.WIDTH, wall_scene.HEIGHT)),
+        wall_scene.true_unobserved(wall_scene.CAMERAS["a2"], 1.6),
+    )
+    save_image(wall_folders["scene"] / "ref.png", other)
     with pytest.warns(
         UserWarning, match=r"shows \d+% of \d+ places.*taken all the same: scene\.yaml says `trust: true`"
     ):
-        found = completed(wall, tmp_path / "out", **named("a2", trust=True))["a2"]
+        found = run_reference_stage(wall_folders, tmp_path / "out", **reference_entry("a2", trust=True))["a2"]
     assert mask.any() and np.array_equal(found.image[mask], other[mask]), "neither moved nor recolored"
-    truth = small.photo(small.CAMERAS["a2"])
-    away = cv2.dilate(small.true_mask(small.CAMERAS["a2"], 1.6).astype(np.uint8), np.ones((9, 9))) == 0
+    truth = wall_scene.photo(wall_scene.CAMERAS["a2"])
+    away = cv2.dilate(wall_scene.true_mask(wall_scene.CAMERAS["a2"], 1.6).astype(np.uint8), np.ones((9, 9))) == 0
     assert np.array_equal(found.image[away], truth[away])
 
 
-def test_a_painting_is_trusted_by_a_line_that_names_it(wall, tmp_path):
-    save_image(wall["scene"] / "painted" / "a2.png", pattern(5, (small.WIDTH, small.HEIGHT)))
+def test_a_painting_is_trusted_by_a_line_that_names_it(wall_folders, tmp_path):
+    save_image(wall_folders["scene"] / "painted" / "a2.png", natural_noise(5, (wall_scene.WIDTH, wall_scene.HEIGHT)))
     line = r"write `reference: \{view: a2, image: painted/a2\.png, trust: true\}` in scene\.yaml"
     with pytest.raises(ValueError, match=line):
-        completed(wall, tmp_path / "refused")
-    views = load_placed_views(wall["poses"])
+        run_reference_stage(wall_folders, tmp_path / "refused")
+    views = load_placed_views(wall_folders["poses"])
     of_painting = ReferenceSpec(view="a2", image="painted/a2.png", trust=True)
-    assert [each.trust for each in load_reference_files(wall["scene"], views, of_painting)] == [True]
-    save_image(wall["scene"] / "ref.png", small.photo(small.CAMERAS["a2"]))
+    assert [each.trust for each in load_reference_files(wall_folders["scene"], views, of_painting)] == [True]
+    save_image(wall_folders["scene"] / "ref.png", wall_scene.photo(wall_scene.CAMERAS["a2"]))
     of_another = ReferenceSpec(view="a2", image="ref.png", trust=True)
-    assert [each.trust for each in load_reference_files(wall["scene"], views, of_another)] == [False]
+    assert [each.trust for each in load_reference_files(wall_folders["scene"], views, of_another)] == [False]
 
 
 # --------------------------------------------------------------------------------------------------- real captures
@@ -187,10 +182,8 @@ def test_a_painting_is_trusted_by_a_line_that_names_it(wall, tmp_path):
 @pytest.mark.parametrize("name", ["bear", "dinosaur", "fox", "garden", "statue"])
 def test_real_photographs(name):
     """Every tenth view: its redrawn picture is accepted; its nearest views' photographs and another scene's are not."""
-    if not (CAPTURES / name).is_dir() or not (CAPTURES / "bear").is_dir():
-        pytest.skip("no ../shared/data")
     capture, foreign = (
-        redrawn.load_photographs(CAPTURES / each) for each in (name, "bear" if name != "bear" else "garden")
+        redrawn.load_photographs(real_capture(each)) for each in (name, "bear" if name != "bear" else "garden")
     )
     photo_of_another = foreign.picture(next(iter(foreign.files)))
     for view in list(capture.files)[5::40]:

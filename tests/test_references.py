@@ -1,4 +1,4 @@
-"""References that people bring: named, painted or from other tools; what reruns for them, and what is refused."""
+"""User references: named, painted or from other tools; what reruns for them, and what is refused."""
 
 from __future__ import annotations
 
@@ -9,12 +9,28 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import small_scene as small
 import torch
 import yaml
 from PIL import Image
-from small_capture import HEIGHT, OPENCV, WIDTH, prepare, run, some_truth, write_pictures, write_transforms
-from small_references import SIZE, completed, from_another_tool, named, pattern, psnr, write_wall
+from scenes import wall_scene
+from scenes.capture import (
+    HEIGHT,
+    OPENCV,
+    WIDTH,
+    make_truth,
+    run_stages,
+    write_capture,
+    write_pictures,
+)
+from scenes.gaussians import join_gaussians
+from scenes.images import natural_noise, psnr, rectangle_mask
+from scenes.references import (
+    SIZE,
+    reference_entry,
+    resize_and_compress,
+    run_reference_stage,
+    write_wall_capture,
+)
 
 from reffusion import geometry
 from reffusion.capture import lens
@@ -41,14 +57,12 @@ from stages.plan import reference as plan_reference
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def object_at() -> np.ndarray:
-    hidden = np.zeros(SIZE[::-1], bool)
-    hidden[40:80, 60:100] = True
-    return hidden
+def object_mask() -> np.ndarray:
+    return rectangle_mask(SIZE[::-1], (40, 80), (60, 100))
 
 
-def with_object(image: np.ndarray) -> np.ndarray:
-    return np.where(object_at()[..., None], np.uint8(250), image)
+def whiten_object(image: np.ndarray) -> np.ndarray:
+    return np.where(object_mask()[..., None], np.uint8(250), image)
 
 
 # --------------------------------------------------------------------------------------------------- registration
@@ -56,10 +70,10 @@ def with_object(image: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("how", [{}, {"crop": 0}, {"scale": 1.0, "quality": 95}, {"scale": 0.8, "crop": 12, "gain": 1}])
 def test_a_picture_from_another_tool_comes_back_onto_its_photograph(how):
-    truth, size = pattern(0), SIZE
-    photo, changed = with_object(truth), from_another_tool(truth, **how)
+    truth, size = natural_noise(0), SIZE
+    photo, changed = whiten_object(truth), resize_and_compress(truth, **how)
     picture = cv2.resize(changed, size, interpolation=cv2.INTER_CUBIC)
-    found = registration.register(picture, photo, object_at())
+    found = registration.register(picture, photo, object_mask())
     assert found.fits and found.inlier_ratio > 0.95
     crop, (height, width) = how.get("crop", 5), changed.shape[:2]
     scale = np.array([width + crop, height + crop]) / size * np.array(size) / (width, height)
@@ -71,32 +85,36 @@ def test_a_picture_from_another_tool_comes_back_onto_its_photograph(how):
     result = color.recolor(registration.warp(picture, moved)[0], found.gain, found.offset)
     gain = np.full(3, 1 / how.get("gain", 0.92))
     ideal = color.recolor(registration.warp(picture, expected)[0], gain, np.zeros(3))
-    assert psnr(result, truth, object_at()) > psnr(ideal, truth, object_at()) - 0.5 > psnr(picture, truth, object_at())
+    assert (
+        psnr(result, truth, object_mask())
+        > psnr(ideal, truth, object_mask()) - 0.5
+        > psnr(picture, truth, object_mask())
+    )
 
 
 def test_an_aligned_reference_comes_through_untouched():
-    truth = pattern(0)
-    found = registration.register(truth, with_object(truth), object_at())
+    truth = natural_noise(0)
+    found = registration.register(truth, whiten_object(truth), object_mask())
     assert found.is_identical and found.affine is None and (found.gain == 1).all() and not found.offset.any()
-    slightly = from_another_tool(truth, scale=1.0, crop=0, quality=70, gain=1)
-    found = registration.register(slightly, with_object(truth), object_at())
+    slightly = resize_and_compress(truth, scale=1.0, crop=0, quality=70, gain=1)
+    found = registration.register(slightly, whiten_object(truth), object_mask())
     assert found.fits and found.affine is None and not found.is_identical, "not resampled, cut in only"
 
 
 def test_what_was_repainted_elsewhere_moves_nothing():
-    truth = pattern(0)
-    picture = from_another_tool(truth, scale=1.0, crop=0, quality=90, gain=0.9)
-    picture[90:, :50] = pattern(1)[90:, :50]
-    found = registration.register(picture, with_object(truth), object_at())
+    truth = natural_noise(0)
+    picture = resize_and_compress(truth, scale=1.0, crop=0, quality=90, gain=0.9)
+    picture[90:, :50] = natural_noise(1)[90:, :50]
+    found = registration.register(picture, whiten_object(truth), object_mask())
     assert found.fits and found.affine is None and found.gain == pytest.approx(1 / 0.9, abs=0.01)
 
 
 def test_another_picture_fits_badly_and_a_plain_one_cannot_be_told():
-    photo = with_object(pattern(0))
-    found = registration.register(pattern(1), photo, object_at())
+    photo = whiten_object(natural_noise(0))
+    found = registration.register(natural_noise(1), photo, object_mask())
     assert not found.fits and found.inlier_ratio < 0.2 and f"shows {found.inlier_ratio:.0%} of" in found.mismatch
     plain = np.full_like(photo, 90)
-    found = registration.register(plain, with_object(plain + 20), object_at())
+    found = registration.register(plain, whiten_object(plain + 20), object_mask())
     assert found.fits and np.isnan(found.inlier_ratio) and "too plain" in str(found)
 
 
@@ -117,7 +135,7 @@ def test_only_the_hole_and_its_rim_are_taken():
 def test_a_moved_reference_is_read_once_through_the_lens(tmp_path):
     """Distorted, cropped, resized: straight again, as the photograph's own undistorted picture."""
     shot = lens.from_colmap(OPENCV[0], WIDTH, HEIGHT, OPENCV[1])
-    image = pattern(3, (WIDTH, HEIGHT))
+    image = natural_noise(3, (WIDTH, HEIGHT))
     save_image(tmp_path / "whole.png", image)
     whole, inside = undistort_reference(ReferenceFile("v", tmp_path / "whole.png"), shot, False)
     still, _ = undistort_reference(ReferenceFile("v", tmp_path / "whole.png"), shot, False, np.eye(2, 3))
@@ -211,19 +229,24 @@ def test_the_depth_of_an_object_alone_is_a_depth_map(tmp_path):
 
 
 REFUSALS = [
-    ("unknown view", named("q"), (), "reference: there is no view 'q'.*v0"),
-    ("missing file", named("v01", "no.png"), (), r"no\.png: no such file; correct `reference`"),
-    ("missing depth", named("v01", depth="no.npy"), (), r"no\.npy: no such file"),
-    ("depth of another kind", named("v01", depth="note.txt"), (), r"note\.txt: a depth map is a 16-bit"),
-    ("other proportions", named("v01", "tall.png"), (), r"tall\.png: 72x96"),
+    ("unknown view", reference_entry("q"), (), "reference: there is no view 'q'.*v0"),
+    ("missing file", reference_entry("v01", "no.png"), (), r"no\.png: no such file; correct `reference`"),
+    ("missing depth", reference_entry("v01", depth="no.npy"), (), r"no\.npy: no such file"),
+    ("depth of another kind", reference_entry("v01", depth="note.txt"), (), r"note\.txt: a depth map is a 16-bit"),
+    ("other proportions", reference_entry("v01", "tall.png"), (), r"tall\.png: 72x96"),
     (
         "two for a view",
-        {"reference": [*named("v01").values(), *named("v01.png").values()]},
+        {"reference": [*reference_entry("v01").values(), *reference_entry("v01.png").values()]},
         (),
         "two for the view 'v01'",
     ),
-    ("test view", named("v01") | {"test": ["v01"]}, (), r"ref\.png: 'v01' is a test view"),
-    ("neither", named("v01") | {"train": ["v00", "v02", "v03"], "test": ["v04"]}, (), "'v01' is neither a training"),
+    ("test view", reference_entry("v01") | {"test": ["v01"]}, (), r"ref\.png: 'v01' is a test view"),
+    (
+        "neither",
+        reference_entry("v01") | {"train": ["v00", "v02", "v03"], "test": ["v04"]},
+        (),
+        "'v01' is neither a training",
+    ),
     ("painting of no view", {}, ["zebra.png"], r"painted/zebra\.png: no view is called 'zebra'"),
     ("painting of a test view", {"test": ["v01"]}, ["v01.png"], r"painted/v01\.png: 'v01' is a test view"),
     ("two paintings", {}, ["v01.png", "v01.jpg"], r"v01\.png: there is v01\.jpg too"),
@@ -232,9 +255,9 @@ REFUSALS = [
 ]
 
 
-def with_references(folder: Path, painted=()) -> Path:
-    """A capture with the files that `REFUSALS` names."""
-    prepare(folder, "transforms", some_truth())
+def write_reference_capture(folder: Path, painted=()) -> Path:
+    """Write a capture with the files that `REFUSALS` names."""
+    write_capture(folder, "transforms", make_truth())
     write_pictures(folder, ["ref"])
     write_pictures(folder, ["tall"], (HEIGHT, WIDTH))
     (folder / "note.txt").write_text("")
@@ -246,7 +269,7 @@ def with_references(folder: Path, painted=()) -> Path:
 
 @pytest.mark.parametrize(("params", "painted", "message"), [r[1:] for r in REFUSALS], ids=[r[0] for r in REFUSALS])
 def test_references_are_refused_before_any_work(tmp_path, params, painted, message):
-    folder = with_references(tmp_path / "s", painted)
+    folder = write_reference_capture(tmp_path / "s", painted)
     with pytest.raises(ValueError, match=message):
         plan_poses.preview(poses.Params(**params), folder)
 
@@ -261,9 +284,9 @@ UNPLACED = {
 
 @pytest.mark.parametrize(("name", "params", "painted", "message"), REFUSALS, ids=[r[0] for r in REFUSALS])
 def test_references_are_refused_by_what_poses_wrote(tmp_path, name, params, painted, message):
-    folder = with_references(tmp_path / "s", painted)
+    folder = write_reference_capture(tmp_path / "s", painted)
     asked = params.get("reference")
-    _, placed = run(folder, **{key: value for key, value in params.items() if key != "reference"})
+    _, placed = run_stages(folder, **{key: value for key, value in params.items() if key != "reference"})
     for layout in ("images", "masks"):
         shutil.rmtree(folder / layout)  # nothing of the capture is looked at
     (folder / "transforms.json").unlink()
@@ -284,26 +307,26 @@ def test_the_stage_reads_nothing_of_the_capture(tmp_path):
 
 
 def test_paintings_stand_for_named_references_and_masks_beside_them_are_passed_over(tmp_path):
-    folder = prepare(tmp_path / "s", "transforms", some_truth())
+    folder = write_capture(tmp_path / "s", "transforms", make_truth())
     write_pictures(folder, ["ref", "painted/v01", "painted/v01_mask", "painted/v03", "painted/v03_depth"])
     named_too = [{"view": "v01", "image": "ref.png"}, {"view": "v02", "image": "ref.png"}]
     assert "v01 (painted), v02, v03 (painted)" in plan_poses.preview(poses.Params(reference=named_too), folder)[-1]
     params = reference.Params(reference=named_too)
     (note,) = plan_reference.preview(params, scene=folder)
     assert note == "takes over the scene's reference: no diffusion here"
-    _, placed = run(folder)
+    _, placed = run_stages(folder)
     (note,) = plan_reference.preview(params, scene=folder, poses=placed)
     assert "v01 (painted), v02, v03 (painted)" in note
     assert not plan_reference.needed_weights(reference.Params(), frozenset({"painted"}))
 
 
-def test_a_view_that_was_not_placed_is_told(tmp_path):
-    folder = prepare(tmp_path / "s", "transforms", some_truth())
+def test_a_view_without_a_pose_is_named(tmp_path):
+    folder = write_capture(tmp_path / "s", "transforms", make_truth())
     write_pictures(folder, ["ref"])
-    save_lenses(tmp_path, {"v00": some_truth().lens}, False, {})
+    save_lenses(tmp_path, {"v00": make_truth().lens}, False, {})
     save_json(tmp_path / "views.json", {"train": ["v00"], "test": [], "clean": []})
     with pytest.raises(ValueError, match=r"ref\.png: its view 'v01' could not be placed"):
-        plan_reference.preview(reference.Params(**named("v01")), scene=folder, poses=tmp_path)
+        plan_reference.preview(reference.Params(**reference_entry("v01")), scene=folder, poses=tmp_path)
     write_pictures(folder, ["painted/v00", "painted/v01_mask"])  # a mask that was copied along
     (note,) = plan_reference.preview(reference.Params(), scene=folder, poses=tmp_path)
     assert "v00 (painted)" in note
@@ -312,57 +335,54 @@ def test_a_view_that_was_not_placed_is_told(tmp_path):
 # ---------------------------------------------------------------------------------------------- the stage's artifact
 
 
-@pytest.fixture
-def wall(tmp_path):
-    return write_wall(tmp_path)
-
-
-def test_a_reference_from_another_tool_ends_near_the_clean_one(wall, tmp_path):
-    truth, mask = small.photo(small.CAMERAS["a2"]), small.true_mask(small.CAMERAS["a2"], 1.6)
-    save_image(wall["scene"] / "clean.png", truth)
-    Image.fromarray(from_another_tool(truth, quality=95)).save(wall["scene"] / "far.jpg", quality=80)
-    clean_one = completed(wall, tmp_path / "clean", **named("a2", "clean.png"))["a2"]
+def test_a_reference_from_another_tool_ends_near_the_clean_one(wall_folders, tmp_path):
+    truth, mask = wall_scene.photo(wall_scene.CAMERAS["a2"]), wall_scene.true_mask(wall_scene.CAMERAS["a2"], 1.6)
+    save_image(wall_folders["scene"] / "clean.png", truth)
+    Image.fromarray(resize_and_compress(truth, quality=95)).save(wall_folders["scene"] / "far.jpg", quality=80)
+    clean_one = run_reference_stage(wall_folders, tmp_path / "clean", **reference_entry("a2", "clean.png"))["a2"]
     assert np.array_equal(clean_one.image, truth) and clean_one.depth is None
-    far = completed(wall, tmp_path / "far", **named("a2", "far.jpg"))["a2"]
+    far = run_reference_stage(wall_folders, tmp_path / "far", **reference_entry("a2", "far.jpg"))["a2"]
     assert psnr(far.image, truth, mask) > 33 and np.array_equal(far.mask, clean_one.mask)
     away = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) == 0
     assert np.array_equal(far.image[away], truth[away]), "the photograph elsewhere"
-    save_image(wall["scene"] / "other.png", pattern(5, (small.WIDTH, small.HEIGHT)))
+    save_image(wall_folders["scene"] / "other.png", natural_noise(5, (wall_scene.WIDTH, wall_scene.HEIGHT)))
     with pytest.raises(ValueError, match=r"other\.png: does not fit its view 'a2'.*shows \d+% of .*another view"):
-        completed(wall, tmp_path / "other", **named("a2", "other.png"))
+        run_reference_stage(wall_folders, tmp_path / "other", **reference_entry("a2", "other.png"))
 
 
-def test_depth_of_a_reference_reaches_its_artifact(wall, tmp_path):
-    truth = small.photo(small.CAMERAS["a2"])
-    save_image(wall["scene"] / "clean.png", truth)
-    depth = np.add.outer(np.zeros(2 * small.HEIGHT), np.linspace(1000, 60000, 2 * small.WIDTH))
-    save_png16(wall["scene"] / "depth.png", depth)
-    found = completed(wall, tmp_path / "out", **named("a2", "clean.png", depth="depth.png"))["a2"]
+def test_depth_of_a_reference_reaches_its_artifact(wall_folders, tmp_path):
+    truth = wall_scene.photo(wall_scene.CAMERAS["a2"])
+    save_image(wall_folders["scene"] / "clean.png", truth)
+    depth = np.add.outer(np.zeros(2 * wall_scene.HEIGHT), np.linspace(1000, 60000, 2 * wall_scene.WIDTH))
+    save_png16(wall_folders["scene"] / "depth.png", depth)
+    found = run_reference_stage(
+        wall_folders, tmp_path / "out", **reference_entry("a2", "clean.png", depth="depth.png")
+    )["a2"]
     assert (
         found.depth.shape == found.mask.shape
         and np.corrcoef(found.depth.ravel(), depth[1::2, 1::2].ravel())[0, 1] > 0.999
     )
 
 
-def test_what_is_to_be_painted_is_laid_out_and_a_painting_comes_back(wall, tmp_path):
-    first = completed(wall, tmp_path / "first")
+def test_pictures_to_paint_are_exported_and_paintings_are_read_back(wall_folders, tmp_path):
+    first = run_reference_stage(wall_folders, tmp_path / "first")
     assert list(first) == ["a2"]
     laid_out = tmp_path / "first" / "to_paint"
     lines = [line.split() for line in (laid_out / "ranked.txt").read_text().splitlines() if line[0] != "#"]
     assert lines[0][0] == "1." and lines[0][2] == "100%" and len(lines) == 1, "one view sees all of so flat a hole"
     view = lines[0][1]
     shown, mask = load_image(laid_out / f"{view}.png"), load_mask(laid_out / f"{view}_mask.png")
-    photo, hidden = small.photo(small.CAMERAS[view]), small.true_mask(small.CAMERAS[view], 1.6)
+    photo, hidden = wall_scene.photo(wall_scene.CAMERAS[view]), wall_scene.true_mask(wall_scene.CAMERAS[view], 1.6)
     assert (
-        np.array_equal(mask, small.true_never_seen(small.CAMERAS[view], 1.6))
+        np.array_equal(mask, wall_scene.true_unobserved(wall_scene.CAMERAS[view], 1.6))
         and (shown[mask] == view_ranking.GREY).all()
     )
     assert np.array_equal(shown[~hidden], photo[~hidden]) and psnr(shown, photo, hidden & ~mask) > 20
 
-    shutil.copytree(laid_out, wall["scene"] / "painted", ignore=shutil.ignore_patterns("*.txt"))
+    shutil.copytree(laid_out, wall_folders["scene"] / "painted", ignore=shutil.ignore_patterns("*.txt"))
     painted = np.where(mask[..., None], photo, shown)
-    save_image(wall["scene"] / "painted" / f"{view}.png", painted)
-    again = completed(wall, tmp_path / "again")
+    save_image(wall_folders["scene"] / "painted" / f"{view}.png", painted)
+    again = run_reference_stage(wall_folders, tmp_path / "again")
     assert list(again) == [view] and np.array_equal(again[view].image, painted)
     assert f"1. {view}  100%  (painted)" in (tmp_path / "again" / "to_paint" / "ranked.txt").read_text()
 
@@ -371,10 +391,10 @@ def test_views_are_ranked_by_what_they_cover_beyond_those_before():
     """Three cameras at a wall: two see the same piece of it, the third another, of which its border cuts off a part."""
 
     def hole(name: str, x: float, columns: slice) -> view_ranking.Hole:
-        camera = small.camera(name, x)
-        pixels = np.zeros((small.HEIGHT, small.WIDTH), bool)
+        camera = wall_scene.front_camera(name, x)
+        pixels = np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
         pixels[20:40, columns] = True
-        return view_ranking.Hole(camera, pixels, np.full(pixels.shape, small.WALL))
+        return view_ranking.Hole(camera, pixels, np.full(pixels.shape, wall_scene.WALL))
 
     holes = {"a": hole("a", 0.0, slice(10, 40)), "b": hole("b", 0.0, slice(12, 36)), "c": hole("c", 2.0, slice(10, 25))}
     found = view_ranking.rank_views(holes, [], 3)
@@ -386,29 +406,11 @@ def test_views_are_ranked_by_what_they_cover_beyond_those_before():
 # ------------------------------------------------------------------------------------------ what reruns, and what stays
 
 
-def capture(folder: Path) -> Path:
-    """A scene on disk: the wall with a red square before it, masks of the square."""
-    cameras = {name: small.CAMERAS[name] for name in small.TRAIN}
-    truth = some_truth()
-    points = np.stack([*(a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 20), np.linspace(-0.7, 0.7, 14))),
-                       np.full(280, small.WALL)], -1)  # fmt: skip
-    shown = type(truth)({n: c.world_to_camera for n, c in cameras.items()}, points, truth.model)
-    folder.mkdir()
-    write_transforms(folder, shown)
-    for name, camera in cameras.items():
-        mask = small.true_mask(camera, 1.4)
-        save_image(
-            folder / f"images/{name}.png", np.where(mask[..., None], np.uint8([230, 26, 26]), small.photo(camera))
-        )
-        save_mask(folder / f"masks/{name}.png", mask)
-    return folder
-
-
 SMALL = "poses.refine=false fit.iterations=20 fit.densify.cap_max=1000 masks.invent=consistent masks.hull=1"
 
 
 def test_a_new_reference_reruns_nothing_before_its_stage(tmp_path):
-    folder = capture(tmp_path / "wall")
+    folder = write_wall_capture(tmp_path / "wall")
     request = Request(ROOT, tmp_path / "runs", str(folder), profile="laptop", set=SMALL)
 
     def words() -> dict[str, str]:
@@ -428,7 +430,7 @@ def test_a_new_reference_reruns_nothing_before_its_stage(tmp_path):
 
     view = laid_out[0].split(".")[0].removesuffix("_mask")
     shown, mask = (load_image(home / "to_paint" / f"{view}{end}.png") for end in ("", "_mask"))
-    photo = small.photo(small.CAMERAS[view])
+    photo = wall_scene.photo(wall_scene.CAMERAS[view])
     save_image(folder / "painted" / f"{view}.png", np.where(mask > 0, photo, shown))
     assert only_the_reference_changed()
     run_scene(request, "reference")
@@ -436,16 +438,16 @@ def test_a_new_reference_reruns_nothing_before_its_stage(tmp_path):
     assert found.camera.name == view and psnr(found.image, photo, found.mask) > 40
     assert (home / "to_paint" / "ranked.txt").is_file()
 
-    (folder / "scene.yaml").write_text(yaml.safe_dump(named("a0", "truth/a0.png")))
+    (folder / "scene.yaml").write_text(yaml.safe_dump(reference_entry("a0", "truth/a0.png")))
     assert only_the_reference_changed()
-    save_image(folder / "images" / "a4.png", small.photo(small.CAMERAS["a4"]))
+    save_image(folder / "images" / "a4.png", wall_scene.photo(wall_scene.CAMERAS["a4"]))
     assert words()["poses"] == "run", "a photograph is none of these"
     clean(request)
     assert not home.exists() and (folder / "painted" / f"{view}.png").is_file()
 
 
 def test_saved_masks_rerun_neither_poses_nor_the_fit(tmp_path):
-    folder = capture(tmp_path / "wall")
+    folder = write_wall_capture(tmp_path / "wall")
     masks = {path: path.read_bytes() for path in (folder / "masks").iterdir()}
     request = Request(ROOT, tmp_path / "runs", str(folder), profile="laptop", set=SMALL)
 
@@ -474,29 +476,31 @@ def test_saved_masks_rerun_neither_poses_nor_the_fit(tmp_path):
 
 
 def test_a_photograph_that_is_also_a_reference_still_counts_for_poses(tmp_path):
-    folder = prepare(tmp_path / "s", "transforms", some_truth())
+    folder = write_capture(tmp_path / "s", "transforms", make_truth())
     write_pictures(folder, ["ref"])
     (folder / "scene.yaml").write_text("")
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     read = plan_poses.scene_files(poses.Params(), folder, files)
     assert folder / "images/v00.png" in read and folder / "transforms.json" in read
     assert folder / "ref.png" not in read and folder / "scene.yaml" not in read
-    of_reference = plan_reference.scene_files(reference.Params(**named("v00", "images/v00.png")), folder, files)
+    of_reference = plan_reference.scene_files(
+        reference.Params(**reference_entry("v00", "images/v00.png")), folder, files
+    )
     assert of_reference == [folder / "images/v00.png"]
-    scene, _ = run(folder)
+    scene, _ = run_stages(folder)
     assert len(scene.cameras) == 6
 
 
-def test_references_that_contradict_each_other_are_told_from_those_that_agree():
+def test_contradicting_references_are_detected():
     """Two views of a wall: the same paint on it, then another in one of them."""
-    views = [small.camera("a", -0.2), small.camera("b", 0.2)]
-    depth = np.full((small.HEIGHT, small.WIDTH), small.WALL)
+    views = [wall_scene.front_camera("a", -0.2), wall_scene.front_camera("b", 0.2)]
+    depth = np.full((wall_scene.HEIGHT, wall_scene.WIDTH), wall_scene.WALL)
     hole = np.zeros_like(depth, bool)
     hole[20:52, 24:72] = True
     painted = {}
     for view in views:
         points = geometry.unproject(depth, view)
-        painted[view.name] = np.round(255 * small.texture(points[..., 0], points[..., 1])).astype(np.uint8)
+        painted[view.name] = np.round(255 * wall_scene.wall_color(points[..., 0], points[..., 1])).astype(np.uint8)
     holes = {view.name: view_ranking.Hole(view, hole, depth) for view in views}
     alike = [Reference(view, painted[view.name], hole) for view in views]
     assert agreement.color_difference(*alike, *holes.values()) < agreement.CONTRADICTION / 4
@@ -505,22 +509,23 @@ def test_references_that_contradict_each_other_are_told_from_those_that_agree():
     assert (first, second) == ("a", "b") and unlike > 2 * agreement.CONTRADICTION
 
 
-def test_what_references_draw_before_a_scene_is_compared_at_its_own_depth():
+def test_objects_in_front_of_a_scene_are_compared_at_their_own_depth():
     """A striped square before a wall and a step: true in both views; without its depth nothing can be said."""
     near, step = 1.4, 1.7
-    floor = small.plane(step, 2.0, 0.25, small.texture)
+    floor = wall_scene.rectangle_gaussians(step, 2.0, 0.25, wall_scene.wall_color)
     floor = replace(floor, means=floor.means + torch.tensor([0.0, 0.6, 0.0]))
-    scene = small.plane(small.WALL, 2.0, 1.4, small.texture).zip_map(floor, lambda a, b: torch.cat([a, b]))
+    wall = wall_scene.rectangle_gaussians(wall_scene.WALL, 2.0, 1.4, wall_scene.wall_color)
+    scene = join_gaussians(wall, floor)
     references = []
-    for view in (small.camera("a", -0.2), small.camera("b", 0.2)):
-        drawn = small.true_mask(view, near)
+    for view in (wall_scene.front_camera("a", -0.2), wall_scene.front_camera("b", 0.2)):
+        drawn = wall_scene.true_mask(view, near)
         wide = geometry.unproject(np.full(drawn.shape, step), view)[..., 1] > 0.35
-        depth = np.where(drawn, near, np.where(wide, step, small.WALL))
+        depth = np.where(drawn, near, np.where(wide, step, wall_scene.WALL))
         points = geometry.unproject(depth, view)
         stripe = np.where((points[..., :1] * 12).astype(int) % 2 == 0, [0.9, 0.1, 0.1], [0.1, 0.9, 0.1])
-        image = np.where(drawn[..., None], stripe, small.texture(points[..., 0], points[..., 1]))
+        image = np.where(drawn[..., None], stripe, wall_scene.wall_color(points[..., 0], points[..., 1]))
         references.append(Reference(view, np.round(255 * image).astype(np.uint8), drawn, 3 * depth))
-    cameras, nothing = [each.camera for each in references], np.zeros((small.HEIGHT, small.WIDTH), bool)
+    cameras, nothing = [each.camera for each in references], np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
     hidden = {camera.name: nothing for camera in cameras}
     holes = view_ranking.find_holes(scene, cameras, hidden, {each.camera.name: each.mask for each in references})
     measured = agreement.refine_hole_depth(holes, references, scene, hidden)

@@ -1,4 +1,4 @@
-"""Cameras that miss their photographs are found and put right; those that fit, and those that cannot be told, stay."""
+"""Camera refinement corrects wrong cameras, and leaves exact and undetermined ones."""
 
 from dataclasses import replace
 from functools import cache
@@ -6,6 +6,7 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from scenes.cameras import make_camera, project_points, world_rays
 from scipy.spatial.transform import Rotation
 
 from reffusion.capture import refine
@@ -14,37 +15,33 @@ from reffusion.types import Camera
 WIDTH, HEIGHT, FOCAL = 216, 162, 200.0
 
 
-def camera(name: str, x: float, y: float, z: float, turn: float) -> Camera:
+def tilted_camera(name: str, x: float, y: float, z: float, turn: float) -> Camera:
     """At (x, y, -1 + z), turned about y."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec((0.3 * turn, turn, 0.0)).as_matrix()
-    pose[:3, 3] = -pose[:3, :3] @ (x, y, z - 1.0)
-    return Camera(name, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose)
+    rotation = Rotation.from_rotvec((0.3 * turn, turn, 0.0)).as_matrix()
+    return make_camera(name, (WIDTH, HEIGHT), FOCAL, (x, y, z - 1.0), rotation)
 
 
 RNG = np.random.default_rng(4)
 EXACT = [
-    camera(f"v{k}", 0.05 * (k % 3) - 0.05, 0.05 * (k // 3) - 0.05, z, turn)
+    tilted_camera(f"v{k}", 0.05 * (k % 3) - 0.05, 0.05 * (k // 3) - 0.05, z, turn)
     for k, (z, turn) in enumerate(zip(RNG.uniform(-0.03, 0.03, 9), RNG.uniform(-0.05, 0.05, 9), strict=True))
 ]
 WAVES = RNG.normal(0, 1, (80, 2)), RNG.uniform(0, 6.3, (80, 3))
 
 
-def photo(view: Camera) -> np.ndarray:
+def paint_two_walls(view: Camera) -> np.ndarray:
     """A painted wall at z = 4 and another at z = 0.6 that covers its left half."""
-    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    rays = np.stack([(x - view.cx) / view.fx, (y - view.cy) / view.fy, np.ones_like(x)], -1)
-    rays = rays @ view.world_to_camera[:3, :3]
+    rays = world_rays(view)
     near, far = (view.center + rays * ((z - view.center[2]) / rays[..., 2:]) for z in (0.6, 4.0))
     paint = lambda at, scale: np.sin((at[..., :2] @ (scale * WAVES[0]).T)[..., None] + WAVES[1]).sum(2) / 80**0.5
     field = np.where((near[..., :1] < 0), paint(near, 25.0), paint(far, 8.0))
     return (127 + 70 * field).clip(0, 255).astype(np.uint8)
 
 
-PHOTOS = {view.name: photo(view) for view in EXACT}
+PHOTOS = {view.name: paint_two_walls(view) for view in EXACT}
 
 
-def shaken(shift: float, turn: float) -> list[Camera]:
+def perturb_cameras(shift: float, turn: float) -> list[Camera]:
     """Cameras that claim a principal point about `shift` px off and a rotation about `turn` degrees off."""
     rng, views = np.random.default_rng(5), []
     for view in EXACT:
@@ -57,13 +54,13 @@ def shaken(shift: float, turn: float) -> list[Camera]:
 
 
 @pytest.fixture(autouse=True)
-def fewer_tracks(monkeypatch):
+def limit_tracks(monkeypatch):
     monkeypatch.setattr(refine, "TRACKS", 3000)
 
 
 @cache
-def put_right(shift: float, turn: float) -> refine.Refinement:
-    return refine.refine_cameras(shaken(shift, turn), PHOTOS)
+def refine_perturbed(shift: float, turn: float) -> refine.Refinement:
+    return refine.refine_cameras(perturb_cameras(shift, turn), PHOTOS)
 
 
 def test_exact_cameras_are_left_as_they_are():
@@ -73,27 +70,22 @@ def test_exact_cameras_are_left_as_they_are():
 
 
 @pytest.mark.parametrize(("shift", "turn"), [(1.5, 0.0), (0.0, 0.2), (1.0, 0.15)])
-def test_shaken_cameras_are_put_right(shift, turn):
-    given, found = shaken(shift, turn), put_right(shift, turn)
+def test_perturbed_cameras_are_corrected(shift, turn):
+    given, found = perturb_cameras(shift, turn), refine_perturbed(shift, turn)
     assert found.before > 2 * refine.GOOD_RESIDUAL and found.after < 0.12
     # where the pixels of the far and the near wall's points come to lie, against the truth
     points = np.random.default_rng(6).uniform((-0.3, -0.25, 0.6), (0.3, 0.25, 4.0), (400, 3))
 
     def spread(cameras) -> float:
         """px between where these cameras and the true ones see points, less what is the same in all views."""
-        errors = np.array([places(points, cameras[view.name]) - places(points, view) for view in EXACT])
+        errors = np.array([project_points(points, cameras[view.name]) - project_points(points, view) for view in EXACT])
         return float(np.abs(errors - errors.mean(0)).mean())
 
     assert spread(found.cameras) < 0.35 * spread({view.name: view for view in given})
 
 
-def places(points: np.ndarray, view: Camera) -> np.ndarray:
-    local = points @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
-    return local[:, :2] / local[:, 2:] * (view.fx, view.fy) + (view.cx, view.cy)
-
-
 def test_the_frame_stays_where_it_was():
-    found = put_right(1.5, 0.0)
+    found = refine_perturbed(1.5, 0.0)
     there = np.array([found.cameras[view.name].center for view in EXACT])
     here = np.array([view.center for view in EXACT])
     assert np.abs(there.mean(0) - here.mean(0)).max() < 1e-9
@@ -101,28 +93,28 @@ def test_the_frame_stays_where_it_was():
 
 
 def test_a_view_that_shares_nothing_stays_and_hinders_nothing():
-    alone = replace(camera("w", 0.0, 0.0, 0.0, np.pi), width=WIDTH)
-    found = refine.refine_cameras([*shaken(1.5, 0.0), alone], PHOTOS | {"w": PHOTOS["v0"]})
+    alone = replace(tilted_camera("w", 0.0, 0.0, 0.0, np.pi), width=WIDTH)
+    found = refine.refine_cameras([*perturb_cameras(1.5, 0.0), alone], PHOTOS | {"w": PHOTOS["v0"]})
     assert found.after < 0.12
     moved = found.cameras["w"]
     assert (moved.cx, moved.cy) == (alone.cx, alone.cy) and np.linalg.norm(moved.center - alone.center) < 0.05
 
 
 def test_a_principal_point_beyond_reason_is_not_followed():
-    given = shaken(0.5, 0.0)
+    given = perturb_cameras(0.5, 0.0)
     given[4] = replace(given[4], cx=given[4].cx + 0.1 * WIDTH)  # a crop that nobody told of
     found = refine.refine_cameras(given, PHOTOS)
     assert abs(found.cameras["v4"].cx - given[4].cx) < 1e-9
 
 
 def test_the_same_pictures_give_the_same_cameras():
-    first, second = put_right(1.5, 0.0).cameras, refine.refine_cameras(shaken(1.5, 0.0), PHOTOS).cameras
+    first, second = refine_perturbed(1.5, 0.0).cameras, refine.refine_cameras(perturb_cameras(1.5, 0.0), PHOTOS).cameras
     for name in first:
         assert np.array_equal(first[name].world_to_camera, second[name].world_to_camera)
         assert (first[name].cx, first[name].cy) == (second[name].cx, second[name].cy)
 
 
-def test_what_no_camera_explains_moves_no_camera():
+def test_inexplicable_matches_move_no_camera():
     """Leaves in the wind, a rolling shutter: each picture is bent by another half a pixel, the cameras are exact."""
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     rng, pictures = np.random.default_rng(7), {}

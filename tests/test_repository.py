@@ -1,4 +1,4 @@
-"""What lies in the repository works on every machine."""
+"""The repository works on every machine: no links, no paths of one machine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 HOME = re.compile(r"(?<![\w./-])/(?:home|Users|root|work|mnt/c)/[\w.-]+/")  # a folder of somebody's machine
 
 
-def tracked() -> list[tuple[str, Path]]:
+def tracked_files() -> list[tuple[str, Path]]:
     """Mode and path of each file that git keeps."""
     listed = subprocess.run(["git", "ls-files", "--stage", "-z"], cwd=ROOT, capture_output=True, text=True)
     if listed.returncode:
@@ -22,11 +22,11 @@ def tracked() -> list[tuple[str, Path]]:
 
 
 def test_there_are_no_links():
-    assert [path for mode, path in tracked() if mode == "120000"] == []
+    assert [path for mode, path in tracked_files() if mode == "120000"] == []
 
 
 def test_no_file_names_a_folder_of_one_machine():
-    text = [path for _, path in tracked() if path.suffix in (".py", ".md", ".yaml", ".toml", ".txt", ".html", "")]
+    text = [path for _, path in tracked_files() if path.suffix in (".py", ".md", ".yaml", ".toml", ".txt", ".html", "")]
     found = {
         f"{path.relative_to(ROOT)}: {match[0]}"
         for path in text

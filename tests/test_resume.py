@@ -1,6 +1,6 @@
-"""A miniature scene end to end, the runner killed at random moments: the result must not show it.
+"""A small scene end to end, with the runner killed at random moments: the result is the same.
 
-RESUME_KILLS sets the number of kills: 3, to spare time; 20 before a release.
+RESUME_KILLS sets the number of kills: 3 by default to save time, 20 before a release.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes.processes import start_module
 
 from runner import maintenance
 from runner.files import RECEIPT, list_files, read_json
@@ -34,30 +34,23 @@ SMALL = (
 )
 
 
-def start(scene: Path, runs: Path, target: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "runner", "run", target, "--scene", str(scene), "--runs", str(runs)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        [*command, "--profile", "laptop", "--set", SMALL],
-        cwd=ROOT,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
+def start_run(mini_scene: Path, runs: Path, target: str) -> subprocess.Popen[str]:
+    options = ("--scene", mini_scene, "--runs", runs, "--profile", "laptop", "--set", SMALL)
+    one_thread = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    return start_module("runner", "run", target, *options, env=one_thread, merge_stderr=True)
 
 
-def finish(scene: Path, runs: Path) -> dict:
-    process = start(scene, runs, "all")
+def run_to_end(mini_scene: Path, runs: Path) -> dict:
+    process = start_run(mini_scene, runs, "all")
     output, _ = process.communicate(timeout=900)
     assert process.returncode == 0, output
-    return json.loads((runs / scene.name / "evaluate" / "metrics.json").read_text())
+    return json.loads((runs / mini_scene.name / "evaluate" / "metrics.json").read_text())
 
 
-def kill_during(scene: Path, runs: Path, stage: str, delay: float) -> bool:
+def kill_during(mini_scene: Path, runs: Path, stage: str, delay: float) -> bool:
     """Kill the runner `delay` seconds after `stage` has begun; False where the stage had ended before."""
-    process = start(scene, runs, stage)
-    while process.poll() is None and not list((runs / scene.name).glob(f".partial-{stage}-*")):
+    process = start_run(mini_scene, runs, stage)
+    while process.poll() is None and not list((runs / mini_scene.name).glob(f".partial-{stage}-*")):
         time.sleep(0.02)
     try:
         process.wait(delay)
@@ -67,8 +60,8 @@ def kill_during(scene: Path, runs: Path, stage: str, delay: float) -> bool:
     return process.returncode == -signal.SIGKILL
 
 
-def assert_whole(home: Path) -> None:
-    """Every artifact in place is one that a stage finished."""
+def assert_outputs_match_receipts(home: Path) -> None:
+    """Assert that every artifact is one that a stage finished."""
     for stage in ("poses", *STAGES):
         if (home / stage).exists():
             found = read_json(home / stage / RECEIPT)
@@ -76,37 +69,29 @@ def assert_whole(home: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("scene") / "mini"
-    command = [sys.executable, str(ROOT / "data/generate.py"), "--kind", "mini", "--seed", "0", "--out", str(folder)]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def unbroken(scene, tmp_path_factory) -> tuple[Path, dict]:
-    """Where the results of a run from end to end are, and its metrics."""
+def unbroken_run(mini_scene, tmp_path_factory) -> tuple[Path, dict]:
+    """The folder of an uninterrupted run, and its metrics."""
     runs = tmp_path_factory.mktemp("unbroken")
-    return runs / "mini", finish(scene, runs)
+    return runs / "mini", run_to_end(mini_scene, runs)
 
 
-def test_killed_at_random_moments(scene, unbroken, tmp_path):
-    made, metrics = unbroken
+def test_killed_at_random_moments(mini_scene, unbroken_run, tmp_path):
+    made, metrics = unbroken_run
     seconds = {stage: read_json(made / stage / RECEIPT)["seconds"] for stage in STAGES}
     random = np.random.default_rng(0)
     killed = 0
     for stage in sorted((IN_TURN[i % len(IN_TURN)] for i in range(KILLS)), key=STAGES.index):
-        killed += kill_during(scene, tmp_path / "broken", stage, random.uniform(0, seconds[stage]))
-        assert_whole(tmp_path / "broken/mini")
-    assert finish(scene, tmp_path / "broken") == metrics
+        killed += kill_during(mini_scene, tmp_path / "broken", stage, random.uniform(0, seconds[stage]))
+        assert_outputs_match_receipts(tmp_path / "broken/mini")
+    assert run_to_end(mini_scene, tmp_path / "broken") == metrics
     assert killed >= KILLS // 2  # the others came too late, their stage was done
     assert not list((tmp_path / "broken/mini").glob(".partial*"))
 
 
-def test_one_byte_flipped_in_each_kind_of_file_is_noticed_and_named(scene, unbroken, tmp_path, capsys):
+def test_one_byte_flipped_in_each_kind_of_file_is_noticed_and_named(mini_scene, unbroken_run, tmp_path, capsys):
     """Of every stage; what then runs, tests of the runner tell."""
-    shutil.copytree(unbroken[0].parent, tmp_path / "runs")
-    request = Request(ROOT, tmp_path / "runs", str(scene), "laptop", set=SMALL)
+    shutil.copytree(unbroken_run[0].parent, tmp_path / "runs")
+    request = Request(ROOT, tmp_path / "runs", str(mini_scene), "laptop", set=SMALL)
     assert maintenance.verify(request) == 0
     home = tmp_path / "runs" / "mini"
     files = [path for stage in ("poses", *STAGES) for path in list_files(home / stage) if path.name != RECEIPT]

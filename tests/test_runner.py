@@ -4,291 +4,148 @@ from __future__ import annotations
 
 import ast
 import json
-import os
 import shutil
 import signal
 import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
+from scenes.processes import start_module, wait_until
+from scenes.toy_projects import RUNNER_FILES, make_request, write_files
 
 from runner import Failed, Refused, compare, maintenance, process, results
 from runner.execute import run_scene
 from runner.keys import Hashes, code_fingerprints, fingerprint
 from runner.plan import plan, plan_table
-from runner.resolve import Request, resolve
+from runner.resolve import resolve
 
 REPO = Path(__file__).resolve().parent.parent
 
-FILES = {
-    "pipeline.yaml": """
-scene_keys: {poses: [shift, gaussians]}
-stages:
-  poses: {needs: [scene]}
-  fit: {needs: [poses], provided: {by: gaussians, artifact: poses}}
-  masks:
-    needs: [poses, fit]
-    skip_if: [{empty: poses/masks, reason: the scene has no masks}]
-  distill:
-    needs: [fit, masks]
-    skip_if:
-      - {fact: masks.invent, equals: 0, reason: nothing to invent}
-      - {param: distill.gain, equals: 0, reason: no gain}
-  evaluate: {needs: [poses, fit], optional: [masks, distill]}
-profiles: {laptop: {fit: {rate: 2}}, paper: {}}
-variants: {strong: {distill: {gain: 5}}, same: {}}
-""",
-    "stages/__init__.py": "",
-    "stages/poses.py": """
-from pathlib import Path
-from pydantic import BaseModel, ConfigDict
-
-class Params(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    shift: int = 0
-    gaussians: str | None = None
-
-def preview(params, scene):
-    if not (scene / "number.txt").exists():
-        raise ValueError(f"{scene}: no number.txt; write one")
-    return ["reads one number"]
-
-def run(params: Params, out: Path, *, scene: Path) -> None:
-    if (scene / "broken").exists():
-        raise ValueError(f"{scene}: it is\\nbroken")
-    number = abs(int((scene / "number.txt").read_text())) + params.shift
-    (out / "number.txt").write_text(str(number))
-    if params.gaussians:
-        (out / "gaussians.ply").write_text((scene / params.gaussians).read_text())
-    if not (scene / "unmasked").exists():
-        (out / "masks").mkdir(exist_ok=True)
-        (out / "masks" / "a.png").write_text("m")
-""",
-    "stages/fit.py": """
-import time
-from pathlib import Path
-from pydantic import BaseModel, ConfigDict, Field
-
-class Params(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    iterations: int = Field(3, ge=1, description="steps")
-    rate: int = 1
-    pause: float = 0.0  # seconds a step
-    device: str = "cpu"
-
-def run(params: Params, out: Path, *, poses: Path) -> None:
-    from reffusion.optimize import step
-    checkpoint = out / "checkpoint.pt"
-    number, start = map(int, checkpoint.read_text().split()) if checkpoint.exists() else (0, 0)
-    for index in range(start, params.iterations):
-        number = step(number, params.rate)
-        partial = out / "checkpoint.pt.writing"
-        partial.write_text(f"{number} {index + 1}")
-        partial.replace(checkpoint)
-        time.sleep(params.pause)
-    (out / "gaussians.ply").write_text(str(number + int((poses / "number.txt").read_text())))
-    (out / "trace.jsonl").write_text(str(start))
-    checkpoint.unlink()
-""",
-    "stages/masks.py": """
-import ast
-import json
-from pathlib import Path
-from pydantic import BaseModel, ConfigDict
-
-class Params(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    threshold: int = 100
-
-def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
-    invent = int(int((fit / "gaussians.ply").read_text()) < params.threshold)
-    (out / "facts.json").write_text(json.dumps({"invent": invent}))
-""",
-    "stages/distill.py": """
-from pathlib import Path
-from pydantic import BaseModel, ConfigDict, Field
-
-class Params(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    gain: int = 1
-    prior: str = Field("weights", json_schema_extra={"weights": True})
-
-def run(params: Params, out: Path, *, fit: Path, masks: Path) -> None:
-    (out / "gaussians.ply").write_text(str(int((fit / "gaussians.ply").read_text()) * params.gain))
-""",
-    "stages/evaluate.py": """
-import ast
-import json
-from pathlib import Path
-from pydantic import BaseModel, ConfigDict
-
-class Params(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-def run(params, out: Path, *, poses: Path, fit: Path, masks: Path | None, distill: Path | None) -> None:
-    result = int(((distill or fit) / "gaussians.ply").read_text())
-    metrics = {"mean": {"psnr_box": float(result), "lpips_vgg_box": None}}
-    (out / "metrics.json").write_text(json.dumps(metrics))
-""",
-    "reffusion/__init__.py": '"""The package."""',
-    "reffusion/optimize.py": '''
-"""Steps."""
-
-def step(number, rate):
-    """One step."""
-    from .numbers import plus
-    return plus(number, rate)  # forwards
-''',
-    "reffusion/numbers.py": "def plus(a, b):\n    return a + b\n",
-    "reffusion/unused.py": "x = 1\n",
-    "weights/model.bin": "w",
-    "data/toy/number.txt": "4",
-}
 WORDS = ["poses", "fit", "masks", "distill", "evaluate"]
 
 
-def write(root: Path, files: dict[str, str]) -> None:
-    for name, text in files.items():
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_text(text)
-
-
-def request(root: Path, scene: str = "toy", **options) -> Request:
-    return Request(root, root / "runs", scene, **{"profile": "laptop", **options})
-
-
-def words(root: Path, **options) -> dict[str, str]:
-    """Stage -> "word reason" as planned."""
-    job = resolve(request(root, **options))
+def statuses(project: Path, **options) -> dict[str, str]:
+    """Stage -> "status reason" of the plan."""
+    job = resolve(make_request(project, **options))
     return {s: f"{d.status} {d.reason}".strip() for s, d in plan(job, job.pipeline.closure("all")).items()}
 
 
-def ran(capsys, root: Path, target: str = "all", **options) -> list[str]:
-    """The stages that ran, in order."""
+def run_project(capsys, project: Path, target: str = "all", **options) -> list[str]:
+    """Run the scene; return the stages that ran, in order."""
     capsys.readouterr()
-    run_scene(request(root, **options), target)
+    run_scene(make_request(project, **options), target)
     return [line.split(":")[0] for line in capsys.readouterr().out.splitlines() if ": done in" in line]
 
 
-def result(root: Path, home: str = "toy") -> float:
-    return json.loads((root / "runs" / home / "evaluate/metrics.json").read_text())["mean"]["psnr_box"]
+def read_score(project: Path, home: str = "toy") -> float:
+    return json.loads((project / "runs" / home / "evaluate/metrics.json").read_text())["mean"]["psnr_box"]
 
 
-def edit(path: Path, old: str, new: str) -> None:
+def replace_text(path: Path, old: str, new: str) -> None:
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new))
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> Path:
+def finished_project(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("finished")
-    write(root, FILES)
-    run_scene(request(root), "all")
+    write_files(root, RUNNER_FILES)
+    run_scene(make_request(root), "all")
     return root
 
 
 @pytest.fixture
-def root(finished: Path, tmp_path: Path) -> Path:
-    """A toy project in which everything is done."""
-    shutil.copytree(finished, tmp_path / "project")
+def project(finished_project: Path, tmp_path: Path) -> Path:
+    """A toy project in which all stages are done."""
+    shutil.copytree(finished_project, tmp_path / "project")
     return tmp_path / "project"
 
 
 @pytest.fixture
-def fresh(tmp_path: Path) -> Path:
-    write(tmp_path / "project", FILES)
+def empty_project(tmp_path: Path) -> Path:
+    write_files(tmp_path / "project", RUNNER_FILES)
     return tmp_path / "project"
 
 
-def start(root: Path, *arguments: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "runner", "run", "fit", "--root", str(root), "--profile", "laptop", *arguments]
-    environment = {**os.environ, "PYTHONPATH": str(REPO)}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    # A shell starts background jobs, and so their children, with Ctrl-C ignored: as from a terminal, it is not.
-    return subprocess.Popen(command, cwd=REPO, env=environment, preexec_fn=heed_ctrl_c, **pipes)
+def start_runner(project: Path, *arguments: str) -> subprocess.Popen[str]:
+    """Run `fit`. A shell starts background jobs, and their children, with Ctrl-C ignored; a terminal does not."""
+    options = ("--root", project, "--profile", "laptop", *arguments)
+    return start_module("runner", "run", "fit", *options, merge_stderr=True, preexec_fn=restore_ctrl_c)
 
 
-def heed_ctrl_c() -> None:
+def restore_ctrl_c() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def wait_for(found) -> None:
-    for _ in range(600):
-        if found():
-            return
-        time.sleep(0.05)
-    raise AssertionError("waited 30 s in vain")
 
 
 # ------------------------------------------------------------------------------------------------------ what reruns
 
 
-def test_first_run_and_receipts(root):
-    assert result(root) == 10.0  # 3 steps of 2, and the scene's 4
-    receipt = json.loads((root / "runs/toy/fit/receipt.json").read_text())
+def test_first_run_and_receipts(project):
+    assert read_score(project) == 10.0  # 3 steps of 2, and the scene's 4
+    receipt = json.loads((project / "runs/toy/fit/receipt.json").read_text())
     assert receipt["params"] == {"iterations": 3, "rate": 2, "pause": 0.0, "device": "cpu"}
     assert receipt["profile"] == "laptop" and receipt["peak_memory_mb"] > 0 and receipt["versions"]["python"]
     assert list(receipt["code"]) == [
         "reffusion/__init__.py", "reffusion/numbers.py", "reffusion/optimize.py", "stages/fit.py"
     ]  # fmt: skip
-    assert not list((root / "runs/toy").glob(".partial*")) and not list((root / "runs/toy").glob(".old*"))
-    assert (root / "runs/toy/profile").read_text() == "laptop\n"
+    assert not list((project / "runs/toy").glob(".partial*")) and not list((project / "runs/toy").glob(".old*"))
+    assert (project / "runs/toy/profile").read_text() == "laptop\n"
 
 
-def test_fresh_plan(fresh):
-    said = words(fresh)
+def test_fresh_plan(empty_project):
+    said = statuses(empty_project)
     assert said["poses"] == said["fit"] == "run no artifact yet"
     assert said["masks"].startswith("pending left out if the scene has no masks")
     assert said["distill"].startswith("pending") and said["evaluate"].startswith("run")
-    job = resolve(request(fresh))
+    job = resolve(make_request(empty_project))
     assert "reads one number" in plan_table(job, plan(job, ["poses"]))
-    assert not (fresh / "runs").exists() or not (fresh / "runs/toy").exists()  # plan leaves nothing but hashes
+    assert (
+        not (empty_project / "runs").exists() or not (empty_project / "runs/toy").exists()
+    )  # plan leaves nothing but hashes
 
 
-def test_a_second_call_runs_nothing(root, capsys):
-    assert ran(capsys, root) == []
-    assert set(words(root).values()) == {"cached"}
+def test_a_second_call_runs_nothing(project, capsys):
+    assert run_project(capsys, project) == []
+    assert set(statuses(project).values()) == {"cached"}
 
 
-def test_parameter_reruns_its_stage_and_what_depends_on_it(root, capsys):
-    said = words(root, set="fit.iterations=5")
+def test_parameter_reruns_its_stage_and_what_depends_on_it(project, capsys):
+    said = statuses(project, set="fit.iterations=5")
     assert said["poses"] == "cached" and said["fit"] == "run param iterations 3 -> 5"
     assert said["masks"].startswith("stale waits for fit") and said["evaluate"].startswith("stale")
-    assert words(root, set="fit.iterations=5 masks.threshold=99")["masks"] == "run param threshold 100 -> 99"
-    assert ran(capsys, root, set="fit.iterations=5") == ["fit", "masks", "distill", "evaluate"]
-    assert result(root) == 14.0
+    assert statuses(project, set="fit.iterations=5 masks.threshold=99")["masks"] == "run param threshold 100 -> 99"
+    assert run_project(capsys, project, set="fit.iterations=5") == ["fit", "masks", "distill", "evaluate"]
+    assert read_score(project) == 14.0
 
 
-def test_identical_output_stops_a_rerun(root, capsys):
+def test_identical_output_stops_a_rerun(project, capsys):
     """`masks` comes out the same, so `distill` and `evaluate` stay."""
-    assert ran(capsys, root, set="masks.threshold=99") == ["masks"]
-    (root / "data/toy/number.txt").write_text("-4")  # the stage takes its magnitude
-    assert words(root, set="masks.threshold=99")["poses"] == "run need scene changed"
-    assert ran(capsys, root, set="masks.threshold=99") == ["poses"]
+    assert run_project(capsys, project, set="masks.threshold=99") == ["masks"]
+    (project / "data/toy/number.txt").write_text("-4")  # the stage takes its magnitude
+    assert statuses(project, set="masks.threshold=99")["poses"] == "run need scene changed"
+    assert run_project(capsys, project, set="masks.threshold=99") == ["poses"]
 
 
-def test_a_stage_depends_on_those_files_of_the_scene_that_it_says_it_reads(root, capsys):
-    edit(
-        root / "stages/poses.py",
+def test_a_stage_depends_on_those_files_of_the_scene_that_it_says_it_reads(project, capsys):
+    replace_text(
+        project / "stages/poses.py",
         "def preview(",
         """def scene_files(params, scene, files):
     return [path for path in files if path.parent.name != "drafts"]
 
 def preview(""",
     )
-    ran(capsys, root)
-    write(root, {"data/toy/drafts/idea.txt": "?"})
-    assert set(words(root).values()) == {"cached"}
-    write(root, {"data/toy/notes/idea.txt": "?"})
-    assert words(root)["poses"] == "run need scene changed"
+    run_project(capsys, project)
+    write_files(project, {"data/toy/drafts/idea.txt": "?"})
+    assert set(statuses(project).values()) == {"cached"}
+    write_files(project, {"data/toy/notes/idea.txt": "?"})
+    assert statuses(project)["poses"] == "run need scene changed"
 
 
-def test_a_stage_depends_on_facts_that_it_takes_from_other_files(root, capsys):
-    edit(
-        root / "stages/poses.py",
+def test_a_stage_depends_on_facts_that_it_takes_from_other_files(project, capsys):
+    replace_text(
+        project / "stages/poses.py",
         "def preview(",
         """def scene_files(params, scene, files):
     return [path for path in files if path.parent.name != "drafts"]
@@ -298,36 +155,38 @@ def scene_facts(params, scene):
 
 def preview(""",
     )
-    ran(capsys, root)
-    write(root, {"data/toy/drafts/idea.txt": "?"})
-    assert words(root)["poses"] == "run need scene: drafts changed"
-    ran(capsys, root)
-    write(root, {"data/toy/drafts/idea.txt": "!"})
-    assert set(words(root).values()) == {"cached"}
+    run_project(capsys, project)
+    write_files(project, {"data/toy/drafts/idea.txt": "?"})
+    assert statuses(project)["poses"] == "run need scene: drafts changed"
+    run_project(capsys, project)
+    write_files(project, {"data/toy/drafts/idea.txt": "!"})
+    assert set(statuses(project).values()) == {"cached"}
 
 
-def test_what_a_stage_did_without_makes_it_anew_once_it_is_there(root, capsys):
+def test_a_stage_reruns_once_an_optional_need_exists(project, capsys):
     """And where it is gone again, on another machine, what was made with it stays."""
-    edit(
-        root / "stages/evaluate.py",
+    replace_text(
+        project / "stages/evaluate.py",
         "def run(",
         """def unavailable(params):
     return [] if Path(__file__).with_name("metric.txt").exists() else ["the metric"]
 
 def run(""",
     )
-    assert ran(capsys, root) == ["evaluate"] and set(words(root).values()) == {"cached"}
-    write(root, {"stages/metric.txt": ""})
-    assert words(root)["evaluate"] == "run the metric is on this machine now"
-    assert ran(capsys, root) == ["evaluate"]
-    (root / "stages/metric.txt").unlink()
-    assert set(words(root).values()) == {"cached"}
+    assert run_project(capsys, project) == ["evaluate"] and set(statuses(project).values()) == {"cached"}
+    write_files(project, {"stages/metric.txt": ""})
+    assert statuses(project)["evaluate"] == "run the metric is on this machine now"
+    assert run_project(capsys, project) == ["evaluate"]
+    (project / "stages/metric.txt").unlink()
+    assert set(statuses(project).values()) == {"cached"}
 
 
-def test_a_stage_that_reads_the_scene_refuses_before_its_other_needs_are_made(fresh):
-    edit(fresh / "pipeline.yaml", "masks:\n    needs: [poses, fit]", "masks:\n    needs: [scene, poses, fit]")
-    edit(
-        fresh / "stages/masks.py",
+def test_a_stage_that_reads_the_scene_refuses_before_its_other_needs_are_made(empty_project):
+    replace_text(
+        empty_project / "pipeline.yaml", "masks:\n    needs: [poses, fit]", "masks:\n    needs: [scene, poses, fit]"
+    )
+    replace_text(
+        empty_project / "stages/masks.py",
         "def run(params: Params, out: Path, *,",
         """def preview(params, *, scene, poses, fit):
     assert poses is None and fit is None
@@ -337,50 +196,50 @@ def test_a_stage_that_reads_the_scene_refuses_before_its_other_needs_are_made(fr
 
 def run(params: Params, out: Path, *, scene: Path,""",
     )
-    assert words(fresh)["masks"].startswith("pending")
-    write(fresh, {"data/toy/wrong": ""})
-    assert "remove it" in words(fresh)["masks"]
+    assert statuses(empty_project)["masks"].startswith("pending")
+    write_files(empty_project, {"data/toy/wrong": ""})
+    assert "remove it" in statuses(empty_project)["masks"]
     with pytest.raises(Refused, match=r"masks: .*wrong: remove it"):
-        run_scene(request(fresh), "all")
-    assert not (fresh / "runs/toy/poses").exists()
+        run_scene(make_request(empty_project), "all")
+    assert not (empty_project / "runs/toy/poses").exists()
 
 
-def test_what_is_handed_out_outlives_its_artifact_and_is_never_lost(root, capsys):
-    edit(root / "pipeline.yaml", "masks:\n    needs", "masks:\n    export: [drafts]\n    needs")
-    edit(
-        root / "stages/masks.py",
+def test_exported_files_outlive_their_artifact(project, capsys):
+    replace_text(project / "pipeline.yaml", "masks:\n    needs", "masks:\n    export: [drafts]\n    needs")
+    replace_text(
+        project / "stages/masks.py",
         "    invent = ",
         """    (out / "drafts").mkdir()
     for name in ("a", "b", "c")[: params.threshold % 10]:
         (out / "drafts" / name).write_text(str(params.threshold))
     invent = """,
     )
-    given = lambda: {path.name: path.read_text() for path in (root / "runs/toy/drafts").iterdir()}
-    ran(capsys, root, set="masks.threshold=102")
+    given = lambda: {path.name: path.read_text() for path in (project / "runs/toy/drafts").iterdir()}
+    run_project(capsys, project, set="masks.threshold=102")
     assert given() == {"a": "102", "b": "102"}
-    (root / "runs/toy/drafts/a").write_text("drawn")
-    (root / "runs/toy/drafts/mine").write_text("too")
-    run_scene(request(root, set="masks.threshold=103"), "masks")
+    (project / "runs/toy/drafts/a").write_text("drawn")
+    (project / "runs/toy/drafts/mine").write_text("too")
+    run_scene(make_request(project, set="masks.threshold=103"), "masks")
     assert given() == {"a": "drawn", "b": "103", "c": "103", "mine": "too"}
     assert "toy/drafts/a was changed by hand: kept" in capsys.readouterr().out
-    ran(capsys, root, set="masks.threshold=101")
+    run_project(capsys, project, set="masks.threshold=101")
     assert given() == {"a": "drawn", "mine": "too"}
 
 
-def test_code_edits(root, capsys):
-    optimize = root / "reffusion/optimize.py"
-    edit(optimize, "# forwards", "# onwards")
-    edit(optimize, "One step.", "A step.")
-    edit(root / "stages/fit.py", 'description="steps"', 'description="how many"')
-    edit(root / "reffusion/unused.py", "1", "2")
-    assert ran(capsys, root) == []
-    edit(root / "reffusion/numbers.py", "a + b", "a + b + 1")
-    assert words(root)["fit"] == "run code of reffusion/numbers.py changed"
-    trusted = words(root, trust=True)
+def test_code_edits(project, capsys):
+    optimize = project / "reffusion/optimize.py"
+    replace_text(optimize, "# forwards", "# onwards")
+    replace_text(optimize, "One step.", "A step.")
+    replace_text(project / "stages/fit.py", 'description="steps"', 'description="how many"')
+    replace_text(project / "reffusion/unused.py", "1", "2")
+    assert run_project(capsys, project) == []
+    replace_text(project / "reffusion/numbers.py", "a + b", "a + b + 1")
+    assert statuses(project)["fit"] == "run code of reffusion/numbers.py changed"
+    trusted = statuses(project, trust=True)
     assert trusted["fit"] == "cached trusted although code of reffusion/numbers.py changed"
     assert trusted["evaluate"] == "cached"
-    assert words(root, trust=True, set="fit.rate=3")["fit"].startswith("run param rate 2 -> 3")
-    assert ran(capsys, root, "fit") == ["fit"]
+    assert statuses(project, trust=True, set="fit.rate=3")["fit"].startswith("run param rate 2 -> 3")
+    assert run_project(capsys, project, "fit") == ["fit"]
 
 
 def test_fingerprint():
@@ -390,98 +249,106 @@ def test_fingerprint():
     assert fingerprint(ast.parse("x = '''a'''")) != fingerprint(ast.parse("x = '''b'''"))
 
 
-def test_a_models_card_and_its_training_script_are_no_weights(root):
-    before = words(root)
+def test_readmes_and_scripts_in_a_weights_folder_do_not_count(project):
+    before = statuses(project)
     for name in ("README.md", "train.py", "held_out.png"):
-        (root / "weights" / name).write_text("about it")
-    assert words(root) == before
-    (root / "weights/config.json").write_text("{}")
-    assert words(root)["distill"] == "run weights prior changed"
+        (project / "weights" / name).write_text("about it")
+    assert statuses(project) == before
+    (project / "weights/config.json").write_text("{}")
+    assert statuses(project)["distill"] == "run weights prior changed"
 
 
-def test_weights_profile_and_hand_edits(root, capsys):
-    (root / "weights/model.bin").write_text("v")
-    assert words(root)["distill"] == "run weights prior changed"
-    (root / "weights/model.bin").write_text("w")
-    paper = words(root, profile="paper")  # its name is nothing that an artifact depends on; what it sets is
+def test_weights_profile_and_hand_edits(project, capsys):
+    (project / "weights/model.bin").write_text("v")
+    assert statuses(project)["distill"] == "run weights prior changed"
+    (project / "weights/model.bin").write_text("w")
+    paper = statuses(project, profile="paper")  # its name is nothing that an artifact depends on; what it sets is
     assert paper["poses"] == "cached" and paper["fit"] == "run param rate 2 -> 1"
-    assert words(root, profile=None) == words(root)  # pinned by the first run
-    (root / "runs/toy/fit/gaussians.ply").write_text("11")
-    assert words(root, keep=True)["fit"] == "cached gaussians.ply changed"
-    assert ran(capsys, root, keep=True) == ["masks", "distill", "evaluate"] and result(root) == 11.0
-    assert words(root)["fit"] == "cached gaussians.ply by hand" and ran(capsys, root) == []  # from then on
-    assert ran(capsys, root, set="fit.rate=3") == ["fit", "masks", "distill", "evaluate"]
-    assert (root / "runs/toy/kept/fit/gaussians.ply").read_text() == "11"
+    assert statuses(project, profile=None) == statuses(project)  # pinned by the first run
+    (project / "runs/toy/fit/gaussians.ply").write_text("11")
+    assert statuses(project, keep=True)["fit"] == "cached gaussians.ply changed"
+    assert run_project(capsys, project, keep=True) == ["masks", "distill", "evaluate"] and read_score(project) == 11.0
+    assert (
+        statuses(project)["fit"] == "cached gaussians.ply by hand" and run_project(capsys, project) == []
+    )  # from then on
+    assert run_project(capsys, project, set="fit.rate=3") == ["fit", "masks", "distill", "evaluate"]
+    assert (project / "runs/toy/kept/fit/gaussians.ply").read_text() == "11"
 
 
-def test_left_out_and_provided(root, capsys):
-    assert ran(capsys, root, set="masks.threshold=1") == ["masks", "evaluate"]
-    assert words(root, set="masks.threshold=1")["distill"] == "skip nothing to invent"
-    assert words(root, set="distill.gain=0")["distill"] == "skip no gain"
-    write(root, {"data/toy/scene.yaml": "shift: 1\ngaussians: mine.ply\n", "data/toy/mine.ply": "50"})
-    assert words(root)["fit"] == "provided the scene brings `gaussians`"
-    ran(capsys, root)
-    assert result(root) == 50.0
-    write(root, {"data/toy/unmasked": ""})
-    ran(capsys, root)
-    said = words(root)
+def test_skipped_and_provided_stages(project, capsys):
+    assert run_project(capsys, project, set="masks.threshold=1") == ["masks", "evaluate"]
+    assert statuses(project, set="masks.threshold=1")["distill"] == "skip nothing to invent"
+    assert statuses(project, set="distill.gain=0")["distill"] == "skip no gain"
+    write_files(project, {"data/toy/scene.yaml": "shift: 1\ngaussians: mine.ply\n", "data/toy/mine.ply": "50"})
+    assert statuses(project)["fit"] == "provided the scene brings `gaussians`"
+    run_project(capsys, project)
+    assert read_score(project) == 50.0
+    write_files(project, {"data/toy/unmasked": ""})
+    run_project(capsys, project)
+    said = statuses(project)
     assert said["masks"] == "skip the scene has no masks" and said["distill"].startswith("skip")
 
 
-def test_the_scenes_own_file_stands_for_a_stage_only_while_its_parameter_allows(root, capsys):
-    edit(root / "pipeline.yaml", "artifact: poses}", "artifact: poses, param: fit.rate, equals: 2}")
-    write(root, {"data/toy/scene.yaml": "gaussians: mine.ply\n", "data/toy/mine.ply": "50"})
-    assert words(root)["fit"] == "provided the scene brings `gaussians`"
-    ran(capsys, root, set="fit.rate=3")
-    assert words(root, set="fit.rate=3")["fit"] == "cached" and result(root) == 13.0  # 3 steps of 3, and the scene's 4
-    edit(root / "pipeline.yaml", "param: fit.rate", "param: fit.rat")
+def test_the_scenes_own_file_stands_for_a_stage_only_while_its_parameter_allows(project, capsys):
+    replace_text(project / "pipeline.yaml", "artifact: poses}", "artifact: poses, param: fit.rate, equals: 2}")
+    write_files(project, {"data/toy/scene.yaml": "gaussians: mine.ply\n", "data/toy/mine.ply": "50"})
+    assert statuses(project)["fit"] == "provided the scene brings `gaussians`"
+    run_project(capsys, project, set="fit.rate=3")
+    assert (
+        statuses(project, set="fit.rate=3")["fit"] == "cached" and read_score(project) == 13.0
+    )  # 3 steps of 3, and the scene's 4
+    replace_text(project / "pipeline.yaml", "param: fit.rate", "param: fit.rat")
     with pytest.raises(Refused, match=r"a condition asks for fit\.rat, which is not there"):
-        words(root)
+        statuses(project)
 
 
-def test_a_condition_may_ask_for_two_parameters(root):
+def test_a_condition_may_ask_for_two_parameters(project):
     one, both = "{param: distill.gain, equals", "{param: [distill.gain, poses.shift], equals"
-    write(root, {"pipeline.yaml": FILES["pipeline.yaml"].replace(one, both)})
-    assert words(root, set="distill.gain=0 poses.shift=0")["distill"] == "skip no gain"
-    assert not words(root, set="distill.gain=0 poses.shift=1")["distill"].startswith("skip")
-    write(root, {"pipeline.yaml": FILES["pipeline.yaml"].replace(one, both.replace("shift", "nothing"))})
+    write_files(project, {"pipeline.yaml": RUNNER_FILES["pipeline.yaml"].replace(one, both)})
+    assert statuses(project, set="distill.gain=0 poses.shift=0")["distill"] == "skip no gain"
+    assert not statuses(project, set="distill.gain=0 poses.shift=1")["distill"].startswith("skip")
+    write_files(
+        project, {"pipeline.yaml": RUNNER_FILES["pipeline.yaml"].replace(one, both.replace("shift", "nothing"))}
+    )
     with pytest.raises(Refused, match=r"poses\.nothing, which is not there"):
-        words(root, set="distill.gain=0")
+        statuses(project, set="distill.gain=0")
 
 
-def test_a_condition_may_hold_for_some_parameters_only_and_name_facts(root, capsys):
+def test_a_condition_may_hold_for_some_parameters_only_and_name_facts(project, capsys):
     plain = "{fact: masks.invent, equals: 0, reason: nothing to invent}"
     named = '{fact: masks.invent, equals: 0, only: {distill.gain: 2}, reason: "nothing to gain: {invent} of 9"}'
-    write(root, {"pipeline.yaml": FILES["pipeline.yaml"].replace(plain, named)})
+    write_files(project, {"pipeline.yaml": RUNNER_FILES["pipeline.yaml"].replace(plain, named)})
     nothing = "masks.threshold=1 "
-    assert words(root, set=nothing + "distill.gain=2")["distill"].endswith("if nothing to gain: known after masks")
-    assert words(root, set=nothing + "distill.gain=3")["distill"].startswith("run")
-    ran(capsys, root, set=nothing + "distill.gain=2")
-    assert words(root, set=nothing + "distill.gain=2")["distill"] == "skip nothing to gain: 0 of 9"
-    assert words(root, set=nothing + "distill.gain=3")["distill"].startswith("run")
+    assert statuses(project, set=nothing + "distill.gain=2")["distill"].endswith(
+        "if nothing to gain: known after masks"
+    )
+    assert statuses(project, set=nothing + "distill.gain=3")["distill"].startswith("run")
+    run_project(capsys, project, set=nothing + "distill.gain=2")
+    assert statuses(project, set=nothing + "distill.gain=2")["distill"] == "skip nothing to gain: 0 of 9"
+    assert statuses(project, set=nothing + "distill.gain=3")["distill"].startswith("run")
 
 
-def test_scene_yaml_stages_rerun_only_their_stage(root, capsys):
-    write(root, {"data/toy/scene.yaml": "profile: laptop\nstages: {distill: {gain: 3}}\n"})
-    assert ran(capsys, root) == ["distill", "evaluate"]
-    assert ran(capsys, root, set="distill.gain=4") == ["distill", "evaluate"]
-    assert result(root) == 40.0
+def test_scene_yaml_stages_rerun_only_their_stage(project, capsys):
+    write_files(project, {"data/toy/scene.yaml": "profile: laptop\nstages: {distill: {gain: 3}}\n"})
+    assert run_project(capsys, project) == ["distill", "evaluate"]
+    assert run_project(capsys, project, set="distill.gain=4") == ["distill", "evaluate"]
+    assert read_score(project) == 40.0
 
 
-def test_files_outside_the_scene_count(root, capsys):
-    write(root, {"data/toy/scene.yaml": "gaussians: ../../mine.ply\n", "mine.ply": "50"})
-    ran(capsys, root, "poses")
-    write(root, {"mine.ply": "60"})
-    assert ran(capsys, root, "poses") == ["poses"]
-    assert (root / "runs/toy/poses/gaussians.ply").read_text() == "60"
+def test_files_outside_the_scene_count(project, capsys):
+    write_files(project, {"data/toy/scene.yaml": "gaussians: ../../mine.ply\n", "mine.ply": "50"})
+    run_project(capsys, project, "poses")
+    write_files(project, {"mine.ply": "60"})
+    assert run_project(capsys, project, "poses") == ["poses"]
+    assert (project / "runs/toy/poses/gaussians.ply").read_text() == "60"
 
 
-def test_variants_share_what_they_do_not_change(root, capsys):
-    assert ran(capsys, root, variant="strong") == ["distill", "evaluate"]
-    assert sorted(p.name for p in (root / "runs/toy@strong").iterdir() if p.is_dir()) == ["distill", "evaluate"]
-    assert result(root, "toy@strong") == 50.0 and result(root) == 10.0
-    assert set(words(root, variant="same").values()) == {"cached shared with toy"}
-    same = request(root, variant="same")
+def test_variants_share_what_they_do_not_change(project, capsys):
+    assert run_project(capsys, project, variant="strong") == ["distill", "evaluate"]
+    assert sorted(p.name for p in (project / "runs/toy@strong").iterdir() if p.is_dir()) == ["distill", "evaluate"]
+    assert read_score(project, "toy@strong") == 50.0 and read_score(project) == 10.0
+    assert set(statuses(project, variant="same").values()) == {"cached shared with toy"}
+    same = make_request(project, variant="same")
     folder = run_scene(same, "all")["evaluate"]
     (folder / "scene.ply").touch()
     results.show_results("evaluate", folder, same)
@@ -493,40 +360,40 @@ def test_variants_share_what_they_do_not_change(root, capsys):
 # ----------------------------------------------------------------------------------------------- kills, locks, swaps
 
 
-def kill_in_fit(root: Path, steps: int, send: int) -> tuple[int, str]:
-    """Start a long fit, send the runner a signal once a few steps are done; exit code and output."""
-    process = start(root, "--scene", "toy", "--set", f"fit.pause=0.1 fit.iterations={steps}")
-    wait_for(lambda: any((p / "checkpoint.pt").exists() for p in (root / "runs/toy").glob(".partial-fit-*")))
+def kill_in_fit(project: Path, steps: int, send: int) -> tuple[int, str]:
+    """Start a long fit, and send the runner a signal after a few steps; return exit code and output."""
+    process = start_runner(project, "--scene", "toy", "--set", f"fit.pause=0.1 fit.iterations={steps}")
+    wait_until(lambda: any((p / "checkpoint.pt").exists() for p in (project / "runs/toy").glob(".partial-fit-*")))
     process.send_signal(send)
     output, _ = process.communicate(timeout=30)
     return process.returncode, output
 
 
-def test_a_killed_run_leaves_the_old_artifact_and_resumes(root, capsys):
+def test_a_killed_run_leaves_the_old_artifact_and_resumes(project, capsys):
     options = {"set": "fit.pause=0.1 fit.iterations=8"}
-    code, _ = kill_in_fit(root, 8, signal.SIGKILL)
+    code, _ = kill_in_fit(project, 8, signal.SIGKILL)
     assert code == -signal.SIGKILL
-    assert (root / "runs/toy/fit/gaussians.ply").read_text() == "10"
-    assert words(root, **options)["fit"].endswith("goes on where it stopped")
-    assert ran(capsys, root, "fit", **options) == ["fit"]
-    assert int((root / "runs/toy/fit/trace.jsonl").read_text()) > 0  # the step it went on from
-    assert (root / "runs/toy/fit/gaussians.ply").read_text() == "20"
-    assert not list((root / "runs/toy").glob(".partial*"))
+    assert (project / "runs/toy/fit/gaussians.ply").read_text() == "10"
+    assert statuses(project, **options)["fit"].endswith("goes on where it stopped")
+    assert run_project(capsys, project, "fit", **options) == ["fit"]
+    assert int((project / "runs/toy/fit/trace.jsonl").read_text()) > 0  # the step it went on from
+    assert (project / "runs/toy/fit/gaussians.ply").read_text() == "20"
+    assert not list((project / "runs/toy").glob(".partial*"))
 
 
-def test_ctrl_c(root):
-    code, output = kill_in_fit(root, 1000, signal.SIGINT)
+def test_ctrl_c(project):
+    code, output = kill_in_fit(project, 1000, signal.SIGINT)
     assert code == 130 and "the same command goes on from here" in output and "Traceback" not in output
-    assert not list((root / "runs/toy").glob(".partial-fit-*/receipt.json"))
+    assert not list((project / "runs/toy").glob(".partial-fit-*/receipt.json"))
 
 
-def test_two_runners_on_one_scene(root):
-    first = start(root, "--scene", "toy", "--set", "fit.pause=0.2", "--set", "fit.iterations=8")
-    wait_for(lambda: list((root / "runs/toy").glob(".partial-fit-*")))
+def test_two_runners_on_one_scene(project):
+    first = start_runner(project, "--scene", "toy", "--set", "fit.pause=0.2", "--set", "fit.iterations=8")
+    wait_until(lambda: list((project / "runs/toy").glob(".partial-fit-*")))
     first.send_signal(signal.SIGSTOP)  # until the second has had to wait
     with pytest.raises(Refused, match=f"toy is in use by process {first.pid}"):
-        maintenance.clean(request(root))
-    second = start(root, "--scene", "toy", "--set", "fit.pause=0.2 fit.iterations=8")
+        maintenance.clean(make_request(project))
+    second = start_runner(project, "--scene", "toy", "--set", "fit.pause=0.2 fit.iterations=8")
     output = second.stdout.readline()
     first.send_signal(signal.SIGCONT)
     output += second.communicate(timeout=60)[0]
@@ -535,35 +402,35 @@ def test_two_runners_on_one_scene(root):
 
 
 @pytest.mark.parametrize("moment", ["after the old is moved", "after the new is moved", "while the old is deleted"])
-def test_killed_in_the_swap(root, finished, capsys, moment):
+def test_killed_in_the_swap(project, finished_project, capsys, moment):
     """The next run finds one whole artifact at every moment, and does not repeat finished work."""
-    home, five = root / "runs/toy", {"target": "fit", "set": "fit.iterations=5"}
-    assert ran(capsys, root, **five) == ["fit"]
+    home, five = project / "runs/toy", {"target": "fit", "set": "fit.iterations=5"}
+    assert run_project(capsys, project, **five) == ["fit"]
     shutil.copytree(home / "fit", home / "new")
     shutil.rmtree(home / "fit")
     if moment == "after the old is moved":
-        shutil.copytree(finished / "runs/toy/fit", home / ".old-fit")
+        shutil.copytree(finished_project / "runs/toy/fit", home / ".old-fit")
         key = json.loads((home / "new/receipt.json").read_text())["key"]
         (home / "new").rename(home / f".partial-fit-{key}")
     else:
         old = ".gone-.old-fit" if moment == "while the old is deleted" else ".old-fit"
-        shutil.copytree(finished / "runs/toy/fit", home / old)
+        shutil.copytree(finished_project / "runs/toy/fit", home / old)
         (home / "new").rename(home / "fit")
         if moment == "while the old is deleted":
             (home / old / "receipt.json").unlink()
-    assert ran(capsys, root, **five) == []
+    assert run_project(capsys, project, **five) == []
     assert (home / "fit/gaussians.ply").read_text() == "14"
     assert not list(home.glob(".[gop]*")) and not (home / "kept").exists()
 
 
-def test_a_failing_stage_keeps_the_rest(root, capsys):
-    write(root, {"data/toy/broken": ""})
+def test_a_failing_stage_keeps_the_rest(project, capsys):
+    write_files(project, {"data/toy/broken": ""})
     with pytest.raises(Failed, match=r"poses: .*toy: it is broken \(all of it in .*poses.log\)$"):
-        run_scene(request(root), "all")
-    assert "Traceback" in (root / "runs/toy/poses.log").read_text()
-    assert result(root) == 10.0
-    (root / "data/toy/broken").unlink()
-    assert ran(capsys, root) == []
+        run_scene(make_request(project), "all")
+    assert "Traceback" in (project / "runs/toy/poses.log").read_text()
+    assert read_score(project) == 10.0
+    (project / "data/toy/broken").unlink()
+    assert run_project(capsys, project) == []
 
 
 # ---------------------------------------------------------------------------------------------------------- refusals
@@ -598,93 +465,93 @@ REFUSALS = {
 
 
 @pytest.mark.parametrize("case", REFUSALS)
-def test_refused_in_one_line_before_any_work(fresh, case):
+def test_refused_in_one_line_before_any_work(empty_project, case):
     files, options, message = REFUSALS[case]
-    write(fresh, files)
+    write_files(empty_project, files)
     with pytest.raises(Refused, match=message) as caught:
-        run_scene(request(fresh, **{"scene": "toy", **options}), "all")
+        run_scene(make_request(empty_project, **{"scene": "toy", **options}), "all")
     assert "\n" not in str(caught.value)
-    assert not list((fresh / "runs").glob("*/*/receipt.json"))
+    assert not list((empty_project / "runs").glob("*/*/receipt.json"))
 
 
-def test_a_cache_made_on_a_gpu_holds_without_one(root, monkeypatch):
+def test_a_cache_made_on_a_gpu_holds_without_one(project, monkeypatch):
     monkeypatch.setattr("runner.plan.has_cuda", lambda: True)
-    run_scene(request(root, set="fit.device=cuda"), "fit")
+    run_scene(make_request(project, set="fit.device=cuda"), "fit")
     monkeypatch.setattr("runner.plan.has_cuda", lambda: False)
-    assert words(root, set="fit.device=cuda")["fit"].startswith("cached")
-    assert words(root, set="fit.device=cuda fit.rate=9")["fit"].startswith("missing")
+    assert statuses(project, set="fit.device=cuda")["fit"].startswith("cached")
+    assert statuses(project, set="fit.device=cuda fit.rate=9")["fit"].startswith("missing")
 
 
-def test_two_folders_of_one_name(root, tmp_path):
-    write(tmp_path, {"elsewhere/toy/number.txt": "4"})
+def test_two_folders_of_one_name(project, tmp_path):
+    write_files(tmp_path, {"elsewhere/toy/number.txt": "4"})
     with pytest.raises(Refused, match=r"two scenes are called 'toy': .*data/toy.*elsewhere/toy"):
-        resolve(request(root, scene=str(tmp_path / "elsewhere/toy")))
-    shutil.rmtree(root / "data/toy")  # moved, not doubled
-    assert set(words(root, scene=str(tmp_path / "elsewhere/toy")).values()) == {"cached"}
+        resolve(make_request(project, scene=str(tmp_path / "elsewhere/toy")))
+    shutil.rmtree(project / "data/toy")  # moved, not doubled
+    assert set(statuses(project, scene=str(tmp_path / "elsewhere/toy")).values()) == {"cached"}
 
 
-def test_clean(root, capsys):
-    run_scene(request(root, variant="strong"), "distill")
-    maintenance.clean(request(root, variant="strong"))
-    assert (root / "runs/toy").exists() and not (root / "runs/toy@strong").exists()
-    maintenance.clean(request(root, scene=str(root / "data/toy")))
-    assert not (root / "runs/toy").exists()
+def test_clean(project, capsys):
+    run_scene(make_request(project, variant="strong"), "distill")
+    maintenance.clean(make_request(project, variant="strong"))
+    assert (project / "runs/toy").exists() and not (project / "runs/toy@strong").exists()
+    maintenance.clean(make_request(project, scene=str(project / "data/toy")))
+    assert not (project / "runs/toy").exists()
     assert "removing" in (said := capsys.readouterr().out) and "runs/toy: distill, evaluate, fit, masks, poses" in said
-    maintenance.clean(request(root))
+    maintenance.clean(make_request(project))
     assert "nothing was computed for toy" in capsys.readouterr().out
-    run_scene(request(root), "fit")
-    shutil.rmtree(root / "data/toy")
-    maintenance.clean(request(root))
-    assert not (root / "runs/toy").exists()
+    run_scene(make_request(project), "fit")
+    shutil.rmtree(project / "data/toy")
+    maintenance.clean(make_request(project))
+    assert not (project / "runs/toy").exists()
 
 
-def test_clean_removes_only_what_it_was_asked_for_by_name(root):
-    run_scene(request(root, variant="strong"), "distill")
-    write(root, {"runs/mine/notes.txt": "no scene's"})
-    before = sorted(root.rglob("*"))
+def test_clean_removes_only_what_it_was_asked_for_by_name(project):
+    run_scene(make_request(project, variant="strong"), "distill")
+    write_files(project, {"runs/mine/notes.txt": "no scene's"})
+    before = sorted(project.rglob("*"))
     for name in ("*", "to*", "[t]oy", ".locks", "..", ".", "/", "data/..", "toy@strong", "tyo", "toys", "mine"):
         with pytest.raises(Refused, match="toy"):
-            maintenance.clean(request(root, scene=name))
+            maintenance.clean(make_request(project, scene=name))
     for variant in ("*", "../toy", "string"):
         with pytest.raises(Refused, match=r"unknown variant .*strong"):
-            maintenance.clean(request(root, variant=variant))
-    assert sorted(root.rglob("*")) == before
+            maintenance.clean(make_request(project, variant=variant))
+    assert sorted(project.rglob("*")) == before
 
 
-def test_clean_and_a_rerun_leave_what_people_put_there(root, tmp_path, capsys):
+def test_clean_and_a_rerun_leave_what_people_put_there(project, tmp_path, capsys):
     mine = {"notes.txt": "1", "fit/notes.txt": "2", "to_paint/a.png": "3", "report/x.txt": "5"}
     pages = ("report/index.html", "adapted/sheet.png", "adapted/view/adapted.png", "sds-variance/sds_variance.json")
-    write(root / "runs/toy", dict.fromkeys(pages, "a page") | mine)
-    write(tmp_path, {"elsewhere/fit/gaussians.ply": "4"})
-    (root / "runs/toy/linked").symlink_to(tmp_path / "elsewhere")
-    assert words(root)["fit"] == "cached notes.txt added"
-    assert ran(capsys, root, "fit", set="fit.rate=3") == ["fit"]
-    assert (root / "runs/toy/fit/notes.txt").read_text() == "2"
-    (root / "runs/toy/poses/number.txt").write_text("9")
-    maintenance.clean(request(root))
+    write_files(project / "runs/toy", dict.fromkeys(pages, "a page") | mine)
+    write_files(tmp_path, {"elsewhere/fit/gaussians.ply": "4"})
+    (project / "runs/toy/linked").symlink_to(tmp_path / "elsewhere")
+    assert statuses(project)["fit"] == "cached notes.txt added"
+    assert run_project(capsys, project, "fit", set="fit.rate=3") == ["fit"]
+    assert (project / "runs/toy/fit/notes.txt").read_text() == "2"
+    (project / "runs/toy/poses/number.txt").write_text("9")
+    maintenance.clean(make_request(project))
     assert "kept, as it was not made by the runner: " in capsys.readouterr().out
-    home = root / "runs/toy"
+    home = project / "runs/toy"
     left = {path.relative_to(home).as_posix() for path in home.rglob("*") if path.is_file()}
     assert left == {"notes.txt", "report/x.txt", "fit/notes.txt", "to_paint/a.png", "poses/number.txt"}
     assert (tmp_path / "elsewhere/fit/gaussians.ply").read_text() == "4"
-    assert ran(capsys, root, "fit") == ["poses", "fit"]
+    assert run_project(capsys, project, "fit") == ["poses", "fit"]
     assert (home / "fit/notes.txt").exists() and (home / "kept/poses/number.txt").read_text() == "9"
 
 
 # ------------------------------------------------------------------------------------------------------------- batch
 
 
-def test_batch_goes_on_after_a_failed_scene(root, capsys):
-    write(root, {"data/bad/number.txt": "1", "data/bad/broken": "", "data/wide/number.txt": "6"})
-    assert compare.batch(request(root, scene=""), root / "data") == 1
+def test_batch_goes_on_after_a_failed_scene(project, capsys):
+    write_files(project, {"data/bad/number.txt": "1", "data/bad/broken": "", "data/wide/number.txt": "6"})
+    assert compare.batch(make_request(project, scene=""), project / "data") == 1
     output = capsys.readouterr().out
     assert "failed: bad: poses: " in output and "2 of 3 scenes done" in output
-    lines = (root / "runs/results.csv").read_text().split()
+    lines = (project / "runs/results.csv").read_text().split()
     assert lines[0] == "scene,state,psnr_box,lpips_vgg_box"
     rows = {line.split(",")[0]: line.split(",")[1:] for line in lines[1:]}
     assert rows["toy"] == ["done", "10.0000", ""] and rows["wide"] == ["done", "12.0000", ""]
     assert rows["bad"] == ["failed", "", ""]
-    assert (root / "runs/results.md").read_text().splitlines()[-1] == "| mean of 2 |  | 11.0000 |  |"
+    assert (project / "runs/results.md").read_text().splitlines()[-1] == "| mean of 2 |  | 11.0000 |  |"
 
 
 WEIGHTS = """
@@ -716,31 +583,34 @@ class Need:
 """
 
 
-def test_weights_that_are_missing_are_told_before_any_work_and_fetched(fresh, capsys):
+def test_missing_weights_are_reported_before_any_work_and_fetched(empty_project, capsys):
     from runner.weights import fetch_weights
 
-    source = fresh / "stages" / "distill.py"
+    source = empty_project / "stages" / "distill.py"
     source.write_text(source.read_text() + WEIGHTS)
-    (fresh / "reffusion" / "need.py").write_text(NEED)
-    assert words(fresh)["distill"] == "missing acme/net is not here; `make weights profile=laptop` fetches it (2.6 GB)"
+    (empty_project / "reffusion" / "need.py").write_text(NEED)
+    assert (
+        statuses(empty_project)["distill"]
+        == "missing acme/net is not here; `make weights profile=laptop` fetches it (2.6 GB)"
+    )
     with pytest.raises(Refused, match="acme/net is not here"):
-        run_scene(request(fresh), "all")
+        run_scene(make_request(empty_project), "all")
     shown = capsys.readouterr().out
     assert "toy (profile laptop: asked for)" in shown
     assert "weights to fetch: 2.6 GB, by `make weights profile=laptop`" in shown
-    assert not (fresh / "runs" / "toy" / "poses").exists()
+    assert not (empty_project / "runs" / "toy" / "poses").exists()
 
-    asked = request(fresh, scene="")
+    asked = make_request(empty_project, scene="")
     assert fetch_weights(asked, offline=True) == 1
     shown = capsys.readouterr().out
     assert "to fetch         2.6 GB  acme/net  (distill)" in shown and "5 kB  metric.pth" in shown
-    (fresh / "unreachable").touch()
+    (empty_project / "unreachable").touch()
     assert fetch_weights(asked, offline=False) == 2
-    (fresh / "unreachable").unlink()
-    assert fetch_weights(asked, offline=False) == 0 and (fresh / "fetched.txt").exists()
+    (empty_project / "unreachable").unlink()
+    assert fetch_weights(asked, offline=False) == 0 and (empty_project / "fetched.txt").exists()
     assert fetch_weights(asked, offline=False) == 0
     assert "to fetch: about 0 bytes" in capsys.readouterr().out
-    assert not words(fresh)["distill"].startswith("missing")
+    assert not statuses(empty_project)["distill"].startswith("missing")
 
 
 # ------------------------------------------------------------------------------------------------- nested parameters
@@ -771,7 +641,7 @@ def run(params: Params, out: Path, *, fit: Path, masks: Path) -> None:
 """
 NESTING = {
     "stages/distill.py": NESTED,
-    "pipeline.yaml": FILES["pipeline.yaml"]
+    "pipeline.yaml": RUNNER_FILES["pipeline.yaml"]
     .replace("{param: distill.gain, equals: 0", "{param: distill.sds.weight, equals: 0")
     .replace("poses: [shift, gaussians]", "poses: [shift, gaussians], distill: [extra]")
     .replace("laptop: {fit: {rate: 2}}", "laptop: {fit: {rate: 2}, distill: {sds: {weight: 0.5, lora: {rank: 8}}}}")
@@ -779,34 +649,39 @@ NESTING = {
 }
 
 
-def params_of(root: Path, stage: str = "distill", **options) -> dict:
-    return resolve(request(root, **options)).params[stage]
+def resolve_params(project: Path, stage: str = "distill", **options) -> dict:
+    return resolve(make_request(project, **options)).params[stage]
 
 
-def test_groups_merge_layer_over_layer(fresh):
-    write(
-        fresh, {**NESTING, "data/toy/scene.yaml": "extra: {view: a, depth: b}\nstages: {distill: {sds: {weight: 2}}}"}
+def test_groups_merge_layer_over_layer(empty_project):
+    write_files(
+        empty_project,
+        {**NESTING, "data/toy/scene.yaml": "extra: {view: a, depth: b}\nstages: {distill: {sds: {weight: 2}}}"},
     )
     model = {"model": "weights"}
-    assert params_of(fresh)["sds"] == {"weight": 2.0, "lora": {"rank": 8, **model}}
-    assert params_of(fresh, variant="ranked")["sds"] == {"weight": 2.0, "lora": {"rank": 2, **model}}
-    said = params_of(fresh, variant="ranked", set="distill.sds.lora.rank=3 distill.sds.weight=4 distill.gain=2")
+    assert resolve_params(empty_project)["sds"] == {"weight": 2.0, "lora": {"rank": 8, **model}}
+    assert resolve_params(empty_project, variant="ranked")["sds"] == {"weight": 2.0, "lora": {"rank": 2, **model}}
+    said = resolve_params(
+        empty_project, variant="ranked", set="distill.sds.lora.rank=3 distill.sds.weight=4 distill.gain=2"
+    )
     assert said["sds"] == {"weight": 4.0, "lora": {"rank": 3, **model}} and said["gain"] == 2
-    assert params_of(fresh)["extra"] == {"view": "a", "depth": "b"}
-    assert params_of(fresh, set="distill.extra='{view: c}'")["extra"] == {"view": "c"}  # a value of the scene, no group
-    assert params_of(fresh, set="distill.extra=[1,2]")["extra"] == ["1", "2"]
+    assert resolve_params(empty_project)["extra"] == {"view": "a", "depth": "b"}
+    assert resolve_params(empty_project, set="distill.extra='{view: c}'")["extra"] == {
+        "view": "c"
+    }  # a value of the scene, no group
+    assert resolve_params(empty_project, set="distill.extra=[1,2]")["extra"] == ["1", "2"]
 
 
-def test_nested_parameters_rerun_and_leave_out_by_their_dotted_names(fresh, capsys):
-    write(fresh, NESTING)
-    ran(capsys, fresh)
-    said = words(fresh, set="distill.sds.lora.rank=9 distill.sds.weight=3")
+def test_nested_parameters_rerun_and_leave_out_by_their_dotted_names(empty_project, capsys):
+    write_files(empty_project, NESTING)
+    run_project(capsys, empty_project)
+    said = statuses(empty_project, set="distill.sds.lora.rank=9 distill.sds.weight=3")
     assert said["distill"] == "run param sds.lora.rank 8 -> 9, param sds.weight 0.5 -> 3.0"
-    assert words(fresh, set="distill.sds.weight=0")["distill"] == "skip no gain"
-    lost = words(fresh, set="distill.sds.lora.model=./none")["distill"]
+    assert statuses(empty_project, set="distill.sds.weight=0")["distill"] == "skip no gain"
+    lost = statuses(empty_project, set="distill.sds.lora.model=./none")["distill"]
     assert lost.startswith("missing distill.sds.lora.model: no weights at ")
-    (fresh / "weights/model.bin").write_text("v")
-    assert words(fresh)["distill"] == "run weights sds.lora.model changed"
+    (empty_project / "weights/model.bin").write_text("v")
+    assert statuses(empty_project)["distill"] == "run weights sds.lora.model changed"
 
 
 @pytest.mark.parametrize(
@@ -820,40 +695,40 @@ def test_nested_parameters_rerun_and_leave_out_by_their_dotted_names(fresh, caps
         ("distill.sds.=1", r"is not of the form stage.parameter=value"),
     ],
 )
-def test_wrong_nested_parameters_are_named_with_their_layer(fresh, asked, message):
-    write(fresh, NESTING)
+def test_wrong_nested_parameters_are_named_with_their_layer(empty_project, asked, message):
+    write_files(empty_project, NESTING)
     with pytest.raises(Refused, match=message):
-        resolve(request(fresh, set=asked))
+        resolve(make_request(empty_project, set=asked))
 
 
-def test_the_layer_that_asked_last_is_named(fresh):
-    write(fresh, {**NESTING, "data/toy/scene.yaml": "stages: {distill: {sds: {weight: much}}}"})
+def test_the_layer_that_asked_last_is_named(empty_project):
+    write_files(empty_project, {**NESTING, "data/toy/scene.yaml": "stages: {distill: {sds: {weight: much}}}"})
     with pytest.raises(Refused, match=r"toy/scene.yaml: stages: distill.sds.weight = 'much'"):
-        resolve(request(fresh, set="distill.sds.lora.rank=3"))
+        resolve(make_request(empty_project, set="distill.sds.lora.rank=3"))
     with pytest.raises(Refused, match=r"set: distill.sds.weight = 'more'"):
-        resolve(request(fresh, set="distill.sds.weight=more"))
+        resolve(make_request(empty_project, set="distill.sds.weight=more"))
 
 
 # -------------------------------------------------------------------------------------------------------------- keys
 
 
-def test_a_parameter_that_is_no_part_of_the_key_reruns_nothing(fresh, capsys):
-    write(fresh, NESTING)
-    ran(capsys, fresh)
-    assert set(words(fresh, set="distill.checkpoint_seconds=5").values()) == {"cached"}
-    receipt = json.loads((fresh / "runs/toy/distill/receipt.json").read_text())
+def test_a_parameter_that_is_no_part_of_the_key_reruns_nothing(empty_project, capsys):
+    write_files(empty_project, NESTING)
+    run_project(capsys, empty_project)
+    assert set(statuses(empty_project, set="distill.checkpoint_seconds=5").values()) == {"cached"}
+    receipt = json.loads((empty_project / "runs/toy/distill/receipt.json").read_text())
     assert receipt["params"]["checkpoint_seconds"] == 60.0 and receipt["unkeyed"] == ["checkpoint_seconds"]
 
 
-def test_profiles_that_set_the_same_share_artifacts_and_old_receipts_hold(root, capsys):
-    edit(root / "pipeline.yaml", "paper: {}", "paper: {fit: {rate: 2}}")
-    assert set(words(root, profile="paper").values()) == {"cached"}
-    for path in (root / "runs/toy").glob("*/receipt.json"):  # as written when the profile was part of the key
+def test_profiles_that_set_the_same_share_artifacts_and_old_receipts_hold(project, capsys):
+    replace_text(project / "pipeline.yaml", "paper: {}", "paper: {fit: {rate: 2}}")
+    assert set(statuses(project, profile="paper").values()) == {"cached"}
+    for path in (project / "runs/toy").glob("*/receipt.json"):  # as written when the profile was part of the key
         found = json.loads(path.read_text())
         del found["unkeyed"]
         path.write_text(json.dumps(found | {"key": "0" * 20}))
-    assert ran(capsys, root, profile="paper") == []
-    assert words(root, set="fit.rate=3")["fit"] == "run param rate 2 -> 3"
+    assert run_project(capsys, project, profile="paper") == []
+    assert statuses(project, set="fit.rate=3")["fit"] == "run param rate 2 -> 3"
 
 
 # ------------------------------------------------------------------------------------------ where a stage is described
@@ -888,85 +763,95 @@ def run(params: "Params", out, *, poses):
 }
 
 
-def test_a_stage_is_described_in_its_plan_module_and_that_is_no_part_of_its_code(fresh, capsys, monkeypatch):
-    imported = fresh / "imported.txt"
+def test_a_stage_is_described_in_its_plan_module_and_that_is_no_part_of_its_code(empty_project, capsys, monkeypatch):
+    imported = empty_project / "imported.txt"
     monkeypatch.setenv("HEAVY", str(imported))
-    write(fresh, PLANNED)
-    run_scene(request(fresh), "poses")
-    job = resolve(request(fresh))
+    write_files(empty_project, PLANNED)
+    run_scene(make_request(empty_project), "poses")
+    job = resolve(make_request(empty_project))
     assert "3 steps" in plan_table(job, plan(job, ["poses", "fit"])) and not imported.exists()
-    assert "fit" in ran(capsys, fresh) and imported.read_text() == "x"  # by the process that does the work
-    assert result(fresh) == 10.0
-    code = json.loads((fresh / "runs/toy/fit/receipt.json").read_text())["code"]
+    assert (
+        "fit" in run_project(capsys, empty_project) and imported.read_text() == "x"
+    )  # by the process that does the work
+    assert read_score(empty_project) == 10.0
+    code = json.loads((empty_project / "runs/toy/fit/receipt.json").read_text())["code"]
     assert "stages/fit.py" in code and not any("plan" in name for name in code)
-    edit(fresh / "stages/plan/fit.py", 'steps"]', 'steps of"]')
-    assert set(words(fresh).values()) == {"cached"}
-    edit(fresh / "stages/plan/fit.py", "rate: int = 1", "rate: int = 1\n    slope: int = 1")
-    assert words(fresh)["fit"] == "run param slope is new"
-    edit(fresh / "stages/fit.py", "import heavy", "import heavy\nfrom stages.plan import fit")
-    assert "stages/plan/fit.py" in code_fingerprints(fresh, "fit", Hashes(fresh / "hashes"))  # now it is imported
+    replace_text(empty_project / "stages/plan/fit.py", 'steps"]', 'steps of"]')
+    assert set(statuses(empty_project).values()) == {"cached"}
+    replace_text(empty_project / "stages/plan/fit.py", "rate: int = 1", "rate: int = 1\n    slope: int = 1")
+    assert statuses(empty_project)["fit"] == "run param slope is new"
+    replace_text(empty_project / "stages/fit.py", "import heavy", "import heavy\nfrom stages.plan import fit")
+    assert "stages/plan/fit.py" in code_fingerprints(
+        empty_project, "fit", Hashes(empty_project / "hashes")
+    )  # now it is imported
 
 
-def test_a_run_that_does_not_fit_its_needs_is_refused_without_importing_it(fresh, monkeypatch):
-    monkeypatch.setenv("HEAVY", str(fresh / "imported.txt"))
-    write(fresh, PLANNED)
-    edit(fresh / "stages/fit.py", "*, poses", "*, poses, masks")
+def test_a_run_that_does_not_fit_its_needs_is_refused_without_importing_it(empty_project, monkeypatch):
+    monkeypatch.setenv("HEAVY", str(empty_project / "imported.txt"))
+    write_files(empty_project, PLANNED)
+    replace_text(empty_project / "stages/fit.py", "*, poses", "*, poses, masks")
     with pytest.raises(Refused, match=r"stages/fit.py: run\(\) and pipeline.yaml do not agree on its needs: masks"):
-        run_scene(request(fresh), "fit")
-    assert not (fresh / "imported.txt").exists()
+        run_scene(make_request(empty_project), "fit")
+    assert not (empty_project / "imported.txt").exists()
 
 
 # ------------------------------------------------------------------------------------------------------------- asking
 
 
 @pytest.fixture
-def started(monkeypatch) -> list[str]:
-    """What each process is started for that imports stages."""
+def worker_starts(monkeypatch) -> list[str]:
+    """The purpose of each process that is started to import stages."""
     started, start = [], process.start_worker
     monkeypatch.setattr(process, "start_worker", lambda *given, **how: started.append(given[1]) or start(*given, **how))
     return started
 
 
-def test_stages_are_asked_once_for_the_same_inputs(root, capsys, started):
-    assert compare.compare(request(root), "full,same") == 0
-    assert len(started) == 1 and ": done in" not in capsys.readouterr().out
-    edit(root / "data/toy/number.txt", "4", "5")
-    assert compare.compare(request(root), "full,same") == 0
-    assert len(started) > 2  # which files are read, as the scene changed; what the run will do, as far as it is known
+def test_stages_are_asked_once_for_the_same_inputs(project, capsys, worker_starts):
+    assert compare.compare(make_request(project), "full,same") == 0
+    assert len(worker_starts) == 1 and ": done in" not in capsys.readouterr().out
+    replace_text(project / "data/toy/number.txt", "4", "5")
+    assert compare.compare(make_request(project), "full,same") == 0
+    assert (
+        len(worker_starts) > 2
+    )  # which files are read, as the scene changed; what the run will do, as far as it is known
 
 
-def test_what_a_stage_says_of_its_parameters_is_remembered_until_its_code_changes(root, started):
-    words(root)  # in this folder for the first time
-    del started[:]
-    assert set(words(root).values()) == {"cached"} and started == []
-    assert words(root, set="fit.rate=3")["fit"] == "run param rate 2 -> 3" and started == ["describe"] * 2
-    assert words(root, set="fit.rate=3")["fit"].startswith("run") and started == ["describe"] * 3  # its preview anew
-    edit(root / "stages/fit.py", "rate: int = 1", "rate: int = 1\n    slope: int = 1")
-    assert words(root)["fit"] == "run param slope is new, code of stages/fit.py changed"
-    assert words(root, set="fit.slope=2")["poses"] == "cached"
-    write(root, {"stages/fit.py": "import nowhere"})
+def test_descriptions_of_parameters_are_cached_until_the_code_changes(project, worker_starts):
+    statuses(project)  # in this folder for the first time
+    del worker_starts[:]
+    assert set(statuses(project).values()) == {"cached"} and worker_starts == []
+    assert statuses(project, set="fit.rate=3")["fit"] == "run param rate 2 -> 3" and worker_starts == ["describe"] * 2
+    assert (
+        statuses(project, set="fit.rate=3")["fit"].startswith("run") and worker_starts == ["describe"] * 3
+    )  # its preview anew
+    replace_text(project / "stages/fit.py", "rate: int = 1", "rate: int = 1\n    slope: int = 1")
+    assert statuses(project)["fit"] == "run param slope is new, code of stages/fit.py changed"
+    assert statuses(project, set="fit.slope=2")["poses"] == "cached"
+    write_files(project, {"stages/fit.py": "import nowhere"})
     with pytest.raises(Refused, match=r"stages/fit.py: ModuleNotFoundError"):
-        words(root)
+        statuses(project)
 
 
-def test_a_stage_that_was_described_and_cannot_be_imported_any_more_is_refused_before_any_work(fresh):
-    edit(fresh / "stages/distill.py", "from pydantic", "import installed\nfrom pydantic")
-    write(fresh, {"installed.py": ""})
-    assert words(fresh)["distill"].startswith("pending")
-    (fresh / "installed.py").unlink()
+def test_a_stage_that_cannot_be_imported_any_more_is_refused_before_any_work(empty_project):
+    replace_text(empty_project / "stages/distill.py", "from pydantic", "import installed\nfrom pydantic")
+    write_files(empty_project, {"installed.py": ""})
+    assert statuses(empty_project)["distill"].startswith("pending")
+    (empty_project / "installed.py").unlink()
     with pytest.raises(Refused, match=r"stages/distill.py: ModuleNotFoundError.*installed"):
-        run_scene(request(fresh), "all")
-    assert not (fresh / "runs/toy/poses").exists()
+        run_scene(make_request(empty_project), "all")
+    assert not (empty_project / "runs/toy/poses").exists()
 
 
-def test_which_files_a_stage_reads_is_asked_again_only_where_something_changed(root):
+def test_which_files_a_stage_reads_is_asked_again_only_where_something_changed(project):
     reads = "def scene_files(params, scene, files):\n    {}\n    return files\n\ndef preview("
-    edit(root / "stages/poses.py", "def preview(", reads.format("open('asked.txt', 'a').write('x')"))
+    replace_text(project / "stages/poses.py", "def preview(", reads.format("open('asked.txt', 'a').write('x')"))
     for _ in range(2):
-        words(root)
-    assert (root / "asked.txt").read_text() == "x"
-    write(root, {"data/toy/new.txt": ""})
-    assert words(root)["poses"].startswith("run need scene changed") and (root / "asked.txt").read_text() == "xx"
-    edit(root / "stages/poses.py", "return files", "return files[:1]")
-    words(root)
-    assert (root / "asked.txt").read_text() == "xxx"
+        statuses(project)
+    assert (project / "asked.txt").read_text() == "x"
+    write_files(project, {"data/toy/new.txt": ""})
+    assert (
+        statuses(project)["poses"].startswith("run need scene changed") and (project / "asked.txt").read_text() == "xx"
+    )
+    replace_text(project / "stages/poses.py", "return files", "return files[:1]")
+    statuses(project)
+    assert (project / "asked.txt").read_text() == "xxx"

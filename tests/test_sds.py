@@ -1,4 +1,4 @@
-"""Score distillation against a distribution whose score is known, and the two scales it looks at."""
+"""Score distillation against a distribution with a known score, and its two scales."""
 
 import pytest
 import torch
@@ -11,15 +11,15 @@ ABAR = torch.cos(torch.linspace(0.05, 1.5, 100, dtype=torch.float64)) ** 2
 MEAN, VARIANCE = 0.7, 0.25
 
 
-def ideal(noisy, t):
-    """What a perfect denoiser answers when clean data are independent normal numbers: the posterior means."""
+def perfect_denoiser(noisy, t):
+    """The posterior means of a perfect denoiser for independent normal data."""
     a, s = ABAR[t].sqrt().view(-1, 1, 1, 1), (1 - ABAR[t]).sqrt().view(-1, 1, 1, 1)
     eps = s * (noisy - a * MEAN) / (a**2 * VARIANCE + s**2)
     return eps, (noisy - s * eps) / a
 
 
-def expected(latent, t, weighting):
-    """E over noise of w(t) (eps_theta - eps), by hand."""
+def expected_gradient(latent, t, weighting):
+    """The expectation over noise of w(t) (eps_theta - eps), in closed form."""
     a2 = ABAR[t]
     mean = (1 - a2).sqrt() * a2.sqrt() * (latent - MEAN) / (a2 * VARIANCE + 1 - a2)
     return mean * {"one": 1.0, "sigma2": 1 - a2, "x0": ((1 - a2) / a2).sqrt()}[weighting]
@@ -32,13 +32,15 @@ def test_mean_gradient_converges_to_the_closed_form_as_one_over_root_n(weighting
     for count in counts:
         noise = torch.randn(40, count, 1, 1, 1, generator=generator(0, weighting, count), dtype=torch.float64)
         means = [
-            sds_gradient(latent.expand_as(n), ideal, torch.full((count,), t), n, ABAR, weighting=weighting).mean()
+            sds_gradient(
+                latent.expand_as(n), perfect_denoiser, torch.full((count,), t), n, ABAR, weighting=weighting
+            ).mean()
             for n in noise
         ]
-        errors.append((torch.stack(means) - expected(latent, t, weighting)).square().mean().sqrt())
+        errors.append((torch.stack(means) - expected_gradient(latent, t, weighting)).square().mean().sqrt())
     rates = [float((errors[i] / errors[i + 1]).log10() / 1.0) for i in range(2)]
     assert all(0.35 < rate < 0.65 for rate in rates), rates
-    assert errors[-1] < 0.05 * expected(latent, t, weighting).abs()
+    assert errors[-1] < 0.05 * expected_gradient(latent, t, weighting).abs()
 
 
 def test_descent_along_the_gradient_ends_at_the_mean_of_the_data():
@@ -47,7 +49,9 @@ def test_descent_along_the_gradient_ends_at_the_mean_of_the_data():
     for step in range(400):
         draw = generator(1, step)
         noise = torch.randn(latent.shape, generator=draw, dtype=torch.float64)
-        gradient = sds_gradient(latent, ideal, draw_timesteps(1, 100, 0.02, 0.98, draw), noise, ABAR, weighting="x0")
+        gradient = sds_gradient(
+            latent, perfect_denoiser, draw_timesteps(1, 100, 0.02, 0.98, draw), noise, ABAR, weighting="x0"
+        )
         optimizer.zero_grad()
         sds_loss(latent, gradient).backward()
         optimizer.step()
@@ -58,16 +62,18 @@ def test_weightings_differ_by_a_function_of_the_timestep_only():
     t, draw = torch.tensor([1, 40, 98]), generator(2)
     latents = torch.randn(3, 4, 5, 5, generator=draw, dtype=torch.float64)
     noise = torch.randn(3, 4, 5, 5, generator=draw, dtype=torch.float64)
-    one, x0, sigma2 = (sds_gradient(latents, ideal, t, noise, ABAR, weighting=w) for w in ("one", "x0", "sigma2"))
+    one, x0, sigma2 = (
+        sds_gradient(latents, perfect_denoiser, t, noise, ABAR, weighting=w) for w in ("one", "x0", "sigma2")
+    )
     a2 = ABAR[t].view(-1, 1, 1, 1)
     torch.testing.assert_close(x0, ((1 - a2) / a2).sqrt() * one)
     torch.testing.assert_close(sigma2, (1 - a2) * one)
     with pytest.raises(ValueError, match="weighting"):
-        sds_gradient(latents, ideal, t, noise, ABAR, weighting="w")
+        sds_gradient(latents, perfect_denoiser, t, noise, ABAR, weighting="w")
 
 
-def faded(factor, shift=0.2):
-    """(x0, z, mask): x0 has `factor` of z's contrast inside the mask and a mean of its own; outside, other noise."""
+def fade_contrast(factor, shift=0.2):
+    """(x0, z, mask): x0 has `factor` of z's contrast and another mean inside the mask, and other noise outside."""
     z, other = torch.randn(2, 3, 4, 8, 8, generator=generator(9), dtype=torch.float64)
     mask = torch.zeros(3, 1, 8, 8, dtype=torch.float64)
     mask[:, :, 1:6, 2:7] = 1
@@ -76,19 +82,19 @@ def faded(factor, shift=0.2):
 
 
 def test_a_faded_answer_gets_the_contrast_of_the_render_and_keeps_its_mean():
-    x0, z, mask = faded(0.6)
+    x0, z, mask = fade_contrast(0.6)
     clear = match_contrast(x0, z, mask)
     torch.testing.assert_close(clear * mask, (z + 0.2) * mask)
     torch.testing.assert_close(match_contrast(clear, z, mask), clear)
 
 
-def test_what_the_prior_has_more_of_it_may_add():
+def test_matching_contrast_keeps_contrast_that_the_prior_adds():
     for factor in (1.0, 1.5, -0.5):  # as strong, stronger, the opposite
-        x0, z, mask = faded(factor)
+        x0, z, mask = fade_contrast(factor)
         torch.testing.assert_close(match_contrast(x0, z, mask), x0)
 
 
-def test_unfading_asks_for_no_more_contrast_and_blows_nothing_up():
+def test_matching_contrast_never_exceeds_the_render_and_stays_bounded():
     draw = generator(10)
     z, mask = torch.randn(1, 4, 8, 8, generator=draw, dtype=torch.float64), torch.ones(1, 1, 8, 8, dtype=torch.float64)
     centred = lambda x: x - x.mean((2, 3), keepdim=True)
@@ -108,12 +114,13 @@ def test_kept_contrast_means_the_same_in_every_weighting():
     t, draw = torch.tensor([1, 40, 98]), generator(11)
     latents, noise = torch.randn(2, 3, 4, 5, 5, generator=draw, dtype=torch.float64)
     one, x0, sigma2 = (
-        sds_gradient(latents, ideal, t, noise, ABAR, weighting=w, keep_contrast=True) for w in ("one", "x0", "sigma2")
+        sds_gradient(latents, perfect_denoiser, t, noise, ABAR, weighting=w, keep_contrast=True)
+        for w in ("one", "x0", "sigma2")
     )
     a2 = ABAR[t].view(-1, 1, 1, 1)
     torch.testing.assert_close(x0, ((1 - a2) / a2).sqrt() * one)
     torch.testing.assert_close(sigma2, (1 - a2) * one)
-    assert not torch.allclose(x0, sds_gradient(latents, ideal, t, noise, ABAR, weighting="x0"))
+    assert not torch.allclose(x0, sds_gradient(latents, perfect_denoiser, t, noise, ABAR, weighting="x0"))
 
 
 @pytest.mark.parametrize("patches", [0, 1, 2])
@@ -154,10 +161,10 @@ def test_a_mask_keeps_the_gradient_inside_it_and_drops_the_rest():
     latents, noise = torch.randn(2, 2, 4, 6, 6, generator=draw, dtype=torch.float64)
     mask = torch.zeros(2, 1, 6, 6, dtype=torch.float64)
     mask[:, :, 2:5] = 1
-    whole = sds_gradient(latents, ideal, t, noise, ABAR)
-    inside = sds_gradient(latents, ideal, t, noise, ABAR, mask=mask)
+    whole = sds_gradient(latents, perfect_denoiser, t, noise, ABAR)
+    inside = sds_gradient(latents, perfect_denoiser, t, noise, ABAR, mask=mask)
     assert (inside == whole * mask).all() and (whole != 0).any()
-    assert (sds_gradient(latents, ideal, t, noise, ABAR, mask=torch.zeros_like(mask)) == 0).all()
+    assert (sds_gradient(latents, perfect_denoiser, t, noise, ABAR, mask=torch.zeros_like(mask)) == 0).all()
 
 
 def test_a_reduced_mask_covers_every_masked_pixel():

@@ -1,12 +1,12 @@
-"""Can SDS gain? What the initialization shows beside the hole, and who reads the answer."""
+"""The prediction whether SDS can improve the initialization, from its error beside the hole."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from small_params import altered
-from small_scene import CAMERAS, TRAIN, gaussians, true_mask
+from scenes.settings import with_changes
+from scenes.wall_scene import CAMERAS, TRAIN, true_mask, wall_and_square
 
 from reffusion.distill.inputs import resolve_sds
 from reffusion.initialize.sds_gain import GUESSED_SHARE, HOLE_LOSS, MAX_VIEWS, PRIOR_PSNR, predict_gain
@@ -20,9 +20,9 @@ AT, TRAINED = 0.8, [CAMERAS[name] for name in TRAIN]
 
 
 @pytest.fixture(scope="module")
-def given():
-    """The wall without its square, masks, and photographs that show just what it does."""
-    scene, labels = gaussians(AT)
+def wall_without_square():
+    """The wall without its square, masks, and photographs that equal its renders."""
+    scene, labels = wall_and_square(AT)
     wall = scene.map(lambda p: p[~labels])
     hidden = {camera.name: true_mask(camera, AT) for camera in TRAINED}
     sets = {name: MaskSet(mask, mask, mask, mask) for name, mask in hidden.items()}
@@ -31,21 +31,21 @@ def given():
     return wall, sets, photos
 
 
-def test_renders_that_show_the_photographs_cannot_gain(given):
-    wall, sets, photos = given
+def test_renders_that_show_the_photographs_cannot_gain(wall_without_square):
+    wall, sets, photos = wall_without_square
     found = predict_gain(wall, TRAINED, sets, photos)
     assert not found.may_gain and found.psnr_beside > 45 and f"{found.psnr_beside - HOLE_LOSS:.1f} dB" in found.reason
 
 
-def test_what_no_reference_covers_may_gain_however_good_the_rest(given):
-    wall, sets, photos = given
+def test_what_no_reference_covers_may_gain_however_good_the_rest(wall_without_square):
+    wall, sets, photos = wall_without_square
     assert not predict_gain(wall, TRAINED, sets, photos, guessed_share=GUESSED_SHARE).may_gain
     found = predict_gain(wall, TRAINED, sets, photos, guessed_share=0.19)
     assert found.may_gain and "19%" in found.reason and found.psnr_beside > 45
 
 
-def test_what_is_wrong_in_the_hole_or_far_from_it_does_not_count_and_beside_it_does(given):
-    wall, sets, photos = given
+def test_what_is_wrong_in_the_hole_or_far_from_it_does_not_count_and_beside_it_does(wall_without_square):
+    wall, sets, photos = wall_without_square
     rows = np.arange(photos["a0"].shape[0])[:, None]
     in_hole = {name: np.where(sets[name].consistent[..., None], 0, image) for name, image in photos.items()}
     far = {name: np.where((rows < 8)[..., None], 0, image).astype(np.uint8) for name, image in photos.items()}
@@ -57,14 +57,14 @@ def test_what_is_wrong_in_the_hole_or_far_from_it_does_not_count_and_beside_it_d
     assert found.may_gain and found.psnr_beside - HOLE_LOSS < PRIOR_PSNR
 
 
-def test_beside_what_is_put_in_where_nothing_was_removed(given):
-    wall, sets, photos = given
+def test_beside_what_is_put_in_where_nothing_was_removed(wall_without_square):
+    wall, sets, photos = wall_without_square
     put_in = {name: replace(each, consistent=np.zeros_like(each.invent)) for name, each in sets.items()}
     assert predict_gain(wall, TRAINED, put_in, photos) == predict_gain(wall, TRAINED, sets, photos)
 
 
-def test_a_few_views_are_looked_at_and_without_any_it_may_gain(given):
-    wall, sets, photos = given
+def test_a_few_views_are_looked_at_and_without_any_it_may_gain(wall_without_square):
+    wall, sets, photos = wall_without_square
     many = [replace(TRAINED[k % 5], name=f"v{k}") for k in range(3 * MAX_VIEWS)]
     repeated = {camera.name: TRAIN[k % 5] for k, camera in enumerate(many)}
     looked = []
@@ -84,13 +84,13 @@ def test_a_few_views_are_looked_at_and_without_any_it_may_gain(given):
 )
 def test_distillation_reads_what_the_initialization_says(tmp_path, run, may, weight):
     save_json(tmp_path / "facts.json", {"sds_may_gain": may, "sds_reason": "too good at 40.0 dB"})
-    asked = altered(Params(), sds={"run": run, "weight": 1})
+    asked = with_changes(Params(), sds={"run": run, "weight": 1})
     params, said = resolve_sds(asked, tmp_path)
-    assert params == altered(asked, sds={"weight": weight})
+    assert params == with_changes(asked, sds={"weight": weight})
     assert ("40.0 dB" in said) == (run == "auto") and ("left out" in said) == (weight == 0)
 
 
 def test_a_prior_that_is_never_asked_need_not_be_there():
-    nothing = altered(Params(), sds={"run": "never"}, depth={"weight": 0})
+    nothing = with_changes(Params(), sds={"run": "never"}, depth={"weight": 0})
     assert told.needed_weights(nothing, frozenset()) == []
-    assert told.needed_weights(altered(nothing, sds={"run": "auto"}), frozenset()) != []
+    assert told.needed_weights(with_changes(nothing, sds={"run": "auto"}), frozenset()) != []

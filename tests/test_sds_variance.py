@@ -1,17 +1,15 @@
-"""The variance of the SDS gradient: its parts against draws of known variance, and on a small run."""
+"""The variance of the SDS gradient: its parts against samples of known variance, and on a small run."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from small_prior import small_prior
+from scenes.distill_scene import write_initialized_run
+from scenes.networks import small_prior
 
 from benchmarks.studies import sds_variance as benchmark
 from reffusion import seeding
-from reffusion.io.ply import save_ply
-from reffusion.io.scene import save_mask_sets, save_scene
-from reffusion.types import Camera, Gaussians, MaskSet, Scene, Similarity
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -34,27 +32,10 @@ def test_without_noise_and_without_a_pull_nothing_is_left():
     assert found["pull"] == pytest.approx([0.49] * 3)
 
 
-def small_run(home, invent):
-    """A wall in front of three views; `invent`: bool [H, W], the hole in each."""
-    draw = seeding.generator(0, "wall")
-    means = torch.rand(80, 3, generator=draw) * torch.tensor([1.6, 1.2, 0.1]) - torch.tensor([0.8, 0.6, -1.5])
-    wall = Gaussians(
-        means, torch.zeros(80, 4), torch.full((80, 3), -2.0), torch.full((80,), 2.0), torch.zeros(80, 1, 3)
-    )
-    names, height, width = ("a", "b", "c"), *invent.shape
-    cameras = {name: Camera(name, width, height, 40.0, 40.0, width / 2, height / 2, np.eye(4)) for name in names}
-    still = Similarity(1.0, np.zeros(3))
-    scene = Scene(cameras, names, (), frozenset({"c"}), np.zeros((1, 3)), np.zeros((1, 3), np.uint8), still)
-    save_scene(home / "poses", scene)
-    save_ply(home / "initialize" / "gaussians.ply", wall)
-    save_mask_sets(home / "masks", dict.fromkeys(names, MaskSet(*[invent] * 4)))
-    return home
-
-
 def test_on_a_scene_without_ground_truth(tmp_path):
     prior, hole = small_prior(), np.zeros((36, 48), bool)
     hole[10:24, 12:30] = True
-    found = benchmark.measure({"before": prior, "after": prior}, small_run(tmp_path / "run", hole))
+    found = benchmark.measure({"before": prior, "after": prior}, write_initialized_run(tmp_path / "run", hole))
     assert set(found) == {"whole", "window"}
     for by_time in found.values():
         assert by_time["before"] == by_time["after"] and by_time["before"]["over_noise"] > 0
@@ -63,8 +44,8 @@ def test_on_a_scene_without_ground_truth(tmp_path):
     assert text.count("| 1.00 |") == 2 * (len(benchmark.TIMESTEPS) + 3)
 
 
-def test_what_is_missing_is_named(tmp_path):
+def test_missing_inputs_are_named(tmp_path):
     with pytest.raises(ValueError, match="make scene=nowhere initialize"):
         benchmark.load_inputs(tmp_path / "nowhere", small_prior())
     with pytest.raises(ValueError, match="nothing is to be invented"):
-        benchmark.load_inputs(small_run(tmp_path / "run", np.zeros((36, 48), bool)), small_prior())
+        benchmark.load_inputs(write_initialized_run(tmp_path / "run", np.zeros((36, 48), bool)), small_prior())

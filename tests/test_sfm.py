@@ -1,4 +1,4 @@
-"""Structure from motion: on a small drawn room always; on photographs with REFFUSION_SLOW=1 (minutes)."""
+"""Structure from motion: on a small synthetic room, and with REFFUSION_SLOW=1 (minutes) on photographs."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ import pytest
 import torch
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
+from scenes.capture import real_capture
+from scenes.room import render_room_corner, room_textures, room_walk, speckle_texture
 from scipy.spatial.transform import Rotation
 
 from benchmarks.studies.bare_photographs import pose_errors
@@ -27,49 +29,7 @@ from reffusion.io.scene import load_scene
 from stages import poses
 
 ROOT = Path(__file__).parents[1]
-CAPTURES = ROOT.parent / "shared" / "data"
 slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
-
-
-def noise(generator: np.random.Generator, size: int = 256) -> np.ndarray:
-    """[size, size, 3] speckle at several scales, in [0, 255]."""
-    total = np.zeros((size, size, 3))
-    for cell in (2, 4, 8, 16, 32):
-        coarse = generator.random((size // cell, size // cell, 3))
-        total += np.kron(coarse, np.ones((cell, cell, 1))) * cell**0.5
-    return 255 * (total - total.min()) / np.ptp(total)
-
-
-def draw_corner(pose: np.ndarray, textures: np.ndarray, size=(200, 150), focal=170.0) -> np.ndarray:
-    """The corner of a room, planes x = 2, y = 1.5, z = 3, ray-cast; uint8 [H, W, 3]."""
-    columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
-    rays = np.stack([(columns - size[0] / 2) / focal, (rows - size[1] / 2) / focal, np.ones_like(rows)], -1)
-    rays, center = rays @ pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
-    with np.errstate(divide="ignore"):
-        times = (np.array([2.0, 1.5, 3.0]) - center) / rays
-    times = np.where(times > 0, times, np.inf)
-    plane = times.argmin(-1)
-    hit = center + rays * times.min(-1)[..., None]
-    flat = np.stack([hit[..., 1], hit[..., 0], hit[..., 0]], -1), np.stack([hit[..., 2], hit[..., 2], hit[..., 1]], -1)
-    u, v = (np.take_along_axis(axis, plane[..., None], -1)[..., 0] * 40 for axis in flat)
-    texels = textures.shape[1]
-    return textures[plane, v.astype(int) % texels, u.astype(int) % texels].astype(np.uint8)
-
-
-def walk(count: int) -> dict[str, np.ndarray]:
-    """Views that face the corner, up and down by turns: centres on a line would leave the alignment free to turn."""
-    result = {}
-    for k in range(count):
-        t = k / (count - 1) - 0.5
-        center, forward = np.array([1.6 * t, 0.3 * (-1) ** k, -1.0 + 0.8 * t * t]), np.array([0.35 - 0.4 * t, 0.2, 1.0])
-        forward /= np.linalg.norm(forward)
-        right = np.cross([0.0, 1.0, 0.0], forward)
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-        pose[:3, 3] = -pose[:3, :3] @ center
-        result[f"p{k}"] = pose
-    return result
 
 
 def assert_accepted(scene, truth: dict[str, np.ndarray]) -> None:
@@ -78,7 +38,7 @@ def assert_accepted(scene, truth: dict[str, np.ndarray]) -> None:
 
 
 def test_pose_errors_are_those_that_no_similarity_explains():
-    truth = walk(6)
+    truth = room_walk(6)
     turn = Rotation.from_rotvec((0.3, -0.5, 0.2)).as_matrix()
 
     def elsewhere(pose: np.ndarray, shift=(0.0, 0.0, 0.0)) -> np.ndarray:
@@ -97,13 +57,13 @@ def test_pose_errors_are_those_that_no_similarity_explains():
     assert shifts.argmax() == 2 and 0.5 < shifts.max() < 1.0
 
 
-def run(folder: Path, out: Path, **params):
+def run_poses(folder: Path, out: Path, **params):
     out.mkdir()
     poses.run(poses.Params(**params), out, scene=folder)
     return load_scene(out)
 
 
-def solved_by(threads: int, photographs: dict[str, Path], work: Path) -> Poses:
+def reconstruct_with_threads(threads: int, photographs: dict[str, Path], work: Path) -> Poses:
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
@@ -114,16 +74,16 @@ def solved_by(threads: int, photographs: dict[str, Path], work: Path) -> Poses:
 
 def test_a_walk_past_a_corner(tmp_path, capsys):
     """All views that belong to it are placed; the one that does not is named and left out, and so is its mask."""
-    generator, truth = np.random.default_rng(0), walk(6)
-    textures = np.stack([noise(generator) for _ in range(3)])
+    generator, truth = np.random.default_rng(0), room_walk(6)
+    textures = room_textures(generator)
     folder = tmp_path / "s"
     for name, pose in truth.items():
-        save_image(folder / f"{name}.png", draw_corner(pose, textures))
-    save_image(folder / "stray.png", noise(generator)[:150, :200].astype(np.uint8))
+        save_image(folder / f"{name}.png", render_room_corner(pose, textures))
+    save_image(folder / "stray.png", speckle_texture(generator)[:150, :200].astype(np.uint8))
     for name in (*truth, "stray"):
         save_mask(folder / "masks" / f"{name}.png", np.eye(150, 200, dtype=bool))
     with pytest.warns(UserWarning, match="1 views were not placed and are left out: stray"):
-        scene = run(folder, tmp_path / "out")
+        scene = run_poses(folder, tmp_path / "out")
     facts = load_json(tmp_path / "out" / "sfm.json")
     assert (facts["placed"], facts["photographs"], facts["lenses"]) == (6, 7, 1)
     assert facts["points"] == len(scene.points) and 2 < facts["mean_track_length"] < 6
@@ -132,7 +92,9 @@ def test_a_walk_past_a_corner(tmp_path, capsys):
     assert f"structure from motion: 6 of 7 photographs, 1 lens, {facts['points']:,} points in " in said
     assert sorted(scene.cameras) == sorted(truth) == list(scene.train)
     assert_accepted(scene, truth)
-    again, once_more = (solved_by(threads, {n: folder / f"{n}.png" for n in truth}, tmp_path) for threads in (1, 3))
+    again, once_more = (
+        reconstruct_with_threads(threads, {n: folder / f"{n}.png" for n in truth}, tmp_path) for threads in (1, 3)
+    )
     assert all(np.array_equal(again.world_to_camera[n], once_more.world_to_camera[n]) for n in truth)
     assert np.array_equal(again.points, once_more.points)
     assert len(scene.points) > 300 and "stray" not in scene.cameras
@@ -145,19 +107,19 @@ def test_views_that_do_not_belong_together_are_named(tmp_path):
     for name in ("a", "b", "c"):
         save_image(tmp_path / "s" / "images" / f"{name}.jpg", np.full((60, 80, 3), 90, np.uint8))
     with pytest.raises(ValueError, match=r"placed 0 of 3 views.*not a, b, c\. Take more photos"):
-        run(tmp_path / "s", tmp_path / "out", masks="none")
+        run_poses(tmp_path / "s", tmp_path / "out", masks="none")
 
 
 UPRIGHT, ACROSS = (150, 200), (200, 150)  # px: a phone held both ways
 
 
 def write_walk(folder: Path, sizes: Sequence[tuple[int, int]], endings: Sequence[str]) -> dict[str, np.ndarray]:
-    """One photograph of `walk` for each size and ending, in folder/images; the true poses."""
-    generator, truth = np.random.default_rng(0), walk(len(sizes))
-    textures = np.stack([noise(generator) for _ in range(3)])
+    """Write a photograph of `room_walk` for each size and ending to folder/images; return the true poses."""
+    generator, truth = np.random.default_rng(0), room_walk(len(sizes))
+    textures = room_textures(generator)
     (folder / "images").mkdir(parents=True)
     for (name, pose), size, ending in zip(truth.items(), sizes, endings, strict=True):
-        picture = Image.fromarray(draw_corner(pose, textures, size))
+        picture = Image.fromarray(render_room_corner(pose, textures, size))
         picture.save(folder / "images" / f"{name}.{ending}", **{"webp": {"lossless": True}}.get(ending, {}))
     return truth
 
@@ -166,7 +128,7 @@ def test_photographs_of_every_kind_are_placed(tmp_path):
     """WebP and TIFF among them: COLMAP does not read their EXIF data, or them at all."""
     endings = ("webp", "webp", "tiff", "bmp", "png", "webp")
     truth = write_walk(tmp_path / "s", [ACROSS] * 6, endings)
-    scene = run(tmp_path / "s", tmp_path / "out", masks="none")
+    scene = run_poses(tmp_path / "s", tmp_path / "out", masks="none")
     assert sorted(scene.cameras) == sorted(truth)
     assert_accepted(scene, truth)
 
@@ -175,7 +137,7 @@ def test_photographs_of_two_orientations_are_placed(tmp_path):
     """They share a lens, for a phone that is turned is the same phone, and its focal length is found."""
     sizes = [ACROSS, UPRIGHT, UPRIGHT, ACROSS, UPRIGHT, ACROSS, UPRIGHT, UPRIGHT]
     truth = write_walk(tmp_path / "s", sizes, ["png"] * 8)
-    scene = run(tmp_path / "s", tmp_path / "out", masks="none")
+    scene = run_poses(tmp_path / "s", tmp_path / "out", masks="none")
     assert sorted(scene.cameras) == sorted(truth)
     assert_accepted(scene, truth)
     assert [(c.width, c.height) for _, c in sorted(scene.cameras.items())] == sizes
@@ -229,7 +191,7 @@ def test_demo_photos(tmp_path):
     subprocess.run(made, check=True)
     record = json.loads((tmp_path / "s" / "truth" / "cameras.json").read_text())
     truth = {name: np.array(pose) for name, pose in record["world_to_camera"].items()}
-    scene = run(tmp_path / "s", tmp_path / "out")
+    scene = run_poses(tmp_path / "s", tmp_path / "out")
     assert sorted(scene.cameras) == sorted(truth)
     assert_accepted(scene, truth)
 
@@ -237,19 +199,17 @@ def test_demo_photos(tmp_path):
 @slow
 def test_bear(tmp_path):
     """A dozen neighbouring photographs against the poses they came with (which are COLMAP's own, from 96)."""
-    if not (CAPTURES / "bear").is_dir():
-        pytest.skip("the capture bear is not in ../shared/data")
-    brought = load_capture(CAPTURES / "bear")
+    brought = load_capture(real_capture("bear"))
     names = sorted(brought.pictures)[:24:2]
     (tmp_path / "s" / "images").mkdir(parents=True)
     for name in names:
         shutil.copy(brought.pictures[name], tmp_path / "s" / "images")
-    scene = run(tmp_path / "s", tmp_path / "out", masks="none")
+    scene = run_poses(tmp_path / "s", tmp_path / "out", masks="none")
     assert sorted(scene.cameras) == names
-    assert_accepted(scene, {name: about_the_middle(brought.poses, name) for name in names})
+    assert_accepted(scene, {name: center_principal_ray(brought.poses, name) for name in names})
 
 
-def about_the_middle(given: Poses, name: str) -> np.ndarray:
+def center_principal_ray(given: Poses, name: str) -> np.ndarray:
     """The pose [4, 4] turned so that it looks along the ray through the middle of its picture.
 
     bear's pictures are crops, their principal point 17 px off the middle. Structure from motion keeps it in the

@@ -1,8 +1,8 @@
-"""Of several references that bring their depth, who draws what: surfaces in closed form, seen by two cameras."""
+"""Which of several references with depth supplies a surface, on surfaces in closed form that two cameras see."""
 
 import numpy as np
 import pytest
-import small_scene as small
+from scenes.cameras import orbit_camera
 
 from reffusion import geometry
 from reffusion.initialize.sharing import ReferenceSurface, select_finest, unchanged_rim
@@ -10,14 +10,14 @@ from reffusion.initialize.sharing import ReferenceSurface, select_finest, unchan
 SIZE = 64
 
 
-def view(name, azimuth, height, away=3.0):
-    return small.looking(name, azimuth, height, away, np.zeros(3), SIZE, 90.0)
+def sphere_camera(name, azimuth, height, away=3.0):
+    return orbit_camera(name, azimuth, height, away, np.zeros(3), SIZE, 90.0)
 
 
-FRONT, SIDE = view("front", 0.0, 3.0), view("side", 0.0, 0.4)
+FRONT, SIDE = sphere_camera("front", 0.0, 3.0), sphere_camera("side", 0.0, 0.4)
 
 
-def floor(camera, z=0.0):
+def floor_depth(camera, z=0.0):
     """[H, W] depth of the plane at that height, 0 above the horizon."""
     rays = geometry.unproject(np.ones((SIZE, SIZE)), camera) - camera.center
     with np.errstate(divide="ignore"):
@@ -25,61 +25,66 @@ def floor(camera, z=0.0):
     return np.where(depth > 0, depth, 0.0)
 
 
-def shown(camera, depth, pixels=None):
+def make_surface(camera, depth, pixels=None):
     told = depth > 0
     return ReferenceSurface(camera, depth, told if pixels is None else told & pixels)
 
 
-def near_middle(camera, depth, radius):
+def is_near_origin(camera, depth, radius):
     points = geometry.unproject(np.where(depth > 0, depth, 1e6), camera)
     return np.linalg.norm(points, axis=-1) < radius
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_a_surface_is_drawn_by_the_view_that_shows_it_most_finely(order):
-    views = [shown(camera, floor(camera), near_middle(camera, floor(camera), 0.5)) for camera in (FRONT, SIDE)]
+    views = [
+        make_surface(camera, floor_depth(camera), is_near_origin(camera, floor_depth(camera), 0.5))
+        for camera in (FRONT, SIDE)
+    ]
     drawn = dict(zip(order, select_finest([views[k] for k in order]), strict=True))
     assert (drawn[0] == views[0].pixels).mean() > 0.98
     assert drawn[1].sum() < 0.1 * views[1].pixels.sum()  # a border, to a pixel
 
 
-def test_of_two_alike_the_earlier_draws():
-    same = shown(FRONT, floor(FRONT))
+def test_of_two_equal_views_the_earlier_is_used():
+    same = make_surface(FRONT, floor_depth(FRONT))
     first, second = select_finest([same, same])
     assert np.array_equal(first, same.pixels) and not second.any()
 
 
-def test_what_only_one_shows_stays_its_own():
-    wide = shown(SIDE, floor(SIDE), near_middle(SIDE, floor(SIDE), 0.5))
-    narrow = shown(FRONT, floor(FRONT), near_middle(FRONT, floor(FRONT), 0.2))
+def test_a_surface_of_one_view_stays_with_it():
+    wide = make_surface(SIDE, floor_depth(SIDE), is_near_origin(SIDE, floor_depth(SIDE), 0.5))
+    narrow = make_surface(FRONT, floor_depth(FRONT), is_near_origin(FRONT, floor_depth(FRONT), 0.2))
     _, left = select_finest([narrow, wide])
-    away = near_middle(SIDE, floor(SIDE), 0.25)
+    away = is_near_origin(SIDE, floor_depth(SIDE), 0.25)
     assert np.array_equal(left & ~away, wide.pixels & ~away)
-    assert left[near_middle(SIDE, floor(SIDE), 0.15)].mean() < 0.05
+    assert left[is_near_origin(SIDE, floor_depth(SIDE), 0.15)].mean() < 0.05
 
 
-def test_nothing_stands_where_another_looks_past_it():
+def test_a_surface_is_dropped_where_another_view_sees_past_it():
     """A sheet that one view has in mid-air, where the other sees the floor."""
-    sheet = floor(SIDE, z=0.2)
-    hanging = near_middle(SIDE, sheet, 0.4)
-    depth = np.where(hanging, sheet, floor(SIDE))
-    drawn, _ = select_finest([shown(SIDE, depth, hanging), shown(FRONT, floor(FRONT), np.zeros((SIZE, SIZE), bool))])
+    sheet = floor_depth(SIDE, z=0.2)
+    hanging = is_near_origin(SIDE, sheet, 0.4)
+    depth = np.where(hanging, sheet, floor_depth(SIDE))
+    drawn, _ = select_finest(
+        [make_surface(SIDE, depth, hanging), make_surface(FRONT, floor_depth(FRONT), np.zeros((SIZE, SIZE), bool))]
+    )
     assert not drawn[hanging].any()
 
 
-def test_without_depth_nothing_is_said():
+def test_without_depth_nothing_is_selected():
     empty = np.zeros((SIZE, SIZE))
-    whole = shown(SIDE, floor(SIDE))
+    whole = make_surface(SIDE, floor_depth(SIDE))
     drawn, nothing = select_finest([whole, ReferenceSurface(FRONT, empty, np.zeros((SIZE, SIZE), bool))])
     assert np.array_equal(drawn, whole.pixels) and not nothing.any()
     assert np.isinf(ReferenceSurface(FRONT, empty, whole.pixels).footprints).all()
 
 
 def test_a_pixel_is_as_wide_as_its_slant_makes_it():
-    depth = floor(SIDE)
+    depth = floor_depth(SIDE)
     row = SIZE * 3 // 4
     below, above = geometry.unproject(depth, SIDE)[[row, row + 1], SIZE // 2]
-    assert shown(SIDE, depth).footprints[row, SIZE // 2] == pytest.approx(np.linalg.norm(below - above), rel=0.1)
+    assert make_surface(SIDE, depth).footprints[row, SIZE // 2] == pytest.approx(np.linalg.norm(below - above), rel=0.1)
 
 
 def test_a_rim_that_looks_like_the_photograph_is_left():

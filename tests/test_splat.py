@@ -10,7 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from other_device import there_is_one
+from scenes.cameras import make_camera
+from scenes.simulated_gpu import has_gpu
 
 from reffusion.splat import cuda, rasterizer, reference
 from reffusion.types import PARAMETERS, Camera, Gaussians
@@ -19,8 +20,8 @@ BLOCKS = (*PARAMETERS, "features", "background", "probe")
 IMAGES = ("color", "depth", "alpha", "features")
 
 
-def camera(width: int, height: int, distance: float = 3.0) -> Camera:
-    """A view of the origin, a little turned and off-centre so that no symmetry hides an error."""
+def off_center_camera(width: int, height: int, distance: float = 3.0) -> Camera:
+    """A view of the origin, slightly turned and off-centre so that no symmetry hides an error."""
     turn = 0.3
     pose = np.eye(4)
     pose[:3, :3] = [[math.cos(turn), 0, math.sin(turn)], [0, 1, 0], [-math.sin(turn), 0, math.cos(turn)]]
@@ -28,7 +29,7 @@ def camera(width: int, height: int, distance: float = 3.0) -> Camera:
     return Camera("test", width, height, 1.2 * width, 1.25 * width, width / 2 + 0.7, height / 2 - 0.3, pose)
 
 
-def cloud(count: int, log_scale: float, seed: int = 0, degree: int = 3, spread: float = 1.0) -> Gaussians:
+def random_cloud(count: int, log_scale: float, seed: int = 0, degree: int = 3, spread: float = 1.0) -> Gaussians:
     """Random Gaussians around the origin, colours in and out of range, some opacities saturated."""
     generator = torch.Generator().manual_seed(seed)
     normal = lambda *shape: torch.randn(*shape, generator=generator)
@@ -43,7 +44,7 @@ def cloud(count: int, log_scale: float, seed: int = 0, degree: int = 3, spread: 
 
 
 def differentiate(gaussians, view, impl, dtype, channels=3, sh_degree=None):
-    """Rendering, and the gradients of a fixed random linear function of everything rendered."""
+    """The rendering, and the gradients of a fixed random linear function of all its outputs."""
     generator = torch.Generator().manual_seed(1)
     random = lambda *shape: torch.randn(*shape, generator=generator).to(dtype)
     leaf = lambda tensor: tensor.detach().to(dtype).clone().requires_grad_()
@@ -69,7 +70,7 @@ def assert_close(actual, expected, relative, floor, what):
     assert error <= relative * expected.double().norm().item() + floor, (what, error, expected.norm().item())
 
 
-def assert_same(gaussians, view, relative=2e-5, **options):
+def assert_matches_reference(gaussians, view, relative=2e-5, **options):
     """The compiled kernel equals the reference in float64, values and gradients, up to `relative` in L2."""
     fast, fast_gradients = differentiate(gaussians, view, "cpu", torch.float32, **options)
     exact, exact_gradients = differentiate(gaussians, view, "reference", torch.float64, **options)
@@ -92,36 +93,38 @@ def assert_same(gaussians, view, relative=2e-5, **options):
     ],
 )
 def test_equals_reference(count, log_scale, size, options):
-    exact = assert_same(cloud(count, log_scale), camera(*size), **options)
+    exact = assert_matches_reference(random_cloud(count, log_scale), off_center_camera(*size), **options)
     assert exact.alpha.mean() > 0.1
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_stored_degrees(degree):
-    assert_same(cloud(50, -2.5, degree=degree), camera(33, 20))
+    assert_matches_reference(random_cloud(50, -2.5, degree=degree), off_center_camera(33, 20))
 
 
 def test_inside_the_cloud():
     """Gaussians behind, around and right before the camera; the Jacobian's clamp is active for some."""
-    exact = assert_same(cloud(400, -2.5, seed=3, spread=2.0), camera(48, 40, distance=0.1), relative=1e-4)
+    exact = assert_matches_reference(
+        random_cloud(400, -2.5, seed=3, spread=2.0), off_center_camera(48, 40, distance=0.1), relative=1e-4
+    )
     assert (exact.radii == 0).any() and (exact.radii > 100).any()
 
 
 def test_cropped_view():
-    view = camera(64, 48)
-    whole = rasterizer.render(cloud(100, -3.0), view).color
-    part = rasterizer.render(cloud(100, -3.0), view.cropped(17, 9, 32, 24)).color
+    view = off_center_camera(64, 48)
+    whole = rasterizer.render(random_cloud(100, -3.0), view).color
+    part = rasterizer.render(random_cloud(100, -3.0), view.cropped(17, 9, 32, 24)).color
     assert_close(part, whole[9:33, 17:49], 1e-2, 0, "crop")  # the Jacobian's clamp depends on the window
-    assert_same(cloud(100, -3.0), view.cropped(17, 9, 32, 24))
+    assert_matches_reference(random_cloud(100, -3.0), view.cropped(17, 9, 32, 24))
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_a_sampled_view_draws_those_pixels_of_the_whole(antialiased):
-    gaussians, whole = replace(cloud(60, -3.0), antialiased=antialiased), camera(40, 29)
+    gaussians, whole = replace(random_cloud(60, -3.0), antialiased=antialiased), off_center_camera(40, 29)
     pixels = rasterizer.render(gaussians, whole, background=torch.tensor([0.2, 0.3, 0.4]))
     for left, top in ((0, 0), (1, 0), (2, 1)):
         sampled = whole.sampled(3, left, top)
-        exact = assert_same(gaussians, sampled)
+        exact = assert_matches_reference(gaussians, sampled)
         for name in ("color", "depth", "alpha"):
             there = getattr(pixels, name)[top::3, left::3]
             assert getattr(exact, name).shape == there.shape
@@ -131,27 +134,27 @@ def test_a_sampled_view_draws_those_pixels_of_the_whole(antialiased):
 @pytest.mark.parametrize("footprint", [30.0, 300.0, 3000.0])
 def test_needles(footprint):
     """Needles 1000:1, of so many pixels, at all angles."""
-    gaussians = cloud(40, 0.0, seed=5, spread=0.5)
+    gaussians = random_cloud(40, 0.0, seed=5, spread=0.5)
     length = math.log(footprint * 3.0 / (1.2 * 64))
     gaussians = replace(gaussians, log_scales=torch.tensor([length, length - math.log(1000), length - 7]).repeat(40, 1))
-    assert_same(gaussians, camera(64, 64), relative=1e-3)
+    assert_matches_reference(gaussians, off_center_camera(64, 64), relative=1e-3)
 
 
 @pytest.mark.parametrize("log_scale", [-5.0, -3.2, -1.5])
 def test_antialiased_equals_reference(log_scale):
     """From footprints far below a pixel to large ones; faint ones are left out alike."""
-    exact = assert_same(replace(cloud(300, log_scale), antialiased=True), camera(61, 47))
+    exact = assert_matches_reference(replace(random_cloud(300, log_scale), antialiased=True), off_center_camera(61, 47))
     assert exact.alpha.max() > 0.1
-    assert_same(replace(cloud(300, log_scale), antialiased=False), camera(61, 47))
+    assert_matches_reference(replace(random_cloud(300, log_scale), antialiased=False), off_center_camera(61, 47))
 
 
 def test_antialiased_needles_and_sheets():
     """Shapes whose sharp determinant is next to nothing, or nothing: neither is drawn, nor is anything not finite."""
-    gaussians = replace(cloud(40, 0.0, seed=5, spread=0.5), antialiased=True)
+    gaussians = replace(random_cloud(40, 0.0, seed=5, spread=0.5), antialiased=True)
     needles = replace(gaussians, log_scales=torch.tensor([-1.0, -7.9, -7.9]).repeat(40, 1))
-    assert (assert_same(needles, camera(64, 64), relative=1e-3).radii > 0).any()
+    assert (assert_matches_reference(needles, off_center_camera(64, 64), relative=1e-3).radii > 0).any()
     lines = replace(gaussians, log_scales=torch.tensor([-1.0, -500.0, -500.0]).repeat(40, 1))
-    drawn, gradients = differentiate(lines, camera(64, 64), "cpu", torch.float32)
+    drawn, gradients = differentiate(lines, off_center_camera(64, 64), "cpu", torch.float32)
     assert (drawn.radii == 0).all() and all(torch.isfinite(g).all() for g in gradients.values())
 
 
@@ -163,7 +166,7 @@ def test_antialiased_adds_up_to_the_same_from_any_distance(impl):
     one = Gaussians(torch.zeros(1, 3), turn, torch.full((1, 3), -3.0), logit, torch.zeros(1, 1, 3))
     opacity = torch.tensor(2.0).sigmoid().item()
     for distance in (2.0, 5.0, 10.0, 20.0):
-        view = Camera("far", 64, 64, 100.0, 100.0, 32.0, 32.0, np.eye(4))
+        view = make_camera("far", (64, 64), 100.0)
         view.world_to_camera[2, 3] = distance
         size = 100 * math.exp(-3) / distance
         true = 2 * math.pi * opacity * size**2
@@ -176,7 +179,7 @@ def test_antialiased_adds_up_to_the_same_from_any_distance(impl):
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_reference_against_finite_differences(antialiased):
     """Every parameter along random directions, in float64; the random scene has no pixel close to a threshold."""
-    gaussians, view = replace(cloud(12, -1.2, seed=2), antialiased=antialiased), camera(9, 8)
+    gaussians, view = replace(random_cloud(12, -1.2, seed=2), antialiased=antialiased), off_center_camera(9, 8)
     gaussians = gaussians.map(torch.Tensor.double)
     _, gradients = differentiate(gaussians, view, "reference", torch.float64)
     generator = torch.Generator().manual_seed(1)
@@ -204,7 +207,7 @@ def test_reference_against_finite_differences(antialiased):
 
 def test_probe_is_the_gradient_of_the_2d_mean():
     """Shifting the principal point shifts every 2D mean: the probe's gradients add up to that."""
-    gaussians, view = cloud(60, -2.5), camera(30, 30)
+    gaussians, view = random_cloud(60, -2.5), off_center_camera(30, 30)
     _, gradients = differentiate(gaussians, view, "cpu", torch.float32)
     generator = torch.Generator().manual_seed(1)
     random = lambda *shape: torch.randn(*shape, generator=generator).double()
@@ -228,7 +231,7 @@ def test_probe_is_the_gradient_of_the_2d_mean():
 
 
 def test_same_bits_for_any_number_of_threads():
-    gaussians, view, before = cloud(3000, -3.5), camera(150, 131), torch.get_num_threads()
+    gaussians, view, before = random_cloud(3000, -3.5), off_center_camera(150, 131), torch.get_num_threads()
     values, results = torch.rand(131, 150, 2), []
     try:
         for threads in (1, 2, 5):
@@ -243,53 +246,53 @@ def test_same_bits_for_any_number_of_threads():
 
 def test_footprints_over_many_tiles():
     """Each covers the whole of an image of a hundred tiles, far more than room is made for at first."""
-    exact = assert_same(cloud(6, 0.3), camera(200, 150), channels=1)
+    exact = assert_matches_reference(random_cloud(6, 0.3), off_center_camera(200, 150), channels=1)
     assert (exact.radii > 200).all()
 
 
 def test_results_outlive_later_calls():
     """Large arrays are made in memory of earlier calls, but only where nobody holds it any more."""
-    view = camera(160, 150)
-    drawn, gradients = differentiate(cloud(2000, -3.0), view, "cpu", torch.float32)
+    view = off_center_camera(160, 150)
+    drawn, gradients = differentiate(random_cloud(2000, -3.0), view, "cpu", torch.float32)
     kept = [*drawn, *gradients.values()]
     copies = [tensor.clone() for tensor in kept]
     for seed in (1, 2):
-        differentiate(cloud(2000, -3.0, seed=seed), view, "cpu", torch.float32)
+        differentiate(random_cloud(2000, -3.0, seed=seed), view, "cpu", torch.float32)
     assert all(torch.equal(a, b) for a, b in zip(kept, copies, strict=True))
 
 
 def test_equal_depths_are_drawn_by_index():
     """Forty opaque Gaussians in the same place, the first one red, the others green."""
-    gaussians = replace(cloud(40, -1.0), means=torch.zeros(40, 3), opacity_logits=torch.full((40,), 9.0))
+    gaussians = replace(random_cloud(40, -1.0), means=torch.zeros(40, 3), opacity_logits=torch.full((40,), 9.0))
     gaussians.sh[:] = 0.0
     gaussians.sh[:, 0] = torch.tensor([-2.0, 2.0, -2.0])
     gaussians.sh[0, 0] = torch.tensor([2.0, -2.0, -2.0])
     for impl in ("cpu", "reference"):
-        red, green, blue = rasterizer.render(gaussians, camera(20, 20), impl=impl).color[10, 10]
+        red, green, blue = rasterizer.render(gaussians, off_center_camera(20, 20), impl=impl).color[10, 10]
         assert red > 0.8 and green < 0.2 and blue < 0.2
 
 
 def test_zero_quaternion_is_the_identity():
-    gaussians = cloud(30, -2.0)
+    gaussians = random_cloud(30, -2.0)
     zero = replace(gaussians, quaternions=torch.zeros(30, 4))
     identity = replace(gaussians, quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(30, 1))
     for impl in ("cpu", "reference"):
-        drawn = [rasterizer.render(g, camera(20, 20), impl=impl).color for g in (zero, identity)]
+        drawn = [rasterizer.render(g, off_center_camera(20, 20), impl=impl).color for g in (zero, identity)]
         assert torch.equal(*drawn)
-    assert_same(zero, camera(20, 20))
+    assert_matches_reference(zero, off_center_camera(20, 20))
 
 
 def test_order_and_length_of_quaternions_do_not_matter_to_values():
-    gaussians = cloud(30, -2.0)
+    gaussians = random_cloud(30, -2.0)
     longer = replace(gaussians, quaternions=gaussians.quaternions * 1e-18)
-    drawn = [rasterizer.render(g, camera(20, 20)).color for g in (gaussians, longer)]
+    drawn = [rasterizer.render(g, off_center_camera(20, 20)).color for g in (gaussians, longer)]
     assert_close(*drawn, 1e-5, 0, "quaternion length")
 
 
-def extremes() -> Gaussians:
-    """Behind the camera, at its centre, far aside, gigantic, vanishing, transparent, opaque."""
-    center = torch.tensor(camera(20, 20).center, dtype=torch.float32)
-    gaussians = cloud(10, -1.0)
+def extreme_gaussians() -> Gaussians:
+    """Gaussians behind the camera, at its centre, far aside, huge, tiny, transparent and opaque."""
+    center = torch.tensor(off_center_camera(20, 20).center, dtype=torch.float32)
+    gaussians = random_cloud(10, -1.0)
     for array, row, value in (
         (gaussians.means, 0, center * 1.5),
         (gaussians.means, 1, center),
@@ -307,7 +310,7 @@ def extremes() -> Gaussians:
 
 
 def test_extremes_stay_finite():
-    drawn, gradients = differentiate(extremes(), camera(20, 20), "cpu", torch.float32)
+    drawn, gradients = differentiate(extreme_gaussians(), off_center_camera(20, 20), "cpu", torch.float32)
     for name in IMAGES:
         assert torch.isfinite(getattr(drawn, name)).all(), name
     for name, gradient in gradients.items():
@@ -319,9 +322,9 @@ def test_extremes_stay_finite():
 @pytest.mark.parametrize("impl", ["cpu", "reference"])
 def test_nothing_to_draw(impl):
     """No Gaussians, or all behind the camera: the background, zeros, and zero gradients."""
-    view, background = camera(5, 3), torch.tensor([0.1, 0.2, 0.3])
-    behind = replace(cloud(4, -2.0), means=torch.tensor(view.center * 2, dtype=torch.float32).repeat(4, 1))
-    for gaussians in (behind, cloud(0, -2.0)):
+    view, background = off_center_camera(5, 3), torch.tensor([0.1, 0.2, 0.3])
+    behind = replace(random_cloud(4, -2.0), means=torch.tensor(view.center * 2, dtype=torch.float32).repeat(4, 1))
+    for gaussians in (behind, random_cloud(0, -2.0)):
         features = torch.ones(len(gaussians), 2, requires_grad=True)
         drawn = rasterizer.render(gaussians, view, features=features, background=background, impl=impl)
         assert torch.equal(drawn.color, background.expand(3, 5, 3))
@@ -334,24 +337,24 @@ def test_nothing_to_draw(impl):
 
 def test_a_finished_pixel_stays_finished():
     """Opaque sheets: transmittance never falls under 1e-4 and what lies behind changes nothing."""
-    view, count = camera(16, 16), 60
-    gaussians = replace(cloud(count, 0.0), opacity_logits=torch.full((count,), 3.0))
+    view, count = off_center_camera(16, 16), 60
+    gaussians = replace(random_cloud(count, 0.0), opacity_logits=torch.full((count,), 3.0))
     assert rasterizer.render(gaussians, view).alpha.max() <= 1 - 1e-4 + 1e-6
-    assert_same(gaussians, view)
+    assert_matches_reference(gaussians, view)
 
 
 def test_deep_faint_stack():
     """Two thousand layers of alpha about 1/150 at every pixel."""
-    view, gaussians = camera(18, 12), cloud(2000, 2.0, seed=4)
+    view, gaussians = off_center_camera(18, 12), random_cloud(2000, 2.0, seed=4)
     depths = torch.linspace(2.0, 4.0, 2000)[torch.randperm(2000, generator=torch.Generator().manual_seed(0))]
     forward = torch.tensor(view.world_to_camera[2, :3], dtype=torch.float32)
     means = torch.tensor(view.center, dtype=torch.float32) + depths[:, None] * forward
     gaussians = replace(gaussians, means=means, opacity_logits=torch.full((2000,), math.log(1 / 149)))
-    assert_same(gaussians, view, relative=5e-5)
+    assert_matches_reference(gaussians, view, relative=5e-5)
 
 
 def test_accumulate_is_the_gradient_of_features():
-    gaussians, view, values = cloud(200, -2.5), camera(45, 40), torch.rand(40, 45, 2)
+    gaussians, view, values = random_cloud(200, -2.5), off_center_camera(45, 40), torch.rand(40, 45, 2)
     features = torch.zeros(200, 2, requires_grad=True)
     rasterizer.render(gaussians, view, features=features).features.backward(values)
     gathered = rasterizer.accumulate(gaussians, view, values)
@@ -364,7 +367,7 @@ def test_accumulate_is_the_gradient_of_features():
 
 
 def test_counts_are_whole_numbers_of_blended_pixels():
-    gaussians, view = cloud(50, -2.0), camera(45, 40)
+    gaussians, view = random_cloud(50, -2.0), off_center_camera(45, 40)
     counts = rasterizer.accumulate(gaussians, view, torch.ones(40, 45, 1), count=True)[:, 0]
     assert torch.equal(counts, counts.round()) and counts.max() > 20
     projected, _ = reference.project(gaussians.map(torch.Tensor.double), view, None)
@@ -372,12 +375,12 @@ def test_counts_are_whole_numbers_of_blended_pixels():
 
 
 def test_rendering_without_gradients_keeps_nothing():
-    drawn = rasterizer.render(cloud(10, -2.0), camera(9, 9))
+    drawn = rasterizer.render(random_cloud(10, -2.0), off_center_camera(9, 9))
     assert not drawn.color.requires_grad and drawn.color.grad_fn is None
 
 
 def test_background_and_alpha_agree():
-    gaussians, view = cloud(40, -2.5), camera(25, 25)
+    gaussians, view = random_cloud(40, -2.5), off_center_camera(25, 25)
     black, white = (rasterizer.render(gaussians, view, background=torch.full((3,), b)) for b in (0.0, 1.0))
     assert_close(white.color - black.color, (1 - black.alpha)[..., None].expand(-1, -1, 3), 1e-6, 0, "background")
 
@@ -395,7 +398,7 @@ def test_background_and_alpha_agree():
 )
 def test_bad_input_is_named(change, message):
     with pytest.raises(ValueError, match=message):
-        rasterizer.render(cloud(10, -2.0), camera(4, 4), **change)
+        rasterizer.render(random_cloud(10, -2.0), off_center_camera(4, 4), **change)
 
 
 def test_gsplat_without_its_extension_is_named(monkeypatch):
@@ -415,21 +418,21 @@ def test_gsplat_without_its_extension_is_named(monkeypatch):
 
 
 def test_bad_gaussians_are_named():
-    gaussians = cloud(10, -2.0)
+    gaussians = random_cloud(10, -2.0)
     with pytest.raises(ValueError, match="sh is"):
-        rasterizer.render(replace(gaussians, sh=torch.zeros(10, 7, 3)), camera(4, 4))
+        rasterizer.render(replace(gaussians, sh=torch.zeros(10, 7, 3)), off_center_camera(4, 4))
     with pytest.raises(ValueError, match="log_scales has shape"):
-        rasterizer.render(replace(gaussians, log_scales=torch.zeros(9, 3)), camera(4, 4))
+        rasterizer.render(replace(gaussians, log_scales=torch.zeros(9, 3)), off_center_camera(4, 4))
     with pytest.raises(ValueError, match="takes float32"):
-        rasterizer.render(gaussians.map(torch.Tensor.double), camera(4, 4), impl="cpu")
+        rasterizer.render(gaussians.map(torch.Tensor.double), off_center_camera(4, 4), impl="cpu")
 
 
-@pytest.mark.skipif(not there_is_one(), reason="needs a CUDA GPU and gsplat")
+@pytest.mark.skipif(not has_gpu(), reason="needs a CUDA GPU and gsplat")
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_cuda_equals_reference(antialiased):
-    gaussians = replace(cloud(300, -3.2), opacity_logits=torch.linspace(-5, 4, 300))
+    gaussians = replace(random_cloud(300, -3.2), opacity_logits=torch.linspace(-5, 4, 300))
     gaussians = replace(gaussians, antialiased=antialiased)
-    view, there = camera(61, 47), gaussians.map(torch.Tensor.cuda)
+    view, there = off_center_camera(61, 47), gaussians.map(torch.Tensor.cuda)
     exact = rasterizer.render(gaussians.map(torch.Tensor.double), view, impl="reference")
     drawn = rasterizer.render(there, view)
     for name in ("color", "depth", "alpha"):

@@ -1,4 +1,4 @@
-"""Files of splats as editors and other trainers write them: each read to the right values, or refused in one line."""
+"""Files of splats from editors and other trainers are read to the right values, or refused in one line."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from plyfile import PlyData, PlyElement
-from small_capture import prepare, some_truth
-from test_io import some_gaussians
-from test_patch import edited
+from scenes.cameras import make_camera
+from scenes.capture import make_truth, write_capture
+from scenes.edited_capture import write_edited_capture
+from scenes.images import render_color
+from scenes.random_scene import random_gaussians
+from scenes.splat_tables import read_rows, replace_columns, write_rows
 
 from reffusion.io.arrays import load_labels
 from reffusion.io.compressed import load_spz, save_spz
@@ -23,55 +25,29 @@ from reffusion.io.files import BadInput
 from reffusion.io.ply import load_ply, load_points, save_ply
 from reffusion.io.quantized import save_splat
 from reffusion.io.splats import load_splats, summarize_splats
-from reffusion.splat import rasterizer
-from reffusion.types import Camera, Gaussians
+from reffusion.types import Gaussians
 from stages import poses
 from stages.plan import poses as planned
 
 SH0 = 0.28209479177387814
 COUNT = 40
-
-
-def table_of(path) -> np.ndarray:
-    return PlyData.read(str(path), mmap=False)["vertex"].data
-
-
-def save_table(path, table, text=False) -> None:
-    PlyData([PlyElement.describe(table, "vertex")], text=text, byte_order="<").write(str(path))
-
-
-def with_columns(table: np.ndarray, columns: dict[str, np.ndarray], leave_out: tuple[str, ...] = ()) -> np.ndarray:
-    kept = [name for name in table.dtype.names if name not in (*columns, *leave_out)]
-    made = np.empty(
-        len(table), [(name, table.dtype[name]) for name in kept] + [(n, c.dtype) for n, c in columns.items()]
-    )
-    for name in kept:
-        made[name] = table[name]
-    for name, column in columns.items():
-        made[name] = column
-    return made
+VIEW = make_camera("v", (48, 36), 40.0, (0.0, 0.0, -6.0))
 
 
 @pytest.fixture
-def file(tmp_path):
+def splat_file(tmp_path):
     """A .ply of 40 splats of degree 2, and its rows."""
-    save_ply(tmp_path / "g.ply", some_gaussians(COUNT, 2))
-    return tmp_path / "g.ply", table_of(tmp_path / "g.ply")
-
-
-def picture(gaussians: Gaussians) -> np.ndarray:
-    pose = np.eye(4)
-    pose[2, 3] = 6.0
-    return rasterizer.render(gaussians, Camera("v", 48, 36, 40.0, 40.0, 24.0, 18.0, pose)).color.numpy()
+    save_ply(tmp_path / "g.ply", random_gaussians(COUNT, 2))
+    return tmp_path / "g.ply", read_rows(tmp_path / "g.ply")
 
 
 # ---------------------------------------------------------------------------------------------- rows
 
 
-def test_infinite_opacities_and_flat_scales_look_as_their_limits(file):
-    path, table = file
+def test_infinite_opacities_and_flat_scales_look_as_their_limits(splat_file):
+    path, table = splat_file
     table["opacity"][3], table["opacity"][4], table["scale_2"][5], table["scale_0"][6] = np.inf, -np.inf, -np.inf, -1e30
-    save_table(path, table)
+    write_rows(path, table)
     found = load_splats(path)
     assert found.notes == ("2 infinite opacities and 1 scales of minus infinity are clamped to finite values that look "
                            "the same",)  # fmt: skip
@@ -82,7 +58,7 @@ def test_infinite_opacities_and_flat_scales_look_as_their_limits(file):
     opaque[3], flat[5, 2], flat[6, 0] = 80.0, -60.0, -60.0
     limit = Gaussians(made.means, made.quaternions, flat, opaque, made.sh)
     kept = limit.map(lambda p: p[torch.arange(COUNT) != 4])  # transparent: as if it were not there
-    np.testing.assert_allclose(picture(made), picture(kept), atol=1e-6)
+    np.testing.assert_allclose(render_color(made, VIEW), render_color(kept, VIEW), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -91,10 +67,10 @@ def test_infinite_opacities_and_flat_scales_look_as_their_limits(file):
     + [("opacity", np.nan), ("scale_1", np.nan), ("scale_1", np.inf), ("scale_1", 1e30)],
 )
 @pytest.mark.parametrize("text", [False, True])
-def test_rows_that_hold_no_number_are_dropped_with_their_number(file, column, value, text):
-    path, table = file
+def test_rows_that_hold_no_number_are_dropped_with_their_number(splat_file, column, value, text):
+    path, table = splat_file
     table[column][[2, 30]] = value
-    save_table(path, table, text)
+    write_rows(path, table, text)
     found = load_splats(path)
     assert found.notes == ("2 of 40 splats are dropped: 2 with NaN or infinite values",)
     kept = np.delete(np.arange(COUNT), [2, 30])
@@ -102,35 +78,35 @@ def test_rows_that_hold_no_number_are_dropped_with_their_number(file, column, va
     np.testing.assert_allclose(found.rows.sh[:, 3, 1], table["f_rest_10"][kept], rtol=1e-6)
 
 
-def test_padding_is_dropped_and_a_zero_quaternion_is_the_identity(file):
-    path, table = file
+def test_padding_is_dropped_and_a_zero_quaternion_is_the_identity(splat_file):
+    path, table = splat_file
     for name in table.dtype.names:
         table[name][7] = 0
     table["x"][8] = np.nan
     for axis in range(4):
         table[f"rot_{axis}"][9] = 0
-    save_table(path, table)
+    write_rows(path, table)
     found = load_splats(path)
     assert found.notes == ("2 of 40 splats are dropped: 1 with NaN or infinite values and 1 of zeros only (padding)",)
     made = found.gaussians()
     assert not made.quaternions[7].any()
     turned = made.quaternions.clone()
     turned[7] = torch.tensor([1.0, 0.0, 0.0, 0.0])
-    np.testing.assert_array_equal(picture(made), picture(replace(made, quaternions=turned)))
+    np.testing.assert_array_equal(render_color(made, VIEW), render_color(replace(made, quaternions=turned), VIEW))
 
 
-def test_a_file_of_mostly_invalid_rows_is_refused(file):
-    path, table = file
+def test_a_file_of_mostly_invalid_rows_is_refused(splat_file):
+    path, table = splat_file
     table["scale_0"][:21] = np.nan
-    save_table(path, table)
+    write_rows(path, table)
     with pytest.raises(BadInput, match=r"g\.ply: 21 of 40 splats hold NaN or infinite values: the file is damaged"):
         load_ply(path)
     table["scale_0"][0] = 0.5
-    save_table(path, table)
+    write_rows(path, table)
     assert len(load_ply(path)) == 20
     for name in table.dtype.names:
         table[name] = 0
-    save_table(path, table)
+    write_rows(path, table)
     with pytest.raises(BadInput, match=r"it holds no Gaussians: 40 of 40 splats are dropped: 40 of zeros only"):
         load_ply(path)
 
@@ -138,10 +114,10 @@ def test_a_file_of_mostly_invalid_rows_is_refused(file):
 # ---------------------------------------------------------------------------------------------- other trainers
 
 
-def test_the_filter_of_mip_splatting_is_folded_in(file):
-    path, table = file
+def test_the_filter_of_mip_splatting_is_folded_in(splat_file):
+    path, table = splat_file
     sizes = np.random.default_rng(0).uniform(0.01, 2.0, COUNT).astype(np.float32)
-    save_table(path, with_columns(table, {"filter_3D": sizes}))
+    write_rows(path, replace_columns(table, {"filter_3D": sizes}))
     found = load_splats(path)
     assert found.notes == ("the 3D filter of Mip-Splatting is folded into scales and opacities",) and found.antialiased
     scales = np.exp(np.stack([table[f"scale_{k}"] for k in range(3)], 1).astype(np.float64))
@@ -150,15 +126,15 @@ def test_the_filter_of_mip_splatting_is_folded_in(file):
     opacity *= np.sqrt(np.prod(scales**2, 1) / np.prod(widened**2, 1))
     np.testing.assert_allclose(np.exp(found.rows.log_scales), widened, rtol=1e-6)
     np.testing.assert_allclose(1 / (1 + np.exp(-found.rows.opacity_logits.astype(np.float64))), opacity, rtol=2e-6)
-    save_table(path, with_columns(table, {"filter_3D": np.zeros(COUNT, np.float32)}))
+    write_rows(path, replace_columns(table, {"filter_3D": np.zeros(COUNT, np.float32)}))
     plain = load_splats(path).rows
     np.testing.assert_allclose(plain.log_scales[:, 0], table["scale_0"], rtol=1e-6)
     np.testing.assert_allclose(plain.opacity_logits, table["opacity"], rtol=1e-5, atol=1e-6)
 
 
-def test_two_scales_are_a_flat_splat(file):
-    path, table = file
-    save_table(path, with_columns(table, {}, leave_out=("scale_2",)))
+def test_two_scales_are_a_flat_splat(splat_file):
+    path, table = splat_file
+    write_rows(path, replace_columns(table, {}, leave_out=("scale_2",)))
     found = load_splats(path)
     assert found.notes == ("it has two scales, as 2DGS writes: the third axis is flat",)
     made = found.gaussians()
@@ -166,34 +142,34 @@ def test_two_scales_are_a_flat_splat(file):
     np.testing.assert_array_equal(made.log_scales[:, 1], table["scale_1"])
     thin = made.log_scales.clone()
     thin[:, 2] = made.log_scales[:, :2].min(1).values - 9
-    np.testing.assert_allclose(picture(made), picture(replace(made, log_scales=thin)), atol=1e-4)
+    np.testing.assert_allclose(render_color(made, VIEW), render_color(replace(made, log_scales=thin), VIEW), atol=1e-4)
 
 
 @pytest.mark.parametrize("degree", [4, 5])
-def test_higher_harmonics_are_cut_to_degree_3(file, degree):
-    path, table = file
+def test_higher_harmonics_are_cut_to_degree_3(splat_file, degree):
+    path, table = splat_file
     higher = (degree + 1) ** 2 - 1
     draws = np.random.default_rng(0).normal(size=(3 * higher, COUNT)).astype(np.float32)
     rest = {f"f_rest_{k}": draws[k] for k in range(3 * higher)}
-    save_table(path, with_columns(table, rest))
+    write_rows(path, replace_columns(table, rest))
     found = load_splats(path)
     assert found.notes == (f"spherical harmonics of degree {degree} are cut to degree 3",)
     expected = draws.reshape(3, higher, COUNT)[:, :15].transpose(2, 1, 0)
     np.testing.assert_array_equal(found.rows.sh[:, 1:], expected)
-    save_table(path, with_columns(table, {"f_rest_70": draws[70]}))
+    write_rows(path, replace_columns(table, {"f_rest_70": draws[70]}))
     with pytest.raises(BadInput, match="25 f_rest properties; 0, 9, 24, 45 or 72 belong to degrees 0 to 4"):
         summarize_splats(path)
 
 
-def test_colours_in_bytes_stand_for_the_constant_harmonic(file):
-    path, table = file
+def test_colours_in_bytes_stand_for_the_constant_harmonic(splat_file):
+    path, table = splat_file
     colors = np.random.default_rng(0).integers(0, 256, (3, COUNT)).astype(np.uint8)
     without = tuple(n for n in table.dtype.names if n.startswith("f_"))
-    save_table(path, with_columns(table, dict(zip(("red", "green", "blue"), colors, strict=True)), without))
+    write_rows(path, replace_columns(table, dict(zip(("red", "green", "blue"), colors, strict=True)), without))
     made = load_ply(path)
     assert made.sh.shape == (COUNT, 1, 3)
     np.testing.assert_allclose(0.5 + SH0 * made.sh[:, 0], colors.T / 255, atol=1e-6)
-    save_table(path, with_columns(table, {}, ("f_dc_1",)))
+    write_rows(path, replace_columns(table, {}, ("f_dc_1",)))
     with pytest.raises(BadInput, match="not a file of Gaussians, it lacks f_dc_1"):
         summarize_splats(path)
 
@@ -227,7 +203,7 @@ def test_records_of_32_bytes_are_read(tmp_path):
 @pytest.mark.parametrize("version", [3, 4])
 def test_spz_is_read_in_the_frame_of_a_ply(tmp_path, version):
     """The format has y up: its own writer turns a .ply by 180 degrees about x, rotations and harmonics too."""
-    gsply, made, path = pytest.importorskip("gsply"), some_gaussians(300, 3), tmp_path / "s.spz"
+    gsply, made, path = pytest.importorskip("gsply"), random_gaussians(300, 3), tmp_path / "s.spz"
     made = replace(made, sh=0.3 * made.sh.clamp(-3, 3))  # the format holds -1 to 1
     save_spz(path, load_rows(tmp_path, made))
     raw = gsply.read_spz(str(path))
@@ -238,9 +214,9 @@ def test_spz_is_read_in_the_frame_of_a_ply(tmp_path, version):
     again = load_ply(path)
     np.testing.assert_allclose(again.means, made.means, atol=3e-4)
     np.testing.assert_allclose(again.log_scales, made.log_scales, atol=1 / 32 + 1e-4)
-    assert np.abs(picture(again) - picture(made)).mean() < 0.01
+    assert np.abs(render_color(again, VIEW) - render_color(made, VIEW)).mean() < 0.01
     blind = replace(again, sh=torch.cat([again.sh[:, :1], -again.sh[:, 1:]], 1))
-    assert np.abs(picture(blind) - picture(made)).mean() > 0.03
+    assert np.abs(render_color(blind, VIEW) - render_color(made, VIEW)).mean() > 0.03
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(BadInput, match=r"s\.spz: not a \.spz file"):
         load_spz(path)
@@ -255,7 +231,7 @@ def load_rows(folder, gaussians):
 
 
 def test_splat_is_written_as_it_is_read(tmp_path):
-    made = some_gaussians(300, 1)
+    made = random_gaussians(300, 1)
     save_splat(tmp_path / "s.splat", load_rows(tmp_path, made))
     again = load_ply(tmp_path / "s.splat")
     np.testing.assert_array_equal(again.means, made.means)
@@ -280,15 +256,15 @@ def test_other_formats_are_refused_with_what_converts_them(tmp_path, ending):
 def test_rows_dropped_leave_what_was_deleted_consistent(tmp_path, recwarn):
     """Both files hold invalid rows and padding; the mask has a value for each splat that stays."""
     folder = tmp_path / "s"
-    whole, deleted = edited(folder)
-    table = table_of(folder / "scene.ply")
+    whole, deleted = write_edited_capture(folder)
+    table = read_rows(folder / "scene.ply")
     table["opacity"][[1, 2000]] = np.nan
     table["x"][3999] = np.inf
     table["opacity"][:1] = np.inf
-    save_table(folder / "scene.ply", table)
-    left = table_of(folder / "cleaned.ply")
+    write_rows(folder / "scene.ply", table)
+    left = read_rows(folder / "cleaned.ply")
     padding = np.zeros(1500, left.dtype)  # more rows than were deleted
-    save_table(folder / "cleaned.ply", np.concatenate([left, padding]))
+    write_rows(folder / "cleaned.ply", np.concatenate([left, padding]))
     (out := tmp_path / "out").mkdir()
     params = poses.Params(gaussians="scene.ply", cleaned="cleaned.ply", masks="none")
     planned.preview(params, folder)
@@ -308,7 +284,7 @@ def test_what_was_deleted_is_found_in_quantised_files(tmp_path, ending, capsys):
     if ending == "spz":
         pytest.importorskip("gsply")
     folder = tmp_path / "s"
-    _, deleted = edited(folder)
+    _, deleted = write_edited_capture(folder)
     left = load_splats(folder / "cleaned.ply").rows
     (save_splat if ending == "splat" else save_spz)(folder / f"cleaned.{ending}", left)
     (out := tmp_path / "out").mkdir()
@@ -318,11 +294,11 @@ def test_what_was_deleted_is_found_in_quantised_files(tmp_path, ending, capsys):
 
 
 def test_plan_says_what_reading_changes(tmp_path):
-    folder = prepare(tmp_path / "s", "transforms", some_truth())
-    save_ply(folder / "g.ply", some_gaussians(COUNT, 0))
-    table = table_of(folder / "g.ply")
+    folder = write_capture(tmp_path / "s", "transforms", make_truth())
+    save_ply(folder / "g.ply", random_gaussians(COUNT, 0))
+    table = read_rows(folder / "g.ply")
     rest = {f"f_rest_{k}": np.zeros(COUNT, np.float32) for k in range(72)}
-    save_table(folder / "g.ply", with_columns(table, rest | {"filter_3D": np.ones(COUNT, np.float32)}, ("scale_2",)))
+    write_rows(folder / "g.ply", replace_columns(table, rest | {"filter_3D": np.ones(COUNT, np.float32)}, ("scale_2",)))
     notes = planned.preview(poses.Params(gaussians="g.ply"), folder)
     for note in ("the 3D filter of Mip-Splatting is folded into scales and opacities",
                  "it has two scales, as 2DGS writes: the third axis is flat",
@@ -332,7 +308,7 @@ def test_plan_says_what_reading_changes(tmp_path):
 
 def test_points_of_a_cloud_are_not_touched(tmp_path):
     table = np.zeros(3, [(axis, "f4") for axis in "xyz"])
-    save_table(tmp_path / "p.ply", table)
+    write_rows(tmp_path / "p.ply", table)
     assert len(load_points(tmp_path / "p.ply")[0]) == 3
 
 
@@ -344,7 +320,7 @@ def test_splat_transform_and_we_read_the_same(tmp_path):
         [npx, "--yes", "@playcanvas/splat-transform", "-w", str(tmp_path / source), str(tmp_path / target)],
         check=True, capture_output=True,
     )  # fmt: skip
-    made = some_gaussians(300, 3)
+    made = random_gaussians(300, 3)
     made = replace(made, sh=0.3 * made.sh.clamp(-3, 3))
     save_ply(tmp_path / "made.ply", made)
     rows = load_rows(tmp_path, made)

@@ -1,7 +1,8 @@
-"""Points by optical flow: exact where the matches are, robust where one is wrong, honest where there is no parallax."""
+"""Points by optical flow: exact for exact matches, robust to a wrong one, and far away without parallax."""
 
 import numpy as np
 import pytest
+from scenes.cameras import make_camera, project_points, world_rays, yaw
 
 from reffusion.capture import stereo
 from reffusion.io.images import resize_image
@@ -10,20 +11,21 @@ from reffusion.types import Camera
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 
 
-def camera(name: str, x: float, y: float = 0.0, turn: float = 0.0) -> Camera:
+def rig_camera(name: str, x: float, y: float = 0.0, turn: float = 0.0) -> Camera:
     """At (x, y, -1), looking along z, turned about y."""
-    c, s = np.cos(turn), np.sin(turn)
-    pose = np.eye(4)
-    pose[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
-    pose[:3, 3] = -pose[:3, :3] @ (x, y, -1.0)
-    return Camera(name, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose)
+    return make_camera(name, (WIDTH, HEIGHT), FOCAL, (x, y, -1.0), yaw(turn))
 
 
-CAMERAS = [camera("a", 0.0), camera("b", 0.08), camera("c", -0.07, 0.03, 0.05), camera("d", 0.02, -0.09)]
+CAMERAS = [
+    rig_camera("a", 0.0),
+    rig_camera("b", 0.08),
+    rig_camera("c", -0.07, 0.03, 0.05),
+    rig_camera("d", 0.02, -0.09),
+]
 
 
-def matches_of(places_there, here, seen=None) -> stereo.Matches:
-    """Of view a with the others."""
+def make_matches(places_there, here, seen=None) -> stereo.Matches:
+    """Matches of view a with the other views."""
     there = np.array(places_there)
     names = tuple(view.name for view in CAMERAS[1:])
     return stereo.Matches("a", here, names, there, np.ones(there.shape[:2], bool) if seen is None else seen)
@@ -32,18 +34,13 @@ def matches_of(places_there, here, seen=None) -> stereo.Matches:
 BY_NAME = {view.name: view for view in CAMERAS}
 
 
-def places(points: np.ndarray, view: Camera) -> np.ndarray:
-    local = points @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
-    return local[:, :2] / local[:, 2:] * FOCAL + (WIDTH / 2, HEIGHT / 2)
-
-
-def some_points() -> np.ndarray:
+def random_points() -> np.ndarray:
     return np.random.default_rng(0).uniform((-0.3, -0.2, -0.2), (0.3, 0.2, 8.0), (500, 3))
 
 
 def test_exact_matches_give_exact_depths():
-    points, others = some_points(), CAMERAS[1:]
-    matches = matches_of([places(points, o) for o in others], places(points, CAMERAS[0]))
+    points, others = random_points(), CAMERAS[1:]
+    matches = make_matches([project_points(points, o) for o in others], project_points(points, CAMERAS[0]))
     depth, known = stereo.triangulate(matches, BY_NAME)
     assert known.all()
     np.testing.assert_allclose(depth, points[:, 2] + 1, rtol=1e-6)
@@ -52,40 +49,40 @@ def test_exact_matches_give_exact_depths():
 
 
 def test_a_wrong_match_in_one_view_does_not_matter():
-    points, others = some_points(), CAMERAS[1:]
-    there = [places(points, o) for o in others]
+    points, others = random_points(), CAMERAS[1:]
+    there = [project_points(points, o) for o in others]
     there[1] = there[1] + (25.0, -14.0)
-    depth, known = stereo.triangulate(matches_of(there, places(points, CAMERAS[0])), BY_NAME)
+    depth, known = stereo.triangulate(make_matches(there, project_points(points, CAMERAS[0])), BY_NAME)
     assert known.mean() > 0.8
     assert (np.abs(depth / (points[:, 2] + 1) - 1) < 1e-3)[known].mean() > 0.97
 
 
 def test_what_moves_or_matches_nothing_is_left_out():
-    points, others, rng = some_points(), CAMERAS[1:], np.random.default_rng(1)
-    here = places(points, CAMERAS[0])
-    scattered = [places(points, o) + rng.normal(0, 30, (len(points), 2)) for o in others]
-    assert stereo.triangulate(matches_of(scattered, here), BY_NAME)[1].mean() < 0.05
-    nowhere = matches_of([places(points, o) for o in others], here, np.zeros((3, len(points)), bool))
+    points, others, rng = random_points(), CAMERAS[1:], np.random.default_rng(1)
+    here = project_points(points, CAMERAS[0])
+    scattered = [project_points(points, o) + rng.normal(0, 30, (len(points), 2)) for o in others]
+    assert stereo.triangulate(make_matches(scattered, here), BY_NAME)[1].mean() < 0.05
+    nowhere = make_matches([project_points(points, o) for o in others], here, np.zeros((3, len(points)), bool))
     assert not stereo.triangulate(nowhere, BY_NAME)[1].any()
 
 
 def test_without_parallax_a_point_is_far_and_one_that_would_be_behind_is_none():
     directions = np.random.default_rng(2).uniform((-0.3, -0.2, 1.0), (0.3, 0.2, 1.0), (200, 3))
-    others, here = CAMERAS[1:], places(CAMERAS[0].center + directions, CAMERAS[0])
-    depth, known = stereo.triangulate(matches_of([places(o.center + directions, o) for o in others], here), BY_NAME)
+    others, here = CAMERAS[1:], project_points(CAMERAS[0].center + directions, CAMERAS[0])
+    depth, known = stereo.triangulate(
+        make_matches([project_points(o.center + directions, o) for o in others], here), BY_NAME
+    )
     assert known.all() and (depth > 1e4).all()
-    behind = [places(o.center + directions + 0.3 * (o.center - CAMERAS[0].center), o) for o in others]
-    assert not stereo.triangulate(matches_of(behind, here), BY_NAME)[1].any()
+    behind = [project_points(o.center + directions + 0.3 * (o.center - CAMERAS[0].center), o) for o in others]
+    assert not stereo.triangulate(make_matches(behind, here), BY_NAME)[1].any()
 
 
-def pictures(slope: float) -> dict[str, np.ndarray]:
+def paint_slope(slope: float) -> dict[str, np.ndarray]:
     """Views of the plane z = 1 + slope x, painted with noise of several sizes."""
     rng, drawn = np.random.default_rng(3), {}
     waves = rng.normal(0, 14, (60, 2)), rng.uniform(0, 6.3, (60, 3))
     for view in CAMERAS:
-        y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-        rays = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)], -1)
-        rays = rays @ view.world_to_camera[:3, :3]
+        rays = world_rays(view)
         reach = (1 + slope * view.center[0] - view.center[2]) / (rays[..., 2] - slope * rays[..., 0])
         at = view.center + rays * reach[..., None]
         field = np.sin((at[..., :2] @ waves[0].T)[..., None] + waves[1]).sum(2) / 60**0.5
@@ -95,7 +92,7 @@ def pictures(slope: float) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("slope", [0.0, 0.5])
 def test_a_painted_plane_comes_back(slope):
-    points, colors = stereo.triangulate_points(CAMERAS, pictures(slope), 3)
+    points, colors = stereo.triangulate_points(CAMERAS, paint_slope(slope), 3)
     cells = WIDTH * HEIGHT / 9
     assert 0.6 * cells < len(points) < 2 * cells  # later views add what the first does not see
     assert colors.shape == points.shape and colors.dtype == np.uint8
@@ -105,7 +102,7 @@ def test_a_painted_plane_comes_back(slope):
 
 def test_views_of_several_sizes_and_lenses_match(slope=0.3):
     """One at 0.6 of the size, one cropped to a portrait, one larger."""
-    shown, cameras = pictures(slope), []
+    shown, cameras = paint_slope(slope), []
     for view, factor, left in zip(CAMERAS, (1.0, 0.6, 1.0, 1.5), (0, 0, 30, 0), strict=True):
         size = round((WIDTH - 2 * left) * factor), round(HEIGHT * factor)
         cut = np.ascontiguousarray(shown[view.name][:, left : WIDTH - left])
@@ -119,17 +116,17 @@ def test_views_of_several_sizes_and_lenses_match(slope=0.3):
 
 
 def test_plain_pictures_give_nothing():
-    plain = {name: np.full_like(picture, 90) for name, picture in pictures(0.0).items()}
+    plain = {name: np.full_like(picture, 90) for name, picture in paint_slope(0.0).items()}
     assert len(stereo.triangulate_points(CAMERAS, plain, 3)[0]) == 0
 
 
 def test_lonely_views_and_opposite_ones_give_nothing():
-    shown = pictures(0.0)
+    shown = paint_slope(0.0)
     assert len(stereo.triangulate_points(CAMERAS[:1], shown, 3)[0]) == 0
-    opposite = [CAMERAS[0], camera("b", 0.1, turn=np.pi)]
+    opposite = [CAMERAS[0], rig_camera("b", 0.1, turn=np.pi)]
     assert len(stereo.triangulate_points(opposite, shown, 3)[0]) == 0
 
 
 def test_the_same_pictures_give_the_same_points():
-    first, second = (stereo.triangulate_points(CAMERAS, pictures(0.2), 4) for _ in range(2))
+    first, second = (stereo.triangulate_points(CAMERAS, paint_slope(0.2), 4) for _ in range(2))
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))

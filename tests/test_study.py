@@ -1,4 +1,4 @@
-"""The preference study: clips of two methods, a whole session in a browser, votes with a known preference."""
+"""The preference study: clips of two methods, a session in a browser, votes with a known preference."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import re
 import cv2
 import numpy as np
 import pytest
-import small_scene as small
-from browser import visiting
+from scenes import wall_scene
+from scenes.browser import open_page
 
 from reffusion.io.images import save_image
 from reffusion.io.ply import save_ply
@@ -20,17 +20,17 @@ METHODS = ("full", "no_sds", "inpaint_2d")
 
 
 @pytest.fixture
-def home(tmp_path):
-    """Two compared scenes of a wall: `full` shows it, `no_sds` the square before it; `inpaint_2d` made pictures."""
-    everything, labels = small.gaussians(1.0)
+def comparison_folder(tmp_path):
+    """Two compared scenes of a wall: `full` shows it, `no_sds` the square before it, `inpaint_2d` has only pictures."""
+    everything, labels = wall_scene.wall_and_square(1.0)
     wall = everything.map(lambda part: part[~labels])
     runs = []
     for scene in ("x", "y"):
-        poses, _, _ = small.write(tmp_path / scene, 1.0)
+        poses, _, _ = wall_scene.write_poses_and_fit(tmp_path / scene, 1.0)
         for method in METHODS:
             place = tmp_path / (scene if method == "full" else f"{scene}@{method}") / "evaluate"
-            for name in small.TEST:
-                save_image(place / "renders" / f"{name}.png", small.photo(small.CAMERAS[name]))
+            for name in wall_scene.TEST:
+                save_image(place / "renders" / f"{name}.png", wall_scene.photo(wall_scene.CAMERAS[name]))
             metrics = {"mean": {}} | ({"inpainter": "telea"} if method == "inpaint_2d" else {})
             (place / "metrics.json").write_text(json.dumps(metrics))
             if method != "inpaint_2d":
@@ -38,7 +38,7 @@ def home(tmp_path):
             stages = {"poses": str(poses.relative_to(tmp_path)), "evaluate": str(place.relative_to(tmp_path))}
             if method == "full":
                 reference = tmp_path / scene / "reference"
-                save_image(reference / "references/a2.png", small.photo(small.CAMERAS["a2"]))
+                save_image(reference / "references/a2.png", wall_scene.photo(wall_scene.CAMERAS["a2"]))
                 stages["reference"] = str(reference.relative_to(tmp_path))
             runs.append({"scene": scene, "method": method, "state": "done", "stages": stages})
     record = {
@@ -53,9 +53,9 @@ def home(tmp_path):
     return tmp_path / FOLDER_COMPARISON
 
 
-def test_the_pages_of_a_study(home):
-    page = study.make(home, [], frames=6)
-    key = json.loads((home / study.KEY).read_text())
+def test_the_pages_of_a_study(comparison_folder):
+    page = study.make(comparison_folder, [], frames=6)
+    key = json.loads((comparison_folder / study.KEY).read_text())
     assert len(key["pairs"]) == 4 and len(key["checks"]) == 2
     text = page.read_text()
     assert not re.search("no_sds|inpaint_2d|full\\b", text), "who made what is not on the page"
@@ -70,26 +70,28 @@ def test_the_pages_of_a_study(home):
             assert [film.get(cv2.CAP_PROP_FRAME_COUNT) for film in films] == [6, 6]
             ours, theirs = (film.read()[1].astype(float) for film in films)
             assert theirs[..., 2].max() > ours[..., 2].max() - 60 and np.abs(ours - theirs).max() > 60  # the red square
-    again = study.make(home, [], frames=6).read_text()
+    again = study.make(comparison_folder, [], frames=6).read_text()
     assert again == text, "the same seed, the same study"
     with pytest.raises(ValueError, match="no_sdss was not compared"):
-        study.make(home, ["no_sdss"])
+        study.make(comparison_folder, ["no_sdss"])
 
 
-def test_images_where_no_encoder_is(home, monkeypatch):
+def test_images_where_no_encoder_is(comparison_folder, monkeypatch):
     monkeypatch.setattr(turntable, "CODEC", "none"[:4])
-    page = study.make(home, ["no_sds"], frames=6)
+    page = study.make(comparison_folder, ["no_sds"], frames=6)
     names = [path.name for path in (page.parent / "clips").iterdir()]
     assert names and all(name.endswith(".png") for name in names)
-    with visiting(page.as_uri()) as browser:
+    with open_page(page.as_uri()) as browser:
         browser.fill("#name", "someone")
         browser.click("#begin")
         browser.wait_for_function("document.querySelectorAll('.pair img').length == 2")
-        assert browser.evaluate("document.querySelector('.pair img').naturalWidth") == 3 * small.WIDTH + 2 * study.GAP
+        assert (
+            browser.evaluate("document.querySelector('.pair img').naturalWidth") == 3 * wall_scene.WIDTH + 2 * study.GAP
+        )
 
 
-def prefers_ours(browser, key: dict, trial: dict) -> None:
-    """Answer a trial: `full` is better overall, the other more faithful; of a check the right one."""
+def answer_trial(browser, key: dict, trial: dict) -> None:
+    """Answer a trial: `full` is better overall, the other more faithful; in a check the right one is better."""
     ours = key["pairs"].get(trial["id"], {}).get("full") or key["checks"][trial["id"]]["right"]
     left = browser.get_attribute("#left video", "src")
     place = int(left != ours)
@@ -100,10 +102,10 @@ def prefers_ours(browser, key: dict, trial: dict) -> None:
 
 
 @pytest.mark.parametrize("width", [390, 1280])
-def test_a_whole_session(home, tmp_path, width):
-    page = study.make(home, [], frames=6)
-    key = json.loads((home / study.KEY).read_text())
-    with visiting(page.as_uri(), width) as browser:
+def test_a_whole_session(comparison_folder, tmp_path, width):
+    page = study.make(comparison_folder, [], frames=6)
+    key = json.loads((comparison_folder / study.KEY).read_text())
+    with open_page(page.as_uri(), width) as browser:
         assert browser.is_disabled("#begin")
         browser.fill("#name", "Ada L.")
         browser.click("#begin")
@@ -116,7 +118,7 @@ def test_a_whole_session(home, tmp_path, width):
                 browser.click("#begin")
                 assert browser.evaluate("order.map(each => each.trial.id)") == [each["id"] for each in order]
             assert browser.evaluate("answers.answers.length") == number
-            prefers_ours(browser, key, trial)
+            answer_trial(browser, key, trial)
             if number == 0:
                 assert browser.evaluate("document.documentElement.scrollWidth <= innerWidth")
                 browser.screenshot(path=str(tmp_path / f"study-{width}.png"), full_page=True)
@@ -137,9 +139,10 @@ def test_a_whole_session(home, tmp_path, width):
 # --------------------------------------------------------------------------------------------------------------- votes
 
 
-def made_up(participants: int, truth: float, seed: int, spread: float = 0.15) -> tuple[list[dict], dict]:
-    """Votes on 12 pairs by people who prefer the method with probabilities around `truth`; every tenth of them fails a
-    check, and prefers the other always."""
+def simulate_votes(participants: int, truth: float, seed: int, spread: float = 0.15) -> tuple[list[dict], dict]:
+    """Votes on 12 pairs by participants who prefer the method with probabilities around `truth`. Every tenth of them
+    fails a check and always prefers the other method.
+    """
     draws = np.random.default_rng(seed)
     pairs = {f"p{n}": {"scene": str(n), "method": "other", "full": f"ours{n}"} for n in range(12)}
     key = {"study": "s", "pairs": pairs, "checks": {"c": {"right": "good"}}}
@@ -155,7 +158,7 @@ def made_up(participants: int, truth: float, seed: int, spread: float = 0.15) ->
 
 
 def test_a_known_preference_is_given_back_within_the_interval():
-    answers, key = made_up(40, 0.7, 1)
+    answers, key = simulate_votes(40, 0.7, 1)
     (found,), left_out = votes.count_votes(answers, key)
     assert found.low < 0.7 < found.high and found.high - found.low < 0.2
     assert (found.votes, found.participants) == (36 * 12, 36) and len(left_out) == 4
@@ -167,13 +170,13 @@ def test_the_interval_holds_the_truth_as_often_as_it_says(monkeypatch):
     monkeypatch.setattr(votes, "RESAMPLES", 600)
     held = 0
     for seed in range(150):
-        (found,), _ = votes.count_votes(*made_up(30, 0.65, seed))
+        (found,), _ = votes.count_votes(*simulate_votes(30, 0.65, seed))
         held += found.low <= 0.65 <= found.high
     assert 0.88 <= held / 150 <= 0.99
 
 
 def test_all_agree_and_what_is_refused():
-    answers, key = made_up(10, 1.0, 0, 0.0)
+    answers, key = simulate_votes(10, 1.0, 0, 0.0)
     (found,), _ = votes.count_votes(answers, key)
     assert found.share == 1 and 0.6 < found.low < 0.8 and found.high == 1  # nine people
     with pytest.raises(ValueError, match="two files of one participant"):

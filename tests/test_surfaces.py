@@ -1,16 +1,16 @@
-"""A completed surface among photographs: its depth from comparing them, its shine from what is around it."""
+"""Completed surfaces: their depth from photo-consistency, and their view-dependent colour from the surroundings."""
 
 import numpy as np
 import pytest
 import torch
+from scenes.cameras import look_at_camera, make_camera, world_rays
+from scenes.gaussians import round_gaussians
 
-from reffusion import geometry
 from reffusion.background import continuation
 from reffusion.background.plane import CELLS, Plane, remove_reflected_depth
 from reffusion.background.visibility import DepthView, depth_range
 from reffusion.initialize import sweep, view_dependent_color
 from reffusion.morphology import dilate
-from reffusion.splat.conventions import SH0
 from reffusion.splat.reference import colors, harmonics
 from reffusion.types import Camera, Gaussians
 
@@ -19,40 +19,31 @@ HOLE = np.zeros((SIZE, SIZE), bool)
 HOLE[62:98, 62:98] = True
 
 
-def camera(name: str, x: float, y: float) -> Camera:
-    """Looks from (x, y, 3) at the origin of the ground z = 0."""
-    center = np.array([x, y, 3.0])
-    ahead = -center / np.linalg.norm(center)
-    right = np.cross(ahead, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
-    pose[:3, 3] = -pose[:3, :3] @ center
-    return Camera(name, SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, pose)
-
-
 PLACES = [(0, 0.1), (1, 0), (-1, 0.3), (0.2, 1), (0, -1), (0.8, 0.9)]
-CAMERAS = [camera(f"v{k}", x, y) for k, (x, y) in enumerate(PLACES)]
+CAMERAS = [  # they look at the origin of the ground z = 0
+    look_at_camera(f"v{k}", (x, y, 3.0), (0.0, 0.0, 0.0), (SIZE, SIZE), FOCAL, up=(0.0, 1.0, 0.0))
+    for k, (x, y) in enumerate(PLACES)
+]
 
 
-def ground(view: Camera) -> tuple[np.ndarray, np.ndarray]:
+def intersect_ground(view: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Depth [H, W] and points [H, W, 3] of the ground."""
-    rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
+    rays = world_rays(view)
     depth = -view.center[2] / rays[..., 2]
     return depth, view.center + rays * depth[..., None]
 
 
-def shine(way: np.ndarray) -> np.ndarray:
-    """What is added to the ground's colour towards a camera in a direction: more from the right."""
+def reflection(way: np.ndarray) -> np.ndarray:
+    """What is added to the ground's colour in a direction [..., 3] to the camera: more from the right."""
     return (0.5 * way[..., 0] / np.linalg.norm(way, axis=-1))[..., None]
 
 
-def photograph(view: Camera, shines: bool = False) -> np.ndarray:
+def paint_ground(view: Camera, shines: bool = False) -> np.ndarray:
     """uint8 [H, W, 3]: speckled ground."""
-    _, points = ground(view)
+    _, points = intersect_ground(view)
     waves = sum(np.sin(points[..., :2] @ way + phase) for way, phase in WAVES)
     light = 0.45 + 0.12 * waves[..., None] / np.sqrt(len(WAVES)) * np.ones(3)
-    light = light + shine(view.center - points) if shines else light
+    light = light + reflection(view.center - points) if shines else light
     return np.round(light.clip(0, 1) * 255).astype(np.uint8)
 
 
@@ -60,104 +51,112 @@ WAVES = [(np.array([np.cos(a), np.sin(a)]) * f, a * 7) for f in (9.0, 17.0, 31.0
 
 
 @pytest.fixture(scope="module")
-def views() -> list[DepthView]:
-    depths = [ground(view)[0].astype(np.float32) for view in CAMERAS]
+def ground_views() -> list[DepthView]:
+    depths = [intersect_ground(view)[0].astype(np.float32) for view in CAMERAS]
     return [
         DepthView.from_range(view, depth, depth_range(depth), HOLE) for view, depth in zip(CAMERAS, depths, strict=True)
     ]
 
 
-def rough(depth: np.ndarray) -> np.ndarray:
-    """Depth as splats show it: uneven by 2 %, and 2 % too near."""
+def uneven_depth(depth: np.ndarray) -> np.ndarray:
+    """Depth as splats render it: uneven by 2 %, and 2 % too near."""
     return depth * (0.98 + 0.02 * np.random.default_rng(0).standard_normal(depth.shape))
 
 
-def test_photographs_tell_the_depth_that_splats_show_too_near(views):
-    view, photos = CAMERAS[0], {each.name: photograph(each) for each in CAMERAS}
-    true, ring = ground(view)[0], dilate(HOLE, 0.1) & ~HOLE
-    found = sweep.sweep_depth(photos["v0"], rough(true), ring, view, views, photos)
+def test_photographs_tell_the_depth_that_splats_show_too_near(ground_views):
+    view, photos = CAMERAS[0], {each.name: paint_ground(each) for each in CAMERAS}
+    true, ring = intersect_ground(view)[0], dilate(HOLE, 0.1) & ~HOLE
+    found = sweep.sweep_depth(photos["v0"], uneven_depth(true), ring, view, ground_views, photos)
     told = found > 0
     assert told[ring].mean() > 0.7 and not told[~ring].any()
     assert abs(np.median(found[told] / true[told]) - 1) < 0.003
     plain = {name: np.full_like(photo, 128) for name, photo in photos.items()}
-    assert not sweep.sweep_depth(plain["v0"], rough(true), ring, view, views, plain).any()
-    assert not sweep.sweep_depth(photos["v0"], rough(true), ring, view, views[:1], photos).any()
+    assert not sweep.sweep_depth(plain["v0"], uneven_depth(true), ring, view, ground_views, plain).any()
+    assert not sweep.sweep_depth(photos["v0"], uneven_depth(true), ring, view, ground_views[:1], photos).any()
 
 
-def plane(height: float, tilt: float) -> Plane:
+def tilted_plane(height: float, tilt: float) -> Plane:
     normal = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
     cells = np.ones((CELLS,) * 2, bool)
     return Plane(normal, height, np.zeros(3), np.eye(3)[:2], 0.05, cells, cells, ~cells, cells, np.zeros_like(cells))
 
 
 def test_a_plane_moves_onto_what_is_known_around_the_hole():
-    true, ring = ground(CAMERAS[0])[0], dilate(HOLE, 0.1) & ~HOLE
+    true, ring = intersect_ground(CAMERAS[0])[0], dilate(HOLE, 0.1) & ~HOLE
     noise = 1 + 0.004 * np.random.default_rng(1).standard_normal(true.shape)
     far = np.random.default_rng(2).random(true.shape) < 0.2  # something else shows there
     depth = np.where(ring, np.where(far, 1.5, noise) * true, 0.0)
-    moved = continuation.align_plane(plane(0.08, 0.02), depth, CAMERAS[0], HOLE)
+    moved = continuation.align_plane(tilted_plane(0.08, 0.02), depth, CAMERAS[0], HOLE)
     assert np.abs(moved.depth(CAMERAS[0])[HOLE] / true[HOLE] - 1).max() < 0.003
-    off = plane(0.08, 0.02)
+    off = tilted_plane(0.08, 0.02)
     assert continuation.align_plane(off, np.zeros_like(depth), CAMERAS[0], HOLE) is off
     one_sided = np.where(np.arange(SIZE)[:, None] < 64, depth, 0.0) * np.where(np.arange(SIZE) < 64, 1.03, 1.0)
-    still = continuation.align_plane(plane(0.0, 0.0), one_sided, CAMERAS[0], HOLE)
+    still = continuation.align_plane(tilted_plane(0.0, 0.0), one_sided, CAMERAS[0], HOLE)
     assert np.abs(still.depth(CAMERAS[0])[HOLE] / true[HOLE] - 1).max() < continuation.ALIGN_LIMIT
 
 
-def new_gaussians(sh_degree: int) -> Gaussians:
-    """On the ground under the hole, of the colours that the first view shows there without shine."""
+def hole_gaussians(sh_degree: int) -> Gaussians:
+    """Gaussians on the ground under the hole, in the colours of the first view without reflection."""
     view = CAMERAS[0]
-    points, picture = ground(view)[1][HOLE], photograph(view, shines=True)[HOLE] / 255
-    sh = np.zeros((len(points), (sh_degree + 1) ** 2, 3))
-    sh[:, 0] = (picture - 0.5) / SH0
-    count = len(points)
-    parts = (points, np.tile([1.0, 0, 0, 0], (count, 1)), np.full((count, 3), -4.0), np.full(count, 2.0), sh)
-    return Gaussians(*(torch.from_numpy(part).float() for part in parts))
+    points, picture = intersect_ground(view)[1][HOLE], paint_ground(view, shines=True)[HOLE] / 255
+    return round_gaussians(points, picture, np.exp(-4.0), 2.0, (sh_degree + 1) ** 2)
 
 
-def test_what_is_new_shines_as_the_surface_around_it(views):
-    photos = {view.name: photograph(view, shines=True) for view in CAMERAS}
-    fresh = new_gaussians(1)
+def test_new_gaussians_reflect_as_the_surface_around_them(ground_views):
+    photos = {view.name: paint_ground(view, shines=True) for view in CAMERAS}
+    fresh = hole_gaussians(1)
     every = torch.ones(len(fresh), dtype=torch.bool)
-    around = view_dependent_color.measure_change(photos["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
-    lit = view_dependent_color.transfer_sh(fresh, every, CAMERAS[0], around, views)
+    around = view_dependent_color.measure_change(
+        photos["v0"], intersect_ground(CAMERAS[0])[0], HOLE, CAMERAS[0], ground_views, photos
+    )
+    lit = view_dependent_color.transfer_sh(fresh, every, CAMERAS[0], around, ground_views)
     torch.testing.assert_close(colors(lit, CAMERAS[0], 1), colors(fresh, CAMERAS[0], 1), atol=1e-4, rtol=0)
     for view in CAMERAS[1:]:
         means = lit.means.double().numpy()
-        change = shine(view.center - means) - shine(CAMERAS[0].center - means)
+        change = reflection(view.center - means) - reflection(CAMERAS[0].center - means)
         expected = colors(fresh, CAMERAS[0], 1).numpy() + change
         before, after = (np.abs(colors(each, view, 1).numpy() - expected).mean() for each in (fresh, lit))
         assert after < 0.04 and (before < 0.06 or after < before / 3)
 
 
-def test_a_matte_surface_stays_matte(views):
-    photos = {view.name: photograph(view) for view in CAMERAS}
-    fresh = new_gaussians(1)
-    around = view_dependent_color.measure_change(photos["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
-    lit = view_dependent_color.transfer_sh(fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, views)
-    torch.testing.assert_close(lit.sh, fresh.sh, atol=0.01, rtol=0)
-
-
-def test_a_shadow_that_a_reference_does_not_show_is_no_shine(views):
-    light = {view.name: photograph(view) for view in CAMERAS}
-    photos = {name: (photo * 0.6).astype(np.uint8) for name, photo in light.items()}
-    fresh = new_gaussians(1)
-    around = view_dependent_color.measure_change(light["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
-    lit = view_dependent_color.transfer_sh(fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, views)
-    torch.testing.assert_close(lit.sh, fresh.sh, atol=0.01, rtol=0)
-
-
-def test_nothing_is_lent_where_nothing_is_known_or_harmonics_are_flat(views):
-    photos = {view.name: photograph(view, shines=True) for view in CAMERAS}
-    flat, fresh = new_gaussians(0), new_gaussians(1)
-    around = view_dependent_color.measure_change(photos["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
-    every = torch.ones(len(fresh), dtype=torch.bool)
-    assert view_dependent_color.transfer_sh(flat, every, CAMERAS[0], around, views) is flat
-    assert view_dependent_color.transfer_sh(fresh, ~every, CAMERAS[0], around, views) is fresh
-    blind = view_dependent_color.measure_change(
-        photos["v0"], np.zeros_like(HOLE, float), HOLE, CAMERAS[0], views, photos
+def test_a_matte_surface_stays_matte(ground_views):
+    photos = {view.name: paint_ground(view) for view in CAMERAS}
+    fresh = hole_gaussians(1)
+    around = view_dependent_color.measure_change(
+        photos["v0"], intersect_ground(CAMERAS[0])[0], HOLE, CAMERAS[0], ground_views, photos
     )
-    assert view_dependent_color.transfer_sh(fresh, every, CAMERAS[0], blind, views) is fresh
+    lit = view_dependent_color.transfer_sh(
+        fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, ground_views
+    )
+    torch.testing.assert_close(lit.sh, fresh.sh, atol=0.01, rtol=0)
+
+
+def test_a_shadow_that_a_reference_does_not_show_is_no_shine(ground_views):
+    light = {view.name: paint_ground(view) for view in CAMERAS}
+    photos = {name: (photo * 0.6).astype(np.uint8) for name, photo in light.items()}
+    fresh = hole_gaussians(1)
+    around = view_dependent_color.measure_change(
+        light["v0"], intersect_ground(CAMERAS[0])[0], HOLE, CAMERAS[0], ground_views, photos
+    )
+    lit = view_dependent_color.transfer_sh(
+        fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, ground_views
+    )
+    torch.testing.assert_close(lit.sh, fresh.sh, atol=0.01, rtol=0)
+
+
+def test_no_reflection_is_transferred_without_observations_or_harmonics(ground_views):
+    photos = {view.name: paint_ground(view, shines=True) for view in CAMERAS}
+    flat, fresh = hole_gaussians(0), hole_gaussians(1)
+    around = view_dependent_color.measure_change(
+        photos["v0"], intersect_ground(CAMERAS[0])[0], HOLE, CAMERAS[0], ground_views, photos
+    )
+    every = torch.ones(len(fresh), dtype=torch.bool)
+    assert view_dependent_color.transfer_sh(flat, every, CAMERAS[0], around, ground_views) is flat
+    assert view_dependent_color.transfer_sh(fresh, ~every, CAMERAS[0], around, ground_views) is fresh
+    blind = view_dependent_color.measure_change(
+        photos["v0"], np.zeros_like(HOLE, float), HOLE, CAMERAS[0], ground_views, photos
+    )
+    assert view_dependent_color.transfer_sh(fresh, every, CAMERAS[0], blind, ground_views) is fresh
 
 
 def test_harmonics_are_orthonormal():
@@ -167,7 +166,7 @@ def test_harmonics_are_orthonormal():
     torch.testing.assert_close(gram, torch.eye(16, dtype=torch.float64), atol=0.03, rtol=0)
 
 
-def test_what_a_plane_surrounds_is_told_from_what_lies_beyond_it():
+def test_points_inside_a_plane_differ_from_points_beyond_it():
     rows, columns = np.mgrid[:CELLS, :CELLS] - CELLS / 2
     away = np.hypot(rows, columns)
     seen = (away > 20) & (away < 60)
@@ -181,7 +180,7 @@ def test_what_a_plane_surrounds_is_told_from_what_lies_beyond_it():
 
 
 def test_a_mirror_has_the_depth_of_its_plane():
-    view = Camera("a", 64, 64, 70.0, 70.0, 32.0, 32.0, np.eye(4))
+    view = make_camera("a", (64, 64), 70.0)
     whole, nowhere = np.ones((CELLS,) * 2, bool), np.zeros((CELLS,) * 2, bool)
     plate = nowhere.copy()
     plate[CELLS // 2 - 10 : CELLS // 2 + 10, CELLS // 2 - 10 : CELLS // 2 + 10] = True

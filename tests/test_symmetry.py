@@ -1,10 +1,11 @@
-"""What nobody saw of a thing: its mirror image, where photographs agree; a vase by a box, seen by analytic views."""
+"""Unseen parts of an object as its mirror image, where photographs agree: a vase beside a box, in analytic views."""
 
 import cv2
 import numpy as np
 import pytest
-import small_scene
 import torch
+from scenes.cameras import meet_box, orbit_camera, uneven_depth_view, world_rays
+from scenes.gaussians import round_gaussians
 
 from reffusion import geometry
 from reffusion.background.continuation import find_planes
@@ -13,7 +14,6 @@ from reffusion.background.symmetry import find_mirrors
 from reffusion.background.unobserved import find_unobserved
 from reffusion.background.visibility import DepthView
 from reffusion.splat import rasterizer
-from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
 NO_POINTS = np.zeros((0, 3))
@@ -23,13 +23,13 @@ LOW, UPPER = np.array([-0.75, -0.75, 0.0]), np.array([-0.2, -0.3, 0.5])  # corne
 CENTRE, RADIUS = (LOW + UPPER) / 2, 0.45
 
 
-def camera(name: str, azimuth: float, height: float = 1.3, away: float = 3.0) -> Camera:
+def vase_camera(name: str, azimuth: float, height: float = 1.3, away: float = 3.0) -> Camera:
     """Looks at the vase; azimuth in degrees; z is up in the world."""
-    return small_scene.looking(name, azimuth, height, away, np.array([0, 0, 0.2]), SIZE, FOCAL)
+    return orbit_camera(name, azimuth, height, away, np.array([0, 0, 0.2]), SIZE, FOCAL)
 
 
-def on_vase(rays: np.ndarray, center: np.ndarray, cut: bool) -> np.ndarray:
-    """[H, W] along the rays to the vase, an elliptic cylinder, inf beside it; cut: without its right, aslant."""
+def intersect_vase(rays: np.ndarray, center: np.ndarray, cut: bool) -> np.ndarray:
+    """[H, W], the distance along the rays to the vase, an elliptic cylinder; `cut` removes its right part aslant."""
     scale = np.array([1 / WIDE, 1 / DEEP])
     d, o = rays[..., :2] * scale, center[:2] * scale
     a, b, c = (d * d).sum(-1), (d * o).sum(-1), o @ o - 1
@@ -50,73 +50,63 @@ def on_vase(rays: np.ndarray, center: np.ndarray, cut: bool) -> np.ndarray:
 
 
 def render_vase(view: Camera, cut: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth [H, W] without the box, where the box hides it, where the vase is shown without it."""
-    rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
+    """Depth [H, W] without the box, the mask of the box, and the mask of the vase without the box."""
+    rays = world_rays(view)
     ground = np.where(rays[..., 2] < 0, -view.center[2] / np.minimum(rays[..., 2], -1e-9), 50.0).clip(0, 50)
-    vase = on_vase(rays, view.center, cut)
+    vase = intersect_vase(rays, view.center, cut)
     depth = np.minimum(ground, vase)
-    bounds = np.stack([(LOW - view.center) / rays, (UPPER - view.center) / rays])
-    enter, leave = bounds.min(0).max(-1), bounds.max(0).min(-1)
-    return depth, (enter < leave) & (leave > 0) & (enter < depth), vase < ground
+    enter, meets = meet_box(view, LOW, UPPER)
+    return depth, meets & (enter < depth), vase < ground
 
 
-def witness(view: Camera, cut: bool = False) -> DepthView:
-    depth, hidden, _ = render_vase(view, cut)
-    kernel = np.ones((3, 3))
-    wide = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    return DepthView.from_range(view, depth, (cv2.erode(depth, kernel), cv2.dilate(depth, kernel)), wide)
+def vase_depth_view(view: Camera, cut: bool = False) -> DepthView:
+    return uneven_depth_view(view, *render_vase(view, cut)[:2])
 
 
-def colour(points: np.ndarray, halved: bool) -> np.ndarray:
-    """[..., 3]: bands that climb; in a vase that is halved, one half is of other colours than the other."""
+def vase_color(points: np.ndarray, halved: bool) -> np.ndarray:
+    """[..., 3]: rising bands; `halved` gives one half other colours than the other."""
     bands = 0.5 + 0.3 * np.sin(9 * points[..., 2])
     half = np.where(points[..., 0] > 0, 1 - bands, bands) if halved else bands
     return np.stack([half, 0.8 * half, 0.5 * bands], -1)
 
 
-def scene(cut: bool = False, halved: bool = False):
-    """Witnesses, photographs, and Gaussians of all that they show of vase and ground."""
-    views = [witness(camera(f"v{k}", azimuth), cut) for k, azimuth in enumerate(np.linspace(-150, -30, 11))]
+def make_vase_scene(cut: bool = False, halved: bool = False):
+    """Depth views, photographs, and Gaussians of all visible points of vase and ground."""
+    views = [
+        vase_depth_view(vase_camera(f"v{k}", azimuth), cut) for k, azimuth in enumerate(np.linspace(-150, -30, 11))
+    ]
     photos, seen = {}, []
     for view in views:
         points = geometry.unproject(view.depth, view.camera)
-        photos[view.camera.name] = (255 * colour(points, halved)).astype(np.uint8)
+        photos[view.camera.name] = (255 * vase_color(points, halved)).astype(np.uint8)
         seen.append(points[::2, ::2][(~view.masked & (view.depth < 6))[::2, ::2]])
     points = np.concatenate(seen)
     points = points[np.unique(np.floor(points / 0.02), axis=0, return_index=True)[1]]
-    count = len(points)
-    tensor = lambda values: torch.tensor(np.asarray(values), dtype=torch.float32)
-    gaussians = Gaussians(
-        tensor(points),
-        tensor(np.tile([1.0, 0, 0, 0], (count, 1))),
-        tensor(np.full((count, 3), np.log(0.012))),
-        tensor(np.full(count, 6.0)),
-        tensor((colour(points, halved) - 0.5) / SH0)[:, None],
-    )
+    gaussians = round_gaussians(points, vase_color(points, halved), 0.012, 6.0)
     return views, photos, gaussians
 
 
-def sideways(mirrors: list[Mirror]) -> list[Mirror]:
-    """Those of left and right, not of front and back."""
+def left_right_mirrors(mirrors: list[Mirror]) -> list[Mirror]:
+    """The mirrors that exchange left and right, not front and back."""
     return [mirror for mirror in mirrors if abs(mirror.normal[0]) > 0.8]
 
 
 @pytest.fixture(scope="module")
-def whole():
-    views, photos, gaussians = scene()
+def vase_mirrors():
+    views, photos, gaussians = make_vase_scene()
     planes = find_planes(CENTRE, RADIUS, views, NO_POINTS)
     return views, gaussians, planes, find_mirrors(gaussians, CENTRE, RADIUS, views, planes, photos)
 
 
-def test_a_vase_is_its_own_mirror_image(whole):
-    _, _, _, mirrors = whole
-    found = sideways(mirrors)
+def test_a_vase_is_its_own_mirror_image(vase_mirrors):
+    _, _, _, mirrors = vase_mirrors
+    found = left_right_mirrors(mirrors)
     assert len(found) == 1 and len(mirrors) <= 2  # its back is like its front, too
     assert abs(found[0].normal[0]) > 0.995 and abs(found[0].offset) < 0.02
 
 
-def test_the_half_that_the_box_hides_stands_where_it_is(whole):
-    views, _, _, mirrors = whole
+def test_the_half_that_the_box_hides_stands_where_it_is(vase_mirrors):
+    views, _, _, mirrors = vase_mirrors
     for view in views[::3]:
         true, hidden, vase = render_vase(view.camera)
         found = render_mirrors(mirrors, view.camera, hidden, views).plausible_depth
@@ -130,8 +120,8 @@ def test_the_half_that_the_box_hides_stands_where_it_is(whole):
         assert wrong.sum() < 0.02 * behind_box.sum()
 
 
-def test_its_pixels_are_undecided_and_have_its_depth(whole):
-    views, gaussians, planes, mirrors = whole
+def test_mirrored_pixels_are_unobserved_and_have_its_depth(vase_mirrors):
+    views, gaussians, planes, mirrors = vase_mirrors
     view = views[5]
     true, hidden, vase = render_vase(view.camera)
     supposed = np.isfinite(render_mirrors(mirrors, view.camera, hidden, views).plausible_depth) & vase
@@ -143,21 +133,21 @@ def test_its_pixels_are_undecided_and_have_its_depth(whole):
 
 
 @pytest.mark.parametrize("how", [{"cut": True}, {"halved": True}])
-def test_what_is_unlike_on_its_other_side_has_no_mirror(how):
-    views, photos, gaussians = scene(**how)
+def test_an_asymmetric_object_has_no_mirror(how):
+    views, photos, gaussians = make_vase_scene(**how)
     planes = find_planes(CENTRE, RADIUS, views, NO_POINTS)
-    assert not sideways(find_mirrors(gaussians, CENTRE, RADIUS, views, planes, photos))
+    assert not left_right_mirrors(find_mirrors(gaussians, CENTRE, RADIUS, views, planes, photos))
 
 
-def test_nothing_stands_there_and_nothing_is_asked():
-    views, photos, gaussians = scene()
+def test_without_an_object_there_is_no_mirror():
+    views, photos, gaussians = make_vase_scene()
     assert find_mirrors(gaussians, CENTRE, RADIUS, views, [], photos) == []
     planes = find_planes(CENTRE, RADIUS, views, NO_POINTS)
     assert find_mirrors(gaussians, CENTRE, np.inf, views, planes, photos) == []
 
 
 def test_a_camera_behind_the_mirror_shows_the_image_with_its_sides_swapped():
-    draws, view = np.random.default_rng(3), camera("v", -70)
+    draws, view = np.random.default_rng(3), vase_camera("v", -70)
     means = torch.tensor(draws.uniform(-0.4, 0.4, (60, 3)), dtype=torch.float32)
     colors = torch.tensor(draws.uniform(-1, 1, (60, 1, 3)), dtype=torch.float32)
     balls = Gaussians(means, torch.eye(4)[:1].repeat(60, 1), torch.full((60, 3), -3.0), torch.full((60,), 2.0), colors)

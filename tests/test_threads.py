@@ -1,4 +1,4 @@
-"""How many threads the steps of a long work on the CPU take."""
+"""The number of threads of a long computation on the CPU."""
 
 import time
 
@@ -10,8 +10,8 @@ from reffusion.prior.threads import CALIBRATION_STEPS, MIN_STEPS, RECENT_STEPS, 
 STEPS = 12
 
 
-def used(seconds, steps=MIN_STEPS, device="cpu", idle=time.perf_counter):
-    """The parts at once of each of `STEPS` steps, which take `seconds[parts]`; a core is idle, or as `idle` says."""
+def record_parts(seconds, steps=MIN_STEPS, device="cpu", idle=time.perf_counter):
+    """The parts that run at once in each of `STEPS` steps, which take `seconds[parts]`; `idle`: idle time."""
     before, found = torch.get_num_threads(), []
     torch.set_num_threads(2)
     try:
@@ -29,20 +29,24 @@ def used(seconds, steps=MIN_STEPS, device="cpu", idle=time.perf_counter):
 
 
 def test_all_threads_are_used_while_they_pay():
-    assert used({1: 0.1, 2: 0.0}) == [1] * CALIBRATION_STEPS + [2] * (STEPS - CALIBRATION_STEPS)
+    assert record_parts({1: 0.1, 2: 0.0}) == [1] * CALIBRATION_STEPS + [2] * (STEPS - CALIBRATION_STEPS)
 
 
 def test_one_thread_is_used_where_the_others_hold_it_up():
-    assert used({1: 0.0, 2: 0.1}) == [1] * CALIBRATION_STEPS + [2] * RECENT_STEPS + [1] * (
+    assert record_parts({1: 0.0, 2: 0.1}) == [1] * CALIBRATION_STEPS + [2] * RECENT_STEPS + [1] * (
         STEPS - CALIBRATION_STEPS - RECENT_STEPS
     )
 
 
 def test_a_core_that_others_use_is_left_to_them():
-    assert used({1: 0.01, 2: 0.0}, idle=lambda: 0.5 * time.perf_counter()) == [1] * STEPS
-    assert used({1: 0.1, 2: 0.0}, idle=lambda: float("inf"))[-1] == 2  # where nobody tells
+    assert record_parts({1: 0.01, 2: 0.0}, idle=lambda: 0.5 * time.perf_counter()) == [1] * STEPS
+    assert record_parts({1: 0.1, 2: 0.0}, idle=lambda: float("inf"))[-1] == 2  # where nobody tells
     assert 0 < idle_seconds() < float("inf")
 
 
 def test_little_work_and_gpus_are_left_to_torch():
-    assert used({1: 0.0, 2: 0.0}, steps=MIN_STEPS - 1) == [1] * STEPS == used({1: 0.0, 2: 0.0}, device="meta")
+    assert (
+        record_parts({1: 0.0, 2: 0.0}, steps=MIN_STEPS - 1)
+        == [1] * STEPS
+        == record_parts({1: 0.0, 2: 0.0}, device="meta")
+    )

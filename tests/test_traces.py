@@ -1,17 +1,16 @@
-"""Error against run time: what stages log, a clock that stands while it measures, early ends, budgets, the gate."""
+"""Error against run time: traces of stages, pauses of the clock, early ends, budgets, and the regression gate."""
 
 import copy
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
-import small_scene as small
 import torch
 from pydantic import ValidationError
 from safetensors.torch import load_file
-from small_prior import save_small_prior
+from scenes.networks import save_small_prior
+from scenes.stage_runs import run_through_initialize, trace_lines
 
 from benchmarks.bench import gate
 from benchmarks.bench.points import Diagram, Point, recommendation
@@ -21,14 +20,13 @@ from reffusion.distill import loop as distilling
 from reffusion.fit import reconstruction as fitting
 from reffusion.initialize import fill
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_mask_sets, save_references
 from reffusion.io.traces import MAIN, load_trace
 from reffusion.prior import personalize as personalizing
-from reffusion.types import PARAMETERS, Reference
+from reffusion.types import PARAMETERS
 from runner import Refused
 from runner.parameters import parse_duration, split_budget, stack_layers
 from runner.pipeline import load_pipeline, load_scene_file
-from stages import distill, fit, initialize, masks, personalize
+from stages import distill, fit, personalize
 
 ROOT = Path(__file__).resolve().parent.parent
 NEAR = 1.7
@@ -41,49 +39,33 @@ DISTILL = {"iterations": 8, "sds": OFF, "adversarial": OFF, "depth": OFF, "refer
 
 
 @pytest.fixture(scope="module")
-def ready(tmp_path_factory):
-    """Folders of a small scene up to `initialize`, and of a random prior."""
+def initialized_folders(tmp_path_factory):
+    """The folders of a small scene up to `initialize`, and of a random prior."""
     home = tmp_path_factory.mktemp("scene")
-    poses, fitted, _ = small.write(home, NEAR)
-    folders = {"poses": poses, "fit": fitted, "masks": home / "masks", "reference": home / "reference"}
-    for name in ("masks", "initialize"):
-        (home / name).mkdir()
-    masks.run(masks.Params(), home / "masks", poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fitted)
-    view = small.CAMERAS["a2"]
-    save_references(
-        folders["reference"],
-        [Reference(view, small.photo(view), load_mask_sets(home / "masks", ["a2"])["a2"].invent)],
-    )
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(fill, "COMPLETION", Completion(planar_share=2.0))  # no planes: both solvers
-        initialize.run(initialize.Params(), home / "initialize", **folders)
+        folders = run_through_initialize(home, NEAR)
     save_small_prior(home / "prior")
-    return SimpleNamespace(home=home, prior=str(home / "prior"), **folders)
+    return folders | {"prior": home / "prior"}
 
 
-def run(stage: str, ready, out: Path, **changed) -> Path:
-    """One of the iterative stages on the small scene; its folder."""
+def run_stage(stage: str, initialized_folders, out: Path, **changed) -> Path:
+    """Run one of the iterative stages on the small scene; return its folder."""
     out.mkdir(parents=True, exist_ok=True)
     if stage == "fit":
-        fit.run(fit.Params().changed(FIT | changed), out, poses=ready.poses)
-        return out
-    needs = {"poses": ready.poses, "fit": ready.fit, "masks": ready.masks, "reference": ready.reference}
-    if stage == "personalize":
-        personalize.run(
-            personalize.Params(**{**PERSONALIZE, "prior": ready.prior, **changed}),
-            out,
-            poses=ready.poses,
-            raw_masks=ready.home / "raw_masks",
-            reference=ready.reference,
-        )
+        fit.run(fit.Params().changed(FIT | changed), out, poses=initialized_folders["poses"])
+    elif stage == "personalize":
+        params = personalize.Params(**{**PERSONALIZE, "prior": str(initialized_folders["prior"]), **changed})
+        poses, reference = initialized_folders["poses"], initialized_folders["reference"]
+        personalize.run(params, out, poses=poses, raw_masks=poses.with_name("raw_masks"), reference=reference)
     else:
-        needs |= {"personalize": None, "initialize": ready.home / "initialize"}
-        distill.run(distill.Params(**{**DISTILL, **changed}), out, **needs)
+        needs = {name: folder for name, folder in initialized_folders.items() if name != "prior"}
+        distill.run(distill.Params(**{**DISTILL, **changed}), out, personalize=None, **needs)
     return out
 
 
-def result(folder: Path) -> list[torch.Tensor]:
-    """The numbers a stage made; the header of a file of LoRA weights is not the same in every run."""
+def load_result(folder: Path) -> list[torch.Tensor]:
+    """The numbers of a stage's result; the header of a LoRA file differs between runs."""
     if (folder / "gaussians.ply").exists():
         gaussians = load_ply(folder / "gaussians.ply")
         return [getattr(gaussians, name) for name in PARAMETERS]
@@ -91,21 +73,17 @@ def result(folder: Path) -> list[torch.Tensor]:
     return [weights[name] for name in sorted(weights)]
 
 
-def same(one: Path, other: Path) -> bool:
-    pairs = list(zip(result(one), result(other), strict=True))
-    return all(torch.equal(a, b) for a, b in pairs) and lines(one) == lines(other)
-
-
-def lines(folder: Path) -> list[dict]:
-    return [{k: v for k, v in line.items() if k != "seconds"} for line in trace.read_trace(folder / "trace.jsonl")]
+def has_same_result(one: Path, other: Path) -> bool:
+    pairs = list(zip(load_result(one), load_result(other), strict=True))
+    return all(torch.equal(a, b) for a, b in pairs) and trace_lines(one) == trace_lines(other)
 
 
 # ------------------------------------------------------------------------------------------------------ the schema
 
 
 @pytest.mark.parametrize("stage", ["fit", "personalize", "distill"])
-def test_a_stages_trace_follows_the_schema(ready, tmp_path, stage):
-    series = load_trace(run(stage, ready, tmp_path / stage) / "trace.jsonl", stage)
+def test_a_stages_trace_follows_the_schema(initialized_folders, tmp_path, stage):
+    series = load_trace(run_stage(stage, initialized_folders, tmp_path / stage) / "trace.jsonl", stage)
     found = series.pop("")
     assert not series and found[0]["iteration"] == 0
     steps = {"fit": 40, "personalize": 10, "distill": 8}[stage]
@@ -114,18 +92,14 @@ def test_a_stages_trace_follows_the_schema(ready, tmp_path, stage):
     assert len(found) >= 5 and all(MAIN[stage][0] in line for line in found)
 
 
-def test_fit_without_held_out_views_is_judged_by_views_before_their_step(ready, tmp_path):
-    found = load_trace(run("fit", ready, tmp_path / "fit", holdout=0) / "trace.jsonl", "fit")[""]
-    assert (
-        MAIN["fit"] == ("psnr_held_out", "psnr")
-        and "psnr_held_out" not in found[1]
-        and "psnr" not in found[0]
-        and "psnr" in found[1]
-    )
+def test_fit_without_held_out_views_is_judged_by_views_before_their_step(initialized_folders, tmp_path):
+    found = load_trace(run_stage("fit", initialized_folders, tmp_path / "fit", holdout=0) / "trace.jsonl", "fit")[""]
+    assert MAIN["fit"] == ("psnr_held_out", "psnr") and "psnr_held_out" not in found[1]
+    assert "psnr" not in found[0] and "psnr" in found[1]
 
 
-def test_the_solvers_of_initialize_are_traced_against_points_they_do_not_get(ready):
-    series = load_trace(ready.home / "initialize" / "trace.jsonl", "initialize")
+def test_the_solvers_of_initialize_are_traced_against_points_they_do_not_get(initialized_folders):
+    series = load_trace(initialized_folders["initialize"] / "trace.jsonl", "initialize")
     assert set(series) == {"planes a2", "completion a2", "bilateral a2"}
     steps = series["bilateral a2"]
     assert len(steps) > 3 and steps[-1]["reason"] == "converged"
@@ -211,7 +185,7 @@ def test_checkpoints_cost_under_two_percent(tmp_path, monkeypatch, saving, every
 
 
 @pytest.mark.parametrize("stage", ["fit", "personalize", "distill"])
-def test_a_slow_disk_does_not_hold_a_stage_up(ready, tmp_path, monkeypatch, stage):
+def test_a_slow_disk_does_not_hold_a_stage_up(initialized_folders, tmp_path, monkeypatch, stage):
     """One checkpoint of 0.3 s, and none more in a run of less than 15: by a clock of the test's own."""
     now, saved = [0.0], []
 
@@ -225,17 +199,17 @@ def test_a_slow_disk_does_not_hold_a_stage_up(ready, tmp_path, monkeypatch, stag
 
     monkeypatch.setattr(trace.time, "monotonic", monotonic)
     monkeypatch.setattr(trace, "save_checkpoint", slowly)
-    run(stage, ready, tmp_path, checkpoint_seconds=1e-9)
+    run_stage(stage, initialized_folders, tmp_path, checkpoint_seconds=1e-9)
     assert len(saved) == 1
 
 
 @pytest.mark.parametrize("stage", list(KILLED))
-def test_a_stage_gives_the_same_after_a_kill(ready, tmp_path, monkeypatch, stage):
+def test_a_stage_gives_the_same_after_a_kill(initialized_folders, tmp_path, monkeypatch, stage):
     monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
     module, name, position = KILLED[stage]
     often = {"checkpoint_seconds": 1e-9}
-    whole = run(stage, ready, tmp_path / "whole", **often)
-    real, moment = getattr(module, name), lines(whole)[-1]["iteration"] // 2
+    whole = run_stage(stage, initialized_folders, tmp_path / "whole", **often)
+    real, moment = getattr(module, name), trace_lines(whole)[-1]["iteration"] // 2
 
     def killing(*given):
         if given[position] == moment:
@@ -244,11 +218,11 @@ def test_a_stage_gives_the_same_after_a_kill(ready, tmp_path, monkeypatch, stage
 
     monkeypatch.setattr(module, name, killing)
     with pytest.raises(KeyboardInterrupt):
-        run(stage, ready, tmp_path / "broken", **often)
+        run_stage(stage, initialized_folders, tmp_path / "broken", **often)
     assert (tmp_path / "broken" / trace.CHECKPOINT).exists()
     monkeypatch.setattr(module, name, real)
-    broken = run(stage, ready, tmp_path / "broken", **often)
-    assert same(broken, whole)
+    broken = run_stage(stage, initialized_folders, tmp_path / "broken", **often)
+    assert has_same_result(broken, whole)
     assert not (broken / trace.CHECKPOINT).exists()
 
 
@@ -259,12 +233,12 @@ def test_a_stage_gives_the_same_after_a_kill(ready, tmp_path, monkeypatch, stage
     ("text", "seconds"),
     [("5m", 300), ("90s", 90), ("1h30m", 5400), ("2.5m", 150), (120, 120), ("45", 45), ("1H", 3600)],
 )
-def test_times_are_read(text, seconds):
+def test_durations_are_parsed(text, seconds):
     assert parse_duration(text, "x") == seconds
 
 
 @pytest.mark.parametrize("text", ["", "m", "5 minutes", "-5m", "0", "5x", None, "5m5", [5]])
-def test_what_is_no_time_is_refused(text):
+def test_invalid_durations_are_refused(text):
     with pytest.raises(Refused, match=r"scene.yaml: budget .* like 5m"):
         parse_duration(text, "scene.yaml")
 
@@ -309,14 +283,16 @@ def test_steps_that_fit_are_counted_once(tmp_path):
 
 
 @pytest.mark.parametrize("stage", ["fit", "personalize", "distill"])
-def test_a_budget_shortens_a_stage_and_its_schedule(ready, tmp_path, stage):
+def test_a_budget_shortens_a_stage_and_its_schedule(initialized_folders, tmp_path, stage):
     """A moment's budget: the fewest steps, a twentieth; the trial before them leaves no mark on the result."""
     steps = {"fit": 2, "personalize": 1, "distill": 1}[stage]
-    out = run(stage, ready, tmp_path / "short", seconds=1e-3)
-    assert lines(out)[-1]["iteration"] == steps
+    out = run_stage(stage, initialized_folders, tmp_path / "short", seconds=1e-3)
+    assert trace_lines(out)[-1]["iteration"] == steps
     assert json.loads((out / trace.LENGTH).read_text())["steps"] == steps
-    asked = run(stage, ready, tmp_path / "asked", **{"steps" if stage == "personalize" else "iterations": steps})
-    assert same(out, asked)
+    asked = run_stage(
+        stage, initialized_folders, tmp_path / "asked", **{"steps" if stage == "personalize" else "iterations": steps}
+    )
+    assert has_same_result(out, asked)
 
 
 @pytest.mark.parametrize(
@@ -331,8 +307,8 @@ def test_betas_are_parts(made, betas):
 # -------------------------------------------------------------------------------------------------------- the gate
 
 
-def as_measured(baselines: dict) -> list[Diagram]:
-    """The committed baselines as if they had been measured now."""
+def points_of_baselines(baselines: dict) -> list[Diagram]:
+    """The committed baselines as new measurements."""
     return [
         Diagram(name, "", "", None, [Point(*key.rsplit(", ", 1), 0.0, *value) for key, value in points.items()])
         for name, points in baselines["diagrams"].items()
@@ -341,7 +317,7 @@ def as_measured(baselines: dict) -> list[Diagram]:
 
 def test_the_gate_sees_a_planted_regression():
     baselines = gate.load(ROOT / "benchmarks" / "bench" / "baselines.json")
-    diagrams, unit = as_measured(baselines), baselines["machine_unit"]
+    diagrams, unit = points_of_baselines(baselines), baselines["machine_unit"]
     assert gate.regressions(diagrams, unit, baselines) == []
     assert gate.regressions(diagrams, 2 * unit, baselines) == [], "a machine half as fast may take twice as long"
     name, key = "bilateral", "8 px, converged"

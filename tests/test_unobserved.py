@@ -1,12 +1,12 @@
-"""What photographs say of the space behind an object: a table with free space under it, seen by analytic views."""
+"""The visibility of the space behind an object: a table with free space below, in analytic views."""
 
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-import small_scene
 import torch
+from scenes.cameras import meet_box, orbit_camera, uneven_depth_view, world_rays
 
 from reffusion import geometry
 from reffusion.background.continuation import find_planes
@@ -28,18 +28,20 @@ from reffusion.types import Camera, Gaussians
 
 NO_POINTS = np.zeros((0, 3))
 TOP, FLOOR, EDGE, BOX, HIGH = 0.0, -1.0, 1.0, 0.3, 0.5  # z of table top and floor; half sides; height of the box
+CORNERS = (-BOX, -BOX, 0.0), (BOX, BOX, HIGH)
 SIZE, FOCAL = 160, 150.0
 
 
-def camera(name: str, azimuth: float, height: float, away: float = 3.5) -> Camera:
+def table_camera(name: str, azimuth: float, height: float, away: float = 3.5) -> Camera:
     """Looks at the middle of the table; azimuth in degrees; z is up in the world."""
-    return small_scene.looking(name, azimuth, height, away, np.zeros(3), SIZE, FOCAL)
+    return orbit_camera(name, azimuth, height, away, np.zeros(3), SIZE, FOCAL)
 
 
-def render_scene(view: Camera, notched: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth [H, W] of table and floor, whether the ray meets the box first, whether the table shows without it; one
-    that is notched lacks a quarter, up to the middle of the box."""
-    rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
+def render_table(view: Camera, notched: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth [H, W] of table and floor, the mask of the box, and the mask of the table without the box; `notched`
+    removes a quarter of the table, up to the middle of the box.
+    """
+    rays = world_rays(view)
     to = lambda z: (z - view.center[2]) / rays[..., 2]
     at = lambda t: view.center + rays * t[..., None]
     table, floor = to(TOP), to(FLOOR)
@@ -47,49 +49,46 @@ def render_scene(view: Camera, notched: bool = False) -> tuple[np.ndarray, np.nd
     on_table &= ~(notched & (at(table)[..., :2] > 0).all(-1))
     floor = np.where(floor > 0, floor, 20.0)
     depth = np.where(on_table & (table < floor), table, floor)
-    low, high = np.array([-BOX, -BOX, 0.0]), np.array([BOX, BOX, HIGH])
-    bounds = np.stack([(low - view.center) / rays, (high - view.center) / rays])
-    enter, leave = bounds.min(0).max(-1), bounds.max(0).min(-1)
-    return depth, (enter < leave) & (leave > 0) & (enter < depth), on_table & (table < floor)
+    enter, meets = meet_box(view, *CORNERS)
+    return depth, meets & (enter < depth), on_table & (table < floor)
 
 
-def witness(view: Camera, notched: bool = False) -> DepthView:
-    depth, hidden, _ = render_scene(view, notched)
-    kernel = np.ones((3, 3))
-    wide = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    return DepthView.from_range(view, depth, (cv2.erode(depth, kernel), cv2.dilate(depth, kernel)), wide)
+def table_depth_view(view: Camera, notched: bool = False) -> DepthView:
+    return uneven_depth_view(view, *render_table(view, notched)[:2])
 
 
 @pytest.fixture(scope="module")
-def views():
-    above = [witness(camera(f"a{k}", 30 * k, 1.6)) for k in range(12)]
-    return above + [witness(camera(f"l{k}", 60 * k, -0.5)) for k in range(6)]  # these look under the table
+def table_views():
+    above = [table_depth_view(table_camera(f"a{k}", 30 * k, 1.6)) for k in range(12)]
+    return above + [
+        table_depth_view(table_camera(f"l{k}", 60 * k, -0.5)) for k in range(6)
+    ]  # these look under the table
 
 
-def test_a_point_is_seen_on_its_surface_only(views):
+def test_a_point_is_seen_on_its_surface_only(table_views):
     points = np.array([[0.7, 0.7, 0.0], [0.7, 0.7, 0.4], [0.7, 0.7, -0.5], [0.0, 0.0, 0.25], [0.0, 0.0, 0.0]])
-    said = count_views(points, views)
+    said = count_views(points, table_views)
     assert said.seen[0] >= 6 and said.free[0] == 0, "the table's top"
     assert said.free[1] >= 6 and said.seen[1] == 0, "the air above it"
     assert said.seen[2] == 0 and said.free[2] >= 2, "under the table low views look through"
-    assert said.seen[3] == said.free[3] == 0 and said.masked[3] == len(views), "within the box nobody knows"
-    above = count_views(points, views, np.tile([0.0, 0.0, 1.0], (5, 1)))
+    assert said.seen[3] == said.free[3] == 0 and said.masked[3] == len(table_views), "within the box nobody knows"
+    above = count_views(points, table_views, np.tile([0.0, 0.0, 1.0], (5, 1)))
     assert above.seen[4] == 0 and above.free[4] == 0, "nor, from above, what it stands on"
 
 
-def test_a_surface_does_not_face_views_from_its_other_side(views):
+def test_a_surface_does_not_face_views_from_its_other_side(table_views):
     point = np.array([[0.7, 0.7, 0.0]])
-    up, down = (count_views(point, views, np.array([[0.0, 0.0, z]])).seen[0] for z in (1.0, -1.0))
-    assert up + down == count_views(point, views).seen[0]
+    up, down = (count_views(point, table_views, np.array([[0.0, 0.0, z]])).seen[0] for z in (1.0, -1.0))
+    assert up + down == count_views(point, table_views).seen[0]
     assert up >= 6 and down >= 1, "the thin top is seen from both"
 
 
-def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(views):
-    planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
+def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(table_views):
+    planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, table_views, NO_POINTS)
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.offset))
     assert abs(table.normal[2]) > 0.999 and abs(table.offset) < 0.01
-    view = camera("new", 15.0, 1.6)
-    depth, _, on_table = render_scene(view)
+    view = table_camera("new", 15.0, 1.6)
+    depth, _, on_table = render_table(view)
     at = table.depth(view)
     goes_on = table.pixels_on(table.continued, at, view, np.ones_like(on_table))
     place = geometry.unproject(np.where(np.isfinite(at), at, 1.0), view)
@@ -100,20 +99,20 @@ def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(views):
     np.testing.assert_allclose(at[footprint], depth[footprint], rtol=0.01)
 
 
-def test_a_table_is_seen_from_above_though_what_stands_beside_it_is_lower(views):
-    above = [view for view in views if view.camera.name.startswith("a")]
+def test_a_table_is_seen_from_above_though_what_stands_beside_it_is_lower(table_views):
+    above = [view for view in table_views if view.camera.name.startswith("a")]
     planes = find_planes(np.array([0.0, 0.0, -0.2]), 0.45, above, NO_POINTS)
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.offset))
     assert table.contains(table.seen, np.array([[0.7, 0.7, 0.0]]))[0]
 
 
 @pytest.mark.parametrize(("wide", "through"), [(0.15, False), (0.4, True)])
-def test_a_speck_that_views_look_through_is_no_hole(wide, through):
+def test_a_speck_that_views_see_through_is_no_hole(wide, through):
     """Beside the box's edge views' depth is rough."""
     views = []
     for turn in range(0, 360, 30):
-        view = witness(camera(f"a{turn}", turn, 1.6))
-        rays = geometry.pixel_rays(view.camera) @ view.camera.world_to_camera[:3, :3]
+        view = table_depth_view(table_camera(f"a{turn}", turn, 1.6))
+        rays = world_rays(view.camera)
         place = view.camera.center - rays * (view.camera.center[2] / rays[..., 2])[..., None]
         spot = (np.abs(place[..., :2] - [BOX + wide, 0]) < wide / 2).all(-1)
         views.append(replace(view, depth=np.where(spot, 2 * view.depth, view.depth)))
@@ -126,7 +125,7 @@ def test_a_speck_that_views_look_through_is_no_hole(wide, through):
 def test_borders_that_are_visible_go_on_under_the_box():
     """The box hides the inner corner of an L-shaped table: what is beyond the line between its visible edges is free,
     though the convex hull of the table has it."""
-    views = [witness(camera(f"a{k}", 30 * k, 1.6), notched=True) for k in range(12)]
+    views = [table_depth_view(table_camera(f"a{k}", 30 * k, 1.6), notched=True) for k in range(12)]
     planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.offset))
     steps = (np.arange(len(table.continued)) + 0.5 - len(table.continued) / 2) * table.cell_size
@@ -137,24 +136,19 @@ def test_borders_that_are_visible_go_on_under_the_box():
     assert table.enclosed[under & (across > 1.3 * BOX)].mean() < 0.05
 
 
-def beside_a_plinth(view: Camera) -> DepthView:
-    """Rough ground with a plinth's face upright behind the box, that ends where the box begins."""
-    rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
+def plinth_depth_view(view: Camera) -> DepthView:
+    """Rough ground with the upright face of a plinth behind the box, which ends where the box begins."""
+    rays = world_rays(view)
     ground, face = -view.center[2] / rays[..., 2], (0.5 - view.center[1]) / rays[..., 1]
     place = view.center + rays * face[..., None]
     upright = (face > 0) & (place[..., 0] < -BOX) & (place[..., 0] > -1.5) & (place[..., 2] > 0) & (place[..., 2] < 0.7)
     depth = np.where(upright, face, np.where(ground > 0, ground, 20.0))
-    low, high = np.array([-BOX, -BOX, 0.0]), np.array([BOX, BOX, HIGH])
-    bounds = np.stack([(low - view.center) / rays, (high - view.center) / rays])
-    enter, leave = bounds.min(0).max(-1), bounds.max(0).min(-1)
-    wide = cv2.dilate(((enter < leave) & (leave > 0)).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    near, far = 0.94 * cv2.erode(depth, np.ones((3, 3))), 1.06 * cv2.dilate(depth, np.ones((3, 3)))
-    return DepthView.from_range(view, depth, (near, far), wide)
+    return uneven_depth_view(view, depth, meet_box(view, *CORNERS)[1], tolerance=0.06)
 
 
 def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
     """Near their crossing, and beneath it, rough ground looks like the wall's: on both sides of the box."""
-    views = [beside_a_plinth(camera(f"a{k}", 200 + 12 * k, 1.4)) for k in range(12)]
+    views = [plinth_depth_view(table_camera(f"a{k}", 200 + 12 * k, 1.4)) for k in range(12)]
     planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
     face = max(planes, key=lambda plane: abs(plane.normal[1]))
     assert abs(face.normal[1]) > 0.99
@@ -166,21 +160,21 @@ def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
     assert ground.continued[under].mean() > 0.95
 
 
-def test_what_lies_beneath_the_table_in_all_views_but_one_is_not_what_is_behind_the_box(views):
+def test_gaussians_beneath_the_table_are_not_the_surface_behind_the_box(table_views):
     """Left there by a fit that is wrong about the ground in one view."""
-    camera = views[0].camera
-    rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
+    camera = table_views[0].camera
+    rays = world_rays(camera)
     beneath = np.clip((-0.2 - camera.center[2]) / np.minimum(rays[..., 2], -1e-3), 0, 20)
     grey = np.full((SIZE, SIZE, 3), 128, np.uint8)
     left = surface_gaussians(grey, beneath, np.ones((SIZE, SIZE), bool), camera, sh_count=1, spread=0.6)
-    hidden = render_scene(camera)[1] & render_scene(camera)[2]
+    hidden = render_table(camera)[1] & render_table(camera)[2]
 
     def shows_it(view):
-        rays = geometry.pixel_rays(view.camera) @ view.camera.world_to_camera[:3, :3]
+        rays = world_rays(view.camera)
         depth = (-0.2 - view.camera.center[2]) / np.minimum(rays[..., 2], -1e-3)
         return DepthView.from_range(view.camera, depth, (depth, depth), view.masked)
 
-    above = views[:12]
+    above = table_views[:12]
     others = count_views(geometry.unproject(beneath, camera)[hidden], above[4:]).occluded
     asked = np.zeros_like(hidden)
     asked[hidden] = others > 3
@@ -190,9 +184,9 @@ def test_what_lies_beneath_the_table_in_all_views_but_one_is_not_what_is_behind_
     assert one.unobserved[asked].mean() > 0.75 and all_of_them.unobserved[asked].mean() < 0.1
 
 
-def test_what_stands_before_a_plane_does_not_speak_against_it():
+def test_objects_in_front_of_a_plane_do_not_refute_it():
     """Half of what is around the patch is a ball before the wall; behind, it would be one that cuts through."""
-    view, everywhere, nowhere = camera("v", 0, 0.0), np.ones((CELLS, CELLS), bool), np.zeros((CELLS, CELLS), bool)
+    view, everywhere, nowhere = table_camera("v", 0, 0.0), np.ones((CELLS, CELLS), bool), np.zeros((CELLS, CELLS), bool)
     wall = Plane(
         np.array([1.0, 0, 0]), 0.0, np.zeros(3), np.eye(3)[1:], 0.05, nowhere, everywhere, nowhere, nowhere, nowhere
     )
@@ -213,30 +207,27 @@ def test_slivers_go_and_patches_stay():
     assert not found[:40].any() and found[52:78, 52:88].all() and not (found & ~mask).any()
 
 
-def test_a_vase_that_hides_its_far_side_does_not_speak_against_it(views):
+def test_an_object_that_hides_its_far_side_does_not_refute_it(table_views):
     """Half of the views look at the box's side from behind: something stands before it there."""
     exact = lambda depth: (depth, (depth, depth))
     whole = [
-        DepthView.from_range(v.camera, *exact(drawn_with_the_box(v.camera)), np.zeros_like(v.masked))
-        for v in views[:12]
+        DepthView.from_range(v.camera, *exact(render_box_depth(v.camera)), np.zeros_like(v.masked))
+        for v in table_views[:12]
     ]
     point, side = np.array([[BOX, 0.0, 0.25]]), np.array([[1.0, 0.0, 0.0]])
     plain, faced = count_views(point, whole), count_views(point, whole, side)
     assert plain.occluded[0] >= 4 and faced.occluded[0] == 0 and faced.seen[0] >= 3
 
 
-def drawn_with_the_box(view: Camera) -> np.ndarray:
+def render_box_depth(view: Camera) -> np.ndarray:
     """Depth [H, W] of table, floor and box."""
-    rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
-    low, high = np.array([-BOX, -BOX, 0.0]), np.array([BOX, BOX, HIGH])
-    enter = np.stack([(low - view.center) / rays, (high - view.center) / rays]).min(0).max(-1)
-    depth, hidden, _ = render_scene(view)
-    return np.where(hidden, enter, depth)
+    depth, hidden, _ = render_table(view)
+    return np.where(hidden, meet_box(view, *CORNERS)[0], depth)
 
 
-def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(views):
-    view, other = views[0], views[1]
-    depth, hidden, on_table = render_scene(view.camera)
+def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(table_views):
+    view, other = table_views[0], table_views[1]
+    depth, hidden, on_table = render_table(view.camera)
     place = geometry.unproject(depth, view.camera)
     shadow = on_table & ~hidden & (np.hypot(place[..., 0] - 0.5, place[..., 1] - 0.5) < 0.3)
     grain = np.random.default_rng(0).integers(-12, 13, (SIZE, SIZE, 1))
@@ -246,22 +237,22 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(views):
     found = shadows.detect_shadows(truth, photo, hidden)
     assert (found & shadow).sum() > 0.9 * (shadow & ~view.masked).sum() and not found[5:25, 5:25].any()
     assert not shadows.detect_shadows(truth, truth, hidden).any()
-    there = geometry.unproject(render_scene(other.camera)[0], other.camera)
-    same = render_scene(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.25) & ~other.masked
+    there = geometry.unproject(render_table(other.camera)[0], other.camera)
+    same = render_table(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.25) & ~other.masked
     carried, light = shadows.project_shadow(found, shadows.log_light(truth, photo), depth, view.camera, [other])["a1"]
-    assert carried[same].mean() > 0.9 and not carried[~render_scene(other.camera)[2]].mean() > 0.02
+    assert carried[same].mean() > 0.9 and not carried[~render_table(other.camera)[2]].mean() > 0.02
     lit = np.clip(np.full((SIZE, SIZE, 3), 140) + np.random.default_rng(1).integers(-12, 13, (SIZE, SIZE, 1)), 0, 255)
-    core = render_scene(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.2) & ~other.masked
+    core = render_table(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.2) & ~other.masked
     again = shadows.relight((lit * 0.6).astype(np.uint8), light)
     assert np.abs(again[core].astype(float) - lit[core]).mean() < 4 and np.abs(lit[core] * 0.4).mean() > 50
     outside = ~cv2.dilate(carried.astype(np.uint8), np.ones((9, 9))).astype(bool)
     assert (again[outside] == (lit * 0.6).astype(np.uint8)[outside]).all(), "where nothing is known it stays as it is"
 
 
-def test_what_has_other_colours_than_gravel_is_debris():
+def test_gaussians_of_other_colours_than_gravel_are_debris():
     """Before rough ground nearly everything counts as seen; a teal splinter of the object does not belong there."""
-    view = camera("v", 0, 2.0)
-    depth, _, _ = render_scene(view)
+    view = table_camera("v", 0, 2.0)
+    depth, _, _ = render_table(view)
     rough = (depth * (1 + 0.1 * np.random.default_rng(0).random(depth.shape))).astype(np.float32)
     witness = DepthView.from_range(view, rough, depth_range(rough), np.zeros_like(rough, bool))
     photo = np.random.default_rng(1).integers(90, 160, (*rough.shape, 3)).astype(np.uint8)
@@ -274,15 +265,15 @@ def test_what_has_other_colours_than_gravel_is_debris():
     assert not count_color_mismatches(Gaussians(*parts), [smooth], {"v": photo}).any()
 
 
-def test_views_say_of_points_what_the_formulas_say(views):
+def test_visibility_of_points_follows_the_formulas(table_views):
     """Points on both surfaces, before, behind and beside them, behind cameras and nowhere; with and without a side."""
     noise = np.random.default_rng(0)
     points = noise.uniform(-1.5, 1.5, (3000, 3)) * (1, 1, 0.7)
     points[:1000, 2], points[1000:1500, 2], points[-2], points[-1] = TOP, FLOOR, (9, 0, 0.5), np.nan
     normals = noise.normal(size=points.shape)
     for sides in (None, normals):
-        said, expected = count_views(points, views, sides), np.zeros((4, len(points)), int)
-        for view in views:
+        said, expected = count_views(points, table_views, sides), np.zeros((4, len(points)), int)
+        for view in table_views:
             uv, z = geometry.project(points, view.camera)
             maps = (view.masked, view.nearest, view.farthest)
             (hidden, inside), (nearest, _), (farthest, _) = (geometry.sample_nearest(each, uv) for each in maps)

@@ -1,4 +1,4 @@
-"""The variants of pipeline.yaml: what each leaves out and shares, which Gaussians its terms reach, and that it runs."""
+"""The variants of pipeline.yaml: the stages that each skips and shares, the Gaussians it changes, and runs."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import small_scene as small
 import torch
-from small_capture import prepare as write_capture
-from small_capture import some_truth
-from small_params import altered
-from small_prior import save_small_prior
-from test_distill import OFF, PLAIN, hole, leaves, reached, train_view, wall
+from scenes import wall_scene
+from scenes.capture import make_truth
+from scenes.capture import write_capture as write_capture
+from scenes.distill_scene import OFF, PLAIN, as_leaves, has_gradient, random_wall, square_hole, train_view
+from scenes.networks import save_small_prior
+from scenes.settings import with_changes
+from scenes.stage_runs import run_through_masks
 
 from reffusion import seeding, trace
 from reffusion.distill import loop as D
@@ -34,7 +35,7 @@ from runner.artifacts import hash_contents
 from runner.pipeline import load_pipeline
 from runner.plan import Decision, decide
 from runner.resolve import Request, ResolvedJob, resolve
-from stages import distill, evaluate, finish, fit, initialize, lift, masks
+from stages import distill, evaluate, finish, fit, initialize, lift
 from stages.plan import fit as plan_fit
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -65,7 +66,7 @@ PLANS = {
 # ------------------------------------------------------------------------------------------------------- the plans
 
 
-def decisions(job: ResolvedJob) -> dict[str, Decision]:
+def decide_stages(job: ResolvedJob) -> dict[str, Decision]:
     said: dict[str, Decision] = {}
     for stage in job.pipeline.stages:
         said[stage] = decide(job, stage, said)
@@ -73,10 +74,10 @@ def decisions(job: ResolvedJob) -> dict[str, Decision]:
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    """A small scene, and runs/ as its own run would leave it, as far as the runner looks."""
+def finished_capture(tmp_path_factory):
+    """A small scene, and runs/ after its own run, as far as the runner looks."""
     home = tmp_path_factory.mktemp("variants")
-    scene, runs = write_capture(home / "scene", "llff", some_truth()), home / "runs"
+    scene, runs = write_capture(home / "scene", "llff", make_truth()), home / "runs"
     job, said = resolve(Request(ROOT, runs, str(scene), profile="laptop")), {}
     for stage in job.pipeline.stages:
         said[stage] = decide(job, stage, said)
@@ -101,9 +102,9 @@ def test_every_variant_has_a_plan_here():
 
 
 @pytest.mark.parametrize("variant", PLANS)
-def test_a_variant_runs_what_it_changes_and_shares_the_rest(capture, variant):
-    scene, runs = capture
-    said = decisions(resolve(Request(ROOT, runs, str(scene), profile="laptop", variant=variant)))
+def test_a_variant_runs_what_it_changes_and_shares_the_rest(finished_capture, variant):
+    scene, runs = finished_capture
+    said = decide_stages(resolve(Request(ROOT, runs, str(scene), profile="laptop", variant=variant)))
     runs_here, left_out = PLANS[variant]
     assert {s for s, d in said.items() if d.status == "skip"} == {*left_out, *({"lift"} - set(runs_here))}
     assert {s for s, d in said.items() if d.status in ("run", "stale", "pending")} == set(runs_here)
@@ -114,33 +115,33 @@ def test_a_variant_runs_what_it_changes_and_shares_the_rest(capture, variant):
 
 @pytest.mark.parametrize("variant", [name for name in PLANS if name.startswith("no_")])
 def test_with_the_papers_terms_every_ablation_leaves_something_out(tmp_path, variant):
-    scene = write_capture(tmp_path / "scene", "llff", some_truth())
+    scene = write_capture(tmp_path / "scene", "llff", make_truth())
     request = Request(ROOT, tmp_path / "runs", str(scene), profile="paper-terms")
     assert resolve(request).params != resolve(replace(request, variant=variant)).params
 
 
 def test_the_papers_terms_are_the_papers_at_the_laptops_size(tmp_path):
-    scene, runs = write_capture(tmp_path / "scene", "llff", some_truth()), tmp_path / "runs"
+    scene, runs = write_capture(tmp_path / "scene", "llff", make_truth()), tmp_path / "runs"
     terms = resolve(Request(ROOT, runs, str(scene), profile="paper-terms")).params
     laptop = resolve(Request(ROOT, runs, str(scene), profile="laptop")).params
     size = {"prior", "iterations", "depth.steps", *(f"adversarial.{name}" for name in ("patches", "size", "width"))}
     paper, ours, theirs = (
-        single(p) for p in (distill.Params().model_dump(mode="json"), terms["distill"], laptop["distill"])
+        by_dotted_name(p) for p in (distill.Params().model_dump(mode="json"), terms["distill"], laptop["distill"])
     )
     assert {name for name, value in ours.items() if value != paper[name]} == size
     assert all(ours[name] == theirs[name] for name in size)
     assert {stage for stage in terms if terms[stage] != laptop[stage]} == {"personalize", "initialize", "distill"}
 
 
-def single(params):
+def by_dotted_name(params):
     """Parameters by their dotted names."""
     groups = {name: value for name, value in params.items() if isinstance(value, dict)}
     inner = {f"{name}.{each}": value for name, group in groups.items() for each, value in group.items()}
     return {name: value for name, value in params.items() if name not in groups} | inner
 
 
-def test_the_papers_profile_takes_every_variant(capture):
-    scene, runs = capture
+def test_the_papers_profile_takes_every_variant(finished_capture):
+    scene, runs = finished_capture
     for variant in ("lift_perceptual_diffusion", "sds_plain"):
         resolve(Request(ROOT, runs, str(scene), profile="paper", variant=variant))
 
@@ -150,170 +151,165 @@ def test_the_papers_profile_takes_every_variant(capture):
 MSE, PATCHES = LiftTerm(weight=1), LiftTerm(weight=1, loss="perceptual", patch=20)
 
 
-def lifted(name="a", shift=0.0):
+def lifted_view(name="a", shift=0.0):
     view = train_view(name, shift)
     return replace(view, lifted=torch.rand(view.photo.shape, generator=seeding.generator(4, name)))
 
 
 @pytest.mark.parametrize("how", [MSE, PATCHES], ids=["mse", "patches"])
-def test_lifted_pictures_reach_the_gaussians_they_may_and_no_other(how):
-    start, masked = wall()
+def test_lifted_pictures_reach_only_the_gaussians_they_may(how):
+    start, masked = random_wall()
     for allowed in (masked, torch.ones_like(masked)):
-        gaussians = leaves(start)
-        given = lifted(), how, perceptual.multi_scale_dssim, seeding.generator(1)
+        gaussians = as_leaves(start)
+        given = lifted_view(), how, perceptual.multi_scale_dssim, seeding.generator(1)
         loss, rendering = evaluate_lift(gaussians, allowed, *given)
         loss.backward()
-        got = reached(gaussians)
+        got = has_gradient(gaussians)
         assert not got[~allowed].any() and (got & masked & (rendering.radii > 0)).any()
     assert got[~masked].any(), "unconfined it reaches the unmasked ones"
 
 
 def test_the_squared_error_is_that_of_the_holes_pixels():
-    (gaussians, masked), view = wall(), lifted()
+    (gaussians, masked), view = random_wall(), lifted_view()
     loss, rendering = evaluate_lift(gaussians, masked, view, MSE, None, seeding.generator(1))
-    expected = ((rendering.color - view.lifted)[hole()] ** 2).mean()
+    expected = ((rendering.color - view.lifted)[square_hole()] ** 2).mean()
     assert float(loss) == pytest.approx(float(expected))
-    outside = torch.where(hole()[..., None], view.lifted, float("nan"))
+    outside = torch.where(square_hole()[..., None], view.lifted, float("nan"))
     again, _ = evaluate_lift(gaussians, masked, replace(view, lifted=outside), MSE, None, seeding.generator(1))
     assert float(again) == float(loss), "pixels outside the hole were looked at"
 
 
-def moved(start, ended):
+def has_moved(start, ended):
     return torch.stack([(getattr(ended, n) != getattr(start, n)).flatten(1).any(1) for n in PARAMETERS[:3]]).any(0)
 
 
 @pytest.fixture
-def every_step(monkeypatch):
-    """Gaussians that changed region are looked for after every step."""
+def check_regions_every_step(monkeypatch):
+    """Look for Gaussians that changed region after every step."""
     monkeypatch.setattr(D, "REGION_EVERY", 1)
 
 
-def run_distill(folder, views, **changes):
+def run_short_distill(folder, views, **changes):
     folder.mkdir()
-    settings = altered(PLAIN, **{"iterations": 3, "sds": OFF, "checkpoint_seconds": 10, **changes})
-    (start, masked), holes = wall(), [ReferenceHole(train_view().camera, train_view().photo, hole())]
+    settings = with_changes(PLAIN, **{"iterations": 3, "sds": OFF, "checkpoint_seconds": 10, **changes})
+    (start, masked), holes = random_wall(), [ReferenceHole(train_view().camera, train_view().photo, square_hole())]
     ended, labels = D.distill(start, masked, TermInputs(views, holes, start.means[masked]), settings, folder)
     return start, ended, masked, labels
 
 
-def test_distillation_carries_lifted_pictures_to_masked_gaussians_only(tmp_path, every_step):
-    views = [lifted("a"), lifted("b", 0.1)]
+def test_distillation_carries_lifted_pictures_to_masked_gaussians_only(tmp_path, check_regions_every_step):
+    views = [lifted_view("a"), lifted_view("b", 0.1)]
     chosen = {"lift": {"weight": 1}, "reconstruction": {"every": 0}}
-    start, ended, masked, _ = run_distill(tmp_path / "x", views, **chosen)
-    assert moved(start, ended)[masked].any() and not moved(start, ended)[~masked].any()
+    start, ended, masked, _ = run_short_distill(tmp_path / "x", views, **chosen)
+    assert has_moved(start, ended)[masked].any() and not has_moved(start, ended)[~masked].any()
     assert trace.read_trace(tmp_path / "x" / "trace.jsonl")[-1]["lift"] > 0
     with pytest.raises(ValueError, match="pictures of the stage lift"):
-        run_distill(tmp_path / "y", [train_view()], lift={"weight": 1})
+        run_short_distill(tmp_path / "y", [train_view()], lift={"weight": 1})
     with pytest.raises(ValueError, match="needs a distance"):
-        run_distill(tmp_path / "z", views, lift={"weight": 1, "loss": "perceptual"})
+        run_short_distill(tmp_path / "z", views, lift={"weight": 1, "loss": "perceptual"})
 
 
 @pytest.mark.parametrize("confined", [True, False])
-def test_without_confinement_every_term_reaches_all_gaussians(tmp_path, every_step, confined):
+def test_without_confinement_every_term_reaches_all_gaussians(tmp_path, check_regions_every_step, confined):
     views = [train_view("a"), train_view("b", 0.1)]
     photographs = {"confined": confined}
-    start, ended, masked, labels = run_distill(tmp_path / "photographs", views, **photographs)
-    assert moved(start, ended)[~masked].any() and moved(start, ended)[masked].any() != confined
+    start, ended, masked, labels = run_short_distill(tmp_path / "photographs", views, **photographs)
+    assert has_moved(start, ended)[~masked].any() and has_moved(start, ended)[masked].any() != confined
     reference = {"confined": confined, "reference": {"weight": 1}, "reconstruction": {"every": 0}}
-    start, ended, masked, _ = run_distill(tmp_path / "reference", views, **reference)
-    assert moved(start, ended)[masked].any() and moved(start, ended)[~masked].any() != confined
+    start, ended, masked, _ = run_short_distill(tmp_path / "reference", views, **reference)
+    assert has_moved(start, ended)[masked].any() and has_moved(start, ended)[~masked].any() != confined
     assert (labels == masked).all()
 
 
 @pytest.mark.parametrize("reaches", ["masked", "all"])
-def test_the_references_pixels_may_move_the_background_in_the_hole_too(tmp_path, every_step, reaches):
+def test_the_references_pixels_may_move_the_background_in_the_hole_too(tmp_path, check_regions_every_step, reaches):
     chosen = {"reference": {"weight": 1, "reaches": reaches}, "reconstruction": {"every": 0}}
-    start, ended, masked, _ = run_distill(tmp_path / reaches, [train_view("a")], **chosen)
-    assert moved(start, ended)[masked].any() and moved(start, ended)[~masked].any() == (reaches == "all")
+    start, ended, masked, _ = run_short_distill(tmp_path / reaches, [train_view("a")], **chosen)
+    assert has_moved(start, ended)[masked].any() and has_moved(start, ended)[~masked].any() == (reaches == "all")
 
 
 # ---------------------------------------------------------------------------------------------------- the stages
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene")
-    poses, fitted, _ = small.write(folder, NEAR)
-    found = {"poses": poses, "fit": fitted, "masks": folder / "masks"}
-    found["masks"].mkdir()
-    masks.run(masks.Params(), found["masks"], poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fitted)
-    return found
+def masked_scene(tmp_path_factory):
+    return run_through_masks(tmp_path_factory.mktemp("scene"), NEAR)
 
 
 @pytest.fixture(scope="module")
-def painted(scene, tmp_path_factory):
+def lifted_views(masked_scene, tmp_path_factory):
     out = tmp_path_factory.mktemp("lift")
-    lift.run(lift.Params(), out, **scene)
+    lift.run(lift.Params(), out, **masked_scene)
     return out
 
 
-def initialized(scene, out, start, **needs):
+def run_initialize(masked_scene, out, start, **needs):
     out.mkdir()
     needs = {"reference": None, **needs}
-    initialize.run(initialize.Params(start=start), out, **scene, **needs)
+    initialize.run(initialize.Params(start=start), out, **masked_scene, **needs)
     return load_ply(out / "gaussians.ply"), load_labels(out / "labels.npy")
 
 
-def test_lift_paints_the_hole_of_every_view_and_names_the_painter(scene, painted):
-    sets, facts = load_mask_sets(scene["masks"], small.TRAIN), load_json(painted / "facts.json")
+def test_lift_paints_the_hole_of_every_view_and_names_the_painter(masked_scene, lifted_views):
+    sets, facts = load_mask_sets(masked_scene["masks"], wall_scene.TRAIN), load_json(lifted_views / "facts.json")
     assert facts["views"] == 5 and facts["inpainter"].startswith("OpenCV")
-    for name in small.TRAIN:
-        view, found = small.CAMERAS[name], load_image(painted / "images" / f"{name}.png")
+    for name in wall_scene.TRAIN:
+        view, found = wall_scene.CAMERAS[name], load_image(lifted_views / "images" / f"{name}.png")
         outside = ~sets[name].consistent & ~sets[name].invent
-        assert (found[outside] == small.photo(view)[outside]).all()
+        assert (found[outside] == wall_scene.photo(view)[outside]).all()
         # The square before the wall is red; what is painted continues the wall.
-        error = np.abs(found.astype(int) - small.photo(view))[sets[name].invent]
+        error = np.abs(found.astype(int) - wall_scene.photo(view))[sets[name].invent]
         assert error.mean() < 30, name
-    (best,) = load_references(painted, load_scene(scene["poses"]))
-    assert best.camera.name == load_json(scene["masks"] / "facts.json")["best_reference"]
+    (best,) = load_references(lifted_views, load_scene(masked_scene["poses"]))
+    assert best.camera.name == load_json(masked_scene["masks"] / "facts.json")["best_reference"]
 
 
-def test_lift_goes_on_where_it_was_killed(scene, painted, tmp_path):
-    marked = np.full((small.HEIGHT, small.WIDTH, 3), 7, np.uint8)
+def test_lift_goes_on_where_it_was_killed(masked_scene, lifted_views, tmp_path):
+    marked = np.full((wall_scene.HEIGHT, wall_scene.WIDTH, 3), 7, np.uint8)
     save_image(tmp_path / "images" / "a0.png", marked)
     (tmp_path / "images" / ".a1.png").write_bytes(b"half a picture")
-    lift.run(lift.Params(), tmp_path, **scene)
+    lift.run(lift.Params(), tmp_path, **masked_scene)
     assert (load_image(tmp_path / "images" / "a0.png") == marked).all()
     for name in ("a1", "a4"):
         file = Path("images") / f"{name}.png"
-        assert (tmp_path / file).read_bytes() == (painted / file).read_bytes()
+        assert (tmp_path / file).read_bytes() == (lifted_views / file).read_bytes()
 
 
-def test_lift_by_diffusion(scene, tmp_path):
+def test_lift_by_diffusion(masked_scene, tmp_path):
     save_small_prior(tmp_path / "prior")
     params = lift.Params(inpainter="diffusion", prior=str(tmp_path / "prior"), steps=1)
     (tmp_path / "out").mkdir()
-    lift.run(params, tmp_path / "out", **scene)
+    lift.run(params, tmp_path / "out", **masked_scene)
     facts = load_json(tmp_path / "out" / "facts.json")
     assert facts["inpainter"].startswith("diffusion by") and facts["views"] == 5
 
 
-def test_nothing_is_filled_where_nothing_shall_be(scene, tmp_path):
-    gaussians, new = initialized(scene, tmp_path / "nothing", "nothing", reference=tmp_path / "never read")
-    labels = load_labels(scene["masks"] / "labels.npy")
+def test_initialize_by_nothing_adds_no_gaussians(masked_scene, tmp_path):
+    gaussians, new = run_initialize(masked_scene, tmp_path / "nothing", "nothing", reference=tmp_path / "never read")
+    labels = load_labels(masked_scene["masks"] / "labels.npy")
     assert not new.any() and labels.any()
-    assert (gaussians.means == load_ply(scene["fit"] / "gaussians.ply").means[~labels]).all()
+    assert (gaussians.means == load_ply(masked_scene["fit"] / "gaussians.ply").means[~labels]).all()
 
 
-def test_random_gaussians_fill_the_region_of_the_hole_by_their_seed(scene, tmp_path):
-    gaussians, new = initialized(scene, tmp_path / "random", "random")
+def test_random_gaussians_fill_the_region_of_the_hole_by_their_seed(masked_scene, tmp_path):
+    gaussians, new = run_initialize(masked_scene, tmp_path / "random", "random")
     removed = load_json(tmp_path / "random" / "facts.json")["removed_gaussians"]
-    debris = int(load_labels(scene["masks"] / "debris.npy").sum())
+    debris = int(load_labels(masked_scene["masks"] / "debris.npy").sum())
     assert int(new.sum()) == max(removed - debris, random_init.MIN_GAUSSIANS)
     at = gaussians.means[new]
     # Removed were the square and what of the wall it hides from all views.
-    assert (at[:, :2].abs() < 1.3 * small.HALF).all()
-    assert (at[:, 2] > NEAR - 0.1).all() and (at[:, 2] < small.WALL + 0.1).all()
-    again, _ = initialized(scene, tmp_path / "again", "random")
+    assert (at[:, :2].abs() < 1.3 * wall_scene.HALF).all()
+    assert (at[:, 2] > NEAR - 0.1).all() and (at[:, 2] < wall_scene.WALL + 0.1).all()
+    again, _ = run_initialize(masked_scene, tmp_path / "again", "random")
     assert (again.means == gaussians.means).all() and (again.sh == gaussians.sh).all()
 
 
-def test_scattered_points_lie_where_the_holes_are():
+def test_random_points_lie_in_the_holes():
     box = random_init.bounding_box(np.random.default_rng(0).uniform(-1, 1, (4000, 3)))
     assert np.allclose(box, [[-1.15] * 3, [1.15] * 3], atol=0.05)
     assert np.allclose(random_init.box_at((0, 1, 2), (2, 2, 4)), [[-1, 0, 0], [1, 2, 4]])
-    view, half = small.CAMERAS["a2"], np.zeros((small.HEIGHT, small.WIDTH), bool)
-    half[:, : small.WIDTH // 2] = True
+    view, half = wall_scene.CAMERAS["a2"], np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
+    half[:, : wall_scene.WIDTH // 2] = True
     holes, box = ([view], {"a2": half}), random_init.box_at((0, 0, 2), (0.5, 0.5, 0.5))
     points = random_init.sample_points(box, 300, *holes, torch.Generator())
     assert points.shape == (300, 3) and (points[:, 0] < 0).all()
@@ -321,15 +317,15 @@ def test_scattered_points_lie_where_the_holes_are():
         random_init.sample_points(random_init.box_at((9, 9, 2), (0.1, 0.1, 0.1)), 9, *holes, torch.Generator())
 
 
-def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
+def test_the_chain_of_lifted_pictures(masked_scene, lifted_views, tmp_path, monkeypatch):
     """The hole of the wall filled from pictures inpainted one by one: nearer to the wall than to nothing."""
-    assert initialized(scene, tmp_path / "initialize", "lift", lift=painted)[1].any()
+    assert run_initialize(masked_scene, tmp_path / "initialize", "lift", lift=lifted_views)[1].any()
     with pytest.raises(ValueError, match=r"set distill.lift.weight"):
-        initialized(scene, tmp_path / "without", "lift")
+        run_initialize(masked_scene, tmp_path / "without", "lift")
     reference = tmp_path / "reference"
-    mask = load_mask_sets(scene["masks"], ["a2"])["a2"].invent
-    save_references(reference, [Reference(small.CAMERAS["a2"], small.photo(small.CAMERAS["a2"]), mask)])
-    chain = scene | {"reference": reference, "personalize": None, "initialize": tmp_path / "initialize"}
+    mask = load_mask_sets(masked_scene["masks"], ["a2"])["a2"].invent
+    save_references(reference, [Reference(wall_scene.CAMERAS["a2"], wall_scene.photo(wall_scene.CAMERAS["a2"]), mask)])
+    chain = masked_scene | {"reference": reference, "personalize": None, "initialize": tmp_path / "initialize"}
     for name in ("XDG_CACHE_HOME", "TORCH_HOME"):
         monkeypatch.setenv(name, str(tmp_path / "nothing"))  # as on a machine without weights
     for loss, perceptual_name in (("mse", None), ("perceptual", "multi-scale D-SSIM")):
@@ -337,13 +333,13 @@ def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
         params = distill.Params(iterations=4, lift={"weight": 1, "loss": loss, "patch": 24}, **without)
         out = tmp_path / loss
         out.mkdir()
-        distill.run(params, out, **chain, lift=painted)
+        distill.run(params, out, **chain, lift=lifted_views)
         facts = load_json(out / "facts.json")
         said = facts["perceptual"] and facts["perceptual"].split(" (")[0]
         assert facts["inpainter"].startswith("OpenCV") and said == perceptual_name
         assert trace.read_trace(out / "trace.jsonl")[-1]["lift"] > 0
     out = tmp_path / "evaluate"
-    given = scene | {"raw_masks": scene["poses"].with_name("raw_masks")}
+    given = masked_scene | {"raw_masks": masked_scene["poses"].with_name("raw_masks")}
     given |= {"initialize": chain["initialize"], "distill": tmp_path / "mse"}
     for folder in (tmp_path / "finish", out):
         folder.mkdir()
@@ -355,34 +351,34 @@ def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
     assert summary["consistency"]["pairs"] == 1 and summary["consistency"]["consistency"] < 0.05
 
 
-def test_rendered_views_inpainted_in_2d(scene, tmp_path):
+def test_rendered_views_inpainted_in_2d(masked_scene, tmp_path):
     for name in ("finish", "fit", "inpainted"):
         (tmp_path / name).mkdir()
-    given = scene | {"raw_masks": scene["poses"].with_name("raw_masks")}
+    given = masked_scene | {"raw_masks": masked_scene["poses"].with_name("raw_masks")}
     finish.run(finish.Params(), tmp_path / "finish", **given)
     evaluate.run(evaluate.Params(), tmp_path / "fit", **given, finish=tmp_path / "finish")
     evaluate.run(evaluate.Params(inpaint=True), tmp_path / "inpainted", **given, finish=tmp_path / "finish")
     before, after = (load_json(tmp_path / n / "metrics.json") for n in ("fit", "inpainted"))
     assert before["inpainter"] is None and after["inpainter"].startswith("OpenCV") and after["result"] == "fit"
     assert after["mean"]["psnr_box"] > before["mean"]["psnr_box"] + 5, "the red square is still there"
-    for name in small.TEST:
+    for name in wall_scene.TEST:
         pictures = [load_image(tmp_path / n / "renders" / f"{name}.png") for n in ("fit", "inpainted")]
-        mask = load_mask(scene["masks"] / "consistent" / f"{name}.png")
+        mask = load_mask(masked_scene["masks"] / "consistent" / f"{name}.png")
         assert (pictures[0][~mask] == pictures[1][~mask]).all() and (pictures[0][mask] != pictures[1][mask]).any()
     raw = load_image(tmp_path / "inpainted" / "renders_fit" / "t0.png")
     assert (raw == load_image(tmp_path / "fit" / "renders" / "t0.png")).all()
 
 
-def test_the_masked_fit_never_sees_a_masked_pixel(scene, tmp_path):
+def test_the_masked_fit_never_sees_a_masked_pixel(masked_scene, tmp_path):
     """Photographs with noise where they are masked, and another object's colour, give the same Gaussians to the bit."""
     values = {"iterations": 12, "sh.degree": 0, "init.flow_cell": 6, "densify.cap_max": 1500, "densify.every": 4}
     params = fit.Params(pixels="unmasked").changed(values)
     found = []
     for seed in (0, 1):
-        poses = small.write(tmp_path / f"scene{seed}", NEAR)[0]
-        for name, mask in load_raw_masks(poses.with_name("raw_masks"), small.TRAIN).items():
+        poses = wall_scene.write_poses_and_fit(tmp_path / f"scene{seed}", NEAR)[0]
+        for name, mask in load_raw_masks(poses.with_name("raw_masks"), wall_scene.TRAIN).items():
             noise = np.random.default_rng(seed).integers(0, 256, (*mask.shape, 3), np.uint8)
-            picture = np.where(mask[..., None], noise, small.photo(small.CAMERAS[name]))
+            picture = np.where(mask[..., None], noise, wall_scene.photo(wall_scene.CAMERAS[name]))
             save_image(poses / "images" / f"{name}.png", picture)
         out = tmp_path / f"fit{seed}"
         out.mkdir()
@@ -393,19 +389,19 @@ def test_the_masked_fit_never_sees_a_masked_pixel(scene, tmp_path):
     assert (means[:, 2] > 1.85).float().mean() > 0.95, "Gaussians stand where the object was"
 
 
-def test_a_masked_fit_needs_masks_and_fits_a_scene_that_brings_gaussians(scene, tmp_path):
-    poses = small.write(tmp_path, NEAR, masks={})[0]
+def test_a_masked_fit_needs_masks_and_fits_a_scene_that_brings_gaussians(masked_scene, tmp_path):
+    poses = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})[0]
     with pytest.raises(ValueError, match=r"fit.pixels is 'unmasked', but the scene has no masks"):
         fit.run(fit.Params(iterations=1, pixels="unmasked"), tmp_path, poses=poses, raw_masks=tmp_path / "raw_masks")
-    save_ply(poses / "gaussians.ply", small.gaussians(NEAR)[0])
+    save_ply(poses / "gaussians.ply", wall_scene.wall_and_square(NEAR)[0])
     assert plan_fit.preview(fit.Params(), poses=poses)
     assert not plan_fit.preview(fit.Params(pixels="unmasked"), poses=poses)
 
 
-def test_the_box_is_the_test_masks_whatever_was_left_out(scene, tmp_path):
-    view, given = small.CAMERAS["a1"], load_mask(scene["masks"] / "consistent" / "a1.png")
-    raw_masks = scene["poses"].with_name("raw_masks")
+def test_the_box_is_the_test_masks_whatever_was_left_out(masked_scene, tmp_path):
+    view, given = wall_scene.CAMERAS["a1"], load_mask(masked_scene["masks"] / "consistent" / "a1.png")
+    raw_masks = masked_scene["poses"].with_name("raw_masks")
     raw = load_raw_masks(raw_masks, ["a1"])["a1"]
-    assert (load_object_mask(view, raw_masks, scene["masks"]) == given).all()
+    assert (load_object_mask(view, raw_masks, masked_scene["masks"]) == given).all()
     assert (load_object_mask(view, raw_masks, None) == raw).all()
-    assert not load_object_mask(small.CAMERAS["t0"], raw_masks, None).any()
+    assert not load_object_mask(wall_scene.CAMERAS["t0"], raw_masks, None).any()

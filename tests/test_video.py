@@ -1,4 +1,4 @@
-"""A video as a scene: which frames are taken, what is refused, what is kept; and HEIC photographs."""
+"""Videos as scenes: the choice of frames, refusals, and their cache; HEIC photographs."""
 
 import base64
 import csv
@@ -38,14 +38,14 @@ AAAQAGAAAAAAAA
 """
 
 
-def photographs(step=STEP):
-    """A camera that passes a wall of blocks."""
+def render_walk(step=STEP):
+    """Pictures of a camera that passes a wall of blocks."""
     draw = np.random.default_rng(1)
     wall = cv2.resize(draw.integers(0, 255, (40, 120, 3), np.uint8), None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
     return [wall[:HEIGHT, k * step : k * step + WIDTH] for k in range(SHOTS)]
 
 
-def film(path, pictures):
+def write_video(path, pictures):
     path.parent.mkdir(parents=True, exist_ok=True)
     written = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 30, (WIDTH, HEIGHT))
     for picture in pictures:
@@ -54,19 +54,19 @@ def film(path, pictures):
     return path
 
 
-def shaken(pictures):
-    """Of each: once blurred, as it is, again, and smeared."""
+def blur_some(pictures):
+    """Four pictures for each: blurred, unchanged twice, and smeared."""
     soft = lambda picture: cv2.GaussianBlur(picture, (0, 0), 4)
     return [way(picture) for picture in pictures for way in (soft, np.copy, np.copy, lambda p: cv2.blur(p, (25, 1)))]
 
 
 @pytest.fixture
-def walk(tmp_path):
-    return film(tmp_path / "given" / "walk.mp4", shaken(photographs()))
+def walk_video(tmp_path):
+    return write_video(tmp_path / "given" / "walk.mp4", blur_some(render_walk()))
 
 
-def test_sharp_frames_spaced_by_what_moves_and_the_same_ones_again(walk, tmp_path):
-    said = video.extract_frames(walk, tmp_path / "a", "hash")
+def test_sharp_frames_spaced_by_what_moves_and_the_same_ones_again(walk_video, tmp_path):
+    said = video.update_frames(walk_video, tmp_path / "a", "hash")
     numbers = [int(path.stem.removeprefix("frame_")) for path in sorted((tmp_path / "a/images").iterdir())]
     assert all(number % 4 in (1, 2) for number in numbers), "none is blurred or smeared"
     way = STEP * SHOTS / WIDTH  # widths
@@ -78,66 +78,66 @@ def test_sharp_frames_spaced_by_what_moves_and_the_same_ones_again(walk, tmp_pat
     with open(tmp_path / "a/frames.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 4 * SHOTS and [int(r["frame"]) for r in rows if r["what"] == video.TAKEN] == numbers
-    video.extract_frames(walk, tmp_path / "b", "hash")
+    video.update_frames(walk_video, tmp_path / "b", "hash")
     for path in (tmp_path / "a/images").iterdir():
         assert path.read_bytes() == (tmp_path / "b/images" / path.name).read_bytes()
 
 
 def test_where_the_camera_stands_nothing_is_taken_twice(tmp_path):
-    still = photographs()
-    stands = film(tmp_path / "stands.mp4", [*still[:30], *[still[30]] * 90, *still[30:]])
-    video.extract_frames(stands, tmp_path / "out", "")
+    still = render_walk()
+    stands = write_video(tmp_path / "stands.mp4", [*still[:30], *[still[30]] * 90, *still[30:]])
+    video.update_frames(stands, tmp_path / "out", "")
     numbers = [int(path.stem.removeprefix("frame_")) for path in (tmp_path / "out/images").iterdir()]
     assert sum(30 <= number < 120 for number in numbers) <= 2
 
 
-def test_a_film_that_was_held_upright_stands_upright(walk, tmp_path):
-    data = bytearray(walk.read_bytes())
+def test_a_film_that_was_held_upright_stands_upright(walk_video, tmp_path):
+    data = bytearray(walk_video.read_bytes())
     at = data.find(b"tkhd") + 4 + 40  # the matrix of its track
     data[at : at + 36] = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, HEIGHT << 16, 0, 1 << 30)
-    turned = walk.with_name("turned.mp4")
+    turned = walk_video.with_name("turned.mp4")
     turned.write_bytes(data)
     read = lambda path: next(frame for _, _, frame in video._frames(path, lambda number: number == 9))
-    assert np.array_equal(read(turned), np.rot90(read(walk), -1))
+    assert np.array_equal(read(turned), np.rot90(read(walk_video), -1))
 
 
 @pytest.mark.parametrize(
     ("made", "message"),
     [
         (lambda path: path.write_text("no film"), "not a video that OpenCV reads; mp4, mov, mkv and webm are"),
-        (lambda path: film(path, photographs()[:5]), "5 frames; a video that walks around"),
-        (lambda path: film(path, [photographs()[0]] * 60), "moves by 0% of its width in all; walk around"),
-        (lambda path: film(path, [np.zeros((HEIGHT, WIDTH, 3), np.uint8)] * 60), "moves by 0% of its width"),
-        (lambda path: film(path, [cv2.GaussianBlur(p, (0, 0), 9) for p in photographs()]), "blurred throughout"),
+        (lambda path: write_video(path, render_walk()[:5]), "5 frames; a video that walks around"),
+        (lambda path: write_video(path, [render_walk()[0]] * 60), "moves by 0% of its width in all; walk around"),
+        (lambda path: write_video(path, [np.zeros((HEIGHT, WIDTH, 3), np.uint8)] * 60), "moves by 0% of its width"),
+        (lambda path: write_video(path, [cv2.GaussianBlur(p, (0, 0), 9) for p in render_walk()]), "blurred throughout"),
         (lambda path: path.mkdir(), "a folder; a file is expected"),
     ],
 )
-def test_what_is_no_walk_around_a_scene(tmp_path, made, message):
+def test_videos_without_enough_views_are_refused(tmp_path, made, message):
     made(tmp_path / "x.mp4")
     with pytest.raises(BadInput, match=message):
-        video.extract_frames(tmp_path / "x.mp4", tmp_path / "out", "")
+        video.update_frames(tmp_path / "x.mp4", tmp_path / "out", "")
     assert not (tmp_path / "out/images").exists() and not (tmp_path / "out/frames.json").exists()
 
 
-def test_a_video_is_a_scene(walk, tmp_path, capfd):
+def test_a_video_is_a_scene(walk_video, tmp_path, capfd):
     runs = tmp_path / "runs"
     frames = runs / "walk" / "frames"
-    job = resolve(Request(ROOT, runs, str(walk), "laptop"))
+    job = resolve(Request(ROOT, runs, str(walk_video), "laptop"))
     assert job.folder == frames and job.home == runs / "walk"
-    again = lambda path=walk: update_frames(path, frames, ROOT, job.hashes)
+    again = lambda path=walk_video: update_frames(path, frames, ROOT, job.hashes)
     again()
     assert capfd.readouterr().out.count("frames of walk.mp4, the sharpest of every") == 1, "taken once"
-    other = film(tmp_path / "other" / "walk.mp4", photographs(2))
+    other = write_video(tmp_path / "other" / "walk.mp4", render_walk(2))
     with pytest.raises(Refused, match="holds frames of another video"):
         again(other)
     (frames / "masks").mkdir()
     (frames / "masks/frame_00002.png").write_bytes(b"by hand")
     again()
-    walk.write_bytes(other.read_bytes())
+    walk_video.write_bytes(other.read_bytes())
     with pytest.raises(Refused, match=r"masks/frame_00002.png for them; rename the video"):
         again()
     (runs / "walk/source").write_text(str(frames))
-    clean(Request(ROOT, runs, str(walk)))
+    clean(Request(ROOT, runs, str(walk_video)))
     assert [path.name for path in (runs / "walk").rglob("*") if path.is_file()] == ["frame_00002.png"]
     with pytest.raises(Refused, match="not a video that OpenCV reads"):
         again(ROOT / "README.md")
@@ -156,7 +156,7 @@ def test_photographs_of_a_phone(tmp_path):
         load_image(path)
 
 
-def test_heic_without_its_reader_is_told_in_a_line(tmp_path):
+def test_heic_without_its_reader_is_refused_in_one_line(tmp_path):
     (tmp_path / "a.heic").write_bytes(base64.b64decode(PHONE))
     code = "import sys; sys.modules['pi_heif'] = None\nfrom reffusion.io.images import load_image; load_image('a.heic')"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)

@@ -1,38 +1,40 @@
-"""The viewer: whose camera is drawn, which layers there are, what a visitor is shown, and when."""
+"""The viewer: cameras, layers, and which picture a visitor gets when."""
 
-import time
 import urllib.request
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
-import small_scene
 import torch
-from browser import visiting
+from scenes import wall_scene
+from scenes.browser import open_page
+from scenes.cameras import make_scene
+from scenes.gaussians import join_gaussians
+from scenes.processes import wait_until
 
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.images import save_image, save_mask
 from reffusion.io.ply import save_ply
 from reffusion.io.scene import load_scene, save_scene
 from reffusion.splat import rasterizer
-from reffusion.types import Scene, Similarity
+from reffusion.types import Similarity
 from report import gaussian_layers, unseen_overlay, view
 
 SIMILARITY = Similarity(2.0, np.array([0.1, 0.2, 0.3]))
 NEEDS = {"poses": "a", "fit": "b", "masks": "c", "initialize": "d", "distill": "e", "lift": None}
 
 
-def finished(home, needs):
-    """A run whose result is the wall; before distillation the square stood before it, too."""
-    gaussians, labels = small_scene.gaussians(1.0)
-    train = {name: small_scene.CAMERAS[name] for name in small_scene.TRAIN}
+def write_finished_job(home, needs):
+    """Write a run whose result is the wall; before distillation the square stands in front of it."""
+    gaussians, labels = wall_scene.wall_and_square(1.0)
+    train = {name: wall_scene.CAMERAS[name] for name in wall_scene.TRAIN}
     points = gaussians.means.double().numpy()
-    scene = Scene(train, small_scene.TRAIN, (), frozenset(), points, np.zeros((len(points), 3), np.uint8), SIMILARITY)
+    scene = make_scene(train, points=points, similarity=SIMILARITY)
     poses = home.with_name(home.name.split("@")[0]) / "poses"
     save_scene(poses, scene)
-    for name in small_scene.TRAIN:
-        save_image(poses / "images" / f"{name}.png", small_scene.photo(train[name]))
+    for name in wall_scene.TRAIN:
+        save_image(poses / "images" / f"{name}.png", wall_scene.photo(train[name]))
     for stage in ("fit", "masks", "initialize", "distill"):
         if stage != "masks":
             save_ply(home / stage / "gaussians.ply", gaussians)
@@ -44,7 +46,7 @@ def finished(home, needs):
     return gaussians, labels
 
 
-def visitor(camera):
+def visitor_camera(camera):
     """A visitor's camera as viser describes it."""
     rotation = camera.world_to_camera[:3, :3]
     place = {"wxyz": view._quaternion(rotation.T), "position": camera.center}
@@ -52,10 +54,10 @@ def visitor(camera):
 
 
 def test_a_visitor_who_stands_at_a_view_sees_that_view():
-    gaussians, _ = small_scene.gaussians(1.0)
-    for camera in small_scene.CAMERAS.values():
+    gaussians, _ = wall_scene.wall_and_square(1.0)
+    for camera in wall_scene.CAMERAS.values():
         centred = camera.cropped(0, 0, round(2 * camera.cx), round(2 * camera.cy))
-        seen = view.visitor_camera(visitor(centred), centred.height)
+        seen = view.visitor_camera(visitor_camera(centred), centred.height)
         assert (seen.width, seen.height) == (centred.width, centred.height)
         assert np.allclose(seen.world_to_camera, centred.world_to_camera)
         expected = (rasterizer.render(gaussians, centred).color.clamp(0, 1) * 255).round().byte().numpy()
@@ -63,7 +65,7 @@ def test_a_visitor_who_stands_at_a_view_sees_that_view():
 
 
 def test_the_layers_are_those_that_the_result_was_made_from(tmp_path):
-    gaussians, labels = finished(tmp_path / "x", NEEDS)
+    gaussians, labels = write_finished_job(tmp_path / "x", NEEDS)
     added, kept = int(labels.sum()), int((~labels).sum())
     save_ply(tmp_path / "x/distill/snapshots/20.ply", gaussians.map(lambda p: p[labels]))
     save_ply(tmp_path / "x/distill/snapshots/100.ply", gaussians.map(lambda p: p[labels][:3]))
@@ -75,25 +77,25 @@ def test_the_layers_are_those_that_the_result_was_made_from(tmp_path):
         assert count(state, removed=True) == added, "what the stage masks labelled of the fit"
         assert count(state, kept=True, added=True, removed=True) == kept + new + added and count(state) == 0
     assert torch.equal(found.states["result"][1].opacity_logits, gaussians.opacity_logits[labels])
-    finished(tmp_path / "x@remove", NEEDS | {"initialize": None, "distill": None})
+    write_finished_job(tmp_path / "x@remove", NEEDS | {"initialize": None, "distill": None})
     alone = gaussian_layers.load_layers(tmp_path / "x@remove", SIMILARITY)
     assert list(alone.states) == ["result"] and len(alone.states["result"][1]) == 0 and len(alone.removed) == added
     with pytest.raises(ValueError, match="make scene=x variant=no_sds all"):
         gaussian_layers.load_layers(tmp_path / "x@no_sds", SIMILARITY)
 
 
-def test_what_evaluate_adds_beyond_the_capture_counts_as_kept(tmp_path):
+def test_the_backdrop_of_evaluate_counts_as_kept(tmp_path):
     """And what it leaves out is missing from either."""
-    gaussians, labels = finished(tmp_path / "x", NEEDS)
+    gaussians, labels = write_finished_job(tmp_path / "x", NEEDS)
     backdrop = gaussians.map(lambda p: p[:5] + 3)
-    fewer = gaussians.map(lambda p: p[1:]).zip_map(backdrop, lambda a, b: torch.cat([a, b]))
+    fewer = join_gaussians(gaussians.map(lambda p: p[1:]), backdrop)
     save_ply(tmp_path / "x/evaluate/scene.ply", fewer, similarity=SIMILARITY)
     kept, added = gaussian_layers.load_layers(tmp_path / "x", SIMILARITY).states["result"]
     assert len(kept) + len(added) == len(fewer) and len(added) == int(labels[1:].sum())
 
 
-def test_what_no_photograph_shows_is_hatched(tmp_path):
-    gaussians, _ = finished(tmp_path / "x", NEEDS)
+def test_unobserved_pixels_are_hatched(tmp_path):
+    gaussians, _ = write_finished_job(tmp_path / "x", NEEDS)
     scene = load_scene(tmp_path / "x/poses")
     shape = next(iter(scene.cameras.values()))
     for name in scene.train:  # all of them hide what lies on the left
@@ -107,50 +109,50 @@ def test_what_no_photograph_shows_is_hatched(tmp_path):
     assert unseen_overlay.load_seen_views(tmp_path / "y", scene) == []
 
 
-def test_nothing_is_served_of_a_scene_that_is_not_there(tmp_path):
+def test_a_missing_scene_is_not_served(tmp_path):
     with pytest.raises(ValueError, match="make scene=y all"):
         view.Viewer(tmp_path / "y")
 
 
 @pytest.fixture
-def window(tmp_path):
-    finished(tmp_path / "x", NEEDS)
+def viewer(tmp_path):
+    write_finished_job(tmp_path / "x", NEEDS)
     opened = view.Viewer(tmp_path / "x", port=8300)
     yield opened
     opened.close()
 
 
-def test_the_page_is_served_on_this_machine_only(window):
-    assert window.server.get_host() == "127.0.0.1"
-    with urllib.request.urlopen(f"http://127.0.0.1:{window.server.get_port()}") as page:
+def test_the_page_is_served_on_this_machine_only(viewer):
+    assert viewer.server.get_host() == "127.0.0.1"
+    with urllib.request.urlopen(f"http://127.0.0.1:{viewer.server.get_port()}") as page:
         assert page.status == 200
 
 
-def test_a_visitor_gets_a_small_picture_at_once_then_the_whole_and_another_when_he_chooses(window, monkeypatch):
+def test_a_visitor_gets_a_small_picture_at_once_then_the_whole_and_another_when_he_chooses(viewer, monkeypatch):
     drawn = []
 
-    camera = visitor(small_scene.CAMERAS[small_scene.TRAIN[0]])
+    camera = visitor_camera(wall_scene.CAMERAS[wall_scene.TRAIN[0]])
     camera.on_update = lambda _: None
     guest = SimpleNamespace(
         client_id=7, camera=camera, scene=SimpleNamespace(set_background_image=lambda image, **_: drawn.append(image))
     )
-    monkeypatch.setattr(window.server, "get_clients", lambda: {7: guest})
-    window._serve_visitor(guest)
-    wait(lambda: len(drawn) == 2)
+    monkeypatch.setattr(viewer.server, "get_clients", lambda: {7: guest})
+    viewer._serve_visitor(guest)
+    wait_until(lambda: len(drawn) == 2)
     assert [image.shape[0] for image in drawn] == [view.MOVING, view.STILL]
-    assert np.array_equal(drawn[-1], window._render_for(view.visitor_camera(camera, view.STILL), camera))
-    there = next(h for h in window.server.gui._gui_input_handle_from_uuid.values() if h.label == "what was kept")
+    assert np.array_equal(drawn[-1], viewer._render_for(view.visitor_camera(camera, view.STILL), camera))
+    there = next(h for h in viewer.server.gui._gui_input_handle_from_uuid.values() if h.label == "what was kept")
     there.value = False
-    wait(lambda: len(drawn) == 4)
+    wait_until(lambda: len(drawn) == 4)
     assert drawn[-1].mean() < drawn[1].mean(), "the wall is gone"
-    monkeypatch.setattr(window.server, "get_clients", dict)
-    wait(lambda: 7 not in window.requests)
+    monkeypatch.setattr(viewer.server, "get_clients", dict)
+    wait_until(lambda: 7 not in viewer.requests)
 
 
 @pytest.mark.parametrize("width", [1280, 390])
-def test_a_browser_shows_the_result_without_what_is_unchecked_and_before_distillation(window, width):
+def test_a_browser_shows_the_result_without_what_is_unchecked_and_before_distillation(viewer, width):
     """The square, added by distillation, is red and in the middle of the picture; the page asks no other machine."""
-    with visiting(f"http://127.0.0.1:{window.server.get_port()}", width) as page:
+    with open_page(f"http://127.0.0.1:{viewer.server.get_port()}", width) as page:
         page.wait_for_selector("canvas", timeout=60000)
 
         def red() -> bool:
@@ -160,19 +162,11 @@ def test_a_browser_shows_the_result_without_what_is_unchecked_and_before_distill
             )
             return red > 150 > 100 > max(blue, green)
 
-        wait(red)
+        wait_until(red)
         added = page.get_by_role("checkbox").nth(1)
         added.uncheck()
-        wait(lambda: not red())
+        wait_until(lambda: not red())
         added.check()
-        wait(red)
+        wait_until(red)
         page.get_by_role("slider").press("ArrowLeft")
         page.wait_for_function("document.body.innerText.match(/initialization/g).length > 1")
-
-
-def wait(done):
-    for _ in range(600):
-        if done():
-            return
-        time.sleep(0.05)
-    raise AssertionError("it did not happen within half a minute")

@@ -1,4 +1,4 @@
-"""Weights: found in each layout without a network; each way in which they may be wrong has its message; fetching."""
+"""Weights: found in each layout without a network, a message for each fault, and downloads."""
 
 import hashlib
 import http.server
@@ -27,8 +27,8 @@ PARTS = ("unet", "vae", "text_encoder", "tokenizer", "scheduler")
 
 
 @pytest.fixture
-def caches(tmp_path, monkeypatch):
-    """Empty caches, a working directory without anything, and no network."""
+def isolated_machine(tmp_path, monkeypatch):
+    """Empty caches, an empty working directory, and no network."""
     for name in ("HF_HUB_CACHE", "HF_HUB_OFFLINE", "TORCH_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -45,7 +45,7 @@ def caches(tmp_path, monkeypatch):
     return tmp_path
 
 
-def copied(target: Path) -> Path:
+def copy_prior(target: Path) -> Path:
     target.mkdir(parents=True)
     for part in PARTS:
         shutil.copytree(TINY / part, target / part)
@@ -53,10 +53,10 @@ def copied(target: Path) -> Path:
     return target
 
 
-def cached(tmp_path, name="acme/paint", state="0123abc", main=True) -> Path:
-    """An entry of the hub's cache."""
+def write_hub_entry(tmp_path, name="acme/paint", state="0123abc", main=True) -> Path:
+    """Write an entry of the hub's cache."""
     entry = tmp_path / "hub" / "hub" / f"models--{name.replace('/', '--')}"
-    copied(entry / "snapshots" / state)
+    copy_prior(entry / "snapshots" / state)
     if main:
         (entry / "refs").mkdir()
         (entry / "refs" / "main").write_text(state)
@@ -66,15 +66,15 @@ def cached(tmp_path, name="acme/paint", state="0123abc", main=True) -> Path:
 # ------------------------------------------------------------------------------------------------------ where they lie
 
 
-def test_an_id_is_found_in_the_hub_cache_and_loaded_without_a_network(caches):
-    entry = cached(caches)
+def test_an_id_is_found_in_the_hub_cache_and_loaded_without_a_network(isolated_machine):
+    entry = write_hub_entry(isolated_machine)
     assert local.locate("acme/paint") == entry / "snapshots" / "0123abc"
     prior = load_prior("acme/paint")
     assert prior.native_size == 64 and load_prior(entry).native_size == 64
 
 
-def test_the_state_that_main_names_is_taken(caches):
-    entry = cached(caches, main=False)
+def test_the_state_that_main_names_is_taken(isolated_machine):
+    entry = write_hub_entry(isolated_machine, main=False)
     assert local.locate("acme/paint") == entry / "snapshots" / "0123abc"  # the only one
     (entry / "snapshots" / "0456def").mkdir()
     assert local.locate("acme/paint") is None
@@ -83,33 +83,33 @@ def test_the_state_that_main_names_is_taken(caches):
     assert local.locate("acme/paint").name == "0456def"
 
 
-def test_an_id_is_found_as_a_folder_here_and_in_the_projects_cache(caches):
-    mine = copied(caches / "cache" / "reffusion" / "acme" / "paint")
+def test_an_id_is_found_as_a_folder_here_and_in_the_projects_cache(isolated_machine):
+    mine = copy_prior(isolated_machine / "cache" / "reffusion" / "acme" / "paint")
     assert local.locate("acme/paint") == mine
-    here = copied(caches / "elsewhere" / "acme" / "paint")
+    here = copy_prior(isolated_machine / "elsewhere" / "acme" / "paint")
     assert local.locate("acme/paint").resolve() == here
 
 
-def test_the_hubs_own_variables_are_read(caches, monkeypatch):
-    assert local.hub_cache() == caches / "hub" / "hub"
-    monkeypatch.setenv("HF_HUB_CACHE", str(caches / "other"))
-    assert local.hub_cache() == caches / "other"
+def test_the_hubs_own_variables_are_read(isolated_machine, monkeypatch):
+    assert local.hub_cache() == isolated_machine / "hub" / "hub"
+    monkeypatch.setenv("HF_HUB_CACHE", str(isolated_machine / "other"))
+    assert local.hub_cache() == isolated_machine / "other"
 
 
-def test_what_is_not_here_is_told_at_once_with_the_alternatives(caches):
+def test_missing_weights_are_reported_at_once_with_alternatives(isolated_machine):
     with pytest.raises(
         ValueError, match=r"prior priors/tiny is not on this machine: no folder .*elsewhere/priors/tiny"
     ):
         load_prior("priors/tiny")
     with pytest.raises(ValueError, match=r"run `make weights`.*stable-diffusion-v1-5/stable-diffusion-inpainting"):
         load_prior(published.SD2)
-    for wrong in (caches / "absent", "./absent", "three/part/name", "~/absent"):
+    for wrong in (isolated_machine / "absent", "./absent", "three/part/name", "~/absent"):
         with pytest.raises(ValueError, match="no such folder"):
             load_prior(wrong)
 
 
-def test_half_precision_files_alone_are_enough(caches):
-    folder = copied(caches / "half")
+def test_half_precision_files_alone_are_enough(isolated_machine):
+    folder = copy_prior(isolated_machine / "half")
     (folder / "unet" / "diffusion_pytorch_model.safetensors").rename(
         folder / "unet" / "diffusion_pytorch_model.fp16.safetensors"
     )
@@ -120,15 +120,15 @@ def test_half_precision_files_alone_are_enough(caches):
 # -------------------------------------------------------------------------------------------------------- what is wrong
 
 
-def edit(path: Path, **changes) -> None:
+def edit_json(path: Path, **changes) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
-def cut(path: Path, keep: float) -> None:
+def truncate_to_share(path: Path, keep: float) -> None:
     path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
 
 
-def without_a_weight(path: Path) -> None:
+def drop_weight(path: Path) -> None:
     state = load_file(path)
     state.pop(sorted(state)[0])
     save_file(state, path, metadata={"format": "pt"})
@@ -138,56 +138,68 @@ UNET, VAE, TEXT = "unet/config.json", "vae/config.json", "text_encoder/config.js
 WRONG = {
     "a part is missing": (lambda f: shutil.rmtree(f / "vae"), "lacks vae; it must be a diffusers pipeline folder"),
     "cut short": (
-        lambda f: cut(f / "unet/diffusion_pytorch_model.safetensors", 0.9),
+        lambda f: truncate_to_share(f / "unet/diffusion_pytorch_model.safetensors", 0.9),
         r"unet/diffusion_pytorch_model.safetensors is cut short.*make weights",
     ),
-    "cut to nothing": (lambda f: cut(f / "text_encoder/model.safetensors", 0), "no readable header"),
+    "cut to nothing": (lambda f: truncate_to_share(f / "text_encoder/model.safetensors", 0), "no readable header"),
     "a web page": (lambda f: (f / "text_encoder/model.safetensors").write_text("<html>" * 9), "no readable header"),
     "no safetensors": (lambda f: (f / "text_encoder/model.safetensors").unlink(), "no .safetensors file there"),
     "no configuration": (lambda f: (f / VAE).write_text("{"), r"vae/config.json cannot be read"),
-    "no inpainting model": (lambda f: edit(f / UNET, in_channels=4), "takes 4 channels.*takes 9"),
-    "parts of two models": (lambda f: edit(f / TEXT, hidden_size=32), "text of width 64, the text encoder gives 32"),
+    "no inpainting model": (lambda f: edit_json(f / UNET, in_channels=4), "takes 4 channels.*takes 9"),
+    "parts of two models": (
+        lambda f: edit_json(f / TEXT, hidden_size=32),
+        "text of width 64, the text encoder gives 32",
+    ),
     "unknown prediction": (
-        lambda f: edit(f / "scheduler/scheduler_config.json", prediction_type="sample"),
+        lambda f: edit_json(f / "scheduler/scheduler_config.json", prediction_type="sample"),
         "prediction_type 'sample' is not supported; epsilon and v_prediction are",
     ),
-    "shapes of the UNet": (lambda f: edit(f / UNET, block_out_channels=[32, 64, 128]), "unet: the weights do not fit"),
-    "shapes of the text encoder": (lambda f: edit(f / TEXT, intermediate_size=96), "text_encoder: the weights do not"),
-    "a weight is missing": (lambda f: without_a_weight(f / "text_encoder/model.safetensors"), "1 weights are missing"),
+    "shapes of the UNet": (
+        lambda f: edit_json(f / UNET, block_out_channels=[32, 64, 128]),
+        "unet: the weights do not fit",
+    ),
+    "shapes of the text encoder": (
+        lambda f: edit_json(f / TEXT, intermediate_size=96),
+        "text_encoder: the weights do not",
+    ),
+    "a weight is missing": (lambda f: drop_weight(f / "text_encoder/model.safetensors"), "1 weights are missing"),
     "a weight of the UNet is missing": (
-        lambda f: without_a_weight(f / "unet/diffusion_pytorch_model.safetensors"),
+        lambda f: drop_weight(f / "unet/diffusion_pytorch_model.safetensors"),
         "unet: .*missing",
     ),
-    "half an SDXL": (lambda f: edit(f / UNET, addition_embed_type="text_time"), "neither Stable Diffusion nor SDXL"),
+    "half an SDXL": (
+        lambda f: edit_json(f / UNET, addition_embed_type="text_time"),
+        "neither Stable Diffusion nor SDXL",
+    ),
 }
 
 
 @pytest.mark.parametrize("spoil, message", WRONG.values(), ids=WRONG)
-def test_each_fault_has_its_message(caches, spoil, message):
-    folder = copied(caches / "faulty")
+def test_each_fault_has_its_message(isolated_machine, spoil, message):
+    folder = copy_prior(isolated_machine / "faulty")
     spoil(folder)
     with pytest.raises(ValueError, match=rf"prior (?s:.*){message}"):
         load_prior(folder)
 
 
-def test_a_lost_shard_is_named(caches):
-    folder = copied(caches / "shards")
+def test_a_lost_shard_is_named(isolated_machine):
+    folder = copy_prior(isolated_machine / "shards")
     index = folder / "unet" / "diffusion_pytorch_model.safetensors.index.json"
     index.write_text(json.dumps({"weight_map": {"a": "diffusion_pytorch_model-00001-of-00002.safetensors"}}))
     with pytest.raises(ValueError, match=r"00001-of-00002.safetensors is missing"):
         local.check(folder)
 
 
-def test_what_a_stage_needs(caches):
+def test_weights_needed_by_a_stage(isolated_machine):
     need = local.model_need(published.SD2, "float16")
     assert "not on this machine" in need.problem and need.fetched and 2.5e9 < need.bytes < 2.7e9
-    folder = copied(caches / "good")
+    folder = copy_prior(isolated_machine / "good")
     assert local.model_need(str(folder), "float32").problem is None
     shutil.rmtree(folder / "unet")
     broken = local.model_need(str(folder), "float32")
     assert "lacks unet" in broken.problem and not broken.fetched
     assert "no weights of alex and vgg" in local.lpips_need().problem and local.lpips_need().optional
-    own = caches / "cache" / "reffusion" / "lpips"
+    own = isolated_machine / "cache" / "reffusion" / "lpips"
     own.mkdir(parents=True)
     for name in ("alex.safetensors", "vgg.pth"):  # whole, and half of a pair
         (own / name).write_bytes(b"x")
@@ -221,10 +233,10 @@ def test_one_set_of_weights_a_part_is_chosen():
 
 
 class Hub(http.server.BaseHTTPRequestHandler):
-    """As much of a hub as fetching asks for: models, one that is gated, none else.
+    """The part of a hub that downloads use: models, one of them gated.
 
     `models`: name -> file -> bytes. `spoilt`: files that arrive with a byte flipped. `stalls`: files of which half is
-    sent, and then nothing. `ranges`: first bytes asked for, where not 0. Set by `hub`.
+    sent, and then nothing. `ranges`: the first bytes of range requests, where not 0. Set by `hub`.
     """
 
     STATE = "a" * 40
@@ -308,8 +320,8 @@ for name in sys.argv[1:]:
 """
 
 
-def fetched(*names, **environment) -> list[str]:
-    """What fetching these models says, a line each; a fresh process, for the hub's address is read once."""
+def fetch_models(*names, **environment) -> list[str]:
+    """The output of downloading these models, in lines; in a new process, which reads the hub's address."""
     variables = {k: v for k, v in os.environ.items() if not k.startswith("HF_")} | environment
     variables |= {"PYTHONPATH": str(ROOT), "HF_HUB_DISABLE_XET": "1", "HF_HUB_ETAG_TIMEOUT": "2"}
     done = subprocess.run(
@@ -318,8 +330,10 @@ def fetched(*names, **environment) -> list[str]:
     return done.stdout.strip().splitlines()
 
 
-def test_a_model_is_fetched_from_the_hub_and_its_refusals_are_told_apart(tmp_path, monkeypatch, hub):
-    said = fetched("acme/paint", "acme/gated", "acme/gone", published.SD2, HF_ENDPOINT=hub[0], HF_HOME=str(tmp_path))
+def test_a_model_is_fetched_from_the_hub_and_each_refusal_has_its_message(tmp_path, monkeypatch, hub):
+    said = fetch_models(
+        "acme/paint", "acme/gated", "acme/gone", published.SD2, HF_ENDPOINT=hub[0], HF_HOME=str(tmp_path)
+    )
     folder, gated, gone, moved = said
     monkeypatch.delenv("HF_HUB_CACHE", raising=False)
     monkeypatch.setenv("HF_HOME", str(tmp_path))
@@ -382,8 +396,8 @@ def test_weights_of_the_laptop_are_fetched_killed_resumed_and_checked(tmp_path, 
             assert [path.read_bytes() for path in found] == ([files[name]] if name != "README.md" else [])
 
 
-def test_no_network_and_the_offline_switch_are_told(tmp_path):
-    (unreachable,) = fetched("acme/paint", HF_ENDPOINT="http://127.0.0.1:9", HF_HOME=str(tmp_path))
+def test_missing_network_and_offline_mode_have_their_messages(tmp_path):
+    (unreachable,) = fetch_models("acme/paint", HF_ENDPOINT="http://127.0.0.1:9", HF_HOME=str(tmp_path))
     assert "acme/paint: the hub does not answer" in unreachable and "copy its cache" in unreachable
-    (offline,) = fetched("acme/paint", HF_HUB_OFFLINE="1", HF_HOME=str(tmp_path))
+    (offline,) = fetch_models("acme/paint", HF_HUB_OFFLINE="1", HF_HOME=str(tmp_path))
     assert "HF_HUB_OFFLINE is set" in offline

@@ -1,0 +1,1 @@
+"""Small scenes, captures, pipelines and networks with known truth, from which tests are built."""

@@ -1,0 +1,31 @@
+"""A real browser without a window, where there is one."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+@contextmanager
+def open_page(address: str, width: int = 1280) -> Iterator[object]:
+    """Open a page of this width; it must log no error and make no request to another machine."""
+    if not CHROMIUM:
+        pytest.skip("no Chromium is installed")
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    wrong: list[str] = []
+    with playwright.sync_playwright() as engine:
+        browser = engine.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": width, "height": 900}, bypass_csp=True)  # so that tests may ask
+        page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        own = ("data:", "blob:", "file:", "http://127.0.0.1:")
+        page.on("request", lambda asked: None if asked.url.startswith(own) else wrong.append(asked.url[:200]))
+        page.goto(address)
+        yield page
+        browser.close()
+    assert not wrong, wrong

@@ -1,0 +1,66 @@
+"""Commands of the project in processes of their own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def start_module(
+    module: str,
+    *arguments: object,
+    cwd: Path = ROOT,
+    env: Mapping[str, str] | None = None,
+    merge_stderr: bool = False,
+    preexec_fn: Callable[[], object] | None = None,
+) -> subprocess.Popen[str]:
+    """Start `python -m module arguments`; its output is captured.
+
+    Args:
+        env: variables that are set beside those of this process.
+        merge_stderr: errors go into the output.
+        preexec_fn: called in the new process before it runs the module.
+    """
+    command = [sys.executable, "-m", module, *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **(env or {})}
+    errors = subprocess.STDOUT if merge_stderr else subprocess.PIPE
+    return subprocess.Popen(
+        command, cwd=cwd, env=environment, stdout=subprocess.PIPE, stderr=errors, text=True, preexec_fn=preexec_fn
+    )
+
+
+def run_module(
+    module: str,
+    *arguments: object,
+    cwd: Path = ROOT,
+    env: Mapping[str, str] | None = None,
+    timeout: float | None = None,
+    preexec_fn: Callable[[], object] | None = None,
+) -> subprocess.CompletedProcess[str]:
+    """Run `python -m module arguments` to its end, at most `timeout` seconds."""
+    process = start_module(module, *arguments, cwd=cwd, env=env, preexec_fn=preexec_fn)
+    output, errors = process.communicate(timeout=timeout)
+    return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    """Return once the condition holds; fail after 30 s."""
+    for _ in range(600):
+        if condition():
+            return
+        time.sleep(0.05)
+    raise AssertionError("waited 30 s in vain")
+
+
+def fake_nvidia_smi(folder: Path, output: str) -> dict[str, str]:
+    """An environment in which `nvidia-smi` prints this output."""
+    tool = folder / "nvidia-smi"
+    tool.write_text(f"#!/bin/sh\necho '{output}'\n")
+    tool.chmod(0o755)
+    return {**os.environ, "PATH": f"{folder}:{os.environ['PATH']}"}

@@ -1,0 +1,73 @@
+"""The camera path around a capture and the video along it."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scenes import wall_scene
+from scenes.cameras import make_scene
+
+from reffusion import geometry
+from reffusion.io.ply import save_ply
+from reffusion.io.scene import save_scene
+from reffusion.types import Camera, Similarity
+from report import camera_path, turntable
+
+
+def ring_cameras(count: int, radius: float, height: float = 0.3) -> list[Camera]:
+    """Cameras on a circle about the y axis, rows downwards along +y, all looking at the origin."""
+    turns = 2 * np.pi * np.arange(count) / count
+    centers = np.stack([radius * np.cos(turns), np.full(count, -height), radius * np.sin(turns)], 1)
+    poses = [camera_path.look_at(center, np.zeros(3), np.array([0.0, 1.0, 0.0])) for center in centers]
+    return [Camera(str(k), 64, 48, 60.0, 60.0, 31.0, 25.0, pose) for k, pose in enumerate(poses)]
+
+
+def test_a_ring_of_cameras_gives_the_ring_back():
+    made = camera_path.ellipse_path(ring_cameras(9, 2.0), np.random.default_rng(0).normal(0, 0.1, (50, 3)), 12)
+    centers = np.stack([camera.center for camera in made])
+    assert np.allclose(np.hypot(centers[:, 0], centers[:, 2]), 2.0) and np.allclose(centers[:, 1], -0.3)
+    steps = np.linalg.norm(np.diff(centers, axis=0, append=centers[:1]), axis=1)
+    assert np.allclose(steps, steps[0]), "closed, and even"
+    assert np.allclose(camera_path.focus_point(ring_cameras(9, 2.0), np.zeros((0, 3))), 0, atol=0.02)
+
+
+def test_every_camera_looks_at_the_focus_upright():
+    cameras = list(wall_scene.CAMERAS.values())
+    points = np.array([[0.0, 0.0, 2.0]])
+    target = camera_path.focus_point(cameras, points)
+    assert target[2] == pytest.approx(2.0, abs=0.05), "parallel axes: the points say how far"
+    for camera in camera_path.ellipse_path(cameras, points, 8):
+        rotation = camera.world_to_camera[:3, :3]
+        assert np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) > 0
+        pixels, depth = geometry.project(target[None], camera)
+        assert np.allclose(pixels[0], (camera.width / 2, camera.height / 2)) and depth[0] > 0
+        assert rotation[1, 1] > 0.9, "rows go down as the photographs' do"
+
+
+def test_degenerate_captures_have_a_path():
+    above = [camera_path.look_at(np.array([0.0, -2.0, 0.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))]
+    one = [Camera("v", 8, 6, 9.0, 9.0, 4.0, 3.0, above[0])]
+    for camera in camera_path.ellipse_path(one, np.zeros((0, 3)), 3):
+        assert np.isfinite(camera.world_to_camera).all() and np.allclose(camera.center, (0, -2, 0))
+    with pytest.raises(ValueError, match="needs a camera"):
+        camera_path.ellipse_path([], np.zeros((0, 3)), 3)
+
+
+def test_the_video_shows_the_result_of_a_variant_in_the_scenes_poses(tmp_path):
+    gaussians, labels = wall_scene.wall_and_square(1.0)
+    similarity = Similarity(2.0, np.array([0.1, 0.2, 0.3]))
+    train = {name: wall_scene.CAMERAS[name] for name in wall_scene.TRAIN}
+    points = gaussians.means.double().numpy()[~labels.numpy()]
+    scene = make_scene(train, points=points, similarity=similarity)
+    save_scene(tmp_path / "x" / "poses", scene)
+    with pytest.raises(ValueError, match="make scene=x all"):
+        turntable.make(tmp_path / "x@no_sds")
+    wall = gaussians.map(lambda p: p[~labels])
+    save_ply(tmp_path / "x@no_sds" / "evaluate" / "scene.ply", wall, similarity=similarity)
+    film, frames = cv2.VideoCapture(str(turntable.make(tmp_path / "x@no_sds", frames=6))), []
+    while (read := film.read())[0]:
+        frames.append(read[1])
+    assert len(frames) == 6 and frames[0].shape == (wall_scene.HEIGHT, wall_scene.WIDTH, 3)
+    first = camera_path.ellipse_path(list(train.values()), points, 6)[0]
+    drawn = turntable.rasterizer.render(wall, first).color
+    assert (torch.from_numpy(frames[0][..., ::-1].copy()) / 255 - drawn).abs().mean() < 0.03, "but for compression"

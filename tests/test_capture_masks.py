@@ -1,0 +1,189 @@
+"""Captures with uncommon masks and references, and pictures paired with poses by order."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from scenes.capture import (
+    HEIGHT,
+    WIDTH,
+    Truth,
+    make_truth,
+    preview_stages,
+    write_capture,
+    write_masks,
+    write_pictures,
+)
+from scenes.capture_checks import (
+    OBJECT,
+    SHARE,
+    assert_cameras,
+    assert_masked_views,
+    assert_message,
+    masked_share,
+    refusal_before_writing,
+    refusal_message,
+    rename_views,
+    run_with_messages,
+    write_named_model,
+)
+from scenes.room import render_room_corner, room_walk, speckle_texture
+
+from reffusion.io.images import save_image
+
+# ---------------------------------------------------------------------------------------------- F: masks of any kind
+
+
+def write_capture_with_masks(folder: Path, masks: str, draw) -> Truth:
+    """Write a COLMAP capture whose masks are the Pillow images that `draw` returns."""
+    truth = make_truth()
+    write_capture(folder, "colmap", truth)
+    (folder / "masks").rename(folder / masks)
+    for path in (folder / masks).iterdir():
+        draw().save(path)
+    return truth
+
+
+def palette_image(numbers: np.ndarray, colors: dict[int, tuple[int, int, int]]) -> Image.Image:
+    image, table = Image.fromarray(numbers.astype(np.uint8), "L"), np.full((256, 3), 17)
+    for number, color in colors.items():
+        table[number] = color
+    image.putpalette(table.astype(np.uint8).tobytes())
+    assert image.mode == "P"
+    return image
+
+
+def test_palette_whose_black_is_the_last_entry(tmp_path):
+    """As an annotation tool writes it whose table begins with the first label, dark red."""
+    draw = lambda: palette_image(np.where(OBJECT, 0, 2), {0: (128, 0, 0), 1: (0, 128, 0), 2: (0, 0, 0)})
+    truth = write_capture_with_masks(tmp_path / "s", "masks", draw)
+    _, out, _ = run_with_messages(tmp_path / "s")
+    assert_masked_views(out, truth.world_to_camera)
+
+
+def test_one_class_of_a_palette_by_its_number(tmp_path):
+    """Pascal VOC: classes by number, the contour is 255 and bright."""
+    numbers = np.where(OBJECT, 15, 0)
+    numbers[50:60, 10:90] = 7
+    numbers[HEIGHT // 4 - 1, WIDTH // 4 : WIDTH // 2] = 255
+    colors = {0: (0, 0, 0), 7: (128, 128, 128), 15: (192, 128, 128), 255: (224, 224, 192)}
+    truth = write_capture_with_masks(tmp_path / "s", "SegmentationClass", lambda: palette_image(numbers, colors))
+    _, out, _ = run_with_messages(tmp_path / "s", masks={"folder": "SegmentationClass", "id": 15})
+    assert_masked_views(out, truth.world_to_camera)
+
+
+def numbered_16_bit() -> Image.Image:
+    """A 16-bit map of object numbers: the object has the parts 3 and 1024 and stands on 40000."""
+    numbers = np.where(OBJECT, 1024, 0).astype(np.uint16)
+    numbers[HEIGHT // 4 : HEIGHT // 4 + 5][:, WIDTH // 4 : WIDTH // 2] = 3
+    numbers[50:] = 40000
+    return Image.fromarray(numbers)
+
+
+def test_object_numbers_of_16_bits_are_refused_without_id(tmp_path):
+    write_capture_with_masks(tmp_path / "s", "masks", numbered_16_bit)
+    message = refusal_before_writing(tmp_path / "s")
+    assert ".png" in message and re.search(r"\bid\b", message), message
+
+
+def test_two_object_numbers_of_16_bits(tmp_path):
+    truth = write_capture_with_masks(tmp_path / "s", "masks", numbered_16_bit)
+    _, out, _ = run_with_messages(tmp_path / "s", masks={"id": [3, 1024]})
+    assert_masked_views(out, truth.world_to_camera)
+
+
+def test_antialiased_outlines_are_no_object_numbers(tmp_path):
+    soft = cv2.GaussianBlur(255 * OBJECT.astype(np.uint8), (0, 0), 0.8)
+    truth = write_capture_with_masks(tmp_path / "s", "masks", lambda: Image.fromarray(soft))
+    _, out, _ = run_with_messages(tmp_path / "s")
+    assert [masked_share(out, v) for v in truth.world_to_camera] == pytest.approx([SHARE] * 6, abs=0.003)
+
+
+# ---------------------------------------------------------------------------------------------- G: references
+
+
+def test_reference_and_its_depth_among_photographs_of_input(tmp_path):
+    folder, names = tmp_path / "s", [f"IMG_{k}" for k in range(6)]
+    write_pictures(folder / "input", [*names, "clean plate"], ending=".jpg")
+    Image.fromarray(np.full((HEIGHT, WIDTH), 4000, np.uint16)).save(folder / "input/clean plate depth.png")
+    write_masks(folder / "masks", names)
+    reference = {"view": "IMG_2", "image": "input/clean plate.jpg", "depth": "input/clean plate depth.png"}
+    notes = preview_stages(folder, reference=reference)
+    assert_message(notes, "6 training")
+    assert_message(notes, "6 masks")
+    assert_message(notes, "6 photos bring no poses")
+
+
+def test_two_references_beside_pictures_of_llff(tmp_path):
+    folder, truth = tmp_path / "s", make_truth()
+    write_capture(folder, "llff", truth)
+    write_pictures(folder / "images_4", ["v00_inpainted", "v03_inpainted"])
+    references = [{"view": f"v0{k}", "image": f"images_4/v0{k}_inpainted.png"} for k in (0, 3)]
+    scene, out, _ = run_with_messages(folder, reference=references)
+    assert scene.train == tuple(sorted(truth.world_to_camera))
+    assert_cameras(scene, truth)
+    assert_masked_views(out, truth.world_to_camera)
+
+
+# ---------------------------------------------------------------------------------------------- H: order
+
+
+def test_frames_of_another_tool_are_not_paired_by_order(tmp_path):
+    folder, truth = tmp_path / "s", make_truth()
+    stems = [f"frame_{k:05d}" for k in range(6)]
+    write_pictures(folder / "images", stems, ending=".jpg")
+    write_masks(folder / "masks", stems)
+    names = {v: f"DJI_{10 * k:04d}_V.JPG" for k, v in enumerate(sorted(truth.world_to_camera))}
+    write_named_model(folder / "sparse/0", truth, names, text=True)
+    assert_message([refusal_message(folder)], "images")
+
+
+def write_corner_capture(folder: Path, order: list[int]) -> Truth:
+    """A drawn corner of a room, its points coloured as seen, and images IMG_8 to IMG_13 in the model; `image00k.png` is
+    the view number `order[k]`."""
+    generator, cameras = np.random.default_rng(5), room_walk(6)
+    textures = np.stack([cv2.GaussianBlur(speckle_texture(generator), (0, 0), 5) for _ in range(3)])
+    textures = 255 * (textures - textures.min()) / np.ptp(textures)
+    pictures = [render_room_corner(pose, textures, (WIDTH, HEIGHT), 90.0) for pose in cameras.values()]
+    columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(4, WIDTH, 9), np.arange(4, HEIGHT, 9)))
+    rays = np.stack([(columns + 0.5 - WIDTH / 2) / 90, (rows + 0.5 - HEIGHT / 2) / 90, np.ones(len(rows))], -1)
+    points, colors = [], []
+    for pose, picture in zip(cameras.values(), pictures, strict=True):
+        directions, center = rays @ pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
+        times = (np.array([2.0, 1.5, 3.0]) - center) / directions
+        points.append(center + directions * np.where(times > 0, times, np.inf).min(-1, keepdims=True))
+        colors.append(picture[rows, columns])
+    truth = Truth(cameras, np.concatenate(points), ("SIMPLE_PINHOLE", (90.0, WIDTH / 2, HEIGHT / 2)))
+    write_named_model(folder / "sparse/0", truth, {v: f"IMG_{8 + k}.JPG" for k, v in enumerate(cameras)})
+    recolor(folder / "sparse/0/points3D.bin", np.concatenate(colors))
+    for k, chosen in enumerate(order):
+        save_image(folder / f"images_4/image{k:03d}.png", pictures[chosen])
+    write_masks(folder / "images_4/label", [f"image{k:03d}" for k in range(6)])
+    return rename_views(truth, {f"p{chosen}": f"image{k:03d}" for k, chosen in enumerate(order)})
+
+
+def recolor(path: Path, colors: np.ndarray) -> None:
+    from reffusion.io.colmap import POINT
+
+    data = path.read_bytes()
+    records = np.frombuffer(data[8:], POINT).copy()
+    records["rgb"] = colors
+    path.write_bytes(data[:8] + records.tobytes())
+
+
+def test_renamed_copies_follow_the_order_of_file_names(tmp_path):
+    """IMG_10.JPG comes before IMG_8.JPG."""
+    truth = write_corner_capture(tmp_path / "s", [2, 3, 4, 5, 0, 1])
+    scene, _, sentences = run_with_messages(tmp_path / "s")
+    assert_cameras(scene, truth)
+    assert_message(sentences, "order")
+
+
+def test_renamed_copies_that_points_contradict_are_refused(tmp_path):
+    write_corner_capture(tmp_path / "s", [0, 3, 5, 1, 4, 2])
+    assert_message([refusal_before_writing(tmp_path / "s")], "images")

@@ -1,0 +1,110 @@
+"""Warnings about unusual captures, and their absence for good ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import wall_scene
+from scenes.cameras import make_scene
+
+from reffusion.capture.checks import sanity
+from reffusion.capture.checks.sanity import find_odd_exposures, find_odd_masks
+from reffusion.geometry import pixel_rays
+from reffusion.io.arrays import save_json
+from reffusion.io.images import image_size
+from reffusion.io.scene import load_raw_masks, load_scene, load_views
+from reffusion.types import Camera
+from report import check
+
+
+@pytest.fixture(scope="module")
+def wall_capture(tmp_path_factory):
+    """Scene, masks and pictures of a wall with a square before it; its texture is fine enough to localize."""
+    folder = tmp_path_factory.mktemp("odd")
+    poses, _, _ = wall_scene.write_poses_and_fit(folder, 1.5)
+    scene = load_scene(poses)
+    return scene, load_raw_masks(folder / "raw_masks", scene.train), load_views(poses, scene.cameras)
+
+
+def describe_oddities(scene, masks, pictures) -> str:
+    return "; ".join([*find_odd_masks(scene, masks), *find_odd_exposures(scene, pictures.__getitem__)])
+
+
+def test_a_good_capture_has_no_warning(wall_capture):
+    scene, masks, pictures = wall_capture
+    assert describe_oddities(scene, masks, pictures) == ""
+    assert describe_oddities(replace(scene, points=scene.points[:3]), {}, pictures) == ""
+
+
+def test_inverted_masks(wall_capture):
+    scene, masks, pictures = wall_capture
+    assert "the masks cover 9" in describe_oddities(scene, {name: ~mask for name, mask in masks.items()}, pictures)
+    one = describe_oddities(scene, masks | {"a1": ~masks["a1"]}, pictures)
+    assert "the mask of a1 covers more than 50%" in one and "inverted?" in one
+
+
+def test_masks_that_disagree_in_3d(wall_capture):
+    scene, masks, pictures = wall_capture
+    elsewhere = np.roll(masks["a3"], 40, 0)
+    assert describe_oddities(scene, masks | {"a3": elsewhere}, pictures) == (
+        "the mask of a3 shows something else than those of the other views do"
+    )
+    far = {name: np.roll(mask, 17 * k, 0) for k, (name, mask) in enumerate(masks.items())}
+    assert "masks do not agree in 3D" in describe_oddities(scene, far, pictures)
+    assert describe_oddities(replace(scene, clean=frozenset({"a3"})), masks | {"a3": elsewhere}, pictures) == ""
+
+
+def test_masks_of_a_small_object_in_a_deep_scene_agree():
+    """A ball of radius 0.03, 1 away from each of ten cameras around it, in a garden that reaches to 40."""
+    draws, cameras, masks = np.random.default_rng(0), {}, {}
+    for k in range(10):
+        turn, pose = np.radians(9 * k), np.eye(4)
+        pose[:3, :3] = [[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]]
+        pose[2, 3] = 1.0
+        camera = Camera(f"v{k}", 64, 64, 250.0, 250.0, 32.0, 32.0, pose)
+        rays = pixel_rays(camera)
+        apart = np.linalg.norm(rays - [0, 0, 1] * rays[..., 2:], axis=-1)
+        cameras[camera.name], masks[camera.name] = camera, apart < 0.03
+    directions = draws.standard_normal((40_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    points = directions * np.geomspace(0.5, 40, 40_000)[:, None]
+    colours = np.zeros((40_000, 3), np.uint8)
+    scene = make_scene(cameras, points=points, colors=colours)
+    assert sanity._warn_inconsistent(scene, masks) == []
+    moved = masks | {"v4": np.roll(masks["v4"], 20, 0)}
+    assert sanity._warn_inconsistent(scene, moved) == [
+        "the mask of v4 shows something else than those of the other views do"
+    ]
+
+
+def test_exposure_that_jumps(wall_capture):
+    scene, masks, pictures = wall_capture
+    dark = (pictures["a2"] * 0.4).astype(np.uint8)
+    assert "exposed otherwise than the rest (a2; a2 is 0.4" in describe_oddities(scene, masks, pictures | {"a2": dark})
+
+
+def test_the_sheet_shows_every_mask_over_its_photograph(tmp_path, wall_capture):
+    _, masks, _ = wall_capture
+    poses, _, _ = wall_scene.write_poses_and_fit(tmp_path / "wall", 1.5)
+    save_json(tmp_path / "wall/raw_masks/warnings.json", ["the mask of a3 is odd"])
+    path, lines = check.make(tmp_path / "wall")
+    assert lines == ["the mask of a3 is odd"] and image_size(path)[0] > 3 * check.WIDTH
+    shown = check.overlay_masks(poses, tmp_path / "wall/raw_masks", "a3")
+    assert shown.shape[:2] == (180, 240)
+    assert (np.abs(shown.astype(int) - check.TINT).sum(-1) < 300).mean() > 0.5 * masks["a3"].mean()
+
+
+def test_check_says_how_structure_from_motion_went(tmp_path, monkeypatch, capsys):
+    poses, _, _ = wall_scene.write_poses_and_fit(tmp_path / "wall", 1.5)
+    save_json(poses / "sfm.json", {"summary": "structure from motion: 3 of 4 photographs"})
+    monkeypatch.setattr("sys.argv", ["check", "--scene", "wall", "--runs", str(tmp_path)])
+    check.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "structure from motion: 3 of 4 photographs" and "nothing odd" in lines[1]
+
+
+def test_the_sheet_needs_the_stage_raw_masks(tmp_path):
+    with pytest.raises(ValueError, match=r"run `make scene=x raw_masks` first"):
+        check.make(tmp_path / "x")
