@@ -9,7 +9,7 @@ from reffusion.io.arrays import load_json
 from reffusion.io.images import image_size, load_image
 from reffusion.io.scene import raw_mask_files
 from report import inline_images, page
-from report.job_data import Job
+from report.job_data import JobFiles
 from report.results import load_views
 
 MEGABYTES = 3.0  # approximate size of all pictures together
@@ -83,7 +83,7 @@ addEventListener('beforeprint', () => document.querySelectorAll('details').forEa
 """
 
 
-def before_after_section(job: Job) -> list[str]:
+def before_after_section(job: JobFiles) -> list[str]:
     """Heading and slider, or a sentence that says which stage is missing."""
     views = {name: pictures for name in rendered_views(job) if (pictures := find_pictures(job, name))}
     top = page.heading("Before and after")
@@ -107,13 +107,13 @@ def before_after_section(job: Job) -> list[str]:
     return [top, page.paragraph(words, quiet=True), f'<div class="compare">{choice}', *pairs, "</div>"]
 
 
-def rendered_views(job: Job) -> list[str]:
+def rendered_views(job: JobFiles) -> list[str]:
     """Sorted names of the views that the stage `evaluate` rendered."""
     folder = job.folders.get("evaluate", Path()) / "renders"
     return sorted(path.stem for path in folder.glob("*.png")) if "evaluate" in job.folders else []
 
 
-def find_pictures(job: Job, name: str) -> dict[str, Path]:
+def find_pictures(job: JobFiles, name: str) -> dict[str, Path]:
     """Kind of picture (`TITLES`) -> file, for the pictures of a view that exist."""
     evaluate = job.folders["evaluate"]
     poses, raw_masks = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))

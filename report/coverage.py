@@ -8,14 +8,14 @@ from pathlib import Path
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_mask
 from report import page
-from report.job_data import Job
+from report.job_data import JobFiles
 from report.results import load_views
 
 HEADER = ("view", "mask, of the picture", "made up, of the mask", "uncovered, of the mask")
 MIN_UNCOVERED = 0.01  # share of a mask above which a view counts as uncovered; `initialize` names the same views
 
 
-def coverage_section(job: Job) -> list[str]:
+def coverage_section(job: JobFiles) -> list[str]:
     """A sentence, and a table with a bar for each share."""
     top = page.heading("What was covered")
     shares = view_shares(job)
@@ -38,7 +38,7 @@ def coverage_section(job: Job) -> list[str]:
     return parts + _unseen(job)
 
 
-def view_shares(job: Job) -> dict[str, tuple[float, float, float | None]]:
+def view_shares(job: JobFiles) -> dict[str, tuple[float, float, float | None]]:
     """Training view that shows the object -> shares: mask of the picture, made up of the mask, uncovered of the mask.
 
     The uncovered share is None before the stage `initialize`.
@@ -74,7 +74,7 @@ def _bar(share: float | None) -> str:
     return f'<td class="bar" style="background-size: {part} 100%">{100 * share:.1f} %</td>'
 
 
-def _unseen(job: Job) -> list[str]:
+def _unseen(job: JobFiles) -> list[str]:
     """Paragraph on the test views with pixels that no training view saw."""
     rows = load_views(job.folders["evaluate"] / "per_view.csv") if "evaluate" in job.folders else {}
     shares = {name: row["unseen_share"] for name, row in rows.items() if row.get("unseen_share", 0) > MIN_UNCOVERED}

@@ -24,7 +24,7 @@ from report import (
     scenes_page,
     trace_charts,
 )
-from report.job_data import Job, load_job
+from report.job_data import JobFiles, load_job
 
 WORDS = {
     "skip": "left\u00a0out", "provided": "brought", "cached": "done", "run": "to\u00a0run", "stale": "to\u00a0run",
@@ -83,7 +83,7 @@ def make(home: Path) -> Path:
     return path
 
 
-def summarize_result(job: Job) -> str:
+def summarize_result(job: JobFiles) -> str:
     """The result in one sentence."""
     mean, counts = job.metrics.get("mean", {}), job.metrics.get("gaussians", {})
     if not job.metrics:
@@ -102,7 +102,7 @@ def summarize_result(job: Job) -> str:
 # --------------------------------------------------------------------------------------------------------- sections
 
 
-def unfinished_note(job: Job) -> list[str]:
+def unfinished_note(job: JobFiles) -> list[str]:
     """Paragraph with the stages that still have to run."""
     due = [stage for stage, entry in job.plan.items() if entry["word"] not in ("cached", "skip", "provided")]
     if not job.plan:
@@ -110,7 +110,7 @@ def unfinished_note(job: Job) -> list[str]:
     return [page.paragraph(f"Still to run, or to run again: {', '.join(due)}.")] if due else []
 
 
-def capture_notes(job: Job) -> list[str]:
+def capture_notes(job: JobFiles) -> list[str]:
     """Selected video frames, the outcome of structure from motion, and warnings about the photographs."""
     record = job.home.with_name(job.home.name.split("@")[0]) / "frames" / "frames.json"
     lines = [load_json(record)["said"]] if record.is_file() else []
@@ -122,7 +122,7 @@ def capture_notes(job: Job) -> list[str]:
     return [page.bullets(lines)] if lines else []
 
 
-def whole_job_section(job: Job, out: Path) -> list[str]:
+def whole_job_section(job: JobFiles, out: Path) -> list[str]:
     """The whole job over time, and the scores of initialization and result."""
     draw_job(job, out / "job.png")
     parts = [
@@ -137,7 +137,7 @@ def whole_job_section(job: Job, out: Path) -> list[str]:
     return parts + score_table(job)
 
 
-def draw_job(job: Job, path: Path, ceiling: float | None = None) -> None:
+def draw_job(job: JobFiles, path: Path, ceiling: float | None = None) -> None:
     """Chart PSNR and stages against seconds; for `ceiling` see `trace_charts.draw_job_chart`."""
     seconds = {stage: receipt["seconds"] for stage, receipt in job.receipts.items()}
     lines = {stage: series.get("", []) for stage, series in job.traces.items()}
@@ -147,7 +147,7 @@ def draw_job(job: Job, path: Path, ceiling: float | None = None) -> None:
     trace_charts.draw_job_chart(seconds, {stage: own for stage, own in lines.items() if own}, box, path, ceiling)
 
 
-def score_table(job: Job) -> list[str]:
+def score_table(job: JobFiles) -> list[str]:
     """Mean metrics of the result, and of the initialization beside them."""
     after, initial = job.metrics.get("mean", {}), job.metrics.get("initialize", {})
     names = [name for name, value in after.items() if value is not None]
@@ -161,7 +161,7 @@ def score_table(job: Job) -> list[str]:
     return [page.table(["mean over test views", *names], lines)]
 
 
-def stage_sections(job: Job, out: Path) -> list[str]:
+def stage_sections(job: JobFiles, out: Path) -> list[str]:
     """A chart for each stage with a trace."""
     parts = []
     for stage, series in job.traces.items():
@@ -175,7 +175,7 @@ def stage_sections(job: Job, out: Path) -> list[str]:
     return parts
 
 
-def skipped_section(job: Job) -> list[str]:
+def skipped_section(job: JobFiles) -> list[str]:
     """The runner's reasons for stages that were left out, brought by the scene, or still have to run."""
     if not job.plan:
         return []
@@ -188,7 +188,7 @@ def skipped_section(job: Job) -> list[str]:
     return parts + ([page.table(["stage", "", "because"], rows, text=(1, 2))] if rows else [page.paragraph("Nothing.")])
 
 
-def receipts_section(job: Job) -> list[str]:
+def receipts_section(job: JobFiles) -> list[str]:
     """Seconds, memory and machine of each stage; versions once."""
     total = sum(receipt["seconds"] for receipt in job.receipts.values())
     rows = []
@@ -208,7 +208,7 @@ def receipts_section(job: Job) -> list[str]:
     ]
 
 
-def files_section(job: Job) -> list[str]:
+def files_section(job: JobFiles) -> list[str]:
     """Links to the result files."""
     targets = {"turntable.webm: video around the capture": "turntable.webm"}
     targets = targets if (job.home / "turntable.webm").is_file() else {}

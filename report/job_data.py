@@ -18,7 +18,7 @@ STAGES = (
 
 
 @dataclass(frozen=True)
-class Job:
+class JobFiles:
     """A scene's job as it lies on the disk.
 
     Attributes:
@@ -42,7 +42,7 @@ class Job:
     metrics: dict[str, Any]
 
 
-def load_job(home: Path) -> Job:
+def load_job(home: Path) -> JobFiles:
     """Load a job; ValueError if no stage has been done."""
     plan = load_plan(home)
     names = list(plan or STAGES)
@@ -63,7 +63,7 @@ def load_job(home: Path) -> Job:
     scores = load_json(metrics) if metrics.is_file() else {}
     record = home / "plan.json"
     unset = load_json(record).get("params", {}) if record.exists() else {}
-    return Job(home, plan, unset, folders, load_receipts(folders), traces, tuple(unread), scores)
+    return JobFiles(home, plan, unset, folders, load_receipts(folders), traces, tuple(unread), scores)
 
 
 def load_plan(home: Path) -> dict[str, dict[str, Any]]:

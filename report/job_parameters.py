@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from report import page
-from report.job_data import Job
+from report.job_data import JobFiles
 
 
 def flatten_parameters(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -31,7 +31,7 @@ def default_parameters(stage: str) -> dict[str, Any]:
     return dict(flatten_parameters(params.model_dump(mode="json")))
 
 
-def command_line_parameters(job: Job) -> dict[str, Any]:
+def command_line_parameters(job: JobFiles) -> dict[str, Any]:
     """stage.parameter -> value, for parameters set by `set=` or `budget=`; empty if no plan was recorded."""
     unset = {stage: dict(flatten_parameters(values)) for stage, values in job.unset.items()}
     return {
@@ -42,7 +42,7 @@ def command_line_parameters(job: Job) -> dict[str, Any]:
     }
 
 
-def parameters_section(job: Job) -> list[str]:
+def parameters_section(job: JobFiles) -> list[str]:
     """Table of parameters that differ from the defaults, those set on the command line first."""
     overrides, override_rows, rows = command_line_parameters(job), [], []
     for stage, receipt in job.receipts.items():
@@ -71,7 +71,7 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def reproduce_section(job: Job) -> list[str]:
+def reproduce_section(job: JobFiles) -> list[str]:
     """The command that repeats the job."""
     name, _, variant = job.home.name.partition("@")
     source = job.home.with_name(name) / "source"

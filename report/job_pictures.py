@@ -15,7 +15,7 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 from report import before_after, inline_images, page
 from report.check import overlay_masks, view_role
-from report.job_data import Job
+from report.job_data import JobFiles
 from report.sheet import pick_evenly
 
 MAX_MASK_VIEWS, FIRST_MASK_VIEWS, MASK_SIDE = 60, 12, 240  # most views, views visible at once, longer side in px
@@ -26,7 +26,7 @@ MIN_ALPHA = 0.5  # below this alpha there is no depth
 RESULTS = ("distill", "initialize", "fit")  # stages with Gaussians, latest first
 
 
-def masks_section(job: Job) -> list[str]:
+def masks_section(job: JobFiles) -> list[str]:
     """Masks over photographs: input masks tinted, the classes from the stage `masks` outlined."""
     poses, raw_masks = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))
     top = page.heading("Masks")
@@ -54,7 +54,7 @@ def masks_section(job: Job) -> list[str]:
     return [top, page.paragraph(words, quiet=True), inline_images.picture_grid(list(map(cell, first))), more]
 
 
-def draw_mask_classes(job: Job, poses: Path, name: str) -> np.ndarray:
+def draw_mask_classes(job: JobFiles, poses: Path, name: str) -> np.ndarray:
     """uint8 [h, w, 3]: the reduced photograph with its mask tinted and its pixel classes outlined."""
     small = np.ascontiguousarray(overlay_masks(poses, job.folders.get("raw_masks", Path()), name))
     for kind, colour in (("consistent", REMOVED), ("invent", INVENTED)):
@@ -72,7 +72,7 @@ def draw_outline(picture: np.ndarray, mask: np.ndarray, colour: tuple[int, int, 
     cv2.polylines(picture, moved, True, colour, 1 if picture.shape[1] < 400 else 2)
 
 
-def references_section(job: Job) -> list[str]:
+def references_section(job: JobFiles) -> list[str]:
     """Each reference beside its photograph, the hole outlined, with its origin and fit."""
     folder, poses = job.folders.get("reference", Path()), job.folders.get("poses", Path())
     top = page.heading("References")
@@ -121,7 +121,7 @@ def _origin(facts: dict, folder: Path, name: str) -> str:
     return f"{way}, the best of {len(scores)} tries" if len(scores) > 1 else way
 
 
-def extra_views_section(job: Job) -> list[str]:
+def extra_views_section(job: JobFiles) -> list[str]:
     """Views that were completed in addition to the references, and why."""
     folder = job.folders.get("initialize", Path())
     shares = _facts(folder).get("extra_views", {}) if "initialize" in job.folders else {}
@@ -138,7 +138,7 @@ def extra_views_section(job: Job) -> list[str]:
     return [page.heading("Extra views", 3), page.paragraph(reason), inline_images.picture_grid(cells)]
 
 
-def depth_section(job: Job) -> list[str]:
+def depth_section(job: JobFiles) -> list[str]:
     """Depth of a few views before and after, in the same colours."""
     stages = [s for s in RESULTS if s in job.folders and (job.folders[s] / "gaussians.ply").is_file()]
     top = page.heading("Depth, before and after")

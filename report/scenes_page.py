@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from report import page, trace_charts
-from report.job_data import Job
+from report.job_data import JobFiles
 
 COLUMNS = ("stage", "quantity", "scenes", "quartile_1", "median", "quartile_3")
 WHOLE_JOB = "whole job"
 SCORES = ("lpips_vgg_box", "psnr_box", "ssim_box", "flip_box")
 
 
-def make(jobs: list[Job], out: Path) -> Path:
+def make(jobs: list[JobFiles], out: Path) -> Path:
     """Write index.html, stages.png and stages.csv into `out`; return the page's path."""
     out.mkdir(parents=True, exist_ok=True)
     rows = summarize_stages(jobs)
@@ -66,7 +66,7 @@ def format_quartiles(values: tuple, digits: int | None = None) -> str:
     return f"{middle:,.{digits}f} [{low:,.{digits}f}, {high:,.{digits}f}]"
 
 
-def main_error_curves(jobs: list[Job]) -> dict[str, tuple[str, list[np.ndarray]]]:
+def main_error_curves(jobs: list[JobFiles]) -> dict[str, tuple[str, list[np.ndarray]]]:
     """Stage -> its main quantity (the one most traces have), and a curve [moments, 2] for each scene that has it."""
     curves: dict[str, tuple[str, list[np.ndarray]]] = {}
     for stage in dict.fromkeys(stage for job in jobs for stage in job.traces):
@@ -81,7 +81,7 @@ def main_error_curves(jobs: list[Job]) -> dict[str, tuple[str, list[np.ndarray]]
     return curves
 
 
-def summarize_stages(jobs: list[Job]) -> list[tuple]:
+def summarize_stages(jobs: list[JobFiles]) -> list[tuple]:
     """Rows of `COLUMNS`: seconds, memory and last main error of each stage; scores of the result."""
     errors = main_error_curves(jobs)
     rows = []
@@ -107,7 +107,7 @@ def quartiles(values: list[float]) -> tuple[int, float, float, float]:
     return len(values), low, middle, high
 
 
-def scene_table(jobs: list[Job], out: Path) -> str:
+def scene_table(jobs: list[JobFiles], out: Path) -> str:
     """HTML table with a row per scene: stages done, seconds and scores."""
     names = [n for n in SCORES if any(job.metrics.get("mean", {}).get(n) is not None for job in jobs)]
     rows = []

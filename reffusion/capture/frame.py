@@ -171,9 +171,7 @@ def add_random_points(
         mine = views == k
         colors[mine] = image_of(names[k])[pixels[mine, 1], pixels[mine, 0]]
     return replace(
-        scene,
-        points=np.concatenate([scene.points, points]),
-        point_colors=np.concatenate([scene.point_colors, colors]),
+        scene, points=np.concatenate([scene.points, points]), point_colors=np.concatenate([scene.point_colors, colors])
     )
 
 

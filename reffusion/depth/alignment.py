@@ -47,12 +47,7 @@ class Alignment:
 
 
 def align(
-    estimate: np.ndarray,
-    target: np.ndarray,
-    weights: np.ndarray | None = None,
-    *,
-    robust: bool = False,
-    seed: int = 0,
+    estimate: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None, *, robust: bool = False, seed: int = 0
 ) -> Alignment:
     """Fit scale and offset by least squares on the pixels of positive weight (paper, depth supervision).
 

@@ -75,12 +75,7 @@ def build_objective(inputs: TermInputs, settings: Params) -> Objective:
 
 
 def distill(
-    initial: Gaussians,
-    masked: Tensor,
-    inputs: TermInputs,
-    settings: Params,
-    folder: Path,
-    rates: Rates | None = None,
+    initial: Gaussians, masked: Tensor, inputs: TermInputs, settings: Params, folder: Path, rates: Rates | None = None
 ) -> tuple[Gaussians, Tensor]:
     """Optimises an initialization. Resumes from the checkpoint in `folder`, bit for bit on the CPU.
 

@@ -128,12 +128,7 @@ def find_gaps(
 
 
 def add_surface(
-    draft: Draft,
-    reference: Reference,
-    depth: np.ndarray,
-    pixels: np.ndarray,
-    background: Background,
-    sheets: Sheets,
+    draft: Draft, reference: Reference, depth: np.ndarray, pixels: np.ndarray, background: Background, sheets: Sheets
 ) -> Draft:
     """The draft with a surface at `depth`, [H, W], that shows these pixels of the reference, bool [H, W]."""
     camera = reference.camera

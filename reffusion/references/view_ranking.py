@@ -50,10 +50,7 @@ class RankedView:
 
 @torch.no_grad()
 def find_holes(
-    remaining: Gaussians,
-    cameras: Sequence[Camera],
-    hidden: Mapping[str, np.ndarray],
-    invent: Mapping[str, np.ndarray],
+    remaining: Gaussians, cameras: Sequence[Camera], hidden: Mapping[str, np.ndarray], invent: Mapping[str, np.ndarray]
 ) -> dict[str, Hole]:
     """View name -> its hole, for the views that have one.
 

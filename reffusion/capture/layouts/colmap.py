@@ -17,12 +17,7 @@ from reffusion.capture.layouts.capture import (
     resize_lens,
 )
 from reffusion.capture.layouts.points import are_tracks_inside, contradicts_order, keep_points_in_frame
-from reffusion.capture.names import (
-    list_pictures,
-    name_views,
-    normalize_path,
-    pair_pictures,
-)
+from reffusion.capture.names import list_pictures, name_views, normalize_path, pair_pictures
 from reffusion.io.colmap import ModelImage, is_model, load_cameras, load_images, load_model_points, model_file
 from reffusion.io.files import BadInput
 
