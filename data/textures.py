@@ -122,8 +122,8 @@ def wallpaper(rng, size, repeats=4):
     for sign in (-1, 1):
         off = np.abs((u + sign * swing + 0.25 * (1 + sign)) % 1 - 0.5)
         color = blend(color, second, step(0.022, 0.012, np.abs(off - 0.02)))
-    for shift in (0.0, 0.5):
-        a, b = (u + shift) % 1 - 0.5, (y * repeats + shift) % 1 - 0.5
+    for phase in (0.0, 0.5):
+        a, b = (u + phase) % 1 - 0.5, (y * repeats + phase) % 1 - 0.5
         radius, angle = np.hypot(a, b), np.arctan2(b, a)
         for tilt in (0.6, np.pi - 0.6):
             p, q = a * np.cos(tilt) + b * np.sin(tilt), b * np.cos(tilt) - a * np.sin(tilt)

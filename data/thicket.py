@@ -1,7 +1,7 @@
 """Grass and foliage: a box divided into cells with a leaf each. A ray walks from cell to cell.
 
-No leaf is stored: its shape follows from the number of its cell, so a lawn of a hundred thousand blades costs as much as
-its box and a few steps per ray. A leaf never sticks out of its cell, so the first one that a ray hits is the nearest.
+No leaf is stored: its shape follows from the number of its cell, so a lawn of a hundred thousand blades costs only its
+box and a few steps per ray. A leaf never sticks out of its cell, so the first one that a ray hits is the nearest.
 Coordinates are those of the box: its centre is the origin, its edges lie along the axes.
 """
 
