@@ -135,7 +135,7 @@ def label_gaussians(
     by the colours of the other photographs."""
     sure = np.zeros((len(gaussians), 2))
     for name, mask in masks.items():
-        ballots = torch.as_tensor(np.stack([_remove_rim(mask), _remove_rim(~mask)], -1), device=gaussians.means.device)
+        ballots = torch.as_tensor(np.stack([remove_rim(mask), remove_rim(~mask)], -1), device=gaussians.means.device)
         sure += rasterizer.accumulate(gaussians, cameras[name], ballots.to(gaussians.means.dtype)).cpu().numpy()
     inside, outside = sure.T
     margin = max(1, round(RIM * max(next(iter(masks.values())).shape)))
@@ -184,7 +184,7 @@ def is_visible(gaussians: Gaussians, camera: Camera, image: np.ndarray, mask: np
     return float(off[mask].mean()) < ABSENT * float(off[around].mean()) + LEVEL
 
 
-def _remove_rim(mask: np.ndarray) -> np.ndarray:
+def remove_rim(mask: np.ndarray) -> np.ndarray:
     """The mask without its rim, unless that is most of it."""
     inner = erode(mask, max(1, round(RIM * max(mask.shape))))
     return inner if inner.sum() > 0.25 * mask.sum() else mask

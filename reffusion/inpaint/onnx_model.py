@@ -1,4 +1,4 @@
-"""Runs inpainters from ONNX files on the CPU. The only module that imports onnxruntime, which is optional."""
+"""Runs inpainters from ONNX files on the CPU."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+
+from reffusion.onnx import open_session
 
 ONNX_TYPES = {"float32": "tensor(float)", "uint8": "tensor(uint8)"}
 
@@ -36,23 +37,9 @@ def load(file: Path, dtype: str) -> Network:
     Raises:
         ValueError: no onnxruntime, no ONNX model, or other inputs and outputs; one line that names the file.
     """
-    session = _open_session(file)
+    session = open_session(file, str(file))
     side = _read_side(session, file, dtype)
     return Network(side, lambda picture, hole: _run(session, file, dtype, picture, hole))
-
-
-def _open_session(file: Path) -> Any:
-    try:
-        import onnxruntime
-    except ImportError:
-        raise ValueError(f"{file.name} needs onnxruntime: `pip install onnxruntime`") from None
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = torch.get_num_threads()  # onnxruntime does not read OMP_NUM_THREADS
-    options.log_severity_level = 3  # errors only: it would warn of output sizes that exporters misname
-    try:
-        return onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's exceptions have no common base class
-        raise ValueError(f"{file} is no ONNX model that onnxruntime reads ({_one_line(error)})") from None
 
 
 def _read_side(session: Any, file: Path, dtype: str) -> int | None:

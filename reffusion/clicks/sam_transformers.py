@@ -1,0 +1,71 @@
+"""SAM through transformers, where its weights are on this machine.
+
+The network's own processor needs torchvision, so pictures are prepared in `reffusion.clicks.segmenter`.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from reffusion.clicks.segmenter import LOWER_RIGHT, UPPER_LEFT, Segmenter
+from reffusion.weights import local
+
+SOURCE = "facebook/sam-vit-base"
+KIND = "sam"
+
+
+def load_sam(source: str | Path = SOURCE) -> Segmenter | None:
+    """The model in a local folder, or of a hub id; None where its weights are not on this machine.
+
+    Raises:
+        ValueError: a folder without a model, an incomplete one, or a model of another kind.
+    """
+    from transformers import AutoConfig, SamModel
+    from transformers.utils import logging as transformers_logging
+
+    folder = local.locate(source)
+    if folder is None:
+        return None
+    if not (folder / "config.json").is_file():
+        raise ValueError(f"segmentation network {folder}: it lacks config.json; it must be a transformers model folder")
+    transformers_logging.disable_progress_bar()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            kind = AutoConfig.from_pretrained(folder).model_type
+            if kind != KIND:
+                raise ValueError(f"a model of type {kind!r}; those of type {KIND!r} are understood")
+            model = SamModel.from_pretrained(folder, dtype=torch.float32)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"segmentation network {folder}: {str(error).splitlines()[0]}") from error
+    return wrap_model(model, str(source))
+
+
+def wrap_model(model: nn.Module, name: str = SOURCE) -> Segmenter:
+    """A Segmenter from a SamModel in memory."""
+    config: Any = model.config
+    model = model.requires_grad_(False).eval()
+
+    @torch.no_grad()
+    def encode(square: np.ndarray) -> Tensor:
+        return model.get_image_embeddings(torch.as_tensor(square))
+
+    @torch.no_grad()
+    def decode(features: Tensor, points: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        corner = np.isin(labels, (UPPER_LEFT, LOWER_RIGHT))
+        prompt: dict[str, Tensor] = {}
+        if corner.any():
+            prompt["input_boxes"] = torch.as_tensor(points[corner].reshape(1, 1, 4))
+        if not corner.all():
+            prompt["input_points"] = torch.as_tensor(points[~corner])[None, None]
+            prompt["input_labels"] = torch.as_tensor(labels[~corner])[None, None]
+        answer = model(image_embeddings=features, multimask_output=True, **prompt)
+        return answer.pred_masks[0, 0].numpy(), answer.iou_scores[0, 0].numpy()
+
+    return Segmenter(name, config.vision_config.image_size, encode, decode)

