@@ -206,6 +206,7 @@ def test_the_gradient_agrees_with_finite_differences_in_float64():
 # ------------------------------------------------------------------------------------------ views that tell nothing
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "estimate, reason",
     [(np.full(WALL.shape, 3.0), "constant"), (-WALL, "reversed"), (np.zeros(WALL.shape), "constant")],
@@ -243,6 +244,7 @@ def test_a_view_larger_than_asked_for_is_rendered_smaller():
 # ------------------------------------------------------------------------------------------ repainting
 
 
+@pytest.mark.integration
 def test_repainting_changes_the_hole_only_and_the_less_the_later_it_starts(prior, text):
     image = torch.rand(3, HEIGHT, WIDTH, generator=generator(5)) * 1.6 - 0.8
     hole, changes = torch.from_numpy(HOLE), []
@@ -305,6 +307,7 @@ def run_depth_distill(folder, prior, text, estimator, settings=RUN):
     return D.distill(gaussians, masked, inputs, settings, folder)
 
 
+@pytest.mark.integration
 def test_interrupted_distillation_with_the_depth_term_resumes_bit_for_bit(prior, text, tmp_path, monkeypatch):
     monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
     whole, _ = run_depth_distill(tmp_path / "whole", prior, text, constant_estimator(WALL))
@@ -327,6 +330,7 @@ def test_interrupted_distillation_with_the_depth_term_resumes_bit_for_bit(prior,
     assert 0 < trace_lines(tmp_path / "whole")[-1]["depth"] < trace_lines(tmp_path / "whole")[1]["depth"]
 
 
+@pytest.mark.integration
 def test_skipped_views_are_counted_by_reason_and_move_nothing(prior, text, tmp_path):
     ended, _ = run_depth_distill(tmp_path, prior, text, constant_estimator(np.full(WALL.shape, 2.0)))
     assert trace_lines(tmp_path)[-1]["depth_skipped_constant"] == 3 and "depth" not in trace_lines(tmp_path)[-1]

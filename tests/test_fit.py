@@ -121,6 +121,7 @@ def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, ga
         assert first == second
 
 
+@pytest.mark.integration
 def test_exposures_are_found_and_taken_out_again(tmp_path):
     """Photographs of which each has another exposure: where it is fitted the held-out view, exposed as on average, is
     right; where not, it is not; and the photographs come back as if none had differed."""

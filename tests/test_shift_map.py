@@ -41,6 +41,7 @@ def gradient_energy(image: np.ndarray) -> float:
     return float((np.diff(grey, axis=0)[:, 1:][inner] ** 2 + np.diff(grey, axis=1)[1:][inner] ** 2).mean())
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("seed", range(3))
 def test_a_path_goes_on_and_the_lawn_stays_as_sharp_as_it_is(seed):
     truth = paint_lawn()
