@@ -453,6 +453,7 @@ TRANSFORMS: dict[str, Change] = {
 }
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("change", TRANSFORMS.values(), ids=TRANSFORMS.keys())
 def test_transforms_json(good_captures, tmp_path, change):
     said = assert_bad_input(good_captures, tmp_path, "transforms", change, "")

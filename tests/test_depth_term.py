@@ -156,6 +156,7 @@ def test_a_displaced_surface_converges_to_the_wall():
         assert (getattr(optimizer.gaussians, name)[~masked] == getattr(gaussians, name)[~masked]).all(), name
 
 
+@pytest.mark.integration
 def test_the_gradient_reaches_the_geometry_of_masked_gaussians_only(prior, text):
     gaussians, masked = slanted_wall(0.9)
     gaussians = as_leaves(gaussians)

@@ -20,6 +20,8 @@ from reffusion.params.distill import AdversarialTerm
 from reffusion.prior.windows import window_around, windows_around
 from reffusion.seeding import generator
 
+pytestmark = pytest.mark.integration
+
 SMALL, RATE = AdversarialTerm(patches=16, size=8, width=8), 3e-3
 
 
@@ -100,7 +102,6 @@ def test_penalty_of_the_critic_and_its_slope_by_finite_differences():
 # ------------------------------------------------------------------------------------------ the critic's parts
 
 
-@pytest.mark.integration
 def test_scores_at_the_start_are_of_one_size_whatever_the_width():
     """Equalised learning rate: all weights are unit normal, and what passes keeps its size."""
     sizes = []
@@ -211,7 +212,6 @@ def checker_patches(count, fine, label):
     return 0.5 * signs * board + 0.05 * random_normal(count, 3, 8, 8, label=label)
 
 
-@pytest.mark.integration
 @pytest.mark.parametrize("penalized", ["real", "fake"])
 @pytest.mark.parametrize("form", ["non-saturating", "saturating"])
 def test_the_critic_separates_two_textures_and_its_slope_leads_to_the_real_one(penalized, form):
@@ -235,7 +235,6 @@ def test_the_critic_separates_two_textures_and_its_slope_leads_to_the_real_one(p
         assert ((nearer - fake) * fake.sign()).mean() < 0, "the coarse texture is not taken away"
 
 
-@pytest.mark.integration
 def test_the_penalty_holds_the_critics_slope_down():
     slopes = {}
     for penalty in (0.0, 10.0):
@@ -259,7 +258,6 @@ def test_generator_loss_leaves_the_critics_weights_alone_and_learning_leaves_the
     assert all((a != b).any() for a, b in zip(before, adversary.critic.parameters(), strict=True))
 
 
-@pytest.mark.integration
 def test_an_adversary_continues_from_its_state_bit_for_bit():
     def trained(adversary, steps):
         return [

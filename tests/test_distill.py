@@ -53,6 +53,8 @@ from reffusion.splat.rasterizer import render
 from reffusion.trace import load_checkpoint, read_trace
 from reffusion.types import PARAMETERS, MaskSet
 
+pytestmark = pytest.mark.integration
+
 
 def gradients_of(term, gaussians, masked, prior, text, view=None):
     gaussians, view = as_leaves(gaussians), view or train_view()
@@ -186,7 +188,6 @@ def test_any_number_of_threads_gives_the_same_bits(prior, text, tmp_path, off):
         assert (getattr(found[0], name) == getattr(found[1], name)).all(), name
 
 
-@pytest.mark.integration
 def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp_path, monkeypatch):
     monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
     monkeypatch.setattr(D, "REGION_EVERY", 2)
@@ -349,7 +350,6 @@ def test_nan_names_step_term_and_view(prior, text, tmp_path):
 # ------------------------------------------------------------------------------------------ the reference
 
 
-@pytest.mark.integration
 def test_painting_keeps_known_pixels_and_a_candidates_picture_is_its_seeds(prior):
     image = torch.rand(3, HEIGHT, WIDTH, generator=generator(5)) * 2 - 1
     options = {"prompt": "", "steps": 2, "start": 0.6, "guidance": 0.0}
@@ -428,7 +428,6 @@ def select_folders(stage_folders, *names):
     return {name: stage_folders[name] for name in names}
 
 
-@pytest.mark.integration
 def test_stages_chain_through_files_with_the_scenes_own_reference(stage_folders):
     from stages import distill, personalize, reference
     from stages.plan import reference as plan
@@ -463,7 +462,6 @@ def test_stages_chain_through_files_with_the_scenes_own_reference(stage_folders)
         )
 
 
-@pytest.mark.integration
 def test_reference_inpaints_the_best_view_and_keeps_all_else(stage_folders):
     from stages import reference
 

@@ -132,6 +132,7 @@ def floor_background() -> Background:
     return Background(views, {view.name: paint_planks(view) for view in CAMERAS}, planes=[FLOOR], radius=1.0)
 
 
+@pytest.mark.integration
 def test_planks_run_on_in_their_own_perspective():
     image = np.where(disk_mask((SIDE, SIDE), 70, 62, 24)[..., None], np.uint8(RED), paint_planks(CAMERAS[0]))
 

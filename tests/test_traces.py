@@ -28,6 +28,8 @@ from runner.parameters import parse_duration, split_budget, stack_layers
 from runner.pipeline import load_pipeline, load_scene_file
 from stages import distill, fit, personalize
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 NEAR = 1.7
 FIT = {"iterations": 40, "sh.degree": 0, "densify.cap_max": 500, "holdout": 3, "densify.stop": 0.3}
