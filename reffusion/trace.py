@@ -137,14 +137,14 @@ def log_spaced(iteration: int, last: int, per_octave: int = 2, first: int = 1) -
 def steps_within_budget(
     folder: Path, asked: int, seconds: float, spent: Callable[[], float], trial: Callable[[Path, int], object]
 ) -> int:
-    """The number of `asked` steps that a stage can do in its `seconds`: at least a twentieth of them.
+    """How many steps a stage can do in its `seconds`: between a twentieth of `asked` and `asked`.
 
     The answer depends on the machine and its load. It is written to `folder/length.json`, and read back on a resume.
 
     Args:
         seconds: for the whole stage; 0: no limit, and nothing is measured or written.
         spent: returns the seconds used up when the steps begin.
-        trial: runs that many steps, with a trace in the given folder; must leave everything else unchanged.
+        trial: (folder, count) runs `count` steps with a trace in the folder; must leave everything else unchanged.
     """
     if not seconds:
         return asked

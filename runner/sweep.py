@@ -19,7 +19,7 @@ from runner.text import display_path, format_bytes
 
 @dataclass(frozen=True)
 class Unused:
-    """An artifact that no plan uses: its folder, the bytes of the files in its receipt, and why."""
+    """An artifact that no plan uses: its folder, its size in bytes, and why no plan uses it."""
 
     folder: Path
     size: int

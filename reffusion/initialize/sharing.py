@@ -29,11 +29,11 @@ EDGE = np.ones((3, 3), np.uint8)  # px: the position of an edge is accurate to a
 
 @dataclass(frozen=True)
 class Share:
-    """What one of several references draws over what remains, of the pixels whose depth it brings.
+    """Which pixels of its depth map one of several references adds to the scene.
 
     Attributes:
-        drawn: bool [H, W], the pixels that it draws.
-        ceded: bool [H, W], the pixels that it leaves to other references, or as they are.
+        drawn: bool [H, W], pixels that become Gaussians.
+        ceded: bool [H, W], pixels that do not: another reference adds them, or the scene shows them already.
     """
 
     drawn: np.ndarray

@@ -61,7 +61,7 @@ def render(
 
 
 def prepare(device: str) -> None:
-    """Load the implementation for a device before time is measured: gsplat compiles its extension when first loaded."""
+    """Loads gsplat if the device is CUDA, so that compiling its extension is not timed. On the CPU nothing is done."""
     if torch.device(device).type == "cuda":
         _implementation("cuda", torch.zeros(1, device=device))
 
