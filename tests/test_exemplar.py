@@ -26,6 +26,8 @@ from reffusion.inpaint.shift_map.plane_symmetry import MIN_CELLS, PlanePixels, f
 from reffusion.inpaint.source_image import without_geometry
 from reffusion.types import Camera
 
+pytestmark = pytest.mark.integration
+
 SIDE = 128
 RED = (255, 0, 0)
 
@@ -43,7 +45,6 @@ def middle_mask():
     return rectangle_mask((96, 128), (30, 61), (45, 84))
 
 
-@pytest.mark.integration
 def test_a_pattern_is_continued_as_sharp_as_it_is():
     """A hole in a checkerboard with period 16, of which nine tenths of the board's own contrast must come back."""
     wrong = lambda painted: np.abs(painted[middle_mask()].astype(int) - checker_image()[middle_mask()]).mean()
@@ -63,7 +64,6 @@ def test_only_the_hole_changes_and_its_content_does_not_count():
     assert (complete_alone(image, np.zeros_like(middle_mask())) == image).all()
 
 
-@pytest.mark.integration
 @pytest.mark.parametrize("kind", ["a pixel", "specks", "at the border", "nearly all"])
 def test_every_hole_is_filled(kind):
     image, mask = np.random.default_rng(1).integers(60, 200, (64, 80, 3), np.uint8), np.zeros((64, 80), bool)
@@ -132,7 +132,6 @@ def floor_background() -> Background:
     return Background(views, {view.name: paint_planks(view) for view in CAMERAS}, planes=[FLOOR], radius=1.0)
 
 
-@pytest.mark.integration
 def test_planks_run_on_in_their_own_perspective():
     image = np.where(disk_mask((SIDE, SIDE), 70, 62, 24)[..., None], np.uint8(RED), paint_planks(CAMERAS[0]))
 
@@ -212,7 +211,6 @@ def test_a_texture_without_period_has_no_symmetry():
     assert find_symmetry(PlanePixels(some.pixels[:MIN_CELLS], some.coordinates[:MIN_CELLS], some.image)) is None
 
 
-@pytest.mark.integration
 @pytest.mark.parametrize("shown", [paint_planks, paint_tabletop])
 def test_joints_and_round_borders_go_on_where_a_floor_repeats_itself(shown):
     around = replace(floor_background(), photos={view.name: shown(view) for view in CAMERAS})

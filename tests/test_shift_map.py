@@ -15,6 +15,8 @@ from reffusion.inpaint.shift_map.photo_offsets import fill_from_photo, frequent_
 from reffusion.inpaint.source_image import without_geometry
 from reffusion.types import Camera
 
+pytestmark = pytest.mark.integration
+
 HEIGHT, WIDTH = 120, 200
 PATH = slice(40, 56)
 HOLE = disk_mask((HEIGHT, WIDTH), 58, 100, 27)
@@ -41,7 +43,6 @@ def gradient_energy(image: np.ndarray) -> float:
     return float((np.diff(grey, axis=0)[:, 1:][inner] ** 2 + np.diff(grey, axis=1)[1:][inner] ** 2).mean())
 
 
-@pytest.mark.integration
 @pytest.mark.parametrize("seed", range(3))
 def test_a_path_goes_on_and_the_lawn_stays_as_sharp_as_it_is(seed):
     truth = paint_lawn()
