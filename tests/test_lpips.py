@@ -18,6 +18,8 @@ from reffusion.metrics import image_metrics, lpips
 from reffusion.weights import local, lpips_package
 from reffusion.weights.published import LPIPS, LPIPS_PACKAGES, LpipsNet
 
+pytestmark = pytest.mark.integration
+
 
 def smooth_pair(height, width, seed=0, noise=0.1):
     """A smooth picture and a noisy copy, [H, W, 3] in [0, 1]."""
@@ -181,7 +183,6 @@ def test_lpips_takes_the_linear_weights_of_an_installed_package(empty_caches, mo
     assert reason is None and set(model.files) == {"vgg16-own.pth", "vgg.pth"}
 
 
-@pytest.mark.integration
 @pytest.mark.parametrize("net", ["alex", "vgg"])
 @pytest.mark.parametrize("half", [False, True])
 def test_the_gradient_is_finite_where_features_vanish(net, half):
@@ -299,7 +300,6 @@ def published_packages(tmp_path_factory):
     return folder
 
 
-@pytest.mark.integration
 @pytest.mark.parametrize("net", ["alex", "vgg"])
 def test_the_published_weights_give_the_published_formula(net, published_packages, tmp_path):
     """The arrays are read here by numpy alone, the formula is `lpips_by_definition`."""

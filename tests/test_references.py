@@ -54,6 +54,8 @@ from stages import poses, reference
 from stages.plan import poses as plan_poses
 from stages.plan import reference as plan_reference
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 
 
@@ -409,7 +411,6 @@ def test_views_are_ranked_by_what_they_cover_beyond_those_before():
 SMALL = "poses.refine=false fit.iterations=20 fit.densify.cap_max=1000 masks.invent=consistent masks.hull=1"
 
 
-@pytest.mark.integration
 def test_a_new_reference_reruns_nothing_before_its_stage(tmp_path):
     folder = write_wall_capture(tmp_path / "wall")
     request = Request(ROOT, tmp_path / "runs", str(folder), profile="laptop", set=SMALL)
@@ -447,7 +448,6 @@ def test_a_new_reference_reruns_nothing_before_its_stage(tmp_path):
     assert not home.exists() and (folder / "painted" / f"{view}.png").is_file()
 
 
-@pytest.mark.integration
 def test_saved_masks_rerun_neither_poses_nor_the_fit(tmp_path):
     folder = write_wall_capture(tmp_path / "wall")
     masks = {path: path.read_bytes() for path in (folder / "masks").iterdir()}

@@ -13,6 +13,8 @@ from runner.compare import compare
 from runner.execute import run_scene
 from runner.sweep import sweep
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.fixture(scope="module")
 def finished_comparison(tmp_path_factory) -> Path:
