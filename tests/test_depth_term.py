@@ -12,7 +12,7 @@ from scenes.stage_runs import trace_lines
 
 from reffusion import trace
 from reffusion.depth import background_depth, estimates
-from reffusion.depth.background_depth import Completion
+from reffusion.depth.background_depth import CompletionSettings
 from reffusion.distill import depth_estimator
 from reffusion.distill import loop as D
 from reffusion.distill.depth_estimator import DepthEstimator, build_estimator
@@ -35,7 +35,7 @@ ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
 WALL = 0.5 + 0.004 * (COLUMNS + 0.5 - WIDTH / 2) - 0.002 * (ROWS + 0.5 - HEIGHT / 2)  # disparity of a slanted wall
 HOLE = (np.abs(COLUMNS + 0.5 - WIDTH / 2) < 7) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 6)
 NO_POINTS = np.zeros((0, 3))
-HOW = Completion(ring=0.2)
+HOW = CompletionSettings(ring=0.2)
 DEPTH = DepthTerm(steps=2)
 
 
@@ -350,4 +350,4 @@ def test_an_estimate_that_is_not_finite_names_step_and_view(prior, text, tmp_pat
 def test_initialize_and_distill_complete_depth_alike():
     from reffusion.initialize import fill
 
-    assert fill.COMPLETION == Completion() == build_estimator(Params(), NO_POINTS).how
+    assert fill.COMPLETION == CompletionSettings() == build_estimator(Params(), NO_POINTS).how

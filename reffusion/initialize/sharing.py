@@ -14,7 +14,7 @@ from scipy import ndimage
 from reffusion import geometry
 from reffusion.background.model import Background
 from reffusion.depth import alignment, background_depth
-from reffusion.depth.background_depth import Completion, Hints
+from reffusion.depth.background_depth import CompletionSettings, Hints
 from reffusion.gaussians.surfels import surface_normals
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference
@@ -69,7 +69,7 @@ class ReferenceSurface:
 
 
 def share_surfaces(
-    remaining: Gaussians, references: Sequence[Reference], background: Background, completion: Completion
+    remaining: Gaussians, references: Sequence[Reference], background: Background, completion: CompletionSettings
 ) -> dict[str, Share]:
     """View name -> its share, of the references with a depth map; empty where there are fewer than two.
 
@@ -98,7 +98,7 @@ def share_surfaces(
 
 @torch.no_grad()
 def align_reference_depth(
-    remaining: Gaussians, reference: Reference, background: Background, completion: Completion
+    remaining: Gaussians, reference: Reference, background: Background, completion: CompletionSettings
 ) -> np.ndarray:
     """[H, W] the depth map of a reference in world units; 0 where unknown."""
     assert reference.depth is not None

@@ -26,7 +26,7 @@ class Unused:
     why: str
 
 
-def sweep(request: Request, yes: bool) -> None:
+def collect_garbage(request: Request, yes: bool) -> None:
     """List artifacts that no plan of the scenes in runs/, or of one scene and its variants, uses.
 
     Removes them with `yes`, or after a question on a terminal.
