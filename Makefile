@@ -34,6 +34,7 @@
 ## make prior [steps=N]           train the embedded prior further (hours)
 ## make prior-report              measure the embedded prior (minutes): runs/prior-report
 ## make setup | test | lint       .venv; the tests, with slow=1 the slow ones too (make fuzz: hours); ruff and mypy
+## make test-fast                 the tests that start no processes and train nothing (two minutes)
 ## make bench                     work-precision diagrams of the kernels: runs/bench; gate=1: against the baselines
 ## make stability                 stiff and extreme cases, each with its bound (minutes): runs/stability.json
 ##
@@ -70,7 +71,7 @@ options := $(where) profile budget set trust keep
 cluster := engine address cores
 
 .PHONY: help setup named ready all $(STAGES) plan check compare report study mask view turntable patch export verify \
-	clean gc spinnerf batch weights demo prior prior-report sds-variance adapted sparse test fuzz bench stability gpu \
+	clean gc spinnerf batch weights demo prior prior-report sds-variance adapted sparse test test-fast fuzz bench stability gpu \
 	gpu-check lint
 .DELETE_ON_ERROR:
 
@@ -212,9 +213,9 @@ sparse: ready $(others)
 		--out="$${runs:-runs}/sparse"
 
 # Two processes with one thread each. Each gets whole files, so that tests of a file share compiled kernels.
-test: $(VENV)/.ready-dev
-	$(if $(slow),REFFUSION_SLOW=1) OMP_NUM_THREADS=1 \
-		$(PY) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+test test-fast: $(VENV)/.ready-dev
+	$(if $(slow),REFFUSION_SLOW=1) OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses 2 --dist loadfile \
+		--no-loadscope-reorder $(if $(filter test-fast,$@),-m "not integration")
 
 # Every reader on damaged files, ten minutes each.
 fuzz: $(VENV)/.ready-dev

@@ -135,19 +135,19 @@ def log_spaced(iteration: int, last: int, per_octave: int = 2, first: int = 1) -
 
 
 def steps_within_budget(
-    folder: Path, asked: int, seconds: float, spent: Callable[[], float], trial: Callable[[Path, int], object]
+    folder: Path, max_steps: int, seconds: float, elapsed: Callable[[], float], trial: Callable[[Path, int], object]
 ) -> int:
-    """The number of `asked` steps that a stage can do in its `seconds`: at least a twentieth of them.
+    """How many steps a stage can do in its `seconds`: between a twentieth of `max_steps` and `max_steps`.
 
     The answer depends on the machine and its load. It is written to `folder/length.json`, and read back on a resume.
 
     Args:
         seconds: for the whole stage; 0: no limit, and nothing is measured or written.
-        spent: returns the seconds used up when the steps begin.
-        trial: runs that many steps, with a trace in the given folder; must leave everything else unchanged.
+        elapsed: returns the seconds used up when the steps begin.
+        trial: (folder, count) runs `count` steps with a trace in the folder; must leave everything else unchanged.
     """
     if not seconds:
-        return asked
+        return max_steps
     path = folder / LENGTH
     if path.exists():
         return json.loads(path.read_text())["steps"]
@@ -158,12 +158,12 @@ def steps_within_budget(
     at = {line["iteration"]: line["seconds"] for line in read_trace(tried / "trace.jsonl")}
     shutil.rmtree(tried)
     step = (at[TRIAL_STEPS] - at[1]) / (TRIAL_STEPS - 1)  # the first step compiles and fills caches
-    steps = min(asked, max(-(-asked // 20), int((seconds - spent()) / max(step, 1e-9))))
-    record = {"steps": steps, "of": asked, "seconds_per_step": step, "seconds": seconds}
+    steps = min(max_steps, max(-(-max_steps // 20), int((seconds - elapsed()) / max(step, 1e-9))))
+    record = {"steps": steps, "of": max_steps, "seconds_per_step": step, "seconds": seconds}
     partial = path.with_suffix(".writing")
     partial.write_text(json.dumps(record) + "\n")
     os.replace(partial, path)
-    print(f"{steps} of {asked} steps fit into {seconds:.0f} s, at {step:.3g} s each", flush=True)
+    print(f"{steps} of {max_steps} steps fit into {seconds:.0f} s, at {step:.3g} s each", flush=True)
     return steps
 
 

@@ -191,7 +191,7 @@ class MaskSet:
         raw: the given 2D mask (all False where none was given).
         consistent: C, rendered back from the labelled Gaussians; it must not supervise.
         unobserved: U, inside C: no other photograph shows what is visible there without the object.
-        invent: I, the pixels to be invented: U, and the region the scene asks to fill.
+        invent: I, the pixels to be invented: U (all of C with `masks.invent: consistent`), and the region to fill.
     """
 
     raw: np.ndarray

@@ -26,7 +26,11 @@ LABEL_OFFSETS = [(6, 0), (-6, 0), (5, 7), (-5, 7), (5, -7), (-5, -7), (0, 10), (
 
 
 def new_figure(height: float, rows: int = 1, columns: int = 1, **options) -> tuple[Figure, np.ndarray]:
-    """A figure of page width and its axes [rows, columns], in the common style."""
+    """A figure of page width and its axes [rows, columns], in the common style.
+
+    Args:
+        height: of the figure, inches. options: of matplotlib's `Figure.subplots`.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -16,7 +16,7 @@
 - compare.py: many runs: `compare` and `batch`.
   - parallel.py: several runs at once; progress.py: how far each one is.
 - results.py: prints scores; calls report/ for tables and pages.
-- maintenance.py: verifies artifacts or removes them; sweep.py: removes those that no plan uses.
+- maintenance.py: verifies artifacts or removes them; garbage.py: removes those that no plan uses.
 - weights.py: lists and fetches the weights that stages need.
 - text.py: errors, sizes, times and paths as text.
 """

@@ -14,12 +14,12 @@ from runner.compare import batch, compare
 from runner.engine import ENGINES, make_engine
 from runner.execute import Execution, run_scene
 from runner.files import write_json
+from runner.garbage import collect_garbage
 from runner.gpu_costs import cost_table
 from runner.maintenance import clean, verify
 from runner.plan import plan, plan_record, plan_table
 from runner.resolve import Request, resolve
 from runner.results import call_report, show_results
-from runner.sweep import sweep
 from runner.text import display_path, format_error
 from runner.weights import fetch_weights
 from runner.worker import INTERRUPTED
@@ -86,8 +86,8 @@ def _batch(request: Request, arguments: argparse.Namespace) -> int:
     return call_report("batch", *options) or int(failed > 0)
 
 
-def _sweep(request: Request, arguments: argparse.Namespace) -> int:
-    sweep(request, arguments.yes)
+def _collect_garbage(request: Request, arguments: argparse.Namespace) -> int:
+    collect_garbage(request, arguments.yes)
     return 0
 
 
@@ -104,7 +104,7 @@ _COMMANDS = {
     "weights": lambda request, arguments: int(fetch_weights(request, arguments.offline) > 0),
     "verify": lambda request, arguments: int(verify(request) > 0),
     "clean": _clean,
-    "gc": _sweep,
+    "gc": _collect_garbage,
 }
 
 

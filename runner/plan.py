@@ -236,8 +236,8 @@ def plan(job: ResolvedJob, stages: list[str], done: dict[str, Decision] | None =
 
 def _stage_question(job: ResolvedJob, stage: str, decisions: dict[str, Decision]) -> dict[str, Any]:
     """The question to a stage, see `worker.describe`. A stage that may run gets the paths of its needs, for a preview.
-    One that reads the scene is asked, and may refuse, before its other needs are made; it gets only those of them that
-    are final."""
+    A stage that reads the scene is asked before its other needs are made, so that it can refuse early; it gets the
+    paths of the needs that are final already."""
     spec, question = job.pipeline.stages[stage], job.question(stage)
     others = {need: decisions[need] for need in spec.all_needs if need != SCENE}
     needs = {need: each.path for need, each in others.items() if each.is_final or SCENE not in spec.all_needs}

@@ -47,7 +47,7 @@ def _print_problems(missing: list[dict[str, Any]]) -> None:
     for need in missing:
         if not need["fetched"]:
             print(f"error: {need['problem']}", file=sys.stderr)
-    for places in dict.fromkeys(tuple(need.get("looked", ())) for need in missing):
-        names = [need["name"] for need in missing if tuple(need.get("looked", ())) == places]
+    for places in dict.fromkeys(tuple(need.get("folders", ())) for need in missing):
+        names = [need["name"] for need in missing if tuple(need.get("folders", ())) == places]
         if places:
             print(f"looked for {', '.join(names)} in {', '.join(places)}")

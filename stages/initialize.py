@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +27,7 @@ from reffusion.io.scene import load_references
 from reffusion.masks import voting
 from reffusion.params.initialize import Params
 from reffusion.trace import Trace
-from reffusion.types import Reference
+from reffusion.types import MaskSet, Reference
 from reffusion.workspace import Workspace
 
 WARN_SHARE = 0.01  # uncovered share of C from which a view is named
@@ -82,15 +84,40 @@ def run(
 
     save_ply(out / "gaussians.ply", draft.gaussians)
     save_labels(out / "labels.npy", draft.is_new.cpu())
+    photos = background.photos if is_method else None
+    save_json(out / "facts.json", summarize(params, space, draft, floaters, sets, extra, trusted, photos))
+
+
+def summarize(
+    params: Params,
+    space: Workspace,
+    draft: Draft,
+    floaters: int,
+    sets: Mapping[str, MaskSet],
+    extra: Sequence[Reference],
+    trusted: Sequence[Reference],
+    photos: Mapping[str, np.ndarray] | None,
+) -> dict[str, Any]:
+    """The stage's facts: what was added and removed, what nothing covers, and whether SDS may gain; warns of views with
+    uncovered pixels.
+
+    Args:
+        photos: view -> uint8 [H, W, 3], without the shadows that were removed; None for a baseline.
+    """
+    train = [space.scene.cameras[name] for name in space.scene.train]
     uncovered = {
         each.name: coverage.uncovered_share(draft.gaussians, each, sets[each.name].consistent) for each in train
     }
     shares = {each.camera.name: float(each.mask.sum() / sets[each.camera.name].consistent.sum()) for each in extra}
     gain = GainPrediction(True, f"start is {params.start}", None)
-    if is_method:
-        gain = predict_gain(draft.gaussians, train, sets, background.photos, max(shares.values(), default=0.0))
+    if photos is not None:
+        gain = predict_gain(draft.gaussians, train, sets, photos, max(shares.values(), default=0.0))
     print(f"SDS {'may' if gain.may_gain else 'cannot'} gain: {gain.reason}")
-    facts = {
+    if named := [f"{name} ({share:.1%})" for name, share in uncovered.items() if share > WARN_SHARE]:
+        print(
+            f"uncovered in {len(named)} views: {', '.join(named)}: complete another view and add it to the references"
+        )
+    return {
         "new_gaussians": int(draft.is_new.sum()),
         "removed_gaussians": int(space.labels.sum()),
         "floaters": floaters,
@@ -102,11 +129,6 @@ def run(
         "psnr_beside": gain.psnr_beside,
         "uncovered_share": sum(uncovered.values()) / max(len(uncovered), 1),
     }
-    save_json(out / "facts.json", facts)
-    if named := [f"{name} ({share:.1%})" for name, share in uncovered.items() if share > WARN_SHARE]:
-        print(
-            f"uncovered in {len(named)} views: {', '.join(named)}: complete another view and add it to the references"
-        )
 
 
 def load_completed(params: Params, space: Workspace, reference: Path | None, lift: Path | None) -> list[Reference]:

@@ -46,7 +46,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     consistent = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
     # What lies inside the mask in (almost) every view can only be the object, whatever the votes say.
     dirty = {name: consistent[name] for name in scene.train if name not in scene.clean}
-    labels = labels | voting.hidden_inside(gaussians, train, dirty, share=params.hull)
+    labels = labels | voting.hidden_inside(gaussians, train, dirty, share=params.inside_share)
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
     views = render_depth_views(gaussians, train, hidden)
     background = Background(views, {}, points=scene.points).with_planes(gaussians, labels)

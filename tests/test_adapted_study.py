@@ -14,6 +14,8 @@ from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_scene, save_references
 from reffusion.types import Reference
 
+pytestmark = pytest.mark.integration
+
 HOLE = np.zeros((36, 48), bool)
 HOLE[10:24, 12:30] = True
 

@@ -15,6 +15,8 @@ from reffusion.metrics import image_metrics
 from reffusion.splat import rasterizer
 from stages import distill
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 
 NEAR = 1.7

@@ -19,6 +19,8 @@ from reffusion.metrics import image_metrics
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
+pytestmark = pytest.mark.integration
+
 TRAIN = [wall_scene.CAMERAS[name] for name in wall_scene.TRAIN]
 
 

@@ -340,6 +340,7 @@ VALUES = {  # parameter -> values that it cannot have
 }
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in VALUES.items() for value in values])
 def test_values_of_parameters(good_captures, tmp_path, name, value):
     stage, *groups = name.split(".")
@@ -452,6 +453,7 @@ TRANSFORMS: dict[str, Change] = {
 }
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("change", TRANSFORMS.values(), ids=TRANSFORMS.keys())
 def test_transforms_json(good_captures, tmp_path, change):
     said = assert_bad_input(good_captures, tmp_path, "transforms", change, "")
@@ -893,6 +895,7 @@ ASKED = [
 THROUGH_THE_COMMAND = [*QUICK, *(ASKED if SLOW else ASKED[:1])]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("names", "change", "set_"), THROUGH_THE_COMMAND)
 def test_the_command_says_one_line_and_ends_with_2(good_captures, tmp_path, names, change, set_):
     folder, runs = tmp_path / "s", tmp_path / "runs"

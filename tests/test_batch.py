@@ -23,6 +23,8 @@ from runner.execute import Execution, run_scene
 from runner.progress import Progress
 from runner.resolve import Request
 
+pytestmark = pytest.mark.integration
+
 REPO = Path(__file__).resolve().parent.parent
 STAGE = COMPARE_FILES["stages/distill.py"].replace(
     "    time.sleep(params.pause)\n",

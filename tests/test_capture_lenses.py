@@ -168,7 +168,7 @@ def test_video_without_frames(tmp_path, coded):
     other = data.replace(b"mp4v", b"av01").replace(b"esds", b"free")
     path.write_bytes(other if coded else data.replace(b"vide", b"soun"))
     with pytest.raises(BadInput) as caught:
-        video.update_frames(path, tmp_path / "s", "0")
+        video.extract_frames(path, tmp_path / "s", "0")
     message = str(caught.value)
     assert "\n" not in message and "walk.mp4" in message and not (tmp_path / "s").exists()
     way_out = ("codec", "decode", "H.264", "h264", "ffmpeg", "convert") if coded else ("video",)

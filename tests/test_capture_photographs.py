@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 from scenes.capture_checks import run_with_messages
 from scenes.room import render_room_corner, room_textures, room_walk
 
 from benchmarks.studies.bare_photographs import pose_errors
+
+pytestmark = pytest.mark.integration
 
 ORIENTATION, EXIF_FOLDER, FOCAL_35_MM = 0x0112, 0x8769, 0xA405
 

@@ -28,6 +28,8 @@ from report.mask import Server
 from report.mask_session import Capture, Session
 from stages import masks, poses
 
+pytestmark = pytest.mark.integration
+
 NEAR = 1.7
 
 

@@ -24,6 +24,8 @@ from runner.execute import Execution, run_scene
 from runner.retry import run_attempt, take_over
 from runner.worker import INTERRUPTED
 
+pytestmark = pytest.mark.integration
+
 REPO = Path(__file__).resolve().parent.parent
 slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
 

@@ -25,6 +25,8 @@ from report.paired_statistics import confidence_half_width, paired_difference, p
 from runner import Refused
 from runner.compare import compare
 
+pytestmark = pytest.mark.integration
+
 REPO = Path(__file__).resolve().parent.parent
 
 PUBLISHED = 'method,metric,value,protocol\nsomebody,psnr_box,19.5,"ten scenes, 1600 px"\n'

@@ -65,6 +65,7 @@ def test_leaves_have_no_third_face():
     assert find_third_faces(face, free[:200], found[:1], np.zeros(3), 0.5, 0.02) == [], "one plane has no corner"
 
 
+@pytest.mark.integration
 def test_sparse_points_tell_where_planes_lie_that_are_drawn_too_near():
     views = []
     for turn in np.linspace(0.1, 0.6, 12):

@@ -20,6 +20,8 @@ from runner.plan import plan, plan_table
 from runner.resolve import Request, resolve
 from runner.text import format_seconds
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 HALF = {"device": "cuda", "dtype": "float16"}
 WORK = {

@@ -13,6 +13,8 @@ import yaml
 from reffusion.io import colmap
 from reffusion.io.images import load_image, load_mask
 
+pytestmark = pytest.mark.integration
+
 
 def png_stems(folder: Path) -> list[str]:
     return sorted(path.stem for path in folder.glob("*.png"))

@@ -10,6 +10,8 @@ import yaml
 
 from reffusion.io.images import load_mask
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.mark.parametrize(
     ("name", "mask", "share"),

@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pytest
 
 from benchmarks.studies import depth as study
 from reffusion.io import colmap
 from reffusion.io.images import load_mask
+
+pytestmark = pytest.mark.integration
 
 
 def test_truth_is_where_sparse_points_are(generate, tmp_path):

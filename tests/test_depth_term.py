@@ -12,7 +12,7 @@ from scenes.stage_runs import trace_lines
 
 from reffusion import trace
 from reffusion.depth import background_depth, estimates
-from reffusion.depth.background_depth import Completion
+from reffusion.depth.background_depth import CompletionSettings
 from reffusion.distill import depth_estimator
 from reffusion.distill import loop as D
 from reffusion.distill.depth_estimator import DepthEstimator, build_estimator
@@ -35,7 +35,7 @@ ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
 WALL = 0.5 + 0.004 * (COLUMNS + 0.5 - WIDTH / 2) - 0.002 * (ROWS + 0.5 - HEIGHT / 2)  # disparity of a slanted wall
 HOLE = (np.abs(COLUMNS + 0.5 - WIDTH / 2) < 7) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 6)
 NO_POINTS = np.zeros((0, 3))
-HOW = Completion(ring=0.2)
+HOW = CompletionSettings(ring=0.2)
 DEPTH = DepthTerm(steps=2)
 
 
@@ -156,6 +156,7 @@ def test_a_displaced_surface_converges_to_the_wall():
         assert (getattr(optimizer.gaussians, name)[~masked] == getattr(gaussians, name)[~masked]).all(), name
 
 
+@pytest.mark.integration
 def test_the_gradient_reaches_the_geometry_of_masked_gaussians_only(prior, text):
     gaussians, masked = slanted_wall(0.9)
     gaussians = as_leaves(gaussians)
@@ -189,7 +190,7 @@ def test_the_gradient_agrees_with_finite_differences_in_float64():
     exact = few.map(lambda p: p.double())
 
     def value(changed: Gaussians) -> float:
-        depth = render(changed, VIEW, impl="reference").depth
+        depth = render(changed, VIEW, impl="torch").depth
         return float((depth[compared] - torch.from_numpy(1 / WALL)[compared]).square().mean())
 
     assert float(loss.detach()) == pytest.approx(value(exact), rel=1e-4)
@@ -206,6 +207,7 @@ def test_the_gradient_agrees_with_finite_differences_in_float64():
 # ------------------------------------------------------------------------------------------ views that tell nothing
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "estimate, reason",
     [(np.full(WALL.shape, 3.0), "constant"), (-WALL, "reversed"), (np.zeros(WALL.shape), "constant")],
@@ -243,6 +245,7 @@ def test_a_view_larger_than_asked_for_is_rendered_smaller():
 # ------------------------------------------------------------------------------------------ repainting
 
 
+@pytest.mark.integration
 def test_repainting_changes_the_hole_only_and_the_less_the_later_it_starts(prior, text):
     image = torch.rand(3, HEIGHT, WIDTH, generator=generator(5)) * 1.6 - 0.8
     hole, changes = torch.from_numpy(HOLE), []
@@ -305,6 +308,7 @@ def run_depth_distill(folder, prior, text, estimator, settings=RUN):
     return D.distill(gaussians, masked, inputs, settings, folder)
 
 
+@pytest.mark.integration
 def test_interrupted_distillation_with_the_depth_term_resumes_bit_for_bit(prior, text, tmp_path, monkeypatch):
     monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
     whole, _ = run_depth_distill(tmp_path / "whole", prior, text, constant_estimator(WALL))
@@ -327,6 +331,7 @@ def test_interrupted_distillation_with_the_depth_term_resumes_bit_for_bit(prior,
     assert 0 < trace_lines(tmp_path / "whole")[-1]["depth"] < trace_lines(tmp_path / "whole")[1]["depth"]
 
 
+@pytest.mark.integration
 def test_skipped_views_are_counted_by_reason_and_move_nothing(prior, text, tmp_path):
     ended, _ = run_depth_distill(tmp_path, prior, text, constant_estimator(np.full(WALL.shape, 2.0)))
     assert trace_lines(tmp_path)[-1]["depth_skipped_constant"] == 3 and "depth" not in trace_lines(tmp_path)[-1]
@@ -345,4 +350,4 @@ def test_an_estimate_that_is_not_finite_names_step_and_view(prior, text, tmp_pat
 def test_initialize_and_distill_complete_depth_alike():
     from reffusion.initialize import fill
 
-    assert fill.COMPLETION == Completion() == build_estimator(Params(), NO_POINTS).how
+    assert fill.COMPLETION == CompletionSettings() == build_estimator(Params(), NO_POINTS).how

@@ -20,6 +20,8 @@ from reffusion.params.distill import AdversarialTerm
 from reffusion.prior.windows import window_around, windows_around
 from reffusion.seeding import generator
 
+pytestmark = pytest.mark.integration
+
 SMALL, RATE = AdversarialTerm(patches=16, size=8, width=8), 3e-3
 
 

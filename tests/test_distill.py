@@ -53,6 +53,8 @@ from reffusion.splat.rasterizer import render
 from reffusion.trace import load_checkpoint, read_trace
 from reffusion.types import PARAMETERS, MaskSet
 
+pytestmark = pytest.mark.integration
+
 
 def gradients_of(term, gaussians, masked, prior, text, view=None):
     gaussians, view = as_leaves(gaussians), view or train_view()

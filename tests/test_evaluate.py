@@ -24,6 +24,8 @@ from reffusion.types import Gaussians, MaskSet, Scene, Similarity
 from report import sheet
 from stages import evaluate, finish
 
+pytestmark = pytest.mark.integration
+
 SIMILARITY = Similarity(0.02, np.array([500_000.0, -3.0, 40.0]))
 WIDTH, HEIGHT = 48, 36
 

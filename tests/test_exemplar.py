@@ -26,7 +26,10 @@ from reffusion.inpaint.shift_map.plane_symmetry import MIN_CELLS, PlanePixels, f
 from reffusion.inpaint.source_image import without_geometry
 from reffusion.types import Camera
 
+pytestmark = pytest.mark.integration
+
 SIDE = 128
+HOLE = disk_mask((SIDE, SIDE), 70, 62, 24)
 RED = (255, 0, 0)
 
 
@@ -126,32 +129,25 @@ def floor_background() -> Background:
     for view in CAMERAS:
         depth = FLOOR.depth(view)
         depth = np.where(np.isfinite(depth) & (depth < 5), depth, 0).astype(np.float32)
-        views.append(DepthView.from_range(view, depth, depth_range(depth), disk_mask((SIDE, SIDE), 70, 62, 24)))
+        views.append(DepthView.from_range(view, depth, depth_range(depth), HOLE))
     return Background(views, {view.name: paint_planks(view) for view in CAMERAS}, planes=[FLOOR], radius=1.0)
 
 
 def test_planks_run_on_in_their_own_perspective():
-    image = np.where(disk_mask((SIDE, SIDE), 70, 62, 24)[..., None], np.uint8(RED), paint_planks(CAMERAS[0]))
+    image = np.where(HOLE[..., None], np.uint8(RED), paint_planks(CAMERAS[0]))
 
     def off(around):
         found = exemplar.complete_view(
             image,
-            disk_mask((SIDE, SIDE), 70, 62, 24),
+            HOLE,
             CAMERAS[0],
-            disk_mask((SIDE, SIDE), 70, 62, 24),
+            HOLE,
             around,
             range(3),
         )
-        return np.mean(
-            [
-                np.abs(each.image.astype(int) - paint_planks(CAMERAS[0]))[disk_mask((SIDE, SIDE), 70, 62, 24)].mean()
-                for each in found
-            ]
-        )
+        return np.mean([np.abs(each.image.astype(int) - paint_planks(CAMERAS[0]))[HOLE].mean() for each in found])
 
-    plain = np.abs(telea(image, disk_mask((SIDE, SIDE), 70, 62, 24)).astype(int) - paint_planks(CAMERAS[0]))[
-        disk_mask((SIDE, SIDE), 70, 62, 24)
-    ].mean()
+    plain = np.abs(telea(image, HOLE).astype(int) - paint_planks(CAMERAS[0]))[HOLE].mean()
     carried, shifted = off(floor_background()), off(replace(floor_background(), planes=[]))
     assert carried < 0.9 * shifted and carried < 0.6 * plain
 
@@ -213,45 +209,39 @@ def test_a_texture_without_period_has_no_symmetry():
 def test_joints_and_round_borders_go_on_where_a_floor_repeats_itself(shown):
     around = replace(floor_background(), photos={view.name: shown(view) for view in CAMERAS})
     truth = shown(CAMERAS[0]).astype(int)
-    image = np.where(disk_mask((SIDE, SIDE), 70, 62, 24)[..., None], np.uint8(RED), shown(CAMERAS[0]))
+    image = np.where(HOLE[..., None], np.uint8(RED), shown(CAMERAS[0]))
     target, sources, smooth, how = exemplar._find_surfaces(
         image,
-        disk_mask((SIDE, SIDE), 70, 62, 24),
+        HOLE,
         CAMERAS[0],
-        disk_mask((SIDE, SIDE), 70, 62, 24),
+        HOLE,
         around,
-        render_mirrors([], CAMERAS[0], disk_mask((SIDE, SIDE), 70, 62, 24), []),
+        render_mirrors([], CAMERAS[0], HOLE, []),
     )
-    found = fill_plane(target, disk_mask((SIDE, SIDE), 70, 62, 24), sources, 1, how[1])
+    found = fill_plane(target, HOLE, sources, 1, how[1])
     picture, filled = found.image, found.filled
-    assert (
-        filled[disk_mask((SIDE, SIDE), 70, 62, 24)].mean() > 0.9
-        and not filled[~disk_mask((SIDE, SIDE), 70, 62, 24)].any()
-        and (picture[~filled] == image[~filled]).all()
-    )
+    assert filled[HOLE].mean() > 0.9 and not filled[~HOLE].any() and (picture[~filled] == image[~filled]).all()
     dark = lambda done: done.mean(-1)[filled] < 90  # joints; and what is bright is the plate
     kind = lambda done: dark(done).astype(int) + 2 * (done.mean(-1)[filled] > 195)
     wrong = lambda done: (kind(done) != kind(truth)).mean()
-    patches = np.mean(
-        [wrong(complete(target, disk_mask((SIDE, SIDE), 70, 62, 24), sources, smooth, k).image) for k in range(3)]
-    )
+    patches = np.mean([wrong(complete(target, HOLE, sources, smooth, k).image) for k in range(3)])
     assert wrong(picture) < 0.7 * patches
 
 
 def test_a_hole_without_source_pixels_is_left():
-    image = np.where(disk_mask((SIDE, SIDE), 70, 62, 24)[..., None], np.uint8(RED), paint_planks(CAMERAS[0]))
+    image = np.where(HOLE[..., None], np.uint8(RED), paint_planks(CAMERAS[0]))
     target, sources, _, how = exemplar._find_surfaces(
         image,
-        disk_mask((SIDE, SIDE), 70, 62, 24),
+        HOLE,
         CAMERAS[0],
-        disk_mask((SIDE, SIDE), 70, 62, 24),
+        HOLE,
         floor_background(),
-        render_mirrors([], CAMERAS[0], disk_mask((SIDE, SIDE), 70, 62, 24), []),
+        render_mirrors([], CAMERAS[0], HOLE, []),
     )
     found = fill_plane(
         target,
-        disk_mask((SIDE, SIDE), 70, 62, 24),
-        [replace(s, usable=np.zeros_like(disk_mask((SIDE, SIDE), 70, 62, 24))) for s in sources],
+        HOLE,
+        [replace(s, usable=np.zeros_like(HOLE)) for s in sources],
         1,
         how[1],
     )

@@ -34,6 +34,8 @@ from runner.resolve import resolve as prepare_job
 from stages import reference
 from stages.plan import reference as plan_reference
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 HEIGHT, WIDTH = 96, 136  # multiples of 8: the means are of these pixels alone
 SIDE = 32

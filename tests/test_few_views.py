@@ -21,6 +21,8 @@ from reffusion.splat import rasterizer
 from reffusion.types import Scene, Similarity
 from stages import fit as stage
 
+pytestmark = pytest.mark.integration
+
 WALL, NEAR, HALF = 2.0, 1.5, 0.2  # depth of the wall and of a square before it; half its side
 NONE: dict[str, np.ndarray] = {}
 

@@ -12,6 +12,8 @@ from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_scene, save_scene
 from stages import evaluate, finish
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.fixture
 def fit_folders(tmp_path):

@@ -59,7 +59,7 @@ def true_gaussians() -> Gaussians:
 
 
 def render_photos(cameras) -> dict[str, np.ndarray]:
-    pictures = {c.name: render(true_gaussians(), c, impl="reference").color.clamp(0, 1) for c in cameras}
+    pictures = {c.name: render(true_gaussians(), c, impl="torch").color.clamp(0, 1) for c in cameras}
     return {name: (picture * 255).round().byte().numpy() for name, picture in pictures.items()}
 
 
@@ -121,6 +121,7 @@ def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, ga
         assert first == second
 
 
+@pytest.mark.integration
 def test_exposures_are_found_and_taken_out_again(tmp_path):
     """Photographs of which each has another exposure: where it is fitted the held-out view, exposed as on average, is
     right; where not, it is not; and the photographs come back as if none had differed."""
@@ -249,7 +250,7 @@ def test_a_scene_a_thousand_times_larger_and_far_away_fits_alike(tmp_path):
     moved = run_fit(tmp_path / "far", cameras, initial_model(far.apply(far.invert(points))))
     assert len(plain) == len(moved)
     for camera in arc_cameras():
-        a, b = (render(g, camera, impl="reference").color for g in (plain, moved))
+        a, b = (render(g, camera, impl="torch").color for g in (plain, moved))
         assert (a - b).abs().max() < 0.01
 
 

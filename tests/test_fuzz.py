@@ -38,6 +38,8 @@ from reffusion.types import Gaussians
 from runner import Refused
 from runner.user_yaml import read_user_yaml
 
+pytestmark = pytest.mark.integration
+
 SLOW = os.environ.get("REFFUSION_SLOW") == "1"
 SECONDS = float(os.environ.get("REFFUSION_FUZZ_SECONDS", "600"))
 QUICK = 40  # files a reader in an ordinary run

@@ -7,6 +7,8 @@ import pytest
 
 from benchmarks.studies import gain, holes
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 
 

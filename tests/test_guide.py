@@ -18,9 +18,12 @@ COMMANDS = [line.split("#")[0].strip() for line in re.findall(r"^make .*", GUIDE
 QUICK = ("plan", "check", "mask")
 LITTLE = "fit.iterations=20 personalize.steps=2 distill.iterations=2"
 
-pytestmark = pytest.mark.skipif(
-    not Path(sys.prefix, ".ready").exists(), reason="the tests do not run in an environment that make has set up"
-)
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.skipif(
+        not Path(sys.prefix, ".ready").exists(), reason="the tests do not run in an environment that make has set up"
+    ),
+]
 
 
 @pytest.fixture(scope="module")

@@ -28,6 +28,8 @@ from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Reference
 from stages import initialize
 
+pytestmark = pytest.mark.integration
+
 NEAR = 1.7
 SHEETS = Sheets()
 

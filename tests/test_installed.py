@@ -16,6 +16,8 @@ from scenes.processes import run_module
 from runner.keys import Hashes, code_fingerprints
 from runner.pipeline import load_pipeline
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("reffusion", "stages", "runner", "report")
 BUILD = "import sys, setuptools.build_meta as build; build.build_wheel(sys.argv[1])"

@@ -6,7 +6,7 @@ import numpy as np
 from scenes.cameras import make_camera
 
 from reffusion.background.continuation import _enclosed_patches
-from reffusion.depth.background_depth import Completion, Hints, ViewDepth, continue_depth
+from reffusion.depth.background_depth import CompletionSettings, Hints, ViewDepth, continue_depth
 from reffusion.depth.layers import label_surfaces, segment_surfaces
 from reffusion.graph_cut import alpha_expansion
 from reffusion.morphology import dilate_by_distance
@@ -47,7 +47,7 @@ def test_where_other_views_look_past_a_surface_its_colours_are_another_ones():
     picture = np.where(leaves[..., None], picture[0, 0], picture)
     view = make_camera("v", (120, 100), 100.0)
     past = lambda depth: (columns >= 62) & (depth < 0.97 / disparity)
-    how = Completion(planar_share=2.0, ring=0.2, margin=0.01)
+    how = CompletionSettings(planar_share=2.0, ring=0.2, margin=0.01)
     wrong = []
     for looked_past in (None, past):
         seen = ViewDepth(
@@ -83,7 +83,7 @@ def test_what_stands_on_a_plane_that_goes_on_keeps_its_hidden_rim():
     everywhere: under the vase's rim, too."""
     table, depth, vase, picture, hole = vase_scene()
     view = make_camera("v", (120, 100), 100.0)
-    how = Completion(planar_share=2.0, ring=0.2, margin=0.03)
+    how = CompletionSettings(planar_share=2.0, ring=0.2, margin=0.03)
     known, hints = ~dilate_by_distance(hole, how.margin), Hints(np.where(hole, table, np.inf), (table,))
     seen = ViewDepth(view, np.where(hole, table, depth), known, hole, hole, hole, hints)
     found, said = continue_depth(seen, picture, np.zeros((0, 3)), how)
@@ -138,7 +138,7 @@ def test_depth_steps_where_the_picture_has_an_edge():
     disparity, picture, hole = step_scene()
     view = make_camera("v", (120, 100), 100.0)
     seen = ViewDepth(view, 1 / disparity, ~hole, hole, hole, np.zeros_like(hole))
-    found, said = continue_depth(seen, picture, np.zeros((0, 3)), Completion(planar_share=2.0, ring=0.2))
+    found, said = continue_depth(seen, picture, np.zeros((0, 3)), CompletionSettings(planar_share=2.0, ring=0.2))
     assert "2 surfaces" in said
     error = np.abs(found / disparity - 1)[hole]
     assert np.quantile(error, 0.95) < 0.01

@@ -18,6 +18,8 @@ from reffusion.metrics import image_metrics, lpips
 from reffusion.weights import local, lpips_package
 from reffusion.weights.published import LPIPS, LPIPS_PACKAGES, LpipsNet
 
+pytestmark = pytest.mark.integration
+
 
 def smooth_pair(height, width, seed=0, noise=0.1):
     """A smooth picture and a noisy copy, [H, W, 3] in [0, 1]."""

@@ -264,7 +264,7 @@ def test_any_subset_of_the_objects_goes_and_the_others_stay(tmp_path):
     poses, fit, labels = wall_scene.write_poses_and_fit(tmp_path, NEAR)
     first = labels & (load_ply(fit / "gaussians.ply").means[:, 0] < 0)
     for path in sorted((tmp_path / "raw_masks/masks").glob("*.png")):
-        mask, half = load_mask(path), left_of_square(path.stem)
+        mask, half = load_mask(path), mask_left_of_square(path.stem)
         for name, part in (("left", half), ("right", ~half)):
             save_mask(tmp_path / "raw_masks/masks" / name / path.name, mask & part)
         path.unlink()
@@ -284,7 +284,7 @@ def test_any_subset_of_the_objects_goes_and_the_others_stay(tmp_path):
     assert across[left[0] & right[0] & labels].abs().max() < 1.5 * apart  # a column at the seam, which both show
 
 
-def left_of_square(name: str) -> np.ndarray:
+def mask_left_of_square(name: str) -> np.ndarray:
     """bool [H, W]: the pixels left of the middle of the square."""
     camera = wall_scene.CAMERAS[name]
     column = geometry.project(np.array([[0.0, 0.0, NEAR]]), camera)[0][0, 0]

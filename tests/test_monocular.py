@@ -11,7 +11,7 @@ from scenes import wall_scene
 from scenes.networks import small_depth_model
 
 from reffusion.depth import monocular
-from reffusion.depth.background_depth import Completion, ViewDepth
+from reffusion.depth.background_depth import CompletionSettings, ViewDepth
 from reffusion.initialize import unprojection
 from reffusion.seeding import generator
 from reffusion.types import Reference
@@ -102,7 +102,7 @@ def test_the_references_depth_is_the_estimate_aligned():
     height = (np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH][0] + 0.5 - wall_scene.HEIGHT / 2) / wall_scene.FOCAL
     true = (1 - 0.2 * height) / wall_scene.WALL
     behind_it = lambda estimate: unprojection.estimate_depth(
-        replace(remaining, means=means), reference, hole, hole, np.zeros((0, 3)), Completion(), estimate
+        replace(remaining, means=means), reference, hole, hole, np.zeros((0, 3)), CompletionSettings(), estimate
     )
     _, made_up, said = behind_it(50 * true - 3)
     assert "aligned" in said

@@ -141,7 +141,7 @@ def test_ssim_is_never_computed_in_tf32(monkeypatch):
 def test_confined_rows_receive_exactly_nothing():
     leaves = gaussians_near_origin(30).map(lambda p: p.requires_grad_())
     select = torch.arange(30) % 3 == 0
-    rendering = render(confine(leaves, select), unit_camera(), impl="reference")
+    rendering = render(confine(leaves, select), unit_camera(), impl="torch")
     (rendering.color.square().sum() + rendering.depth.sum() + rendering.alpha.sum()).backward()
     for name in PARAMETERS:
         gradient = getattr(leaves, name).grad
@@ -159,9 +159,9 @@ def test_confine_stops_even_nan():
 
 def test_confine_leaves_the_picture_alone():
     gaussians = gaussians_near_origin(20)
-    seen = render(gaussians, unit_camera(), impl="reference").color
+    seen = render(gaussians, unit_camera(), impl="torch").color
     confined = confine(gaussians, torch.zeros(20, dtype=torch.bool))
-    assert torch.equal(render(confined, unit_camera(), impl="reference").color, seen)
+    assert torch.equal(render(confined, unit_camera(), impl="torch").color, seen)
 
 
 # ---------------------------------------------------------------------------------------------- Adam
@@ -350,8 +350,8 @@ def test_split_keeps_the_picture_roughly():
     parent = gaussians_near_origin(12, seed=4, scale=0.1)
     parent.opacity_logits[:] = 0.0
     children = split(parent, seeding.generator(0, "split"))
-    before = render(parent, unit_camera(48, 36), impl="reference")
-    after = render(children, unit_camera(48, 36), impl="reference")
+    before = render(parent, unit_camera(48, 36), impl="torch")
+    after = render(children, unit_camera(48, 36), impl="torch")
     error = (before.color - after.color).square().mean()
     assert error < 0.25 * before.color.square().mean()
     assert abs(after.alpha.mean() / before.alpha.mean() - 1) < 0.25
@@ -375,7 +375,7 @@ def test_slopes_do_not_depend_on_the_image_size():
     for width in (32, 64):
         optimizer = GaussianOptimizer(gaussians_near_origin(15, seed=7, scale=0.15))
         probe = torch.zeros(15, 2, requires_grad=True)
-        seen = render(optimizer.gaussians, unit_camera(width, width * 3 // 4), impl="reference", probe=probe)
+        seen = render(optimizer.gaussians, unit_camera(width, width * 3 // 4), impl="torch", probe=probe)
         (seen.color - 0.3).square().mean().backward()
         optimizer.observe(probe.grad, seen.radii, width, width * 3 // 4)
         slopes.append(optimizer.grad2d_sum)

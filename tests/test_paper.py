@@ -83,7 +83,7 @@ ABSENT = {
     "fit.init.flow_cell": 0,
     "fit.densify.per_pixel": 0,
     "masks.tidy": False,
-    "masks.hull": 1,
+    "masks.inside_share": 1,
     "masks.debris": False,
     "masks.negligible": 0,
     "personalize.samples.hole_share": 0,

@@ -26,6 +26,8 @@ from reffusion.prior.model import pipeline
 from reffusion.weights import published
 from runner.resolve import Request, resolve
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 STAGES = {
     "masks": ("poses", "raw_masks", "fit"),

@@ -27,6 +27,8 @@ from report import patch
 from stages import poses
 from stages.plan import poses as planned
 
+pytestmark = pytest.mark.integration
+
 NEAR = 1.7  # of the square before the wall, small_scene's
 HERE = Similarity(1.0, np.zeros(3))
 

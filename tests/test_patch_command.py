@@ -26,6 +26,8 @@ from report import export, patch_files
 from stages import poses
 from stages.plan import poses as planned
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 FRAME = Similarity(0.31, np.array([1.5, -20.0, 4.0]))
 

@@ -15,6 +15,8 @@ from reffusion.prior.windows import two_scale_masks
 from reffusion.seeding import generator
 from reffusion.trace import load_checkpoint, read_trace
 
+pytestmark = pytest.mark.integration
+
 NATIVE, SIZE = 16, 12
 TRAINING = Params(
     steps=4, optimizer={"lr_unet": 1e-3, "lr_text": 1e-4, "batch": 2}, samples={"size": SIZE}, checkpoint_seconds=1e9

@@ -52,6 +52,8 @@ from stages import fit, poses, raw_masks
 from stages.plan import poses as plan
 from stages.plan import raw_masks as raw_masks_plan
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.mark.parametrize("model", [PINHOLE, RADIAL, OPENCV, FISHEYE], ids=lambda m: m[0])
 @pytest.mark.parametrize("layout", ["llff+bin", "llff+txt", "colmap", "colmap txt", "transforms", "transforms each"])

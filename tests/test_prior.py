@@ -118,6 +118,7 @@ def test_guidance_zero_is_the_conditional_prediction(tiny_prior):
         diffusion.guided(tiny_prior, noisy, t, condition, text, None, 1.0)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("dropout", [0.1, 0.0], ids=["beside the weights", "added to them"])
 @pytest.mark.parametrize("layers", ["attention", "attention+conv"])
 def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny_prior, tmp_path, layers, dropout):

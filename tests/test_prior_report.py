@@ -15,6 +15,8 @@ from reffusion.io.images import load_image, save_image
 from reffusion.metrics import image_metrics
 from report import prior as page
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 
 

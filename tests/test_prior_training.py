@@ -12,6 +12,8 @@ from scenes.networks import save_small_prior
 
 from priors.tiny import build, images, train
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 TINY = ROOT / "priors" / "tiny"
 

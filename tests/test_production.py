@@ -21,6 +21,8 @@ from reffusion.prior.personalize import train_step
 from reffusion.seeding import generator
 from reffusion.weights import published
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 
 

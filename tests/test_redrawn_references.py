@@ -20,6 +20,8 @@ from reffusion.params.reference import ReferenceSpec
 from reffusion.references import color, registration
 from reffusion.references.files import load_reference_files
 
+pytestmark = pytest.mark.integration
+
 SIZE = (480, 360)
 
 

@@ -54,6 +54,8 @@ from stages import poses, reference
 from stages.plan import poses as plan_poses
 from stages.plan import reference as plan_reference
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 
 
@@ -406,7 +408,7 @@ def test_views_are_ranked_by_what_they_cover_beyond_those_before():
 # ------------------------------------------------------------------------------------------ what reruns, and what stays
 
 
-SMALL = "poses.refine=false fit.iterations=20 fit.densify.cap_max=1000 masks.invent=consistent masks.hull=1"
+SMALL = "poses.refine=false fit.iterations=20 fit.densify.cap_max=1000 masks.invent=consistent masks.inside_share=1"
 
 
 def test_a_new_reference_reruns_nothing_before_its_stage(tmp_path):

@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from reffusion.capture import refine
 from reffusion.types import Camera
 
+pytestmark = pytest.mark.integration
+
 WIDTH, HEIGHT, FOCAL = 216, 162, 200.0
 
 

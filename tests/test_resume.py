@@ -23,6 +23,8 @@ from runner.keys import Hashes
 from runner.plan import decide
 from runner.resolve import Request, resolve
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 KILLS = int(os.environ.get("RESUME_KILLS", "3"))
 STAGES = ("fit", "masks", "reference", "personalize", "initialize", "distill", "finish", "evaluate")

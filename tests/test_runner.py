@@ -19,6 +19,8 @@ from runner.keys import Hashes, code_fingerprints, fingerprint
 from runner.plan import plan, plan_table
 from runner.resolve import resolve
 
+pytestmark = pytest.mark.integration
+
 REPO = Path(__file__).resolve().parent.parent
 
 WORDS = ["poses", "fit", "masks", "distill", "evaluate"]

@@ -32,6 +32,8 @@ from runner.keys import Hashes
 from runner.plan import decide, plan_table
 from runner.resolve import Request, resolve
 
+pytestmark = pytest.mark.integration
+
 SLOW = os.environ.get("REFFUSION_SLOW") == "1"
 KILLS, SIZES = (200, 30) if SLOW else (3, 1)
 SHORT = {  # two stages are enough for what concerns no stage

@@ -11,6 +11,8 @@ from scenes.networks import small_prior
 from benchmarks.studies import sds_variance as benchmark
 from reffusion import seeding
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 
 

@@ -28,6 +28,8 @@ from reffusion.io.images import save_image, save_mask
 from reffusion.io.scene import load_scene
 from stages import poses
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).parents[1]
 slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
 

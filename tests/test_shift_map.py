@@ -15,6 +15,8 @@ from reffusion.inpaint.shift_map.photo_offsets import fill_from_photo, frequent_
 from reffusion.inpaint.source_image import without_geometry
 from reffusion.types import Camera
 
+pytestmark = pytest.mark.integration
+
 HEIGHT, WIDTH = 120, 200
 PATH = slice(40, 56)
 HOLE = disk_mask((HEIGHT, WIDTH), 58, 100, 27)

@@ -17,6 +17,8 @@ from reffusion.masks import regions
 from reffusion.types import PARAMETERS
 from stages import fit, initialize, masks
 
+pytestmark = pytest.mark.integration
+
 NEAR = 1.7
 
 

@@ -42,6 +42,7 @@ print(sorted({name.split(".")[0] for name in sys.modules} & set(sys.argv[2].spli
 """
 
 
+@pytest.mark.integration
 def test_a_scene_whose_background_is_seen_imports_no_diffusion(tmp_path):
     wall_scene.write_poses_and_fit(tmp_path, 0.8)  # far from the wall: each view shows what the others miss
     command = [sys.executable, "-c", RUN_STAGES, str(tmp_path), " ".join(UNUSED)]

@@ -13,7 +13,7 @@ import torch
 from scenes.cameras import make_camera
 from scenes.simulated_gpu import has_gpu
 
-from reffusion.splat import cuda, rasterizer, reference
+from reffusion.splat import cuda, pure_torch, rasterizer
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 BLOCKS = (*PARAMETERS, "features", "background", "probe")
@@ -73,7 +73,7 @@ def assert_close(actual, expected, relative, floor, what):
 def assert_matches_reference(gaussians, view, relative=2e-5, **options):
     """The compiled kernel equals the reference in float64, values and gradients, up to `relative` in L2."""
     fast, fast_gradients = differentiate(gaussians, view, "cpu", torch.float32, **options)
-    exact, exact_gradients = differentiate(gaussians, view, "reference", torch.float64, **options)
+    exact, exact_gradients = differentiate(gaussians, view, "torch", torch.float64, **options)
     assert torch.equal(fast.radii, exact.radii)
     for name in IMAGES:
         assert_close(getattr(fast, name), getattr(exact, name), relative, 1e-6, name)
@@ -158,7 +158,7 @@ def test_antialiased_needles_and_sheets():
     assert (drawn.radii == 0).all() and all(torch.isfinite(g).all() for g in gradients.values())
 
 
-@pytest.mark.parametrize("impl", ["cpu", "reference"])
+@pytest.mark.parametrize("impl", ["cpu", "torch"])
 def test_antialiased_adds_up_to_the_same_from_any_distance(impl):
     """The sum of alpha of a round Gaussian is 2 pi o (f s / z)^2, also where that is far below a pixel; 3DGS's low-pass
     makes it at least 2 pi o 0.3, as bright from afar as from near."""
@@ -181,7 +181,7 @@ def test_reference_against_finite_differences(antialiased):
     """Every parameter along random directions, in float64; the random scene has no pixel close to a threshold."""
     gaussians, view = replace(random_cloud(12, -1.2, seed=2), antialiased=antialiased), off_center_camera(9, 8)
     gaussians = gaussians.map(torch.Tensor.double)
-    _, gradients = differentiate(gaussians, view, "reference", torch.float64)
+    _, gradients = differentiate(gaussians, view, "torch", torch.float64)
     generator = torch.Generator().manual_seed(1)
     random = lambda *shape: torch.randn(*shape, generator=generator).double()
     features, weights = random(12, 3), [random(8, 9, 3), random(8, 9), random(8, 9), random(8, 9, 3)]
@@ -193,7 +193,7 @@ def test_reference_against_finite_differences(antialiased):
             features=changed.get("features", features),
             background=changed.get("background", torch.tensor([0.2, 0.3, 0.4]).double()),
             probe=changed.get("probe"),
-            impl="reference",
+            impl="torch",
         )
         return sum((getattr(drawn, n) * w).sum().item() for n, w in zip(IMAGES, weights, strict=True))
 
@@ -222,7 +222,7 @@ def test_probe_is_the_gradient_of_the_2d_mean():
             features=features,
             background=torch.tensor([0.2, 0.3, 0.4]).double(),
             probe=probe,
-            impl="reference",
+            impl="torch",
         )
         return sum((getattr(drawn, n) * w).sum().item() for n, w in zip(IMAGES, weights, strict=True))
 
@@ -267,7 +267,7 @@ def test_equal_depths_are_drawn_by_index():
     gaussians.sh[:] = 0.0
     gaussians.sh[:, 0] = torch.tensor([-2.0, 2.0, -2.0])
     gaussians.sh[0, 0] = torch.tensor([2.0, -2.0, -2.0])
-    for impl in ("cpu", "reference"):
+    for impl in ("cpu", "torch"):
         red, green, blue = rasterizer.render(gaussians, off_center_camera(20, 20), impl=impl).color[10, 10]
         assert red > 0.8 and green < 0.2 and blue < 0.2
 
@@ -276,7 +276,7 @@ def test_zero_quaternion_is_the_identity():
     gaussians = random_cloud(30, -2.0)
     zero = replace(gaussians, quaternions=torch.zeros(30, 4))
     identity = replace(gaussians, quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(30, 1))
-    for impl in ("cpu", "reference"):
+    for impl in ("cpu", "torch"):
         drawn = [rasterizer.render(g, off_center_camera(20, 20), impl=impl).color for g in (zero, identity)]
         assert torch.equal(*drawn)
     assert_matches_reference(zero, off_center_camera(20, 20))
@@ -319,7 +319,7 @@ def test_extremes_stay_finite():
     assert drawn.radii[9] > 0
 
 
-@pytest.mark.parametrize("impl", ["cpu", "reference"])
+@pytest.mark.parametrize("impl", ["cpu", "torch"])
 def test_nothing_to_draw(impl):
     """No Gaussians, or all behind the camera: the background, zeros, and zero gradients."""
     view, background = off_center_camera(5, 3), torch.tensor([0.1, 0.2, 0.3])
@@ -361,7 +361,7 @@ def test_accumulate_is_the_gradient_of_features():
     assert_close(gathered, features.grad, 1e-6, 1e-6, "accumulate")
     for count in (False, True):
         exact = rasterizer.accumulate(
-            gaussians.map(torch.Tensor.double), view, values.double(), impl="reference", count=count
+            gaussians.map(torch.Tensor.double), view, values.double(), impl="torch", count=count
         )
         assert_close(rasterizer.accumulate(gaussians, view, values, count=count), exact, 2e-6, 0, count)
 
@@ -370,7 +370,7 @@ def test_counts_are_whole_numbers_of_blended_pixels():
     gaussians, view = random_cloud(50, -2.0), off_center_camera(45, 40)
     counts = rasterizer.accumulate(gaussians, view, torch.ones(40, 45, 1), count=True)[:, 0]
     assert torch.equal(counts, counts.round()) and counts.max() > 20
-    projected, _ = reference.project(gaussians.map(torch.Tensor.double), view, None)
+    projected, _ = pure_torch.project(gaussians.map(torch.Tensor.double), view, None)
     assert set(torch.nonzero(counts)[:, 0].tolist()) <= set(projected.order.tolist())
 
 
@@ -392,7 +392,7 @@ def test_background_and_alpha_agree():
         ({"background": torch.ones(4)}, "background has shape"),
         ({"probe": torch.ones(10, 2).double()}, "probe is torch.float64"),
         ({"sh_degree": 4}, "sh_degree 4 is outside 0..3"),
-        ({"impl": "metal"}, "none of auto, reference, cpu, cuda"),
+        ({"impl": "metal"}, "none of auto, torch, cpu, cuda"),
         ({"impl": "cuda"}, "impl='cuda' needs"),
     ],
 )
@@ -433,7 +433,7 @@ def test_cuda_equals_reference(antialiased):
     gaussians = replace(random_cloud(300, -3.2), opacity_logits=torch.linspace(-5, 4, 300))
     gaussians = replace(gaussians, antialiased=antialiased)
     view, there = off_center_camera(61, 47), gaussians.map(torch.Tensor.cuda)
-    exact = rasterizer.render(gaussians.map(torch.Tensor.double), view, impl="reference")
+    exact = rasterizer.render(gaussians.map(torch.Tensor.double), view, impl="torch")
     drawn = rasterizer.render(there, view)
     for name in ("color", "depth", "alpha"):
         assert_close(getattr(drawn, name).cpu(), getattr(exact, name), 1e-4, 0, name)

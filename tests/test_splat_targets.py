@@ -11,6 +11,8 @@ from pathlib import Path
 import llvmlite.binding
 import pytest
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 SLOW = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="half a minute; set REFFUSION_SLOW=1")
 TARGETS = {"x86-64": ("x86-64", "+sse2"), "avx2": ("haswell", "+avx,+avx2,+fma,+bmi,+bmi2,+f16c,+popcnt,+sse4.2")}

@@ -16,6 +16,8 @@ from reffusion.io.ply import save_ply
 from report import study, turntable, votes
 from report.results import FOLDER_COMPARISON
 
+pytestmark = pytest.mark.integration
+
 METHODS = ("full", "no_sds", "inpaint_2d")
 
 

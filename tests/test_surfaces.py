@@ -11,7 +11,7 @@ from reffusion.background.plane import CELLS, Plane, remove_reflected_depth
 from reffusion.background.visibility import DepthView, depth_range
 from reffusion.initialize import sweep, view_dependent_color
 from reffusion.morphology import dilate
-from reffusion.splat.reference import colors, harmonics
+from reffusion.splat.pure_torch import colors, harmonics
 from reffusion.types import Camera, Gaussians
 
 SIZE, FOCAL = 160, 180.0

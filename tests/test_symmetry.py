@@ -86,7 +86,7 @@ def make_vase_scene(cut: bool = False, halved: bool = False):
     return views, photos, gaussians
 
 
-def left_right_mirrors(mirrors: list[Mirror]) -> list[Mirror]:
+def select_left_right_mirrors(mirrors: list[Mirror]) -> list[Mirror]:
     """The mirrors that exchange left and right, not front and back."""
     return [mirror for mirror in mirrors if abs(mirror.normal[0]) > 0.8]
 
@@ -100,7 +100,7 @@ def vase_mirrors():
 
 def test_a_vase_is_its_own_mirror_image(vase_mirrors):
     _, _, _, mirrors = vase_mirrors
-    found = left_right_mirrors(mirrors)
+    found = select_left_right_mirrors(mirrors)
     assert len(found) == 1 and len(mirrors) <= 2  # its back is like its front, too
     assert abs(found[0].normal[0]) > 0.995 and abs(found[0].offset) < 0.02
 
@@ -136,7 +136,7 @@ def test_mirrored_pixels_are_unobserved_and_have_its_depth(vase_mirrors):
 def test_an_asymmetric_object_has_no_mirror(how):
     views, photos, gaussians = make_vase_scene(**how)
     planes = find_planes(CENTRE, RADIUS, views, NO_POINTS)
-    assert not left_right_mirrors(find_mirrors(gaussians, CENTRE, RADIUS, views, planes, photos))
+    assert not select_left_right_mirrors(find_mirrors(gaussians, CENTRE, RADIUS, views, planes, photos))
 
 
 def test_without_an_object_there_is_no_mirror():

@@ -15,7 +15,7 @@ from scenes.stage_runs import run_through_initialize, trace_lines
 from benchmarks.bench import gate
 from benchmarks.bench.points import Diagram, Point, recommendation
 from reffusion import trace
-from reffusion.depth.background_depth import Completion
+from reffusion.depth.background_depth import CompletionSettings
 from reffusion.distill import loop as distilling
 from reffusion.fit import reconstruction as fitting
 from reffusion.initialize import fill
@@ -27,6 +27,8 @@ from runner import Refused
 from runner.parameters import parse_duration, split_budget, stack_layers
 from runner.pipeline import load_pipeline, load_scene_file
 from stages import distill, fit, personalize
+
+pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).resolve().parent.parent
 NEAR = 1.7
@@ -43,7 +45,7 @@ def initialized_folders(tmp_path_factory):
     """The folders of a small scene up to `initialize`, and of a random prior."""
     home = tmp_path_factory.mktemp("scene")
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(fill, "COMPLETION", Completion(planar_share=2.0))  # no planes: both solvers
+        patched.setattr(fill, "COMPLETION", CompletionSettings(planar_share=2.0))  # no planes: both solvers
         folders = run_through_initialize(home, NEAR)
     save_small_prior(home / "prior")
     return folders | {"prior": home / "prior"}

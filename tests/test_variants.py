@@ -38,6 +38,8 @@ from runner.resolve import Request, ResolvedJob, resolve
 from stages import distill, evaluate, finish, fit, initialize, lift
 from stages.plan import fit as plan_fit
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parent.parent
 NEAR = 1.7
 

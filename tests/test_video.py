@@ -66,7 +66,7 @@ def walk_video(tmp_path):
 
 
 def test_sharp_frames_spaced_by_what_moves_and_the_same_ones_again(walk_video, tmp_path):
-    said = video.update_frames(walk_video, tmp_path / "a", "hash")
+    said = video.extract_frames(walk_video, tmp_path / "a", "hash")
     numbers = [int(path.stem.removeprefix("frame_")) for path in sorted((tmp_path / "a/images").iterdir())]
     assert all(number % 4 in (1, 2) for number in numbers), "none is blurred or smeared"
     way = STEP * SHOTS / WIDTH  # widths
@@ -78,7 +78,7 @@ def test_sharp_frames_spaced_by_what_moves_and_the_same_ones_again(walk_video, t
     with open(tmp_path / "a/frames.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 4 * SHOTS and [int(r["frame"]) for r in rows if r["what"] == video.TAKEN] == numbers
-    video.update_frames(walk_video, tmp_path / "b", "hash")
+    video.extract_frames(walk_video, tmp_path / "b", "hash")
     for path in (tmp_path / "a/images").iterdir():
         assert path.read_bytes() == (tmp_path / "b/images" / path.name).read_bytes()
 
@@ -86,7 +86,7 @@ def test_sharp_frames_spaced_by_what_moves_and_the_same_ones_again(walk_video, t
 def test_where_the_camera_stands_nothing_is_taken_twice(tmp_path):
     still = render_walk()
     stands = write_video(tmp_path / "stands.mp4", [*still[:30], *[still[30]] * 90, *still[30:]])
-    video.update_frames(stands, tmp_path / "out", "")
+    video.extract_frames(stands, tmp_path / "out", "")
     numbers = [int(path.stem.removeprefix("frame_")) for path in (tmp_path / "out/images").iterdir()]
     assert sum(30 <= number < 120 for number in numbers) <= 2
 
@@ -115,10 +115,11 @@ def test_a_film_that_was_held_upright_stands_upright(walk_video, tmp_path):
 def test_videos_without_enough_views_are_refused(tmp_path, made, message):
     made(tmp_path / "x.mp4")
     with pytest.raises(BadInput, match=message):
-        video.update_frames(tmp_path / "x.mp4", tmp_path / "out", "")
+        video.extract_frames(tmp_path / "x.mp4", tmp_path / "out", "")
     assert not (tmp_path / "out/images").exists() and not (tmp_path / "out/frames.json").exists()
 
 
+@pytest.mark.integration
 def test_a_video_is_a_scene(walk_video, tmp_path, capfd):
     runs = tmp_path / "runs"
     frames = runs / "walk" / "frames"

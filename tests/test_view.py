@@ -21,6 +21,8 @@ from reffusion.splat import rasterizer
 from reffusion.types import Similarity
 from report import gaussian_layers, unseen_overlay, view
 
+pytestmark = pytest.mark.integration
+
 SIMILARITY = Similarity(2.0, np.array([0.1, 0.2, 0.3]))
 NEEDS = {"poses": "a", "fit": "b", "masks": "c", "initialize": "d", "distill": "e", "lift": None}
 

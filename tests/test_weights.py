@@ -344,6 +344,7 @@ def test_a_model_is_fetched_from_the_hub_and_each_refusal_has_its_message(tmp_pa
     assert "the hub has no such model" in moved and "stable-diffusion-v1-5/stable-diffusion-inpainting" in moved
 
 
+@pytest.mark.integration
 def test_weights_of_the_laptop_are_fetched_killed_resumed_and_checked(tmp_path, hub):
     """LaMa, MI-GAN, Depth Anything: what `make weights` lists, from a local hub."""
     address, handler = hub

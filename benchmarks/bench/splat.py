@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from benchmarks.bench.points import Diagram, Point, cpu_seconds
-from reffusion.splat import rasterizer, reference
+from reffusion.splat import pure_torch, rasterizer
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -57,7 +57,7 @@ def relative(value: torch.Tensor, truth: torch.Tensor) -> float:
 
 def errors(gaussians: Gaussians) -> tuple[float, float]:
     """Relative errors of float32: of the image, and the largest of the gradients."""
-    (picture, slopes), (color, gradients) = step(gaussians.map(torch.Tensor.float), "cpu"), step(gaussians, "reference")
+    (picture, slopes), (color, gradients) = step(gaussians.map(torch.Tensor.float), "cpu"), step(gaussians, "torch")
     return relative(picture, color), max(relative(a, b) for a, b in zip(slopes, gradients, strict=True))
 
 
@@ -84,17 +84,17 @@ def footprint_diagram() -> Diagram:
 
 def cutoff_diagram() -> Diagram:
     """Cost of skipping faint contributions, in the oracle: error against skipping none, and the remaining work."""
-    gaussians, original = scene(3.0), reference.MIN_ALPHA
-    draw = lambda: step(gaussians, "reference")
+    gaussians, original = scene(3.0), pure_torch.MIN_ALPHA
+    draw = lambda: step(gaussians, "torch")
     ones = torch.ones(VIEW.height, VIEW.width, 1, dtype=torch.float64)
     pairs = lambda: float(rasterizer.accumulate(gaussians, VIEW, ones,
-                                           impl="reference", count=True).sum())  # fmt: skip
+                                           impl="torch", count=True).sum())  # fmt: skip
     points = []
     try:
-        reference.MIN_ALPHA = 1e-12
+        pure_torch.MIN_ALPHA = 1e-12
         color, gradients = draw()
         for cutoff in CUTOFFS:
-            reference.MIN_ALPHA = cutoff
+            pure_torch.MIN_ALPHA = cutoff
             picture, slopes = draw()
             per_pair = 4.2e-9  # seconds, docs/method.md#splatting: the oracle's own time does not depend on the cut-off
             seconds, name = per_pair * pairs(), f"1/{1 / cutoff:.0f}"
@@ -102,7 +102,7 @@ def cutoff_diagram() -> Diagram:
             points.append(Point("image", name, cutoff, relative(picture, color), seconds))
             points.append(Point("worst gradient", name, cutoff, worst, seconds, False))
     finally:
-        reference.MIN_ALPHA = original
+        pure_torch.MIN_ALPHA = original
     return Diagram(
         "cutoff",
         "Cut-off of faint contributions, float64, footprints of 3 px (work: pairs that blend x 4.2 ns)",

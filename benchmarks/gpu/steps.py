@@ -14,7 +14,7 @@ from benchmarks.gpu import full_size
 from benchmarks.gpu.bench import PAPER, Bench, Sizes
 from reffusion import trace
 from reffusion.depth import monocular
-from reffusion.depth.background_depth import Completion, ViewDepth
+from reffusion.depth.background_depth import CompletionSettings, ViewDepth
 from reffusion.distill.adversary import Adversary
 from reffusion.distill.depth_estimator import DepthEstimator, network_estimator
 from reffusion.distill.terms.adversarial import evaluate_adversarial
@@ -134,8 +134,11 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[DepthEstimator, str]:
         torch.nn.init.constant_(model.head.conv3.bias, 1e4)  # else the last ReLU would cut nearly all values to 0
         network, source = monocular.make_network(model, device), "random"
     tries = [
-        network_estimator(lambda image, sign=sign: sign * monocular.predict_disparity(network, image), Completion())
-             for sign in (1, -1)]  # fmt: skip
+        network_estimator(
+            lambda image, sign=sign: sign * monocular.predict_disparity(network, image), CompletionSettings()
+        )
+        for sign in (1, -1)
+    ]
 
     def disparity(view: ViewDepth, picture: Callable[[], np.ndarray]) -> np.ndarray:
         painted = picture()

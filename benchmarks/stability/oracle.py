@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from reffusion.splat import rasterizer, reference
+from reffusion.splat import pure_torch, rasterizer
 from reffusion.splat.conventions import MAX_ALPHA
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
@@ -38,7 +38,7 @@ class Rendered(NamedTuple):
 
 
 def render_with_gradients(gaussians: Gaussians, camera: Camera, impl: str, seed: int = 0, far: float = 1.0) -> Rendered:
-    """Render with "cpu" in float32, or with "reference" in float64 with the cut-offs of "cpu".
+    """Render with "cpu" in float32, or with "torch" in float64 with the cut-offs of "cpu".
 
     `far` is the unit of depth in the linear function.
     """
@@ -72,9 +72,9 @@ def blended_pixels(gaussians: Gaussians, camera: Camera) -> Tensor:
 
 def _render_reference(blended: Tensor, gaussians: Gaussians, camera: Camera, features, background, probe):
     """The reference's images with given cut-offs, and its radii."""
-    projected, radii = reference.project(gaussians, camera, probe)
+    projected, radii = pure_torch.project(gaussians, camera, probe)
     again = torch.sort(projected.depths.float(), stable=True).indices  # equal depths by index
-    projected = reference.Projected(*(array[again] for array in projected))
+    projected = pure_torch.Projected(*(array[again] for array in projected))
     order = projected.order
     columns, rows = torch.meshgrid(torch.arange(camera.width), torch.arange(camera.height), indexing="xy")
     dx, dy = (torch.stack((columns, rows), -1).reshape(-1, 1, 2) + 0.5 - projected.means).unbind(2)
@@ -84,7 +84,7 @@ def _render_reference(blended: Tensor, gaussians: Gaussians, camera: Camera, fea
     after = torch.cumprod(1 - alpha, 1)
     weights = alpha * torch.cat((torch.ones_like(after[:, :1]), after), 1)[:, :-1]
     behind = after[:, -1:] if len(order) else torch.ones_like(dx.sum(1, keepdim=True))
-    layers = (reference.colors(gaussians, camera, gaussians.sh_degree)[order], projected.depths[:, None])
+    layers = (pure_torch.colors(gaussians, camera, gaussians.sh_degree)[order], projected.depths[:, None])
     image = weights @ torch.cat((*layers, features[order]), 1)
     covered = weights.sum(1)
     shaped = lambda array: array.reshape(camera.height, camera.width, *array.shape[1:])
@@ -107,7 +107,7 @@ def errors(gaussians: Gaussians, camera: Camera, relative: float, seed: int = 0)
     """
     # Depth is in units of the farthest one, so that the terms of all sums are of order one, as `FLOOR` assumes.
     far = max(1.0, rasterizer.render(gaussians, camera, impl="cpu").depth.max().item())
-    fast, exact = (render_with_gradients(gaussians, camera, impl, seed, far) for impl in ("cpu", "reference"))
+    fast, exact = (render_with_gradients(gaussians, camera, impl, seed, far) for impl in ("cpu", "torch"))
     if not torch.equal(fast.radii, exact.radii):
         return {"radii": float("inf")}
     lengths = gaussians.quaternions.double().norm(dim=1, keepdim=True)

@@ -16,7 +16,7 @@ from reffusion.background.mirrors import Mirror, reflect_points
 from reffusion.background.plane import Plane, remove_reflected_depth
 from reffusion.background.visibility import DepthView, count_views, is_seen
 from reffusion.splat.conventions import SH0
-from reffusion.splat.reference import colors
+from reffusion.splat.pure_torch import colors
 from reffusion.types import Gaussians
 
 REACH = 3.0  # radii of the object around its middle within which a thing must end

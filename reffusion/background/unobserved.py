@@ -33,7 +33,7 @@ MIN_SHARE = 0.3  # the same, of all pixels beside the patch
 
 
 @dataclass(frozen=True)
-class Uncovered:
+class HoleGeometry:
     """What one view shows once the object is removed.
 
     Attributes:
@@ -62,7 +62,7 @@ def find_unobserved(
     views: Sequence[DepthView],
     planes: Sequence[Plane],
     mirrors: Sequence[Mirror] = (),
-) -> Uncovered:
+) -> HoleGeometry:
     """Split the pixels of C into observed and unobserved ones.
 
     The remaining Gaussians are rendered, each pixel is unprojected, and the views count that see this point unmasked,
@@ -109,7 +109,7 @@ def find_unobserved(
     below = _below_planes(planes, camera, depth, mask)
     confirmed = morphology.remove_slivers(confirmed & ~occluding & ~below, MASK_MARGIN) & mask
     continued_depth = np.where(unobserved, nearest, np.inf)
-    return Uncovered(unobserved, continued_depth, depth, alpha, tuple(plane_depths), confirmed)
+    return HoleGeometry(unobserved, continued_depth, depth, alpha, tuple(plane_depths), confirmed)
 
 
 def _below_planes(planes: Sequence[Plane], camera: Camera, depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:

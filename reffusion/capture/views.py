@@ -99,7 +99,16 @@ def _similar_names(name: str, names: Collection[str]) -> str:
 def check_proportions(
     path: Path, name: str, of_size: tuple[int, int], tolerance: float, what: str, upright: bool = False
 ) -> None:
-    """BadInput where the proportions of a picture differ from those of its view by more than `tolerance`."""
+    """Checks that a picture has the aspect ratio of its view.
+
+    Args:
+        name: of the view. of_size: (width, height) of the view.
+        tolerance: largest relative difference of the aspect ratios.
+        what: the kind of picture, for the message. upright: whether the picture's EXIF orientation is applied.
+
+    Raises:
+        BadInput: the ratios differ by more than `tolerance`.
+    """
     (width, height), (of_width, of_height) = image_size(path, upright), of_size
     if abs(width * of_height - height * of_width) > tolerance * width * of_height:
         raise BadInput(

@@ -29,7 +29,7 @@ FARTHEST_RATIO = 2.0  # depth is limited to this many times the farthest known d
 
 
 @dataclass(frozen=True)
-class Completion:
+class CompletionSettings:
     """Settings for finding the depth behind the object.
 
     PAPER leaves open: the depth model. Without one the surroundings are continued under one of two hypotheses:
@@ -134,7 +134,7 @@ def extract_depth(
     camera: Camera,
     hole: np.ndarray,
     hidden: np.ndarray,
-    settings: Completion,
+    settings: CompletionSettings,
     hints: Hints = NO_HINTS,
 ) -> ViewDepth:
     """The depth of a rendering: known where alpha is high, except in the hole and a margin around it."""
@@ -154,7 +154,7 @@ def continue_depth(
     view: ViewDepth,
     guide: np.ndarray | Callable[[], np.ndarray],
     points: np.ndarray,
-    settings: Completion,
+    settings: CompletionSettings,
     log: SolverLog = NO_LOG,
     farthest: bool = False,
 ) -> tuple[np.ndarray, str]:
@@ -267,17 +267,19 @@ def _in_free_space(view: ViewDepth, disparity: np.ndarray) -> np.ndarray:
     return view.hole & view.hints.free_space(1 / np.maximum(disparity, view.least_disparity))
 
 
-def points_around(view: ViewDepth, points: np.ndarray, settings: Completion) -> tuple[np.ndarray, np.ndarray]:
+def points_around(view: ViewDepth, points: np.ndarray, settings: CompletionSettings) -> tuple[np.ndarray, np.ndarray]:
     """Image points [S, 2] and disparities [S] of the sparse points that are visible around the hole."""
     return visible_points(points, view.camera, _surroundings(view, settings), view.disparity)
 
 
-def _surroundings(view: ViewDepth, settings: Completion) -> np.ndarray:
+def _surroundings(view: ViewDepth, settings: CompletionSettings) -> np.ndarray:
     excluded = view.hidden | view.hole
     return morphology.dilate_by_distance(excluded, settings.ring) & ~excluded
 
 
-def _fit_planar_model(view: ViewDepth, points: np.ndarray, settings: Completion) -> tuple[planes.PlanarModel, str]:
+def _fit_planar_model(
+    view: ViewDepth, points: np.ndarray, settings: CompletionSettings
+) -> tuple[planes.PlanarModel, str]:
     """The planes fitted to the surroundings, and a description: how many explain what share of the samples.
 
     The samples are the sparse points where there are enough. Where planes explain most of these but not all, so that
@@ -300,7 +302,9 @@ def _fit_planar_model(view: ViewDepth, points: np.ndarray, settings: Completion)
     return model, f"{model.planes} planes explain {model.explained:.0%} of {len(values)} {source}"
 
 
-def _fit_planes(view: ViewDepth, pixels: np.ndarray, values: np.ndarray, settings: Completion) -> planes.PlanarModel:
+def _fit_planes(
+    view: ViewDepth, pixels: np.ndarray, values: np.ndarray, settings: CompletionSettings
+) -> planes.PlanarModel:
     generator = seeding.generator(settings.seed, "planes", view.camera.name)
     return planes.planar_model(pixels, values, view.hole.shape, generator, tolerance=settings.planar_tolerance)
 

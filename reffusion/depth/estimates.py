@@ -6,12 +6,12 @@ import numpy as np
 
 from reffusion import geometry
 from reffusion.depth import alignment, bilateral
-from reffusion.depth.background_depth import Completion, ViewDepth, continue_depth
+from reffusion.depth.background_depth import CompletionSettings, ViewDepth, continue_depth
 from reffusion.depth.solverlog import NO_LOG, SolverLog
 
 
 def align_estimate(
-    view: ViewDepth, guide: np.ndarray, estimate: np.ndarray, settings: Completion, log: SolverLog = NO_LOG
+    view: ViewDepth, guide: np.ndarray, estimate: np.ndarray, settings: CompletionSettings, log: SolverLog = NO_LOG
 ) -> tuple[np.ndarray, str]:
     """A monocular estimate aligned to the scene, [H, W] float64 disparity, and a description of how well it fits.
 
@@ -47,7 +47,7 @@ def align_depth_map(
     guide: np.ndarray,
     depth: np.ndarray,
     points: np.ndarray,
-    settings: Completion,
+    settings: CompletionSettings,
     log: SolverLog = NO_LOG,
 ) -> tuple[np.ndarray, str]:
     """A reference's own depth map aligned to the scene, [H, W] float64 disparity, and a description of the method.

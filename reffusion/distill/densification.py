@@ -14,9 +14,10 @@ PRUNE_OPA = 0.005  # opacity below which Gaussians are pruned when others are ad
 
 
 def densify_masked(optimizer: GaussianOptimizer, generator: torch.Generator) -> None:
-    """Clones or splits the share of the masked Gaussians with the largest screen-space gradients.
+    """Clones or splits the `DENSIFIED_SHARE` of masked Gaussians with the largest screen-space gradients, then prunes
+    every Gaussian, masked or not, of an opacity below `PRUNE_OPA`.
 
-    Only masked Gaussians are considered, because only their gradients are observed.
+    Only masked Gaussians grow, because the optimiser accumulates screen-space gradients of these alone.
 
     Args:
         generator: draws the positions of split Gaussians.

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from reffusion.depth import background_depth, estimates, monocular
-from reffusion.depth.background_depth import Completion, ViewDepth
+from reffusion.depth.background_depth import CompletionSettings, ViewDepth
 from reffusion.params.distill import Params
 
 
@@ -25,7 +25,7 @@ class DepthEstimator(NamedTuple):
             is called. Raises Degenerate where the disparity is undetermined.
     """
 
-    how: Completion
+    how: CompletionSettings
     disparity: Callable[[ViewDepth, Callable[[], np.ndarray]], np.ndarray]
 
 
@@ -36,14 +36,14 @@ def build_estimator(params: Params, points: np.ndarray) -> DepthEstimator:
         points: [P, 3] sparse points of the scene.
     """
     # PAPER leaves open: whether an estimate is aligned by least squares or robustly on known pixels; least squares.
-    how = Completion(robust=False, seed=params.seed)
+    how = CompletionSettings(robust=False, seed=params.seed)
     if not params.depth.model:
         return continuation_estimator(points, how)
     network = monocular.load_network(params.depth.model, params.device)
     return network_estimator(partial(monocular.predict_disparity, network), how)
 
 
-def continuation_estimator(points: np.ndarray, how: Completion) -> DepthEstimator:
+def continuation_estimator(points: np.ndarray, how: CompletionSettings) -> DepthEstimator:
     """An estimator without a depth network: it continues the scene's own depth around the hole through it.
 
     Args:
@@ -52,7 +52,7 @@ def continuation_estimator(points: np.ndarray, how: Completion) -> DepthEstimato
     return DepthEstimator(how, lambda view, picture: background_depth.continue_depth(view, picture, points, how)[0])
 
 
-def network_estimator(network: Callable[[Tensor], Tensor], how: Completion) -> DepthEstimator:
+def network_estimator(network: Callable[[Tensor], Tensor], how: CompletionSettings) -> DepthEstimator:
     """The paper's estimator: a network's depth of the repainted view, aligned and passed through the bilateral solver.
 
     Args:

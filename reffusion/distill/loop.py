@@ -69,8 +69,8 @@ def build_objective(inputs: TermInputs, settings: Params) -> Objective:
     """
     terms = [term for module in TERMS if (term := module.build(inputs, settings)) is not None]
     # A GPU does one thing after another.
-    overlaps = not inputs.masked_means.is_cuda and all(term.is_background or term.allows_overlap for term in terms)
-    overlaps = overlaps and any(term.is_background for term in terms)
+    overlaps = not inputs.masked_means.is_cuda and all(term.runs_apart or term.allows_overlap for term in terms)
+    overlaps = overlaps and any(term.runs_apart for term in terms)
     return Objective(terms, inputs.references, settings, {}, OverlapWorker(torch.get_num_threads() if overlaps else 1))
 
 
@@ -125,9 +125,9 @@ def take_step(optimizer: GaussianOptimizer, step: int, objective: Objective) -> 
     """One step of Adam along the gradient of the weighted sum. Returns what the terms log."""
     background, foreground = [], []
     for term in objective.terms:
-        (background if term.is_background else foreground).append(term)
+        (background if term.runs_apart else foreground).append(term)
     gaussians, masked = optimizer.gaussians, optimizer.masked
-    apart = gaussians.map(lambda p: p.detach().requires_grad_())  # accumulates the background terms' gradient
+    apart = gaussians.map(lambda p: p.detach().requires_grad_())  # accumulates the gradient of the terms that run apart
     with objective.worker.overlap(lambda: [_add_gradient(term, step, apart, masked) for term in background]) as result:
         parts = [_add_gradient(term, step, gaussians, masked) for term in foreground]
     parts = [part for part in (*result(), *parts) if part is not None]
@@ -183,7 +183,7 @@ def _add_gradient(term: Term, step: int, gaussians: Gaussians, masked: Tensor) -
             return _Contribution(torch.zeros_like(masked), {}, skipped=f"{label}_skipped_{reason}")
         _backward(term.weight * value.loss, gaussians)
     log, radii, observed = dict(value.log), value.rendering.radii, None
-    if term.is_background:
+    if term.runs_apart:
         norms = _gradient_norms(gaussians, masked)
         log |= {f"{label}_gradient_mean": float(norms.mean()), f"{label}_gradient_max": float(norms.max())}
     if value.probe is not None:

@@ -131,8 +131,8 @@ def uncovered_share(gaussians: Gaussians, camera: Camera, mask: np.ndarray, min_
 
 @torch.no_grad()
 def pixels_in_front(gaussians: Gaussians, depth: np.ndarray, reference: Reference, mask: np.ndarray) -> np.ndarray:
-    """bool [H, W]: what a reference draws outside C in front of all Gaussians: the back of a thing whose front earlier
-    references drew, seen from inside.
+    """bool [H, W]: pixels outside C whose surface is nearer than every Gaussian. Most are the inner side of a surface
+    that an earlier reference added.
 
     Args:
         depth: [H, W] of the reference's surface. mask: bool [H, W], C.

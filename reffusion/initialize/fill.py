@@ -11,7 +11,7 @@ import torch
 from reffusion.background.model import Background
 from reffusion.background.unobserved import find_unobserved
 from reffusion.depth import billboard, monocular
-from reffusion.depth.background_depth import Completion, Hints
+from reffusion.depth.background_depth import CompletionSettings, Hints
 from reffusion.depth.monocular import DepthNetwork
 from reffusion.gaussians.sheets import Sheets
 from reffusion.initialize import coverage, unprojection
@@ -27,7 +27,7 @@ from reffusion.types import Reference
 OVERLAP = 0.006  # of the image's width: how far new Gaussians extend beyond the hole
 COVERED = 0.9  # alpha below which a reference also fills pixels of C
 GAP_ALPHA = 0.5  # alpha in C of another view below which the new surface has a gap
-COMPLETION = Completion()
+COMPLETION = CompletionSettings()
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from scipy import ndimage
 from reffusion import geometry
 from reffusion.background.model import Background
 from reffusion.depth import alignment, background_depth
-from reffusion.depth.background_depth import Completion, Hints
+from reffusion.depth.background_depth import CompletionSettings, Hints
 from reffusion.gaussians.surfels import surface_normals
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference
@@ -29,11 +29,11 @@ EDGE = np.ones((3, 3), np.uint8)  # px: the position of an edge is accurate to a
 
 @dataclass(frozen=True)
 class Share:
-    """What one of several references draws over what remains, of the pixels whose depth it brings.
+    """Which pixels of its depth map one of several references adds to the scene.
 
     Attributes:
-        drawn: bool [H, W], the pixels that it draws.
-        ceded: bool [H, W], the pixels that it leaves to other references, or as they are.
+        drawn: bool [H, W], pixels that become Gaussians.
+        ceded: bool [H, W], pixels that do not: another reference adds them, or the scene shows them already.
     """
 
     drawn: np.ndarray
@@ -69,7 +69,7 @@ class ReferenceSurface:
 
 
 def share_surfaces(
-    remaining: Gaussians, references: Sequence[Reference], background: Background, completion: Completion
+    remaining: Gaussians, references: Sequence[Reference], background: Background, completion: CompletionSettings
 ) -> dict[str, Share]:
     """View name -> its share, of the references with a depth map; empty where there are fewer than two.
 
@@ -98,7 +98,7 @@ def share_surfaces(
 
 @torch.no_grad()
 def align_reference_depth(
-    remaining: Gaussians, reference: Reference, background: Background, completion: Completion
+    remaining: Gaussians, reference: Reference, background: Background, completion: CompletionSettings
 ) -> np.ndarray:
     """[H, W] the depth map of a reference in world units; 0 where unknown."""
     assert reference.depth is not None

@@ -12,7 +12,7 @@ import torch
 from reffusion import geometry, trace
 from reffusion.background.model import Background
 from reffusion.depth import background_depth, estimates
-from reffusion.depth.background_depth import NO_HINTS, Completion, Hints
+from reffusion.depth.background_depth import NO_HINTS, CompletionSettings, Hints
 from reffusion.depth.solverlog import SolverLog
 from reffusion.gaussians.sheets import Sheets, sheet_gaussians
 from reffusion.initialize.draft import Draft
@@ -33,7 +33,7 @@ def estimate_depth(
     hole: np.ndarray,
     mask: np.ndarray,
     points: np.ndarray,
-    completion: Completion,
+    completion: CompletionSettings,
     disparity: np.ndarray | None = None,
     log: trace.Trace | None = None,
     hints: Hints = NO_HINTS,

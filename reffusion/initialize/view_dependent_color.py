@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from reffusion import geometry, morphology
 from reffusion.background.visibility import DepthView, is_seen
 from reffusion.splat.conventions import SH0
-from reffusion.splat.reference import harmonics
+from reffusion.splat.pure_torch import harmonics
 from reffusion.types import Camera, Gaussians
 
 RING = 0.1  # of the image's width: how far around the hole the surface is sampled

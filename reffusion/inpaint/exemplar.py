@@ -47,8 +47,11 @@ MIN_LAYER_SHARE = 0.02  # of the hole that a foreground layer must continue into
 
 
 def mask_to_paint(hidden: np.ndarray, unknown: np.ndarray) -> np.ndarray:
-    """bool [H, W], the pixels of a view to paint when those of `unknown`, bool [H, W], are: also narrow parts of C
-    (`hidden`, bool [H, W]) between them, and the rim."""
+    """bool [H, W], the pixels of a view to paint: `unknown`, narrow observed strips between its parts, and the rim.
+
+    Args:
+        hidden: bool [H, W], C. unknown: bool [H, W], the pixels of C that must be painted.
+    """
     observed = hidden & ~unknown
     reach = to_pixels(MIN_KEPT_RADIUS, hidden.shape[1])
     free = np.pad((~hidden | observed).astype(np.uint8), reach, constant_values=1)

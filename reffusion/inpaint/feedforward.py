@@ -64,8 +64,8 @@ def run_network(network: Network, image: np.ndarray, hole: np.ndarray) -> np.nda
 def crop_around(hole: np.ndarray, side: int) -> tuple[slice, slice]:
     """Rows and columns of a square around the hole, bool [H, W].
 
-    The square is twice as long as the hole and at least `side` px, but no longer than the image's shorter side. If the
-    hole itself is longer than that, the crop is no square: it takes all of the shorter side.
+    Its side is twice the longer side of the hole's bounding box and at least `side` px, but at most the image's shorter
+    side. If the hole is longer than that, the crop is a rectangle that takes all of the shorter side.
     """
     spans = [np.flatnonzero(hole.any(axis)) for axis in (1, 0)]
     longest = max(int(span[-1] - span[0]) + 1 for span in spans)

@@ -11,7 +11,7 @@ import torch
 from reffusion import geometry, morphology
 from reffusion.background.visibility import ROUGHNESS, DepthView, count_views, is_seen
 from reffusion.splat import rasterizer
-from reffusion.splat.reference import colors
+from reffusion.splat.pure_torch import colors
 from reffusion.types import Gaussians
 
 COLOR_MARGIN = 10.0  # of 255: a Gaussian beyond the colours around its pixel by more than this has another colour

@@ -48,8 +48,11 @@ class MaskSpec(Settings):
 
 
 class SceneKeys(Settings):
-    """Keys about masks are UNKEYED: the views and mask files that follow from them are hashed instead (`scene_facts` in
-    `stages.plan`)."""
+    """The keys of scene.yaml that `poses` and `raw_masks` read.
+
+    Entries about masks do not enter a stage's hash; the views and files that they select do (`scene_facts` in
+    `stages.plan`).
+    """
 
     layout: Literal["llff", "colmap", "transforms", "photos"] | None = Field(None, description="None: detected")
     images: str | None = Field(None, description="folder of pictures, relative to the scene; None: the usual folders")

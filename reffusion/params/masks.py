@@ -25,7 +25,7 @@ class Params(Settings):
         description="Gaussians that hardly any view shows are labelled by their position; in masks, islands below 1 % "
         "of the image's width are removed and holes below 2 % closed",
     )
-    hull: float = Field(
+    inside_share: float = Field(
         0.9,
         ge=0,
         le=1,

@@ -1,7 +1,7 @@
 """3D Gaussian splatting: one interface, three implementations of the same conventions (docs/method.md#splatting).
 
-`reference` is plain torch in any dtype (the oracle of the tests), `cpu` is compiled by numba, and `cuda` is gsplat.
-Each is imported at its first use.
+`torch` uses autograd in any dtype (the oracle of the tests), `cpu` is compiled by numba, and `cuda` is gsplat. Each is
+imported at its first use.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from reffusion.types import PARAMETERS, Camera, Gaussians, Rendering
 
-Implementation = Literal["auto", "reference", "cpu", "cuda"]
+Implementation = Literal["auto", "torch", "cpu", "cuda"]
 
 
 def render(
@@ -33,7 +33,7 @@ def render(
         camera: the view, of size 1 x 1 or larger.
         features: [N, C] values to blend like colours, over a background of zeros; differentiable.
         background: [3] colour behind everything, black if None; differentiable.
-        impl: "auto" selects "cuda" for tensors on a GPU, else "cpu". "reference" supports float64 and any device.
+        impl: "auto" selects "cuda" for tensors on a GPU, else "cpu". "torch" supports float64 and any device.
         sh_degree: highest degree of spherical harmonics used, 0 to the stored one (the default).
         probe: [N, 2] added to the 2D means, in pixels. Pass zeros that require a gradient; after the backward pass
             their gradient is dLoss/d(2D mean).
@@ -61,7 +61,7 @@ def render(
 
 
 def prepare(device: str) -> None:
-    """Load the implementation for a device before time is measured: gsplat compiles its extension when first loaded."""
+    """Loads gsplat if the device is CUDA, so that compiling its extension is not timed. On the CPU nothing is done."""
     if torch.device(device).type == "cuda":
         _implementation("cuda", torch.zeros(1, device=device))
 
@@ -92,21 +92,21 @@ def accumulate(
 def _implementation(impl: Implementation, means: Tensor):
     if impl == "auto":
         impl = "cuda" if means.is_cuda else "cpu"
-    if impl == "reference":
-        from reffusion.splat import reference
+    if impl == "torch":
+        from reffusion.splat import pure_torch
 
-        return reference
+        return pure_torch
     if impl == "cuda":
         from reffusion.splat import cuda
 
         cuda.require_gpu(means)
         return cuda
     if impl != "cpu":
-        raise ValueError(f"impl {impl!r} is none of auto, reference, cpu, cuda")
+        raise ValueError(f"impl {impl!r} is none of auto, torch, cpu, cuda")
     if means.dtype != torch.float32 or means.device.type != "cpu":
         raise ValueError(
             f"the cpu splatting takes float32 tensors on the CPU, not {means.dtype} on {means.device}; "
-            "impl='reference' takes any"
+            "impl='torch' takes any"
         )
     from reffusion.splat import cpu
 

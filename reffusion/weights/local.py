@@ -36,7 +36,7 @@ class Need:
         optional: the stage works without them, and reports what it leaves out.
         half: half precision is sufficient.
         file: the only file of the hub model that is needed; None: all that diffusers or transformers reads.
-        looked: the folders that are searched for a file.
+        folders: the folders that are searched for a file.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Need:
     optional: bool = False
     half: bool = False
     file: str | None = None
-    looked: tuple[str, ...] = ()
+    folders: tuple[str, ...] = ()
 
     def fetch(self) -> None:
         """Download and check them. Raises ValueError with a one-line message on failure."""
@@ -83,7 +83,7 @@ def lpips_need() -> Need:
     """The need for the package with both LPIPS networks."""
     missing = [net for net in LPIPS.nets if not lpips_files(net)]
     problem = f"LPIPS is left out: no weights of {' and '.join(missing)} on this machine" if missing else None
-    return Need(LPIPS_NAME, problem, LPIPS.bytes, optional=True, looked=tuple(map(abbreviate_home, lpips_folders())))
+    return Need(LPIPS_NAME, problem, LPIPS.bytes, optional=True, folders=tuple(map(abbreviate_home, lpips_folders())))
 
 
 def lpips_files(net: str, folder: str | Path | None = None) -> tuple[Path, ...]:

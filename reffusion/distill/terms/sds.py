@@ -61,7 +61,7 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
         select_view=select_view,
         reaches=reach_hole(settings, everywhere=sds.reaches == "all"),
         loss=loss,
-        is_background=True,
+        runs_apart=True,
     )
 
 

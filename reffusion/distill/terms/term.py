@@ -69,9 +69,9 @@ class Term:
         every: steps between two in which it is computed.
         fills_hole: it acts on the masked Gaussians, and is left out where there are none.
         uses_one_thread: torch computes it on one thread, which is faster where most of the work is rendering.
-        is_background: its gradient is accumulated apart from that of the others, so that its norm can be logged, and
+        runs_apart: its gradient is accumulated apart from that of the others, so that its norm can be logged, and
             in another thread where that is faster.
-        allows_overlap: it may be computed at the same time as a background term.
+        allows_overlap: it may be computed at the same time as a term that runs apart.
         state: what it trains; None for nothing.
     """
 
@@ -83,7 +83,7 @@ class Term:
     every: int = 1
     fills_hole: bool = True
     uses_one_thread: bool = False
-    is_background: bool = False
+    runs_apart: bool = False
     allows_overlap: bool = False
     state: Stateful | None = None
 

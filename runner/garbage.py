@@ -19,14 +19,14 @@ from runner.text import display_path, format_bytes
 
 @dataclass(frozen=True)
 class Unused:
-    """An artifact that no plan uses: its folder, the bytes of the files in its receipt, and why."""
+    """An artifact that no plan uses: its folder, its size in bytes, and why no plan uses it."""
 
     folder: Path
     size: int
     why: str
 
 
-def sweep(request: Request, yes: bool) -> None:
+def collect_garbage(request: Request, yes: bool) -> None:
     """List artifacts that no plan of the scenes in runs/, or of one scene and its variants, uses.
 
     Removes them with `yes`, or after a question on a terminal.

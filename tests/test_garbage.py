@@ -11,7 +11,9 @@ from scenes.toy_projects import make_request, write_project
 from runner import Refused
 from runner.compare import compare
 from runner.execute import run_scene
-from runner.sweep import sweep
+from runner.garbage import collect_garbage
+
+pytestmark = pytest.mark.integration
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +40,7 @@ def list_artifacts(comparison_copy: Path) -> set[str]:
 
 def test_nothing_is_listed_where_all_is_used(comparison_copy, capsys):
     before = list_artifacts(comparison_copy)
-    sweep(make_request(comparison_copy, ""), yes=True)
+    collect_garbage(make_request(comparison_copy, ""), yes=True)
     assert capsys.readouterr().out == "nothing that no plan uses\n" and list_artifacts(comparison_copy) == before
 
 
@@ -53,13 +55,13 @@ def test_unused_artifacts_are_listed_first_and_removed_on_request(comparison_cop
     (comparison_copy / "runs/toy/distill/gain.txt").write_text("changed by hand")
     (comparison_copy / "runs/toy/mine").mkdir()
     (comparison_copy / "runs/toy/mine/big.txt").write_text("no receipt")
-    sweep(make_request(comparison_copy, ""), yes=False)
+    collect_garbage(make_request(comparison_copy, ""), yes=False)
     said = capsys.readouterr().out
     assert (
         "runs/toy/distill: left out: no gain" in said and "runs/toy@better/evaluate: there is no variant better" in said
     )
     assert "nothing was removed; yes=1 removes them" in said and list_artifacts(comparison_copy) == before
-    sweep(make_request(comparison_copy, ""), yes=True)
+    collect_garbage(make_request(comparison_copy, ""), yes=True)
     assert list_artifacts(comparison_copy) == {"toy/poses", "toy@none/evaluate"}
     left = {path.name for path in (comparison_copy / "runs/toy/distill").iterdir()}
     assert left == {"notes.txt", "gain.txt"} and (comparison_copy / "runs/toy/mine/big.txt").exists()
@@ -71,17 +73,17 @@ def test_older_code_counts_as_used_and_a_scene_that_is_gone_is_kept(comparison_c
     stage = comparison_copy / "stages/distill.py"
     stage.write_text(stage.read_text() + "\nMORE = 1\n")
     before = list_artifacts(comparison_copy)
-    sweep(make_request(comparison_copy, ""), yes=True)
+    collect_garbage(make_request(comparison_copy, ""), yes=True)
     assert list_artifacts(comparison_copy) == before
     (comparison_copy / "data/toy").rename(comparison_copy / "data/elsewhere")
-    sweep(make_request(comparison_copy, ""), yes=True)
+    collect_garbage(make_request(comparison_copy, ""), yes=True)
     assert "toy: kept, as it cannot be planned: its scene is not there" in capsys.readouterr().out
     assert list_artifacts(comparison_copy) == before
     with pytest.raises(Refused, match="nothing was computed for nobody"):
-        sweep(make_request(comparison_copy, "nobody"), yes=True)
+        collect_garbage(make_request(comparison_copy, "nobody"), yes=True)
 
 
 def test_other_parameters_are_those_of_the_command(comparison_copy, capsys):
-    sweep(make_request(comparison_copy, "toy", set="distill.gain=7"), yes=False)
+    collect_garbage(make_request(comparison_copy, "toy", set="distill.gain=7"), yes=False)
     said = capsys.readouterr().out
     assert "runs/toy/distill: to be made again: param gain 1 -> 7" in said and "runs/toy/poses" not in said
