@@ -1,17 +1,20 @@
-"""Clicks on a photograph, and the pixels that they mark."""
+"""Clicks and strokes on a photograph, and the pixels that they mark."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 OBJECT, OTHER, UNKNOWN = 1, -1, 0
+_SHIFT = 4  # fractional bits of coordinates when strokes are painted
 
 
 @dataclass(frozen=True)
 class Clicks:
-    """Clicks on a view in the order in which they were made; a scribble is many clicks.
+    """Clicks on a view in the order in which they were made.
 
     Attributes:
         points: [K, 2] float64, pixels of the view, as in docs/architecture.md.
@@ -25,6 +28,28 @@ class Clicks:
         return len(self.points)
 
 
+@dataclass(frozen=True)
+class Mark:
+    """A click, which selects or deselects a whole region, or a stroke of a brush, which changes just the pixels below.
+
+    Attributes:
+        points: [K, 2] float64, pixels of the view; one point of a click, the path of a stroke.
+        positive: True = on the object, False = on the background.
+        radius: of the brush, px; 0 = a click.
+    """
+
+    points: np.ndarray
+    positive: bool
+    radius: float = 0.0
+
+
+def clicks_of(marks: Sequence[Mark]) -> Clicks:
+    """The clicks among marks."""
+    clicks = [mark for mark in marks if not mark.radius]
+    points = np.concatenate([np.zeros((0, 2)), *(mark.points for mark in clicks)])
+    return Clicks(points, np.array([mark.positive for mark in clicks for _ in mark.points], bool))
+
+
 def mark_pixels(clicks: Clicks, shape: tuple[int, int]) -> np.ndarray:
     """int8 [H, W], OBJECT, OTHER or UNKNOWN. Only the clicked pixels are marked, since a click may be next to the
     object's border; the later click wins."""
@@ -33,3 +58,27 @@ def mark_pixels(clicks: Clicks, shape: tuple[int, int]) -> np.ndarray:
     for column, row, positive in zip(columns, rows, clicks.positive, strict=True):
         found[row, column] = OBJECT if positive else OTHER
     return found
+
+
+def confirmed_pixels(marks: Sequence[Mark], shape: tuple[int, int]) -> np.ndarray:
+    """int8 [H, W], OBJECT, OTHER or UNKNOWN: the pixels of clicks and below strokes; the later mark wins."""
+    found = np.full(shape, UNKNOWN, np.int8)
+    for mark in marks:
+        sign = OBJECT if mark.positive else OTHER
+        if mark.radius:
+            found[stroke_pixels(mark, shape)] = sign
+        else:
+            clicked = mark_pixels(Clicks(mark.points, np.full(len(mark.points), mark.positive)), shape)
+            found[clicked != UNKNOWN] = sign
+    return found
+
+
+def stroke_pixels(stroke: Mark, shape: tuple[int, int]) -> np.ndarray:
+    """bool [H, W]: the pixels whose centres lie within the brush's radius of the stroke's path."""
+    painted, scale = np.zeros(shape, np.uint8), 2**_SHIFT
+    path = np.round((stroke.points - 0.5) * scale).astype(np.int32)
+    for point in path:
+        cv2.circle(painted, point.tolist(), round(stroke.radius * scale), 1, -1, shift=_SHIFT)
+    width = max(1, round(2 * stroke.radius))
+    cv2.polylines(painted, [path.reshape(-1, 1, 2)], False, 1, width, shift=_SHIFT)
+    return painted > 0

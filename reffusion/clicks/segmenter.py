@@ -104,7 +104,10 @@ def predict_masks(segmenter: Segmenter, features: ImageFeatures, prompt: Prompt)
     logits, scores = segmenter.decode(features.values, at, np.concatenate(labels).astype(np.int64))
     if not np.isfinite(logits).all():
         raise FloatingPointError(f"{segmenter.name}: its answer is not finite")
-    return [Candidate(_to_picture(each, segmenter.side, features) > 0, float(q)) for each, q in zip(logits, scores)]
+    return [
+        Candidate(_to_picture(each, segmenter.side, features) > 0, float(q))
+        for each, q in zip(logits, scores, strict=True)
+    ]
 
 
 def _to_picture(logits: np.ndarray, side: int, features: ImageFeatures) -> np.ndarray:

@@ -1,13 +1,21 @@
-"""Segments a photograph by clicks, in about a second on one core; and moves the borders of masks to its edges."""
+"""Segments a photograph by clicks and strokes, and moves the borders of masks to its edges.
+
+Regions are proposed by colours and edges of surfaces, and by a segmentation network if there is one. The region is
+selected whose border follows edges of surfaces and colours.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from scipy import ndimage
 
 from reffusion.clicks.geodesic_cut import correct_labels, grow_object, nested_candidates, object_score
-from reffusion.clicks.marks import OBJECT, OTHER, UNKNOWN, Clicks, mark_pixels
+from reffusion.clicks.marks import OBJECT, OTHER, Clicks, Mark, clicks_of, confirmed_pixels, mark_pixels, stroke_pixels
+from reffusion.clicks.segmenter import Candidate, Prompt
 from reffusion.morphology import disk
 
 LONGEST = 192  # px, the larger side of the picture that is segmented
@@ -19,8 +27,140 @@ RING = 0.25  # of the square root of a mask's pixels: width of the ring around i
 MARGIN = 3  # bands around a mask whose colours are used
 
 
-def segment_view(image: np.ndarray, clicks: Clicks, relief: np.ndarray | None = None) -> np.ndarray:
-    """bool [H, W], True = the object that clicks are on; empty without a click on the object.
+@dataclass(frozen=True)
+class ViewEvidence:
+    """What is known of a view before anything is marked in it.
+
+    Attributes:
+        image: uint8 [H, W, 3].
+        relief: [H, W], logarithm of the depth times the focal length in pixels; None: the scene is not fitted yet.
+        ask: the masks of a segmentation network for a prompt, from parts to the whole; None: there is no network.
+    """
+
+    image: np.ndarray
+    relief: np.ndarray | None = None
+    ask: Callable[[Prompt], list[Candidate]] | None = None
+
+
+def apply_marks(view: ViewEvidence, marks: Sequence[Mark], before: np.ndarray | None = None) -> np.ndarray:
+    """bool [H, W]: the mask after marks are applied one after the other.
+
+    A stroke changes the pixels below it. The first click on the object selects it; each later click adds or removes one
+    connected region, which contains no pixel that earlier marks confirm to be otherwise. So a click never changes what
+    is not connected with it.
+
+    Args:
+        before: bool [H, W], the mask that the marks correct; None: empty.
+    """
+    shape = view.image.shape[:2]
+    mask = np.zeros(shape, bool) if before is None else before
+    for k, mark in enumerate(marks):
+        if mark.radius:
+            painted = stroke_pixels(mark, shape)
+            mask = mask | painted if mark.positive else mask & ~painted
+            continue
+        for i in range(len(mark.points)):
+            done = [*marks[:k], Mark(mark.points[: i + 1], mark.positive)]
+            if mask.any():
+                mask = correct_mask(view, mask, clicks_of(done), confirmed_pixels(done, shape))
+            elif mark.positive:
+                mask = segment_view(view, clicks_of(done))
+    return mask
+
+
+def segment_view(view: ViewEvidence, clicks: Clicks) -> np.ndarray:
+    """bool [H, W], True = the object that clicks are on; empty without a click on the object."""
+    if not clicks.positive.any():
+        return np.zeros(view.image.shape[:2], bool)
+    own, *others = _propose(view, clicks)
+    # The network's first mask is of a part; one click rarely means that.
+    best = _most_object(view, clicks, [own, *others[1:]])
+    return own if best is None else best
+
+
+def correct_mask(view: ViewEvidence, before: np.ndarray, clicks: Clicks, confirmed: np.ndarray) -> np.ndarray:
+    """bool [H, W]: the mask `before` [H, W] with one region added or removed by the last click, if that contradicts it.
+
+    Args:
+        confirmed: int8 [H, W], the pixels of all marks, see `marks.confirmed_pixels`.
+    """
+    at, positive = clicks.points[-1], bool(clicks.positive[-1])
+    if _value_at(before, at) == positive:
+        return before
+    reach = _reach_of_click(view, before, clicks)
+    masks = [reach, *_propose(view, clicks)]
+    alone = Clicks(
+        np.concatenate([clicks.points[clicks.positive != positive], at[None]]),
+        np.append(np.zeros((clicks.positive != positive).sum(), bool), True),
+    )
+    masks += [mask if positive else ~mask for mask in _propose(view, alone)]
+    results, kept = [], confirmed == (OTHER if positive else OBJECT)
+    for mask in masks:
+        region = _part_at((mask & ~before if positive else before & ~mask) & ~kept, at)
+        if region.any():
+            results.append(before | region if positive else before & ~region)
+    if not results:
+        return before
+    best = _most_object(view, clicks, results)
+    return results[0] if best is None else best
+
+
+def _propose(view: ViewEvidence, clicks: Clicks) -> list[np.ndarray]:
+    """bool [H, W] each: the object by colours and surfaces, and by the network; empty without a click on the object."""
+    if not clicks.positive.any():
+        return []
+    own = segment_by_surfaces(view.image, clicks, view.relief)
+    if view.ask is None:
+        return [own]
+    masks = [own, *(each.mask for each in view.ask(Prompt(clicks)))]
+    return [*masks, view.ask(Prompt(clicks, bounding_box(own)))[-1].mask] if own.any() else masks
+
+
+def _most_object(view: ViewEvidence, clicks: Clicks, masks: Sequence[np.ndarray]) -> np.ndarray | None:
+    """The mask that is most an object of its own, of those that agree with the clicks; None if none does."""
+    agreeing = [
+        mask
+        for mask in masks
+        if all(_value_at(mask, at) == positive for at, positive in zip(clicks.points, clicks.positive, strict=True))
+    ]
+    if len(agreeing) < 2:
+        return agreeing[0] if agreeing else None
+    lab, small, _ = _downscale(view.image, clicks)
+    pairs, length = _pixel_pairs(small)
+    edges = _find_depth_edges(view.relief, small, pairs, length)
+    depth_edges = np.zeros(len(pairs)) if edges is None else edges
+
+    def merit(mask: np.ndarray) -> float:
+        labels = cv2.resize(mask.astype(np.float32), small[::-1], interpolation=cv2.INTER_AREA) > 0.5
+        ends = labels.ravel()[pairs]
+        rim = ends[:, 0] != ends[:, 1]
+        on_edges = float(depth_edges[rim].mean()) if rim.any() else 0.0
+        return object_score(labels.ravel(), _ring(labels).ravel(), lab, pairs, depth_edges) + on_edges
+
+    return max(agreeing, key=merit)
+
+
+def _value_at(mask: np.ndarray, at: np.ndarray) -> bool:
+    column, row = (int(each) for each in at)
+    return bool(mask[min(row, mask.shape[0] - 1), min(column, mask.shape[1] - 1)])
+
+
+def _part_at(mask: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """bool [H, W]: the connected part of a mask that a point lies in; empty if the point lies outside."""
+    if not _value_at(mask, at):
+        return np.zeros_like(mask)
+    parts, _ = ndimage.label(mask, np.ones((3, 3)))
+    return parts == parts[min(int(at[1]), mask.shape[0] - 1), min(int(at[0]), mask.shape[1] - 1)]
+
+
+def bounding_box(mask: np.ndarray) -> tuple[float, float, float, float]:
+    """(left, top, right, bottom) of a mask that is not empty, px."""
+    rows, columns = np.nonzero(mask)
+    return float(columns.min()), float(rows.min()), float(columns.max() + 1), float(rows.max() + 1)
+
+
+def segment_by_surfaces(image: np.ndarray, clicks: Clicks, relief: np.ndarray | None = None) -> np.ndarray:
+    """bool [H, W], True = the object that clicks are on, by colours and edges of surfaces; at least one is positive.
 
     Args:
         image: uint8 [H, W, 3].
@@ -28,8 +168,6 @@ def segment_view(image: np.ndarray, clicks: Clicks, relief: np.ndarray | None = 
         relief: [H, W], logarithm of the depth times the focal length in pixels, where the scene has been fitted.
     """
     shape = image.shape[:2]
-    if not clicks.positive.any():
-        return np.zeros(shape, bool)
     lab, small, marks = _downscale(image, clicks)
     border = np.ones(small, bool)
     border[1:-1, 1:-1] = False
@@ -87,20 +225,16 @@ def _ring(mask: np.ndarray) -> np.ndarray:
     return ~erode(~mask, far) & erode(~mask, 1)
 
 
-def correct_mask(image: np.ndarray, before: np.ndarray, clicks: Clicks, relief: np.ndarray | None = None) -> np.ndarray:
-    """bool [H, W]: the mask `before` [H, W], corrected by clicks that contradict it. A correction extends to where
-    colours change, and to the edges of surfaces where their relief is known."""
-    lab, small, marks = _downscale(image, clicks)
+def _reach_of_click(view: ViewEvidence, before: np.ndarray, clicks: Clicks) -> np.ndarray:
+    """bool [H, W]: the mask `before`, corrected by clicks that contradict it. A correction extends to where colours
+    change, and to the edges of surfaces where their relief is known."""
+    lab, small, marks = _downscale(view.image, clicks)
     before_small = cv2.resize(before.astype(np.float32), small[::-1], interpolation=cv2.INTER_AREA) > 0.5
-    wrong = np.where((marks == OBJECT) & ~before_small | (marks == OTHER) & before_small, marks, UNKNOWN)
-    if not wrong.any():
-        return refine_edges(image, before, mark_pixels(clicks, before.shape))
     grid = _pixel_pairs(small)
-    mask = correct_labels(
-        lab, *grid, marks.ravel(), before_small.ravel(), _find_depth_edges(relief, small, *grid)
-    ).reshape(small)
+    depth_edges = _find_depth_edges(view.relief, small, *grid)
+    mask = correct_labels(lab, *grid, marks.ravel(), before_small.ravel(), depth_edges).reshape(small)
     same = _upscale(mask == before_small, before.shape)
-    return refine_edges(image, np.where(same, before, ~before), mark_pixels(clicks, before.shape))
+    return refine_edges(view.image, np.where(same, before, ~before), mark_pixels(clicks, before.shape))
 
 
 def _downscale(image: np.ndarray, clicks: Clicks) -> tuple[np.ndarray, tuple[int, int], np.ndarray]:
