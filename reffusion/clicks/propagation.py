@@ -58,19 +58,19 @@ def propagate_masks(
 
     Args:
         cameras: all views.
-        evidence_of: view -> its photograph, with a segmentation network.
+        evidence_of: view -> its photograph; without a segmentation network a mask is the projection of the votes.
         masks: view -> bool [H, W], at least one; they stay as they are.
     """
     drawn = dict(masks)
     own_votes = {name: count_votes(gaussians, cameras[name], mask) for name, mask in masks.items()}
     votes = sum(own_votes.values())
     order = order_by_distance(cameras, masks)
-    for k in trace.progress(len(order), "masks from views to view"):
+    for k in trace.progress(len(order), "masks from view to view"):
         name = order[k]
-        projection = project_votes(gaussians, cameras[name], votes)
-        if projection.silhouette.sum() < MIN_PIXELS:
+        view, projection = evidence_of(name), project_votes(gaussians, cameras[name], votes)
+        if view.ask is None or projection.silhouette.sum() < MIN_PIXELS:
             continue
-        drawn[name] = mask = draw_mask(evidence_of(name), projection)
+        drawn[name] = mask = draw_mask(view, projection)
         if agreement(mask, projection) > MIN_AGREEMENT:
             votes = votes + count_votes(gaussians, cameras[name], mask)
     return dict(masks) | {

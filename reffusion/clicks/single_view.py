@@ -42,7 +42,9 @@ class ViewEvidence:
     ask: Callable[[Prompt], list[Candidate]] | None = None
 
 
-def apply_marks(view: ViewEvidence, marks: Sequence[Mark], before: np.ndarray | None = None) -> np.ndarray:
+def apply_marks(
+    view: ViewEvidence, marks: Sequence[Mark], before: np.ndarray | None = None, first: int = 0
+) -> np.ndarray:
     """bool [H, W]: the mask after marks are applied one after the other.
 
     A stroke changes the pixels below it. The first click on the object selects it; each later click adds or removes one
@@ -51,10 +53,12 @@ def apply_marks(view: ViewEvidence, marks: Sequence[Mark], before: np.ndarray | 
 
     Args:
         before: bool [H, W], the mask that the marks correct; None: empty.
+        first: index of the first mark that `before` does not contain.
     """
     shape = view.image.shape[:2]
     mask = np.zeros(shape, bool) if before is None else before
-    for k, mark in enumerate(marks):
+    for k in range(first, len(marks)):
+        mark = marks[k]
         if mark.radius:
             painted = stroke_pixels(mark, shape)
             mask = mask | painted if mark.positive else mask & ~painted
