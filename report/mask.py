@@ -7,6 +7,7 @@ need.
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from http import HTTPStatus
@@ -18,13 +19,16 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 from PIL import Image
 
+from reffusion.clicks.local_segmenter import load_local_segmenter
 from report import cli
-from report.mask_session import Session, load_capture, load_local_segmenter
+from report.mask_session import Session, load_capture
 
 PORT = 8090
 PAGE = Path(__file__).with_name("mask.html")
 THUMBNAIL = 160  # longer side, px
 MAX_REQUEST_BYTES = 2_000_000
+LOG_TAIL_BYTES = 4000
+BAR = re.compile(r"(\d+)/(\d+) \[[^<\]]*<([\d:]+)")  # of a progress bar: done, total, time left
 TINT = (255, 0, 160)
 # The page is one file and contacts no other server.
 POLICY = "default-src 'none'; img-src 'self' data:; connect-src 'self'; "
@@ -36,8 +40,8 @@ class Server(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, session: Session, port: int = PORT, fit: subprocess.Popen | None = None):
-        self.session, self.fit = session, fit
+    def __init__(self, session: Session, port: int = PORT, fit: subprocess.Popen | None = None, next_command: str = ""):
+        self.session, self.fit, self.next_command = session, fit, next_command
         for number in range(port, port + 100):
             try:
                 super().__init__(("127.0.0.1", number), Handler)
@@ -51,9 +55,23 @@ class Server(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_address[1]}/"
 
     def state(self) -> dict:
-        """The session's state, and whether the fit is running."""
+        """The session's state, and that of the fit."""
         running = self.fit is not None and self.fit.poll() is None
-        return self.session.state() | {"fitting": running}
+        log = self.session.capture.fit.with_suffix(".log")
+        progress = read_progress(log) if running and log.is_file() else None
+        return self.session.state() | {"fitting": running, "fit_progress": progress, "next": self.next_command}
+
+
+def read_progress(log: Path) -> dict[str, object] | None:
+    """The share done and the time left of a running stage, from the last progress bar in its log; None if there is
+    none."""
+    with open(log, "rb") as file:
+        file.seek(max(0, log.stat().st_size - LOG_TAIL_BYTES))
+        found = BAR.findall(file.read().decode("utf-8", "replace"))
+    if not found or int(found[-1][1]) == 0:
+        return None
+    done, total, left = found[-1]
+    return {"share": int(done) / int(total), "left": left}
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -82,15 +100,21 @@ class Handler(BaseHTTPRequestHandler):
             return
         try:
             request = json.loads(self.rfile.read(length) or b"{}")
-            if self.path == "/clicks":
-                points = [(float(x), float(y), sign == "+") for x, y, sign in request["clicks"]]
-                self.server.session.click(str(request["view"]), points)
+            if self.path == "/mark":
+                points = [(float(x), float(y)) for x, y in request["points"]]
+                self.server.session.mark(str(request["view"]), points, request["sign"] == "+", float(request["radius"]))
+                self._send_json(HTTPStatus.OK, self.server.state())
+            elif self.path == "/remove":
+                self.server.session.remove(int(request["index"]))
+                self._send_json(HTTPStatus.OK, self.server.state())
+            elif self.path == "/clear":
+                self.server.session.clear(str(request["view"]))
                 self._send_json(HTTPStatus.OK, self.server.state())
             elif self.path == "/save":
                 self._send_json(HTTPStatus.OK, self.server.session.save())
             else:
                 self._send_json(HTTPStatus.NOT_FOUND, {"error": "no such page"})
-        except (ValueError, KeyError, TypeError, OSError) as error:
+        except (ValueError, LookupError, TypeError, OSError) as error:
             self._send_json(HTTPStatus.BAD_REQUEST, {"error": str(error)})
 
     def _is_local_request(self) -> bool:
@@ -157,10 +181,20 @@ def main() -> None:
         capture, segmenter = load_capture(cli.run_folder(arguments)), load_local_segmenter()
         fit = subprocess.Popen(stage_command("fit", arguments))
         session = Session(capture, lambda: fit.poll() == 0, segmenter)
-        server = Server(session, arguments.port, fit)
+        server = Server(session, arguments.port, fit, f"make scene={arguments.scene} all")
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
+    port = server.server_address[1]
     print(f"{server.address}  (Ctrl-C ends)", flush=True)
+    print(
+        f"from another machine: `ssh -L {port}:localhost:{port} THIS_MACHINE`, then open the same address there",
+        flush=True,
+    )
+    if segmenter is None:
+        print(
+            "clicks are segmented by colours and surfaces; `make weights` fetches a network (37 MB) "
+            "that needs fewer"
+        )
     try:
         server.serve_forever()
     except KeyboardInterrupt:

@@ -1,23 +1,24 @@
-"""State behind the mask page: the clicks, the masks that follow from them, and the files they are saved to."""
+"""State behind the mask page: the marks, the masks that follow from them, and the files they are saved to."""
 
 from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from torch import Tensor
 
 from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points
 from reffusion.capture.lenses import load_lenses, load_photograph_sizes
 from reffusion.capture.scene_folder import read_scene
-from reffusion.clicks import all_views
-from reffusion.clicks.marks import Clicks
-from reffusion.clicks.network import SOURCE, ImageFeatures, Segmenter, encode_image, load_segmenter, predict_mask
-from reffusion.clicks.single_view import correct_mask, segment_view
+from reffusion.clicks.marks import Mark
+from reffusion.clicks.scene_masks import load_evidence
+from reffusion.clicks.scene_segmentation import Event, FittedViews, correct_scene, count_first, propagate
+from reffusion.clicks.segmenter import ImageFeatures, Segmenter, encode_image
+from reffusion.clicks.single_view import ViewEvidence, apply_marks
 from reffusion.command import root
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.files import BadInput
@@ -26,7 +27,11 @@ from reffusion.io.ply import load_ply
 from reffusion.io.scene import list_objects, load_raw_masks, load_scene, load_views
 from reffusion.params.clicks import CLICKS
 from reffusion.params.raw_masks import Params
+from reffusion.types import Gaussians
 from report import sheet
+
+KEPT_VIEWS = 128  # whose network features stay in memory, 4 MB each
+KEPT_RESULTS = 64  # numbers of marks whose masks stay in memory
 
 
 @dataclass(frozen=True)
@@ -65,17 +70,10 @@ def load_capture(home: Path) -> Capture:
     if roles.values != WHITE:
         raise BadInput(f"{folder}: its masks hold object numbers or are inverted; remove them: clicks write white ones")
     files = roles.masks.get("", {})
-    written = _saved_clicks(folder)["written"]
+    written = _saved_marks(folder)["written"]
     foreign = [name for name, path in files.items() if written.get(_relative_path(path, folder)) != file_digest(path)]
     place = next((path.parent for path in files.values()), folder / (params.mask_folder or "masks"))
     return Capture(folder, place, poses, sheet.stage_folder(home, "fit"), load_raw_masks(raw_masks, foreign))
-
-
-def load_local_segmenter() -> Segmenter | None:
-    """The segmentation network whose weights are on this machine, or None. ValueError if the weights are incomplete."""
-    if (segmenter := load_segmenter()) is not None:
-        print(f"clicks are segmented by {SOURCE}", flush=True)
-    return segmenter
 
 
 def file_digest(path: Path) -> str:
@@ -87,81 +85,87 @@ def _relative_path(path: Path, folder: Path) -> str:
     return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
 
 
-def _saved_clicks(folder: Path) -> dict:
-    return load_json(folder / CLICKS) if (folder / CLICKS).is_file() else {"clicks": {}, "written": {}}
+def _saved_marks(folder: Path) -> dict:
+    return load_json(folder / CLICKS) if (folder / CLICKS).is_file() else {"marks": [], "written": {}}
+
+
+class Superseded(Exception):
+    """The marks changed while masks were computed from them."""
 
 
 class Session:
-    """The clicks on a scene. Safe to call from several threads.
+    """The marks on a scene. Safe to call from several threads.
 
-    A click makes the mask of its view at once, by the segmentation network if there is one. Once the scene is fitted, a
-    background thread labels Gaussians from all clicks and makes the masks of all views.
+    A background thread computes the masks. Before the scene is fitted, a mark changes the mask of its own view alone;
+    afterwards the masks of all views follow, see `reffusion.clicks.scene_segmentation`. The masks after each mark are
+    kept, so that a further mark, or undoing the last one, computes little.
     """
 
     def __init__(self, capture: Capture, fitted: Callable[[], bool], segmenter: Segmenter | None = None):
         self.capture, self.scene = capture, load_scene(capture.poses)
         self.segmenter, self.unsaved = segmenter, False
-        self.embeddings: dict[str, ImageFeatures] = {}  # view that was clicked on -> the network's features
         self.fitted = fitted  # is the fit of these poses finished? the folder may still hold a fit of earlier poses
         self.views = [name for name in self.scene.train if name not in self.scene.clean]
         self.lenses, self.sizes = load_lenses(capture.poses)[0], load_photograph_sizes(capture.poses)
         self.images = load_views(capture.poses, self.views)
-        self.clicks: dict[str, list[tuple[float, float, bool]]] = {}
+        self.events: list[Event] = []
         self.masks, self.versions = dict(capture.given), dict.fromkeys(self.views, 0)
-        self.gaussians: all_views.Gaussians | None = None
-        self.near: all_views.NeighbourGraph | None = None
-        self.labels: Tensor | None = None
-        self.pending_views: list[str] = []  # views whose masks do not follow the latest labels yet
-        self.reliefs: dict[str, np.ndarray] = {}
-        self.revision, self.solved_revision = 0, 0  # of the clicks, and of the clicks that the labels include
-        self.lock, self.changed = threading.RLock(), threading.Event()
-        for name, points in _saved_clicks(capture.folder)["clicks"].items():
-            if name in self.views:
-                at = undistort_points(np.array([p[:2] for p in points]), self.lenses[name], self.sizes[name])
-                self.clicks[name] = [(*xy, p[2] == "+") for xy, p in zip(at.tolist(), points, strict=True)]
+        self.gaussians: Gaussians | None = None
+        self.results: dict[tuple[str, ...], dict[str, np.ndarray]] = {}  # hashes of the first marks -> masks after them
+        self.revision, self.solved_revision = 0, 0  # of the marks, and of the marks that the masks include
+        self.error = ""  # why the masks of the latest revision could not be computed
+        self.lock = threading.Condition(threading.RLock())
+        self.features_of = lru_cache(KEPT_VIEWS)(self._encode)
+        self.evidence_of = lru_cache(None)(self._load_evidence)
+        for saved in _saved_marks(capture.folder)["marks"]:
+            if saved["view"] in self.images and saved["view"] not in capture.given:
+                self.events.append(self._from_photograph(saved))
+        self.revision += bool(self.events)
         threading.Thread(target=self._update_masks, daemon=True).start()
-        for name in self.clicks:
-            self._set_mask(name, self._single_view_mask(name))
+        if segmenter is not None:
+            threading.Thread(target=self._encode_all, daemon=True).start()
 
-    def click(self, name: str, points: list[tuple[float, float, bool]]) -> None:
-        """Replace all clicks on a view; points are in its undistorted pixels.
+    def mark(self, name: str, points: Sequence[tuple[float, float]], positive: bool, radius: float = 0.0) -> None:
+        """Add a click (radius 0), or a stroke of a brush; points are in the view's undistorted pixels.
 
         Raises:
-            ValueError: the view is unknown, has a mask of its own, or a click lies outside it.
+            ValueError: the view is unknown or has a mask of its own, or a point lies outside it.
         """
         if name not in self.images:
             raise ValueError(f"there is no view '{name}'")
         if name in self.capture.given:
-            raise ValueError(f"{name} has a mask of your own; move it out of {self.capture.masks} to click here")
+            raise ValueError(f"{name} has a mask of your own; move it out of {self.capture.masks} to mark here")
         height, width = self.images[name].shape[:2]
-        if any(not (0 <= x <= width and 0 <= y <= height) for x, y, _ in points):
-            raise ValueError(f"a click lies outside {name}, which has {width}x{height} px")
-        with self.lock:
-            self.unsaved = True
-            self.clicks[name] = points
-            if not points:
-                del self.clicks[name]
-            if points or self.gaussians is None:
-                self._set_mask(name, self._single_view_mask(name))
-            self.revision += 1
-            self.changed.set()
+        if not points or any(not (0 <= x <= width and 0 <= y <= height) for x, y in points):
+            raise ValueError(f"a mark lies outside {name}, which has {width}x{height} px")
+        if not 0 <= radius <= max(height, width):
+            raise ValueError(f"a brush of {radius:g} px on a view of {width}x{height} px")
+        self._change([*self.events, Event(name, Mark(np.array(points, float), positive, radius))])
+
+    def remove(self, index: int) -> None:
+        """Remove a mark by its index in the order of all marks; -1 is the last one. IndexError if there is none."""
+        remaining = list(self.events)
+        del remaining[index]
+        self._change(remaining)
+
+    def clear(self, name: str) -> None:
+        """Remove all marks of a view."""
+        self._change([event for event in self.events if event.view != name])
 
     def save(self) -> dict[str, int]:
         """Write masks and clicks.json; return how many masks were "written" and how many of the user's were "kept".
+
+        Waits for the masks of the latest marks.
 
         Raises:
             ValueError: there is no mask to write, or a file that the page did not write is in the way.
         """
         with self.lock:
+            self.lock.wait_for(lambda: self.solved_revision == self.revision)
             masks = {name: mask for name, mask in self.masks.items() if name not in self.capture.given}
             if not any(mask.any() for mask in masks.values()):
                 raise ValueError("nothing to save yet: click on the object first")
-            if self.gaussians is not None and self.solved_revision < self.revision:
-                self._apply_labels(self._solver()(), self.revision)
-            for name in list(self.pending_views):
-                self._refine(name)
-            masks = {name: mask for name, mask in self.masks.items() if name not in self.capture.given}
-            folder, written = self.capture.folder, dict(_saved_clicks(self.capture.folder)["written"])
+            folder, written = self.capture.folder, dict(_saved_marks(self.capture.folder)["written"])
             paths = {name: self.capture.masks / f"{name}.png" for name in masks}
             foreign = [
                 p for p in paths.values() if p.exists() and written.get(_relative_path(p, folder)) != file_digest(p)
@@ -171,7 +175,9 @@ class Session:
             for name, path in paths.items():
                 replace_image(path, to_uint8(distort_mask(masks[name], self.lenses[name], self.sizes[name]) * 1.0))
                 written[_relative_path(path, folder)] = file_digest(path)
-            save_json(folder / CLICKS, {"clicks": self._photograph_clicks(), "written": written})
+            save_json(
+                folder / CLICKS, {"marks": [self._to_photograph(each) for each in self.events], "written": written}
+            )
             self.unsaved = False
             return {"written": len(masks), "kept": len(self.capture.given)}
 
@@ -183,7 +189,16 @@ class Session:
                     "name": name,
                     "width": self.images[name].shape[1],
                     "height": self.images[name].shape[0],
-                    "clicks": [[x, y, "+" if positive else "-"] for x, y, positive in self.clicks.get(name, [])],
+                    "marks": [
+                        {
+                            "index": k,
+                            "points": event.mark.points.tolist(),
+                            "sign": "+" if event.mark.positive else "-",
+                            "radius": event.mark.radius,
+                        }
+                        for k, event in enumerate(self.events)
+                        if event.view == name
+                    ],
                     "mask": self.versions[name] if name in self.masks else None,
                     "given": name in self.capture.given,
                 }
@@ -192,121 +207,141 @@ class Session:
             return {
                 "views": views,
                 "fit": self.gaussians is not None,
-                "busy": len(self.pending_views)
-                or int(self.gaussians is not None and self.solved_revision < self.revision),
+                "busy": self.solved_revision < self.revision,
+                "error": self.error,
                 "unsaved": self.unsaved,
                 "folder": str(self.capture.masks),
             }
 
-    def _photograph_clicks(self) -> dict[str, list]:
-        """The clicks in pixels of the distorted photographs."""
-        clicks = {}
-        for name, points in self.clicks.items():
-            at = distort_points(np.array([p[:2] for p in points]), self.lenses[name], self.sizes[name]).round(1)
-            clicks[name] = [[*xy, "+" if p[2] else "-"] for xy, p in zip(at.tolist(), points, strict=True)]
-        return clicks
+    def _change(self, events: list[Event]) -> None:
+        with self.lock:
+            self.events, self.unsaved, self.error = events, True, ""
+            self.revision += 1
+            self.lock.notify_all()
 
-    def _clicks_on(self, name: str) -> Clicks | None:
-        points = self.clicks.get(name)
-        if not points:
-            return None
-        return Clicks(np.array([p[:2] for p in points], float), np.array([p[2] for p in points], bool))
+    def _from_photograph(self, saved: dict) -> Event:
+        """A saved mark, whose points are pixels of the distorted photograph."""
+        name = saved["view"]
+        points = undistort_points(np.array(saved["points"], float).reshape(-1, 2), self.lenses[name], self.sizes[name])
+        return Event(name, Mark(points, saved["sign"] == "+", saved["radius"] / self._photograph_scale(name)))
 
-    def _set_mask(self, name: str, mask: np.ndarray | None) -> None:
-        if mask is None:
-            self.masks.pop(name, None)
-        else:
-            self.masks[name] = mask
-        self.versions[name] += 1
+    def _to_photograph(self, event: Event) -> dict:
+        name, mark = event.view, event.mark
+        points = distort_points(mark.points, self.lenses[name], self.sizes[name]).round(1).tolist()
+        radius = round(mark.radius * self._photograph_scale(name), 2)
+        return {"view": name, "points": points, "sign": "+" if mark.positive else "-", "radius": radius}
 
-    def _single_view_mask(self, name: str) -> np.ndarray | None:
-        """Mask of a view from its own clicks, before the Gaussians are labelled; None without clicks."""
-        clicks, image, relief = self._clicks_on(name), self.images[name], None
-        if clicks is None:
-            return None
-        if self._uses_network(clicks):
-            return self._network_mask(name, clicks)
-        if self.gaussians is not None:
-            if name not in self.reliefs:
-                self.reliefs[name] = all_views.surface_relief(self.gaussians, self.scene.cameras[name])
-            relief = self.reliefs[name]
-        alone = not self.capture.given and all_views.order_views(self._all_clicks())[0] == name
-        if alone or name not in self.masks:
-            return segment_view(image, clicks, relief)
-        return correct_mask(image, self.masks[name], clicks, relief)
+    def _photograph_scale(self, name: str) -> float:
+        """Pixels of the photograph per pixel of the view."""
+        return self.sizes[name][0] / self.lenses[name].width
 
-    def _uses_network(self, clicks: Clicks) -> bool:
-        """True if the network answers these clicks.
+    def _encode(self, name: str) -> ImageFeatures:
+        assert self.segmenter is not None
+        return encode_image(self.segmenter, self.images[name])
 
-        Negative clicks alone correct a mask that follows from other views, of which the network knows nothing.
-        """
-        return self.segmenter is not None and bool(clicks.positive.any())
+    def _encode_all(self) -> None:
+        """Encode all views ahead of their use; the fit leaves time for it."""
+        for name in self.views[:KEPT_VIEWS]:
+            self.features_of(name)
 
-    def _network_mask(self, name: str, clicks: Clicks) -> np.ndarray:
-        assert self.segmenter is not None  # `_uses_network`
-        if name not in self.embeddings:
-            self.embeddings[name] = encode_image(self.segmenter, self.images[name])
-        return predict_mask(self.segmenter, self.embeddings[name], clicks)
-
-    def _all_clicks(self) -> dict[str, Clicks]:
-        return {name: on for name in self.clicks if (on := self._clicks_on(name)) is not None}
-
-    def _solver(self) -> Callable[[], Tensor | None]:
-        """Function that labels the object from all present clicks, bool [N]; it returns None if nothing marks it."""
-        clicks, given = self._all_clicks(), self.capture.given
-        if not any(each.positive.any() for each in clicks.values()) and not given:
-            return lambda: None
-        by_network = [name for name, on in clicks.items() if self._uses_network(on)]
-        given = given | {name: self._network_mask(name, clicks.pop(name)) for name in by_network}
-        cameras = {name: self.scene.cameras[name] for name in {*self.views, *given}}
-        assert self.gaussians is not None and self.near is not None
-        problem = (self.gaussians, self.near, cameras, self.images.__getitem__, clicks, given)
-        return lambda: all_views.segment_by_clicks(*problem).labels
-
-    def _apply_labels(self, labels: Tensor | None, revision: int) -> None:
-        """Show the labels that include the clicks up to `revision`; views with clicks are updated first."""
-        self.labels, self.solved_revision = labels, revision
-        if labels is None:
-            self.pending_views = []
-            for name in self.views:
-                self._set_mask(name, None)
-            return
-        for name in self.clicks:
-            self._refine(name)
-        self.pending_views = [name for name in self.views if name not in self.clicks and name not in self.capture.given]
-
-    def _refine(self, name: str) -> None:
-        assert self.gaussians is not None and self.labels is not None
-        camera, image, on = self.scene.cameras[name], self.images[name], self._clicks_on(name)
-        self._set_mask(name, all_views.object_mask(self.gaussians, self.labels, camera, image, on))
-        self.pending_views = [each for each in self.pending_views if each != name]
+    def _load_evidence(self, name: str) -> ViewEvidence:
+        features_of = None if self.segmenter is None else lambda: self.features_of(name)
+        return load_evidence(self.images[name], self.gaussians, self.scene.cameras[name], self.segmenter, features_of)
 
     def _update_masks(self) -> None:
-        """Background thread: wait for the fit, then remake the masks of all views whenever clicks change."""
+        """Background thread: remake the masks whenever marks change, and once the scene is fitted."""
         while True:
-            if self.gaussians is None:
-                self.changed.wait(1.0)
-                self.changed.clear()
+            with self.lock:
+                self.lock.wait_for(lambda: self.solved_revision < self.revision, None if self.gaussians else 1.0)
+                revision, events = self.revision, list(self.events)
+            if self.gaussians is None and self.fitted():
                 self._load_fit()
-            elif self.solved_revision < self.revision:
-                with self.lock:
-                    revision, solve = self.revision, self._solver()
-                labels = solve()
-                with self.lock:
-                    if revision == self.revision > self.solved_revision:
-                        self._apply_labels(labels, revision)
-            elif not self.pending_views:
-                self.changed.wait()
-                self.changed.clear()
-            else:
-                with self.lock:
-                    if self.pending_views and self.solved_revision == self.revision:
-                        self._refine(self.pending_views[0])
+                continue
+            if self.solved_revision == revision:
+                continue
+            try:
+                self._solve(events, revision)
+                error = ""
+            except Superseded:
+                continue
+            except (ValueError, FloatingPointError) as failure:
+                error = str(failure)
+            with self.lock:
+                if revision == self.revision:
+                    self.solved_revision, self.error = revision, error
+                    self.lock.notify_all()
 
     def _load_fit(self) -> None:
-        if self.fitted():
-            gaussians = load_ply(self.capture.fit / "gaussians.ply")
-            near = all_views.find_neighbours(gaussians)
-            with self.lock:
-                self.gaussians, self.near = gaussians, near
-                self.revision += bool(self.clicks)
+        gaussians = load_ply(self.capture.fit / "gaussians.ply")
+        with self.lock:
+            self.gaussians = gaussians
+            self.evidence_of.cache_clear()  # the surfaces are known now
+            self.results.clear()
+            self.revision += bool(self.events)
+
+    def _solve(self, events: list[Event], revision: int) -> None:
+        """Compute and show the masks after the events.
+
+        Raises:
+            Superseded: the marks changed meanwhile.
+        """
+
+        def evidence_of(name: str) -> ViewEvidence:
+            if revision != self.revision:
+                raise Superseded
+            return self.evidence_of(name)
+
+        given = self.capture.given
+        if self.gaussians is None:
+            masks = dict(given)
+            for name in dict.fromkeys(event.view for event in events):
+                masks[name] = self._first_mask([event for event in events if event.view == name], evidence_of)
+            self._show(masks, revision)
+            return
+        cameras = {name: self.scene.cameras[name] for name in {*self.views, *given}}
+        views = FittedViews(self.gaussians, cameras, evidence_of)
+        count = 0 if given else count_first(events) if events else 0
+        masks = dict(given)
+        if count:
+            masks[events[0].view] = self._first_mask(events[:count], evidence_of)
+            self._show(self.masks | masks, revision)
+        if events:
+            masks = self._recall(("all", *map(_event_key, events[:count])), lambda: propagate(views, masks))
+        for k in range(count, len(events)):
+            before = masks
+            key = ("all", *map(_event_key, events[: k + 1]))
+            masks = self._recall(key, lambda: correct_scene(views, events[: k + 1], before, given))  # noqa: B023
+        self._show(masks, revision)
+
+    def _first_mask(self, events: Sequence[Event], evidence_of: Callable[[str], ViewEvidence]) -> np.ndarray:
+        """bool [H, W]: the mask of a view from its own marks."""
+        name, marks, mask = events[0].view, [event.mark for event in events], None
+        for k in range(len(marks)):
+            before = mask
+            key = ("view", *map(_event_key, events[: k + 1]))
+            step = lambda: {name: apply_marks(evidence_of(name), marks[: k + 1], before, first=k)}  # noqa: B023
+            mask = self._recall(key, step)[name]
+        assert mask is not None
+        return mask
+
+    def _recall(self, key: tuple[str, ...], compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+        """The result of an earlier computation with this key, or of this one."""
+        if key not in self.results:
+            self.results[key] = compute()
+            while len(self.results) > KEPT_RESULTS:
+                del self.results[next(iter(self.results))]
+        return self.results[key]
+
+    def _show(self, masks: dict[str, np.ndarray], revision: int) -> None:
+        with self.lock:
+            if revision != self.revision:
+                raise Superseded
+            for name in self.views:
+                if masks.get(name) is not self.masks.get(name):
+                    self.versions[name] += 1
+            self.masks = dict(masks)
+
+
+def _event_key(event: Event) -> str:
+    mark = event.mark
+    return f"{event.view} {mark.positive} {mark.radius} {mark.points.tobytes().hex()}"

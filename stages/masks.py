@@ -11,6 +11,7 @@ from torch import Tensor
 
 from reffusion.background.model import Background, surfaces_to_arrays
 from reffusion.background.visibility import render_depth_views
+from reffusion.clicks.local_segmenter import load_local_segmenter
 from reffusion.clicks.scene_masks import masks_from_clicks
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, load_labels, save_arrays, save_json, save_labels
@@ -103,7 +104,9 @@ def collect_raw_masks(
         raise ValueError(
             f"{raw_masks / 'masks'}: no view has a mask of each object; add empty ones where one is unseen"
         )
-    return masks_from_clicks(scene, gaussians, poses, params.clicks, raw) if params.clicks else raw
+    if not params.clicks:
+        return raw
+    return masks_from_clicks(scene, gaussians, poses, params.clicks, raw, load_local_segmenter(params.segmenter))
 
 
 def check_frame(poses: Path, fit: Path, gaussians: Gaussians, train: list[Camera]) -> None:

@@ -154,6 +154,13 @@ def _select(
     return masks[int(np.argmax(merits))]
 
 
+def draw_view(view: ViewEvidence, projection: Projection) -> np.ndarray:
+    """bool [H, W]: the mask of a view that did not vote; empty where votes show too little of the object."""
+    if projection.silhouette.sum() < MIN_PIXELS:
+        return np.zeros_like(projection.silhouette)
+    return combine(view.image, projection, draw_mask(view, projection) if view.ask else None)
+
+
 def agreement(mask: np.ndarray, projection: Projection) -> float:
     """In [0, 1]: the larger of the IoU with what votes show of the object, pixels without votes aside, and the IoU with
     its silhouette. The latter counts where Gaussians that only this view shows stand before the object."""

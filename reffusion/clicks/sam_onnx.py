@@ -9,8 +9,8 @@ import numpy as np
 
 from reffusion.clicks.segmenter import Segmenter
 from reffusion.onnx import open_session
+from reffusion.weights.local import SEGMENTER_FILES
 
-ENCODER, DECODER = "encoder.onnx", "decoder.onnx"
 MASKS, SCORES = "all_masks", "all_scores"  # logits of four masks, 256 x 256 px, and the IoU that is expected of each
 SIZE = 256, 256  # px, masks of the decoder
 PADDING = -1  # label of the point that stands for "no box"
@@ -23,7 +23,7 @@ def load_distilled_sam(folder: Path) -> Segmenter | None:
     Raises:
         ValueError: onnxruntime is not installed, or a file is damaged or another network.
     """
-    files = [folder / name for name in (ENCODER, DECODER)]
+    files = [folder / name for name in SEGMENTER_FILES]
     if not all(file.is_file() for file in files):
         return None
     encoder, decoder = (open_session(file, str(file)) for file in files)

@@ -2,46 +2,100 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from reffusion import trace
 from reffusion.capture.click_coordinates import undistort_clicks
 from reffusion.capture.views import check_outliers
 from reffusion.clicks import all_views
-from reffusion.clicks.marks import Clicks
+from reffusion.clicks.marks import Mark
+from reffusion.clicks.propagation import count_votes, draw_view, project_votes
+from reffusion.clicks.scene_segmentation import Event, FittedViews, segment_scene
+from reffusion.clicks.segmenter import ImageFeatures, Segmenter, encode_image, predict_masks
+from reffusion.clicks.single_view import ViewEvidence
 from reffusion.io.scene import load_views
 from reffusion.params.clicks import Clicked
-from reffusion.types import Gaussians, Scene
+from reffusion.types import Camera, Gaussians, Scene
+
+KEPT_VIEWS = 48  # whose network features stay in memory, 4 MB each
 
 
 def masks_from_clicks(
-    scene: Scene, gaussians: Gaussians, poses: Path, clicks: Clicked, masks: Mapping[str, np.ndarray]
+    scene: Scene,
+    gaussians: Gaussians,
+    poses: Path,
+    clicks: Clicked,
+    masks: Mapping[str, np.ndarray],
+    segmenter: Segmenter | None = None,
 ) -> dict[str, np.ndarray]:
     """View name -> bool [H, W]: masks of all training views, and of the test views that show the object.
 
     Args:
-        clicks: of scene.yaml. masks: those that the scene brings; they stay as they are.
+        clicks: of scene.yaml; those of the view with most clicks on the object come first.
+        masks: those that the scene brings; they stay as they are.
+        segmenter: a segmentation network; None: colours and surfaces alone.
 
     Raises:
         ValueError: the clicks lie where undistorted views show nothing, or on nothing that the Gaussians show.
     """
     check_outliers("clicks", clicks, scene.outliers)
-    points = {name: Clicks(*each) for name, each in undistort_clicks(poses, clicks).items()}
-    image_of = lambda name: load_views(poses, [name])[name]
+    points = undistort_clicks(poses, clicks)
+    events = [
+        Event(name, Mark(point[None], bool(positive)))
+        for name in sorted(points, key=lambda name: (-int(points[name][1].sum()), name))
+        for point, positive in zip(*points[name], strict=True)
+    ]
     cameras = {name: scene.cameras[name] for name in scene.train if name in masks or name not in scene.clean}
-    solution = all_views.segment_by_clicks(
-        gaussians, all_views.find_neighbours(gaussians), cameras, image_of, points, masks
-    )
-    if not solution.labels.any():
+    if clean := [name for name in points if name not in cameras]:
+        raise ValueError(f"scene.yaml: clicks: {clean[0]} is no training view that shows the object")
+    views = FittedViews(gaussians, cameras, evidence_loader(scene, gaussians, poses, segmenter))
+    found = segment_scene(views, events, masks)
+    if not any(mask.any() for mask in found.values()):
         raise ValueError("scene.yaml: clicks: the views show nothing there; click in the middle of the object")
-    names = [name for name in (*scene.train, *scene.test) if name not in {*masks, *scene.clean}]
-    found = dict(masks)
-    for k in trace.progress(len(names), "masks from clicks"):
-        name, camera, image = names[k], scene.cameras[names[k]], image_of(names[k])
-        mask = all_views.object_mask(gaussians, solution.labels, camera, image, points.get(name))
-        if name in scene.train or all_views.is_visible(gaussians, camera, image, mask):
+    return found | masks_of_test_views(scene, views, found)
+
+
+def masks_of_test_views(scene: Scene, views: FittedViews, masks: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """View name -> bool [H, W]: what the masks of training views show in test views whose photographs show it, too."""
+    votes = sum(count_votes(views.gaussians, views.cameras[name], mask) for name, mask in masks.items())
+    found = {}
+    for name in scene.test:
+        camera, view = scene.cameras[name], views.evidence_of(name)
+        mask = draw_view(view, project_votes(views.gaussians, camera, votes))
+        if all_views.is_visible(views.gaussians, camera, view.image, mask):
             found[name] = mask
     return found
+
+
+def evidence_loader(scene: Scene, gaussians: Gaussians, poses: Path, segmenter: Segmenter | None):
+    """Function view -> ViewEvidence, which loads and encodes a photograph when it is first needed."""
+
+    @lru_cache(KEPT_VIEWS)
+    def evidence_of(name: str) -> ViewEvidence:
+        return load_evidence(load_views(poses, [name])[name], gaussians, scene.cameras[name], segmenter)
+
+    return evidence_of
+
+
+def load_evidence(
+    image: np.ndarray,
+    gaussians: Gaussians | None,
+    camera: Camera,
+    segmenter: Segmenter | None,
+    features_of: Callable[[], ImageFeatures] | None = None,
+) -> ViewEvidence:
+    """What is known of a view.
+
+    Args:
+        image: uint8 [H, W, 3].
+        gaussians: None if the scene is not fitted yet.
+        features_of: gives the network's features of the photograph; by default it is encoded at the first prompt.
+    """
+    relief = None if gaussians is None else all_views.surface_relief(gaussians, camera)
+    if segmenter is None:
+        return ViewEvidence(image, relief)
+    features_of = features_of or cache(lambda: encode_image(segmenter, image))
+    return ViewEvidence(image, relief, lambda prompt: predict_masks(segmenter, features_of(), prompt))

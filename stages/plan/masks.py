@@ -1,9 +1,30 @@
 """What `plan` reports of the stage `masks` before it runs."""
 
+from pathlib import Path
+
+from reffusion.clicks.local_segmenter import AUTO, NONE, segmenter_facts
 from reffusion.io import machine
 from reffusion.params.masks import Params
+from reffusion.weights import local
 
 __all__ = ["Params", "lacks"]
+
+
+def optional_weights(params: Params) -> list[local.Need]:
+    """The network that makes masks from clicks."""
+    return [local.segmenter_need()] if params.segmenter == AUTO else []
+
+
+def machine_facts(params: Params) -> dict[str, str]:
+    """What masks from clicks depend on besides the parameters: the network's files."""
+    return segmenter_facts(params.segmenter) if params.clicks else {}
+
+
+def preview(params: Params, **_: Path | None) -> list[str]:
+    """What the stage will do, as far as it is known in advance."""
+    if not params.clicks or segmenter_facts(params.segmenter)["segmenter"] != NONE:
+        return []
+    return ["clicks are segmented by colours and surfaces; with the network of `make weights`, fewer clicks suffice"]
 
 
 def lacks(params: Params) -> list[str]:
