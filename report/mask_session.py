@@ -253,14 +253,14 @@ class Session:
 
     def _solver(self) -> Callable[[], Tensor | None]:
         """Function that labels the object from all present clicks, bool [N]; it returns None if nothing marks it."""
-        clicks, given = self._all_clicks(), self.capture.given
-        if not any(each.positive.any() for each in clicks.values()) and not given:
+        clicks, masks = self._all_clicks(), self.capture.given
+        if not any(each.positive.any() for each in clicks.values()) and not masks:
             return lambda: None
         by_network = [name for name, on in clicks.items() if self._uses_network(on)]
-        given = given | {name: self._network_mask(name, clicks.pop(name)) for name in by_network}
-        cameras = {name: self.scene.cameras[name] for name in {*self.views, *given}}
+        masks = masks | {name: self._network_mask(name, clicks.pop(name)) for name in by_network}
+        cameras = {name: self.scene.cameras[name] for name in {*self.views, *masks}}
         assert self.gaussians is not None and self.near is not None
-        problem = (self.gaussians, self.near, cameras, self.images.__getitem__, clicks, given)
+        problem = (self.gaussians, self.near, cameras, self.images.__getitem__, clicks, masks)
         return lambda: all_views.segment_by_clicks(*problem).labels
 
     def _apply_labels(self, labels: Tensor | None, revision: int) -> None:
