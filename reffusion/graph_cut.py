@@ -27,10 +27,10 @@ def min_cut(true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, st
     second = [nodes, np.full(count, sink), pairs[:, 1], pairs[:, 0]]
     links = tuple(np.concatenate(each) for each in (first, second))
     network = sparse.coo_array((np.concatenate(capacity), links), (count + 2, count + 2)).tocsr()
-    left = network - csgraph.maximum_flow(network, source, sink).flow
-    left.data = (left.data > 0).astype(np.int32)
-    left.eliminate_zeros()
-    reached = csgraph.breadth_first_order(left, source, return_predecessors=False)
+    residual = network - csgraph.maximum_flow(network, source, sink).flow
+    residual.data = (residual.data > 0).astype(np.int32)
+    residual.eliminate_zeros()
+    reached = csgraph.breadth_first_order(residual, source, return_predecessors=False)
     return np.isin(nodes, reached)
 
 
@@ -43,11 +43,11 @@ def alpha_expansion(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, s
         pairs: [E, 2] int, neighbours, each pair once. strength: [E] >= 0, cost of a pair with different labels.
     """
     labels, changed = start.copy(), True
-    here, there = pairs.T
+    first, second = pairs.T
     while changed:
         changed = False
         for label in range(len(cost)):
-            apart = labels[here] != labels[there]
+            apart = labels[first] != labels[second]
             keep = cost[labels, np.arange(len(labels))]
             # Neighbours with different labels cost once unless both move: each that moves gains half of it.
             gain = np.bincount(pairs[apart].T.ravel(), np.tile(strength[apart] / 2, 2), len(labels))

@@ -116,10 +116,10 @@ def label_points(axes: Axes, points: np.ndarray, names: Sequence[str], strong: n
     renderer = axes.figure.canvas.get_renderer()
     unit = axes.figure.dpi / 72
     pixels = axes.transData.transform(points)
-    taken = [np.array([x - 5 * unit, y - 5 * unit, x + 5 * unit, y + 5 * unit]) for x, y in pixels]
+    obstacles = [np.array([x - 5 * unit, y - 5 * unit, x + 5 * unit, y + 5 * unit]) for x, y in pixels]
     steps = pixels[strong][np.argsort(pixels[strong][:, 0], kind="stable")]
     for (x, y), (to_x, to_y) in pairwise(steps):  # the front's own line
-        taken += [np.array([x, y - unit, to_x, y + unit]), np.array([to_x - unit, to_y, to_x + unit, y])]
+        obstacles += [np.array([x, y - unit, to_x, y + unit]), np.array([to_x - unit, to_y, to_x + unit, y])]
     inside = axes.get_window_extent(renderer)
     for index in np.argsort(-pixels[:, 0], kind="stable"):
         colour = BLUE if strong[index] else INK
@@ -129,10 +129,10 @@ def label_points(axes: Axes, points: np.ndarray, names: Sequence[str], strong: n
         )  # fmt: skip
         wide, high = text.get_window_extent(renderer).size
         boxes = [_box(pixels[index], place, wide, high, unit) for place in LABEL_OFFSETS]
-        others = [box for number, box in enumerate(taken) if number != index]
+        others = [box for number, box in enumerate(obstacles) if number != index]
         costs = [_cost(box, place, others, inside) for box, place in zip(boxes, LABEL_OFFSETS, strict=True)]
         best = int(np.argmin(costs))
-        taken.append(boxes[best])
+        obstacles.append(boxes[best])
         corner = (boxes[best][:2] - pixels[index]) / unit
         text.set_position(tuple(corner))
         if np.hypot(*LABEL_OFFSETS[best]) > 12:

@@ -33,7 +33,7 @@ class GaussianLayers:
     def select(self, state: str, kept: bool, added: bool, removed: bool) -> Gaussians:
         """The chosen parts of a state, as one scene."""
         parts = zip((*self.states[state], self.removed), (kept, added, removed), strict=True)
-        chosen = [part if wanted else part.map(lambda p: p[:0]) for part, wanted in parts]
+        chosen = [part if include else part.map(lambda p: p[:0]) for part, include in parts]
         return reduce(lambda one, other: one.zip_map(other, lambda a, b: torch.cat([a, b])), chosen)
 
 

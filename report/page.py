@@ -58,13 +58,13 @@ def table(
 
     `bold` [rows][columns] marks cells, `text` the columns of words (set to the left), `marked` one row.
     """
-    left = lambda column: ' class="text"' if column in text else ""
-    lines = ["<tr>" + "".join(f"<th{left(n)}>{escape(cell)}</th>" for n, cell in enumerate(header)) + "</tr>"]
+    alignment = lambda column: ' class="text"' if column in text else ""
+    lines = ["<tr>" + "".join(f"<th{alignment(n)}>{escape(cell)}</th>" for n, cell in enumerate(header)) + "</tr>"]
     for number, row in enumerate(rows):
         cells = []
         for column, cell in enumerate(row):
             inside = f"<b>{escape(cell)}</b>" if bold and bold[number][column] else escape(cell)
-            cells.append(f"<td{left(column)}>{inside}</td>")
+            cells.append(f"<td{alignment(column)}>{inside}</td>")
         lines.append(("<tr class=ours>" if number == marked else "<tr>") + "".join(cells) + "</tr>")
     return '<div class="wide"><table>\n' + "\n".join(lines) + "\n</table></div>"
 

@@ -32,9 +32,9 @@ def make(home: Path) -> str:
     save_ply(out / NEW, result.map(lambda parameter: parameter[new]), similarity, properties)
     kept, stayed = int((~load_labels(patch.poses / "deleted.npy")).sum()), len(result) - int(new.sum())
     more = kept - stayed
-    left = f"; {more} more than you deleted are gone: haze and floaters behind the object" if more > 0 else ""
+    note = f"; {more} more than you deleted are gone: haze and floaters behind the object" if more > 0 else ""
     return (
-        f"{out / WHOLE}: the whole scene, {len(result)} splats{left}\n"
+        f"{out / WHOLE}: the whole scene, {len(result)} splats{note}\n"
         f"{out / NEW}: the {int(new.sum())} new ones alone, which the whole scene contains too"
     )
 

@@ -101,10 +101,10 @@ def _check_requests(scenes: list[str], requests: dict[tuple[str, str], Request],
 def _choose_methods(only: str, pipeline: Pipeline, own: str) -> list[str]:
     """The methods besides FULL: those named in `only`, or else the scene's own run and all variants."""
     known = [name for name in dict.fromkeys((own, *pipeline.variants)) if name != FULL]
-    wanted = [name for name in re.split(r"[,\s]+", only) if name and name != FULL]
-    for name in (name for name in wanted if name not in known):
+    methods = [name for name in re.split(r"[,\s]+", only) if name and name != FULL]
+    for name in (name for name in methods if name not in known):
         raise Refused(f"variants: {unknown_name('variant', name, known)}")
-    return list(dict.fromkeys(wanted)) if only else known
+    return list(dict.fromkeys(methods)) if only else known
 
 
 def _scenes(request: Request, seeds: int, data: Path | None) -> dict[str, str]:

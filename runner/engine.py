@@ -221,8 +221,8 @@ def run_process(
     interrupted = False
     with open(task.output, "a") if task.output else nullcontext() as output:
         # A process group of its own: Ctrl-C reaches it once, from here.
-        held = (writer,) if lock is None else (lock, writer)
-        process = start_worker(task.root, "run", pass_fds=held, process_group=0, stdout=output, stderr=output)
+        descriptors = (writer,) if lock is None else (lock, writer)
+        process = start_worker(task.root, "run", pass_fds=descriptors, process_group=0, stdout=output, stderr=output)
     assert process.stdin
     os.close(writer)
     try:

@@ -15,8 +15,8 @@ def cost_table(job: ResolvedJob, decisions: dict[str, Decision], gpu: str | None
     Raises:
         Refused: the GPU is unknown.
     """
-    left = [stage for stage, decision in decisions.items() if decision.status not in FINAL]
-    on_gpu = [stage for stage in left if job.params.get(stage, {}).get("device") == "cuda"]
+    remaining = [stage for stage, decision in decisions.items() if decision.status not in FINAL]
+    on_gpu = [stage for stage in remaining if job.params.get(stage, {}).get("device") == "cuda"]
     if not (on_gpu and (gpu or has_cuda())):
         return f"  gpu={gpu}: no stage of this plan runs on CUDA" if gpu else ""
     rows, questions = [], [job.question(stage) | {"gpu": gpu or ""} for stage in on_gpu]

@@ -70,12 +70,12 @@ def stack_layers(
     Groups of parameters merge. A key of scene.yaml is one value, even where it is a mapping (`reference: {view, image,
     depth}`), and is replaced as a whole."""
     keys, brings = pipeline.scene_keys, scene.brings
-    brought = {stage: {key: brings[key] for key in keys[stage] if key in brings} for stage in keys}
+    scene_params = {stage: {key: brings[key] for key in keys[stage] if key in brings} for stage in keys}
     layers = (
         ("pipeline.yaml", {name: stage.params for name, stage in pipeline.stages.items()}),
         (f"pipeline.yaml: profile {profile}", pipeline.profiles[profile]),
         ("budget", shares),
-        (str(scene.path), brought),
+        (str(scene.path), scene_params),
         (f"{scene.path}: stages", copy_scene_keys(pipeline, scene.stages)),
         (f"pipeline.yaml: variant {variant}", copy_scene_keys(pipeline, pipeline.variants.get(variant or "", {}))),
         ("set", copy_scene_keys(pipeline, asked)),
@@ -113,7 +113,7 @@ def split_budget(pipeline: Pipeline, values: Overrides, seconds: float) -> Overr
     if not pipeline.budget:
         raise Refused("pipeline.yaml: a budget is asked for, and there is no table `budget` that shares it out")
     set_params = {f"{stage}.{name}": value for stage in values for name, value in flatten_params(values[stage]).items()}
-    has_values = lambda wanted: all(set_params.get(param, ...) == value for param, value in wanted.items())
+    has_values = lambda expected: all(set_params.get(param, ...) == value for param, value in expected.items())
     is_true = lambda c: c.param and has_values(dict.fromkeys(c.param, c.equals) | c.only)
     remaining = [name for name in pipeline.budget if not any(is_true(c) for c in pipeline.stages[name].skip_if)]
     if not remaining:

@@ -164,12 +164,12 @@ class Pipeline(Strict):
             return list(self.stages)
         if target not in self.stages:
             raise Refused(f"pipeline.yaml: {unknown_name('stage', target, ['all', *self.stages])}")
-        wanted = {target}
+        names = {target}
         for name in reversed(self.stages):
-            if name in wanted:
+            if name in names:
                 stage = self.stages[name]
-                wanted |= {*stage.all_needs, *(need for c in stage.skip_if for need in c.depends_on)}
-        return [name for name in self.stages if name in wanted]
+                names |= {*stage.all_needs, *(need for c in stage.skip_if for need in c.depends_on)}
+        return [name for name in self.stages if name in names]
 
 
 def unknown_name(kind: str, name: object, known: Any) -> str:

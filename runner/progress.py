@@ -67,9 +67,9 @@ class Progress:
                     self._seconds[stage].append(now - row.since)
                 row.finished.add(stage)
                 row.stage, row.state = "", ""
-            left = self._seconds_left(row)
+            seconds = self._seconds_left(row)
         if state == RUNS and not self._live:
-            about = "" if left is None else f"; {format_seconds(left)} left of all its stages"
+            about = "" if seconds is None else f"; {format_seconds(seconds)} left of all its stages"
             print(f"{time.strftime('%H:%M:%S')} {row.name}: {stage}{about}", flush=True)
 
     def end(self, place: int, error: str | None, seconds: float) -> None:
@@ -88,9 +88,9 @@ class Progress:
             ended = [row for row in self._rows if row.finished == set(self._stages)]
             failed = [row for row in ended if row.state.startswith("failed")]
             busy = [row for row in self._rows if row.stage]
-            lefts = [self._seconds_left(row) for row in self._rows if row not in ended]
-            known = [left for left in lefts if left is not None]
-            about = f", {format_seconds(sum(known) / self._at_once)} left" if len(known) == len(lefts) else ""
+            remaining = [self._seconds_left(row) for row in self._rows if row not in ended]
+            known = [seconds for seconds in remaining if seconds is not None]
+            about = f", {format_seconds(sum(known) / self._at_once)} left" if len(known) == len(remaining) else ""
             head = f"{len(ended) - len(failed)} of {len(self._rows)} done, {len(failed)} failed{about}"
             width_name = max(map(len, (row.name for row in self._rows)), default=0)
             lines = [f"{row.name:<{width_name}}  {row.stage:<12} {self._describe(row)}" for row in busy]
@@ -102,8 +102,8 @@ class Progress:
     def _describe(self, row: _Row) -> str:
         if row.state == WAITS:
             return "waits for cores or memory"
-        left, since = self._seconds_left(row), format_seconds(time.monotonic() - row.since)
-        return f"for {since}" + ("" if left is None else f"; {format_seconds(left)} left of all its stages")
+        seconds, since = self._seconds_left(row), format_seconds(time.monotonic() - row.since)
+        return f"for {since}" + ("" if seconds is None else f"; {format_seconds(seconds)} left of all its stages")
 
     def _seconds_left(self, row: _Row) -> float | None:
         """Expected seconds to the end of a run, from earlier runs of its stages on any scene; None: not known."""

@@ -33,10 +33,10 @@ def take_over(folder: Path) -> None:
 
     It is a copy, as the lost attempt may still write to its own folder, which is removed."""
     attempts = sorted(folder.parent.glob(f"{folder.name}.*"), key=lambda path: path.stat().st_mtime)
-    for left in reversed(attempts):
+    for attempt in reversed(attempts):
         if not folder.exists():
             copy = folder.with_name(f".copying-{folder.name}")
             shutil.rmtree(copy, ignore_errors=True)
-            shutil.copytree(left, copy, ignore=shutil.ignore_patterns("*.writing"))
+            shutil.copytree(attempt, copy, ignore=shutil.ignore_patterns("*.writing"))
             copy.rename(folder)
-        shutil.rmtree(left, ignore_errors=True)
+        shutil.rmtree(attempt, ignore_errors=True)

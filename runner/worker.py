@@ -162,16 +162,16 @@ def fetch() -> int:
     Returns:
         How many could not be fetched; their errors go to standard error.
     """
-    wanted = {}
+    downloads = {}
     for stage, question in json.load(sys.stdin).items():
         planned = _import_file(_description_file(stage))
         if hasattr(planned, "needed_weights"):
             params = planned.Params(**question["params"])
             needs = planned.needed_weights(params, frozenset(question["brings"]))
             needs += planned.optional_weights(params) if hasattr(planned, "optional_weights") else []
-            wanted |= {need.name: need for need in needs if need.problem and need.fetched}
+            downloads |= {need.name: need for need in needs if need.problem and need.fetched}
     failed = 0
-    for need in wanted.values():
+    for need in downloads.values():
         try:
             need.fetch()
             print(f"{need.name}: fetched", flush=True)

@@ -127,13 +127,13 @@ def test_evaluate_counts_the_unseen_apart_and_shows_no_black(tmp_path, monkeypat
     cameras = scene.cameras | {"t0": aside}
     save_scene(poses, type(scene)(**{**scene.__dict__, "cameras": cameras}))
     save_image(poses / "images" / "t0.png", wall_scene.photo(aside))
-    given = {"poses": poses, "raw_masks": poses.with_name("raw_masks"), "fit": fit}
+    needs = {"poses": poses, "raw_masks": poses.with_name("raw_masks"), "fit": fit}
     monkeypatch.setattr(finish, "MIN_UNSEEN_SHARE", 0.0)
     for name in ("on", "off"):
         for folder in (tmp_path / name, tmp_path / f"finish-{name}"):
             folder.mkdir()
-        finish.run(finish.Params(backdrop=name == "on"), tmp_path / f"finish-{name}", **given)
-        evaluate.run(evaluate.Params(), tmp_path / name, **given, finish=tmp_path / f"finish-{name}")
+        finish.run(finish.Params(backdrop=name == "on"), tmp_path / f"finish-{name}", **needs)
+        evaluate.run(evaluate.Params(), tmp_path / name, **needs, finish=tmp_path / f"finish-{name}")
     on, off = (load_json(tmp_path / name / "metrics.json") for name in ("on", "off"))
     assert on["mean"]["unseen_share"] == off["mean"]["unseen_share"] > 0.1
     assert on["mean"]["psnr_outside_seen"] > off["mean"]["psnr_outside_seen"] - 0.05

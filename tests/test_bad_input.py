@@ -62,11 +62,11 @@ def first_message(folder: Path, out: Path, set_: str = "") -> str | None:
     except Refused as error:
         return str(error)
     for stage, spec in PIPELINE.stages.items():
-        asked = {"stage": stage, "params": layers.values[stage], "takes": spec.all_needs}
+        question = {"stage": stage, "params": layers.values[stage], "takes": spec.all_needs}
         if "scene" in spec.all_needs and stage in ("poses", "raw_masks"):
-            asked |= {"scene": str(folder), "needs": {"scene": str(folder)}}
+            question |= {"scene": str(folder), "needs": {"scene": str(folder)}}
         try:
-            answer = worker._describe(asked)
+            answer = worker._describe(question)
         except Refused as error:
             return str(error)
         assert "broken" not in answer, answer
@@ -93,12 +93,12 @@ def assert_bad_input(
     out.mkdir()
     change(folder)
     began = time.monotonic()
-    said = first_message(folder, out, set_)
-    assert said is not None, "accepted"
+    message = first_message(folder, out, set_)
+    assert message is not None, "accepted"
     assert time.monotonic() - began < LONGEST
-    assert "\n" not in said and len(said) < 1000 and names in said, said
+    assert "\n" not in message and len(message) < 1000 and names in message, message
     assert not (out / "views.json").exists()
-    return said
+    return message
 
 
 # ---------------------------------------------------------------------------------------------- what changes a capture
@@ -347,10 +347,10 @@ def test_values_of_parameters(good_captures, tmp_path, name, value):
     text = "".join(f"{{{group}: " for group in groups) + value + "}" * len(groups)
     assert_bad_input(good_captures, tmp_path, "transforms", write_yaml(f"stages: {{{stage}: {text}}}"), f"{name}")
     if "[" not in value and "{" not in value and '"' not in value:
-        said = assert_bad_input(
+        message = assert_bad_input(
             good_captures, tmp_path / "typed", "transforms", lambda folder: None, name, f"{name}={value}"
         )
-        assert said.startswith("set: ")
+        assert message.startswith("set: ")
 
 
 SET = {
@@ -456,8 +456,8 @@ TRANSFORMS: dict[str, Change] = {
 @pytest.mark.integration
 @pytest.mark.parametrize("change", TRANSFORMS.values(), ids=TRANSFORMS.keys())
 def test_transforms_json(good_captures, tmp_path, change):
-    said = assert_bad_input(good_captures, tmp_path, "transforms", change, "")
-    assert "transforms.json" in said or ".png" in said or "images" in said
+    message = assert_bad_input(good_captures, tmp_path, "transforms", change, "")
+    assert "transforms.json" in message or ".png" in message or "images" in message
 
 
 # ---------------------------------------------------------------------------------------------- COLMAP, LLFF
@@ -621,8 +621,8 @@ LLFF: dict[str, Change] = {
 
 @pytest.mark.parametrize("change", LLFF.values(), ids=LLFF.keys())
 def test_poses_bounds(good_captures, tmp_path, change):
-    said = assert_bad_input(good_captures, tmp_path, "llff", change, "")
-    assert "poses_bounds.npy" in said or ".png" in said
+    message = assert_bad_input(good_captures, tmp_path, "llff", change, "")
+    assert "poses_bounds.npy" in message or ".png" in message
 
 
 # ---------------------------------------------------------------------------------------------- pictures, masks
@@ -830,8 +830,8 @@ def test_depth_maps(good_captures, tmp_path, name, change):
     began = time.monotonic()
     with pytest.raises(BadInput, match=name):
         capture, roles = read_scene(poses.Params(), folder)
-        given = {"view": "v01", "image": "images/v01.png", "depth": name}
-        found = load_reference_files(folder, capture_views(capture, roles), poses.Params(reference=given).reference)
+        spec = {"view": "v01", "image": "images/v01.png", "depth": name}
+        found = load_reference_files(folder, capture_views(capture, roles), poses.Params(reference=spec).reference)
         load_depth(found[0].depth)
     assert time.monotonic() - began < LONGEST
 

@@ -22,10 +22,10 @@ def tilted_floor_view() -> tuple[Camera, np.ndarray]:
 
 def test_an_object_stands_upright_where_it_meets_the_floor():
     camera, depth = tilted_floor_view()
-    drawn = np.zeros(depth.shape, bool)
-    drawn[20:50, 38:58] = True
-    found = billboard_depth(drawn, depth, camera)
-    assert (found[~drawn] == depth[~drawn]).all() and (found[drawn] <= depth[drawn]).all()
+    mask = np.zeros(depth.shape, bool)
+    mask[20:50, 38:58] = True
+    found = billboard_depth(mask, depth, camera)
+    assert (found[~mask] == depth[~mask]).all() and (found[mask] <= depth[mask]).all()
     points = geometry.unproject(found, camera)
     foot, rim = points[49, 48], points[20:50, 38]
     assert abs(foot[1] - 1.0) < 0.05, "its foot is on the floor"
@@ -37,7 +37,7 @@ def test_an_object_stands_upright_where_it_meets_the_floor():
 
 def test_an_object_on_a_wall_faces_the_camera():
     camera = make_camera("v", (96, 72), 80.0)
-    depth, drawn = np.full((72, 96), 2.0), np.zeros((72, 96), bool)
-    drawn[30:40, 40:50] = True
-    found = billboard_depth(drawn, depth, camera)
-    assert np.isfinite(found).all() and (found[drawn] <= 2.0).all() and found[drawn].min() > 1.8
+    depth, mask = np.full((72, 96), 2.0), np.zeros((72, 96), bool)
+    mask[30:40, 40:50] = True
+    found = billboard_depth(mask, depth, camera)
+    assert np.isfinite(found).all() and (found[mask] <= 2.0).all() and found[mask].min() > 1.8

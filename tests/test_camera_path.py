@@ -69,5 +69,5 @@ def test_the_video_shows_the_result_of_a_variant_in_the_scenes_poses(tmp_path):
         frames.append(read[1])
     assert len(frames) == 6 and frames[0].shape == (wall_scene.HEIGHT, wall_scene.WIDTH, 3)
     first = camera_path.ellipse_path(list(train.values()), points, 6)[0]
-    drawn = turntable.rasterizer.render(wall, first).color
-    assert (torch.from_numpy(frames[0][..., ::-1].copy()) / 255 - drawn).abs().mean() < 0.03, "but for compression"
+    rendering = turntable.rasterizer.render(wall, first).color
+    assert (torch.from_numpy(frames[0][..., ::-1].copy()) / 255 - rendering).abs().mean() < 0.03, "but for compression"

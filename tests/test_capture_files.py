@@ -46,10 +46,10 @@ SHARE = 1 / 16  # of a picture that `write_masks` masks
 
 def run_with_warnings(folder: Path, **params) -> tuple[Scene, Path, str]:
     """Run the stages: the scene, its folder, and the warnings."""
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as records:
         warnings.simplefilter("always")
         scene, out = run_stages(folder, **params)
-    return scene, out, "\n".join(str(each.message) for each in said)
+    return scene, out, "\n".join(str(each.message) for each in records)
 
 
 def assert_view_cameras(scene: Scene, truth: Truth, views: dict[str, str]) -> None:
@@ -105,18 +105,18 @@ def test_the_model_with_most_images_is_taken(tmp_path):
     folder = write_capture(tmp_path / "s", "colmap", truth)
     (folder / "sparse/0").rename(folder / "sparse/1")
     write_model(folder / "sparse/0", replace(truth, world_to_camera=dict([*truth.world_to_camera.items()][:3])))
-    scene, _, said = run_with_warnings(folder)
+    scene, _, messages = run_with_warnings(folder)
     assert_view_cameras(scene, truth, {view: view for view in truth.world_to_camera})
-    assert "sparse/1 is taken, which has most images (9); not sparse/0 (3)" in said
+    assert "sparse/1 is taken, which has most images (9); not sparse/0 (3)" in messages
 
 
 def test_a_lone_model_with_another_number_is_found(tmp_path):
     truth = make_truth()
     folder = write_capture(tmp_path / "s", "colmap txt", truth)
     (folder / "sparse/0").rename(folder / "sparse/1")
-    scene, _, said = run_with_warnings(folder)
+    scene, _, messages = run_with_warnings(folder)
     assert_view_cameras(scene, truth, {view: view for view in truth.world_to_camera})
-    assert "is taken" not in said
+    assert "is taken" not in messages
 
 
 # ---------------------------------------------------------------------------------------------- B, C: names, folders
@@ -193,11 +193,11 @@ def test_blenders_files_with_their_split(tmp_path, splits):
         ]
         record = {"camera_angle_x": 2 * np.arctan(WIDTH / 2 / truth.lens.fx), "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(record))
-    scene, _, said = run_with_warnings(folder, masks="none")
+    scene, _, messages = run_with_warnings(folder, masks="none")
     of = {f"train-r_{n}": views[n] for n in range(4)} | {f"{splits[1]}-r_{n}": views[4 + n] for n in range(2)}
     assert_view_cameras(scene, truth, of)
     assert scene.test == tuple(sorted(view for view in of if not view.startswith("train")))
-    assert ("transforms_val.json" in said) == (len(splits) == 3)
+    assert ("transforms_val.json" in messages) == (len(splits) == 3)
 
 
 # ---------------------------------------------------------------------------------------------- F: what masks hold
@@ -259,9 +259,9 @@ def test_masks_beside_their_photographs(tmp_path, masks):
     folder = write_capture(tmp_path / "s", "colmap", make_truth())
     for path in (folder / "masks").iterdir():
         path.rename(folder / "images" / f"{path.stem}_mask.png")
-    scene, out, said = run_with_warnings(folder, masks=masks)
+    scene, out, messages = run_with_warnings(folder, masks=masks)
     assert np.allclose([*mask_shares(out).values()], SHARE) and len(scene.train) == 6
-    assert "not in the model" not in said
+    assert "not in the model" not in messages
 
 
 def test_photographs_are_not_their_own_masks(tmp_path):
@@ -306,9 +306,9 @@ def test_renamed_copies_in_another_order_than_the_model_are_refused(tmp_path, nu
         with pytest.raises(BadInput, match=r"images_4: its pictures are not in the order of the images of"):
             plan.preview(Params(), folder)
     else:
-        scene, _, said = run_with_warnings(folder)
+        scene, _, messages = run_with_warnings(folder)
         assert_view_cameras(scene, truth, {f"image{k:03d}": view for k, view in enumerate(views)})
-        assert "paired with the images of images.bin in order of names" in said
+        assert "paired with the images of images.bin in order of names" in messages
 
 
 @pytest.mark.parametrize("layout", ["colmap", "transforms"])
@@ -334,9 +334,9 @@ def test_points_of_another_frame_are_not_used(tmp_path, layout, change):
         write_transforms(folder, truth)
         save_points(folder / "sparse_pc.ply", points, colors)
     capture, _ = read_scene(Params(), folder)
-    said = " ".join(capture.warnings)
+    messages = " ".join(capture.warnings)
     assert len(capture.poses.points) == (400 if change == "none" else 0)
-    assert ("not in the frame of the cameras and are not used" in said) == (change != "none")
+    assert ("not in the frame of the cameras and are not used" in messages) == (change != "none")
 
 
 def test_rows_of_poses_bounds_follow_the_file_names(tmp_path):
@@ -449,12 +449,12 @@ def test_mask_path_and_depth_file_path(tmp_path):
         Image.fromarray(np.round(1000 * depth).astype(np.uint16)).save(folder / f"depth/{view}.png")
         frame |= {"mask_path": f"keep/{view}.png", "depth_file_path": f"./depth/{view}.png"}
     (folder / "transforms.json").write_text(json.dumps(record))
-    scene, out, said = run_with_warnings(folder)
+    scene, out, messages = run_with_warnings(folder)
     assert np.allclose([*mask_shares(out).values()], SHARE)
-    assert "mask_path of transforms.json: black, which training ignores, is taken for the object" in said
+    assert "mask_path of transforms.json: black, which training ignores, is taken for the object" in messages
     points = scene.similarity.invert(scene.points)
     assert len(points) > 5000 and np.abs(points[:, 2]).max() < 2e-3, "on the plane z = 0, to the millimetre"
-    assert f"{len(points)} points are made of the depth maps (depth_file_path) of transforms.json" in said
+    assert f"{len(points)} points are made of the depth maps (depth_file_path) of transforms.json" in messages
 
 
 def test_a_16_bit_grey_photograph(tmp_path):

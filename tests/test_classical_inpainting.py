@@ -90,8 +90,8 @@ def test_the_stand_in_for_lpips_is_named_as_such_and_measures_structure(tmp_path
     render = other.clone().requires_grad_()
     distance(render, target).backward()
     step = 1e-3 * torch.randn(32, 32, 3, generator=generator(2))
-    told = float((render.grad * step).sum())
+    slope = float((render.grad * step).sum())
     found = float(distance(other + step, target) - distance(other - step, target))
-    assert found == pytest.approx(2 * told, rel=0.05)
+    assert found == pytest.approx(2 * slope, rel=0.05)
     with pytest.raises(ValueError, match="11 px"):
         distance(target[:10], target[:10])

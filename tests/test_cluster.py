@@ -149,10 +149,10 @@ def write_twelve_scenes(root: Path) -> Path:
 def test_twelve_scenes_with_three_variants_on_ray_are_those_of_one_machine(tmp_path, ray_engine, ray_cluster):
     """A node is killed while it works."""
     root = write_twelve_scenes(tmp_path)
-    there = root / "runs"
+    runs = root / "runs"
 
     def kill() -> None:
-        while len(list(there.glob("*/distill/receipt.json"))) < 3 or not list(there.glob("*/.partial-*.*")):
+        while len(list(runs.glob("*/distill/receipt.json"))) < 3 or not list(runs.glob("*/.partial-*.*")):
             time.sleep(0.01)
         ray_cluster.remove_node(ray_cluster.others.pop(), allow_graceful=False)
 
@@ -174,19 +174,19 @@ def test_twelve_scenes_with_three_variants_on_ray_are_those_of_one_machine(tmp_p
 
 def assert_same_as_one_machine(root: Path, variants: str, least: int) -> None:
     """Assert that runs/ equals a local run file by file, and that a local run repeats nothing."""
-    there = root / "runs"
+    runs = root / "runs"
     local = type(make_request(root, ""))(root, root / "alone", "", "laptop")
     assert compare(local, variants, data=root / "many", execution=Execution(LocalEngine(), 1)) == 0
-    here, away = artifact_hashes(root / "alone"), artifact_hashes(there)
+    here, away = artifact_hashes(root / "alone"), artifact_hashes(runs)
     different = sorted(name for name in {*here, *away} if here.get(name) != away.get(name))
     assert len(here) >= least and not [name for name in different if not name.endswith("metrics.json")]
     for name in different:  # it holds the stages' seconds
-        one, other = (json.loads((place / name).read_text()) for place in (root / "alone", there))
+        one, other = (json.loads((place / name).read_text()) for place in (root / "alone", runs))
         assert one["mean"] == other["mean"] and one["gaussians"] == other["gaussians"]
-    assert_artifacts_complete(there)
-    times = {path: path.stat().st_mtime_ns for path in there.glob("*/*/receipt.json")}
+    assert_artifacts_complete(runs)
+    times = {path: path.stat().st_mtime_ns for path in runs.glob("*/*/receipt.json")}
     assert compare(make_request(root, ""), variants, data=root / "many", execution=Execution(LocalEngine(), 1)) == 0
-    assert {path: path.stat().st_mtime_ns for path in there.glob("*/*/receipt.json")} == times
+    assert {path: path.stat().st_mtime_ns for path in runs.glob("*/*/receipt.json")} == times
 
 
 DRIVER = """

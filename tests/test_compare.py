@@ -310,8 +310,8 @@ def test_several_scenes(job_folder):
     }
     runs = [run for run in record["runs"] if run["method"] in record["methods"]]
     for run in runs.copy():
-        there = {stage: folder.replace("toy", "toy-1") for stage, folder in run["stages"].items()}
-        runs.append(run | {"scene": "toy-1", "stages": there})
+        stages = {stage: folder.replace("toy", "toy-1") for stage, folder in run["stages"].items()}
+        runs.append(run | {"scene": "toy-1", "stages": stages})
     (job_folder / "compare.json").write_text(json.dumps(record | {"runs": runs}))
     row = methods_by_name(job_folder)["better"]
     views = np.array([2.0, 2.2, 2.4, 2.6, 3.0, 3.2, 3.4, 3.6])
@@ -435,10 +435,10 @@ def test_the_report_is_walked_through_in_a_browser(compared_project, job_folder,
     with open_page(job.make(job_folder).as_uri(), width) as page:
         view, left, right = page.locator(".compare select").all()
         names = [option.inner_text() for option in view.locator("option").all()]
-        shown = lambda: [pair.get_attribute("data-view") for pair in page.locator(".pair:visible").all()]
-        assert len(names) > 1 and shown() == names[:1]
+        visible_views = lambda: [pair.get_attribute("data-view") for pair in page.locator(".pair:visible").all()]
+        assert len(names) > 1 and visible_views() == names[:1]
         page.get_by_label("next view").click()
-        assert shown() == [names[1]]
+        assert visible_views() == [names[1]]
         first = "document.querySelector('.pair:not([hidden])')"
         at = lambda: float(page.evaluate(f"{first}.style.getPropertyValue('--at')").rstrip("%"))
         stage = page.locator(".pair:visible .stage").bounding_box()

@@ -113,9 +113,9 @@ def test_only_masked_pixels_of_training_photographs_change(captures_folder, tmp_
             for folder in (scene / "images", scene / "truth", captures_folder / "small/images")
         )
         assert np.array_equal(truth, before)
-        drawn = train.get(name, np.zeros(photo.shape[:2], bool))
-        assert np.array_equal(photo[~drawn], before[~drawn])
-        assert name in test or (photo[drawn] != before[drawn]).any(1).mean() > 0.9
+        mask = train.get(name, np.zeros(photo.shape[:2], bool))
+        assert np.array_equal(photo[~mask], before[~mask])
+        assert name in test or (photo[mask] != before[mask]).any(1).mean() > 0.9
 
 
 def test_a_shadow_darkens_the_ground_outside_the_masks(captures_folder, tmp_path):
@@ -151,14 +151,14 @@ def test_rough_masks_are_wrong_by_no_more_than_they_may(captures_folder, tmp_pat
 def test_the_untouched_scene_has_the_same_views_and_nothing_to_remove(captures_folder, tmp_path):
     options = compositing.Options()
     scene, untouched = composites.make_scenes(PLACE, captures_folder, options, tmp_path)
-    told = (untouched / "scene.yaml").stat().st_mtime_ns
+    mtime = (untouched / "scene.yaml").stat().st_mtime_ns
     assert yaml.safe_load((untouched / "scene.yaml").read_text())["masks"] == "none"
     assert (untouched / "transforms.json").read_text() == (scene / "transforms.json").read_text()
     for name in load_masks(scene):
         same = load_image(untouched / f"images/{name}.png"), load_image(scene / f"truth/{name}.png")
         assert np.array_equal(*same)
     composites.make_scenes(PLACE, captures_folder, options, tmp_path)
-    assert (untouched / "scene.yaml").stat().st_mtime_ns == told
+    assert (untouched / "scene.yaml").stat().st_mtime_ns == mtime
     alone, _ = composites.make_scenes(PLACE, captures_folder, replace(options, reference=False), tmp_path)
     assert alone != scene and "reference" not in yaml.safe_load((alone / "scene.yaml").read_text())
 
@@ -176,8 +176,8 @@ def test_a_place_without_a_surface_is_an_error(captures_folder):
 def test_without_captures_it_is_skipped(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["composites.py", "--captures", str(tmp_path / "none")])
     assert composites.main() == 0
-    said = capsys.readouterr().out
-    assert len(said.splitlines()) == 1 and "skipped" in said
+    output = capsys.readouterr().out
+    assert len(output.splitlines()) == 1 and "skipped" in output
 
 
 def test_the_sets_share_no_place_and_unknown_ones_are_named():

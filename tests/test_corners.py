@@ -58,9 +58,9 @@ def test_leaves_have_no_third_face():
     leaves = draws.uniform(-1, 1, (4000, 3))
     face = np.stack([draws.normal(0.1, 0.004, 200), *draws.uniform(-0.5, 0.5, (2, 200))], 1)
     free = np.ones(4200, bool)
-    asked = lambda samples: find_third_faces(samples, free[: len(samples)], found, np.zeros(3), 0.5, 0.02)
-    assert asked(leaves) == []
-    ((normal, height),) = asked(np.concatenate([leaves[:1500], face]))
+    find_faces = lambda samples: find_third_faces(samples, free[: len(samples)], found, np.zeros(3), 0.5, 0.02)
+    assert find_faces(leaves) == []
+    ((normal, height),) = find_faces(np.concatenate([leaves[:1500], face]))
     assert height * normal[0] == pytest.approx(0.1, abs=0.005)
     assert find_third_faces(face, free[:200], found[:1], np.zeros(3), 0.5, 0.02) == [], "one plane has no corner"
 
@@ -78,18 +78,18 @@ def test_sparse_points_tell_where_planes_lie_that_are_drawn_too_near():
     front = np.stack([draws.uniform(0, 0.5, count), np.zeros(count), draws.uniform(0, 0.6, count)], 1)
     points = np.concatenate([floor, front]) + draws.normal(0, 1e-3, (2 * count, 3))
     points = np.concatenate([points, draws.uniform(-0.6, 0.6, (100, 3))])
-    told, untold = (find_planes((LOW + HIGH) / 2, 0.3, views, each) for each in (points, NO_POINTS))
+    with_points, without_points = (find_planes((LOW + HIGH) / 2, 0.3, views, each) for each in (points, NO_POINTS))
     for axis in (2, 1):
         off = lambda plane, axis=axis: np.degrees(np.arccos(abs(plane.normal[axis])))
-        of_points, of_views = (min(planes, key=off) for planes in (told, untold))
+        of_points, of_views = (min(planes, key=off) for planes in (with_points, without_points))
         assert off(of_points) < 0.2 and abs(of_points.offset) < 2e-3
         assert off(of_views) > 2 * off(of_points)
     line = np.stack([np.linspace(-0.5, 0.5, 200), np.zeros(200), np.zeros(200)], 1)  # tells no direction across
     few = find_planes((LOW + HIGH) / 2, 0.3, views, line)
-    assert all(np.allclose(a.normal, b.normal) for a, b in zip(few, untold, strict=True))
+    assert all(np.allclose(a.normal, b.normal) for a, b in zip(few, without_points, strict=True))
     grass = np.stack([*draws.uniform(-0.5, 0.5, (2, 600)), draws.uniform(-0.05, 0.05, 600)], 1)  # lies sharply nowhere
     rough = find_planes((LOW + HIGH) / 2, 0.3, views, grass)
-    assert all(np.allclose(a.normal, b.normal) for a, b in zip(rough, untold, strict=True))
+    assert all(np.allclose(a.normal, b.normal) for a, b in zip(rough, without_points, strict=True))
 
 
 def test_a_floor_that_is_drawn_twice_is_one_unless_points_tell_a_step():

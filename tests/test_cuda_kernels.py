@@ -33,8 +33,8 @@ def test_ssim_and_its_gradient(size, masked):
     leaf = image.clone().requires_grad_()
     exact = dssim_torch(leaf, target, weights)
     (slope,) = torch.autograd.grad(exact, leaf)
-    there = [None if each is None else each.float().to(DEVICE) for each in (image, target, weights)]
-    value, gradient = cuda_kernels.dssim_and_gradient(*there, window(), (C1, C2))
+    inputs = [None if each is None else each.float().to(DEVICE) for each in (image, target, weights)]
+    value, gradient = cuda_kernels.dssim_and_gradient(*inputs, window(), (C1, C2))
     assert abs(float(value) - float(exact.detach())) < 1e-6
     assert (gradient.cpu().double() - slope).norm() < 1e-5 * slope.norm()
 

@@ -156,15 +156,15 @@ def test_never_seen_pixels_are_never_seen(generate, mini_scene):
         points, _ = raycast.surface_points(world.solids, cameras[k], photographs.pixel_centers(mask), False)
         back, _ = project_by_truth(truth, name, frame.points(points))
         np.testing.assert_allclose(back, photographs.pixel_centers(mask), atol=1e-6)
-        shown = np.zeros(len(points), bool)
+        visible = np.zeros(len(points), bool)
         for view, covered in training.items():
             uv, _ = project_by_truth(truth, view, frame.points(points))
             column, row = np.floor(uv).astype(int).T
             inside = (column >= 0) & (row >= 0) & (column < kind.width) & (row < kind.height)
-            shown[inside] |= ~covered[row[inside], column[inside]]
-        assert shown[~never[mask]].all()
+            visible[inside] |= ~covered[row[inside], column[inside]]
+        assert visible[~never[mask]].all()
         # The few left over are behind furniture that stays.
-        assert shown[never[mask]].mean() < 0.1
+        assert visible[never[mask]].mean() < 0.1
 
 
 @pytest.mark.parametrize("name", ["demo", "wide", "360"])
@@ -197,18 +197,18 @@ def test_too_small_a_share_is_an_error_and_writes_nothing(generate, tmp_path):
 def test_insertion_and_outpainting_are_asked_for_by_scene_files(generate, tmp_path):
     """The references alone of the training views show the object; outpainting keeps the disc of a sphere."""
     stamp = {"width": 64, "height": 48, "samples": 1, "train": 8, "test": 3, "texture": 256}
-    said = {}
+    scenes = {}
     for name in ("insert", "outpaint"):
         generate.generate(tmp_path / name, 0, replace(generate.KINDS[name], **stamp, node=0.4))
-        said[name] = yaml.safe_load((tmp_path / name / "scene.yaml").read_text())
-    folder, reference = tmp_path / "insert", said["insert"]["reference"][0]
+        scenes[name] = yaml.safe_load((tmp_path / name / "scene.yaml").read_text())
+    folder, reference = tmp_path / "insert", scenes["insert"]["reference"][0]
     photo, picture = load_image(folder / f"images_4/{reference['view']}.png"), load_image(folder / reference["image"])
     depth, differs = np.load(folder / reference["depth"]), (photo != picture).any(-1)
-    assert 0.02 < differs.mean() < 0.25 and said["insert"]["region"]["radius"] > 0
+    assert 0.02 < differs.mean() < 0.25 and scenes["insert"]["region"]["radius"] > 0
     assert np.median(depth[differs]) < 0.9 * np.median(depth[~differs])
     mask = load_mask(tmp_path / "outpaint/images_4/test_label/out_00000.png")
-    assert not mask[24, 32] and mask[0, 0] and 3 <= len(said["outpaint"]["reference"]) <= 9
-    assert said["outpaint"]["region"]["outside"]
+    assert not mask[24, 32] and mask[0, 0] and 3 <= len(scenes["outpaint"]["reference"]) <= 9
+    assert scenes["outpaint"]["region"]["outside"]
 
 
 def test_the_photos_layout_has_no_poses(generate, tmp_path):

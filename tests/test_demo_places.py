@@ -96,9 +96,9 @@ def test_a_pair_has_masks_for_each_object_that_make_up_the_hole(generate, tmp_pa
     assert [path.name for path in boxes] == [path.name for path in balls] and len(boxes) == 24
     for box, ball in zip(boxes, balls, strict=True):
         assert load_mask(box).any() and load_mask(ball).any()
-    given = yaml.safe_load((folder / "scene.yaml").read_text())["reference"]
-    assert len({each["view"] for each in given}) == 2
-    assert all((folder / each["image"]).is_file() for each in given)
+    references = yaml.safe_load((folder / "scene.yaml").read_text())["reference"]
+    assert len({each["view"] for each in references}) == 2
+    assert all((folder / each["image"]).is_file() for each in references)
 
 
 def test_leaves_are_where_the_rays_meet_them(generate):

@@ -31,9 +31,9 @@ def test_truth_is_where_sparse_points_are(generate, tmp_path):
         bent = truth["f"] * (1 + truth["k1"] * (rays**2).sum(1, keepdims=True)) * rays
         column, row = np.floor(bent + center).astype(int).T
         inside = (z > 0) & (column >= 0) & (row >= 0) & (column < kind.width) & (row < kind.height)
-        shown = inside.copy()
-        shown[inside] = ~mask[row[inside], column[inside]]
-        error = depths.background_depth(0, kind, pose, rays[shown]) / z[shown] - 1
+        visible = inside.copy()
+        visible[inside] = ~mask[row[inside], column[inside]]
+        error = depths.background_depth(0, kind, pose, rays[visible]) / z[visible] - 1
         agreeing.append(np.abs(error) < 0.01)
         hidden.append(error < -0.01)  # something else is before the point
     agreeing, hidden = np.concatenate(agreeing), np.concatenate(hidden)

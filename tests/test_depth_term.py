@@ -59,8 +59,8 @@ def black_train_view(hole=HOLE):
 
 
 def evaluate_term(gaussians, masked, estimator, prior=None, text=None, view=None, **more):
-    given = view or black_train_view(), prior, text, DEPTH, 7.5, generator(1), estimator
-    return depth_term.evaluate_depth(gaussians, masked, *given, **more)
+    arguments = view or black_train_view(), prior, text, DEPTH, 7.5, generator(1), estimator
+    return depth_term.evaluate_depth(gaussians, masked, *arguments, **more)
 
 
 def wall_depth(moved=1.0, how=HOW):
@@ -149,8 +149,8 @@ def test_a_displaced_surface_converges_to_the_wall():
         optimizer.step(step / 36, visible=masked & (rendering.radii > 0))
     assert losses[-1] < 0.02 * losses[0]
     with torch.no_grad():
-        drawn = render(optimizer.gaussians, VIEW)
-    assert np.abs(drawn.depth.numpy() * WALL - 1)[HOLE].mean() < 0.01
+        final = render(optimizer.gaussians, VIEW)
+    assert np.abs(final.depth.numpy() * WALL - 1)[HOLE].mean() < 0.01
     assert (optimizer.gaussians.sh == gaussians.sh).all()
     for name in PARAMETERS:
         assert (getattr(optimizer.gaussians, name)[~masked] == getattr(gaussians, name)[~masked]).all(), name
@@ -183,9 +183,9 @@ def test_the_gradient_agrees_with_finite_differences_in_float64():
     hole = (np.abs(COLUMNS + 0.5 - WIDTH / 2) < 4) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 4)
     estimator = DepthEstimator(replace(HOW, explained=0.2), lambda *_: WALL)
     gaussians = as_leaves(few)
-    loss, drawn = evaluate_term(gaussians, masked, estimator, view=black_train_view(hole))
+    loss, rendering = evaluate_term(gaussians, masked, estimator, view=black_train_view(hole))
     loss.backward()
-    compared = torch.from_numpy(hole) & (drawn.alpha > 0.2)
+    compared = torch.from_numpy(hole) & (rendering.alpha > 0.2)
     assert compared.sum() > 30
     exact = few.map(lambda p: p.double())
 
@@ -236,10 +236,10 @@ def test_views_without_known_or_rendered_pixels_are_degenerate(prior, text):
 
 
 def test_a_view_larger_than_asked_for_is_rendered_smaller():
-    _, drawn = evaluate_term(
+    _, rendering = evaluate_term(
         *slanted_wall(), depth_estimator.continuation_estimator(NO_POINTS, HOW), max_side=WIDTH // 2
     )
-    assert drawn.depth.shape == (HEIGHT // 2, WIDTH // 2)
+    assert rendering.depth.shape == (HEIGHT // 2, WIDTH // 2)
 
 
 # ------------------------------------------------------------------------------------------ repainting
@@ -259,17 +259,17 @@ def test_repainting_changes_the_hole_only_and_the_less_the_later_it_starts(prior
 
 
 def test_the_picture_is_painted_only_where_planes_do_not_explain(prior, text):
-    asked = []
+    calls = []
 
     def guide():
-        asked.append(1)
+        calls.append(1)
         return np.full((HEIGHT, WIDTH, 3), 0.5)
 
     view = replace(wall_depth(), depth=1 / WALL)
     for share, times in ((0.7, 0), (2.0, 1)):
         found, _ = background_depth.continue_depth(view, guide, NO_POINTS, replace(HOW, planar_share=share))
         np.testing.assert_allclose(found[HOLE], WALL[HOLE], rtol=1e-3)
-        assert len(asked) == times
+        assert len(calls) == times
     smooth = depth_estimator.continuation_estimator(NO_POINTS, replace(HOW, planar_share=2.0))
     assert float(evaluate_term(*slanted_wall(), smooth, prior, text)[0]) < 1e-3
 

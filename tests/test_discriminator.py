@@ -216,11 +216,11 @@ def checker_patches(count, fine, label):
 @pytest.mark.parametrize("form", ["non-saturating", "saturating"])
 def test_the_critic_separates_two_textures_and_its_slope_leads_to_the_real_one(penalized, form):
     adversary = Adversary(with_changes(SMALL, form=form, penalized=penalized), seed=0, rate=RATE)
-    said = [
+    history = [
         adversary.train_step(checker_patches(16, True, (step, 0)), checker_patches(16, False, (step, 1)))
         for step in range(20)
     ]
-    assert said[-1]["critic_loss"] < 0.3 < 1 < said[0]["critic_loss"] and said[-1]["critic_slope"] > 0
+    assert history[-1]["critic_loss"] < 0.3 < 1 < history[0]["critic_loss"] and history[-1]["critic_slope"] > 0
     real, fake = checker_patches(16, True, "r"), checker_patches(16, False, "f")
     with torch.no_grad():
         assert (adversary.critic(real) > 0).all() and (adversary.critic(fake) < 0).all()
@@ -240,8 +240,8 @@ def test_the_penalty_holds_the_critics_slope_down():
     for penalty in (0.0, 10.0):
         adversary = Adversary(with_changes(SMALL, penalty=penalty, penalized="real"), seed=0, rate=RATE)
         for step in range(15):
-            said = adversary.train_step(checker_patches(16, True, (step, 0)), checker_patches(16, False, (step, 1)))
-        assert ("critic_slope" in said) == (penalty > 0)
+            metrics = adversary.train_step(checker_patches(16, True, (step, 0)), checker_patches(16, False, (step, 1)))
+        assert ("critic_slope" in metrics) == (penalty > 0)
         patches = checker_patches(16, True, "r").requires_grad_()
         slopes[penalty] = gradient_penalty(adversary.critic(patches), patches).item()
     assert slopes[10.0] < 0.3 * slopes[0.0]
@@ -265,11 +265,11 @@ def test_an_adversary_continues_from_its_state_bit_for_bit():
         ]
 
     whole = Adversary(SMALL, seed=3, rate=RATE)
-    said = trained(whole, range(6))
+    history = trained(whole, range(6))
     first, second = Adversary(SMALL, seed=3, rate=RATE), Adversary(SMALL, seed=4, rate=RATE)
     trained(first, range(3))
     second.load_state_dict(first.state_dict())
-    assert trained(second, range(3, 6)) == said[3:]
+    assert trained(second, range(3, 6)) == history[3:]
     for a, b in zip(whole.critic.parameters(), second.critic.parameters(), strict=True):
         assert (a == b).all()
 

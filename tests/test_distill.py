@@ -73,18 +73,18 @@ def gradients_of(term, gaussians, masked, prior, text, view=None):
 def test_forbidden_gradients_are_exactly_zero(term, prior, text):
     gaussians, masked = random_wall()
     allowed = ~masked if term == "reconstruction" else masked
-    gaussians, drawn = gradients_of(term, gaussians, masked, prior, text)
+    gaussians, visible = gradients_of(term, gaussians, masked, prior, text)
     got = has_gradient(gaussians)
     assert not got[~allowed].any(), "a forbidden Gaussian has a gradient"
-    assert (got & allowed).sum() > 0.5 * (drawn & allowed).sum(), "hardly any allowed Gaussian has a gradient"
+    assert (got & allowed).sum() > 0.5 * (visible & allowed).sum(), "hardly any allowed Gaussian has a gradient"
     for name in PARAMETERS:
         assert getattr(gaussians, name).grad[allowed].ne(0).any(), name
 
 
 def test_a_clean_view_reconstructs_all_gaussians(prior, text):
     gaussians, masked = random_wall()
-    gaussians, drawn = gradients_of("reconstruction", gaussians, masked, prior, text, train_view(clean=True))
-    assert has_gradient(gaussians)[masked & drawn].float().mean() > 0.5
+    gaussians, visible = gradients_of("reconstruction", gaussians, masked, prior, text, train_view(clean=True))
+    assert has_gradient(gaussians)[masked & visible].float().mean() > 0.5
 
 
 @pytest.mark.parametrize("term", ["sds", "reconstruction"])
@@ -120,16 +120,16 @@ def test_the_critic_reaches_spherical_harmonics_only(reaches):
     gaussians, masked = random_wall()
     moved, view = as_leaves(gaussians), train_view()
     adversary, chosen = Adversary(ADVERSARIAL, seed=0), masked | (reaches == "all")
-    loss, rendering, said = evaluate_adversarial(
+    loss, rendering, metrics = evaluate_adversarial(
         moved, chosen, view, view.photo, square_hole(), adversary, generator(1)
     )
     loss.backward()
     assert all(getattr(moved, name).grad is None for name in PARAMETERS if name != "sh")
-    got, drawn = moved.sh.grad.flatten(1).ne(0).any(1), rendering.radii > 0
+    got, visible = moved.sh.grad.flatten(1).ne(0).any(1), rendering.radii > 0
     assert got[~masked].any() == (reaches == "all")
-    assert got[masked & drawn].float().mean() > 0.5, "hardly any masked Gaussian has a gradient"
+    assert got[masked & visible].float().mean() > 0.5, "hardly any masked Gaussian has a gradient"
     assert moved.sh.grad[masked][:, 1:].ne(0).any(), "the view-dependent coefficients have none"
-    assert said["adversarial"] == loss.item() and said["critic_loss"] > 0 and said["critic_slope"] > 0
+    assert metrics["adversarial"] == loss.item() and metrics["critic_loss"] > 0 and metrics["critic_slope"] > 0
 
 
 def test_the_adversarial_gradient_is_that_of_the_patches_by_finite_differences():
@@ -256,8 +256,8 @@ def test_distillation_may_reach_the_background_too_but_not_what_does_not_show(pr
     settings = with_changes(PLAIN, iterations=2, reconstruction={"every": 0}, sds={"reaches": "all"})
     view = train_view("a")
     moved = has_changed(start, run_distill(tmp_path / "all", prior, text, settings, [view])[0])
-    shown = rasterizer.accumulate(start, view.camera, torch.ones(*square_hole().shape, 1))[:, 0] > 0
-    assert (moved & masked).any() and (moved & ~masked).any() and not (moved & ~shown).any()
+    visible = rasterizer.accumulate(start, view.camera, torch.ones(*square_hole().shape, 1))[:, 0] > 0
+    assert (moved & masked).any() and (moved & ~masked).any() and not (moved & ~visible).any()
 
 
 def test_views_far_from_every_reference_are_not_distilled(prior, text, tmp_path):
@@ -432,12 +432,12 @@ def test_stages_chain_through_files_with_the_scenes_own_reference(stage_folders)
     from stages import distill, personalize, reference
     from stages.plan import reference as plan
 
-    given = load_image(stage_folders["poses"] / "images" / "a.png")
-    save_image(stage_folders["scene"] / "done" / "a.png", given)
+    picture = load_image(stage_folders["poses"] / "images" / "a.png")
+    save_image(stage_folders["scene"] / "done" / "a.png", picture)
     params = reference.Params(prior="nowhere/at-all", reference={"view": "a", "image": "done/a.png"})
     assert "reference a:" in plan.preview(params, **select_folders(stage_folders, "scene", "poses"))[0]
     reference.run(params, stage_folders["reference"], **select_folders(stage_folders, "scene", "poses", "fit", "masks"))
-    assert (load_image(stage_folders["reference"] / "references" / "a.png") == given).all()
+    assert (load_image(stage_folders["reference"] / "references" / "a.png") == picture).all()
     assert (load_mask(stage_folders["reference"] / "masks" / "a.png") == square_hole().numpy()).all()
 
     learning = personalize.Params(prior=stage_folders["prior"], steps=2, optimizer={"batch": 2}, samples={"size": 8})

@@ -94,18 +94,18 @@ def test_views_are_drawn_as_bright_as_photographs_are(stage_folders, tmp_path):
     many = replace(many, log_scales=many.log_scales + 1.0, opacity_logits=torch.full_like(many.opacity_logits, 3.0))
     save_ply(stage_folders["fit"] / "gaussians.ply", many)
     for name, gain in (("view0", [0.3, 0.4, 0.8]), ("view1", [1.0, 1.0, 1.0])):
-        drawn = render(many, load_scene(stage_folders["poses"]).cameras[name])
-        own, shown = 255 * drawn.color.detach().numpy() * gain, drawn.alpha.detach().numpy() > 0.9
-        own[~shown] = 240  # where the fit shows nothing it tells nothing, nor do the mask's pixels
+        rendering = render(many, load_scene(stage_folders["poses"]).cameras[name])
+        own, visible = 255 * rendering.color.detach().numpy() * gain, rendering.alpha.detach().numpy() > 0.9
+        own[~visible] = 240  # where the fit shows nothing it tells nothing, nor do the mask's pixels
         own[10:30, 5:35] = 255
-        assert 0.05 < (~shown).mean() < 0.5
+        assert 0.05 < (~visible).mean() < 0.5
         save_image(stage_folders["poses"] / f"images/{name}.png", own.clip(0, 255).round().astype(np.uint8))
     plain = run_finish_and_evaluate(tmp_path / "plain", stage_folders)
     save_json(stage_folders["fit"] / "exposures.json", {name: dark.tolist() for name in names})
     found = run_finish_and_evaluate(tmp_path / "out", stage_folders)
     for name, gain in (("view0", [0.3, 0.4, 0.8]), ("view2", [0.5, 0.6, 0.7])):
-        shown, before = (load_image(tmp_path / f"{k}/renders/{name}.png") for k in ("out", "plain"))
-        assert np.abs(shown - before * gain).max() < 2.5, name
+        after, before = (load_image(tmp_path / f"{k}/renders/{name}.png") for k in ("out", "plain"))
+        assert np.abs(after - before * gain).max() < 2.5, name
     assert "next to it" in found["exposure"] and plain["exposure"] is None
     assert found["consistency"]["consistency"] == pytest.approx(plain["consistency"]["consistency"], abs=5e-3)
 

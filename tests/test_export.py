@@ -45,17 +45,17 @@ def test_colmap_and_nerfstudio_see_the_scene_as_we_do(tmp_path):
     """Renders of the exported .ply by the exported cameras, in the scene's own frame, are those of the normalised."""
     import pycolmap
 
-    given = random_scene_in_frame()
-    save_cameras(tmp_path, given, "images")
+    scene = random_scene_in_frame()
+    save_cameras(tmp_path, scene, "images")
     model = pycolmap.Reconstruction(str(tmp_path / "sparse/0"))
     frames = {f["file_path"]: f for f in json.loads((tmp_path / "transforms.json").read_text())["frames"]}
     places = np.array([point.xyz for point in model.points3D.values()])
-    np.testing.assert_allclose(places[np.argsort(list(model.points3D))], FRAME.invert(given.points), rtol=1e-12)
+    np.testing.assert_allclose(places[np.argsort(list(model.points3D))], FRAME.invert(scene.points), rtol=1e-12)
     cloud = PlyData.read(str(tmp_path / "sparse_pc.ply"))["vertex"]
-    np.testing.assert_allclose(np.stack([cloud[a] for a in "xyz"], 1), FRAME.invert(given.points), rtol=1e-12)
-    assert len(model.images) == len(frames) == len(given.cameras)
+    np.testing.assert_allclose(np.stack([cloud[a] for a in "xyz"], 1), FRAME.invert(scene.points), rtol=1e-12)
+    assert len(model.images) == len(frames) == len(scene.cameras)
     for image in model.images.values():
-        camera = given.cameras[image.name.removesuffix(".png")]
+        camera = scene.cameras[image.name.removesuffix(".png")]
         made = visible_gaussians(camera)
         save_ply(tmp_path / "scene.ply", made, FRAME)
         own = load_ply(tmp_path / "scene.ply")
@@ -137,9 +137,9 @@ def test_export_writes_and_lists_all_files(tmp_path):
     for name in ("a", "b"):
         save_image(home / "poses" / "images" / f"{name}.png", np.zeros((8, 12, 3), np.uint8))
     save_ply(home / "evaluate" / "scene.ply", replace(random_gaussians(300, 1), antialiased=True), FRAME)
-    said = export.make(home)
-    assert "300 Gaussians of degree 1" in said[0] and "Mip-Splatting" in said[0]
-    assert "3 pinholes" in said[2] and "2 undistorted photographs" in said[2] and len(said) == 3
+    lines = export.make(home)
+    assert "300 Gaussians of degree 1" in lines[0] and "Mip-Splatting" in lines[0]
+    assert "3 pinholes" in lines[2] and "2 undistorted photographs" in lines[2] and len(lines) == 3
     assert (home / "export/scene.ply").read_bytes() == (home / "evaluate/scene.ply").read_bytes()
     (home / "export/cameras/note.txt").write_text("mine")
     export.make(home)

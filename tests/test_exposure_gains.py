@@ -18,18 +18,18 @@ def wall_photos(tmp_path_factory):
 
 
 def dim_photos(photos, bright):
-    shown = lambda photo, gain: (photo * gain).round().clip(0, 255).astype(np.uint8)
-    return {name: shown(photos[name], gain) for name, gain in zip(photos, bright, strict=True)}
+    expose = lambda photo, gain: (photo * gain).round().clip(0, 255).astype(np.uint8)
+    return {name: expose(photos[name], gain) for name, gain in zip(photos, bright, strict=True)}
 
 
 def test_gains_are_robust_to_occluders(wall_photos):
     scene, cameras, photos = wall_photos
     bright = np.exp(np.random.default_rng(0).normal(0, 0.15, (len(cameras), 3)))
     bright /= bright.max() * 1.05
-    told = dim_photos({camera.name: photos[camera.name] for camera in cameras}, bright)
-    for photo in list(told.values())[::3]:  # a thing before a quarter of the picture
+    pictures = dim_photos({camera.name: photos[camera.name] for camera in cameras}, bright)
+    for photo in list(pictures.values())[::3]:  # a thing before a quarter of the picture
         photo[: photo.shape[0] // 2, : photo.shape[1] // 2] = 200
-    found = estimate_gains(scene.points, cameras, told)
+    found = estimate_gains(scene.points, cameras, pictures)
     expected = bright / np.exp(np.log(bright).mean(0))
     assert np.abs(np.log(found / expected)).max() < 0.06
     assert brightness_deviation(found) > 0.05 > brightness_deviation(estimate_gains(scene.points, cameras, photos))
@@ -44,12 +44,12 @@ def test_gains_are_one_without_shared_points(wall_photos):
 
 def test_the_stage_fits_exposures_where_photographs_differ(wall_photos, capsys):
     scene, cameras, photos = wall_photos
-    asked = lambda how, images: preparation.estimate_exposures(Params(exposure=how), scene, cameras, images)
+    estimate = lambda how, images: preparation.estimate_exposures(Params(exposure=how), scene, cameras, images)
     bright = np.where(np.arange(len(cameras)) % 2, 0.6, 0.9)[:, None]
     uneven_ones = dim_photos({camera.name: photos[camera.name] for camera in cameras}, bright)
-    assert asked("auto", photos) is None and asked("never", uneven_ones) is None
-    assert asked("always", photos) is not None
-    found = asked("auto", uneven_ones)
+    assert estimate("auto", photos) is None and estimate("never", uneven_ones) is None
+    assert estimate("always", photos) is not None
+    found = estimate("auto", uneven_ones)
     assert brightness_deviation(found) == pytest.approx(np.log(bright).std(), abs=0.01)
     assert "exposures are fitted: the brightness of the same points differs by" in capsys.readouterr().out
     even = preparation.equalize_exposure(uneven_ones, cameras, found)

@@ -138,14 +138,14 @@ def test_a_torchscript_lama_is_read_as_by_the_baselines(tmp_path):
 
 def record_network_input(side, inner):
     """The input (picture, hole) of a network of this size."""
-    shown = []
+    inputs = []
 
     def paint(image, mask):
-        shown.append((image, mask))
+        inputs.append((image, mask))
         return image
 
     feedforward.run_network(Network(side, paint), np.full((*inner.shape, 3), 77, np.uint8), inner)
-    return shown[0]
+    return inputs[0]
 
 
 def test_a_fixed_size_sees_a_square_around_the_hole_with_as_much_again():
@@ -172,19 +172,19 @@ def test_a_fixed_size_sees_a_square_around_the_hole_with_as_much_again():
 
 def test_other_models_are_refused_in_one_line(tmp_path):
     def refusal(kind, path):
-        with pytest.raises(ValueError) as told:
+        with pytest.raises(ValueError) as error:
             load_inpainter(kind, path)
-        assert "\n" not in str(told.value) and path.name in str(told.value)
-        return str(told.value)
+        assert "\n" not in str(error.value) and path.name in str(error.value)
+        return str(error.value)
 
     file = tmp_path / "net.onnx"
-    wanted = "expected image float32 [1, 3, H, W], mask float32 [1, 1, H, W], of any or one square size"
-    said = refusal("lama", write_onnx_model(file, "migan"))
-    assert wanted in said and "it takes image uint8 [batch_size, 3, height, width]" in said
+    expected = "expected image float32 [1, 3, H, W], mask float32 [1, 1, H, W], of any or one square size"
+    message = refusal("lama", write_onnx_model(file, "migan"))
+    assert expected in message and "it takes image uint8 [batch_size, 3, height, width]" in message
     assert "expected image uint8" in refusal("migan", write_onnx_model(file, "lama", 512))
     assert "it takes input float" in refusal("lama", write_onnx_model(file, names=("input", "mask")))
     for other in ({"mask": 3}, {"size": (512, 256)}, {"size": (512, "width")}, {"batch": 4}):
-        assert wanted in refusal("lama", write_onnx_model(file, **other))
+        assert expected in refusal("lama", write_onnx_model(file, **other))
     assert "one float32 picture" in refusal("lama", write_onnx_model(file, outputs=["result", "mean"]))
     file.write_text("<html>")
     assert "is no ONNX model that onnxruntime reads" in refusal("lama", file)
@@ -308,8 +308,8 @@ def test_a_model_file_is_checked_before_any_work_and_keyed_by_content(empty_weig
     scene, file = write_wall_capture(tmp_path / "wall"), tmp_path / "big.pt"
 
     def planned(inpainter):
-        asked = f"'reference.inpainter={inpainter}'"
-        job = prepare_job(Request(ROOT, tmp_path / "runs", str(scene), profile="laptop", set=asked))
+        setting = f"'reference.inpainter={inpainter}'"
+        job = prepare_job(Request(ROOT, tmp_path / "runs", str(scene), profile="laptop", set=setting))
         assert job.params["initialize"]["inpainter"] == job.params["reference"]["inpainter"]
         found = plan(job, job.pipeline.closure("reference"))["reference"]
         return found.status, found.reason

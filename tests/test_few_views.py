@@ -169,11 +169,11 @@ def test_points_behind_the_visible_surface_are_refuted():
     behind = (np.abs(wall[:, :2]) < HALF * WALL / NEAR).all(1)
     colors[: len(wall)][behind] = geometry.sample_nearest(pictures["a"], uv)[0][behind]
     points = SparsePoints.of(positions, colors)
-    told = estimate_multiview_depth(points, views, pictures, NONE, seed=0)
+    estimates = estimate_multiview_depth(points, views, pictures, NONE, seed=0)
     true, inner = render_aperiodic_square(views[0])[0], (slice(22, 50), slice(34, 62))
     wrong = lambda depth: (np.abs(depth / true - 1) > 0.02)[inner].mean()
-    assert wrong(told["a"].depth) < 0.2 < 0.4 < wrong(interpolate_depth(points, views[0], pictures["a"]))
-    assert (np.abs(told["a"].depth / true - 1) < 0.01)[told["a"].confirmed].mean() > 0.97
+    assert wrong(estimates["a"].depth) < 0.2 < 0.4 < wrong(interpolate_depth(points, views[0], pictures["a"]))
+    assert (np.abs(estimates["a"].depth / true - 1) < 0.01)[estimates["a"].confirmed].mean() > 0.97
     alone = estimate_multiview_depth(points, views[:1], pictures, NONE, seed=0)["a"]
     assert not alone.confirmed.any() and not alone.refuted.any(), "one photograph alone is sure of nothing"
     hidden = {"a": np.ones(true.shape, bool)}
@@ -213,8 +213,8 @@ def test_other_views_are_shown_better_than_by_a_fit_from_points(tmp_path, train,
         params = Params(iterations=100, few_views=way).changed({"densify.cap_max": 3000, "init.opacity": 0.5})
         stage.run(params, tmp_path / way, poses=tmp_path / "poses")
         with torch.no_grad():
-            drawn = rasterizer.render(load_ply(tmp_path / way / "gaussians.ply"), view).color.numpy()
-        error[way] = np.abs(drawn - render_wall_and_square(view)[1] / 255)[8:-8, 16:-16].mean()
+            rendering = rasterizer.render(load_ply(tmp_path / way / "gaussians.ply"), view).color.numpy()
+        error[way] = np.abs(rendering - render_wall_and_square(view)[1] / 255)[8:-8, 16:-16].mean()
     assert error["surfaces"] < 0.5 * error["fewer_harmonics"]
     assert "Gaussians on surfaces between 760 points" in capsys.readouterr().out
 
@@ -229,11 +229,11 @@ def test_an_interrupted_fit_from_surfaces_goes_on_to_the_same_end(tmp_path, monk
 
     steps, do = [], reconstruction.step
 
-    def stopping(*given):
-        steps.append(given)
+    def stopping(*arguments):
+        steps.append(arguments)
         if len(steps) == 7:
             raise KeyboardInterrupt
-        return do(*given)
+        return do(*arguments)
 
     monkeypatch.setattr(reconstruction, "step", stopping)
     with pytest.raises(KeyboardInterrupt):

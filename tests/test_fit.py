@@ -69,17 +69,17 @@ def initial_model(points=None, degree: int = 1) -> Gaussians:
     return initial_gaussians(points, colors, degree, 1000, seeding.generator(0))
 
 
-def run_fit(folder, cameras=None, initial=None, settings=SETTINGS, **given) -> Gaussians:
+def run_fit(folder, cameras=None, initial=None, settings=SETTINGS, **options) -> Gaussians:
     folder.mkdir(exist_ok=True)
     cameras = cameras or arc_cameras()
-    return fit(cameras, render_photos(arc_cameras()), initial or initial_model(), settings, folder=folder, **given)
+    return fit(cameras, render_photos(arc_cameras()), initial or initial_model(), settings, folder=folder, **options)
 
 
 def test_a_fit_improves_and_logs_it(tmp_path):
-    held = arc_cameras()[2:3]
-    cameras = [c for c in arc_cameras() if c.name != held[0].name]
+    held_out = arc_cameras()[2:3]
+    cameras = [c for c in arc_cameras() if c.name != held_out[0].name]
     settings = SETTINGS.changed({"iterations": 240, "densify.reset_every": 0, "random_background": False})
-    fitted = run_fit(tmp_path, cameras, settings=settings, held_out=held)
+    fitted = run_fit(tmp_path, cameras, settings=settings, held_out=held_out)
     lines = [json.loads(line) for line in (tmp_path / "trace.jsonl").read_text().splitlines()]
     assert lines[-1]["iteration"] == 240 and lines[-1]["gaussians"] == len(fitted)
     assert lines[-1]["psnr_held_out"] > lines[0]["psnr_held_out"] + 2
@@ -125,13 +125,13 @@ def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, ga
 def test_exposures_are_found_and_taken_out_again(tmp_path):
     """Photographs of which each has another exposure: where it is fitted the held-out view, exposed as on average, is
     right; where not, it is not; and the photographs come back as if none had differed."""
-    held, cameras = arc_cameras(9)[4], [c for k, c in enumerate(arc_cameras(9)) if k != 4]
-    pictures, gains = render_photos([*cameras, held]), (0.7, 1.2, 0.8, 1.25, 1.1, 0.85, 1.15, 0.95)
+    target, cameras = arc_cameras(9)[4], [c for k, c in enumerate(arc_cameras(9)) if k != 4]
+    pictures, gains = render_photos([*cameras, target]), (0.7, 1.2, 0.8, 1.25, 1.1, 0.85, 1.15, 0.95)
     poses = tmp_path / "poses"
     for camera, gain in zip(cameras, gains, strict=True):
         changed = (pictures[camera.name] * np.array([gain, 1.0, 2 - gain]) + 8 * (gain - 1)).clip(0, 255)
         save_image(poses / "images" / f"{camera.name}.png", changed.round().astype(np.uint8))
-    shown = load_views(poses, [c.name for c in cameras]) | {held.name: pictures[held.name]}
+    photos = load_views(poses, [c.name for c in cameras]) | {target.name: pictures[target.name]}
     values = {"iterations": 2000, "densify.stop": 0.3, "densify.reset_every": 0, "random_background": False}
     settings = SETTINGS.changed(values)
     scores = []
@@ -140,11 +140,11 @@ def test_exposures_are_found_and_taken_out_again(tmp_path):
         folder.mkdir()
         fit(
             cameras,
-            shown,
+            photos,
             initial_model(),
             settings,
             folder=folder,
-            held_out=[held],
+            held_out=[target],
             gains=np.ones((8, 3)) if on else None,
         )
         scores.append(trace.read_trace(folder / "trace.jsonl")[-1]["psnr_held_out"])
@@ -153,8 +153,8 @@ def test_exposures_are_found_and_taken_out_again(tmp_path):
     names = [c.name for c in cameras]
     assert away(exposure.load_normalized_views(poses, tmp_path / "True", names)) < 0.3 * away(load_views(poses, names))
     for view, image in exposure.load_normalized_views(poses, tmp_path / "False", names).items():
-        assert np.array_equal(image, shown[view])
-    assert exposure.normalize_exposure(pictures[held.name], tmp_path / "True", held.name) is pictures[held.name]
+        assert np.array_equal(image, photos[view])
+    assert exposure.normalize_exposure(pictures[target.name], tmp_path / "True", target.name) is pictures[target.name]
 
 
 def test_a_view_is_exposed_as_the_photographs_next_to_it(tmp_path):
@@ -162,22 +162,22 @@ def test_a_view_is_exposed_as_the_photographs_next_to_it(tmp_path):
     cameras = arc_cameras(12)
     seen = [camera for k, camera in enumerate(cameras) if k % 3 != 1]
 
-    def told(gain_of) -> dict[str, float]:
+    def interpolate_gains(gain_of) -> dict[str, float]:
         bright = np.array([[gain_of(cameras.index(camera))] * 3 for camera in seen])
         exposure.Exposures([camera.name for camera in seen], gains=bright).save(tmp_path)
         return {name: matrix[0, 0] for name, matrix in exposure.view_exposures(tmp_path, cameras).items()}
 
     assert exposure.view_exposures(tmp_path, cameras) == {}
-    steps = told(lambda k: 0.7 if k < 6 else 1.3)
+    steps = interpolate_gains(lambda k: 0.7 if k < 6 else 1.3)
     assert steps["view0"] == pytest.approx(0.7) and steps["view11"] == pytest.approx(1.3)
     assert steps["view1"] == pytest.approx(0.7, abs=0.05) and steps["view10"] == pytest.approx(1.3, abs=0.05)
     draws = np.random.default_rng(0).choice([0.8, 1.2], 12)
-    mixed = told(lambda k: draws[k])
+    mixed = interpolate_gains(lambda k: draws[k])
     assert all(0.85 < mixed[f"view{k}"] < 1.15 for k in (4, 7))
     color = torch.rand(2, 3, 3)
     matrix = exposure.view_exposures(tmp_path, cameras)["view4"]
-    shown = exposure.apply_exposure(color, matrix)
-    np.testing.assert_allclose(exposure.undo_exposure(shown.numpy(), matrix), color, atol=1e-6)
+    display = exposure.apply_exposure(color, matrix)
+    np.testing.assert_allclose(exposure.undo_exposure(display.numpy(), matrix), color, atol=1e-6)
     assert exposure.apply_exposure(color, None) is color
 
 
@@ -218,11 +218,11 @@ def test_seeds_matter_and_repeat(tmp_path):
 def test_gaussians_whose_places_are_known_move_a_tenth_as_far(tmp_path):
     settings = SETTINGS.changed({"iterations": 1, "densify.stop": 0.0, "densify.start": 0.0})
     known = torch.arange(40) % 2 == 0
-    free, held = run_fit(tmp_path / "a", settings=settings), run_fit(tmp_path / "b", settings=settings, placed=known)
-    moved, hardly = free.means - initial_model().means, held.means - initial_model().means
+    free, placed = run_fit(tmp_path / "a", settings=settings), run_fit(tmp_path / "b", settings=settings, placed=known)
+    moved, hardly = free.means - initial_model().means, placed.means - initial_model().means
     assert moved.abs().max() > 1e-3 and torch.equal(hardly[~known], moved[~known])
     torch.testing.assert_close(hardly[known], PLACED_RATE_FACTOR * moved[known], rtol=1e-3, atol=1e-7)
-    assert torch.equal(free.sh, held.sh) and torch.equal(free.log_scales, held.log_scales)
+    assert torch.equal(free.sh, placed.sh) and torch.equal(free.log_scales, placed.log_scales)
 
 
 def test_masked_pixels_do_not_matter_to_the_fit(tmp_path):
@@ -370,9 +370,9 @@ def test_a_dense_start_looks_at_half_the_size_first():
     camera = make_camera("v", (7, 4), 5.0)
     image, counts = np.arange(84, dtype=np.uint8).reshape(4, 7, 3), np.ones((4, 7), np.float32)
     counts[0, 0] = 0
-    given = [camera], {"v": image}, {"v": counts}, range(3), 0
+    args = [camera], {"v": image}, {"v": counts}, range(3), 0
     sizes = [
-        (c.width, c.height, tuple(t.shape), tuple(w.shape)) for c, t, w in view_loader.iterate_views(*given, coarse=2)
+        (c.width, c.height, tuple(t.shape), tuple(w.shape)) for c, t, w in view_loader.iterate_views(*args, coarse=2)
     ]
     assert sizes == [(4, 2, (2, 4, 3), (2, 4))] * 2 + [(7, 4, (4, 7, 3), (4, 7))]
     small, _, weights = view_loader.downsample(camera, image, counts)
@@ -386,12 +386,12 @@ def test_sparse_steps_look_at_every_pixel_in_four_turns(monkeypatch):
     camera = make_camera("v", (7, 5), 5.0)
     image, counts = np.zeros((5, 7, 3), np.uint8), np.arange(35, dtype=np.float32).reshape(5, 7)
     image[..., 0] = counts
-    given = [camera], {"v": image}, {"v": counts}, range(5), 0
+    args = [camera], {"v": image}, {"v": counts}, range(5), 0
     assert all(
-        look[0] == camera for look in view_loader.iterate_views(*given, sparse=range(4))
+        look[0] == camera for look in view_loader.iterate_views(*args, sparse=range(4))
     )  # too small to do without
     monkeypatch.setattr(view_loader, "MIN_SPARSE_PIXELS", 35)
-    looks = list(view_loader.iterate_views(*given, sparse=range(4)))
+    looks = list(view_loader.iterate_views(*args, sparse=range(4)))
     assert sorted(np.concatenate([weights.flatten() for _, _, weights in looks[:4]])) == list(range(35))
     for seen, target, weights in looks[:4]:
         assert target.shape[:2] == weights.shape == (seen.height, seen.width) and seen.every == 2

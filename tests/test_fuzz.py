@@ -260,9 +260,9 @@ def try_read(read: Callable[[Path], object], path: Path) -> None:
     try:
         read(path)
     except (BadInput, Refused) as error:
-        said = str(error)
-        assert "\n" not in said and len(said) < 1500, said
-        assert path.parent.name in said or path.name in said or "scene.yaml" in said, said
+        message = str(error)
+        assert "\n" not in message and len(message) < 1500, message
+        assert path.parent.name in message or path.name in message or "scene.yaml" in message, message
     assert time.monotonic() - began < LONGEST, "too long"
 
 

@@ -56,15 +56,15 @@ def test_unused_artifacts_are_listed_first_and_removed_on_request(comparison_cop
     (comparison_copy / "runs/toy/mine").mkdir()
     (comparison_copy / "runs/toy/mine/big.txt").write_text("no receipt")
     collect_garbage(make_request(comparison_copy, ""), yes=False)
-    said = capsys.readouterr().out
+    log = capsys.readouterr().out
     assert (
-        "runs/toy/distill: left out: no gain" in said and "runs/toy@better/evaluate: there is no variant better" in said
+        "runs/toy/distill: left out: no gain" in log and "runs/toy@better/evaluate: there is no variant better" in log
     )
-    assert "nothing was removed; yes=1 removes them" in said and list_artifacts(comparison_copy) == before
+    assert "nothing was removed; yes=1 removes them" in log and list_artifacts(comparison_copy) == before
     collect_garbage(make_request(comparison_copy, ""), yes=True)
     assert list_artifacts(comparison_copy) == {"toy/poses", "toy@none/evaluate"}
-    left = {path.name for path in (comparison_copy / "runs/toy/distill").iterdir()}
-    assert left == {"notes.txt", "gain.txt"} and (comparison_copy / "runs/toy/mine/big.txt").exists()
+    remaining = {path.name for path in (comparison_copy / "runs/toy/distill").iterdir()}
+    assert remaining == {"notes.txt", "gain.txt"} and (comparison_copy / "runs/toy/mine/big.txt").exists()
     run_scene(make_request(comparison_copy), "all")
     assert "toy/evaluate" in list_artifacts(comparison_copy)
 
@@ -85,5 +85,5 @@ def test_older_code_counts_as_used_and_a_scene_that_is_gone_is_kept(comparison_c
 
 def test_other_parameters_are_those_of_the_command(comparison_copy, capsys):
     collect_garbage(make_request(comparison_copy, "toy", set="distill.gain=7"), yes=False)
-    said = capsys.readouterr().out
-    assert "runs/toy/distill: to be made again: param gain 1 -> 7" in said and "runs/toy/poses" not in said
+    log = capsys.readouterr().out
+    assert "runs/toy/distill: to be made again: param gain 1 -> 7" in log and "runs/toy/poses" not in log

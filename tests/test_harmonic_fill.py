@@ -49,10 +49,10 @@ def test_known_pixels_stay_and_the_hole_lies_within_their_range(size):
     images, hidden = signed_random_images(3, 3, *size), (signed_random_images(3, 1, *size, seed=1) > 0).double()
     hidden[..., 0, 0] = 0
     filled = harmonic_extension(images, hidden)
-    given = (hidden == 0).expand_as(images)
-    assert torch.equal(filled[given], images[given])
-    low = images.where(given, torch.inf).amin((2, 3), keepdim=True)
-    high = images.where(given, -torch.inf).amax((2, 3), keepdim=True)
+    known = (hidden == 0).expand_as(images)
+    assert torch.equal(filled[known], images[known])
+    low = images.where(known, torch.inf).amin((2, 3), keepdim=True)
+    high = images.where(known, -torch.inf).amax((2, 3), keepdim=True)
     assert bool(((filled >= low - 1e-12) & (filled <= high + 1e-12)).all())
 
 

@@ -123,11 +123,11 @@ def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side()
     errors = []
     for how in (replace(SHEETS, opacity=0.95, offset_px=0.0, spread=0.4), SHEETS):
         background = Background([], {})
-        drawn = rules.add_surface(Draft.start(nothing), reference, depth, reference.mask, background, how).gaussians
+        gaussians = rules.add_surface(Draft.start(nothing), reference, depth, reference.mask, background, how).gaussians
         inner = (slice(14, 26), slice(14, 34))
-        here, there = (rasterizer.render(drawn, v).color.numpy() - render_floor(v)[1] for v in (view, opposite))
-        assert np.abs(here[inner]).mean() < 0.02
-        errors.append(np.sqrt((there[inner] ** 2).mean()))
+        front, back = (rasterizer.render(gaussians, v).color.numpy() - render_floor(v)[1] for v in (view, opposite))
+        assert np.abs(front[inner]).mean() < 0.02
+        errors.append(np.sqrt((back[inner] ** 2).mean()))
     assert errors[1] < 0.6 * errors[0]
 
 
@@ -151,9 +151,9 @@ def test_holes_left_by_faint_gaussians_are_filled(masks_folders, tmp_path):
     )
     remaining = gaussians.map(lambda p: p[~labels])
     reference = Reference(view, wall_scene.photo(view), np.zeros_like(sets.invent))
-    asked = rules.find_hole(Draft.start(remaining), reference, sets.consistent, 0.9)
-    assert (asked & sets.unobserved).sum() > 0.9 * wall_scene.true_unobserved(view, NEAR).sum()
-    assert not (asked & ~sets.consistent).any()
+    hole = rules.find_hole(Draft.start(remaining), reference, sets.consistent, 0.9)
+    assert (hole & sets.unobserved).sum() > 0.9 * wall_scene.true_unobserved(view, NEAR).sum()
+    assert not (hole & ~sets.consistent).any()
 
 
 def test_sparse_points_count_where_they_are_visible():
@@ -205,12 +205,12 @@ def test_refit_moves_the_gaussians_and_leaves_no_checkpoint(masks_folders, tmp_p
     for name, steps in (("none", 0), ("first", 40), ("again", 40)):
         out = tmp_path / name
         out.mkdir()
-        given = write_true_references(out / "r", masks_folders["masks"], "a2")
+        reference = write_true_references(out / "r", masks_folders["masks"], "a2")
         initialize.run(
             initialize.Params(refit_steps=steps, view_dependent_color=True, depth={"sweep": True}, extra_views=2),
             out,
             **masks_folders,
-            reference=given,
+            reference=reference,
         )
         found[name] = load_ply(out / "gaussians.ply")
         visible = [path.name for path in out.rglob("*") if ".settle" not in path.parts]
@@ -233,11 +233,11 @@ def test_an_extra_view_with_few_pixels_is_sampled_less_than_the_reference():
         np.zeros((view.height, view.width), bool),
     )
     large[10:40, 10:40], few[0, :3] = True, True
-    shown = lambda *masks: Supervision([view] * 40, {}, {}, [Reference(view, picture, mask) for mask in masks])
-    assert repetitions(shown(large)) == [20]
-    assert repetitions(shown(large, few, few, few)) == [20, 1, 1, 1]
-    assert repetitions(shown(large, large)) == [10, 10]
-    assert repetitions(shown()) == []
+    supervise = lambda *masks: Supervision([view] * 40, {}, {}, [Reference(view, picture, mask) for mask in masks])
+    assert repetitions(supervise(large)) == [20]
+    assert repetitions(supervise(large, few, few, few)) == [20, 1, 1, 1]
+    assert repetitions(supervise(large, large)) == [10, 10]
+    assert repetitions(supervise()) == []
 
 
 def test_a_gap_is_narrow_and_a_hole_is_not():
@@ -262,8 +262,8 @@ def test_a_completed_view_pulls_by_its_window_as_by_the_whole():
     found = []
     for camera, image, weights in ((view, picture, mask.astype(np.float32)), (window, part, counts)):
         leaves = wall.map(lambda p: p.clone().requires_grad_())
-        drawn = rasterizer.render(leaves, camera).color
-        loss = reconstruction_loss(drawn, torch.from_numpy(image) / 255, torch.from_numpy(weights))
+        rendering = rasterizer.render(leaves, camera).color
+        loss = reconstruction_loss(rendering, torch.from_numpy(image) / 255, torch.from_numpy(weights))
         loss.backward()
         found.append((loss.detach(), leaves.sh.grad))
     torch.testing.assert_close(found[0], found[1], rtol=1e-3, atol=1e-7)
@@ -273,14 +273,14 @@ def test_the_back_of_a_thing_is_drawn_though_its_front_shows_from_behind():
     """What a reference draws before all that the Gaussians show, and not where they show it already."""
     view, near = wall_scene.front_camera("v", 0.0), 1.4
     wall = wall_scene.rectangle_gaussians(wall_scene.WALL, 2.0, 1.4, wall_scene.wall_color)
-    drawn, hidden = wall_scene.true_mask(view, near), np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
-    reference = Reference(view, np.zeros((*drawn.shape, 3), np.uint8), drawn)
-    depth = np.where(drawn, near, wall_scene.WALL)
-    assert (coverage.pixels_in_front(wall, depth, reference, hidden) == drawn).all()
+    mask, hidden = wall_scene.true_mask(view, near), np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
+    reference = Reference(view, np.zeros((*mask.shape, 3), np.uint8), mask)
+    depth = np.where(mask, near, wall_scene.WALL)
+    assert (coverage.pixels_in_front(wall, depth, reference, hidden) == mask).all()
     front = wall_scene.rectangle_gaussians(near, wall_scene.HALF, wall_scene.HALF, wall_scene.wall_color)
     both = join_gaussians(wall, front)
-    assert coverage.pixels_in_front(both, depth, reference, hidden).sum() < 0.2 * drawn.sum()  # the square's soft rim
-    assert not coverage.pixels_in_front(wall, depth, reference, drawn).any()
+    assert coverage.pixels_in_front(both, depth, reference, hidden).sum() < 0.2 * mask.sum()  # the square's soft rim
+    assert not coverage.pixels_in_front(wall, depth, reference, mask).any()
 
 
 def test_pixels_stained_by_an_edge_lie_beside_it_on_what_stays():

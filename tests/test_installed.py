@@ -57,8 +57,8 @@ def test_all_is_in_one_package(wheel_folder):
     ours += [path for path in (ROOT / "priors" / "tiny").rglob("*") if path.suffix in (".json", ".safetensors")]
     for path in ours:
         inside = path.relative_to(ROOT)
-        there = wheel_folder if inside.parts[0] == "reffusion" else app
-        assert (there / inside).read_bytes() == path.read_bytes()
+        base = wheel_folder if inside.parts[0] == "reffusion" else app
+        assert (base / inside).read_bytes() == path.read_bytes()
     entries = next(wheel_folder.glob("*.dist-info/entry_points.txt")).read_text()
     assert "reffusion = reffusion.command:main" in entries
 

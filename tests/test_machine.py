@@ -36,10 +36,10 @@ POOR = {
 
 @pytest.mark.parametrize("name", list(POOR))
 def test_each_missing_requirement_is_one_line_with_a_remedy(name):
-    changes, said = POOR[name]
+    changes, pattern = POOR[name]
     (line,) = find_missing(replace(GOOD, **changes), 16.0, memory_param="distill.memory_gb")
     assert "\n" not in line
-    assert re.search(said, line), line
+    assert re.search(pattern, line), line
 
 
 def test_a_complete_machine_has_no_warning():
@@ -88,13 +88,13 @@ def test_a_stage_reports_missing_requirements_first(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "environ", fake_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 535.183.01"))
     monkeypatch.chdir(ROOT)
     machine.detect.cache_clear()
-    asked = lambda **params: {"stage": "distill", "params": params, "takes": TAKES, "brings": []}
+    question = lambda **params: {"stage": "distill", "params": params, "takes": TAKES, "brings": []}
     began = time.perf_counter()
-    said = worker._describe(asked(device="cuda", memory_gb=16))["lacks"]
+    problems = worker._describe(question(device="cuda", memory_gb=16))["lacks"]
     assert time.perf_counter() - began < 1
-    assert any("distill.memory_gb is 16, and NVIDIA GeForce GTX 1080 has 9 GB" in line for line in said)
-    assert any("built without CUDA" in line or "needs 580" in line for line in said)
-    assert "lacks" not in worker._describe(asked(device="cpu"))
+    assert any("distill.memory_gb is 16, and NVIDIA GeForce GTX 1080 has 9 GB" in line for line in problems)
+    assert any("built without CUDA" in line or "needs 580" in line for line in problems)
+    assert "lacks" not in worker._describe(question(device="cpu"))
     machine.detect.cache_clear()
 
 

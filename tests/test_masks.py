@@ -122,9 +122,9 @@ def test_pixels_seen_by_other_views_are_not_invented(tmp_path):
 
 
 def test_a_missing_and_a_contradicting_mask_are_outvoted(tmp_path):
-    given = {name: wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR) for name in wall_scene.TRAIN[1:]}
-    given["a3"] = np.zeros_like(given["a3"])
-    sets, facts, _, _ = classify(tmp_path, NEAR, masks=given)
+    masks = {name: wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR) for name in wall_scene.TRAIN[1:]}
+    masks["a3"] = np.zeros_like(masks["a3"])
+    sets, facts, _, _ = classify(tmp_path, NEAR, masks=masks)
     assert facts["voting_views"] == 4
     assert wall_scene.iou(sets["a0"].consistent, wall_scene.true_mask(wall_scene.CAMERAS["a0"], NEAR)) > 0.9
     assert not sets["a0"].raw.any()
@@ -133,17 +133,17 @@ def test_a_missing_and_a_contradicting_mask_are_outvoted(tmp_path):
 def test_gaussians_inside_every_mask_are_the_object_even_if_outvoted(tmp_path, monkeypatch):
     """All masks leave out the same spot of the object, as a bright reflection is left out: C closes over it."""
     rows, columns = np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH] + 0.5
-    given = {}
+    masks = {}
     for name in wall_scene.TRAIN:
         (at,), _ = geometry.project(np.array([[0.0, 0.0, NEAR]]), wall_scene.CAMERAS[name])
         spot = np.hypot(columns - at[0], rows - at[1]) < 2.5
-        given[name] = wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR) & ~spot
+        masks[name] = wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR) & ~spot
     monkeypatch.setattr(consolidation, "GAP", 0.1)
     found = {}
-    for hull in (0.9, 1.0):
-        (tmp_path / str(hull)).mkdir()
-        params = Params(hull=hull, debris=False)
-        _, _, found[hull], truth = classify(tmp_path / str(hull), NEAR, params, masks=given)
+    for share in (0.9, 1.0):
+        (tmp_path / str(share)).mkdir()
+        params = Params(inside_share=share, debris=False)
+        _, _, found[share], truth = classify(tmp_path / str(share), NEAR, params, masks=masks)
     lost = truth & ~found[1.0]
     assert lost.sum() >= 4, "the vote alone leaves the spot standing"
     assert found[0.9][lost].all()
@@ -151,8 +151,8 @@ def test_gaussians_inside_every_mask_are_the_object_even_if_outvoted(tmp_path, m
 
 
 def test_a_clean_view_shows_what_the_object_hid(tmp_path):
-    given = {name: wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR) for name in wall_scene.TRAIN if name != "a2"}
-    sets, facts, _, _ = classify(tmp_path, NEAR, masks=given, clean=("a2",))
+    masks = {name: wall_scene.true_mask(wall_scene.CAMERAS[name], NEAR) for name in wall_scene.TRAIN if name != "a2"}
+    sets, facts, _, _ = classify(tmp_path, NEAR, masks=masks, clean=("a2",))
     assert facts["voting_views"] == 5
     assert not sets["a2"].unobserved.any()
     hidden = classify(tmp_path / "b", NEAR)[1] if (tmp_path / "b").mkdir() is None else None
@@ -161,8 +161,8 @@ def test_a_clean_view_shows_what_the_object_hid(tmp_path):
 
 @pytest.mark.parametrize("value", [False, True])
 def test_empty_and_full_masks_are_handled(tmp_path, value):
-    given = np.full((wall_scene.HEIGHT, wall_scene.WIDTH), value)
-    sets, facts, found, _ = classify(tmp_path, NEAR, masks=dict.fromkeys(wall_scene.TRAIN, given))
+    mask = np.full((wall_scene.HEIGHT, wall_scene.WIDTH), value)
+    sets, facts, found, _ = classify(tmp_path, NEAR, masks=dict.fromkeys(wall_scene.TRAIN, mask))
     assert bool(found.any()) == value
     assert all(each.consistent.mean() == (1.0 if value else 0.0) for each in sets.values())
     assert (facts["best_reference"] is None) == (not value)
@@ -197,22 +197,22 @@ def test_a_region_to_be_filled_removes_nothing_and_is_a_part_of_m(tmp_path, inve
 def test_masks_say_what_is_to_be_filled(tmp_path):
     """As they are, whatever stands there; beside them nothing is."""
     poses, fit, _ = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})
-    wanted = np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
-    wanted[10:30, 5:40] = True
+    mask = np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
+    mask[10:30, 5:40] = True
     for name in wall_scene.TRAIN:
-        save_mask(tmp_path / "raw_masks/fill" / f"{name}.png", wanted)
+        save_mask(tmp_path / "raw_masks/fill" / f"{name}.png", mask)
     run_masks(poses, fit, tmp_path)
     sets = load_mask_sets(tmp_path, wall_scene.CAMERAS)
     assert not load_labels(tmp_path / "labels.npy").any()
-    assert all((sets[name].invent == wanted).all() and not sets[name].consistent.any() for name in wall_scene.TRAIN)
+    assert all((sets[name].invent == mask).all() and not sets[name].consistent.any() for name in wall_scene.TRAIN)
 
 
 def test_the_drawn_part_of_a_region_and_its_rim_are_repainted():
     """Within C all of it is, whatever was drawn there; what is thin or faint was not drawn."""
-    invent, consistent, shown = np.zeros((60, 100), bool), np.zeros((60, 100), bool), np.zeros((60, 100))
-    invent[10:50, 10:90], consistent[10:50, 10:20], shown[20:40, 40:60] = True, True, 0.9
-    shown[30, 50], shown[15, 80] = 0.0, 0.01  # a pinhole, haze
-    found = regions.restrict_to_new(invent, consistent, shown)
+    invent, consistent, alpha = np.zeros((60, 100), bool), np.zeros((60, 100), bool), np.zeros((60, 100))
+    invent[10:50, 10:90], consistent[10:50, 10:20], alpha[20:40, 40:60] = True, True, 0.9
+    alpha[30, 50], alpha[15, 80] = 0.0, 0.01  # a pinhole, haze
+    found = regions.restrict_to_new(invent, consistent, alpha)
     rows, columns = np.nonzero(found & ~consistent)
     assert found[20:40, 40:60].all() and (found & consistent == invent & consistent).all()
     assert rows.min() == 20 and rows.max() == 39 and columns.min() == 40 and columns.max() == 59

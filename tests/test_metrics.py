@@ -141,8 +141,8 @@ def test_where_the_truth_shows_the_object_only_the_outside_is_scored():
     mask = np.zeros((40, 50), bool)
     mask[10:25, 15:35] = True
     found = image_metrics.score_view(image, truth, mask_box(mask), mask=mask, shows_object=True)
-    there = {name for name, value in found.items() if value is not None}
-    assert there == {"psnr_outside", "ssim_outside", "flip_outside"} and tuple(found) == image_metrics.COLUMNS
+    names = {name for name, value in found.items() if value is not None}
+    assert names == {"psnr_outside", "ssim_outside", "flip_outside"} and tuple(found) == image_metrics.COLUMNS
 
 
 # --- FLIP

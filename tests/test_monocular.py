@@ -46,10 +46,10 @@ def test_a_picture_is_prepared_as_the_models_own_processor_does(network, size):
         image_mean=list(monocular.MEAN), image_std=list(monocular.DEVIATION),
     )  # fmt: skip
     image = random_smooth_image(*size)
-    wanted = own((image * 255).byte().numpy(), return_tensors="pt", input_data_format="channels_first").pixel_values
+    expected = own((image * 255).byte().numpy(), return_tensors="pt", input_data_format="channels_first").pixel_values
     prepared = monocular.preprocess(network, image)
-    assert prepared.shape == wanted.shape
-    assert (prepared - wanted).abs().max() < 0.02  # theirs is rounded to 8 bits: half a level is 0.009
+    assert prepared.shape == expected.shape
+    assert (prepared - expected).abs().max() < 0.02  # theirs is rounded to 8 bits: half a level is 0.009
 
 
 def test_disparity_has_the_pictures_size_and_repeats(network, depth_model_folder):
@@ -68,8 +68,8 @@ def test_a_metric_model_is_inverted(network):
     answer = model(pixel_values=monocular.preprocess(network, image)).predicted_depth
     found = monocular.predict_disparity(monocular.make_network(model), image)
     inverse = 1 / answer[None].clamp(1e-6, 1e6)
-    wanted = torch.nn.functional.interpolate(inverse, (48, 64), mode="bilinear")[0, 0].detach()
-    torch.testing.assert_close(found, wanted)
+    expected = torch.nn.functional.interpolate(inverse, (48, 64), mode="bilinear")[0, 0].detach()
+    torch.testing.assert_close(found, expected)
 
 
 def test_refusals_name_what_is_wrong(tmp_path, depth_model_folder):
@@ -104,8 +104,8 @@ def test_the_references_depth_is_the_estimate_aligned():
     behind_it = lambda estimate: unprojection.estimate_depth(
         replace(remaining, means=means), reference, hole, hole, np.zeros((0, 3)), CompletionSettings(), estimate
     )
-    _, made_up, said = behind_it(50 * true - 3)
-    assert "aligned" in said
+    _, made_up, message = behind_it(50 * true - 3)
+    assert "aligned" in message
     np.testing.assert_allclose(made_up[hole], 1 / true[hole], rtol=0.02)
     with pytest.raises(ValueError, match="reference a2: the estimate falls"):
         behind_it(-true)

@@ -46,9 +46,9 @@ def run_in_nerfbaselines(root: Path, module: str, *words: str) -> str:
 
 
 def load_scores(root: Path, out: str = "out") -> dict[str, float]:
-    said = json.loads((root / out / "results/book.json").read_text())
-    assert said["evaluation_protocol"] == "spinnerf-box" and said["nb_info"]["method"] == "reffusion"
-    return said["metrics"]
+    results = json.loads((root / out / "results/book.json").read_text())
+    assert results["evaluation_protocol"] == "spinnerf-box" and results["nb_info"]["method"] == "reffusion"
+    return results["metrics"]
 
 
 def assert_equal_to_metrics(root: Path, theirs: dict[str, float]) -> None:

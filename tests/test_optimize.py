@@ -121,9 +121,9 @@ def test_ssim_is_never_computed_in_tf32(monkeypatch):
     """Neither there nor on the way back; before and after, and where it fails, the flag is as it was."""
     seen, convolve = [], torch.nn.functional.conv2d
 
-    def watched(*given, **options):
+    def watched(*arguments, **options):
         seen.append(torch.backends.cudnn.allow_tf32)
-        return convolve(*given, **options)
+        return convolve(*arguments, **options)
 
     monkeypatch.setattr(ssim.F, "conv2d", watched)
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)

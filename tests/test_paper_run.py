@@ -68,15 +68,15 @@ def photo_tensor(view) -> torch.Tensor:
 
 def network_that_sees_the_tilt() -> torch.nn.Module:
     """A random Depth Anything whose output correlates with the tilt of the wall; others are refused."""
-    wanted = -np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH][0].ravel()
+    tilt = -np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH][0].ravel()
     for seed in (28, *range(200)):
         model = small_depth_model(seed=seed)
         network = monocular.make_network(model)
-        said = [
+        predictions = [
             monocular.predict_disparity(network, photo_tensor(wall_scene.CAMERAS[n])).numpy().ravel()
             for n in ("a0", "a2", "a4")
         ]
-        if min(np.corrcoef(answer, wanted)[0, 1] for answer in said) > 0.5:
+        if min(np.corrcoef(answer, tilt)[0, 1] for answer in predictions) > 0.5:
             return model
     raise AssertionError("no such network among 200")
 
@@ -90,13 +90,13 @@ def tilt_wall(fit: Path) -> None:
 
 def small_paper_params(weights: Path) -> dict[str, Settings]:
     """stage -> the profile's parameters but for `SIZES`, `WEIGHTS` and `HERE`."""
-    said = resolve(Request(ROOT, ROOT / "runs", "", profile="paper"), scene=False).params
+    params = resolve(Request(ROOT, ROOT / "runs", "", profile="paper"), scene=False).params
     found = {}
     for stage in STAGES:
-        profile = importlib.import_module(f"reffusion.params.{stage}").Params(**said[stage])
+        profile = importlib.import_module(f"reffusion.params.{stage}").Params(**params[stage])
         places = {name: str(weights / folder) for name, folder in WEIGHTS.get(stage, {}).items()}
         assert profile == profile.changed({n: STANDS_FOR[folder] for n, folder in WEIGHTS.get(stage, {}).items()})
-        here = {name: value for name, value in HERE.items() if name in said[stage]}
+        here = {name: value for name, value in HERE.items() if name in params[stage]}
         found[stage] = profile.changed(SIZES.get(stage, {}) | places | here)
     return found
 
@@ -138,8 +138,8 @@ def test_personalization_leaves_the_papers_lora(stage_outputs):
     facts = json.loads(header[8 : 8 + int.from_bytes(header[:8], "little")])
     shapes = {name.rpartition(".lora")[0]: each["shape"] for name, each in facts.items() if "lora_A" in name}
     assert {shape[0] for shape in shapes.values()} == {8} and any("text_encoder" in name for name in shapes)
-    said = json.loads(facts["__metadata__"]["lora_adapter_metadata"])
-    assert [said[f"{part}.{name}"] for part in ("unet", "text_encoder") for name in ("r", "lora_alpha")] == [8, 16] * 2
+    lora = json.loads(facts["__metadata__"]["lora_adapter_metadata"])
+    assert [lora[f"{part}.{name}"] for part in ("unet", "text_encoder") for name in ("r", "lora_alpha")] == [8, 16] * 2
 
 
 def test_every_term_works_and_masked_gaussians_multiply(stage_outputs):

@@ -54,9 +54,9 @@ def load_views_with(tmp_path_factory):
     """A function from parameters to training views (I lies beside C, and view a3 has no I), and both masks."""
     home = tmp_path_factory.mktemp("insertion")
     poses, fitted, _ = wall_scene.write_poses_and_fit(home, NEAR, clean=("a4",))
-    hidden, drawn, none = (np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool) for _ in range(3))
-    hidden[20:40, 10:30], drawn[20:40, 50:70] = True, True
-    sets = {name: MaskSet(none, hidden, none, none if name == "a3" else drawn) for name in wall_scene.CAMERAS}
+    hidden, invent, none = (np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool) for _ in range(3))
+    hidden[20:40, 10:30], invent[20:40, 50:70] = True, True
+    sets = {name: MaskSet(none, hidden, none, none if name == "a3" else invent) for name in wall_scene.CAMERAS}
     save_mask_sets(home / "masks", sets)
     space = Workspace(poses, fitted, home / "masks")
 
@@ -64,16 +64,16 @@ def load_views_with(tmp_path_factory):
         views = inputs.load_train_views(with_changes(Params(), **changes), space)
         return {view.camera.name: view for view in views}
 
-    return made, torch.from_numpy(hidden), torch.from_numpy(drawn)
+    return made, torch.from_numpy(hidden), torch.from_numpy(invent)
 
 
 def test_photographs_do_not_supervise_where_an_object_is_drawn(load_views_with):
-    made, hidden, drawn = load_views_with
+    made, hidden, invent = load_views_with
     views = made()
-    assert torch.equal(views["a0"].supervises, ~(hidden | drawn)) and torch.equal(views["a3"].supervises, ~hidden)
+    assert torch.equal(views["a0"].supervises, ~(hidden | invent)) and torch.equal(views["a3"].supervises, ~hidden)
     assert views["a4"].clean and views["a4"].supervises.all()
     _, _, not_seen = _downscale(views["a0"], 10_000)  # the depth term's
-    assert torch.equal(not_seen, hidden | drawn)
+    assert torch.equal(not_seen, hidden | invent)
 
 
 def test_a_view_without_invented_pixels_is_distilled_where_c_is_repainted(load_views_with):
@@ -103,9 +103,9 @@ def test_a_clean_view_can_be_a_reference(tmp_path):
     for name in ("reference", "initialize"):
         paths[name].mkdir()
     run_masks(poses, fitted, paths["masks"], masks.Params(invent="consistent"))
-    given = {"view": "a2", "image": "images/a2.png"}
-    asked = reference.Params(reference=given)
-    reference.run(asked, paths["reference"], **{k: paths[k] for k in ("scene", "poses", "fit", "masks")})
+    spec = {"view": "a2", "image": "images/a2.png"}
+    params = reference.Params(reference=spec)
+    reference.run(params, paths["reference"], **{k: paths[k] for k in ("scene", "poses", "fit", "masks")})
     (found,) = load_references(paths["reference"], load_scene(poses))
     sets = load_mask_sets(paths["masks"], ["a2"])["a2"]
     assert not sets.invent.any() and (found.mask == sets.consistent).all() and found.mask.sum() > 100
@@ -118,19 +118,19 @@ def test_a_clean_view_can_be_a_reference(tmp_path):
 
 
 def test_an_unadapted_prior_is_not_prompted_unless_asked():
-    asked = [(None, ""), *product(("no_personalization", "sds_plain"), ("", "distill.prompts=sks"))]
+    cases = [(None, ""), *product(("no_personalization", "sds_plain"), ("", "distill.prompts=sks"))]
     where = ROOT, ROOT / "runs", ""
-    requests = [Request(*where, profile="paper", variant=variant, set=chosen) for variant, chosen in asked]
+    requests = [Request(*where, profile="paper", variant=variant, set=chosen) for variant, chosen in cases]
     jobs = resolve_all(requests, Hashes(ROOT / "runs" / HASHES), scene=False)
     assert [job.params["distill"]["prompts"] for job in jobs] == ["sks", "empty", "sks", "empty", "sks"]
 
 
 def test_prompts_of_the_prior(prior, monkeypatch):
     monkeypatch.setattr(inputs, "load_prior", lambda *_, **__: prior)
-    _, told = inputs.load_adapted_prior(Params(), None)
-    _, nothing = inputs.load_adapted_prior(Params(prompts="empty"), None)
-    assert torch.equal(told, diffusion.embed_text(prior, list(crops.PROMPTS)))
-    assert torch.equal(nothing, diffusion.embed_text(prior, [""] * 3)) and not torch.equal(told[0], nothing[0])
+    _, embeddings = inputs.load_adapted_prior(Params(), None)
+    _, empty = inputs.load_adapted_prior(Params(prompts="empty"), None)
+    assert torch.equal(embeddings, diffusion.embed_text(prior, list(crops.PROMPTS)))
+    assert torch.equal(empty, diffusion.embed_text(prior, [""] * 3)) and not torch.equal(embeddings[0], empty[0])
 
 
 def test_guidance_of_the_empty_prompt_changes_nothing_and_costs_nothing(prior, monkeypatch):
@@ -138,8 +138,8 @@ def test_guidance_of_the_empty_prompt_changes_nothing_and_costs_nothing(prior, m
     noisy, condition, at = noise[:, :4], noise[:, 4:], torch.tensor([300, 700])
     empty = diffusion.embed_text(prior, ["", ""])
     rows = []
-    asked = diffusion.raw_prediction
-    monkeypatch.setattr(diffusion, "raw_prediction", lambda p, z, *rest: rows.append(len(z)) or asked(p, z, *rest))
+    predict = diffusion.raw_prediction
+    monkeypatch.setattr(diffusion, "raw_prediction", lambda p, z, *rest: rows.append(len(z)) or predict(p, z, *rest))
     with torch.no_grad():
         plain = diffusion.guided(prior, noisy, at, condition, empty, None, 0.0)
         guided = diffusion.guided(prior, noisy, at, condition, empty, empty, 7.5)
@@ -148,9 +148,9 @@ def test_guidance_of_the_empty_prompt_changes_nothing_and_costs_nothing(prior, m
 
 def test_colours_above_1_are_shown_as_1_and_may_only_come_back():
     color = torch.tensor([-0.2, 0.5, 1.5, 1.5], requires_grad=True)
-    shown = clamp_to_display(color)
-    assert torch.equal(shown, torch.tensor([0.0, 0.5, 1.0, 1.0]))
-    (shown * torch.tensor([1.0, 1.0, 1.0, -1.0])).sum().backward()  # a step goes against the gradient
+    display = clamp_to_display(color)
+    assert torch.equal(display, torch.tensor([0.0, 0.5, 1.0, 1.0]))
+    (display * torch.tensor([1.0, 1.0, 1.0, -1.0])).sum().backward()  # a step goes against the gradient
     assert color.grad.tolist() == [0, 1, 1, 0]
 
 
@@ -179,9 +179,9 @@ def test_a_tenth_of_realfills_masks_repaints_all():
     whole = {}
     for kind in ("rectangles", "realfill"):
         draws = generator(0, "masks")
-        drawn = [crops.random_mask(TrainingSamples(masks=kind), 32, draws) for _ in range(600)]
-        assert all(((mask == 0) | (mask == 1)).all() for mask in drawn)
-        whole[kind] = np.mean([bool(mask.all()) for mask in drawn])
+        samples = [crops.random_mask(TrainingSamples(masks=kind), 32, draws) for _ in range(600)]
+        assert all(((mask == 0) | (mask == 1)).all() for mask in samples)
+        whole[kind] = np.mean([bool(mask.all()) for mask in samples])
     assert whole["rectangles"] < 0.01 and whole["realfill"] == pytest.approx(0.1, abs=0.03)
 
 

@@ -37,11 +37,11 @@ HERE = Similarity(1.0, np.zeros(3))
 def test_deleted_splats_are_found_in_any_order_quantised_and_turned(turn):
     points, deleted = plane_with_ball()
     draws = np.random.default_rng(1)
-    left = points[~deleted][draws.permutation(np.count_nonzero(~deleted))] * turn
-    found = matching.match_gaussians(points, left.astype(np.float16).astype(np.float64))
+    rest = points[~deleted][draws.permutation(np.count_nonzero(~deleted))] * turn
+    found = matching.match_gaussians(points, rest.astype(np.float16).astype(np.float64))
     assert found.turn == turn and found.found == 1
     assert np.count_nonzero(found.deleted != deleted) <= 0.002 * len(points)
-    exact = matching.match_gaussians(points, left)
+    exact = matching.match_gaussians(points, rest)
     np.testing.assert_array_equal(exact.deleted, deleted)
 
 
@@ -62,9 +62,9 @@ def test_splats_with_changed_pose_or_size_are_not_matched(moved):
 def run_poses_after_edit(folder, **params):
     out = folder.parent / f"{folder.name}_out"
     out.mkdir(exist_ok=True)
-    given = poses.Params(gaussians="scene.ply", cleaned="cleaned.ply", **params)
-    planned.preview(given, folder)
-    poses.run(given, out, scene=folder)
+    settings = poses.Params(gaussians="scene.ply", cleaned="cleaned.ply", **params)
+    planned.preview(settings, folder)
+    poses.run(settings, out, scene=folder)
     return out
 
 
@@ -72,40 +72,40 @@ def run_poses_after_edit(folder, **params):
 def test_poses_says_which_splats_were_deleted(tmp_path, compressed, capsys):
     whole, deleted = write_edited_capture(tmp_path / "s")
     if compressed:
-        left = whole.map(lambda p: p[torch.from_numpy(~deleted)])
-        save_compressed(tmp_path / "s" / "cleaned.ply", left, HERE)
+        rest = whole.map(lambda p: p[torch.from_numpy(~deleted)])
+        save_compressed(tmp_path / "s" / "cleaned.ply", rest, HERE)
     out = run_poses_after_edit(tmp_path / "s", masks="none")
     assert np.count_nonzero(load_labels(out / "deleted.npy").numpy() != deleted) <= 2 * compressed
     assert f"{deleted.sum()} of 4000 splats were deleted" in capsys.readouterr().out
-    brought = load_ply(out / "gaussians.ply", None)
+    gaussians = load_ply(out / "gaussians.ply", None)
     np.testing.assert_allclose(
-        load_scene(out).similarity.invert(brought.means.double().numpy()), whole.means, atol=1e-4
+        load_scene(out).similarity.invert(gaussians.means.double().numpy()), whole.means, atol=1e-4
     )
     assert load_property_names(out / "gaussians.ply")[: len(EDITOR)] == EDITOR
 
 
 def assert_refusal(folder, message, **params):
-    with pytest.raises(ValueError, match=message) as told:
+    with pytest.raises(ValueError, match=message) as error:
         run_poses_after_edit(folder, **params)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(error.value)
 
 
 def test_refusals_say_what_is_wrong_with_the_cleaned_scene(tmp_path):
     folder = tmp_path / "s"
     whole, _ = write_edited_capture(folder)
-    left = load_ply(folder / "cleaned.ply")
+    rest = load_ply(folder / "cleaned.ply")
     change = lambda made: save_ply(folder / "cleaned.ply", made)
     change(whole)
     assert_refusal(folder, r"cleaned\.ply: 4000 splats, and .*scene\.ply has 4000: nothing was deleted")
-    change(left.map(lambda p: p[:0]))
+    change(rest.map(lambda p: p[:0]))
     assert_refusal(folder, r"cleaned\.ply: it holds no Gaussians: everything was deleted")
-    change(Gaussians(1.2 * left.means, *(getattr(left, name) for name in FIELDS[1:])))
+    change(Gaussians(1.2 * rest.means, *(getattr(rest, name) for name in FIELDS[1:])))
     assert_refusal(folder, r"cleaned\.ply: of its splats \d+% are where scene\.ply has one: .* moved, turned or scaled")
     twice = whole.map(lambda p: torch.cat([p, p[:1]]))
     save_ply(folder / "scene.ply", twice)
     (folder / "cleaned.ply").unlink()
     assert_refusal(folder, r"cleaned\.ply: no such file; correct `cleaned`")
-    change(left)
+    change(rest)
     with pytest.raises(ValueError, match="cleaned: name the scene before"):
         planned.preview(poses.Params(cleaned="cleaned.ply"), folder)
 
@@ -127,8 +127,8 @@ def test_cameras_of_a_capture_look_at_renders(tmp_path):
         np.testing.assert_allclose(scene.cameras[name].center, center, atol=1e-9)
         np.testing.assert_allclose(mine[:3, :3], pose[:3, :3], atol=1e-9)
     seen = exposure.load_normalized_views(out, out, ["v02"])["v02"]
-    drawn = rasterizer.render(load_ply(out / "gaussians.ply"), scene.cameras["v02"]).color.numpy()
-    np.testing.assert_allclose(seen / 255, drawn.clip(0, 1), atol=0.5 / 255 + 1e-6)
+    rendering = rasterizer.render(load_ply(out / "gaussians.ply"), scene.cameras["v02"]).color.numpy()
+    np.testing.assert_allclose(seen / 255, rendering.clip(0, 1), atol=0.5 / 255 + 1e-6)
     assert_refusal(folder, "scene.yaml: test: the scene has no photographs", test="every 8")
     record = json.loads((folder / "transforms.json").read_text())
     del record["w"]
@@ -182,8 +182,8 @@ def test_deleted_splats_replace_votes(tmp_path):
 @pytest.mark.parametrize("moved", [(0.0, 0.0, -9.0), (0.9, 0.3, 0.0)])
 def test_gaussians_in_another_frame_than_the_cameras_are_refused(tmp_path, moved):
     folder, fit, labels = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})
-    given = load_ply(fit / "gaussians.ply")
-    shifted = Gaussians(given.means + torch.tensor(moved), *(getattr(given, name) for name in FIELDS[1:]))
+    gaussians = load_ply(fit / "gaussians.ply")
+    shifted = Gaussians(gaussians.means + torch.tensor(moved), *(getattr(gaussians, name) for name in FIELDS[1:]))
     for path in (folder, fit):
         save_ply(path / "gaussians.ply", shifted)
     save_labels(folder / "deleted.npy", labels)
@@ -209,12 +209,12 @@ def test_the_patch_is_given_back_as_the_editor_wrote_the_scene(tmp_path):
     save_ply(home / "evaluate" / "scene.ply", result, similarity)
     (home / "evaluate" / "receipt.json").write_text('{"needs": {"initialize": "x", "distill": null}}')
     assert "100 new ones" in patch.make(home)
-    given = PlyData.read(str(tmp_path / "s" / "scene.ply"))["vertex"]
+    original = PlyData.read(str(tmp_path / "s" / "scene.ply"))["vertex"]
     whole, alone = (PlyData.read(str(home / "patch" / name))["vertex"] for name in (patch.WHOLE, patch.NEW))
-    assert [p.name for p in whole.properties] == [p.name for p in given.properties]
+    assert [p.name for p in whole.properties] == [p.name for p in original.properties]
     assert len(whole) == 4000 and len(alone) == 100
     for name in ("x", "scale_1", "f_dc_2", "f_rest_5", "rot_3", "opacity"):
-        np.testing.assert_allclose(whole[name], given[name], atol=2e-5)
+        np.testing.assert_allclose(whole[name], original[name], atol=2e-5)
         np.testing.assert_array_equal(alone[name], whole[name][3900:])
     (home / "poses" / "deleted.npy").unlink()
     with pytest.raises(ValueError, match="nothing says what was deleted"):

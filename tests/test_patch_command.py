@@ -42,16 +42,16 @@ def splat_files(tmp_path):
 
 
 def parse_arguments(before, after, out, **others) -> argparse.Namespace:
-    given = {"scene": None, "variant": "", "runs": Path(before).parent / "runs", "cameras": None, "profile": "laptop"}
-    given |= {"budget": None, "set": "", **others}
-    return argparse.Namespace(files=[before, after], out=out, **given)
+    values = {"scene": None, "variant": "", "runs": Path(before).parent / "runs", "cameras": None, "profile": "laptop"}
+    values |= {"budget": None, "set": "", **others}
+    return argparse.Namespace(files=[before, after], out=out, **values)
 
 
 def test_errors_are_one_line(splat_files, tmp_path):
     before, after = splat_files
     out = tmp_path / "patched.ply"
     (tmp_path / "s.ksplat").write_bytes(bytes(4096))
-    for given, message in (
+    for arguments, message in (
         ((), "name a scene (--scene), or two files: reffusion patch before.ply after.ply --out out.ply"),
         ((before,), f"{before}: name two files, the scene before and after the object was deleted"),
         ((before, after), "--out: name the file to write, as --out patched.ply"),
@@ -66,7 +66,7 @@ def test_errors_are_one_line(splat_files, tmp_path):
         ((before, after, "--out", out, "--cameras", tmp_path / "no"), f"{tmp_path / 'no'}: no such folder; --cameras "
          "names one with transforms.json or sparse/0"),
     ):  # fmt: skip
-        ended = run_module("reffusion.command", "patch", *given)
+        ended = run_module("reffusion.command", "patch", *arguments)
         assert (ended.returncode, ended.stderr) == (2, f"error: {message}\n")
         assert not (tmp_path / "runs").exists()
 
@@ -95,12 +95,12 @@ def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
     made = tmp_path / "made"
     _, deleted = write_edited_capture(made)
     remove_pictures(made)
-    asked = parse_arguments(made / "scene.ply", made / "cleaned.ply", tmp_path / "out.ply")
-    patch_files.check_arguments(asked)
-    folder = patch_files.write_scene_folder(asked)
-    assert folder == patch_files.find_folder(asked.runs, *asked.files) and folder.name.startswith("scene-patch-")
-    said = (folder / "scene.yaml").read_text()
-    assert said == 'gaussians: "before/scene.ply"\ncleaned: "after/cleaned.ply"\nmasks: none\n'
+    args = parse_arguments(made / "scene.ply", made / "cleaned.ply", tmp_path / "out.ply")
+    patch_files.check_arguments(args)
+    folder = patch_files.write_scene_folder(args)
+    assert folder == patch_files.find_folder(args.runs, *args.files) and folder.name.startswith("scene-patch-")
+    content = (folder / "scene.yaml").read_text()
+    assert content == 'gaussians: "before/scene.ply"\ncleaned: "after/cleaned.ply"\nmasks: none\n'
     params = poses.Params(gaussians="before/scene.ply", cleaned="after/cleaned.ply", masks="none", longest=64)
     assert "cameras around the hole look at renders" in planned.preview(params, folder)[0]
     (folder / "painted").mkdir()
@@ -108,7 +108,7 @@ def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
     (made / "cameras").mkdir()
     (made / "transforms.json").rename(made / "cameras" / "transforms.json")
     time = (folder / "scene.yaml").stat().st_mtime_ns
-    again = patch_files.write_scene_folder(parse_arguments(*asked.files, asked.out, cameras=made / "cameras"))
+    again = patch_files.write_scene_folder(parse_arguments(*args.files, args.out, cameras=made / "cameras"))
     assert again == folder and (folder / "painted" / "around_00.png").read_text() == "mine"
     assert (folder / "scene.yaml").stat().st_mtime_ns == time
     assert "no photographs: 6 cameras of transforms.json" in planned.preview(params, folder)[0]
@@ -117,7 +117,7 @@ def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
         poses.run(params, out, scene=folder)
     np.testing.assert_array_equal(load_labels(out / "deleted.npy").numpy(), deleted)
     assert len(load_scene(out).train) == 6
-    patch_files.write_scene_folder(asked)
+    patch_files.write_scene_folder(args)
     assert not (folder / "transforms.json").exists()
 
 
@@ -147,17 +147,17 @@ def test_export_writes_the_scene_with_the_object_too(tmp_path):
 
     from reffusion.io.scene import save_scene
 
-    home, given = tmp_path / "s", random_gaussians(200, 1)
+    home, gaussians = tmp_path / "s", random_gaussians(200, 1)
     save_scene(home / "poses", random_scene_in_frame())
     save_ply(home / "evaluate" / "scene.ply", random_gaussians(300, 1), FRAME)
-    save_ply(home / "fit" / "gaussians.ply", given)
-    said = export.make(home)
+    save_ply(home / "fit" / "gaussians.ply", gaussians)
+    lines = export.make(home)
     before, cameras = home / "export/with_object.ply", home / "export/cameras"
-    assert said[3] == (
+    assert lines[3] == (
         f"{before}: the scene with the object, to be edited: delete something in an editor, save the rest as "
         f"AFTER.ply, and `reffusion patch {before} AFTER.ply --cameras {cameras} --out patched.ply` fills the hole"
     )
-    torch.testing.assert_close(load_ply(before, FRAME).means, given.means, rtol=0, atol=1e-5)
+    torch.testing.assert_close(load_ply(before, FRAME).means, gaussians.means, rtol=0, atol=1e-5)
     frames = json.loads((cameras / "transforms.json").read_text())["frames"]
     assert len(frames) == 3
 
@@ -172,8 +172,8 @@ def test_many_splats_are_matched_by_their_exact_places():
     points[5] = (0.0, -0.0, 0.0)
     deleted = draws.random(len(points)) < 0.1
     deleted[[5, *range(1000, 1010)]], deleted[2000:2010] = False, True
-    left = points[~deleted][draws.permutation(np.count_nonzero(~deleted))] * (-1, -1, 1)
-    found = matching.match_gaussians(points, left)
+    rest = points[~deleted][draws.permutation(np.count_nonzero(~deleted))] * (-1, -1, 1)
+    found = matching.match_gaussians(points, rest)
     assert found.found == 1 and found.turn == (-1, -1, 1)
     twins = [*range(1000, 1010), *range(2000, 2010)]
     np.testing.assert_array_equal(np.delete(found.deleted, twins), np.delete(deleted, twins))
@@ -184,9 +184,9 @@ def test_some_splats_that_moved_a_little_are_still_found():
     draws = np.random.default_rng(0)
     points = draws.normal(size=(5000, 3))
     deleted = np.arange(len(points)) < 100
-    left = points[~deleted].copy()
-    left[:40] += 1e-5
-    found = matching.match_gaussians(points, left)
+    rest = points[~deleted].copy()
+    rest[:40] += 1e-5
+    found = matching.match_gaussians(points, rest)
     assert found.found == 1
     np.testing.assert_array_equal(found.deleted, deleted)
 

@@ -159,9 +159,9 @@ def test_photographs_are_measured_by_and_not_learnt_from(fresh_prior, tmp_path):
     thing = torch.zeros(70, 90, dtype=torch.bool)
     thing[:, :45] = True
     photograph = reference.image.flip(2)
-    held = validation.make_held_out([reference], [(photograph, thing)], NATIVE, 0)
-    assert len(held.pictures) == 2 and not (held.holes[1] * two_scale_masks(thing, [], NATIVE)[0]).any()
-    assert held.holes[1].any() and (held.repaint[1] >= held.holes[1]).all()
+    held_out = validation.make_held_out([reference], [(photograph, thing)], NATIVE, 0)
+    assert len(held_out.pictures) == 2 and not (held_out.holes[1] * two_scale_masks(thing, [], NATIVE)[0]).any()
+    assert held_out.holes[1].any() and (held_out.repaint[1] >= held_out.holes[1]).all()
 
     def learnt(folder, photographs):
         folder.mkdir()
@@ -170,10 +170,10 @@ def test_photographs_are_measured_by_and_not_learnt_from(fresh_prior, tmp_path):
         P.personalize(prior, trained, [reference], TRAINING, folder, photographs)
         return lora.state(prior), read_trace(folder / "trace.jsonl")[-1]
 
-    (alone, said), (measured, also) = learnt(tmp_path / "a", []), learnt(tmp_path / "b", [(photograph, thing)])
+    (alone, row), (measured, also) = learnt(tmp_path / "a", []), learnt(tmp_path / "b", [(photograph, thing)])
     assert all(torch.equal(alone[name], measured[name]) for name in alone)
-    assert said["hole_psnr"] == pytest.approx(also["hole_psnr"], abs=3) and "photo_psnr" in also.keys() - said.keys()
-    assert {"clean_latent_mse", "crop_latent_mse"} <= said.keys()
+    assert row["hole_psnr"] == pytest.approx(also["hole_psnr"], abs=3) and "photo_psnr" in also.keys() - row.keys()
+    assert {"clean_latent_mse", "crop_latent_mse"} <= row.keys()
 
 
 def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch):

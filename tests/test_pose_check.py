@@ -43,7 +43,7 @@ def render_two_planes(camera: Camera, images: tuple[np.ndarray, np.ndarray]) -> 
     """uint8 [H, W, 3]: the wall and the square as the camera sees them."""
     rays = world_rays(camera)
     at = [camera.center + rays * ((depth - camera.center[2]) / rays[..., 2:]) for depth in (WALL, SQUARE)]
-    shown = [
+    pictures = [
         cv2.remap(
             image,
             *np.moveaxis(((places[..., :2] + 2) * 64).astype(np.float32), -1, 0),
@@ -54,7 +54,7 @@ def render_two_planes(camera: Camera, images: tuple[np.ndarray, np.ndarray]) -> 
         for image, places in zip(images, at, strict=True)
     ]
     on_square = (np.abs(at[1][..., :2]) < HALF).all(-1, keepdims=True)
-    return np.where(on_square, shown[1], shown[0]).clip(0, 255).astype(np.uint8)
+    return np.where(on_square, pictures[1], pictures[0]).clip(0, 255).astype(np.uint8)
 
 
 def sample_two_planes() -> np.ndarray:
@@ -88,8 +88,8 @@ def run_poses_with_warnings(folder: Path, **params) -> tuple[Path, list[str]]:
         warnings.simplefilter("ignore")
         poses.run(Params(**params), out, scene=folder)
     out.with_name("raw_masks").mkdir(exist_ok=True)
-    said = out / "warnings.json"
-    return out, json.loads(said.read_text()) if said.exists() else []
+    path = out / "warnings.json"
+    return out, json.loads(path.read_text()) if path.exists() else []
 
 
 def contradicting_views(cameras=CAMERAS, **pictures: np.ndarray) -> tuple[str, ...]:
@@ -141,33 +141,33 @@ def test_plain_photographs_and_few_points_tell_nothing():
 
 
 def test_a_photograph_that_contradicts_its_pose_is_left_out(tmp_path):
-    out, said = run_poses_with_warnings(write_two_planes(tmp_path / "scene", **{BAD: PICTURES["v08"]}))
+    out, messages = run_poses_with_warnings(write_two_planes(tmp_path / "scene", **{BAD: PICTURES["v08"]}))
     scene = load_scene(out)
     assert scene.outliers == (BAD,) and BAD not in scene.cameras and len(scene.train) == 9
     assert json.loads((out / "views.json").read_text())["outliers"] == [BAD]
-    assert said == [
+    assert messages == [
         "photographs that contradict their poses, or show something else than the others, are left out: v04; in "
         'scene.yaml, `exclude: ["v04"]` leaves them out for good, `keep: ["v04"]` uses them without this warning'
     ]
     _, lines = check.make(out.parent)
-    assert lines == said
+    assert lines == messages
     assert check.view_role(BAD, json.loads((out / "views.json").read_text())) == "left out"
 
 
 def test_what_the_other_photographs_show_stays_as_it_was(tmp_path):
-    whole, said = run_poses_with_warnings(write_two_planes(tmp_path / "a" / "scene"))
+    whole, messages = run_poses_with_warnings(write_two_planes(tmp_path / "a" / "scene"))
     less, _ = run_poses_with_warnings(write_two_planes(tmp_path / "b" / "scene", **{BAD: PICTURES["v08"]}))
-    assert said == [] and "outliers" not in json.loads((whole / "views.json").read_text())
+    assert messages == [] and "outliers" not in json.loads((whole / "views.json").read_text())
     for name, camera in load_scene(less).cameras.items():
         assert np.allclose(camera.world_to_camera, load_scene(whole).cameras[name].world_to_camera, atol=1e-12)
 
 
 def test_keep_uses_a_view_and_exclude_drops_it_silently(tmp_path):
     folder = write_two_planes(tmp_path / "scene", **{BAD: PICTURES["v08"]})
-    out, said = run_poses_with_warnings(folder, keep=[f"{BAD}.png"])
-    assert said == [] and BAD in load_scene(out).train and load_scene(out).suspects == ()
-    out, said = run_poses_with_warnings(folder.parent / "scene", exclude=[BAD])
-    assert said == [] and BAD not in load_scene(out).cameras and load_scene(out).outliers == ()
+    out, messages = run_poses_with_warnings(folder, keep=[f"{BAD}.png"])
+    assert messages == [] and BAD in load_scene(out).train and load_scene(out).suspects == ()
+    out, messages = run_poses_with_warnings(folder.parent / "scene", exclude=[BAD])
+    assert messages == [] and BAD not in load_scene(out).cameras and load_scene(out).outliers == ()
     save_image(folder / "images" / "v07.png", PICTURES["v01"])
     out, (line,) = run_poses_with_warnings(folder, exclude=[BAD])
     assert 'are left out: v07; in scene.yaml, `exclude: ["v04", "v07"]`' in line
@@ -189,8 +189,8 @@ def test_test_and_clean_views_stay_and_are_named(tmp_path):
 def test_where_most_contradict_nothing_is_left_out(tmp_path):
     noise = np.random.default_rng(1).integers(0, 256, (10, 9, 12, 3)).astype(np.uint8)
     blocks = {n: np.kron(each, np.ones((8, 8, 1), np.uint8)) for n, each in zip(PICTURES, noise, strict=True)}
-    out, said = run_poses_with_warnings(write_two_planes(tmp_path / "scene", **blocks))
-    assert said == ["at least 5 of 10 photographs contradict their poses; do poses and pictures belong together?"]
+    out, messages = run_poses_with_warnings(write_two_planes(tmp_path / "scene", **blocks))
+    assert messages == ["at least 5 of 10 photographs contradict their poses; do poses and pictures belong together?"]
     assert len(load_scene(out).train) == 10
 
 

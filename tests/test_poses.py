@@ -131,18 +131,18 @@ def test_cameras_without_pixels_stay(tmp_path):
     everyone, out = run_stages(folder)
     for path in (folder / "masks", out):
         shutil.rmtree(path)
-    asked = {"train": ["v01"], "test": ["v04"], "clean": ["v01"], "cameras_only": "others"}
-    scene, out = run_stages(folder, **asked)
+    settings = {"train": ["v01"], "test": ["v04"], "clean": ["v01"], "cameras_only": "others"}
+    scene, out = run_stages(folder, **settings)
     assert scene.blank == ("v00", "v02", "v03", "v05") and scene.train == ("v01",)
     assert sorted(path.stem for path in (out / "images").iterdir()) == ["v01", "v04"]
     for name, camera in scene.cameras.items():
         np.testing.assert_allclose(camera.world_to_camera, everyone.cameras[name].world_to_camera, atol=1e-9)
-    params = poses.Params(**asked)
+    params = poses.Params(**settings)
     read = {path.name for path in plan.scene_files(params, folder, sorted(folder.rglob("*.*")))}
     assert {"v01.png", "v04.png"} <= read and "v00.png" not in read
     assert "4 views are cameras only" in plan.preview(params, folder)
     with pytest.raises(BadInput, match="cameras_only: v04 is a training or test view too"):
-        plan.preview(poses.Params(**asked | {"cameras_only": ["v04"]}), folder)
+        plan.preview(poses.Params(**settings | {"cameras_only": ["v04"]}), folder)
 
 
 def test_object_numbers_make_separate_masks(tmp_path):
@@ -167,14 +167,14 @@ def test_object_numbers_make_separate_masks(tmp_path):
 def test_masks_of_what_is_to_be_filled(tmp_path):
     folder = write_capture(tmp_path / "s", "colmap", make_truth(RADIAL))
     (folder / "masks").rename(folder / "new")
-    asked = {"fill": "new", "train": ["v00", "v01", "v02", "v03"]}
-    scene, out = run_stages(folder, **asked)
+    settings = {"fill": "new", "train": ["v00", "v01", "v02", "v03"]}
+    scene, out = run_stages(folder, **settings)
     assert sorted(load_fill_masks(out)) == list(scene.train) and not load_raw_masks(out, scene.train)
-    params, files = raw_masks.Params(**asked), sorted(folder.rglob("*.*"))
+    params, files = raw_masks.Params(**settings), sorted(folder.rglob("*.*"))
     assert folder / "new/v02.png" in raw_masks_plan.scene_files(params, folder, files)
     (folder / "new/v02.png").unlink()
     with pytest.raises(BadInput, match="new: no mask for 1 of 4 training views, 'v02' for one"):
-        plan.preview(poses.Params(**asked), folder)
+        plan.preview(poses.Params(**settings), folder)
 
 
 def test_spin_nerf_with_a_missing_training_mask(tmp_path):
@@ -230,7 +230,7 @@ def test_spin_nerf_folders_are_named_in_a_line_each(tmp_path):
     assert lines["1"] == "4 training and 2 test views (published: 60 and 40); images_4 96x72, images 384x288 px"
     assert "lacks images_4/test_label (no test views" in lines["2"] and "images (full size" in lines["2"]
     assert lines["3"].startswith("cannot be run: lacks poses_bounds.npy") and "4 training" in lines["book"]
-    assert [name for name, said in lines.items() if said == "not there"] == ["4", "7", "9", "10", "12", "trash"]
+    assert [name for name, state in lines.items() if state == "not there"] == ["4", "7", "9", "10", "12", "trash"]
     run_stages(tmp_path / "book", longest=4 * WIDTH)  # the model stands for poses_bounds.npy
     assert image_size(tmp_path / "book_out/images/v00.png")[0] == 4 * WIDTH
     with pytest.raises(ValueError, match="no scenes of SPIn-NeRF"):
@@ -380,13 +380,13 @@ def test_what_the_scene_brings_comes_into_the_normalised_frame(tmp_path):
     means = torch.from_numpy(truth.points).float()
     gaussians = Gaussians(means, torch.ones(60, 4), torch.zeros(60, 3), torch.zeros(60), torch.zeros(60, 4, 3))
     save_ply(folder / "given.ply", gaussians)
-    given = yaml.safe_load(
+    settings = yaml.safe_load(
         """
         gaussians: given.ply
         region: {center: [50, 0, 0], size: [1, 2, 3]}
         """
     )
-    scene, out = run_stages(folder, **given)
+    scene, out = run_stages(folder, **settings)
     similarity = scene.similarity
     np.testing.assert_allclose(load_ply(out / "gaussians.ply").means, similarity.apply(truth.points), atol=1e-5)
     region = load_json(out / "region.json")
@@ -508,8 +508,8 @@ def test_statue_has_its_cameras_adjusted(tmp_path, monkeypatch):
     monkeypatch.setattr("reffusion.capture.refine.TRACKS", 4000)
     plain, _ = run_on_real_capture(tmp_path / "plain", "statue", longest=252)
     scene, out = run_on_real_capture(tmp_path / "adjusted", "statue", longest=252, refine=True)
-    said = load_json(out / "refine.json")
-    assert said["before"] > 0.15 and said["after"] < 0.6 * said["before"]
+    facts = load_json(out / "refine.json")
+    assert facts["before"] > 0.15 and facts["after"] < 0.6 * facts["before"]
     shifts = [scene.cameras[n].cy - plain.cameras[n].cy for n in scene.train]
     assert np.ptp(shifts) > 0.5 and scene.similarity.scale == plain.similarity.scale
     away = [np.linalg.norm(scene.cameras[n].center - plain.cameras[n].center) for n in scene.train]

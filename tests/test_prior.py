@@ -87,13 +87,13 @@ def test_a_folder_says_what_the_hole_shows(tiny_prior, tmp_path):
     assert torch.equal(diffusion.conditioning(tiny_prior, images, masks), expected)
     folder = tmp_path / "prior"
     shutil.copytree(TINY, folder)
-    said = folder / CONDITIONING
+    file = folder / CONDITIONING
     for text in ('{"hole": "grey"}', None):
-        said.write_text(text) if text else said.unlink()
+        file.write_text(text) if text else file.unlink()
         grey = diffusion.conditioning(load_prior(folder), images, masks)
         assert torch.equal(grey, torch.cat([masks, diffusion.encode(tiny_prior, images * (1 - masks))], 1))
     for text in ('{"hole": "blue"}', "{}", "[", "3"):
-        said.write_text(text)
+        file.write_text(text)
         with pytest.raises(ValueError, match=CONDITIONING):
             load_prior(folder)
 

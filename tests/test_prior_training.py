@@ -59,8 +59,8 @@ def test_timesteps_cover_the_schedule_in_every_batch():
     for seed in range(20):
         t = train.spread_timesteps(8, 1000, torch.Generator().manual_seed(seed))
         assert sorted((t // 125).tolist()) == list(range(8))
-    drawn = torch.cat([train.spread_timesteps(8, 1000, torch.Generator().manual_seed(k)) for k in range(500)])
-    assert drawn.min() < 10 and drawn.max() > 990
+    timesteps = torch.cat([train.spread_timesteps(8, 1000, torch.Generator().manual_seed(k)) for k in range(500)])
+    assert timesteps.min() < 10 and timesteps.max() > 990
 
 
 @pytest.fixture(scope="module")
@@ -136,9 +136,9 @@ def test_a_run_that_was_killed_and_resumed_equals_the_unbroken_one(train_command
 
 
 def test_start_begins_with_a_folders_weights(train_command):
-    given, after = load_weights(TINY), train_command("start", 1, "--start", str(TINY))
+    initial, after = load_weights(TINY), train_command("start", 1, "--start", str(TINY))
     fresh = train_command("anew", 1)
-    for part, tensors in given.items():
+    for part, tensors in initial.items():
         # The first step of the warm-up moves each weight by about its rate, 5e-6; half precision rounds to 1e-3 of it.
         moved = max(float((after[part][name] - value).abs().max()) for name, value in tensors.items())
         assert moved < 4e-3, part

@@ -289,7 +289,7 @@ def test_gpu_check_keeps_what_it_has(tmp_path, monkeypatch):
     """At a small size on the CPU, with a critic that runs out of memory: that part says so in a line; all others have
     their figures, against the oracle and in seconds; the file is whole after each part."""
 
-    def full(*given):
+    def full(*arguments):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate\n 20.00 GiB")
 
     written, write = [], gpu_check.write_atomically

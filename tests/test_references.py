@@ -144,11 +144,11 @@ def test_a_moved_reference_is_read_once_through_the_lens(tmp_path):
     assert inside.all() and np.abs(whole.astype(int) - still).max() <= 1
     depth = np.tile(np.linspace(1, 2, WIDTH), (HEIGHT, 1))
     np.save(tmp_path / "depth.npy", depth)
-    given = ReferenceFile("v", tmp_path / "whole.png", tmp_path / "depth.npy")
-    straight = undistort_reference_depth(given, shot, False)
+    file = ReferenceFile("v", tmp_path / "whole.png", tmp_path / "depth.npy")
+    straight = undistort_reference_depth(file, shot, False)
     where = lens.sampling_map(shot, lens.undistorted_pinhole(shot))
     np.testing.assert_allclose(straight, 1 + (where[..., 0] - 0.5) / (WIDTH - 1), atol=0.6 / WIDTH)
-    shifted = undistort_reference_depth(given, shot.pinhole, False, np.array([[1.0, 0, 4], [0, 1, 0]]))
+    shifted = undistort_reference_depth(file, shot.pinhole, False, np.array([[1.0, 0, 4], [0, 1, 0]]))
     np.testing.assert_allclose(shifted[:, :-4], depth[:, 4:], rtol=1e-6)
     assert np.isnan(shifted[:, -4:]).all()
 
@@ -287,16 +287,16 @@ UNPLACED = {
 @pytest.mark.parametrize(("name", "params", "painted", "message"), REFUSALS, ids=[r[0] for r in REFUSALS])
 def test_references_are_refused_by_what_poses_wrote(tmp_path, name, params, painted, message):
     folder = write_reference_capture(tmp_path / "s", painted)
-    asked = params.get("reference")
+    spec = params.get("reference")
     _, placed = run_stages(folder, **{key: value for key, value in params.items() if key != "reference"})
     for layout in ("images", "masks"):
         shutil.rmtree(folder / layout)  # nothing of the capture is looked at
     (folder / "transforms.json").unlink()
     with pytest.raises(ValueError, match=UNPLACED.get(name, message)):
-        plan_reference.preview(reference.Params(reference=asked), scene=folder, poses=placed)
+        plan_reference.preview(reference.Params(reference=spec), scene=folder, poses=placed)
     needs = {"scene": folder, "poses": placed, "fit": tmp_path, "masks": tmp_path}
     with pytest.raises(ValueError, match=UNPLACED.get(name, message)):
-        reference.run(reference.Params(reference=asked), tmp_path / "out", **needs)
+        reference.run(reference.Params(reference=spec), tmp_path / "out", **needs)
     assert not (tmp_path / "out").exists()
 
 
@@ -373,16 +373,16 @@ def test_pictures_to_paint_are_exported_and_paintings_are_read_back(wall_folders
     lines = [line.split() for line in (laid_out / "ranked.txt").read_text().splitlines() if line[0] != "#"]
     assert lines[0][0] == "1." and lines[0][2] == "100%" and len(lines) == 1, "one view sees all of so flat a hole"
     view = lines[0][1]
-    shown, mask = load_image(laid_out / f"{view}.png"), load_mask(laid_out / f"{view}_mask.png")
+    picture, mask = load_image(laid_out / f"{view}.png"), load_mask(laid_out / f"{view}_mask.png")
     photo, hidden = wall_scene.photo(wall_scene.CAMERAS[view]), wall_scene.true_mask(wall_scene.CAMERAS[view], 1.6)
     assert (
         np.array_equal(mask, wall_scene.true_unobserved(wall_scene.CAMERAS[view], 1.6))
-        and (shown[mask] == view_ranking.GREY).all()
+        and (picture[mask] == view_ranking.GREY).all()
     )
-    assert np.array_equal(shown[~hidden], photo[~hidden]) and psnr(shown, photo, hidden & ~mask) > 20
+    assert np.array_equal(picture[~hidden], photo[~hidden]) and psnr(picture, photo, hidden & ~mask) > 20
 
     shutil.copytree(laid_out, wall_folders["scene"] / "painted", ignore=shutil.ignore_patterns("*.txt"))
-    painted = np.where(mask[..., None], photo, shown)
+    painted = np.where(mask[..., None], photo, picture)
     save_image(wall_folders["scene"] / "painted" / f"{view}.png", painted)
     again = run_reference_stage(wall_folders, tmp_path / "again")
     assert list(again) == [view] and np.array_equal(again[view].image, painted)
@@ -431,9 +431,9 @@ def test_a_new_reference_reruns_nothing_before_its_stage(tmp_path):
     assert set(words().values()) == {"cached"}
 
     view = laid_out[0].split(".")[0].removesuffix("_mask")
-    shown, mask = (load_image(home / "to_paint" / f"{view}{end}.png") for end in ("", "_mask"))
+    picture, mask = (load_image(home / "to_paint" / f"{view}{end}.png") for end in ("", "_mask"))
     photo = wall_scene.photo(wall_scene.CAMERAS[view])
-    save_image(folder / "painted" / f"{view}.png", np.where(mask > 0, photo, shown))
+    save_image(folder / "painted" / f"{view}.png", np.where(mask > 0, photo, picture))
     assert only_the_reference_changed()
     run_scene(request, "reference")
     (found,) = load_references(home / "reference", load_scene(home / "poses"))
@@ -520,13 +520,13 @@ def test_objects_in_front_of_a_scene_are_compared_at_their_own_depth():
     scene = join_gaussians(wall, floor)
     references = []
     for view in (wall_scene.front_camera("a", -0.2), wall_scene.front_camera("b", 0.2)):
-        drawn = wall_scene.true_mask(view, near)
-        wide = geometry.unproject(np.full(drawn.shape, step), view)[..., 1] > 0.35
-        depth = np.where(drawn, near, np.where(wide, step, wall_scene.WALL))
+        mask = wall_scene.true_mask(view, near)
+        wide = geometry.unproject(np.full(mask.shape, step), view)[..., 1] > 0.35
+        depth = np.where(mask, near, np.where(wide, step, wall_scene.WALL))
         points = geometry.unproject(depth, view)
         stripe = np.where((points[..., :1] * 12).astype(int) % 2 == 0, [0.9, 0.1, 0.1], [0.1, 0.9, 0.1])
-        image = np.where(drawn[..., None], stripe, wall_scene.wall_color(points[..., 0], points[..., 1]))
-        references.append(Reference(view, np.round(255 * image).astype(np.uint8), drawn, 3 * depth))
+        image = np.where(mask[..., None], stripe, wall_scene.wall_color(points[..., 0], points[..., 1]))
+        references.append(Reference(view, np.round(255 * image).astype(np.uint8), mask, 3 * depth))
     cameras, nothing = [each.camera for each in references], np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
     hidden = {camera.name: nothing for camera in cameras}
     holes = view_ranking.find_holes(scene, cameras, hidden, {each.camera.name: each.mask for each in references})

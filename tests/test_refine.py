@@ -73,7 +73,7 @@ def test_exact_cameras_are_left_as_they_are():
 
 @pytest.mark.parametrize(("shift", "turn"), [(1.5, 0.0), (0.0, 0.2), (1.0, 0.15)])
 def test_perturbed_cameras_are_corrected(shift, turn):
-    given, found = perturb_cameras(shift, turn), refine_perturbed(shift, turn)
+    views, found = perturb_cameras(shift, turn), refine_perturbed(shift, turn)
     assert found.before > 2 * refine.GOOD_RESIDUAL and found.after < 0.12
     # where the pixels of the far and the near wall's points come to lie, against the truth
     points = np.random.default_rng(6).uniform((-0.3, -0.25, 0.6), (0.3, 0.25, 4.0), (400, 3))
@@ -83,15 +83,15 @@ def test_perturbed_cameras_are_corrected(shift, turn):
         errors = np.array([project_points(points, cameras[view.name]) - project_points(points, view) for view in EXACT])
         return float(np.abs(errors - errors.mean(0)).mean())
 
-    assert spread(found.cameras) < 0.35 * spread({view.name: view for view in given})
+    assert spread(found.cameras) < 0.35 * spread({view.name: view for view in views})
 
 
 def test_the_frame_stays_where_it_was():
     found = refine_perturbed(1.5, 0.0)
-    there = np.array([found.cameras[view.name].center for view in EXACT])
-    here = np.array([view.center for view in EXACT])
-    assert np.abs(there.mean(0) - here.mean(0)).max() < 1e-9
-    assert np.abs(there - here).max() < 0.1 * np.ptp(here, 0).max()
+    centers = np.array([found.cameras[view.name].center for view in EXACT])
+    exact = np.array([view.center for view in EXACT])
+    assert np.abs(centers.mean(0) - exact.mean(0)).max() < 1e-9
+    assert np.abs(centers - exact).max() < 0.1 * np.ptp(exact, 0).max()
 
 
 def test_a_view_that_shares_nothing_stays_and_hinders_nothing():
@@ -103,10 +103,10 @@ def test_a_view_that_shares_nothing_stays_and_hinders_nothing():
 
 
 def test_a_principal_point_beyond_reason_is_not_followed():
-    given = perturb_cameras(0.5, 0.0)
-    given[4] = replace(given[4], cx=given[4].cx + 0.1 * WIDTH)  # a crop that nobody told of
-    found = refine.refine_cameras(given, PHOTOS)
-    assert abs(found.cameras["v4"].cx - given[4].cx) < 1e-9
+    cameras = perturb_cameras(0.5, 0.0)
+    cameras[4] = replace(cameras[4], cx=cameras[4].cx + 0.1 * WIDTH)  # a crop that nobody told of
+    found = refine.refine_cameras(cameras, PHOTOS)
+    assert abs(found.cameras["v4"].cx - cameras[4].cx) < 1e-9
 
 
 def test_the_same_pictures_give_the_same_cameras():

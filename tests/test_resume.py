@@ -105,7 +105,7 @@ def test_one_byte_flipped_in_each_kind_of_file_is_noticed_and_named(mini_scene, 
         os.utime(path, ns=(then, then))
     capsys.readouterr()
     assert maintenance.verify(request) == len({stage for stage, _ in kinds}) == 9
-    said = {line.split(": ")[0].rpartition("/")[2]: line for line in capsys.readouterr().out.splitlines()}
+    messages = {line.split(": ")[0].rpartition("/")[2]: line for line in capsys.readouterr().out.splitlines()}
     for (stage, _), path in kinds.items():
-        assert path.relative_to(home / stage).as_posix() in said[stage] or " more changed" in said[stage]
+        assert path.relative_to(home / stage).as_posix() in messages[stage] or " more changed" in messages[stage]
     assert decide(resolve(request), "poses", {}).status == "run"

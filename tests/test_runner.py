@@ -96,10 +96,10 @@ def test_first_run_and_receipts(project):
 
 
 def test_fresh_plan(empty_project):
-    said = statuses(empty_project)
-    assert said["poses"] == said["fit"] == "run no artifact yet"
-    assert said["masks"].startswith("pending left out if the scene has no masks")
-    assert said["distill"].startswith("pending") and said["evaluate"].startswith("run")
+    states = statuses(empty_project)
+    assert states["poses"] == states["fit"] == "run no artifact yet"
+    assert states["masks"].startswith("pending left out if the scene has no masks")
+    assert states["distill"].startswith("pending") and states["evaluate"].startswith("run")
     job = resolve(make_request(empty_project))
     assert "reads one number" in plan_table(job, plan(job, ["poses"]))
     assert (
@@ -113,9 +113,9 @@ def test_a_second_call_runs_nothing(project, capsys):
 
 
 def test_parameter_reruns_its_stage_and_what_depends_on_it(project, capsys):
-    said = statuses(project, set="fit.iterations=5")
-    assert said["poses"] == "cached" and said["fit"] == "run param iterations 3 -> 5"
-    assert said["masks"].startswith("stale waits for fit") and said["evaluate"].startswith("stale")
+    states = statuses(project, set="fit.iterations=5")
+    assert states["poses"] == "cached" and states["fit"] == "run param iterations 3 -> 5"
+    assert states["masks"].startswith("stale waits for fit") and states["evaluate"].startswith("stale")
     assert statuses(project, set="fit.iterations=5 masks.threshold=99")["masks"] == "run param threshold 100 -> 99"
     assert run_project(capsys, project, set="fit.iterations=5") == ["fit", "masks", "distill", "evaluate"]
     assert read_score(project) == 14.0
@@ -216,16 +216,16 @@ def test_exported_files_outlive_their_artifact(project, capsys):
         (out / "drafts" / name).write_text(str(params.threshold))
     invent = """,
     )
-    given = lambda: {path.name: path.read_text() for path in (project / "runs/toy/drafts").iterdir()}
+    read_drafts = lambda: {path.name: path.read_text() for path in (project / "runs/toy/drafts").iterdir()}
     run_project(capsys, project, set="masks.threshold=102")
-    assert given() == {"a": "102", "b": "102"}
+    assert read_drafts() == {"a": "102", "b": "102"}
     (project / "runs/toy/drafts/a").write_text("drawn")
     (project / "runs/toy/drafts/mine").write_text("too")
     run_scene(make_request(project, set="masks.threshold=103"), "masks")
-    assert given() == {"a": "drawn", "b": "103", "c": "103", "mine": "too"}
+    assert read_drafts() == {"a": "drawn", "b": "103", "c": "103", "mine": "too"}
     assert "toy/drafts/a was changed by hand: kept" in capsys.readouterr().out
     run_project(capsys, project, set="masks.threshold=101")
-    assert given() == {"a": "drawn", "mine": "too"}
+    assert read_drafts() == {"a": "drawn", "mine": "too"}
 
 
 def test_code_edits(project, capsys):
@@ -287,8 +287,8 @@ def test_skipped_and_provided_stages(project, capsys):
     assert read_score(project) == 50.0
     write_files(project, {"data/toy/unmasked": ""})
     run_project(capsys, project)
-    said = statuses(project)
-    assert said["masks"] == "skip the scene has no masks" and said["distill"].startswith("skip")
+    states = statuses(project)
+    assert states["masks"] == "skip the scene has no masks" and states["distill"].startswith("skip")
 
 
 def test_the_scenes_own_file_stands_for_a_stage_only_while_its_parameter_allows(project, capsys):
@@ -354,9 +354,9 @@ def test_variants_share_what_they_do_not_change(project, capsys):
     folder = run_scene(same, "all")["evaluate"]
     (folder / "scene.ply").touch()
     results.show_results("evaluate", folder, same)
-    said = capsys.readouterr().out
-    assert "runs/toy/evaluate/: metrics.json" in said
-    assert "make scene=toy variant=same view    make scene=toy variant=same report" in said
+    output = capsys.readouterr().out
+    assert "runs/toy/evaluate/: metrics.json" in output
+    assert "make scene=toy variant=same view    make scene=toy variant=same report" in output
 
 
 # ----------------------------------------------------------------------------------------------- kills, locks, swaps
@@ -498,7 +498,7 @@ def test_clean(project, capsys):
     assert (project / "runs/toy").exists() and not (project / "runs/toy@strong").exists()
     maintenance.clean(make_request(project, scene=str(project / "data/toy")))
     assert not (project / "runs/toy").exists()
-    assert "removing" in (said := capsys.readouterr().out) and "runs/toy: distill, evaluate, fit, masks, poses" in said
+    assert "removing" in (log := capsys.readouterr().out) and "runs/toy: distill, evaluate, fit, masks, poses" in log
     maintenance.clean(make_request(project))
     assert "nothing was computed for toy" in capsys.readouterr().out
     run_scene(make_request(project), "fit")
@@ -533,8 +533,8 @@ def test_clean_and_a_rerun_leave_what_people_put_there(project, tmp_path, capsys
     maintenance.clean(make_request(project))
     assert "kept, as it was not made by the runner: " in capsys.readouterr().out
     home = project / "runs/toy"
-    left = {path.relative_to(home).as_posix() for path in home.rglob("*") if path.is_file()}
-    assert left == {"notes.txt", "report/x.txt", "fit/notes.txt", "to_paint/a.png", "poses/number.txt"}
+    remaining = {path.relative_to(home).as_posix() for path in home.rglob("*") if path.is_file()}
+    assert remaining == {"notes.txt", "report/x.txt", "fit/notes.txt", "to_paint/a.png", "poses/number.txt"}
     assert (tmp_path / "elsewhere/fit/gaussians.ply").read_text() == "4"
     assert run_project(capsys, project, "fit") == ["poses", "fit"]
     assert (home / "fit/notes.txt").exists() and (home / "kept/poses/number.txt").read_text() == "9"
@@ -597,20 +597,20 @@ def test_missing_weights_are_reported_before_any_work_and_fetched(empty_project,
     )
     with pytest.raises(Refused, match="acme/net is not here"):
         run_scene(make_request(empty_project), "all")
-    shown = capsys.readouterr().out
-    assert "toy (profile laptop: asked for)" in shown
-    assert "weights to fetch: 2.6 GB, by `make weights profile=laptop`" in shown
+    output = capsys.readouterr().out
+    assert "toy (profile laptop: asked for)" in output
+    assert "weights to fetch: 2.6 GB, by `make weights profile=laptop`" in output
     assert not (empty_project / "runs" / "toy" / "poses").exists()
 
-    asked = make_request(empty_project, scene="")
-    assert fetch_weights(asked, offline=True) == 1
-    shown = capsys.readouterr().out
-    assert "to fetch         2.6 GB  acme/net  (distill)" in shown and "5 kB  metric.pth" in shown
+    everything = make_request(empty_project, scene="")
+    assert fetch_weights(everything, offline=True) == 1
+    output = capsys.readouterr().out
+    assert "to fetch         2.6 GB  acme/net  (distill)" in output and "5 kB  metric.pth" in output
     (empty_project / "unreachable").touch()
-    assert fetch_weights(asked, offline=False) == 2
+    assert fetch_weights(everything, offline=False) == 2
     (empty_project / "unreachable").unlink()
-    assert fetch_weights(asked, offline=False) == 0 and (empty_project / "fetched.txt").exists()
-    assert fetch_weights(asked, offline=False) == 0
+    assert fetch_weights(everything, offline=False) == 0 and (empty_project / "fetched.txt").exists()
+    assert fetch_weights(everything, offline=False) == 0
     assert "to fetch: about 0 bytes" in capsys.readouterr().out
     assert not statuses(empty_project)["distill"].startswith("missing")
 
@@ -663,10 +663,10 @@ def test_groups_merge_layer_over_layer(empty_project):
     model = {"model": "weights"}
     assert resolve_params(empty_project)["sds"] == {"weight": 2.0, "lora": {"rank": 8, **model}}
     assert resolve_params(empty_project, variant="ranked")["sds"] == {"weight": 2.0, "lora": {"rank": 2, **model}}
-    said = resolve_params(
+    params = resolve_params(
         empty_project, variant="ranked", set="distill.sds.lora.rank=3 distill.sds.weight=4 distill.gain=2"
     )
-    assert said["sds"] == {"weight": 4.0, "lora": {"rank": 3, **model}} and said["gain"] == 2
+    assert params["sds"] == {"weight": 4.0, "lora": {"rank": 3, **model}} and params["gain"] == 2
     assert resolve_params(empty_project)["extra"] == {"view": "a", "depth": "b"}
     assert resolve_params(empty_project, set="distill.extra='{view: c}'")["extra"] == {
         "view": "c"
@@ -677,8 +677,8 @@ def test_groups_merge_layer_over_layer(empty_project):
 def test_nested_parameters_rerun_and_leave_out_by_their_dotted_names(empty_project, capsys):
     write_files(empty_project, NESTING)
     run_project(capsys, empty_project)
-    said = statuses(empty_project, set="distill.sds.lora.rank=9 distill.sds.weight=3")
-    assert said["distill"] == "run param sds.lora.rank 8 -> 9, param sds.weight 0.5 -> 3.0"
+    states = statuses(empty_project, set="distill.sds.lora.rank=9 distill.sds.weight=3")
+    assert states["distill"] == "run param sds.lora.rank 8 -> 9, param sds.weight 0.5 -> 3.0"
     assert statuses(empty_project, set="distill.sds.weight=0")["distill"] == "skip no gain"
     lost = statuses(empty_project, set="distill.sds.lora.model=./none")["distill"]
     assert lost.startswith("missing distill.sds.lora.model: no weights at ")
@@ -804,7 +804,7 @@ def test_a_run_that_does_not_fit_its_needs_is_refused_without_importing_it(empty
 def worker_starts(monkeypatch) -> list[str]:
     """The purpose of each process that is started to import stages."""
     started, start = [], process.start_worker
-    monkeypatch.setattr(process, "start_worker", lambda *given, **how: started.append(given[1]) or start(*given, **how))
+    monkeypatch.setattr(process, "start_worker", lambda *args, **how: started.append(args[1]) or start(*args, **how))
     return started
 
 

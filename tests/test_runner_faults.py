@@ -116,10 +116,10 @@ def test_killed_at_random_moments(short_project, what):
         assert read_score(short_project, "toy@strong") == 19.0
         runs = json.loads((short_project / "runs/toy/compare.json").read_text())["runs"]
         assert [run["state"] for run in runs] == ["done"] * 2
-    left = {
+    remaining = {
         path.name for home in (short_project / "runs").iterdir() for path in home.glob("*") if home.name != ".locks"
     }
-    assert not [name for name in left if name.startswith(".")] and "kept" not in left
+    assert not [name for name in remaining if name.startswith(".")] and "kept" not in remaining
 
 
 @contextmanager
@@ -141,8 +141,8 @@ def test_a_full_disk(short_project):
         for _ in range(SIZES):
             used = shutil.disk_usage(short_project / "runs").used // 1024
             remount(f"size={used + 4 * random.integers(1, 20)}k")
-            said = run_module("runner", *command, timeout=120)
-            assert said.returncode == 0 or "make room" in assert_one_line(said)
+            result = run_module("runner", *command, timeout=120)
+            assert result.returncode == 0 or "make room" in assert_one_line(result)
             assert_artifacts_complete(short_project / "runs")
             if SLOW and random.random() < 0.3:
                 shutil.rmtree(short_project / "runs/toy", ignore_errors=True)
@@ -191,9 +191,9 @@ def test_missing_and_changed_files_are_named_and_made_again(project, capsys):
     (project / "runs/toy/evaluate/metrics.json").unlink()
     (project / "runs/toy/masks/facts.json").unlink()
     flip_byte(project / "runs/toy/fit/gaussians.ply")
-    said = statuses(project)
-    assert said["fit"] == "run gaussians.ply changed since (keep=1 keeps it)" and said["poses"] == "cached"
-    assert said["masks"] == "run facts.json missing" and said["evaluate"] == "run metrics.json missing"
+    states = statuses(project)
+    assert states["fit"] == "run gaussians.ply changed since (keep=1 keeps it)" and states["poses"] == "cached"
+    assert states["masks"] == "run facts.json missing" and states["evaluate"] == "run metrics.json missing"
     flip_byte(project / "runs/toy/poses/masks/a.png")
     assert run_project(capsys, project) == [
         "poses",
@@ -213,9 +213,9 @@ def test_verify_hashes_everything(project, capsys):
         flip_byte(path, quietly=True)
         assert path.name == "facts.json" or set(statuses(project).values()) == {"cached"}  # by size and time
     assert maintenance.verify(make_request(project)) == len(files) + 1
-    said = capsys.readouterr().out
-    assert all(f"toy/{path.parent.name}: {path.name} changed" in said for path in files)
-    assert "data/toy/number.txt: its content changed, its size and time did not" in said and "keep=1" in said
+    output = capsys.readouterr().out
+    assert all(f"toy/{path.parent.name}: {path.name} changed" in output for path in files)
+    assert "data/toy/number.txt: its content changed, its size and time did not" in output and "keep=1" in output
     assert (
         statuses(project)["poses"].startswith("run need scene changed")
         and "gaussians.ply changed" in statuses(project)["fit"]
@@ -289,8 +289,8 @@ def test_pictures_outside_the_scene_count_and_are_listed(tmp_path):
         frame["file_path"] = f"../../pictures/{name}" if number else str(pictures / name)
     (scene / "transforms.json").write_text(json.dumps(record))
     job = lambda: resolve(Request(REPO, tmp_path / "runs", str(scene), "laptop"))
-    before = decide(asked := job(), "poses", {})
-    assert f"read outside the scene's folder: {pictures} (4 files)" in plan_table(asked, {"poses": before})
+    before = decide(resolved := job(), "poses", {})
+    assert f"read outside the scene's folder: {pictures} (4 files)" in plan_table(resolved, {"poses": before})
     shutil.copy(scene / "masks/v2.png", pictures / "v3.png")
     assert decide(job(), "poses", {}).inputs.key != before.inputs.key
 
@@ -379,8 +379,8 @@ def test_typed_names_are_never_run_as_commands(stub_environment, typed):
 
     assert made(f"scene={typed}", "plan") == f"plan|--scene={typed}|\n"
     names = ("variant", "runs", "profile", "budget", "set")
-    given = "|".join(f"--{name}={typed}" for name in names)
-    assert made("scene=x", *(f"{name}={typed}" for name in names), "all") == f"run|all|--scene=x|{given}|\n"
+    options = "|".join(f"--{name}={typed}" for name in names)
+    assert made("scene=x", *(f"{name}={typed}" for name in names), "all") == f"run|all|--scene=x|{options}|\n"
     assert f"--variants={typed}|--seeds={typed}|" in made("scene=x", f"variants={typed}", f"seeds={typed}", "compare")
     assert made("scene=x", f"port={typed}", "view") == f"view|--scene=x|--port={typed}|\n"
     assert made(f"data={typed}", "batch") == f"batch|--data={typed}|\n"

@@ -91,9 +91,9 @@ def test_the_sheet_shows_every_mask_over_its_photograph(tmp_path, wall_capture):
     save_json(tmp_path / "wall/raw_masks/warnings.json", ["the mask of a3 is odd"])
     path, lines = check.make(tmp_path / "wall")
     assert lines == ["the mask of a3 is odd"] and image_size(path)[0] > 3 * check.WIDTH
-    shown = check.overlay_masks(poses, tmp_path / "wall/raw_masks", "a3")
-    assert shown.shape[:2] == (180, 240)
-    assert (np.abs(shown.astype(int) - check.TINT).sum(-1) < 300).mean() > 0.5 * masks["a3"].mean()
+    overlay = check.overlay_masks(poses, tmp_path / "wall/raw_masks", "a3")
+    assert overlay.shape[:2] == (180, 240)
+    assert (np.abs(overlay.astype(int) - check.TINT).sum(-1) < 300).mean() > 0.5 * masks["a3"].mean()
 
 
 def test_check_says_how_structure_from_motion_went(tmp_path, monkeypatch, capsys):

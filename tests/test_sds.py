@@ -205,7 +205,7 @@ def test_small_views_are_enlarged_until_a_window_fits():
 
 
 def test_timesteps_reach_both_ends_of_their_range():
-    drawn = draw_timesteps(5000, 1000, 0.02, 0.98, generator(11))
-    assert (int(drawn.min()), int(drawn.max())) == (20, 979)
+    timesteps = draw_timesteps(5000, 1000, 0.02, 0.98, generator(11))
+    assert (int(timesteps.min()), int(timesteps.max())) == (20, 979)
     with pytest.raises(ValueError, match="range"):
         draw_timesteps(1, 1000, 0.5, 0.4, generator(0))

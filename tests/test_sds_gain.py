@@ -14,7 +14,7 @@ from reffusion.io.arrays import save_json
 from reffusion.params.distill import Params
 from reffusion.splat import rasterizer
 from reffusion.types import MaskSet
-from stages.plan import distill as told
+from stages.plan import distill as plan
 
 AT, TRAINED = 0.8, [CAMERAS[name] for name in TRAIN]
 
@@ -26,8 +26,8 @@ def wall_without_square():
     wall = scene.map(lambda p: p[~labels])
     hidden = {camera.name: true_mask(camera, AT) for camera in TRAINED}
     sets = {name: MaskSet(mask, mask, mask, mask) for name, mask in hidden.items()}
-    drawn = lambda camera: rasterizer.render(wall, camera).color.clamp(0, 1)
-    photos = {camera.name: (255 * drawn(camera)).round().to(torch.uint8).numpy() for camera in TRAINED}
+    render_color = lambda camera: rasterizer.render(wall, camera).color.clamp(0, 1)
+    photos = {camera.name: (255 * render_color(camera)).round().to(torch.uint8).numpy() for camera in TRAINED}
     return wall, sets, photos
 
 
@@ -67,15 +67,15 @@ def test_a_few_views_are_looked_at_and_without_any_it_may_gain(wall_without_squa
     wall, sets, photos = wall_without_square
     many = [replace(TRAINED[k % 5], name=f"v{k}") for k in range(3 * MAX_VIEWS)]
     repeated = {camera.name: TRAIN[k % 5] for k, camera in enumerate(many)}
-    looked = []
+    names = []
 
     class Photos(dict):
         def __getitem__(self, name):
-            looked.append(name)
+            names.append(name)
             return photos[repeated[name]]
 
     predict_gain(wall, many, {n: sets[o] for n, o in repeated.items()}, Photos(repeated))
-    assert len(looked) == MAX_VIEWS and looked[0] == "v0" and looked[-1] == many[-1].name
+    assert len(names) == MAX_VIEWS and names[0] == "v0" and names[-1] == many[-1].name
     assert predict_gain(wall, TRAINED, sets, {}).may_gain and predict_gain(wall, TRAINED, sets, {}).psnr_beside is None
 
 
@@ -84,13 +84,13 @@ def test_a_few_views_are_looked_at_and_without_any_it_may_gain(wall_without_squa
 )
 def test_distillation_reads_what_the_initialization_says(tmp_path, run, may, weight):
     save_json(tmp_path / "facts.json", {"sds_may_gain": may, "sds_reason": "too good at 40.0 dB"})
-    asked = with_changes(Params(), sds={"run": run, "weight": 1})
-    params, said = resolve_sds(asked, tmp_path)
-    assert params == with_changes(asked, sds={"weight": weight})
-    assert ("40.0 dB" in said) == (run == "auto") and ("left out" in said) == (weight == 0)
+    settings = with_changes(Params(), sds={"run": run, "weight": 1})
+    params, reason = resolve_sds(settings, tmp_path)
+    assert params == with_changes(settings, sds={"weight": weight})
+    assert ("40.0 dB" in reason) == (run == "auto") and ("left out" in reason) == (weight == 0)
 
 
 def test_a_prior_that_is_never_asked_need_not_be_there():
     nothing = with_changes(Params(), sds={"run": "never"}, depth={"weight": 0})
-    assert told.needed_weights(nothing, frozenset()) == []
-    assert told.needed_weights(with_changes(nothing, sds={"run": "auto"}), frozenset()) != []
+    assert plan.needed_weights(nothing, frozenset()) == []
+    assert plan.needed_weights(with_changes(nothing, sds={"run": "auto"}), frozenset()) != []

@@ -90,8 +90,8 @@ def test_a_walk_past_a_corner(tmp_path, capsys):
     assert (facts["placed"], facts["photographs"], facts["lenses"]) == (6, 7, 1)
     assert facts["points"] == len(scene.points) and 2 < facts["mean_track_length"] < 6
     assert 0.05 < facts["mean_residual_px"] < 0.6
-    said = capsys.readouterr().out
-    assert f"structure from motion: 6 of 7 photographs, 1 lens, {facts['points']:,} points in " in said
+    output = capsys.readouterr().out
+    assert f"structure from motion: 6 of 7 photographs, 1 lens, {facts['points']:,} points in " in output
     assert sorted(scene.cameras) == sorted(truth) == list(scene.train)
     assert_accepted(scene, truth)
     again, once_more = (
@@ -157,9 +157,9 @@ def test_which_views_share_a_lens(tmp_path):
         Image.new("L", size).save(tmp_path / name, exif=exif)
         return tmp_path / name
 
-    taken = {"a": (ACROSS, 28), "b": (ACROSS, 28), "c": (UPRIGHT, 28), "d": (ACROSS, 56), "e": (UPRIGHT, None)}
-    taken |= {"f": ((150, 150), 28), "g": (ACROSS, None)}
-    groups = sfm.group_by_lens({n: written(f"{n}.webp", *how) for n, how in taken.items()}, tmp_path)
+    photos = {"a": (ACROSS, 28), "b": (ACROSS, 28), "c": (UPRIGHT, 28), "d": (ACROSS, 56), "e": (UPRIGHT, None)}
+    photos |= {"f": ((150, 150), 28), "g": (ACROSS, None)}
+    groups = sfm.group_by_lens({n: written(f"{n}.webp", *how) for n, how in photos.items()}, tmp_path)
     assert [group for group, _ in groups] == [["f"], ["e", "g"], ["a", "b", "c"], ["d"]]
     film = 1.25 / 43.27  # of a 4:3 picture: the longer side over the diagonal, over the film's diagonal in mm
     assert [focal for _, focal in groups][1:] == [None, pytest.approx(28 * film, 1e-3), pytest.approx(56 * film, 1e-3)]
@@ -201,27 +201,27 @@ def test_demo_photos(tmp_path):
 @slow
 def test_bear(tmp_path):
     """A dozen neighbouring photographs against the poses they came with (which are COLMAP's own, from 96)."""
-    brought = load_capture(real_capture("bear"))
-    names = sorted(brought.pictures)[:24:2]
+    capture = load_capture(real_capture("bear"))
+    names = sorted(capture.pictures)[:24:2]
     (tmp_path / "s" / "images").mkdir(parents=True)
     for name in names:
-        shutil.copy(brought.pictures[name], tmp_path / "s" / "images")
+        shutil.copy(capture.pictures[name], tmp_path / "s" / "images")
     scene = run_poses(tmp_path / "s", tmp_path / "out", masks="none")
     assert sorted(scene.cameras) == names
-    assert_accepted(scene, {name: center_principal_ray(brought.poses, name) for name in names})
+    assert_accepted(scene, {name: center_principal_ray(capture.poses, name) for name in names})
 
 
-def center_principal_ray(given: Poses, name: str) -> np.ndarray:
+def center_principal_ray(source: Poses, name: str) -> np.ndarray:
     """The pose [4, 4] turned so that it looks along the ray through the middle of its picture.
 
     bear's pictures are crops, their principal point 17 px off the middle. Structure from motion keeps it in the
     middle and turns the camera by as much (1.8 degrees) instead, which the comparison must not count.
     """
-    lens = given.lenses[name]
+    lens = source.lenses[name]
     ray = np.array([(lens.width / 2 - lens.cx) / lens.fx, (lens.height / 2 - lens.cy) / lens.fy, 1.0])
     ray /= np.linalg.norm(ray)
     axis = np.cross(ray, [0.0, 0.0, 1.0])
     skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     turn = np.eye(4)
     turn[:3, :3] += skew + skew @ skew / (1 + ray[2])
-    return turn @ given.world_to_camera[name]
+    return turn @ source.world_to_camera[name]

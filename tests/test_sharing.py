@@ -26,8 +26,8 @@ def floor_depth(camera, z=0.0):
 
 
 def make_surface(camera, depth, pixels=None):
-    told = depth > 0
-    return ReferenceSurface(camera, depth, told if pixels is None else told & pixels)
+    known = depth > 0
+    return ReferenceSurface(camera, depth, known if pixels is None else known & pixels)
 
 
 def is_near_origin(camera, depth, radius):
@@ -41,9 +41,9 @@ def test_a_surface_is_drawn_by_the_view_that_shows_it_most_finely(order):
         make_surface(camera, floor_depth(camera), is_near_origin(camera, floor_depth(camera), 0.5))
         for camera in (FRONT, SIDE)
     ]
-    drawn = dict(zip(order, select_finest([views[k] for k in order]), strict=True))
-    assert (drawn[0] == views[0].pixels).mean() > 0.98
-    assert drawn[1].sum() < 0.1 * views[1].pixels.sum()  # a border, to a pixel
+    finest = dict(zip(order, select_finest([views[k] for k in order]), strict=True))
+    assert (finest[0] == views[0].pixels).mean() > 0.98
+    assert finest[1].sum() < 0.1 * views[1].pixels.sum()  # a border, to a pixel
 
 
 def test_of_two_equal_views_the_earlier_is_used():
@@ -55,10 +55,10 @@ def test_of_two_equal_views_the_earlier_is_used():
 def test_a_surface_of_one_view_stays_with_it():
     wide = make_surface(SIDE, floor_depth(SIDE), is_near_origin(SIDE, floor_depth(SIDE), 0.5))
     narrow = make_surface(FRONT, floor_depth(FRONT), is_near_origin(FRONT, floor_depth(FRONT), 0.2))
-    _, left = select_finest([narrow, wide])
+    _, remaining = select_finest([narrow, wide])
     away = is_near_origin(SIDE, floor_depth(SIDE), 0.25)
-    assert np.array_equal(left & ~away, wide.pixels & ~away)
-    assert left[is_near_origin(SIDE, floor_depth(SIDE), 0.15)].mean() < 0.05
+    assert np.array_equal(remaining & ~away, wide.pixels & ~away)
+    assert remaining[is_near_origin(SIDE, floor_depth(SIDE), 0.15)].mean() < 0.05
 
 
 def test_a_surface_is_dropped_where_another_view_sees_past_it():
@@ -66,17 +66,17 @@ def test_a_surface_is_dropped_where_another_view_sees_past_it():
     sheet = floor_depth(SIDE, z=0.2)
     hanging = is_near_origin(SIDE, sheet, 0.4)
     depth = np.where(hanging, sheet, floor_depth(SIDE))
-    drawn, _ = select_finest(
+    finest, _ = select_finest(
         [make_surface(SIDE, depth, hanging), make_surface(FRONT, floor_depth(FRONT), np.zeros((SIZE, SIZE), bool))]
     )
-    assert not drawn[hanging].any()
+    assert not finest[hanging].any()
 
 
 def test_without_depth_nothing_is_selected():
     empty = np.zeros((SIZE, SIZE))
     whole = make_surface(SIDE, floor_depth(SIDE))
-    drawn, nothing = select_finest([whole, ReferenceSurface(FRONT, empty, np.zeros((SIZE, SIZE), bool))])
-    assert np.array_equal(drawn, whole.pixels) and not nothing.any()
+    finest, nothing = select_finest([whole, ReferenceSurface(FRONT, empty, np.zeros((SIZE, SIZE), bool))])
+    assert np.array_equal(finest, whole.pixels) and not nothing.any()
     assert np.isinf(ReferenceSurface(FRONT, empty, whole.pixels).footprints).all()
 
 
@@ -90,8 +90,8 @@ def test_a_pixel_is_as_wide_as_its_slant_makes_it():
 def test_a_rim_that_looks_like_the_photograph_is_left():
     random = np.random.default_rng(0)
     photo = random.integers(0, 256, (40, 40, 3), np.uint8)
-    image, drawn, thing = photo.copy(), np.zeros((40, 40), bool), np.zeros((40, 40), bool)
-    drawn[8:32, 8:32] = thing[12:28, 12:28] = True
+    image, mask, thing = photo.copy(), np.zeros((40, 40), bool), np.zeros((40, 40), bool)
+    mask[8:32, 8:32] = thing[12:28, 12:28] = True
     image[thing] = (photo[thing].astype(int) + 128) % 256
     image[18:22, 18:22] = photo[18:22, 18:22]  # inside it is the thing's own colour by chance
-    assert np.array_equal(unchanged_rim(image, photo, drawn), drawn & ~thing)
+    assert np.array_equal(unchanged_rim(image, photo, mask), mask & ~thing)

@@ -32,8 +32,8 @@ def paint_lawn(path: bool = True) -> np.ndarray:
 
 
 def fill_and_mark(image: np.ndarray, seed: int = 0, **fields) -> tuple[np.ndarray, np.ndarray]:
-    shown = replace(without_geometry(image, HOLE), **fields)  # type: ignore[arg-type]
-    found = fill_from_photo(shown, HOLE, shown, seed=seed)
+    photo = replace(without_geometry(image, HOLE), **fields)  # type: ignore[arg-type]
+    found = fill_from_photo(photo, HOLE, photo, seed=seed)
     return found.image, found.filled
 
 

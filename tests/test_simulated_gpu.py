@@ -48,14 +48,14 @@ def run_on_cpu_and_gpu(tmp_path, work) -> list:
 
 def test_the_stand_in_refuses_what_cuda_refuses():
     with simulated_gpu():
-        here, there = torch.ones(3), torch.ones(3, device="cuda")
-        assert there.device.type == "cuda" and not here.is_cuda and (there + 1).is_cuda and there[here > 0].is_cuda
-        for mixed in (lambda: here + there, lambda: torch.where(here > 0, there, 0.0), lambda: here[there > 0]):
+        cpu, gpu = torch.ones(3), torch.ones(3, device="cuda")
+        assert gpu.device.type == "cuda" and not cpu.is_cuda and (gpu + 1).is_cuda and gpu[cpu > 0].is_cuda
+        for mixed in (lambda: cpu + gpu, lambda: torch.where(cpu > 0, gpu, 0.0), lambda: cpu[gpu > 0]):
             with pytest.raises(RuntimeError, match="same device"):
                 mixed()
         with pytest.raises(TypeError, match="numpy"):
-            there.numpy()
-        assert there.cpu().numpy().sum() == 3 and (there.to(here) + here).device.type == "cpu"
+            gpu.numpy()
+        assert gpu.cpu().numpy().sum() == 3 and (gpu.to(cpu) + cpu).device.type == "cpu"
 
 
 @pytest.mark.parametrize("vote", ["weight", "count"])
@@ -75,8 +75,8 @@ def test_a_region_on_a_gpu():
     gaussians, _ = wall_scene.wall_and_square(NEAR)
     box = regions.Region((0, 0, NEAR), (0.5, 0.5, 0.1))
     with simulated_gpu():
-        there = regions.inside_region(gaussians.map(lambda p: p.to("cuda")), box)
-        assert there.is_cuda and there.any() and torch.equal(there.cpu(), regions.inside_region(gaussians, box))
+        inside = regions.inside_region(gaussians.map(lambda p: p.to("cuda")), box)
+        assert inside.is_cuda and inside.any() and torch.equal(inside.cpu(), regions.inside_region(gaussians, box))
 
 
 @pytest.mark.parametrize(

@@ -62,9 +62,9 @@ def test_the_pipeline_leaves_diffusion_out_where_nothing_is_to_be_invented():
 
 def test_personalization_is_left_out_where_sds_cannot_gain_and_the_profile_asks():
     pipeline = yaml.safe_load((ROOT / "pipeline.yaml").read_text())
-    (asked,) = (c for c in pipeline["stages"]["personalize"]["skip_if"] if c.get("fact") == "initialize.sds_may_gain")
-    assert asked["equals"] is False and "{sds_reason}" in asked["reason"]
-    assert asked["only"] == {"distill.sds.run": "auto", "distill.depth.weight": 0}  # the depth term asks the prior too
+    (rule,) = (c for c in pipeline["stages"]["personalize"]["skip_if"] if c.get("fact") == "initialize.sds_may_gain")
+    assert rule["equals"] is False and "{sds_reason}" in rule["reason"]
+    assert rule["only"] == {"distill.sds.run": "auto", "distill.depth.weight": 0}  # the depth term asks the prior too
     runs = {name: profile["distill"].get("sds", {}).get("run") for name, profile in pipeline["profiles"].items()}
     assert runs == {"paper": None, "best": None, "laptop": "auto", "laptop-terms": "always", "paper-terms": None}
 

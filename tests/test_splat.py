@@ -51,7 +51,7 @@ def differentiate(gaussians, view, impl, dtype, channels=3, sh_degree=None):
     gaussians = gaussians.map(leaf)
     features, background = leaf(random(len(gaussians), channels)), leaf(torch.tensor([0.2, 0.3, 0.4]))
     probe = leaf(torch.zeros(len(gaussians), 2))
-    drawn = rasterizer.render(
+    rendering = rasterizer.render(
         gaussians,
         view,
         features=features,
@@ -60,9 +60,9 @@ def differentiate(gaussians, view, impl, dtype, channels=3, sh_degree=None):
         sh_degree=sh_degree,
         probe=probe,
     )
-    loss = sum((getattr(drawn, name) * random(*getattr(drawn, name).shape)).sum() for name in IMAGES)
+    loss = sum((getattr(rendering, name) * random(*getattr(rendering, name).shape)).sum() for name in IMAGES)
     leaves = (*(getattr(gaussians, name) for name in PARAMETERS), features, background, probe)
-    return drawn, dict(zip(BLOCKS, torch.autograd.grad(loss, leaves), strict=True))
+    return rendering, dict(zip(BLOCKS, torch.autograd.grad(loss, leaves), strict=True))
 
 
 def assert_close(actual, expected, relative, floor, what):
@@ -126,9 +126,9 @@ def test_a_sampled_view_draws_those_pixels_of_the_whole(antialiased):
         sampled = whole.sampled(3, left, top)
         exact = assert_matches_reference(gaussians, sampled)
         for name in ("color", "depth", "alpha"):
-            there = getattr(pixels, name)[top::3, left::3]
-            assert getattr(exact, name).shape == there.shape
-            assert (getattr(exact, name) - there).abs().max() < 1e-4, name
+            expected = getattr(pixels, name)[top::3, left::3]
+            assert getattr(exact, name).shape == expected.shape
+            assert (getattr(exact, name) - expected).abs().max() < 1e-4, name
 
 
 @pytest.mark.parametrize("footprint", [30.0, 300.0, 3000.0])
@@ -154,8 +154,8 @@ def test_antialiased_needles_and_sheets():
     needles = replace(gaussians, log_scales=torch.tensor([-1.0, -7.9, -7.9]).repeat(40, 1))
     assert (assert_matches_reference(needles, off_center_camera(64, 64), relative=1e-3).radii > 0).any()
     lines = replace(gaussians, log_scales=torch.tensor([-1.0, -500.0, -500.0]).repeat(40, 1))
-    drawn, gradients = differentiate(lines, off_center_camera(64, 64), "cpu", torch.float32)
-    assert (drawn.radii == 0).all() and all(torch.isfinite(g).all() for g in gradients.values())
+    rendering, gradients = differentiate(lines, off_center_camera(64, 64), "cpu", torch.float32)
+    assert (rendering.radii == 0).all() and all(torch.isfinite(g).all() for g in gradients.values())
 
 
 @pytest.mark.parametrize("impl", ["cpu", "torch"])
@@ -187,7 +187,7 @@ def test_reference_against_finite_differences(antialiased):
     features, weights = random(12, 3), [random(8, 9, 3), random(8, 9), random(8, 9), random(8, 9, 3)]
 
     def loss(changed: dict[str, torch.Tensor]) -> float:
-        drawn = rasterizer.render(
+        rendering = rasterizer.render(
             replace(gaussians, **{k: v for k, v in changed.items() if k in PARAMETERS}),
             view,
             features=changed.get("features", features),
@@ -195,7 +195,7 @@ def test_reference_against_finite_differences(antialiased):
             probe=changed.get("probe"),
             impl="torch",
         )
-        return sum((getattr(drawn, n) * w).sum().item() for n, w in zip(IMAGES, weights, strict=True))
+        return sum((getattr(rendering, n) * w).sum().item() for n, w in zip(IMAGES, weights, strict=True))
 
     base = {name: getattr(gaussians, name) for name in PARAMETERS} | {"features": features}
     base |= {"background": torch.tensor([0.2, 0.3, 0.4]).double(), "probe": torch.zeros(12, 2).double()}
@@ -216,7 +216,7 @@ def test_probe_is_the_gradient_of_the_2d_mean():
 
     def loss(shift: float) -> float:
         probe = torch.tensor([[shift, 0.0]]).double().repeat(60, 1)
-        drawn = rasterizer.render(
+        rendering = rasterizer.render(
             gaussians.map(torch.Tensor.double),
             view,
             features=features,
@@ -224,7 +224,7 @@ def test_probe_is_the_gradient_of_the_2d_mean():
             probe=probe,
             impl="torch",
         )
-        return sum((getattr(drawn, n) * w).sum().item() for n, w in zip(IMAGES, weights, strict=True))
+        return sum((getattr(rendering, n) * w).sum().item() for n, w in zip(IMAGES, weights, strict=True))
 
     slope = (loss(1e-6) - loss(-1e-6)) / 2e-6
     assert gradients["probe"][:, 0].sum().item() == pytest.approx(slope, rel=1e-3)
@@ -236,8 +236,8 @@ def test_same_bits_for_any_number_of_threads():
     try:
         for threads in (1, 2, 5):
             torch.set_num_threads(threads)
-            drawn, gradients = differentiate(gaussians, view, "cpu", torch.float32)
-            results.append([*drawn, *gradients.values(), rasterizer.accumulate(gaussians, view, values)])
+            rendering, gradients = differentiate(gaussians, view, "cpu", torch.float32)
+            results.append([*rendering, *gradients.values(), rasterizer.accumulate(gaussians, view, values)])
     finally:
         torch.set_num_threads(before)
     for other in results[1:]:
@@ -253,8 +253,8 @@ def test_footprints_over_many_tiles():
 def test_results_outlive_later_calls():
     """Large arrays are made in memory of earlier calls, but only where nobody holds it any more."""
     view = off_center_camera(160, 150)
-    drawn, gradients = differentiate(random_cloud(2000, -3.0), view, "cpu", torch.float32)
-    kept = [*drawn, *gradients.values()]
+    rendering, gradients = differentiate(random_cloud(2000, -3.0), view, "cpu", torch.float32)
+    kept = [*rendering, *gradients.values()]
     copies = [tensor.clone() for tensor in kept]
     for seed in (1, 2):
         differentiate(random_cloud(2000, -3.0, seed=seed), view, "cpu", torch.float32)
@@ -277,16 +277,16 @@ def test_zero_quaternion_is_the_identity():
     zero = replace(gaussians, quaternions=torch.zeros(30, 4))
     identity = replace(gaussians, quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(30, 1))
     for impl in ("cpu", "torch"):
-        drawn = [rasterizer.render(g, off_center_camera(20, 20), impl=impl).color for g in (zero, identity)]
-        assert torch.equal(*drawn)
+        images = [rasterizer.render(g, off_center_camera(20, 20), impl=impl).color for g in (zero, identity)]
+        assert torch.equal(*images)
     assert_matches_reference(zero, off_center_camera(20, 20))
 
 
 def test_order_and_length_of_quaternions_do_not_matter_to_values():
     gaussians = random_cloud(30, -2.0)
     longer = replace(gaussians, quaternions=gaussians.quaternions * 1e-18)
-    drawn = [rasterizer.render(g, off_center_camera(20, 20)).color for g in (gaussians, longer)]
-    assert_close(*drawn, 1e-5, 0, "quaternion length")
+    images = [rasterizer.render(g, off_center_camera(20, 20)).color for g in (gaussians, longer)]
+    assert_close(*images, 1e-5, 0, "quaternion length")
 
 
 def extreme_gaussians() -> Gaussians:
@@ -310,13 +310,13 @@ def extreme_gaussians() -> Gaussians:
 
 
 def test_extremes_stay_finite():
-    drawn, gradients = differentiate(extreme_gaussians(), off_center_camera(20, 20), "cpu", torch.float32)
+    rendering, gradients = differentiate(extreme_gaussians(), off_center_camera(20, 20), "cpu", torch.float32)
     for name in IMAGES:
-        assert torch.isfinite(getattr(drawn, name)).all(), name
+        assert torch.isfinite(getattr(rendering, name)).all(), name
     for name, gradient in gradients.items():
         assert torch.isfinite(gradient).all(), name
-    assert drawn.radii[[0, 1, 2, 4, 8]].tolist() == [0] * 5
-    assert drawn.radii[9] > 0
+    assert rendering.radii[[0, 1, 2, 4, 8]].tolist() == [0] * 5
+    assert rendering.radii[9] > 0
 
 
 @pytest.mark.parametrize("impl", ["cpu", "torch"])
@@ -326,11 +326,11 @@ def test_nothing_to_draw(impl):
     behind = replace(random_cloud(4, -2.0), means=torch.tensor(view.center * 2, dtype=torch.float32).repeat(4, 1))
     for gaussians in (behind, random_cloud(0, -2.0)):
         features = torch.ones(len(gaussians), 2, requires_grad=True)
-        drawn = rasterizer.render(gaussians, view, features=features, background=background, impl=impl)
-        assert torch.equal(drawn.color, background.expand(3, 5, 3))
-        assert not drawn.depth.any() and not drawn.alpha.any() and not drawn.radii.any()
-        assert drawn.features.shape == (3, 5, 2) and not drawn.features.any()
-        (drawn.features.sum() + drawn.depth.sum()).backward()
+        rendering = rasterizer.render(gaussians, view, features=features, background=background, impl=impl)
+        assert torch.equal(rendering.color, background.expand(3, 5, 3))
+        assert not rendering.depth.any() and not rendering.alpha.any() and not rendering.radii.any()
+        assert rendering.features.shape == (3, 5, 2) and not rendering.features.any()
+        (rendering.features.sum() + rendering.depth.sum()).backward()
         assert features.grad is None or not features.grad.any()
         assert not rasterizer.accumulate(gaussians, view, torch.ones(3, 5, 1), impl=impl).any()
 
@@ -375,8 +375,8 @@ def test_counts_are_whole_numbers_of_blended_pixels():
 
 
 def test_rendering_without_gradients_keeps_nothing():
-    drawn = rasterizer.render(random_cloud(10, -2.0), off_center_camera(9, 9))
-    assert not drawn.color.requires_grad and drawn.color.grad_fn is None
+    rendering = rasterizer.render(random_cloud(10, -2.0), off_center_camera(9, 9))
+    assert not rendering.color.requires_grad and rendering.color.grad_fn is None
 
 
 def test_background_and_alpha_agree():
@@ -432,12 +432,12 @@ def test_bad_gaussians_are_named():
 def test_cuda_equals_reference(antialiased):
     gaussians = replace(random_cloud(300, -3.2), opacity_logits=torch.linspace(-5, 4, 300))
     gaussians = replace(gaussians, antialiased=antialiased)
-    view, there = off_center_camera(61, 47), gaussians.map(torch.Tensor.cuda)
+    view, on_gpu = off_center_camera(61, 47), gaussians.map(torch.Tensor.cuda)
     exact = rasterizer.render(gaussians.map(torch.Tensor.double), view, impl="torch")
-    drawn = rasterizer.render(there, view)
+    rendering = rasterizer.render(on_gpu, view)
     for name in ("color", "depth", "alpha"):
-        assert_close(getattr(drawn, name).cpu(), getattr(exact, name), 1e-4, 0, name)
+        assert_close(getattr(rendering, name).cpu(), getattr(exact, name), 1e-4, 0, name)
     for count in (False, True):
         values = torch.rand(47, 61, 2)
-        gathered = rasterizer.accumulate(there, view, values.cuda(), count=count)
+        gathered = rasterizer.accumulate(on_gpu, view, values.cuda(), count=count)
         assert_close(gathered.cpu(), rasterizer.accumulate(gaussians, view, values, count=count), 1e-3, 0, count)

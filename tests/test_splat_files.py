@@ -262,9 +262,9 @@ def test_rows_dropped_leave_what_was_deleted_consistent(tmp_path, recwarn):
     table["x"][3999] = np.inf
     table["opacity"][:1] = np.inf
     write_rows(folder / "scene.ply", table)
-    left = read_rows(folder / "cleaned.ply")
-    padding = np.zeros(1500, left.dtype)  # more rows than were deleted
-    write_rows(folder / "cleaned.ply", np.concatenate([left, padding]))
+    rest = read_rows(folder / "cleaned.ply")
+    padding = np.zeros(1500, rest.dtype)  # more rows than were deleted
+    write_rows(folder / "cleaned.ply", np.concatenate([rest, padding]))
     (out := tmp_path / "out").mkdir()
     params = poses.Params(gaussians="scene.ply", cleaned="cleaned.ply", masks="none")
     planned.preview(params, folder)
@@ -272,11 +272,11 @@ def test_rows_dropped_leave_what_was_deleted_consistent(tmp_path, recwarn):
     kept = np.delete(np.arange(len(whole)), [1, 2000, 3999])
     np.testing.assert_array_equal(load_labels(out / "deleted.npy").numpy(), deleted[kept])
     assert len(load_ply(out / "gaussians.ply")) == 3997
-    said = json.loads((out / "warnings.json").read_text())
-    assert said[0] == ("scene.ply: 3 of 4000 splats are dropped: 3 with NaN or infinite values; 1 infinite opacities "
-                       "are clamped to finite values that look the same")  # fmt: skip
-    rows = len(left) + 1500
-    assert said[1] == f"cleaned.ply: 1500 of {rows} splats are dropped: 1500 of zeros only (padding)"
+    lines = json.loads((out / "warnings.json").read_text())
+    assert lines[0] == ("scene.ply: 3 of 4000 splats are dropped: 3 with NaN or infinite values; 1 infinite opacities "
+                        "are clamped to finite values that look the same")  # fmt: skip
+    rows = len(rest) + 1500
+    assert lines[1] == f"cleaned.ply: 1500 of {rows} splats are dropped: 1500 of zeros only (padding)"
 
 
 @pytest.mark.parametrize("ending", ["splat", "spz"])
@@ -285,8 +285,8 @@ def test_what_was_deleted_is_found_in_quantised_files(tmp_path, ending, capsys):
         pytest.importorskip("gsply")
     folder = tmp_path / "s"
     _, deleted = write_edited_capture(folder)
-    left = load_splats(folder / "cleaned.ply").rows
-    (save_splat if ending == "splat" else save_spz)(folder / f"cleaned.{ending}", left)
+    rest = load_splats(folder / "cleaned.ply").rows
+    (save_splat if ending == "splat" else save_spz)(folder / f"cleaned.{ending}", rest)
     (out := tmp_path / "out").mkdir()
     poses.run(poses.Params(gaussians="scene.ply", cleaned=f"cleaned.{ending}", masks="none"), out, scene=folder)
     assert np.count_nonzero(load_labels(out / "deleted.npy").numpy() != deleted) <= 2

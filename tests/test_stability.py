@@ -33,9 +33,9 @@ def test_case(name):
 
 @pytest.mark.parametrize("case", random_scenes.CASES, ids=lambda case: case.name)
 def test_a_tenth_of_the_random_scenes(case):
-    *given, count = case.measure.args
+    *arguments, count = case.measure.args
     assert count == 10 * SCENES
-    assert case.measure.func(*given, SCENES) <= case.bound
+    assert case.measure.func(*arguments, SCENES) <= case.bound
 
 
 def test_names_are_unique():

@@ -26,9 +26,9 @@ CAMERAS = [
 
 def make_matches(places_there, here, seen=None) -> stereo.Matches:
     """Matches of view a with the other views."""
-    there = np.array(places_there)
+    places = np.array(places_there)
     names = tuple(view.name for view in CAMERAS[1:])
-    return stereo.Matches("a", here, names, there, np.ones(there.shape[:2], bool) if seen is None else seen)
+    return stereo.Matches("a", here, names, places, np.ones(places.shape[:2], bool) if seen is None else seen)
 
 
 BY_NAME = {view.name: view for view in CAMERAS}
@@ -50,9 +50,9 @@ def test_exact_matches_give_exact_depths():
 
 def test_a_wrong_match_in_one_view_does_not_matter():
     points, others = random_points(), CAMERAS[1:]
-    there = [project_points(points, o) for o in others]
-    there[1] = there[1] + (25.0, -14.0)
-    depth, known = stereo.triangulate(make_matches(there, project_points(points, CAMERAS[0])), BY_NAME)
+    places = [project_points(points, o) for o in others]
+    places[1] = places[1] + (25.0, -14.0)
+    depth, known = stereo.triangulate(make_matches(places, project_points(points, CAMERAS[0])), BY_NAME)
     assert known.mean() > 0.8
     assert (np.abs(depth / (points[:, 2] + 1) - 1) < 1e-3)[known].mean() > 0.97
 
@@ -79,15 +79,15 @@ def test_without_parallax_a_point_is_far_and_one_that_would_be_behind_is_none():
 
 def paint_slope(slope: float) -> dict[str, np.ndarray]:
     """Views of the plane z = 1 + slope x, painted with noise of several sizes."""
-    rng, drawn = np.random.default_rng(3), {}
+    rng, pictures = np.random.default_rng(3), {}
     waves = rng.normal(0, 14, (60, 2)), rng.uniform(0, 6.3, (60, 3))
     for view in CAMERAS:
         rays = world_rays(view)
         reach = (1 + slope * view.center[0] - view.center[2]) / (rays[..., 2] - slope * rays[..., 0])
         at = view.center + rays * reach[..., None]
         field = np.sin((at[..., :2] @ waves[0].T)[..., None] + waves[1]).sum(2) / 60**0.5
-        drawn[view.name] = (127 + 70 * field).clip(0, 255).astype(np.uint8)
-    return drawn
+        pictures[view.name] = (127 + 70 * field).clip(0, 255).astype(np.uint8)
+    return pictures
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.5])
@@ -102,14 +102,14 @@ def test_a_painted_plane_comes_back(slope):
 
 def test_views_of_several_sizes_and_lenses_match(slope=0.3):
     """One at 0.6 of the size, one cropped to a portrait, one larger."""
-    shown, cameras = paint_slope(slope), []
+    pictures, cameras = paint_slope(slope), []
     for view, factor, left in zip(CAMERAS, (1.0, 0.6, 1.0, 1.5), (0, 0, 30, 0), strict=True):
         size = round((WIDTH - 2 * left) * factor), round(HEIGHT * factor)
-        cut = np.ascontiguousarray(shown[view.name][:, left : WIDTH - left])
-        shown[view.name] = resize_image(cut, size)
+        cut = np.ascontiguousarray(pictures[view.name][:, left : WIDTH - left])
+        pictures[view.name] = resize_image(cut, size)
         focal, middle = FOCAL * factor, ((WIDTH / 2 - left) * factor, HEIGHT / 2 * factor)
         cameras.append(Camera(view.name, *size, focal, focal, *middle, view.world_to_camera))
-    points, _ = stereo.triangulate_points(cameras, shown, 3)
+    points, _ = stereo.triangulate_points(cameras, pictures, 3)
     assert len(points) > 0.6 * WIDTH * HEIGHT / 9
     away = np.abs(points[:, 2] - 1 - slope * points[:, 0]) / 2
     assert np.median(away) < 0.01 and np.quantile(away, 0.95) < 0.05
@@ -121,10 +121,10 @@ def test_plain_pictures_give_nothing():
 
 
 def test_lonely_views_and_opposite_ones_give_nothing():
-    shown = paint_slope(0.0)
-    assert len(stereo.triangulate_points(CAMERAS[:1], shown, 3)[0]) == 0
+    pictures = paint_slope(0.0)
+    assert len(stereo.triangulate_points(CAMERAS[:1], pictures, 3)[0]) == 0
     opposite = [CAMERAS[0], rig_camera("b", 0.1, turn=np.pi)]
-    assert len(stereo.triangulate_points(opposite, shown, 3)[0]) == 0
+    assert len(stereo.triangulate_points(opposite, pictures, 3)[0]) == 0
 
 
 def test_the_same_pictures_give_the_same_points():

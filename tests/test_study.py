@@ -152,10 +152,10 @@ def simulate_votes(participants: int, truth: float, seed: int, spread: float = 0
     for number in range(participants):
         bad = number % 10 == 9
         own = 0.0 if bad else np.clip(truth + spread * draws.uniform(-1, 1), 0, 1)
-        said = [{"trial": "c", "overall": "bad" if bad else "good"}]
+        trials = [{"trial": "c", "overall": "bad" if bad else "good"}]
         for name, pair in pairs.items():
-            said.append({"trial": name, "overall": pair["full"] if draws.random() < own else "theirs"})
-        answers.append({"study": "s", "participant": str(number), "answers": said})
+            trials.append({"trial": name, "overall": pair["full"] if draws.random() < own else "theirs"})
+        answers.append({"study": "s", "participant": str(number), "answers": trials})
     return answers, key
 
 
@@ -170,11 +170,11 @@ def test_a_known_preference_is_given_back_within_the_interval():
 
 def test_the_interval_holds_the_truth_as_often_as_it_says(monkeypatch):
     monkeypatch.setattr(votes, "RESAMPLES", 600)
-    held = 0
+    hits = 0
     for seed in range(150):
         (found,), _ = votes.count_votes(*simulate_votes(30, 0.65, seed))
-        held += found.low <= 0.65 <= found.high
-    assert 0.88 <= held / 150 <= 0.99
+        hits += found.low <= 0.65 <= found.high
+    assert 0.88 <= hits / 150 <= 0.99
 
 
 def test_all_agree_and_what_is_refused():

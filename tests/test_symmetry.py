@@ -44,8 +44,8 @@ def intersect_vase(rays: np.ndarray, center: np.ndarray, cut: bool) -> np.ndarra
         slant, end = np.array([1.0, 0.0, 0.7]), WIDE
         side, lid = (np.where(at(t) @ slant > end, np.inf, t) for t in (side, lid))
         face = (end - center @ slant) / (rays @ slant)
-        shown = (face > 0) & inside(at(face)) & (at(face)[..., 2] > 0) & (at(face)[..., 2] < HIGH)
-        side = np.minimum(side, np.where(shown, face, np.inf))
+        visible = (face > 0) & inside(at(face)) & (at(face)[..., 2] > 0) & (at(face)[..., 2] < HIGH)
+        side = np.minimum(side, np.where(visible, face, np.inf))
     return np.minimum(side, lid)
 
 
@@ -113,9 +113,9 @@ def test_the_half_that_the_box_hides_stands_where_it_is(vase_mirrors):
         behind_box = cv2.erode((hidden & vase).astype(np.uint8), np.ones((7, 7))) > 0
         if behind_box.sum() < 100:
             continue
-        told = np.isfinite(found) & behind_box
-        assert told.sum() > 0.5 * behind_box.sum()
-        assert np.median(np.abs(found / true - 1)[told]) < 0.01
+        known = np.isfinite(found) & behind_box
+        assert known.sum() > 0.5 * behind_box.sum()
+        assert np.median(np.abs(found / true - 1)[known]) < 0.01
         wrong = np.isfinite(found) & ~(cv2.dilate(vase.astype(np.uint8), np.ones((9, 9))) > 0)
         assert wrong.sum() < 0.02 * behind_box.sum()
 

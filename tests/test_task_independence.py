@@ -11,9 +11,9 @@ TASKS = re.compile(r"outpaint|insertion|sparse.views", re.IGNORECASE)
 def code_words(path: Path) -> set[str]:
     """Names and strings of a file's code, without docstrings."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    said = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)}
+    docstrings = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)}
     strings = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str)
-               and id(n) not in said}  # fmt: skip
+               and id(n) not in docstrings}  # fmt: skip
     names = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}
     names |= {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
     return strings | names | {n.arg for n in ast.walk(tree) if isinstance(n, ast.arg)}

@@ -213,10 +213,10 @@ def test_a_stage_gives_the_same_after_a_kill(initialized_folders, tmp_path, monk
     whole = run_stage(stage, initialized_folders, tmp_path / "whole", **often)
     real, moment = getattr(module, name), trace_lines(whole)[-1]["iteration"] // 2
 
-    def killing(*given):
-        if given[position] == moment:
+    def killing(*arguments):
+        if arguments[position] == moment:
             raise KeyboardInterrupt
-        return real(*given)
+        return real(*arguments)
 
     monkeypatch.setattr(module, name, killing)
     with pytest.raises(KeyboardInterrupt):
@@ -271,8 +271,8 @@ def test_steps_that_fit_are_counted_once(tmp_path):
         rows = [{"seconds": s, "iteration": i} for i, s in enumerate(seconds)]
         (folder / "trace.jsonl").write_text("\n".join(map(json.dumps, rows)))
 
-    count = lambda name, asked, seconds, spent: trace.steps_within_budget(
-        tmp_path / name, asked, seconds, lambda: spent, trial
+    count = lambda name, total, seconds, spent: trace.steps_within_budget(
+        tmp_path / name, total, seconds, lambda: spent, trial
     )
     assert count("a", 100, 0, 5.0) == 100 and not tried, "no budget, nothing measured"
     assert count("b", 100, 30.0, 10.0) == 40
@@ -291,10 +291,10 @@ def test_a_budget_shortens_a_stage_and_its_schedule(initialized_folders, tmp_pat
     out = run_stage(stage, initialized_folders, tmp_path / "short", seconds=1e-3)
     assert trace_lines(out)[-1]["iteration"] == steps
     assert json.loads((out / trace.LENGTH).read_text())["steps"] == steps
-    asked = run_stage(
+    expected = run_stage(
         stage, initialized_folders, tmp_path / "asked", **{"steps" if stage == "personalize" else "iterations": steps}
     )
-    assert has_same_result(out, asked)
+    assert has_same_result(out, expected)
 
 
 @pytest.mark.parametrize(

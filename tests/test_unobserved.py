@@ -67,11 +67,11 @@ def table_views():
 
 def test_a_point_is_seen_on_its_surface_only(table_views):
     points = np.array([[0.7, 0.7, 0.0], [0.7, 0.7, 0.4], [0.7, 0.7, -0.5], [0.0, 0.0, 0.25], [0.0, 0.0, 0.0]])
-    said = count_views(points, table_views)
-    assert said.seen[0] >= 6 and said.free[0] == 0, "the table's top"
-    assert said.free[1] >= 6 and said.seen[1] == 0, "the air above it"
-    assert said.seen[2] == 0 and said.free[2] >= 2, "under the table low views look through"
-    assert said.seen[3] == said.free[3] == 0 and said.masked[3] == len(table_views), "within the box nobody knows"
+    counts = count_views(points, table_views)
+    assert counts.seen[0] >= 6 and counts.free[0] == 0, "the table's top"
+    assert counts.free[1] >= 6 and counts.seen[1] == 0, "the air above it"
+    assert counts.seen[2] == 0 and counts.free[2] >= 2, "under the table low views look through"
+    assert counts.seen[3] == counts.free[3] == 0 and counts.masked[3] == len(table_views), "within the box nobody knows"
     above = count_views(points, table_views, np.tile([0.0, 0.0, 1.0], (5, 1)))
     assert above.seen[4] == 0 and above.free[4] == 0, "nor, from above, what it stands on"
 
@@ -166,7 +166,7 @@ def test_gaussians_beneath_the_table_are_not_the_surface_behind_the_box(table_vi
     rays = world_rays(camera)
     beneath = np.clip((-0.2 - camera.center[2]) / np.minimum(rays[..., 2], -1e-3), 0, 20)
     grey = np.full((SIZE, SIZE, 3), 128, np.uint8)
-    left = surface_gaussians(grey, beneath, np.ones((SIZE, SIZE), bool), camera, sh_count=1, spread=0.6)
+    floaters = surface_gaussians(grey, beneath, np.ones((SIZE, SIZE), bool), camera, sh_count=1, spread=0.6)
     hidden = render_table(camera)[1] & render_table(camera)[2]
 
     def shows_it(view):
@@ -176,12 +176,12 @@ def test_gaussians_beneath_the_table_are_not_the_surface_behind_the_box(table_vi
 
     above = table_views[:12]
     others = count_views(geometry.unproject(beneath, camera)[hidden], above[4:]).occluded
-    asked = np.zeros_like(hidden)
-    asked[hidden] = others > 3
-    one = find_unobserved(left, camera, hidden, [shows_it(above[3]), *above[4:]], [])
-    all_of_them = find_unobserved(left, camera, hidden, [*map(shows_it, above)], [])
-    assert asked.sum() > 100
-    assert one.unobserved[asked].mean() > 0.75 and all_of_them.unobserved[asked].mean() < 0.1
+    region = np.zeros_like(hidden)
+    region[hidden] = others > 3
+    one = find_unobserved(floaters, camera, hidden, [shows_it(above[3]), *above[4:]], [])
+    all_of_them = find_unobserved(floaters, camera, hidden, [*map(shows_it, above)], [])
+    assert region.sum() > 100
+    assert one.unobserved[region].mean() > 0.75 and all_of_them.unobserved[region].mean() < 0.1
 
 
 def test_objects_in_front_of_a_plane_do_not_refute_it():
@@ -237,12 +237,12 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(table_vi
     found = shadows.detect_shadows(truth, photo, hidden)
     assert (found & shadow).sum() > 0.9 * (shadow & ~view.masked).sum() and not found[5:25, 5:25].any()
     assert not shadows.detect_shadows(truth, truth, hidden).any()
-    there = geometry.unproject(render_table(other.camera)[0], other.camera)
-    same = render_table(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.25) & ~other.masked
+    points = geometry.unproject(render_table(other.camera)[0], other.camera)
+    same = render_table(other.camera)[2] & (np.hypot(points[..., 0] - 0.5, points[..., 1] - 0.5) < 0.25) & ~other.masked
     carried, light = shadows.project_shadow(found, shadows.log_light(truth, photo), depth, view.camera, [other])["a1"]
     assert carried[same].mean() > 0.9 and not carried[~render_table(other.camera)[2]].mean() > 0.02
     lit = np.clip(np.full((SIZE, SIZE, 3), 140) + np.random.default_rng(1).integers(-12, 13, (SIZE, SIZE, 1)), 0, 255)
-    core = render_table(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.2) & ~other.masked
+    core = render_table(other.camera)[2] & (np.hypot(points[..., 0] - 0.5, points[..., 1] - 0.5) < 0.2) & ~other.masked
     again = shadows.relight((lit * 0.6).astype(np.uint8), light)
     assert np.abs(again[core].astype(float) - lit[core]).mean() < 4 and np.abs(lit[core] * 0.4).mean() > 50
     outside = ~cv2.dilate(carried.astype(np.uint8), np.ones((9, 9))).astype(bool)
@@ -272,17 +272,17 @@ def test_visibility_of_points_follows_the_formulas(table_views):
     points[:1000, 2], points[1000:1500, 2], points[-2], points[-1] = TOP, FLOOR, (9, 0, 0.5), np.nan
     normals = noise.normal(size=points.shape)
     for sides in (None, normals):
-        said, expected = count_views(points, table_views, sides), np.zeros((4, len(points)), int)
+        counts, expected = count_views(points, table_views, sides), np.zeros((4, len(points)), int)
         for view in table_views:
             uv, z = geometry.project(points, view.camera)
             maps = (view.masked, view.nearest, view.farthest)
             (hidden, inside), (nearest, _), (farthest, _) = (geometry.sample_nearest(each, uv) for each in maps)
             faced = True if sides is None else ((view.camera.center - points) * sides).sum(-1) > 0
-            shown = inside & ~hidden & (z > 0) & (nearest > 0)
+            visible = inside & ~hidden & (z > 0) & (nearest > 0)
             on = (z > nearest * (1 - SURFACE)) & (z < farthest * (1 + SURFACE))
             behind_it = z > farthest * (1 + SURFACE)
             free = nearest > z * (1 + FREE)
-            expected += [shown & on & faced, shown & free, shown & behind_it & faced, inside & hidden & (z > 0)]
-            assert (is_seen(view, points) == (shown & on)).all()
+            expected += [visible & on & faced, visible & free, visible & behind_it & faced, inside & hidden & (z > 0)]
+            assert (is_seen(view, points) == (visible & on)).all()
         for name, count in zip(("seen", "free", "occluded", "masked"), expected, strict=True):
-            assert (getattr(said, name) == count).all() and count.any(), name
+            assert (getattr(counts, name) == count).all() and count.any(), name

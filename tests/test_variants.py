@@ -69,10 +69,10 @@ PLANS = {
 
 
 def decide_stages(job: ResolvedJob) -> dict[str, Decision]:
-    said: dict[str, Decision] = {}
+    decisions: dict[str, Decision] = {}
     for stage in job.pipeline.stages:
-        said[stage] = decide(job, stage, said)
-    return said
+        decisions[stage] = decide(job, stage, decisions)
+    return decisions
 
 
 @pytest.fixture(scope="module")
@@ -80,19 +80,19 @@ def finished_capture(tmp_path_factory):
     """A small scene, and runs/ after its own run, as far as the runner looks."""
     home = tmp_path_factory.mktemp("variants")
     scene, runs = write_capture(home / "scene", "llff", make_truth()), home / "runs"
-    job, said = resolve(Request(ROOT, runs, str(scene), profile="laptop")), {}
+    job, decisions = resolve(Request(ROOT, runs, str(scene), profile="laptop")), {}
     for stage in job.pipeline.stages:
-        said[stage] = decide(job, stage, said)
-        if said[stage].status == "run":
+        decisions[stage] = decide(job, stage, decisions)
+        if decisions[stage].status == "run":
             place = runs / "scene" / stage
             (place / "masks").mkdir(parents=True)
             (place / "masks" / "v00.png").write_text(stage)
             (place / "facts.json").write_text(json.dumps({"invent_pixels": 7, "sds_may_gain": True}))
-            inputs = said[stage].inputs
+            inputs = decisions[stage].inputs
             receipt = asdict(inputs) | {"key": inputs.key} | hash_contents(place, job.hashes)
             (place / "receipt.json").write_text(json.dumps(receipt))
-            said[stage] = decide(job, stage, said)
-    assert [s for s, d in said.items() if d.status != "cached"] == ["lift"]
+            decisions[stage] = decide(job, stage, decisions)
+    assert [s for s, d in decisions.items() if d.status != "cached"] == ["lift"]
     return scene, runs
 
 
@@ -106,13 +106,13 @@ def test_every_variant_has_a_plan_here():
 @pytest.mark.parametrize("variant", PLANS)
 def test_a_variant_runs_what_it_changes_and_shares_the_rest(finished_capture, variant):
     scene, runs = finished_capture
-    said = decide_stages(resolve(Request(ROOT, runs, str(scene), profile="laptop", variant=variant)))
+    decisions = decide_stages(resolve(Request(ROOT, runs, str(scene), profile="laptop", variant=variant)))
     runs_here, left_out = PLANS[variant]
-    assert {s for s, d in said.items() if d.status == "skip"} == {*left_out, *({"lift"} - set(runs_here))}
-    assert {s for s, d in said.items() if d.status in ("run", "stale", "pending")} == set(runs_here)
-    shared = {s for s, d in said.items() if d.status == "cached"}
-    assert shared == set(said) - set(runs_here) - set(left_out) - {"lift"}
-    assert all(said[s].reason == "shared with scene" for s in shared)
+    assert {s for s, d in decisions.items() if d.status == "skip"} == {*left_out, *({"lift"} - set(runs_here))}
+    assert {s for s, d in decisions.items() if d.status in ("run", "stale", "pending")} == set(runs_here)
+    shared = {s for s, d in decisions.items() if d.status == "cached"}
+    assert shared == set(decisions) - set(runs_here) - set(left_out) - {"lift"}
+    assert all(decisions[s].reason == "shared with scene" for s in shared)
 
 
 @pytest.mark.parametrize("variant", [name for name in PLANS if name.startswith("no_")])
@@ -163,8 +163,8 @@ def test_lifted_pictures_reach_only_the_gaussians_they_may(how):
     start, masked = random_wall()
     for allowed in (masked, torch.ones_like(masked)):
         gaussians = as_leaves(start)
-        given = lifted_view(), how, perceptual.multi_scale_dssim, seeding.generator(1)
-        loss, rendering = evaluate_lift(gaussians, allowed, *given)
+        arguments = lifted_view(), how, perceptual.multi_scale_dssim, seeding.generator(1)
+        loss, rendering = evaluate_lift(gaussians, allowed, *arguments)
         loss.backward()
         got = has_gradient(gaussians)
         assert not got[~allowed].any() and (got & masked & (rendering.radii > 0)).any()
@@ -337,16 +337,16 @@ def test_the_chain_of_lifted_pictures(masked_scene, lifted_views, tmp_path, monk
         out.mkdir()
         distill.run(params, out, **chain, lift=lifted_views)
         facts = load_json(out / "facts.json")
-        said = facts["perceptual"] and facts["perceptual"].split(" (")[0]
-        assert facts["inpainter"].startswith("OpenCV") and said == perceptual_name
+        loss_name = facts["perceptual"] and facts["perceptual"].split(" (")[0]
+        assert facts["inpainter"].startswith("OpenCV") and loss_name == perceptual_name
         assert trace.read_trace(out / "trace.jsonl")[-1]["lift"] > 0
     out = tmp_path / "evaluate"
-    given = masked_scene | {"raw_masks": masked_scene["poses"].with_name("raw_masks")}
-    given |= {"initialize": chain["initialize"], "distill": tmp_path / "mse"}
+    needs = masked_scene | {"raw_masks": masked_scene["poses"].with_name("raw_masks")}
+    needs |= {"initialize": chain["initialize"], "distill": tmp_path / "mse"}
     for folder in (tmp_path / "finish", out):
         folder.mkdir()
-    finish.run(finish.Params(), tmp_path / "finish", **given)
-    evaluate.run(evaluate.Params(), out, **given, finish=tmp_path / "finish")
+    finish.run(finish.Params(), tmp_path / "finish", **needs)
+    evaluate.run(evaluate.Params(), out, **needs, finish=tmp_path / "finish")
     summary = load_json(out / "metrics.json")
     assert summary["inpainter"].startswith("OpenCV") and summary["perceptual"] is None
     assert summary["result"] == "distill" and summary["mean"]["psnr_box"] > 20
@@ -356,10 +356,10 @@ def test_the_chain_of_lifted_pictures(masked_scene, lifted_views, tmp_path, monk
 def test_rendered_views_inpainted_in_2d(masked_scene, tmp_path):
     for name in ("finish", "fit", "inpainted"):
         (tmp_path / name).mkdir()
-    given = masked_scene | {"raw_masks": masked_scene["poses"].with_name("raw_masks")}
-    finish.run(finish.Params(), tmp_path / "finish", **given)
-    evaluate.run(evaluate.Params(), tmp_path / "fit", **given, finish=tmp_path / "finish")
-    evaluate.run(evaluate.Params(inpaint=True), tmp_path / "inpainted", **given, finish=tmp_path / "finish")
+    needs = masked_scene | {"raw_masks": masked_scene["poses"].with_name("raw_masks")}
+    finish.run(finish.Params(), tmp_path / "finish", **needs)
+    evaluate.run(evaluate.Params(), tmp_path / "fit", **needs, finish=tmp_path / "finish")
+    evaluate.run(evaluate.Params(inpaint=True), tmp_path / "inpainted", **needs, finish=tmp_path / "finish")
     before, after = (load_json(tmp_path / n / "metrics.json") for n in ("fit", "inpainted"))
     assert before["inpainter"] is None and after["inpainter"].startswith("OpenCV") and after["result"] == "fit"
     assert after["mean"]["psnr_box"] > before["mean"]["psnr_box"] + 5, "the red square is still there"
@@ -401,9 +401,9 @@ def test_a_masked_fit_needs_masks_and_fits_a_scene_that_brings_gaussians(masked_
 
 
 def test_the_box_is_the_test_masks_whatever_was_left_out(masked_scene, tmp_path):
-    view, given = wall_scene.CAMERAS["a1"], load_mask(masked_scene["masks"] / "consistent" / "a1.png")
+    view, mask = wall_scene.CAMERAS["a1"], load_mask(masked_scene["masks"] / "consistent" / "a1.png")
     raw_masks = masked_scene["poses"].with_name("raw_masks")
     raw = load_raw_masks(raw_masks, ["a1"])["a1"]
-    assert (load_object_mask(view, raw_masks, masked_scene["masks"]) == given).all()
+    assert (load_object_mask(view, raw_masks, masked_scene["masks"]) == mask).all()
     assert (load_object_mask(view, raw_masks, None) == raw).all()
     assert not load_object_mask(wall_scene.CAMERAS["t0"], raw_masks, None).any()

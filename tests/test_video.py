@@ -66,7 +66,7 @@ def walk_video(tmp_path):
 
 
 def test_sharp_frames_spaced_by_what_moves_and_the_same_ones_again(walk_video, tmp_path):
-    said = video.extract_frames(walk_video, tmp_path / "a", "hash")
+    message = video.extract_frames(walk_video, tmp_path / "a", "hash")
     numbers = [int(path.stem.removeprefix("frame_")) for path in sorted((tmp_path / "a/images").iterdir())]
     assert all(number % 4 in (1, 2) for number in numbers), "none is blurred or smeared"
     way = STEP * SHOTS / WIDTH  # widths
@@ -74,7 +74,7 @@ def test_sharp_frames_spaced_by_what_moves_and_the_same_ones_again(walk_video, t
     apart = np.diff([number // 4 for number in numbers]) * STEP / WIDTH
     assert apart.min() > 0 and apart.max() <= 2.5 * video.SPACING
     facts = json.loads((tmp_path / "a/frames.json").read_text())
-    assert facts["taken"] == len(numbers) and facts["said"] == said and facts["size"] == [WIDTH, HEIGHT]
+    assert facts["taken"] == len(numbers) and facts["said"] == message and facts["size"] == [WIDTH, HEIGHT]
     with open(tmp_path / "a/frames.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 4 * SHOTS and [int(r["frame"]) for r in rows if r["what"] == video.TAKEN] == numbers

@@ -42,8 +42,8 @@ def write_finished_job(home, needs):
             save_ply(home / stage / "gaussians.ply", gaussians)
         if stage != "fit":
             save_labels(home / stage / "labels.npy", labels)
-    shown = gaussians if needs["distill"] else gaussians.map(lambda p: p[~labels])
-    save_ply(home / "evaluate" / "scene.ply", shown, similarity=SIMILARITY)
+    result = gaussians if needs["distill"] else gaussians.map(lambda p: p[~labels])
+    save_ply(home / "evaluate" / "scene.ply", result, similarity=SIMILARITY)
     save_json(home / "evaluate" / "receipt.json", {"needs": needs})
     return gaussians, labels
 
@@ -104,9 +104,9 @@ def test_unobserved_pixels_are_hatched(tmp_path):
         save_mask(tmp_path / f"x/masks/consistent/{name}.png", np.indices((shape.height, shape.width))[1] < 12)
     seen_by = unseen_overlay.load_seen_views(tmp_path / "x", scene)
     camera = scene.cameras[scene.train[0]]
-    drawn = view.render_picture(gaussians, camera)
-    noted = unseen_overlay.hatch_unseen(drawn, gaussians, camera, seen_by)
-    changed = (noted != drawn).any(-1)
+    picture = view.render_picture(gaussians, camera)
+    noted = unseen_overlay.hatch_unseen(picture, gaussians, camera, seen_by)
+    changed = (noted != picture).any(-1)
     assert changed[camera.height // 2 :, :8].mean() > 0.15 and not changed[camera.height // 2 :, -20:].any()
     assert unseen_overlay.load_seen_views(tmp_path / "y", scene) == []
 
@@ -131,22 +131,22 @@ def test_the_page_is_served_on_this_machine_only(viewer):
 
 
 def test_a_visitor_gets_a_small_picture_at_once_then_the_whole_and_another_when_he_chooses(viewer, monkeypatch):
-    drawn = []
+    images = []
 
     camera = visitor_camera(wall_scene.CAMERAS[wall_scene.TRAIN[0]])
     camera.on_update = lambda _: None
     guest = SimpleNamespace(
-        client_id=7, camera=camera, scene=SimpleNamespace(set_background_image=lambda image, **_: drawn.append(image))
+        client_id=7, camera=camera, scene=SimpleNamespace(set_background_image=lambda image, **_: images.append(image))
     )
     monkeypatch.setattr(viewer.server, "get_clients", lambda: {7: guest})
     viewer._serve_visitor(guest)
-    wait_until(lambda: len(drawn) == 2)
-    assert [image.shape[0] for image in drawn] == [view.MOVING, view.STILL]
-    assert np.array_equal(drawn[-1], viewer._render_for(view.visitor_camera(camera, view.STILL), camera))
-    there = next(h for h in viewer.server.gui._gui_input_handle_from_uuid.values() if h.label == "what was kept")
-    there.value = False
-    wait_until(lambda: len(drawn) == 4)
-    assert drawn[-1].mean() < drawn[1].mean(), "the wall is gone"
+    wait_until(lambda: len(images) == 2)
+    assert [image.shape[0] for image in images] == [view.MOVING, view.STILL]
+    assert np.array_equal(images[-1], viewer._render_for(view.visitor_camera(camera, view.STILL), camera))
+    checkbox = next(h for h in viewer.server.gui._gui_input_handle_from_uuid.values() if h.label == "what was kept")
+    checkbox.value = False
+    wait_until(lambda: len(images) == 4)
+    assert images[-1].mean() < images[1].mean(), "the wall is gone"
     monkeypatch.setattr(viewer.server, "get_clients", dict)
     wait_until(lambda: 7 not in viewer.requests)
 

@@ -271,22 +271,22 @@ class Hub(http.server.BaseHTTPRequestHandler):
             return self._answer(200, json.dumps(facts).encode(), Content_Type="application/json")
         name = path.partition("/resolve/")[2].partition("/")[2]
         body = files[name]
-        told = {"ETag": f'"{digest(body)}"', "X_Repo_Commit": self.STATE, "X_Linked_Etag": f'"{digest(body)}"'}
+        headers = {"ETag": f'"{digest(body)}"', "X_Repo_Commit": self.STATE, "X_Linked_Etag": f'"{digest(body)}"'}
         if name in self.spoilt:
             body = body[:-1] + bytes([body[-1] ^ 1])
         first = int(self.headers.get("Range", "bytes=0-").removeprefix("bytes=").split("-")[0])
         if first and self.command == "GET":
             self.ranges.append(first)
-            told["Content_Range"] = f"bytes {first}-{len(body) - 1}/{len(body)}"
+            headers["Content_Range"] = f"bytes {first}-{len(body) - 1}/{len(body)}"
         if name in self.stalls and self.command == "GET":
             self.send_response(200)
-            for header, value in {"Content-Length": str(len(body)), **told}.items():
+            for header, value in {"Content-Length": str(len(body)), **headers}.items():
                 self.send_header(header.replace("_", "-"), value)
             self.end_headers()
             self.wfile.write(body[: len(body) // 2])
             self.wfile.flush()
             return self.stalled.wait(60)
-        return self._answer(206 if first else 200, body[first:], **told)
+        return self._answer(206 if first else 200, body[first:], **headers)
 
     do_HEAD = do_GET
 
@@ -331,10 +331,10 @@ def fetch_models(*names, **environment) -> list[str]:
 
 
 def test_a_model_is_fetched_from_the_hub_and_each_refusal_has_its_message(tmp_path, monkeypatch, hub):
-    said = fetch_models(
+    messages = fetch_models(
         "acme/paint", "acme/gated", "acme/gone", published.SD2, HF_ENDPOINT=hub[0], HF_HOME=str(tmp_path)
     )
-    folder, gated, gone, moved = said
+    folder, gated, gone, moved = messages
     monkeypatch.delenv("HF_HUB_CACHE", raising=False)
     monkeypatch.setenv("HF_HOME", str(tmp_path))
     assert local.locate("acme/paint") == Path(folder)
@@ -381,16 +381,16 @@ def test_weights_of_the_laptop_are_fetched_killed_resumed_and_checked(tmp_path, 
     handler.stalls.clear()
     handler.spoilt.add(migan.file)
     process = begin()
-    out, said = process.communicate(timeout=120)
-    assert process.returncode == 1 and f"{migan.file} arrived damaged" in said, said
+    out, errors = process.communicate(timeout=120)
+    assert process.returncode == 1 and f"{migan.file} arrived damaged" in errors, errors
     assert re.search(r"to fetch +208 MB +Carve/LaMa-ONNX", out) and out.index("to fetch: about 3") < out.index(
         "fetched"
     )
     assert handler.ranges and min(handler.ranges) >= 10_000_000, "it went on where it was killed"
     handler.spoilt.clear()
     process = begin()
-    out, said = process.communicate(timeout=120)
-    assert process.returncode == 0, said
+    out, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
     for repo, files in handler.models.items():
         for name in files if repo != "acme/paint" else ():
             found = list((tmp_path / "hub").glob(f"hub/models--{repo.replace('/', '--')}/snapshots/*/{name}"))

@@ -16,15 +16,15 @@ def draw(diagram: Diagram, path: Path) -> None:
 
     against_time = diagram.over == "seconds"
     figure = Figure(figsize=(7.2, 4.6) if against_time else (9.6, 4.2), layout="constrained")
-    left = figure.subplots() if against_time else figure.subplots(1, 2)
+    panels = figure.subplots() if against_time else figure.subplots(1, 2)
     long = against_time and min(p.seconds for p in diagram.points) > 10
     scale, work = (1.0, "seconds") if long else (1e3, "milliseconds of CPU")
-    axes = left if against_time else left[0]
+    axes = panels if against_time else panels[0]
     for curve, points in diagram.curves.items():
         across = [scale * p.seconds if against_time else p.x for p in points]
         axes.plot(across, [p.error for p in points], marker=".", label=curve)
         if not against_time:
-            left[1].plot(across, [1e3 * p.seconds for p in points], marker=".", label=curve)
+            panels[1].plot(across, [1e3 * p.seconds for p in points], marker=".", label=curve)
         for x, point in zip(across, points, strict=True):
             if against_time and point.stands:
                 axes.annotate(point.setting, (x, point.error), textcoords="offset points", xytext=(4, 4), fontsize=7)
@@ -34,8 +34,8 @@ def draw(diagram: Diagram, path: Path) -> None:
     if against_time or min(p.x for p in diagram.points) > 0:
         axes.set_xscale("log")
     if not against_time:
-        left[1].set(xlabel=diagram.over, ylabel="milliseconds of CPU", xscale=axes.get_xscale(), yscale="log")
-        left[1].grid(alpha=0.3, which="both")
+        panels[1].set(xlabel=diagram.over, ylabel="milliseconds of CPU", xscale=axes.get_xscale(), yscale="log")
+        panels[1].grid(alpha=0.3, which="both")
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize=8)
     figure.suptitle(diagram.title, fontsize=10)

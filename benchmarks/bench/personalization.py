@@ -49,7 +49,7 @@ def diagram(run: Path, out: Path) -> Diagram:
     if not (run / "reference" / "receipt.json").exists():
         raise ValueError(f"{run}/reference is missing: run `make scene={run.name} reference` first")
     usual = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["personalize"]
-    given = {name: run / name for name in ("poses", "raw_masks", "reference")}
+    needs = {name: run / name for name in ("poses", "raw_masks", "reference")}
     choices = [("steps", {"steps": n}) for n in STEPS]
     choices += [("rank, 200 steps", {"steps": 200, "lora": {"rank": n, "alpha": n}}) for n in RANKS]
     rates = [{"lr_unet": r, "lr_text": r / 5} for r in RATES]
@@ -62,7 +62,7 @@ def diagram(run: Path, out: Path) -> Diagram:
         folder = out / "personalization" / name.replace(", ", "_").replace(" ", "")
         if not (folder / "pytorch_lora_weights.safetensors").exists():  # an interrupted one continues
             folder.mkdir(parents=True, exist_ok=True)
-            personalize.run(personalize.Params(**{**usual, **changed, **grouped}), folder, **given)
+            personalize.run(personalize.Params(**{**usual, **changed, **grouped}), folder, **needs)
         last = trace.read_trace(folder / "trace.jsonl")[-1]
         points.append(Point(curve, name, 0.0, last["clean_latent_mse"], last["seconds"]))
     return Diagram(

@@ -83,10 +83,10 @@ def completion_diagram() -> Diagram:
     truth, target, confidence, guide, _ = picture()
     hole = confidence == 0
     points = []
-    for curve, shown in (("with the picture", guide), ("without", None)):
+    for curve, image in (("with the picture", guide), ("without", None)):
         for most in UNKNOWNS:
             plate = completion.Plate(ring=0.08, most_unknowns=most)
-            work = lambda plate=plate, shown=shown: completion.complete(target, confidence, shown, plate)
+            work = lambda plate=plate, image=image: completion.complete(target, confidence, image, plate)
             error = float(np.sqrt(np.mean((work() - truth)[hole] ** 2)) / truth.std())
             points.append(Point(curve, f"{most} unknowns", most, error, cpu_seconds(work)))
     return Diagram(

@@ -157,8 +157,8 @@ def count_adam() -> dict[str, float]:
         rows = [optimize._rows(getattr(each, name)) for each in optimizer._states()]
         updates.append(adam.Update(*rows, torch.zeros_like(rows[0]), rates[name], 1.0))
     everyone, steps = torch.ones(GAUSSIANS, dtype=torch.bool), torch.ones(GAUSSIANS, dtype=torch.int32)
-    given = (steps, everyone, ~everyone, *adam.unbiasing((0.9, 0.999), 1, steps.device), 0.9, 0.999, 1e-15)
-    return _scaled(count_work(lambda: adam.adam(updates, *given)), GAUSSIANS)
+    arguments = (steps, everyone, ~everyone, *adam.unbiasing((0.9, 0.999), 1, steps.device), 0.9, 0.999, 1e-15)
+    return _scaled(count_work(lambda: adam.adam(updates, *arguments)), GAUSSIANS)
 
 
 def _scaled(counts: dict[str, float], count: int) -> dict[str, float]:

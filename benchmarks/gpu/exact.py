@@ -83,10 +83,10 @@ def check_similarity(bench: Bench) -> dict[str, Any]:
     image, other = 0.5 + 0.1 * image, 0.5 + 0.1 * other  # low contrast loses most digits in the subtraction
     weights = torch.rand(size, size, generator=draw, dtype=torch.float64) > 0.3
 
-    def told(loss, dtype: torch.dtype, device: str) -> dict[str, Tensor]:
+    def evaluate(loss, dtype: torch.dtype, device: str) -> dict[str, Tensor]:
         leaf = image.to(device, dtype).requires_grad_()
         value = loss(leaf, other.to(device, dtype), weights.to(device, dtype))
         (slope,) = torch.autograd.grad(value, leaf)
         return {"value": value.detach().cpu().double(), "gradient": slope.cpu().double()}
 
-    return compare_blocks(told(dssim, torch.float32, bench.device), told(dssim_torch, torch.float64, "cpu"))
+    return compare_blocks(evaluate(dssim, torch.float32, bench.device), evaluate(dssim_torch, torch.float64, "cpu"))

@@ -105,11 +105,11 @@ def psnr_difference(extent: float, offset: float) -> float:
 
 def camera_difference(extent: float, offset: float) -> float:
     """Largest difference of normalised poses and points from those of the scene of extent 1 at the origin."""
-    here, there = normalized_scene(extent, offset), normalized_scene(1.0, 0.0)
+    scene, reference = normalized_scene(extent, offset), normalized_scene(1.0, 0.0)
     poses_apart = [
-        np.abs(here.cameras[n].world_to_camera - there.cameras[n].world_to_camera).max() for n in there.cameras
+        np.abs(scene.cameras[n].world_to_camera - reference.cameras[n].world_to_camera).max() for n in reference.cameras
     ]
-    return float(nan_safe_max(*poses_apart, np.abs(here.points - there.points).max()))
+    return float(nan_safe_max(*poses_apart, np.abs(scene.points - reference.points).max()))
 
 
 def export_vertices(extent: float, offset: float) -> np.ndarray:

@@ -112,14 +112,14 @@ def errors(gaussians: Gaussians, camera: Camera, relative: float, seed: int = 0)
         return {"radii": float("inf")}
     lengths = gaussians.quaternions.double().norm(dim=1, keepdim=True)
     by_name = {}
-    for kind, here, there in (
+    for kind, actual, expected in (
         ("values", fast.images, exact.images),
         ("gradients", *_scale_quaternions(fast, exact, lengths)),
     ):
-        for name in there:
-            error = (here[name].double() - there[name]).norm().item()
+        for name in expected:
+            error = (actual[name].double() - expected[name]).norm().item()
             label = name if kind == "values" else f"gradient of {name}"
-            by_name[label] = error / (there[name].norm().item() + FLOOR[kind] / relative)
+            by_name[label] = error / (expected[name].norm().item() + FLOOR[kind] / relative)
     return by_name
 
 

@@ -51,8 +51,8 @@ def world_from_camera(points: list[list[float]], view: Camera) -> torch.Tensor:
 def oracle_error(change: Callable[[Gaussians], Gaussians], view: Camera | None = None) -> float:
     """Error of the worst block; infinite if nothing is drawn, which would test nothing."""
     gaussians, view = change(cloud()), view or camera()
-    drawn = rasterizer.render(gaussians, view, impl="cpu").alpha.max() > 0
-    return oracle.worst_error(gaussians, view, RELATIVE) if drawn else math.inf
+    is_visible = rasterizer.render(gaussians, view, impl="cpu").alpha.max() > 0
+    return oracle.worst_error(gaussians, view, RELATIVE) if is_visible else math.inf
 
 
 def scale_all(scale: float, gaussians: Gaussians) -> Gaussians:

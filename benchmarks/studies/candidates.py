@@ -41,7 +41,7 @@ def score_candidates(run: Path, untouched: Path, out: Path, seed: int, models: d
     needs = {name: run / name for name in ("poses", "fit", "masks")}
     reference.run(Params(**params), out, scene=out, **needs)
     facts = load_json(out / "candidates.json")
-    view, taken = facts["view"], facts["chosen"]
+    view, chosen = facts["view"], facts["chosen"]
     pixels = load_mask_sets(run / "masks", [view])[view]
     truth, sheet = load_image(untouched / f"poses/images/{view}.png"), load_image(out / "candidates.png")
     candidates = np.split(sheet, sheet.shape[1] // truth.shape[1], 1)
@@ -49,9 +49,9 @@ def score_candidates(run: Path, untouched: Path, out: Path, seed: int, models: d
     true = box.crop(truth)
     targets = image_metrics.lpips_targets(true, models)
     scores = [image_metrics.score(box.crop(each), true, targets) for each in candidates]
-    order = [taken, *(k for k in range(len(candidates)) if k != taken)]
+    order = [chosen, *(k for k in range(len(candidates)) if k != chosen)]
     save_image(out / "sheet.png", np.concatenate([true, *(box.crop(candidates[k]) for k in order)], 1))
-    return {"view": view, "taken": taken, **{name: [each[name] for each in scores] for name in SCORES}}
+    return {"view": view, "taken": chosen, **{name: [each[name] for each in scores] for name in SCORES}}
 
 
 def table(rows: list[dict]) -> str:
@@ -61,7 +61,7 @@ def table(rows: list[dict]) -> str:
         complete = [row for row in rows if None not in row[name]]
         values = [(np.mean(row[name]), row[name][row["taken"]], best(row[name])) for row in complete]
         means = [f"{value:.4f}" for value in np.mean(values, 0)]
-        hit = np.mean([taken == best for _, taken, best in values])
+        hit = np.mean([score == best for _, score, best in values])
         chance = np.mean([1 / len(row[name]) for row in complete])
         lines.append(f"| {name} | {' | '.join(means)} | {hit:.2f} | {chance:.2f} |")
     return "\n".join(lines) + "\n"

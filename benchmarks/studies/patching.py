@@ -56,8 +56,8 @@ def write_scenes(run: Path, scene: Path, out: Path) -> None:
     """Write the three scenes' folders to `out`."""
     placed, gaussians = load_scene(run / "poses"), load_ply(run / "fit" / "gaussians.ply")
     deleted = torch.from_numpy(in_box(gaussians.means.double().numpy(), load_object_labels(run / "masks").numpy()))
-    left = gaussians.map(lambda p: p[~deleted])
-    stripped = type(left)(left.means, left.quaternions, left.log_scales, left.opacity_logits, left.sh[:, :1])
+    rest = gaussians.map(lambda p: p[~deleted])
+    stripped = type(rest)(rest.means, rest.quaternions, rest.log_scales, rest.opacity_logits, rest.sh[:, :1])
     reference = next((run / "reference" / "references").glob("*.png"))
     width = max(max(camera.width, camera.height) for camera in placed.cameras.values())
     for kind in KINDS:

@@ -89,12 +89,12 @@ def variances(samples: Tensor) -> dict:
     """Variances of gradients [T, K, M], T and K at least 2; see the module docstring."""
     noise = samples.var(1)  # [T, M], unbiased
     mean = samples.mean(1)
-    left = noise / samples.shape[1]  # part of the noise that remains in the mean of K draws
+    residual = noise / samples.shape[1]  # part of the noise that remains in the mean of K draws
     over_noise = noise.mean()
-    over_timesteps = (mean.var(0) - left.mean(0)).mean().clamp(min=0)
+    over_timesteps = (mean.var(0) - residual.mean(0)).mean().clamp(min=0)
     return {
         "noise": noise.mean(1).tolist(),
-        "pull": (mean.square() - left).mean(1).clamp(min=0).tolist(),
+        "pull": (mean.square() - residual).mean(1).clamp(min=0).tolist(),
         "over_noise": float(over_noise),
         "over_timesteps": float(over_timesteps),
         "together": float(over_noise + over_timesteps),

@@ -73,5 +73,5 @@ def sample_visible(camera: Camera, points: np.ndarray, picture: np.ndarray, cell
     cell = max(1.0, camera.width / cells)
     index = np.zeros(len(points), int)
     index[inside] = (uv[inside] // cell).astype(int) @ (10_000, 1)
-    shown = inside & (depth < NEARLY * np.maximum(nearest_depths(index, depth), 0))
-    return np.where(shown[:, None], values, np.nan)
+    visible = inside & (depth < NEARLY * np.maximum(nearest_depths(index, depth), 0))
+    return np.where(visible[:, None], values, np.nan)

@@ -97,7 +97,7 @@ def pair_names(wanted: Mapping[K, Iterable[str]], known: Mapping[V, Iterable[str
         wanted, known: identity -> the paths by which it may be called.
     """
     pairs: dict[K, V] = {}
-    taken: set[V] = set()
+    used: set[V] = set()
     for fold in (str, str.casefold):
         mine, theirs = _split(wanted, fold), _split(known, fold)
         deepest = max((len(parts) for side in (mine, theirs) for paths in side.values() for parts in paths), default=0)
@@ -107,9 +107,9 @@ def pair_names(wanted: Mapping[K, Iterable[str]], known: Mapping[V, Iterable[str
                 candidates = owners.get(key, set())
                 if len(identities) == len(candidates) == 1:
                     (identity,), (candidate,) = identities, candidates
-                    if identity not in pairs and candidate not in taken:
+                    if identity not in pairs and candidate not in used:
                         pairs[identity] = candidate
-                        taken.add(candidate)
+                        used.add(candidate)
     return pairs
 
 
@@ -132,8 +132,8 @@ def pair_pictures(wanted: Mapping[K, str], files: Collection[str]) -> dict[K, st
     pairs = pair_names({key: [path] for key, path in wanted.items()}, {file: [file] for file in files})
     rest = {key: [strip_ending(normalize_path(path))] for key, path in wanted.items()}
     by_stem = pair_names(rest, {file: [strip_ending(file)] for file in files})
-    taken = set(pairs.values())
-    return pairs | {key: file for key, file in by_stem.items() if key not in pairs and file not in taken}
+    used = set(pairs.values())
+    return pairs | {key: file for key, file in by_stem.items() if key not in pairs and file not in used}
 
 
 def pair_masks(masks: Collection[str], views: Mapping[V, Iterable[str]]) -> dict[str, V]:

@@ -63,41 +63,41 @@ def refine_cameras(cameras: Sequence[Camera], images: Mapping[str, np.ndarray]) 
         cameras: undistorted views in the normalised frame.
         images: view name -> uint8 [H, W, 3].
     """
-    given = {camera.name: camera for camera in cameras}
+    initial = {camera.name: camera for camera in cameras}
     cell = max(4, round((sum(c.width * c.height for c in cameras) / (2 * TRACKS)) ** 0.5))
     probe = cameras[:: -(-len(cameras) // PROBE_VIEWS)]
     coarse = max(LEAST_CELL, round(max(max(camera.width, camera.height) for camera in cameras) / PROBE_CELLS))
-    before = flow_residual(list(stereo.match_views(probe, cameras, images, coarse)), given, coarse)
+    before = flow_residual(list(stereo.match_views(probe, cameras, images, coarse)), initial, coarse)
     if not before > GOOD_RESIDUAL:
-        return Refinement(given, before, None)
+        return Refinement(initial, before, None)
     matches = list(stereo.match_views(cameras, cameras, images, cell))
     odd = [((m.pixels // cell).sum(1) % 2).astype(bool) for m in matches]
     fitting = [_select(m, ~o) for m, o in zip(matches, odd, strict=True)]
     checking = [_select(m, o) for m, o in zip(matches, odd, strict=True)]
-    before = flow_residual(checking, given, cell)  # of neighbours: those of the few views lie farther apart
+    before = flow_residual(checking, initial, cell)  # of neighbours: those of the few views lie farther apart
     if not before > GOOD_RESIDUAL:
-        return Refinement(given, before, None)
-    adjusted = _align(_adjust(fitting, given), given)
+        return Refinement(initial, before, None)
+    adjusted = _align(_adjust(fitting, initial), initial)
     after = flow_residual(checking, adjusted, cell)
-    return Refinement(adjusted, before, after) if after < LARGEST_RATIO * before else Refinement(given, before, None)
+    return Refinement(adjusted, before, after) if after < LARGEST_RATIO * before else Refinement(initial, before, None)
 
 
-def _adjust(matches: Sequence[stereo.Matches], given: Mapping[str, Camera]) -> dict[str, Camera]:
+def _adjust(matches: Sequence[stereo.Matches], initial: Mapping[str, Camera]) -> dict[str, Camera]:
     """`bundle_adjust` in rounds. It restarts while principal points leave their range, with these held fixed."""
-    held: set[str] = set()
+    fixed: set[str] = set()
     while True:
-        cameras = dict(given)
+        cameras = dict(initial)
         for _ in range(ROUNDS):
-            cameras = bundle_adjust(cameras, *_build_tracks(matches, cameras), held)
-        escaped = {name for name, camera in cameras.items() if _shift(camera, given[name]) > LARGEST_SHIFT} - held
+            cameras = bundle_adjust(cameras, *_build_tracks(matches, cameras), fixed)
+        escaped = {name for name, camera in cameras.items() if _shift(camera, initial[name]) > LARGEST_SHIFT} - fixed
         if not escaped:
             return cameras
-        held |= escaped
+        fixed |= escaped
 
 
-def _shift(camera: Camera, given: Camera) -> float:
+def _shift(camera: Camera, initial: Camera) -> float:
     """Displacement of the principal point, in units of the picture's longer side."""
-    return float(np.hypot(camera.cx - given.cx, camera.cy - given.cy) / max(given.width, given.height))
+    return float(np.hypot(camera.cx - initial.cx, camera.cy - initial.cy) / max(initial.width, initial.height))
 
 
 def flow_residual(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camera], cell: int) -> float:
@@ -148,17 +148,17 @@ def _select(matches: stereo.Matches, chosen: np.ndarray) -> stereo.Matches:
     )
 
 
-def _align(cameras: Mapping[str, Camera], given: Mapping[str, Camera]) -> dict[str, Camera]:
+def _align(cameras: Mapping[str, Camera], initial: Mapping[str, Camera]) -> dict[str, Camera]:
     """Align adjusted cameras with the given ones by a similarity: adjustment does not fix the frame."""
     names = list(cameras)
-    turns = [given[n].world_to_camera[:3, :3].T @ cameras[n].world_to_camera[:3, :3] for n in names]
+    turns = [initial[n].world_to_camera[:3, :3].T @ cameras[n].world_to_camera[:3, :3] for n in names]
     turn = Rotation.from_matrix(turns).mean().as_matrix()
-    centers, given_centers = (np.array([each[n].center for n in names]) for each in (cameras, given))
-    mean, given_mean = centers.mean(0), given_centers.mean(0)
+    centers, initial_centers = (np.array([each[n].center for n in names]) for each in (cameras, initial))
+    mean, initial_mean = centers.mean(0), initial_centers.mean(0)
     turned = (centers - mean) @ turn.T
-    scale = (turned * (given_centers - given_mean)).sum() / (turned**2).sum()
+    scale = (turned * (initial_centers - initial_mean)).sum() / (turned**2).sum()
     moved = {}
-    for name, center in zip(names, scale * turned + given_mean, strict=True):
+    for name, center in zip(names, scale * turned + initial_mean, strict=True):
         pose = np.eye(4)
         pose[:3, :3] = cameras[name].world_to_camera[:3, :3] @ turn.T
         pose[:3, 3] = -pose[:3, :3] @ center

@@ -118,10 +118,10 @@ def load_roles(
     labelled = (
         None if label_files is None else _test_mask_views(capture, mask_files, label_folder, label_files, test_named)
     )
-    asked = None if cameras_only in (None, OTHERS) else _select_views(cameras_only, capture, "cameras_only")
-    train_named, test_views = _split_views(train_named, test_named, labelled, asked or [], capture)
+    blank_named = None if cameras_only in (None, OTHERS) else _select_views(cameras_only, capture, "cameras_only")
+    train_named, test_views = _split_views(train_named, test_named, labelled, blank_named or [], capture)
     _check_enough(train_named, cameras_only is not None)
-    blank = _camera_only_views(cameras_only, asked, {*train_named, *test_views}, capture)
+    blank = _camera_only_views(cameras_only, blank_named, {*train_named, *test_views}, capture)
     clean_views = _clean_views(clean, train_named, capture)
     labels = None if labelled is None else dict(zip(labelled, label_files or (), strict=True))
     held_out, test_files = _split_masks(test_views, mask_files, labels or {})
@@ -196,17 +196,17 @@ def _split_views(
 
 
 def _camera_only_views(
-    asked: Sequence[str] | str | None, named: Sequence[str] | None, taken: set[str], capture: Capture
+    cameras_only: Sequence[str] | str | None, named: Sequence[str] | None, used: set[str], capture: Capture
 ) -> tuple[str, ...]:
     """The views whose pixels are not used."""
-    if asked is None:
+    if cameras_only is None:
         return ()
     if named is None:
-        return tuple(name for name in capture.pictures if name not in taken)
-    if both := sorted(set(named) & taken):
-        if not isinstance(asked, str):
+        return tuple(name for name in capture.pictures if name not in used)
+    if both := sorted(set(named) & used):
+        if not isinstance(cameras_only, str):
             raise BadInput(f"scene.yaml: cameras_only: {', '.join(both)} is a training or test view too")
-    return tuple(name for name in named if name not in taken)
+    return tuple(name for name in named if name not in used)
 
 
 def _check_enough(train: Sequence[str], sparse: bool = False) -> None:

@@ -29,8 +29,8 @@ def read_scene(params: SceneKeys, scene: Path, longest: int = LONGEST) -> tuple[
     Raises:
         BadInput: naming the file and the remedy where one is wrong.
     """
-    given = reference_list(params.reference)
-    references = frozenset(scene / name for each in given for name in (each.image, each.depth) if name is not None)
+    specs = reference_list(params.reference)
+    references = frozenset(scene / name for each in specs for name in (each.image, each.depth) if name is not None)
     capture = load_capture(scene, params.layout, params.images, longest, references)
     roles = load_roles(
         scene,

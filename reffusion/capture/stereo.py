@@ -90,8 +90,8 @@ def match_views(
         by_name = {camera.name: camera for camera in cameras}
         side = lambda name: (by_name[name], gray[name])
         both_ways = pool.map(lambda pair: _flow_both_ways(side(pair[0]), side(pair[1]), cell), pairs)
-        for (one, other), (there, back) in zip(pairs, both_ways, strict=True):
-            found[one, other], found[other, one] = there, back
+        for (one, other), (forward, back) in zip(pairs, both_ways, strict=True):
+            found[one, other], found[other, one] = forward, back
     for camera in chosen:
         pixels = _pixels(gray[camera.name], cell).reshape(-1, 2)
         places, seen = np.empty((len(neighbours_of[camera.name]), *pixels.shape)), np.empty((0, len(pixels)), bool)
@@ -123,8 +123,8 @@ def _flow_both_ways(
     are valid [P]."""
     if not _has_same_scale(one[0], other[0]):
         return [_follow_resampled(*one, *other, cell), _follow_resampled(*other, *one, cell)]
-    there, back = _flow(one[1], other[1]), _flow(other[1], one[1])
-    return [_follow_flow(one[1], there, back, cell), _follow_flow(other[1], back, there, cell)]
+    forward, back = _flow(one[1], other[1]), _flow(other[1], one[1])
+    return [_follow_flow(one[1], forward, back, cell), _follow_flow(other[1], back, forward, cell)]
 
 
 def _flow(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -148,18 +148,18 @@ def _follow_resampled(
     if scale.min() < 1:
         picture = cv2.GaussianBlur(picture, (0, 0), 0.5 / scale.min())
     warp = np.array([[scale[0], 0, shift[0] + scale[0] / 2 - 0.5], [0, scale[1], shift[1] + scale[1] / 2 - 0.5]])
-    shown = cv2.warpAffine(picture, warp, (camera.width, camera.height), borderMode=cv2.BORDER_REPLICATE)
-    places, seen = _follow_flow(gray, _flow(gray, shown), _flow(shown, gray), cell)
+    resampled = cv2.warpAffine(picture, warp, (camera.width, camera.height), borderMode=cv2.BORDER_REPLICATE)
+    places, seen = _follow_flow(gray, _flow(gray, resampled), _flow(resampled, gray), cell)
     places = (places - shift) / scale
     return places, seen & ((places > 0) & (places < (other.width, other.height))).all(-1)
 
 
-def _follow_flow(gray: np.ndarray, there: np.ndarray, back: np.ndarray, cell: int) -> tuple[np.ndarray, np.ndarray]:
+def _follow_flow(gray: np.ndarray, forward: np.ndarray, back: np.ndarray, cell: int) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates [P, 2] that flow leads to, one pixel per cell, and [P] bool: the way back agrees and the place has
     contrast."""
     pixels = _pixels(gray, cell)
     columns, rows = pixels.astype(int).transpose(2, 0, 1)
-    moved = there[rows, columns]
+    moved = forward[rows, columns]
     at = (pixels + moved - 0.5).astype(np.float32)
     # beyond the border no way back agrees
     returned = cv2.remap(back, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e6,) * 4)

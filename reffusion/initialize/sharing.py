@@ -90,9 +90,9 @@ def share_surfaces(
         known.append(over & (depth > 0))
         rim = unchanged_rim(each.image, background.photos[name], over)
         surfaces.append(ReferenceSurface(each.camera, depth, known[-1] & ~rim))
-    drawn = select_finest(surfaces)
+    finest = select_finest(surfaces)
     return {
-        each.camera.name: Share(own, pixels & ~own) for each, pixels, own in zip(surfaces, known, drawn, strict=True)
+        each.camera.name: Share(own, pixels & ~own) for each, pixels, own in zip(surfaces, known, finest, strict=True)
     }
 
 
@@ -119,13 +119,13 @@ def select_finest(surfaces: Sequence[ReferenceSurface]) -> list[np.ndarray]:
     found = []
     for i, each in enumerate(surfaces):
         points, own = geometry.unproject(each.depth, each.camera)[each.pixels], each.footprints[each.pixels]
-        drawn = np.ones(len(points), bool)
+        finest = np.ones(len(points), bool)
         for j, other in enumerate(surfaces):
             if i != j:
                 same, past, theirs = cross_visibility(points, each.normals[each.pixels], other)
-                drawn &= ~past & ~(same & ((theirs < own) | (theirs == own) & (j < i)))
+                finest &= ~past & ~(same & ((theirs < own) | (theirs == own) & (j < i)))
         pixels = each.pixels.copy()
-        pixels[each.pixels] = drawn
+        pixels[each.pixels] = finest
         found.append(pixels)
     return found
 
@@ -143,10 +143,10 @@ def cross_visibility(
     uv, z = geometry.project(points, other.camera)
     near, inside = geometry.sample_nearest(near, uv)
     maps = far, other.pixels, other.footprints, other.normals
-    far, drawn, footprint, normal = (geometry.sample_nearest(each, uv)[0] for each in maps)
+    far, covered, footprint, normal = (geometry.sample_nearest(each, uv)[0] for each in maps)
     inside &= (z > 0) & (far > 0)
     same_depth = (z > (1 - SAME_DEPTH) * near) & (z < (1 + SAME_DEPTH) * far)
-    same = inside & drawn & same_depth & ((normal * normals).sum(1) > SAME_NORMAL)
+    same = inside & covered & same_depth & ((normal * normals).sum(1) > SAME_NORMAL)
     return same, inside & (z < (1 - PAST) * near), footprint
 
 

@@ -158,12 +158,12 @@ def _symmetry_of(plane: int, sources: Sequence[SourceImage]) -> PlaneSymmetry | 
 
 
 def _surfaces_behind(
-    own: DepthView, hidden: np.ndarray, asked: np.ndarray, planes: Sequence[Plane], mirrored: MirrorImage
+    own: DepthView, hidden: np.ndarray, pixels: np.ndarray, planes: Sequence[Plane], mirrored: MirrorImage
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What a view would show without the object: plane indices, int [H, W]; depth, [H, W] float64; and foreground
     layers, int [H, W], see `_interpolate_depth`.
 
-    In the `asked` pixels, bool [H, W], C and its rim, it is the nearest plane that other views see there or that
+    In `pixels`, bool [H, W], C and its rim, it is the nearest plane that other views see there or that
     continues there; where there is none, depth and layer are those of `_interpolate_depth`.
     """
     surface = remove_reflected_depth(own.depth, own.camera, planes)
@@ -174,7 +174,7 @@ def _surfaces_behind(
         at = each.depth(own.camera)
         cells = each.seen | each.enclosed | each.continued | each.reflective
         possible = hidden | (at < (1 + MAX_DISTANCE) * surface)
-        mine = each.pixels_on(cells, at, own.camera, asked & possible) & (at < nearest)
+        mine = each.pixels_on(cells, at, own.camera, pixels & possible) & (at < nearest)
         plane[mine], nearest[mine] = k, at[mine]
     for k in range(1, len(planes) + 1):
         beside = (plane == k) & ~hidden & (layer >= 0)

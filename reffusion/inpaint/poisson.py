@@ -30,7 +30,7 @@ def blend(
     rows, columns = np.nonzero(hole)
     index = np.full(hole.shape, -1)
     index[rows, columns] = np.arange(len(rows))
-    diagonal, wanted = np.full(len(rows), color_weight), color_weight * own[rows, columns].astype(np.float64)
+    diagonal, rhs = np.full(len(rows), color_weight), color_weight * own[rows, columns].astype(np.float64)
     links = []
     for down, along, gradient in ((0, 1, right), (0, -1, right), (1, 0, below), (-1, 0, below)):
         row, column = rows + down, columns + along
@@ -40,14 +40,14 @@ def blend(
         row, column = row[here], column[here]
         first = np.minimum(rows[here], row), np.minimum(columns[here], column)
         diagonal[here] += 1
-        wanted[here] -= gradient[first] * (down + along)
+        rhs[here] -= gradient[first] * (down + along)
         other = index[row, column]
         outside = other < 0
-        wanted[here[outside]] += known[row[outside], column[outside]]
+        rhs[here[outside]] += known[row[outside], column[outside]]
         links.append(np.stack([here[~outside], other[~outside]]))
     here, other = np.concatenate(links, 1)
     matrix = sparse.csc_matrix((-np.ones(len(here)), (here, other)), (len(rows),) * 2) + sparse.diags(diagonal)
-    return splu(matrix.tocsc()).solve(wanted)
+    return splu(matrix.tocsc()).solve(rhs)
 
 
 def paste(image: np.ndarray, picture: np.ndarray, mask: np.ndarray, both: np.ndarray) -> np.ndarray:

@@ -60,8 +60,8 @@ def find_missing(here: Machine, memory_gb: float = 0.0, splats: bool = True, mem
     found = []
     if here.torch_cuda == "":
         found.append(f"this torch is built without CUDA: {INSTALL}, or pip install torch from its CUDA index")
-    wanted = _major(here.torch_cuda)
-    oldest = OLDEST_DRIVER.get(wanted, 0) if wanted else 0
+    cuda_major = _major(here.torch_cuda)
+    oldest = OLDEST_DRIVER.get(cuda_major, 0) if cuda_major else 0
     if here.driver is not None and here.driver < oldest:
         found.append(
             f"the NVIDIA driver is {here.driver}, and torch's CUDA {here.torch_cuda} needs {oldest} or later: "
@@ -70,7 +70,7 @@ def find_missing(here: Machine, memory_gb: float = 0.0, splats: bool = True, mem
     if splats and not here.gsplat:
         found.append(f"gsplat is not installed: {INSTALL}")
     elif splats and not here.extension:
-        found += _cannot_build(here, wanted)
+        found += _cannot_build(here, cuda_major)
     if memory_gb and here.gigabytes is not None and memory_gb > here.gigabytes:
         found.append(
             f"{memory_param} is {memory_gb:g}, and {here.gpu or 'this GPU'} has {here.gigabytes:.0f} GB: "
@@ -79,18 +79,18 @@ def find_missing(here: Machine, memory_gb: float = 0.0, splats: bool = True, mem
     return found
 
 
-def _cannot_build(here: Machine, wanted: int | None) -> list[str]:
+def _cannot_build(here: Machine, cuda_major: int | None) -> list[str]:
     """Why gsplat cannot be compiled: its wheel holds sources only, which nvcc compiles when they are first loaded."""
     if here.nvcc is None:
-        toolkit = f"CUDA toolkit {wanted}" if wanted else "the CUDA toolkit"
+        toolkit = f"CUDA toolkit {cuda_major}" if cuda_major else "the CUDA toolkit"
         return [
             f"gsplat has no compiled extension, and there is no nvcc to build it: install {toolkit} (or name it in "
             "CUDA_HOME), then `make gpu`"
         ]
-    if wanted and here.nvcc and _major(here.nvcc) != wanted:
+    if cuda_major and here.nvcc and _major(here.nvcc) != cuda_major:
         return [
             f"gsplat has no compiled extension, and nvcc {here.nvcc} cannot build it for torch's CUDA "
-            f"{here.torch_cuda}: install CUDA toolkit {wanted}, then `make gpu`"
+            f"{here.torch_cuda}: install CUDA toolkit {cuda_major}, then `make gpu`"
         ]
     return []
 
@@ -107,10 +107,10 @@ def _query_gpu() -> tuple[str | None, float | None, int | None]:
     fields = ["--query-gpu=name,memory.total,driver_version", "--format=csv,noheader,nounits"]
     first = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")[0]
     with suppress(OSError, ValueError, subprocess.TimeoutExpired):
-        said = subprocess.run(
+        proc = subprocess.run(
             [command, *([f"--id={first}"] if first else []), *fields], capture_output=True, text=True, timeout=10
         )
-        name, memory, driver = (word.strip() for word in said.stdout.splitlines()[0].split(",")) if said.stdout else ()
+        name, memory, driver = (word.strip() for word in proc.stdout.splitlines()[0].split(",")) if proc.stdout else ()
         return name, float(memory) * 2**20 / 1e9, int(driver.split(".")[0])
     return None, None, None
 

@@ -67,12 +67,12 @@ def save_ply(
     )
     comments = [ANTIALIASED] if gaussians.antialiased else []
     found = {name: column for names, values in blocks for name, column in zip(names, values.T, strict=True)}
-    wanted = [name for name in properties or found if name in found]
-    wanted += [name for name in found if name not in wanted and name not in NORMAL]
-    table = np.empty(count, [(name, position_type if name in POSITION else "f4") for name in wanted])
+    columns = [name for name in properties or found if name in found]
+    columns += [name for name in found if name not in columns and name not in NORMAL]
+    table = np.empty(count, [(name, position_type if name in POSITION else "f4") for name in columns])
     for start in range(0, count, BLOCK):  # so that a row is in the processor's cache until its last property is written
         rows = slice(start, start + BLOCK)
-        for name in wanted:
+        for name in columns:
             table[name][rows] = found[name] if name in NORMAL else found[name][rows]
     save_vertices(path, table, comments)
 

@@ -75,11 +75,11 @@ def load_header(path: Path) -> Header:
                 break
         else:
             raise BadInput(f"{path}: cut off within its header")
-        held = tuple((name, count, tuple(properties)) for name, count, properties in elements)
-        header = Header(form == "ascii", held, tuple(comments), file.tell())
+        layout = tuple((name, count, tuple(properties)) for name, count, properties in elements)
+        header = Header(form == "ascii", layout, tuple(comments), file.tell())
         if form not in ("ascii", "binary_little_endian", "binary_big_endian"):
             raise BadInput(f"{path}: not a readable PLY file with vertices: its format is '{shorten(form)}'")
-        if any(count < 0 for _, count, _ in held) or not any(name == "vertex" for name, _, _ in held):
+        if any(count < 0 for _, count, _ in layout) or not any(name == "vertex" for name, _, _ in layout):
             raise BadInput(f"{path}: not a readable PLY file with vertices")
         if header.at + header.least_bytes() > Path(path).stat().st_size:
             raise BadInput(f"{path}: cut off: it is too short for what its header declares")

@@ -106,11 +106,11 @@ def from_states(net: Net, backbone: dict[str, Tensor], linear: dict[str, Tensor]
     Raises ValueError naming the first key that is missing or has another shape.
     """
     model = Lpips(net)
-    wanted = {f"features.{key}": value for key, value in model.features.state_dict(keep_vars=True).items()}
-    wanted_linear = {f"lin{i}.model.1.weight": weight for i, weight in enumerate(model.linear)}
+    feature_targets = {f"features.{key}": value for key, value in model.features.state_dict(keep_vars=True).items()}
+    linear_targets = {f"lin{i}.model.1.weight": weight for i, weight in enumerate(model.linear)}
     for state, targets, shape in [
-        (backbone, wanted, lambda p: p.shape),
-        (linear, wanted_linear, lambda p: (1, len(p), 1, 1)),
+        (backbone, feature_targets, lambda p: p.shape),
+        (linear, linear_targets, lambda p: (1, len(p), 1, 1)),
     ]:
         for key, parameter in targets.items():
             if key not in state:

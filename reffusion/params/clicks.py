@@ -9,11 +9,11 @@ from pydantic import BeforeValidator, Field
 CLICKS = "clicks.json"  # in a scene's folder: what the mask page keeps for itself, and no stage reads
 
 
-def _click(said: Any) -> Any:
+def _click(value: Any) -> Any:
     """Complete a click: YAML reads an unquoted + or - as text, and a click without either is on the object."""
-    if not isinstance(said, list | tuple) or len(said) not in (2, 3):
+    if not isinstance(value, list | tuple) or len(value) not in (2, 3):
         raise ValueError("a click is [x, y, +] on the object, [x, y, -] on what is not")
-    return (*said, "+") if len(said) == 2 else said
+    return (*value, "+") if len(value) == 2 else value
 
 
 Click = Annotated[

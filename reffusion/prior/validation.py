@@ -90,9 +90,9 @@ def measure_errors(
 
 
 @torch.no_grad()
-def _hole_errors(prior: Prior, held: HeldOut, seed: int, level: float) -> Tensor:
+def _hole_errors(prior: Prior, held_out: HeldOut, seed: int, level: float) -> Tensor:
     """[2, B]: both errors of `denoising_error` in the hole of the reference, at one noise level."""
-    samples = held.reference
+    samples = held_out.reference
     timesteps = torch.full((len(samples.prompts),), round(level * (prior.timesteps - 1)))
     generator = seeded(seed, "personalize", "held out", level)
     noise = torch.randn(len(samples.prompts), *latent_shape(prior, samples.images.shape[-1]), generator=generator)
@@ -101,13 +101,13 @@ def _hole_errors(prior: Prior, held: HeldOut, seed: int, level: float) -> Tensor
 
 
 @torch.no_grad()
-def _one_step_psnr(prior: Prior, held: HeldOut, seed: int) -> dict[str, float]:
+def _one_step_psnr(prior: Prior, held_out: HeldOut, seed: int) -> dict[str, float]:
     """PSNR of the hole in the reference and of those in photographs, for one denoising step from pure noise.
 
     One step predicts the mean of what the prior would paint.
     """
-    text = diffusion.embed_text(prior, [PROMPTS[GLOBAL]]).expand(len(held.pictures), -1, -1)
-    images, repaint, holes = (each.to(prior.device) for each in (held.pictures, held.repaint, held.holes))
+    text = diffusion.embed_text(prior, [PROMPTS[GLOBAL]]).expand(len(held_out.pictures), -1, -1)
+    images, repaint, holes = (each.to(prior.device) for each in (held_out.pictures, held_out.repaint, held_out.holes))
     generator = seeded(seed, "personalize", "expected")
     sampled = diffusion.sample(prior, images, repaint, text, steps=1, random=generator)
     squared_error = (((sampled - images) / 2).square().mean(1, keepdim=True) * holes).sum((1, 2, 3)) / holes.sum(

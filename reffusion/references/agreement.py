@@ -60,10 +60,10 @@ def _align_depth(hole: Hole, reference: Reference, remaining: Gaussians, hidden:
     """The hole with the depth map of its reference, aligned to the surroundings."""
     size = hole.camera.width, hole.camera.height
     shrunk = lambda array: cv2.resize(array, size, interpolation=cv2.INTER_NEAREST)
-    told = shrunk(reference.depth.astype(np.float64))
+    depth = shrunk(reference.depth.astype(np.float64))
     covered = cv2.resize((hidden | reference.mask).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.01
-    shown = rasterizer.render(remaining, hole.camera, sh_degree=0)
-    aligned, _ = align_either(told, shown.depth.cpu().numpy(), (shown.alpha.cpu().numpy() > 0.5) & ~covered)
+    rendering = rasterizer.render(remaining, hole.camera, sh_degree=0)
+    aligned, _ = align_either(depth, rendering.depth.cpu().numpy(), (rendering.alpha.cpu().numpy() > 0.5) & ~covered)
     return replace(hole, depth=np.where(np.isfinite(aligned), aligned, 0.0))
 
 
@@ -73,9 +73,9 @@ def find_contradictions(references: Sequence[Reference], holes: Mapping[str, Hol
     Args:
         holes: view name -> its hole (`view_ranking.find_holes`).
     """
-    shown = [each for each in references if each.camera.name in holes]
+    candidates = [each for each in references if each.camera.name in holes]
     found = []
-    for a, b in combinations(shown, 2):
+    for a, b in combinations(candidates, 2):
         unlike = color_difference(a, b, holes[a.camera.name], holes[b.camera.name])
         if unlike is not None and unlike > CONTRADICTION:
             found.append((a.camera.name, b.camera.name, unlike))
@@ -86,8 +86,8 @@ def color_difference(a: Reference, b: Reference, hole_a: Hole, hole_b: Hole) -> 
     """How far the colours of one reference lie beyond those of the other around the same point, [0, 1]: the mean over
     what both show in their holes, in both directions. None where they share too few pixels."""
     ways = [_one_way_difference(a, b, hole_a, hole_b), _one_way_difference(b, a, hole_b, hole_a)]
-    told = [way for way in ways if way is not None]
-    return sum(told) / len(told) if told else None
+    differences = [way for way in ways if way is not None]
+    return sum(differences) / len(differences) if differences else None
 
 
 def _one_way_difference(a: Reference, b: Reference, hole_a: Hole, hole_b: Hole) -> float | None:

@@ -72,12 +72,12 @@ def load_reference_files(
             raise BadInput(f"scene.yaml: reference: two for the view '{name}'; keep one")
         depth = None if each.depth is None else folder / each.depth
         found[name] = ReferenceFile(name, path, depth, each.undistorted, trust=each.trust)
-    for given in _paintings(list_paintings(folder), views):
-        named = found.get(given.view)
-        found[given.view] = replace(given, trust=named is not None and named.trust and named.path == given.path)
-    for given in found.values():
-        _check(given, views)
-    return sorted(found.values(), key=lambda given: given.view)
+    for file in _paintings(list_paintings(folder), views):
+        named = found.get(file.view)
+        found[file.view] = replace(file, trust=named is not None and named.trust and named.path == file.path)
+    for file in found.values():
+        _check(file, views)
+    return sorted(found.values(), key=lambda file: file.view)
 
 
 def describe_references(given: Sequence[ReferenceFile]) -> str:
@@ -110,26 +110,24 @@ def _paintings(files: Sequence[Path], views: ViewTable) -> list[ReferenceFile]:
     return [ReferenceFile(name, path, depths.get(name), True, True) for name, path in pictures.items()]
 
 
-def _check(given: ReferenceFile, views: ViewTable) -> None:
-    where = "" if given.painted else "; correct `reference` in scene.yaml"
-    for path in (given.path, given.depth):
+def _check(file: ReferenceFile, views: ViewTable) -> None:
+    where = "" if file.painted else "; correct `reference` in scene.yaml"
+    for path in (file.path, file.depth):
         if path is not None and not path.is_file():
             raise BadInput(f"{path}: no such file{where}")
-    if given.view in views.test:
+    if file.view in views.test:
         raise BadInput(
-            f"{given.path}: '{given.view}' is a test view, and scored: a reference would train it; "
+            f"{file.path}: '{file.view}' is a test view, and scored: a reference would train it; "
             "make it for a training view, or take the view out of `test` in scene.yaml"
         )
-    if given.view not in views.train:
+    if file.view not in views.train:
         raise BadInput(
-            f"{given.path}: '{given.view}' is neither a training nor a test view; "
+            f"{file.path}: '{file.view}' is neither a training nor a test view; "
             "name it in `train` in scene.yaml, or make the reference for another view"
         )
-    check_proportions(
-        given.path, given.view, views.size_of(given.view), PROPORTION_TOLERANCE, "reference", views.upright
-    )
-    if given.depth is not None:
-        if given.depth.suffix.lower() not in DEPTH_ENDINGS:
-            raise BadInput(f"{given.depth}: a depth map is a 16-bit .png, a .npy or an .exr; convert it")
-        if given.depth.suffix.lower() not in (".npy", ".exr"):
-            image_size(given.depth)
+    check_proportions(file.path, file.view, views.size_of(file.view), PROPORTION_TOLERANCE, "reference", views.upright)
+    if file.depth is not None:
+        if file.depth.suffix.lower() not in DEPTH_ENDINGS:
+            raise BadInput(f"{file.depth}: a depth map is a 16-bit .png, a .npy or an .exr; convert it")
+        if file.depth.suffix.lower() not in (".npy", ".exr"):
+            image_size(file.depth)

@@ -173,12 +173,12 @@ class _Pair:
 
     @classmethod
     def at(cls, picture: np.ndarray, photo: np.ndarray, known: np.ndarray, working: int) -> _Pair:
-        given = np.array(photo.shape[1::-1])
-        size = np.maximum(1, np.rint(given * min(1.0, working / given.max()))).astype(int)
-        if (size == given).all():
+        full_size = np.array(photo.shape[1::-1])
+        size = np.maximum(1, np.rint(full_size * min(1.0, working / full_size.max()))).astype(int)
+        if (size == full_size).all():
             return cls(picture, photo, known, np.ones(2))
         reduce = lambda image: cv2.resize(image, size.tolist(), interpolation=cv2.INTER_AREA)
-        return cls(reduce(picture), reduce(photo), reduce(known.astype(np.float32)) > 0.99, given / size)
+        return cls(reduce(picture), reduce(photo), reduce(known.astype(np.float32)) > 0.99, full_size / size)
 
     def judge(self, moved: np.ndarray) -> Registration:
         """The registration by a map [2, 3] in working pixels, in full-size pixels."""
@@ -227,13 +227,13 @@ class _Pair:
         """Refine a map by the affine part of the remaining displacements. None for a map that resizing and cropping
         cannot make, and where the identity needs no refinement."""
         for _ in range(REFINEMENTS):
-            left = self.compare(moved)[2].affine()
-            if left is None or (moved is IDENTITY and _shift(left, self.known.shape) < IDENTITY_SHIFT):
+            correction = self.compare(moved)[2].affine()
+            if correction is None or (moved is IDENTITY and _shift(correction, self.known.shape) < IDENTITY_SHIFT):
                 return None
-            moved = _compose(moved, left)
+            moved = _compose(moved, correction)
             if not self.is_plausible(moved):
                 return None
-            if _shift(left, self.known.shape) < IDENTITY_SHIFT / 4:
+            if _shift(correction, self.known.shape) < IDENTITY_SHIFT / 4:
                 break
         return self.judge(moved)
 

@@ -69,11 +69,11 @@ def find_holes(
             cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > least
         )
         covered = shrunk(hidden[camera.name] | invent[camera.name], 0.01)
-        drawn = rasterizer.render(remaining, small, sh_degree=0)
-        known = (drawn.alpha.cpu().numpy() > 0.5) & ~covered
+        rendering = rasterizer.render(remaining, small, sh_degree=0)
+        known = (rendering.alpha.cpu().numpy() > 0.5) & ~covered
         pixels = shrunk(invent[camera.name], 0.5) & covered
         if pixels.any() and known.any():
-            found[camera.name] = Hole(small, pixels, inpaint_depth(drawn.depth.cpu().numpy(), known))
+            found[camera.name] = Hole(small, pixels, inpaint_depth(rendering.depth.cpu().numpy(), known))
     return found
 
 
@@ -91,7 +91,7 @@ def rank_views(view_holes: Mapping[str, Hole], chosen: Sequence[str], most: int)
     covers, total = _coverage(view_holes)
     if not total:
         return []
-    left, result = np.ones(total, bool), []
+    uncovered, result = np.ones(total, bool), []
     named = [name for name in chosen if name in view_holes]
     at_border = {name for name in view_holes if _touches_border(view_holes[name])}
     groups = [([name], 1, 0.0) for name in named] + [
@@ -101,12 +101,12 @@ def rank_views(view_holes: Mapping[str, Hole], chosen: Sequence[str], most: int)
     for group, count, least in groups:
         for _ in range(min(count, len(named) + most - len(result))):
             candidates = sorted(set(group) - {each.view for each in result})
-            gains = {name: int((covers[name] & left).sum()) for name in candidates}
+            gains = {name: int((covers[name] & uncovered).sum()) for name in candidates}
             best = max(candidates, key=gains.__getitem__, default=None)
             if best is None or gains[best] < least * total:
                 break
             result.append(RankedView(best, gains[best] / total))
-            left &= ~covers[best]
+            uncovered &= ~covers[best]
     return result
 
 

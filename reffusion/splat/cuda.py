@@ -1,8 +1,8 @@
 """Splatting on a CUDA GPU by gsplat 1.5, with the conventions of the other implementations.
 
 Calls the steps of gsplat's `rasterization` separately, because the probe is added to the 2D means between two of them.
-Two differences from `pure_torch` cannot be configured: the transmittance limit is <= 1e-4 instead of <, and the conic is
-inverted from a float32 determinant (long needles lose digits).
+Two differences from `pure_torch` cannot be configured: the transmittance limit is <= 1e-4 instead of <, and the conic
+is inverted from a float32 determinant (long needles lose digits).
 """
 
 from __future__ import annotations

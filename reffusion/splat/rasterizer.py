@@ -135,8 +135,8 @@ def _check_tensor(name: str, tensor: Tensor, shape: tuple[int | None, ...], like
         want is None or want == have for want, have in zip(shape, tensor.shape, strict=True)
     )
     if not fits:
-        wanted = ", ".join("*" if size is None else str(size) for size in shape)
-        raise ValueError(f"{name} has shape {list(tensor.shape)}; [{wanted}] is needed")
+        expected = ", ".join("*" if size is None else str(size) for size in shape)
+        raise ValueError(f"{name} has shape {list(tensor.shape)}; [{expected}] is needed")
     if tensor.dtype != like.dtype or tensor.device != like.device:
         raise ValueError(
             f"{name} is {tensor.dtype} on {tensor.device}, but the Gaussians' means are {like.dtype} on {like.device}"

@@ -291,10 +291,10 @@ def find_mismatch(configs: Mapping[str, Mapping[str, Any]]) -> str | None:
         return f"prediction_type {kind!r} is not supported; {' and '.join(PREDICTIONS)} are: take another model"
     texts = [configs[part] for part in ("text_encoder", "text_encoder_2") if part in configs]
     widths = [text.get("hidden_size", 512) for text in texts]
-    wanted = unet.get("cross_attention_dim", 1280)
-    if wanted != sum(widths):
+    expected = unet.get("cross_attention_dim", 1280)
+    if expected != sum(widths):
         actual = " + ".join(map(str, widths))
-        return f"the UNet reads text of width {wanted}, the text encoder gives {actual}: the parts are of two models"
+        return f"the UNet reads text of width {expected}, the text encoder gives {actual}: the parts are of two models"
     return _find_added_mismatch(unet, texts)
 
 
@@ -306,7 +306,7 @@ def _find_added_mismatch(unet: Mapping[str, Any], texts: Sequence[Mapping[str, A
     if kind is None:
         return None
     width = texts[1].get("projection_dim", 512) + 6 * (unet.get("addition_time_embed_dim") or 0)
-    wanted = unet.get("projection_class_embeddings_input_dim")
-    if width != wanted:
-        return f"the UNet's added conditions are {wanted} numbers, the text encoder's and the sizes' {width}"
+    expected = unet.get("projection_class_embeddings_input_dim")
+    if width != expected:
+        return f"the UNet's added conditions are {expected} numbers, the text encoder's and the sizes' {width}"
     return None

@@ -21,10 +21,10 @@ def open_page(address: str, width: int = 1280) -> Iterator[object]:
     with playwright.sync_playwright() as engine:
         browser = engine.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": width, "height": 900}, bypass_csp=True)  # so that tests may ask
-        page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+        page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
         page.on("pageerror", lambda error: wrong.append(str(error)))
         own = ("data:", "blob:", "file:", "http://127.0.0.1:")
-        page.on("request", lambda asked: None if asked.url.startswith(own) else wrong.append(asked.url[:200]))
+        page.on("request", lambda request: None if request.url.startswith(own) else wrong.append(request.url[:200]))
         page.goto(address)
         yield page
         browser.close()

@@ -181,12 +181,12 @@ def reprojection_error(scene, truth: Truth) -> float:
     worst = 0.0
     for name, pose in truth.world_to_camera.items():
         at = truth.points @ pose[:3, :3].T + pose[:3, 3]
-        shown = lens.to_pixels(at[:, :2] / at[:, 2:], truth.lens)
+        pixels = lens.to_pixels(at[:, :2] / at[:, 2:], truth.lens)
         camera = scene.cameras[name]
         ours = scene.similarity.apply(truth.points) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         uv = (ours[:, :2] / ours[:, 2:] * (camera.fx, camera.fy)) + (camera.cx, camera.cy)
         back = (uv - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-        worst = max(worst, float(np.abs(lens.to_pixels(back, truth.lens) - shown).max()))
+        worst = max(worst, float(np.abs(lens.to_pixels(back, truth.lens) - pixels).max()))
         assert (camera.width, camera.height) == (WIDTH, HEIGHT)
     return worst
 

@@ -29,8 +29,8 @@ def write_edited_capture(folder, scale=5.0, offset=(50.0, 0.0, 0.0)):
     whole = Gaussians(means, draw(count, 4), draw(count, 3) - 3, draw(count) + 1, draw(count, 4, 3))
     write_capture(folder, "transforms", truth)
     save_ply(folder / "scene.ply", whole, properties=EDITOR)
-    left = whole.map(lambda p: p[torch.from_numpy(~deleted)].flip(0))
-    save_ply(folder / "cleaned.ply", Gaussians(*(getattr(left, n) for n in FIELDS[:4]), left.sh[:, :1]))
+    rest = whole.map(lambda p: p[torch.from_numpy(~deleted)].flip(0))
+    save_ply(folder / "cleaned.ply", Gaussians(*(getattr(rest, n) for n in FIELDS[:4]), rest.sh[:, :1]))
     return whole, deleted
 
 

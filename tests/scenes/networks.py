@@ -64,5 +64,5 @@ class MeanInpainter(torch.nn.Module):
     def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         assert image.size(2) % 8 == 0 and image.size(3) % 8 == 0
         assert mask.size(1) == 1 and image.size(2) == mask.size(2)
-        shown = (image * (1 - mask)).sum([2, 3], keepdim=True) / (1 - mask).sum()
-        return image * (1 - mask) + shown * mask
+        mean = (image * (1 - mask)).sum([2, 3], keepdim=True) / (1 - mask).sum()
+        return image * (1 - mask) + mean * mask

@@ -58,30 +58,30 @@ class GpuMode(TorchFunctionMode):
                 return self._moved(func, args, kwargs)
             if func in ONLY_ON_CPU and here:
                 raise TypeError("can't convert cuda:0 device type tensor to numpy")
-            wanted = _is_gpu(kwargs.get("device"))
-            leaf = wanted and kwargs.pop("requires_grad", False)  # the disguised one, not what it hides
-            if wanted:
+            to_gpu = _is_gpu(kwargs.get("device"))
+            leaf = to_gpu and kwargs.pop("requires_grad", False)  # the disguised one, not what it hides
+            if to_gpu:
                 kwargs.pop("device")
             on_gpu = any(isinstance(t, GpuTensor) for t in tensors)
             self._refuse_mixed(func, args, tensors)
             result = func(*args, **kwargs)
-        if not (wanted or on_gpu) or func is torch.Tensor.as_subclass:
+        if not (to_gpu or on_gpu) or func is torch.Tensor.as_subclass:
             return result
-        shown = tree_map(lambda each: disguise(each) if isinstance(each, torch.Tensor) else each, result)
-        return shown.requires_grad_() if leaf else shown
+        output = tree_map(lambda each: disguise(each) if isinstance(each, torch.Tensor) else each, result)
+        return output.requires_grad_() if leaf else output
 
     def _moved(self, func: Any, args: Any, kwargs: dict[str, Any]) -> torch.Tensor:
         tensor, *rest = args
         device = kwargs.pop("device", None)
-        given = [*rest]
+        positional = [*rest]
         if rest and (isinstance(rest[0], (str, torch.device))):
-            device = given.pop(0)
+            device = positional.pop(0)
         elif rest and isinstance(rest[0], torch.Tensor):  # to(other): its type and its place
-            device, given = (GPU_DEVICE if isinstance(rest[0], GpuTensor) else "cpu"), [rest[0].dtype, *rest[1:]]
+            device, positional = (GPU_DEVICE if isinstance(rest[0], GpuTensor) else "cpu"), [rest[0].dtype, *rest[1:]]
         if func is not torch.Tensor.to:
-            device, given, kwargs = ("cpu" if func is torch.Tensor.cpu else GPU_DEVICE), [], {}
+            device, positional, kwargs = ("cpu" if func is torch.Tensor.cpu else GPU_DEVICE), [], {}
         on_gpu = isinstance(tensor, GpuTensor) if device is None else _is_gpu(device)
-        moved = tensor.to(*given, **kwargs) if given or kwargs else tensor
+        moved = tensor.to(*positional, **kwargs) if positional or kwargs else tensor
         return disguise(moved) if on_gpu else moved.as_subclass(torch.Tensor)
 
     def _refuse_mixed(self, func: Any, args: Any, tensors: list[torch.Tensor]) -> None:
@@ -113,9 +113,9 @@ def simulated_gpu() -> Iterator[None]:
     enter = lambda value: disguise(value) if isinstance(value, torch.Tensor) else value
 
     def render(gaussians, camera, features, background, degree, probe):
-        given = (leave(each) for each in (features, background))
-        drawn = cpu.render(gaussians.map(leave), camera, *given, degree, leave(probe))
-        return Rendering(*map(enter, drawn))
+        inputs = (leave(each) for each in (features, background))
+        rendering = cpu.render(gaussians.map(leave), camera, *inputs, degree, leave(probe))
+        return Rendering(*map(enter, rendering))
 
     def accumulate(gaussians, camera, values, count):
         return enter(cpu.accumulate(gaussians.map(leave), camera, leave(values), count))

@@ -96,10 +96,10 @@ def find_image_folder(folder: Path, images: str | None, usual: tuple[str, ...]) 
     """
     if images is not None:
         return folder / images
-    there = [folder / name for name in usual if has_pictures(folder / name, nested=name != ".")]
-    if not there:
+    folders = [folder / name for name in usual if has_pictures(folder / name, nested=name != ".")]
+    if not folders:
         raise BadInput(f"{folder}: no pictures in {', '.join(usual)}; name their folder as `images` in scene.yaml")
-    return next((path for path in there if (path / "label").is_dir()), there[0])
+    return next((path for path in folders if (path / "label").is_dir()), folders[0])
 
 
 def lens_from_model(camera: ModelCamera, source: Path) -> Lens:

@@ -62,8 +62,8 @@ def find_masks(folder: Path, capture: Capture, asked: str | MaskSpec | None, opt
         if files and not {place / path for path in files} <= ignored:
             return FoundMasks(group_by_object(place, files, capture), values)
     if ignored:
-        said = f"mask_path of {capture.pose_source.name}: black, which training ignores, is taken for the object"
-        return FoundMasks({"": capture.ignore_masks}, MaskValues(named.numbers, inverted=True), said)
+        warning = f"mask_path of {capture.pose_source.name}: black, which training ignores, is taken for the object"
+        return FoundMasks({"": capture.ignore_masks}, MaskValues(named.numbers, inverted=True), warning)
     if optional:
         return FoundMasks({})
     raise BadInput(

@@ -199,11 +199,11 @@ def select_frames(seen: list[FrameStats]) -> tuple[list[FrameStats], list[FrameS
 
 def _write(video: Path, folder: Path, chosen: list[FrameStats]) -> tuple[int, int]:
     """Write the frames as frame_<number>.jpg; returns their (width, height)."""
-    wanted, size = {each.number for each in chosen}, (0, 0)
+    numbers, size = {each.number for each in chosen}, (0, 0)
     partial = folder.with_name(f".{folder.name}-{os.getpid()}")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    for number, _, frame in _frames(video, wanted.__contains__):
+    for number, _, frame in _frames(video, numbers.__contains__):
         picture = cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
         size = (picture.shape[1], picture.shape[0])
         Image.fromarray(picture).save(partial / f"frame_{number:05d}.jpg", quality=QUALITY, subsampling=0)
@@ -214,11 +214,11 @@ def _write(video: Path, folder: Path, chosen: list[FrameStats]) -> tuple[int, in
     return size
 
 
-def _frames(video: Path, wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, np.ndarray]]:
-    """Number, seconds and picture, uint8 [H, W, 3] BGR, of the frames whose number is `wanted`."""
+def _frames(video: Path, is_chosen: Callable[[int], bool]) -> Iterator[tuple[int, float, np.ndarray]]:
+    """Number, seconds and picture, uint8 [H, W, 3] BGR, of the frames whose number `is_chosen`."""
     video_file, number = _open_video(video), 0
     while video_file.grab():
-        if wanted(number):
+        if is_chosen(number):
             seconds = video_file.get(cv2.CAP_PROP_POS_MSEC) / 1000
             whole, frame = video_file.retrieve()
             if whole and frame is not None and frame.ndim == 3:
