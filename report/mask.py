@@ -191,10 +191,7 @@ def main() -> None:
         flush=True,
     )
     if segmenter is None:
-        print(
-            "clicks are segmented by colours and surfaces; `make weights` fetches a network (37 MB) "
-            "that needs fewer"
-        )
+        print("clicks are segmented by colours and surfaces; `make weights` fetches a network (37 MB) that needs fewer")
     try:
         server.serve_forever()
     except KeyboardInterrupt:

@@ -3,6 +3,7 @@
 import itertools
 import threading
 import time
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,11 +13,14 @@ from scenes import wall_scene
 from scenes.browser import open_page
 from scenes.gaussians import round_gaussians
 from scenes.stage_runs import run_masks
+from scipy import ndimage
 
 from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points
 from reffusion.clicks import all_views
-from reffusion.clicks.marks import Clicks
-from reffusion.clicks.single_view import correct_mask, segment_view
+from reffusion.clicks.marks import Mark, confirmed_pixels, stroke_pixels
+from reffusion.clicks.scene_segmentation import Event, FittedViews, correct_scene, segment_scene
+from reffusion.clicks.segmenter import Candidate
+from reffusion.clicks.single_view import ViewEvidence, apply_marks
 from reffusion.graph_cut import min_cut
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, load_mask, save_image, save_mask, to_uint8
@@ -34,8 +38,13 @@ NEAR = 1.7
 
 
 def make_clicks(*points):
-    """Clicks at (x, y); a third entry False marks a click beside the object."""
-    return Clicks(np.array([p[:2] for p in points], float), np.array([len(p) < 3 for p in points]))
+    """Clicks at (x, y), one mark each; a third entry False marks a click beside the object."""
+    return [Mark(np.array([p[:2]], float), len(p) < 3) for p in points]
+
+
+def click_mask(picture, *points, relief=None, before=None):
+    """The mask after clicks on a picture."""
+    return apply_marks(ViewEvidence(picture, relief), make_clicks(*points), before)
 
 
 # ---------------------------------------------------------------------------------------------- one photograph
@@ -69,39 +78,70 @@ def test_one_click_finds_what_is_of_one_colour_and_another_the_rest():
     picture, disk = disk_picture()
     rows = np.mgrid[:240, :320][0]
     red = disk & (abs(rows - 120) >= 12)
-    assert wall_scene.iou(segment_view(picture, make_clicks((150, 85), (150, 155))) & red, red) > 0.97
-    assert wall_scene.iou(segment_view(picture, make_clicks((150, 85), (150, 155), (150, 120))), disk) > 0.97
-    assert not segment_view(picture, make_clicks((10, 10, False))).any()
-    assert not segment_view(picture, Clicks(np.zeros((0, 2)), np.zeros(0, bool))).any()
+    assert wall_scene.iou(click_mask(picture, (150, 85), (150, 155)) & red, red) > 0.97
+    assert wall_scene.iou(click_mask(picture, (150, 85), (150, 155), (150, 120)), disk) > 0.97
+    assert not click_mask(picture, (10, 10, False)).any()
+    assert not click_mask(picture).any()
 
 
 def test_where_the_depth_is_known_a_click_goes_as_far_as_the_surface():
     picture, disk = disk_picture()
     picture[:, 180:] = picture[70:90, 140:160].mean((0, 1))  # what stands behind has the disk's colour, and touches it
     relief = np.where(disk, 0.0, 300.0)
-    alone, flat = (
-        segment_view(picture, make_clicks((150, 85))),
-        segment_view(picture, make_clicks((150, 85)), 0 * relief),
-    )
+    alone, flat = click_mask(picture, (150, 85)), click_mask(picture, (150, 85), relief=0 * relief)
     assert wall_scene.iou(alone, disk) < 0.9 and (alone == flat).all()
-    assert wall_scene.iou(segment_view(picture, make_clicks((150, 85)), relief), disk) > 0.95
+    assert wall_scene.iou(click_mask(picture, (150, 85), relief=relief), disk) > 0.95
     half = disk & (np.mgrid[:240, :320][1] < 150)
-    assert wall_scene.iou(correct_mask(picture, half, make_clicks((165, 90)), relief), disk) > 0.9
+    assert wall_scene.iou(click_mask(picture, (165, 90), relief=relief, before=half), disk) > 0.9
 
 
 def test_a_click_takes_back_what_it_is_on():
     picture, disk = disk_picture()
     stripe = disk & (abs(np.mgrid[:240, :320][0] - 120) < 12)
-    without = correct_mask(picture, disk, make_clicks((150, 120, False)))
+    without = click_mask(picture, (150, 120, False), before=disk)
     assert not without[115:125, 140:160].any() and wall_scene.iou(without, disk & ~stripe) > 0.9
-    again = correct_mask(picture, without, make_clicks((150, 120)))
-    assert wall_scene.iou(again, disk) > 0.95
+    assert wall_scene.iou(click_mask(picture, (150, 120), before=without), disk) > 0.95
+
+
+def test_a_correction_changes_one_region_and_keeps_what_marks_confirm():
+    """Random clicks and strokes: each changes one connected region below it, and no pixel that others confirm."""
+    picture, _ = disk_picture((120, 160))
+    picture = picture[:120, 70:230]
+    draw = np.random.default_rng(0)
+    for _ in range(6):
+        marks, mask = make_clicks((80, 85)), None
+        mask = apply_marks(ViewEvidence(picture), marks)
+        for _ in range(5):
+            at = draw.uniform((2, 2), (158, 118), (2, 2))
+            radius = float(draw.choice([0.0, 4.0]))
+            marks.append(Mark(at if radius else at[:1], bool(draw.integers(2)), radius))
+            before, mask = mask, apply_marks(ViewEvidence(picture), marks, mask, first=len(marks) - 1)
+            assert ndimage.label(mask != before, np.ones((3, 3)))[1] <= (5 if radius else 1)
+            confirmed = confirmed_pixels(marks, mask.shape)
+            assert mask[confirmed == 1].all() and not mask[confirmed == -1].any()
+
+
+def test_a_stroke_covers_the_brush_along_its_path():
+    stroke = Mark(np.array([[10.0, 10.0], [30.0, 10.0], [30.0, 25.0]]), True, 3.0)
+    rows, columns = np.mgrid[:40, :50] + 0.5
+    distance = np.minimum(
+        np.hypot(columns - columns.clip(10, 30), rows - 10), np.hypot(columns - 30, rows - rows.clip(10, 25))
+    )
+    painted = stroke_pixels(stroke, (40, 50))
+    assert painted[distance < 2].all() and not painted[distance > 4.2].any()
 
 
 def test_a_plain_picture_of_any_size_is_no_error():
     for shape in ((1, 1, 3), (2, 300, 3), (40, 40, 3)):
-        found = segment_view(np.full(shape, 7, np.uint8), make_clicks((shape[1] / 2, shape[0] / 2)))
-        assert found.shape == shape[:2]
+        assert click_mask(np.full(shape, 7, np.uint8), (shape[1] / 2, shape[0] / 2)).shape == shape[:2]
+
+
+def test_of_the_networks_masks_the_one_with_edges_around_it_is_selected():
+    picture, disk = disk_picture()
+    half = disk & (np.mgrid[:240, :320][1] < 150)
+    wide = ndimage.binary_dilation(disk, iterations=12)
+    view = ViewEvidence(picture, None, lambda _: [Candidate(each, 0.9) for each in (half, disk, wide)])
+    assert (apply_marks(view, make_clicks((120, 120))) == disk).all()
 
 
 # ---------------------------------------------------------------------------------------------- all views
@@ -146,15 +186,65 @@ def test_clicks_on_nothing_are_refused(clicked_scene, tmp_path):
         run_masks(placed, fit, tmp_path, masks.Params(clicks={"a2": [[3, 3, "-"]]}))
 
 
-def test_a_mask_in_one_view_stays_as_it_was_given(clicked_scene):
-    _, placed, _ = clicked_scene
+def fitted_views(ask=None):
+    """The wall and the square, photographed; `ask`: view -> network."""
     everything, _ = wall_scene.wall_and_square(NEAR)
-    image_of = lambda name: load_image(placed / "images" / f"{name}.png")
-    near = all_views.find_neighbours(everything)
-    found = all_views.segment_by_clicks(everything, near, wall_scene.CAMERAS, image_of, {}, {"a1": square_mask("a1")})
-    assert (found.masks["a1"] == square_mask("a1")).all()
-    shown = all_views.object_mask(everything, found.labels, wall_scene.CAMERAS["a4"], image_of("a4"))
-    assert wall_scene.iou(shown, square_mask("a4")) > 0.9
+    cameras = {name: wall_scene.CAMERAS[name] for name in wall_scene.TRAIN}
+
+    @cache
+    def evidence_of(name):
+        with torch.no_grad():
+            image = to_uint8(rasterizer.render(everything, cameras[name]).color.clamp(0, 1).numpy())
+        relief = all_views.surface_relief(everything, cameras[name])
+        return ViewEvidence(image, relief, ask and ask(name))
+
+    return FittedViews(everything, cameras, evidence_of)
+
+
+def test_a_mask_in_one_view_stays_as_it_was_given():
+    found = segment_scene(fitted_views(), [], {"a1": square_mask("a1")})
+    assert (found["a1"] == square_mask("a1")).all()
+    assert wall_scene.iou(found["a4"], square_mask("a4")) > 0.9
+
+
+def test_a_network_that_knows_the_object_in_parts_gives_the_whole_in_all_views():
+    """The object is two things to the network: the upper and the lower half of the square."""
+
+    def ask(name):
+        square = square_mask(name)
+        rows = np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH][0]
+        middle = np.nonzero(square)[0].mean()
+        halves = [square & (rows < middle), square & (rows >= middle)]
+
+        def answer(prompt):
+            column, row = prompt.clicks.points[0].astype(int)
+            mask = next((half for half in halves if half[row, column]), ~square)
+            return [Candidate(mask & False, 0.5), Candidate(mask, 0.9), Candidate(mask, 0.95)]
+
+        return answer
+
+    found = segment_scene(fitted_views(ask), [], {"a2": square_mask("a2")})
+    assert min(wall_scene.iou(found[name], square_mask(name)) for name in wall_scene.TRAIN) > 0.95
+
+
+def test_a_stroke_in_one_view_corrects_the_others():
+    views = fitted_views()
+    whole = {name: square_mask(name) for name in wall_scene.TRAIN}
+    lower = {
+        name: np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH][0] > np.nonzero(m)[0].mean()
+        for name, m in whole.items()
+    }
+    masks = {name: mask & lower[name] for name, mask in whole.items()}
+    row, column = np.argwhere(whole["a0"] & ~lower["a0"]).mean(0) + 0.5
+    stroke = Event("a0", Mark(np.array([[column - 5, row], [column + 5, row]]), True, 2.0))
+    found = correct_scene(views, [stroke], masks, {})
+    gain = {name: wall_scene.iou(found[name], whole[name]) - wall_scene.iou(masks[name], whole[name]) for name in whole}
+    assert gain["a0"] > 0.05
+    assert min(gain.values()) > 0.5 * gain["a0"]
+    back = correct_scene(views, [stroke, Event("a4", Mark(stroke.mark.points, False, 40.0))], found, {})
+    assert not back["a0"].any() or wall_scene.iou(back["a0"], found["a0"]) < 1
+    kept = confirmed_pixels([stroke.mark], whole["a0"].shape) == 1
+    assert back["a0"][kept].all(), "what is confirmed in a view survives corrections in others"
 
 
 def sheet_points(origin, along, up, color, step=0.04):
@@ -252,38 +342,51 @@ def test_clicks_in_a_browser_make_masks_that_are_saved(page_server, tmp_path, wi
     with open_page(page_server.address, width) as tab:
         tab.wait_for_function("state && state.fit && view")
         name = tab.evaluate("view")
-        box = tab.locator("#stage").bounding_box()
-        column, row = np.argwhere(square_mask(name)).mean(0)[::-1] / (wall_scene.WIDTH, wall_scene.HEIGHT)
-        at = (box["x"] + column * box["width"], box["y"] + row * box["height"])
+        column, row = np.argwhere(square_mask(name)).mean(0)[::-1] + 0.5
+        sheet = tab.evaluate("place()")
+        at = (sheet["left"] + column * sheet["scale"], sheet["top"] + row * sheet["scale"])
         tab.mouse.click(*at)
         tab.wait_for_function("!pending && !state.busy && state.views.every(v => v.mask !== null)", timeout=60_000)
         assert wall_scene.iou(page_server.session.masks[name], square_mask(name)) > 0.9
         tab.mouse.click(*at, button="right")
-        tab.wait_for_function("!pending && !state.busy && of(view).clicks.length === 2")
-        assert not page_server.session.masks[name][round(row * wall_scene.HEIGHT), round(column * wall_scene.WIDTH)]
+        tab.wait_for_function("!pending && !state.busy && of(view).marks.length === 2")
+        assert not page_server.session.masks[name][int(row), int(column)]
         tab.keyboard.press("Control+z")
-        tab.wait_for_function("!pending && !state.busy && of(view).clicks.length === 1")
+        tab.wait_for_function("!pending && !state.busy && of(view).marks.length === 1")
+        tab.keyboard.press("b")
+        tab.locator("#erase").click()
+        tab.mouse.move(*at)
+        tab.mouse.down()
+        tab.mouse.move(at[0] + 10, at[1])
+        tab.mouse.up()
+        tab.wait_for_function("!pending && !state.busy && of(view).marks.length === 2")
+        assert not page_server.session.masks[name][int(row), int(column)]
+        tab.locator("#in").click()
+        assert tab.evaluate("place().scale") > 1.4 * sheet["scale"]
+        tab.locator("#list li button").last.click()
+        tab.wait_for_function("!pending && !state.busy && of(view).marks.length === 1")
         tab.keyboard.press("ArrowRight")
         assert tab.evaluate("view") != name
         tab.locator("#save").click()
-        tab.wait_for_function("document.getElementById('status').textContent.includes('saved')")
+        tab.wait_for_function("!document.getElementById('saved').hidden")
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
     for each in wall_scene.TRAIN:
         assert wall_scene.iou(load_mask(tmp_path / "masks" / f"{each}.png"), square_mask(each)) > 0.85
 
 
 def test_clicks_are_restored_the_next_time(page_server, tmp_path):
-    page_server.session.click("a2", [(48.0, 36.0, True)])
+    page_server.session.mark("a2", [(48.0, 36.0)], True)
     page_server.session.save()
     again = Session(page_server.session.capture, lambda: True)
-    assert again.clicks == {"a2": [(48.0, 36.0, True)]}
+    (event,) = again.events
+    assert event.view == "a2" and event.mark.points.tolist() == [[48.0, 36.0]] and event.mark.positive
     again.save()  # its own files it may write again
 
 
 def test_masks_of_others_are_never_overwritten(page_server, tmp_path):
     save_mask(tmp_path / "masks/a3.png", square_mask("a3"))
     before = load_image(tmp_path / "masks/a3.png")
-    page_server.session.click("a2", [(48.0, 36.0, True)])
+    page_server.session.mark("a2", [(48.0, 36.0)], True)
     with pytest.raises(ValueError, match=r"a3\.png: not written by this page"):
         page_server.session.save()
     assert (load_image(tmp_path / "masks/a3.png") == before).all()
@@ -298,6 +401,8 @@ def test_the_page_is_served_on_localhost_only(page_server):
         request = urllib.request.Request(page_server.address + "save", b"{}", headers)
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(request)
-    request = urllib.request.Request(page_server.address + "clicks", b'{"view": "a9", "clicks": [[1, 1, "+"]]}')
+    request = urllib.request.Request(
+        page_server.address + "mark", b'{"view": "a9", "points": [[1, 1]], "sign": "+", "radius": 0}'
+    )
     with pytest.raises(urllib.error.HTTPError, match="400"):
         urllib.request.urlopen(request)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scenes import wall_scene
 
-from reffusion.clicks.marks import Clicks
-from reffusion.clicks.single_view import segment_view
+from reffusion.clicks.marks import Mark
+from reffusion.clicks.single_view import ViewEvidence, apply_marks
 
 
 def checkered_disk_on_gravel():
@@ -22,7 +22,7 @@ def checkered_disk_on_gravel():
 
 def test_one_click_finds_a_chequered_thing_on_rough_ground():
     picture, relief, disk = checkered_disk_on_gravel()
-    found = segment_view(picture, Clicks(np.array([[110.5, 150.5]]), np.array([True])), relief)
+    found = apply_marks(ViewEvidence(picture, relief), [Mark(np.array([[110.5, 150.5]]), True)])
     assert wall_scene.iou(found, disk) > 0.9
 
 
@@ -32,6 +32,5 @@ def test_a_further_click_never_loses_what_was_clicked_before():
     rows, columns = np.mgrid[:256, :256]
     other = np.hypot(rows - 80, columns - 200) < 20
     picture[other], relief[other] = (200, 40, 40), 0
-    clicks = Clicks(np.array([[110.5, 150.5], [200.5, 80.5]]), np.array([True, True]))
-    found = segment_view(picture, clicks, relief)
+    found = apply_marks(ViewEvidence(picture, relief), [Mark(np.array([[110.5, 150.5], [200.5, 80.5]]), True)])
     assert wall_scene.iou(found & disk, disk) > 0.9 and wall_scene.iou(found & other, other) > 0.9

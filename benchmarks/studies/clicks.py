@@ -2,8 +2,8 @@
 
 Each run needs the stages `poses`, with true masks, and `fit`. Each click is placed like a person's correction, in the
 middle of the largest error of the middle view's mask so far, until that mask is good or there are --clicks clicks.
-Prints that view's IoU after each click, then mean and worst IoU over all views with masks; --sheets writes the masks
-over three views and the worst one.
+Prints that view's IoU after each click, then mean and worst IoU over all views with masks; --segmenter none does
+without the segmentation network; --sheets writes the masks over three views and the worst one.
 """
 
 from __future__ import annotations
@@ -15,9 +15,12 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from reffusion.clicks import all_views
-from reffusion.clicks.marks import Clicks
-from reffusion.clicks.single_view import segment_view
+from reffusion.clicks.local_segmenter import AUTO, load_local_segmenter
+from reffusion.clicks.marks import Mark
+from reffusion.clicks.scene_masks import evidence_loader
+from reffusion.clicks.scene_segmentation import Event, FittedViews, segment_scene
+from reffusion.clicks.segmenter import Segmenter
+from reffusion.clicks.single_view import ViewEvidence, apply_marks
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_raw_masks, load_scene, load_views
@@ -39,41 +42,39 @@ def next_click(mask: np.ndarray, true: np.ndarray) -> tuple[float, float, bool]:
     return column + 0.5, row + 0.5, missing
 
 
-def simulate_clicks(image: np.ndarray, true: np.ndarray, most: int, relief: np.ndarray) -> Clicks:
-    """The clicks that a person would make on a view, printing the IoU after each; `relief` is that of `view_mask`."""
-    chosen, mask = [], np.zeros_like(true)
-    while len(chosen) < most and iou(mask, true) < GOOD_IOU:
-        chosen.append(next_click(mask, true))
-        clicks = Clicks(np.array([each[:2] for each in chosen]), np.array([each[2] for each in chosen]))
+def simulate_clicks(view: ViewEvidence, true: np.ndarray, most: int) -> list[Mark]:
+    """The clicks that a person would make on a view, printing the IoU after each."""
+    marks: list[Mark] = []
+    mask = np.zeros_like(true)
+    while len(marks) < most and iou(mask, true) < GOOD_IOU:
+        x, y, positive = next_click(mask, true)
+        marks.append(Mark(np.array([[x, y]]), positive))
         began = time.monotonic()
-        mask = segment_view(image, clicks, relief)
-        print(f"  click {len(chosen)}: {iou(mask, true):.3f}, {time.monotonic() - began:.1f} s", flush=True)
-    return clicks
+        mask = apply_marks(view, marks, mask, first=len(marks) - 1)
+        print(f"  click {len(marks)}: {iou(mask, true):.3f}, {time.monotonic() - began:.1f} s", flush=True)
+    return marks
 
 
-def evaluate_run(run: Path, most: int, sheet: Path | None) -> str:
+def evaluate_run(run: Path, most: int, segmenter: Segmenter | None, sheet: Path | None) -> str:
     """One line of figures. ValueError if the run has no masks."""
     scene = load_scene(run / "poses")
     true = load_raw_masks(run / "raw_masks", scene.train)
     if not true:
         raise ValueError(f"{run / 'raw_masks/masks'}: no masks to compare with")
-    names = sorted(true)
-    view, images = names[len(names) // 2], load_views(run / "poses", names)
-    gaussians = load_ply(run / "fit/gaussians.ply")
-    clicks = simulate_clicks(images[view], true[view], most, all_views.surface_relief(gaussians, scene.cameras[view]))
+    names, gaussians = sorted(true), load_ply(run / "fit/gaussians.ply")
+    view = names[len(names) // 2]
+    evidence_of = evidence_loader(scene, gaussians, run / "poses", segmenter)
+    marks = simulate_clicks(evidence_of(view), true[view], most)
     began, cameras = time.monotonic(), {name: scene.cameras[name] for name in names}
-    near = all_views.find_neighbours(gaussians)
-    solved = all_views.segment_by_clicks(gaussians, near, cameras, images.__getitem__, {view: clicks}, {})
-    render_mask = lambda name: all_views.object_mask(gaussians, solved.labels, cameras[name], images[name])
-    estimates = {name: render_mask(name) for name in names}
+    estimates = segment_scene(FittedViews(gaussians, cameras, evidence_of), [Event(view, mark) for mark in marks], {})
     seconds = time.monotonic() - began
     shares = {name: iou(estimates[name], true[name]) for name in names}
     worst = min(shares, key=shares.__getitem__)
     if sheet:
-        some = [*names[:: max(1, len(names) // 3)][:3], worst]
+        some, images = [*names[:: max(1, len(names) // 3)][:3], worst], load_views(run / "poses", names)
         save_image(sheet, np.hstack([overlay_mask(images[name], estimates[name]) for name in some]))
     mean = float(np.mean(list(shares.values())))
-    return f"{run.name}: {len(clicks)} clicks, mean {mean:.3f}, worst {shares[worst]:.3f} ({worst}), {seconds:.1f} s"
+    return f"{run.name}: {len(marks)} clicks, mean {mean:.3f}, worst {shares[worst]:.3f} ({worst}), {seconds:.1f} s"
 
 
 def overlay_mask(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -85,13 +86,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=Path, nargs="+", required=True)
     parser.add_argument("--clicks", type=int, default=5, help="largest number of clicks")
+    parser.add_argument("--segmenter", default=AUTO, help="auto, none, or a folder")
     parser.add_argument("--sheets", type=Path, help="folder for pictures")
     arguments = parser.parse_args()
+    segmenter = load_local_segmenter(arguments.segmenter)
     for run in arguments.runs:
-        print(
-            evaluate_run(run, arguments.clicks, arguments.sheets / f"{run.name}.png" if arguments.sheets else None),
-            flush=True,
-        )
+        sheet = arguments.sheets / f"{run.name}.png" if arguments.sheets else None
+        print(evaluate_run(run, arguments.clicks, segmenter, sheet), flush=True)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,8 @@ from reffusion.clicks.single_view import ViewEvidence, bounding_box, erode, refi
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
-MIN_WEIGHT = 2.0  # px of blending weight, over all views, from which votes label a Gaussian
+LEAST_WEIGHT = 0.5  # of the mean blending weight of the Gaussians that a view shows, from which votes label one
+SHOWN = 0.05  # px of blending weight from which a view shows a Gaussian
 MIN_PIXELS = 20  # px of a silhouette below which a view does not show the object
 MIN_PART = 0.1  # of the largest connected part of a silhouette: smaller parts are no prompt
 POINTS = 3  # points of a prompt
@@ -32,6 +33,22 @@ MIN_DEPTH = 0.3  # of the largest distance to the silhouette's border: points ne
 MIN_DEPTH_PX = 1.5
 WHOLE_BONUS = 0.03  # of agreement: the network's mask of the largest object is preferred, since votes know parts first
 MIN_AGREEMENT = 0.8  # of a network's mask with the labels so far, from which it votes
+
+
+@dataclass(frozen=True)
+class Votes:
+    """What masks say of Gaussians.
+
+    Attributes:
+        counts: [N, 2] px of blending weight, inside and outside the masks.
+        least: px of blending weight from which votes label a Gaussian.
+    """
+
+    counts: np.ndarray
+    least: float
+
+    def plus(self, counts: np.ndarray) -> Votes:
+        return Votes(self.counts + counts, self.least)
 
 
 @dataclass(frozen=True)
@@ -61,9 +78,7 @@ def propagate_masks(
         evidence_of: view -> its photograph; without a segmentation network a mask is the projection of the votes.
         masks: view -> bool [H, W], at least one; they stay as they are.
     """
-    drawn = dict(masks)
-    own_votes = {name: count_votes(gaussians, cameras[name], mask) for name, mask in masks.items()}
-    votes = sum(own_votes.values())
+    drawn, votes = dict(masks), count_all_votes(gaussians, cameras, masks)
     order = order_by_distance(cameras, masks)
     for k in trace.progress(len(order), "masks from view to view"):
         name = order[k]
@@ -72,11 +87,19 @@ def propagate_masks(
             continue
         drawn[name] = mask = draw_mask(view, projection)
         if agreement(mask, projection) > MIN_AGREEMENT:
-            votes = votes + count_votes(gaussians, cameras[name], mask)
+            votes = votes.plus(count_votes(gaussians, cameras[name], mask))
     return dict(masks) | {
         name: combine(evidence_of(name).image, project_votes(gaussians, cameras[name], votes), drawn.get(name))
         for name in order
     }
+
+
+def count_all_votes(gaussians: Gaussians, cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray]) -> Votes:
+    """The votes of at least one view with a mask."""
+    counts = [count_votes(gaussians, cameras[name], mask) for name, mask in masks.items()]
+    weights = np.concatenate([each.sum(1) for each in counts])
+    shown = weights[weights > SHOWN]
+    return Votes(np.sum(counts, 0), LEAST_WEIGHT * float(shown.mean()) if len(shown) else SHOWN)
 
 
 @torch.no_grad()
@@ -87,11 +110,11 @@ def count_votes(gaussians: Gaussians, camera: Camera, mask: np.ndarray) -> np.nd
 
 
 @torch.no_grad()
-def project_votes(gaussians: Gaussians, camera: Camera, votes: np.ndarray) -> Projection:
-    """Project votes [N, 2], as `count_votes`."""
-    weight = votes.sum(1)
-    known = weight > MIN_WEIGHT
-    share = np.where(known, votes[:, 0] / np.maximum(weight, MIN_WEIGHT), 0.0)
+def project_votes(gaussians: Gaussians, camera: Camera, votes: Votes) -> Projection:
+    """Project the labels of the Gaussians that enough votes know."""
+    weight = votes.counts.sum(1)
+    known = weight > votes.least
+    share = np.where(known, votes.counts[:, 0] / np.maximum(weight, votes.least), 0.0)
     labels = torch.as_tensor(share > 0.5, device=gaussians.means.device)
     shares = torch.as_tensor(np.stack([share, (1 - share) * known], -1)).to(gaussians.means)
     blended = rasterizer.render(gaussians, camera, sh_degree=0, features=shares).features.cpu().numpy()

@@ -12,7 +12,7 @@ from reffusion.capture.click_coordinates import undistort_clicks
 from reffusion.capture.views import check_outliers
 from reffusion.clicks import all_views
 from reffusion.clicks.marks import Mark
-from reffusion.clicks.propagation import count_votes, draw_view, project_votes
+from reffusion.clicks.propagation import count_all_votes, draw_view, project_votes
 from reffusion.clicks.scene_segmentation import Event, FittedViews, segment_scene
 from reffusion.clicks.segmenter import ImageFeatures, Segmenter, encode_image, predict_masks
 from reffusion.clicks.single_view import ViewEvidence
@@ -60,7 +60,7 @@ def masks_from_clicks(
 
 def masks_of_test_views(scene: Scene, views: FittedViews, masks: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """View name -> bool [H, W]: what the masks of training views show in test views whose photographs show it, too."""
-    votes = sum(count_votes(views.gaussians, views.cameras[name], mask) for name, mask in masks.items())
+    votes = count_all_votes(views.gaussians, views.cameras, masks)
     found = {}
     for name in scene.test:
         camera, view = scene.cameras[name], views.evidence_of(name)

@@ -66,7 +66,7 @@ def segment_scene(
 
 
 def count_first(events: Sequence[Event]) -> int:
-    """The number of events that select the object: those in the view of the first, until the first stroke thereafter."""
+    """The number of events that select the object: those in the view of the first one, until a stroke follows."""
     apart = lambda event: event.view != events[0].view or event.mark.radius > 0
     return next((k for k, event in enumerate(events) if k and apart(event)), len(events))
 
