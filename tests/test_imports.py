@@ -18,9 +18,13 @@ DOORS = {
     "pycolmap": ("reffusion/capture/sfm.py",),
     "diffusers": ("reffusion/prior/model.py",),
     "peft": ("reffusion/prior/lora.py",),
-    "transformers": ("reffusion/prior/model.py", "reffusion/depth/monocular.py", "reffusion/clicks/network.py"),
+    "transformers": (
+        "reffusion/prior/model.py",
+        "reffusion/depth/monocular.py",
+        "reffusion/clicks/sam_transformers.py",
+    ),
     "huggingface_hub": ("reffusion/weights/download.py",),
-    "onnxruntime": ("reffusion/inpaint/onnx_model.py",),
+    "onnxruntime": ("reffusion/onnx.py",),
     "gsply": ("reffusion/io/compressed.py",),
     "ray": ("runner/ray_engine.py",),
     "submitit": ("runner/slurm_engine.py",),
@@ -35,7 +39,9 @@ OWN_FILES = (
     "reffusion/weights/local.py",
     "reffusion/weights/download.py",
     "reffusion/weights/lpips_package.py",
+    "reffusion/weights/npm_package.py",
     "reffusion/weights/painters.py",
+    "reffusion/weights/segmenters.py",
     "reffusion/capture/sfm.py",
     COMPILER,
 )  # weights, databases, pipes, kernels
@@ -159,8 +165,8 @@ def test_report_reads_through_io(path):
         if path.stem in draws
         else ()
     )
-    clicked = ("reffusion.clicks", "reffusion.capture", "reffusion.params", "reffusion.command")
-    making = clicked if path.stem == "mask_session" else ()  # masks
+    clicked = ("reffusion.clicks", "reffusion.capture", "reffusion.params", "reffusion.command", "reffusion.types")
+    making = clicked if path.stem in ("mask", "mask_session") else ()  # masks
     chance = ("reffusion.seeding",) if path.stem in ("study", "votes") else ()  # the order of pairs, intervals
     assert all(name.startswith(("reffusion.io", *chance, *drawing, *making)) for name in own), own
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from reffusion.clicks.local_segmenter import AUTO, load_local_segmenter
+from reffusion.clicks.local_segmenter import load_local_segmenter
 from reffusion.clicks.marks import Mark
 from reffusion.clicks.scene_masks import evidence_loader
 from reffusion.clicks.scene_segmentation import Event, FittedViews, segment_scene
@@ -24,6 +24,7 @@ from reffusion.clicks.single_view import ViewEvidence, apply_marks
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_raw_masks, load_scene, load_views
+from reffusion.weights.segmenters import AUTO
 
 GOOD_IOU = 0.94  # from this IoU on a person would not correct
 TINT = (255, 0, 160)

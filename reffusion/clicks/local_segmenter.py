@@ -1,14 +1,10 @@
-"""The segmentation network on this machine: found, opened, and named for the key of results that depend on it."""
+"""Opens the segmentation network of a setting."""
 
 from __future__ import annotations
 
-import hashlib
-from pathlib import Path
-
+from reffusion.clicks import sam_onnx, sam_transformers
 from reffusion.clicks.segmenter import Segmenter
-from reffusion.weights.local import SEGMENTER_FILES, segmenter_cache
-
-AUTO, NONE = "auto", "none"
+from reffusion.weights.segmenters import AUTO, NONE, segmenter_folder
 
 
 def load_local_segmenter(source: str = AUTO) -> Segmenter | None:
@@ -18,25 +14,11 @@ def load_local_segmenter(source: str = AUTO) -> Segmenter | None:
     Raises:
         ValueError: there is no network at a source that is named, or it is damaged; one line.
     """
-    from reffusion.clicks import sam_onnx, sam_transformers
-
     if source == NONE:
         return None
-    found = sam_onnx.load_distilled_sam(segmenter_cache() if source == AUTO else Path(source).expanduser())
-    if found is None and source != AUTO:
-        found = sam_transformers.load_sam(source)
-        if found is None:
+    segmenter = sam_onnx.load_distilled_sam(segmenter_folder(source))
+    if segmenter is None and source != AUTO:
+        segmenter = sam_transformers.load_sam(source)
+        if segmenter is None:
             raise ValueError(f"segmenter: {source} is not on this machine")
-    return found
-
-
-def segmenter_facts(source: str) -> dict[str, str]:
-    """What masks from clicks depend on: the hash of the network's files, or that there is none."""
-    folder = segmenter_cache() if source == AUTO else Path(source).expanduser()
-    files = [folder / name for name in SEGMENTER_FILES]
-    if source == NONE or not all(file.is_file() for file in files):
-        return {"segmenter": NONE if source == AUTO else source}
-    digest = hashlib.sha256()
-    for file in files:
-        digest.update(file.read_bytes())
-    return {"segmenter": digest.hexdigest()[:16]}
+    return segmenter

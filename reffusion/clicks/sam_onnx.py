@@ -9,7 +9,7 @@ import numpy as np
 
 from reffusion.clicks.segmenter import Segmenter
 from reffusion.onnx import open_session
-from reffusion.weights.local import SEGMENTER_FILES
+from reffusion.weights.published import SEGMENTER_FILES
 
 MASKS, SCORES = "all_masks", "all_scores"  # logits of four masks, 256 x 256 px, and the IoU that is expected of each
 SIZE = 256, 256  # px, masks of the decoder

