@@ -66,7 +66,8 @@ def _cells(runs: list[Run], first: Run, view: str) -> list[tuple[str, np.ndarray
 def _title(run: Run, view: str) -> str:
     row = run.views.get(view, {})
     scores = [f"{row['psnr_box']:.1f} dB"] if "psnr_box" in row else []
-    scores += [f"FLIP {row['flip_box']:.3f}"] if "flip_box" in row else []
+    perceptual = {"LPIPS": row.get("lpips_vgg_box"), "FLIP": row.get("flip_box")}
+    scores += [f"{name} {value:.3f}" for name, value in perceptual.items() if value is not None][:1]
     return "\n".join([run.method, *([", ".join(scores)] if scores else [])])
 
 

@@ -29,7 +29,7 @@ def render_with_gradients(
     bench: Bench, scene: Gaussians, camera: Camera, impl: str, dtype: torch.dtype
 ) -> dict[str, Tensor]:
     """Images, sums of weights and counts of one implementation, and the gradients of a random sum over its images."""
-    device = "cpu" if impl == "reference" else bench.device
+    device = "cpu" if impl == "torch" else bench.device
     place = lambda tensor: tensor.detach().to(device, dtype).clone().requires_grad_()
     leaf = scene.map(place)
     draw = generator(0, "pull")
@@ -73,7 +73,7 @@ def check_splatting(bench: Bench, antialiased: bool = False, crop: bool = False)
     scene = replace(full_size.gaussians(count, "cpu").map(Tensor.detach), antialiased=antialiased)
     impl = "cuda" if bench.device == "cuda" else "cpu"
     results = render_with_gradients(bench, scene, camera, impl, torch.float32)
-    return compare_blocks(results, render_with_gradients(bench, scene, camera, "reference", torch.float64))
+    return compare_blocks(results, render_with_gradients(bench, scene, camera, "torch", torch.float64))
 
 
 def check_similarity(bench: Bench) -> dict[str, Any]:
