@@ -13,8 +13,8 @@ from torch import Tensor
 
 from reffusion.clicks import color_evidence
 from reffusion.clicks.geodesic_cut import keep_connected, relative_distance
-from reffusion.clicks.marks import Clicks, mark_pixels
-from reffusion.clicks.single_view import correct_mask, erode, refine_edges, segment_view
+from reffusion.clicks.marks import UNKNOWN
+from reffusion.clicks.single_view import erode, refine_edges
 from reffusion.graph_cut import min_cut
 from reffusion.masks import voting
 from reffusion.splat import rasterizer
@@ -50,19 +50,6 @@ class NeighbourGraph:
     way: np.ndarray
 
 
-@dataclass(frozen=True)
-class ClickSegmentation:
-    """The object that clicks select.
-
-    Attributes:
-        labels: bool [N], the Gaussians that are the object.
-        masks: view -> bool [H, W], of the views with clicks, or with a given mask.
-    """
-
-    labels: Tensor
-    masks: dict[str, np.ndarray]
-
-
 def find_neighbours(gaussians: Gaussians) -> NeighbourGraph:
     """The graph of neighbouring Gaussians; likeness of colours is relative to the mean difference of neighbours."""
     means, color = (each.detach().cpu().double().numpy() for each in (gaussians.means, gaussians.sh[:, 0] * SH0))
@@ -76,39 +63,6 @@ def find_neighbours(gaussians: Gaussians) -> NeighbourGraph:
     return NeighbourGraph(pairs, np.exp(-unlike / 2), apart * (1 + UNLIKE * np.sqrt(unlike)) + 1e-12)
 
 
-def segment_by_clicks(
-    gaussians: Gaussians,
-    near: NeighbourGraph,
-    cameras: Mapping[str, Camera],
-    image_of: Callable[[str], np.ndarray],
-    clicks: Mapping[str, Clicks],
-    given: Mapping[str, np.ndarray],
-) -> ClickSegmentation:
-    """Segment the object by clicks, and by masks of some views.
-
-    The view with most clicks on the object is segmented by its photograph alone. In each of the others, clicks correct
-    what the Gaussians labelled so far show there.
-
-    Args:
-        near: `find_neighbours` of the Gaussians.
-        cameras: of the views whose photographs show the object.
-        image_of: view -> uint8 [H, W, 3].
-        clicks: view -> clicks in its undistorted pixels.
-        given: view -> bool [H, W], used as they are.
-    """
-    masks, labels = dict(given), torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
-    if masks:
-        labels = label_gaussians(gaussians, near, cameras, masks, image_of)
-    for name in order_views(clicks):
-        if labels.any():
-            before = voting.render_labels(gaussians, labels, cameras[name]) > COVERED
-            masks[name] = correct_mask(image_of(name), before, clicks[name], surface_relief(gaussians, cameras[name]))
-        else:
-            masks[name] = segment_view(image_of(name), clicks[name], surface_relief(gaussians, cameras[name]))
-        labels = label_gaussians(gaussians, near, cameras, masks, image_of)
-    return ClickSegmentation(labels, masks)
-
-
 @torch.no_grad()
 def surface_relief(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """float64 [H, W] px, logarithm of the depth times the focal length, so that its slope does not depend on the
@@ -117,11 +71,6 @@ def surface_relief(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     if not (depth > 0).any():
         return np.zeros_like(depth)
     return np.log(np.where(depth > 0, depth, depth.max())) * camera.fx
-
-
-def order_views(clicks: Mapping[str, Clicks]) -> list[str]:
-    """The views, sorted by falling number of clicks on the object."""
-    return sorted(clicks, key=lambda name: (-int(clicks[name].positive.sum()), name))
 
 
 def label_gaussians(
@@ -163,13 +112,10 @@ def label_gaussians(
     return torch.as_tensor(labels, device=gaussians.means.device)
 
 
-def object_mask(
-    gaussians: Gaussians, labels: Tensor, camera: Camera, image: np.ndarray, clicks: Clicks | None = None
-) -> np.ndarray:
+def object_mask(gaussians: Gaussians, labels: Tensor, camera: Camera, image: np.ndarray) -> np.ndarray:
     """bool [H, W]: the labelled Gaussians in a view, with the border moved to the edges of its photograph."""
     mask = voting.render_labels(gaussians, labels, camera) > COVERED
-    no_clicks = Clicks(np.zeros((0, 2)), np.zeros(0, bool))
-    return refine_edges(image, mask, mark_pixels(clicks or no_clicks, mask.shape))
+    return refine_edges(image, mask, np.full(mask.shape, UNKNOWN, np.int8))
 
 
 def is_visible(gaussians: Gaussians, camera: Camera, image: np.ndarray, mask: np.ndarray) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 from reffusion.clicks.marks import Clicks
 
 # Mean and standard deviation of ImageNet's pixels, with which these networks are trained.
-MEAN, DEVIATION = np.float32((0.485, 0.456, 0.406)), np.float32((0.229, 0.224, 0.225))
+MEAN, DEVIATION = np.array((0.485, 0.456, 0.406), np.float32), np.array((0.229, 0.224, 0.225), np.float32)
 NEGATIVE, POSITIVE, UPPER_LEFT, LOWER_RIGHT = 0, 1, 2, 3  # SAM's labels of points and of a box's corners
 
 
