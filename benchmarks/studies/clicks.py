@@ -1,9 +1,11 @@
 """Masks from simulated clicks against true masks: `python -m benchmarks.studies.clicks --runs runs/demo`.
 
-Each run needs the stages `poses`, with true masks, and `fit`. Each click is placed like a person's correction, in the
-middle of the largest error of the middle view's mask so far, until that mask is good or there are --clicks clicks.
-Prints that view's IoU after each click, then mean and worst IoU over all views with masks; --segmenter none does
-without the segmentation network; --sheets writes the masks over three views and the worst one.
+Each run needs the stages `poses`, `raw_masks` with true masks, and `fit`; --outlines names true masks of some views
+instead, such as benchmarks/studies/bear_outlines.json: the stone bear of instruct-nerf2nerf's `bear`, drawn by hand.
+Each click is placed like a person's correction, in the middle of the largest error of the middle view's mask so far,
+until that mask is good or there are --clicks clicks. Prints that view's IoU after each click, then mean and worst IoU
+over all views with masks; --segmenter none does without the segmentation network; --sheets writes the masks over three
+views and the worst one.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import argparse
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 from scipy import ndimage
 
@@ -21,11 +24,14 @@ from reffusion.clicks.scene_masks import evidence_loader
 from reffusion.clicks.scene_segmentation import Event, FittedViews, segment_scene
 from reffusion.clicks.segmenter import Segmenter
 from reffusion.clicks.single_view import ViewEvidence, apply_marks
+from reffusion.io.arrays import load_json
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_raw_masks, load_scene, load_views
+from reffusion.types import Scene
 from reffusion.weights.segmenters import AUTO
 
+SHIFT = 4  # fractional bits of the corners of outlines
 GOOD_IOU = 0.94  # from this IoU on a person would not correct
 TINT = (255, 0, 160)
 
@@ -56,17 +62,31 @@ def simulate_clicks(view: ViewEvidence, true: np.ndarray, most: int) -> list[Mar
     return marks
 
 
-def evaluate_run(run: Path, most: int, segmenter: Segmenter | None, sheet: Path | None) -> str:
+def load_outlines(path: Path, scene: Scene) -> dict[str, np.ndarray]:
+    """View -> bool [H, W], from a JSON file: view -> polygons, each a list of [x, y] px of the undistorted view."""
+    masks = {}
+    for name, polygons in load_json(path).items():
+        painted = np.zeros((scene.cameras[name].height, scene.cameras[name].width), np.uint8)
+        for polygon in polygons:
+            corners = np.round((np.array(polygon) - 0.5) * 2**SHIFT).astype(np.int32)
+            cv2.fillPoly(painted, [corners], 1, shift=SHIFT)
+        masks[name] = painted > 0
+    return masks
+
+
+def evaluate_run(
+    run: Path, most: int, segmenter: Segmenter | None, outlines: Path | None = None, sheet: Path | None = None
+) -> str:
     """One line of figures. ValueError if the run has no masks."""
     scene = load_scene(run / "poses")
-    true = load_raw_masks(run / "raw_masks", scene.train)
+    true = load_outlines(outlines, scene) if outlines else load_raw_masks(run / "raw_masks", scene.train)
     if not true:
         raise ValueError(f"{run / 'raw_masks/masks'}: no masks to compare with")
     names, gaussians = sorted(true), load_ply(run / "fit/gaussians.ply")
     view = names[len(names) // 2]
     evidence_of = evidence_loader(scene, gaussians, run / "poses", segmenter)
     marks = simulate_clicks(evidence_of(view), true[view], most)
-    began, cameras = time.monotonic(), {name: scene.cameras[name] for name in names}
+    began, cameras = time.monotonic(), {name: scene.cameras[name] for name in scene.train if name not in scene.clean}
     estimates = segment_scene(FittedViews(gaussians, cameras, evidence_of), [Event(view, mark) for mark in marks], {})
     seconds = time.monotonic() - began
     shares = {name: iou(estimates[name], true[name]) for name in names}
@@ -88,12 +108,13 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, nargs="+", required=True)
     parser.add_argument("--clicks", type=int, default=5, help="largest number of clicks")
     parser.add_argument("--segmenter", default=AUTO, help="auto, none, or a folder")
+    parser.add_argument("--outlines", type=Path, help="true masks of some views, as polygons")
     parser.add_argument("--sheets", type=Path, help="folder for pictures")
     arguments = parser.parse_args()
     segmenter = load_local_segmenter(arguments.segmenter)
     for run in arguments.runs:
         sheet = arguments.sheets / f"{run.name}.png" if arguments.sheets else None
-        print(evaluate_run(run, arguments.clicks, segmenter, sheet), flush=True)
+        print(evaluate_run(run, arguments.clicks, segmenter, arguments.outlines, sheet), flush=True)
 
 
 if __name__ == "__main__":
