@@ -250,7 +250,8 @@ def test_the_page_needs_no_other_file(pages):
     html = pages["html"].read_text()
     sources = re.findall(r'src="([^"]*)"', html)
     assert len(sources) == 5 and all(source.startswith("data:image/png;base64,") for source in sources)
-    assert "http" not in html and "<script" not in html and "@import" not in html
+    text = re.sub(r'src="[^"]*"', "", html)  # whose letters may hold any word
+    assert "http" not in text and "<script" not in text and "@import" not in text
     assert html.count("no weights") == 1 and "2D inpainter a brush" in html and "perceptual" not in html
     linked = re.findall(r"\]\((.*?)\)", pages["md"].read_text())
     assert len(linked) == 5 and all((pages["md"].parent / name).stat().st_size > 1000 for name in linked)

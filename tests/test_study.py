@@ -130,8 +130,8 @@ def test_a_whole_session(comparison_folder, tmp_path, width):
             browser.click("#save")
         assert saved.value.suggested_filename == "answers-Ada_L_.json"
         saved.value.save_as(tmp_path / "answers.json")
-        other = browser.evaluate("ordered('Grace').map(each => each.trial.id + each.turned)")
-        assert other != browser.evaluate("ordered('Ada L.').map(each => each.trial.id + each.turned)")
+        other = browser.evaluate("shuffledTrials('Grace').map(each => each.trial.id + each.turned)")
+        assert other != browser.evaluate("shuffledTrials('Ada L.').map(each => each.trial.id + each.turned)")
     found, left_out = votes.count_votes([json.loads((tmp_path / "answers.json").read_text())], key)
     assert left_out == []
     shares = {(each.method, each.question): (each.share, each.votes) for each in found}
