@@ -191,7 +191,7 @@ def main() -> None:
         flush=True,
     )
     if segmenter is None:
-        print("clicks are segmented by colours and surfaces; `make weights` fetches a network (37 MB) that needs fewer")
+        print("clicks are segmented by colours and surfaces; with the network of `make weights` (37 MB) fewer suffice")
     try:
         server.serve_forever()
     except KeyboardInterrupt:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -15,10 +16,17 @@ from reffusion.capture.click_coordinates import distort_mask, distort_points, un
 from reffusion.capture.lenses import load_lenses, load_photograph_sizes
 from reffusion.capture.scene_folder import read_scene
 from reffusion.clicks.marks import Mark
-from reffusion.clicks.scene_masks import load_evidence
-from reffusion.clicks.scene_segmentation import Event, FittedViews, correct_scene, count_first, propagate
+from reffusion.clicks.scene_masks import KEPT_VIEWS, load_evidence
+from reffusion.clicks.scene_segmentation import (
+    Event,
+    FittedViews,
+    Masks,
+    count_first,
+    segment_own_view,
+    segment_scene,
+)
 from reffusion.clicks.segmenter import ImageFeatures, Segmenter, encode_image
-from reffusion.clicks.single_view import ViewEvidence, apply_marks
+from reffusion.clicks.single_view import ViewEvidence
 from reffusion.command import root
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.files import BadInput
@@ -30,7 +38,6 @@ from reffusion.params.raw_masks import Params
 from reffusion.types import Gaussians
 from report import sheet
 
-KEPT_VIEWS = 128  # whose network features stay in memory, 4 MB each
 KEPT_RESULTS = 64  # numbers of marks whose masks stay in memory
 
 
@@ -111,7 +118,7 @@ class Session:
         self.events: list[Event] = []
         self.masks, self.versions = dict(capture.given), dict.fromkeys(self.views, 0)
         self.gaussians: Gaussians | None = None
-        self.results: dict[tuple[str, ...], dict[str, np.ndarray]] = {}  # hashes of the first marks -> masks after them
+        self.results: dict[Hashable, Masks] = {}  # keys of `segment_scene` -> masks
         self.revision, self.solved_revision = 0, 0  # of the marks, and of the marks that the masks include
         self.error = ""  # why the masks of the latest revision could not be computed
         self.lock = threading.Condition(threading.RLock())
@@ -140,17 +147,18 @@ class Session:
             raise ValueError(f"a mark lies outside {name}, which has {width}x{height} px")
         if not 0 <= radius <= max(height, width):
             raise ValueError(f"a brush of {radius:g} px on a view of {width}x{height} px")
-        self._change([*self.events, Event(name, Mark(np.array(points, float), positive, radius))])
+        event = Event(name, Mark(np.array(points, float), positive, radius))
+        self._change(lambda events: [*events, event])
 
     def remove(self, index: int) -> None:
         """Remove a mark by its index in the order of all marks; -1 is the last one. IndexError if there is none."""
-        remaining = list(self.events)
-        del remaining[index]
-        self._change(remaining)
+        with self.lock:
+            removed = self.events[index]
+            self._change(lambda events: [event for event in events if event is not removed])
 
     def clear(self, name: str) -> None:
         """Remove all marks of a view."""
-        self._change([event for event in self.events if event.view != name])
+        self._change(lambda events: [event for event in events if event.view != name])
 
     def save(self) -> dict[str, int]:
         """Write masks and clicks.json; return how many masks were "written" and how many of the user's were "kept".
@@ -158,10 +166,13 @@ class Session:
         Waits for the masks of the latest marks.
 
         Raises:
-            ValueError: there is no mask to write, or a file that the page did not write is in the way.
+            ValueError: there is no mask to write, the masks could not be computed, or a file that the page did not
+                write is in the way.
         """
         with self.lock:
             self.lock.wait_for(lambda: self.solved_revision == self.revision)
+            if self.error:
+                raise ValueError(self.error)
             masks = {name: mask for name, mask in self.masks.items() if name not in self.capture.given}
             if not any(mask.any() for mask in masks.values()):
                 raise ValueError("nothing to save yet: click on the object first")
@@ -213,9 +224,9 @@ class Session:
                 "folder": str(self.capture.masks),
             }
 
-    def _change(self, events: list[Event]) -> None:
+    def _change(self, change: Callable[[list[Event]], list[Event]]) -> None:
         with self.lock:
-            self.events, self.unsaved, self.error = events, True, ""
+            self.events, self.unsaved, self.error = change(self.events), True, ""
             self.revision += 1
             self.lock.notify_all()
 
@@ -264,8 +275,9 @@ class Session:
                 error = ""
             except Superseded:
                 continue
-            except (ValueError, FloatingPointError) as failure:
-                error = str(failure)
+            except Exception as failure:  # the thread goes on, and the page says why there is no mask
+                traceback.print_exc()
+                error = f"no masks: {failure}"
             with self.lock:
                 if revision == self.revision:
                     self.solved_revision, self.error = revision, error
@@ -291,40 +303,19 @@ class Session:
                 raise Superseded
             return self.evidence_of(name)
 
-        given = self.capture.given
+        given, masks = self.capture.given, dict(self.capture.given)
         if self.gaussians is None:
-            masks = dict(given)
             for name in dict.fromkeys(event.view for event in events):
-                masks[name] = self._first_mask([event for event in events if event.view == name], evidence_of)
-            self._show(masks, revision)
-            return
-        cameras = {name: self.scene.cameras[name] for name in {*self.views, *given}}
-        views = FittedViews(self.gaussians, cameras, evidence_of)
-        count = 0 if given else count_first(events) if events else 0
-        masks = dict(given)
-        if count:
-            masks[events[0].view] = self._first_mask(events[:count], evidence_of)
-            self._show(self.masks | masks, revision)
-        if events:
-            masks = self._recall(("all", *map(_event_key, events[:count])), lambda: propagate(views, masks))
-        for k in range(count, len(events)):
-            before = masks
-            key = ("all", *map(_event_key, events[: k + 1]))
-            masks = self._recall(key, lambda: correct_scene(views, events[: k + 1], before, given))  # noqa: B023
+                masks |= segment_own_view(evidence_of, [event for event in events if event.view == name], self._recall)
+        elif events:
+            if not given:  # the marked view first: all views take longer
+                first = segment_own_view(evidence_of, events[: count_first(events)], self._recall)
+                self._show(self.masks | first, revision)
+            cameras = {name: self.scene.cameras[name] for name in {*self.views, *given}}
+            masks = segment_scene(FittedViews(self.gaussians, cameras, evidence_of), events, given, self._recall)
         self._show(masks, revision)
 
-    def _first_mask(self, events: Sequence[Event], evidence_of: Callable[[str], ViewEvidence]) -> np.ndarray:
-        """bool [H, W]: the mask of a view from its own marks."""
-        name, marks, mask = events[0].view, [event.mark for event in events], None
-        for k in range(len(marks)):
-            before = mask
-            key = ("view", *map(_event_key, events[: k + 1]))
-            step = lambda: {name: apply_marks(evidence_of(name), marks[: k + 1], before, first=k)}  # noqa: B023
-            mask = self._recall(key, step)[name]
-        assert mask is not None
-        return mask
-
-    def _recall(self, key: tuple[str, ...], compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    def _recall(self, key: Hashable, compute: Callable[[], Masks]) -> Masks:
         """The result of an earlier computation with this key, or of this one."""
         if key not in self.results:
             self.results[key] = compute()
@@ -340,8 +331,3 @@ class Session:
                 if masks.get(name) is not self.masks.get(name):
                     self.versions[name] += 1
             self.masks = dict(masks)
-
-
-def _event_key(event: Event) -> str:
-    mark = event.mark
-    return f"{event.view} {mark.positive} {mark.radius} {mark.points.tobytes().hex()}"

@@ -242,7 +242,7 @@ def test_a_stroke_in_one_view_corrects_the_others():
     assert gain["a0"] > 0.05
     assert min(gain.values()) > 0.5 * gain["a0"]
     back = correct_scene(views, [stroke, Event("a4", Mark(stroke.mark.points, False, 40.0))], found, {})
-    assert not back["a0"].any() or wall_scene.iou(back["a0"], found["a0"]) < 1
+    assert back["a0"].sum() < found["a0"].sum()
     kept = confirmed_pixels([stroke.mark], whole["a0"].shape) == 1
     assert back["a0"][kept].all(), "what is confirmed in a view survives corrections in others"
 

@@ -20,6 +20,7 @@ from scipy import ndimage
 
 from reffusion.clicks.local_segmenter import load_local_segmenter
 from reffusion.clicks.marks import Mark
+from reffusion.clicks.propagation import iou
 from reffusion.clicks.scene_masks import evidence_loader
 from reffusion.clicks.scene_segmentation import Event, FittedViews, segment_scene
 from reffusion.clicks.segmenter import Segmenter
@@ -34,11 +35,6 @@ from reffusion.weights.segmenters import AUTO
 SHIFT = 4  # fractional bits of the corners of outlines
 GOOD_IOU = 0.94  # from this IoU on a person would not correct
 TINT = (255, 0, 160)
-
-
-def iou(mask: np.ndarray, true: np.ndarray) -> float:
-    """Intersection over union of bool [H, W] masks; 1 if both are empty."""
-    return float((mask & true).sum() / (mask | true).sum()) if (mask | true).any() else 1.0
 
 
 def next_click(mask: np.ndarray, true: np.ndarray) -> tuple[float, float, bool]:

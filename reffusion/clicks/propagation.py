@@ -48,6 +48,7 @@ class Votes:
     least: float
 
     def plus(self, counts: np.ndarray) -> Votes:
+        """These votes and those of a further view."""
         return Votes(self.counts + counts, self.least)
 
 
@@ -217,9 +218,10 @@ def _large_parts(mask: np.ndarray, least: float) -> list[np.ndarray]:
 
 def _drop_small_parts(mask: np.ndarray) -> np.ndarray:
     """The mask without connected parts below `MIN_PART` of the largest one."""
-    parts = _large_parts(mask, 1)
-    large = [part for part in parts if part.sum() >= MIN_PART * parts[0].sum()]
-    return np.logical_or.reduce(large) if large else mask
+    parts, _ = ndimage.label(mask)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    return mask & (sizes >= MIN_PART * sizes.max())[parts]
 
 
 def _deepest_points(mask: np.ndarray) -> Clicks:

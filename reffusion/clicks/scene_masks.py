@@ -20,7 +20,7 @@ from reffusion.io.scene import load_views
 from reffusion.params.clicks import Clicked
 from reffusion.types import Camera, Gaussians, Scene
 
-KEPT_VIEWS = 48  # whose network features stay in memory, 4 MB each
+KEPT_VIEWS = 96  # whose network features stay in memory, 4 MB each
 
 
 def masks_from_clicks(

@@ -7,8 +7,9 @@ that object to all views.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from reffusion.clicks.single_view import ViewEvidence, apply_marks
 from reffusion.morphology import dilate
 from reffusion.types import Camera, Gaussians
 
+Masks = Mapping[str, np.ndarray]  # view -> bool [H, W]
+Recall = Callable[[Hashable, Callable[[], Masks]], Masks]
 SAME_SURFACE = 0.02  # of the depth: a marked point is visible in another view up to this difference
 
 
@@ -29,6 +32,11 @@ class Event:
 
     view: str
     mark: Mark
+
+    @property
+    def key(self) -> tuple[str, bool, float, bytes]:
+        """Equal for equal events."""
+        return self.view, self.mark.positive, self.mark.radius, self.mark.points.tobytes()
 
 
 @dataclass(frozen=True)
@@ -45,24 +53,49 @@ class FittedViews:
     evidence_of: Callable[[str], ViewEvidence]
 
 
+def compute_always(_: Hashable, compute: Callable[[], Masks]) -> Masks:
+    """Remember nothing: the default `recall` of `segment_scene`."""
+    return compute()
+
+
 def segment_scene(
-    views: FittedViews, events: Sequence[Event], given: Mapping[str, np.ndarray]
+    views: FittedViews, events: Sequence[Event], given: Masks, recall: Recall = compute_always
 ) -> dict[str, np.ndarray]:
     """The object's mask, bool [H, W], in every view; empty if nothing marks the object.
 
     Args:
         events: in the order in which they are made.
         given: view -> bool [H, W]; they stay as they are.
+        recall: (key, compute) -> an earlier result with this key, or that of compute().
     """
     count = 0 if given else count_first(events)
-    masks = dict(given)
+    masks = given
     if count:
-        name = events[0].view
-        masks[name] = apply_marks(views.evidence_of(name), [event.mark for event in events[:count]])
-    masks = propagate(views, masks)
-    for k in range(count, len(events)):
-        masks = correct_scene(views, events[: k + 1], masks, given)
+        masks = segment_own_view(views.evidence_of, events[:count], recall)
+    for k in range(count, len(events) + 1):
+        step = (
+            partial(correct_scene, views, events[:k], masks, given) if k > count else partial(propagate, views, masks)
+        )
+        masks = recall(("all views", *(event.key for event in events[:k])), step)
+    return dict(masks)
+
+
+def segment_own_view(
+    evidence_of: Callable[[str], ViewEvidence], events: Sequence[Event], recall: Recall = compute_always
+) -> Masks:
+    """The mask of a view from its own marks alone, under its name; `events`: at least one, all of this view."""
+    name, marks = events[0].view, [event.mark for event in events]
+    masks: Masks = {}
+    for k in range(1, len(events) + 1):
+        step = partial(_apply_last_mark, evidence_of, name, marks[:k], masks.get(name))
+        masks = recall(("own view", *(event.key for event in events[:k])), step)
     return masks
+
+
+def _apply_last_mark(
+    evidence_of: Callable[[str], ViewEvidence], name: str, marks: Sequence[Mark], before: np.ndarray | None
+) -> Masks:
+    return {name: apply_marks(evidence_of(name), marks, before, first=len(marks) - 1)}
 
 
 def count_first(events: Sequence[Event]) -> int:
@@ -71,7 +104,7 @@ def count_first(events: Sequence[Event]) -> int:
     return next((k for k, event in enumerate(events) if k and apart(event)), len(events))
 
 
-def propagate(views: FittedViews, masks: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def propagate(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
     """The object's mask, bool [H, W], in every view; the masks that are given stay."""
     if not any(mask.any() for mask in masks.values()):
         empty = lambda camera: np.zeros((camera.height, camera.width), bool)
@@ -88,9 +121,7 @@ def propagate(views: FittedViews, masks: Mapping[str, np.ndarray]) -> dict[str, 
     }
 
 
-def correct_scene(
-    views: FittedViews, events: Sequence[Event], masks: Mapping[str, np.ndarray], given: Mapping[str, np.ndarray]
-) -> dict[str, np.ndarray]:
+def correct_scene(views: FittedViews, events: Sequence[Event], masks: Masks, given: Masks) -> dict[str, np.ndarray]:
     """The masks of all views after the last event, from those before it."""
     name = events[-1].view
     after = correct_view(views, events, masks[name])
@@ -139,9 +170,9 @@ def _depth(view: ViewEvidence, camera: Camera) -> np.ndarray:
 def spread_change(
     views: FittedViews,
     events: Sequence[Event],
-    masks: Mapping[str, np.ndarray],
+    masks: Masks,
     before: np.ndarray,
-    given: Mapping[str, np.ndarray],
+    given: Masks,
 ) -> dict[str, np.ndarray]:
     """The masks of all views after the last event changed the mask of its own view.
 

@@ -176,18 +176,12 @@ def segment_by_surfaces(image: np.ndarray, clicks: Clicks, relief: np.ndarray | 
     border = np.ones(small, bool)
     border[1:-1, 1:-1] = False
     pairs, length = _pixel_pairs(small)
-    depth_edges, given = (
-        _find_depth_edges(relief, small, pairs, length),
-        (lab, pairs, length, marks.ravel(), border.ravel()),
-    )
-    found = (
-        None
-        if depth_edges is None
-        else _select_object(
-            [*nested_candidates(*given, depth_edges), grow_object(*given, depth_edges)], marks, lab, pairs, depth_edges
-        )
-    )
-    mask = _fill_holes(grow_object(*given), marks) if found is None else found
+    depth_edges, found = _find_depth_edges(relief, small, pairs, length), None
+    problem = lab, pairs, length, marks.ravel(), border.ravel()
+    if depth_edges is not None:
+        candidates = [*nested_candidates(*problem, depth_edges), grow_object(*problem, depth_edges)]
+        found = _select_object(candidates, marks, lab, pairs, depth_edges)
+    mask = _fill_holes(grow_object(*problem), marks) if found is None else found
     return refine_edges(image, _upscale(mask, shape), mark_pixels(clicks, shape))
 
 

@@ -7,7 +7,7 @@ from reffusion.params.masks import Params
 from reffusion.weights import local
 from reffusion.weights.segmenters import AUTO, NONE, segmenter_facts
 
-__all__ = ["Params", "lacks"]
+__all__ = ["Params", "lacks", "preview"]
 
 
 def optional_weights(params: Params) -> list[local.Need]:
