@@ -165,11 +165,12 @@ def fetch() -> int:
     downloads = {}
     for stage, question in json.load(sys.stdin).items():
         planned = _import_file(_description_file(stage))
+        params, needs = planned.Params(**question["params"]), []
         if hasattr(planned, "needed_weights"):
-            params = planned.Params(**question["params"])
-            needs = planned.needed_weights(params, frozenset(question["brings"]))
-            needs += planned.optional_weights(params) if hasattr(planned, "optional_weights") else []
-            downloads |= {need.name: need for need in needs if need.problem and need.fetched}
+            needs += planned.needed_weights(params, frozenset(question["brings"]))
+        if hasattr(planned, "optional_weights"):
+            needs += planned.optional_weights(params)
+        downloads |= {need.name: need for need in needs if need.problem and need.fetched}
     failed = 0
     for need in downloads.values():
         try:

