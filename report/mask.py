@@ -1,11 +1,12 @@
 """Masks from clicks in a browser: `python -m report.mask --scene demo` (`make scene=X mask`).
 
-Runs the stage `poses`, serves the page on this machine only, and meanwhile fits the scene, which masks of all views
-need.
+Runs the stages `poses` and `raw_masks`, serves the page on this machine only, and meanwhile fits the scene, which masks
+of all views need.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import subprocess
@@ -160,7 +161,7 @@ def _mask_png(mask: np.ndarray) -> bytes:
     return file.getvalue()
 
 
-def stage_command(stage: str, arguments) -> list[str]:
+def stage_command(stage: str, arguments: argparse.Namespace) -> list[str]:
     """Command that runs a stage of a scene that may have no masks yet."""
     options = {"--profile": arguments.profile, "--budget": arguments.budget}
     flags = [word for name, value in options.items() if value for word in (name, value)]
@@ -171,32 +172,40 @@ def stage_command(stage: str, arguments) -> list[str]:
 def main() -> None:
     parser = cli.scene_parser("mask", __doc__)
     parser.add_argument("--port", type=int, default=PORT, help="if it is in use, the next free one is taken")
-    parser.add_argument("--profile", help="as for `run`; these three apply to the stages `poses` and `fit`")
+    parser.add_argument("--profile", help="as for `run`; these three apply to the stages up to `fit`")
     parser.add_argument("--budget", help="as for `run`")
     parser.add_argument("--set", default="", help="as for `run`")
     arguments = parser.parse_args()
-    if status := subprocess.run(stage_command("poses", arguments)).returncode:
+    if status := subprocess.run(stage_command("raw_masks", arguments)).returncode:
         raise SystemExit(status)
     try:
         capture, segmenter = load_capture(cli.run_folder(arguments)), load_local_segmenter()
-        fit = subprocess.Popen(stage_command("fit", arguments))
-        session = Session(capture, lambda: fit.poll() == 0, segmenter)
-        server = Server(session, arguments.port, fit, f"make scene={arguments.scene} all")
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
+    fit = subprocess.Popen(stage_command("fit", arguments))
+    try:
+        serve(Session(capture, lambda: fit.poll() == 0, segmenter), arguments, fit)
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+    finally:
+        fit.terminate()
+        fit.wait()
+
+
+def serve(session: Session, arguments: argparse.Namespace, fit: subprocess.Popen) -> None:
+    """Serve the page until Ctrl-C. ValueError if no port is free."""
+    server = Server(session, arguments.port, fit, f"make scene={arguments.scene} all")
     port = server.server_address[1]
     print(f"{server.address}  (Ctrl-C ends)", flush=True)
     print(
-        f"from another machine: `ssh -L {port}:localhost:{port} THIS_MACHINE`, then open the same address there",
-        flush=True,
+        f"from another machine: `ssh -L {port}:localhost:{port} THIS_MACHINE`, then open this address there", flush=True
     )
-    if segmenter is None:
+    if session.segmenter is None:
         print("clicks are segmented by colours and surfaces; with the network of `make weights` (37 MB) fewer suffice")
     try:
         server.serve_forever()
     except KeyboardInterrupt:
-        fit.terminate()
-        fit.wait()
+        pass
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ from reffusion.io.scene import load_mask_sets
 from reffusion.masks import voting
 from reffusion.params.poses import Params as Poses
 from reffusion.splat import rasterizer
+from report import mask
 from report.mask import Server
 from report.mask_session import Capture, Session
 from stages import masks, poses
@@ -322,6 +323,16 @@ def test_invalid_clicks_are_refused(click):
 
 
 # ---------------------------------------------------------------------------------------------- the page
+
+
+def test_the_page_runs_the_stages_that_it_reads(tmp_path, monkeypatch):
+    """On a capture without masks that no stage has seen."""
+    folder = write_small_capture(tmp_path / "scene")
+    monkeypatch.setattr("sys.argv", ["mask", "--scene", str(folder), "--runs", str(tmp_path / "runs")])
+    pages = []
+    monkeypatch.setattr(mask, "serve", lambda session, *_: pages.append(session.capture))
+    mask.main()
+    assert pages[0].masks == folder / "masks" and pages[0].given == {}
 
 
 @pytest.fixture

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import ast
 import graphlib
+import importlib
+import inspect
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from runner.pipeline import load_pipeline
 
 ROOT = Path(__file__).resolve().parent.parent
 OWN = {"reffusion", "stages", "runner", "report"}
@@ -121,6 +125,13 @@ def test_plan_modules_import_nothing_heavy(stage):
     code = f"import sys, stages.plan.{stage}; print(*sorted(set(sys.argv[1:]) & set(sys.modules)))"
     command = [sys.executable, "-c", code, "torch", "scipy", "numba", "cv2", "diffusers", "transformers"]
     assert subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip() == ""
+
+
+@pytest.mark.parametrize(("stage", "needs"), [(n, s.all_needs) for n, s in load_pipeline(ROOT).stages.items()])
+def test_previews_take_the_needs_of_their_stage(stage, needs):
+    described = importlib.import_module(f"stages.plan.{stage}") if (ROOT / f"stages/plan/{stage}.py").exists() else None
+    if preview := getattr(described, "preview", None):
+        inspect.signature(preview).bind(None, **dict.fromkeys(needs))
 
 
 def test_there_are_no_import_cycles():

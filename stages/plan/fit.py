@@ -12,7 +12,7 @@ from reffusion.params.fit import Params
 __all__ = ["Params", "cost", "lacks", "preview"]
 
 
-def preview(params: Params, *, poses: Path | None) -> list[str]:
+def preview(params: Params, *, poses: Path | None, **_: Path | None) -> list[str]:
     has_gaussians = poses is not None and (poses / "gaussians.ply").exists() and params.pixels == "all"
     return ["takes over the scene's gaussians.ply: no optimisation"] if has_gaussians else []
 
