@@ -194,7 +194,8 @@ def main() -> None:
 
 def serve(session: Session, arguments: argparse.Namespace, fit: subprocess.Popen) -> None:
     """Serve the page until Ctrl-C. ValueError if no port is free."""
-    server = Server(session, arguments.port, fit, f"make scene={arguments.scene} all")
+    profile = f" profile={arguments.profile}" if arguments.profile else ""
+    server = Server(session, arguments.port, fit, f"make scene={arguments.scene}{profile} all")
     port = server.server_address[1]
     print(f"{server.address}  (Ctrl-C ends)", flush=True)
     print(
