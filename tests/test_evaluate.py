@@ -67,7 +67,8 @@ def run_finish_and_evaluate(out, stage_folders, **params):
     finished = out.with_name(f"finish-{out.name}")
     for folder in (finished, out):
         folder.mkdir()
-    finish.run(finish.Params(), finished, **stage_folders)
+    only_evaluate = ("raw_masks", "masks")
+    finish.run(finish.Params(), finished, **{k: v for k, v in stage_folders.items() if k not in only_evaluate})
     evaluate.run(evaluate.Params(**params), out, **stage_folders, finish=finished)
     return json.loads((out / "metrics.json").read_text())
 

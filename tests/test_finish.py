@@ -1,6 +1,4 @@
-"""The stage `finish`: which result becomes scene.ply, and when it gets a backdrop; test views have no influence."""
-
-from dataclasses import replace
+"""The stage `finish`: which result becomes scene.ply, and its backdrop."""
 
 import pytest
 import torch
@@ -9,7 +7,6 @@ from scenes import wall_scene
 from reffusion.background.backdrop import DISKS
 from reffusion.io.arrays import load_json
 from reffusion.io.ply import load_ply, save_ply
-from reffusion.io.scene import load_scene, save_scene
 from stages import evaluate, finish
 
 pytestmark = pytest.mark.integration
@@ -18,7 +15,7 @@ pytestmark = pytest.mark.integration
 @pytest.fixture
 def fit_folders(tmp_path):
     poses, fit, _ = wall_scene.write_poses_and_fit(tmp_path, 1.0)
-    return {"poses": poses, "raw_masks": poses.with_name("raw_masks"), "fit": fit}
+    return {"poses": poses, "fit": fit}
 
 
 def add_stages(folders, tmp_path):
@@ -49,11 +46,10 @@ def test_the_last_stage_is_the_result(fit_folders, tmp_path):
     assert facts["backdrop"] is False and not (tmp_path / "three" / "completed").exists()
 
 
-def test_result_and_initialization_get_the_same_backdrop(fit_folders, tmp_path, monkeypatch):
-    monkeypatch.setattr(finish, "MIN_UNSEEN_SHARE", 0.0)
+def test_result_and_initialization_get_the_same_backdrop(fit_folders, tmp_path):
     later = add_stages(fit_folders, tmp_path)
     facts, scene = run_finish(tmp_path / "out", later)
-    assert facts["backdrop"] and facts["unseen_in_other_views"] > 0
+    assert facts["backdrop"]
     completed = {stage: load_ply(tmp_path / f"out/completed/{stage}.ply") for stage in ("initialize", "distill")}
     assert sorted(path.stem for path in (tmp_path / "out/completed").iterdir()) == sorted(completed)
     assert torch.equal(completed["initialize"].means[-DISKS:], completed["distill"].means[-DISKS:])
@@ -63,31 +59,19 @@ def test_result_and_initialization_get_the_same_backdrop(fit_folders, tmp_path, 
     assert len(loaded["fit"]) == facts["gaussians"]["fit"]
 
 
-def test_training_views_decide_and_not_test_views(fit_folders, tmp_path):
-    """Views side by side leave a strip of the outermost unseen by all others; of one view, seen thrice, nothing."""
-    scene = load_scene(fit_folders["poses"])
-    found = {}
-    for name, train in (("spread", scene.train), ("again", (scene.train[2],) * 3)):
-        for test in (scene.test, ()):
-            save_scene(fit_folders["poses"], replace(scene, train=train, test=test))
-            found[name, test] = run_finish(tmp_path / f"{name}-{len(test)}", fit_folders)[0]
-    assert [facts["backdrop"] for facts in found.values()] == [True, True, False, False]
-    shares = [facts["unseen_in_other_views"] for facts in found.values()]
-    assert shares[0] == shares[1] > 0.01 and shares[2] == shares[3] < 0.01
-
-
 def test_a_scene_with_gaussians_keeps_them(fit_folders, tmp_path):
     """They may know more than the views do."""
     save_ply(fit_folders["poses"] / "gaussians.ply", load_ply(fit_folders["fit"] / "gaussians.ply"))
     facts, scene = run_finish(tmp_path / "out", fit_folders)
-    assert facts["backdrop"] is False and facts["unseen_in_other_views"] is None
+    assert facts["backdrop"] is False
     assert len(scene) == facts["gaussians"]["fit"]
 
 
 def test_evaluate_copies_the_scene(fit_folders, tmp_path):
     run_finish(tmp_path / "finish", fit_folders)
     (tmp_path / "evaluate").mkdir()
-    evaluate.run(evaluate.Params(), tmp_path / "evaluate", **fit_folders, finish=tmp_path / "finish")
+    folders = fit_folders | {"raw_masks": fit_folders["poses"].with_name("raw_masks"), "finish": tmp_path / "finish"}
+    evaluate.run(evaluate.Params(), tmp_path / "evaluate", **folders)
     assert (tmp_path / "evaluate/scene.ply").read_bytes() == (tmp_path / "finish/scene.ply").read_bytes()
     metrics, facts = (load_json(tmp_path / name) for name in ("evaluate/metrics.json", "finish/facts.json"))
     assert metrics["backdrop"] == facts["backdrop"] and metrics["result"] == "fit" and "seconds" not in metrics

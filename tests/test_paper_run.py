@@ -35,7 +35,7 @@ STAGES = {
     "personalize": ("poses", "raw_masks", "reference"),
     "initialize": ("poses", "fit", "masks", "reference"),
     "distill": ("poses", "fit", "masks", "reference", "personalize", "initialize"),
-    "finish": ("poses", "raw_masks", "fit", "masks", "reference", "initialize", "distill"),
+    "finish": ("poses", "fit", "reference", "initialize", "distill"),
     "evaluate": ("poses", "raw_masks", "fit", "finish", "masks", "initialize", "distill"),
 }
 # All that differs from the profile: sizes and numbers of steps; where to compute, and where the weights lie.

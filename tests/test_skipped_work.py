@@ -35,9 +35,10 @@ for name in ("masks", "initialize", "finish", "evaluate"):
 masks.run(masks.Params(negligible=0.2), home / "masks", **given, raw_masks=raw_masks)
 given["masks"] = home / "masks"
 initialize.run(initialize.Params(), home / "initialize", **given, reference=None)
-given |= {"raw_masks": raw_masks, "initialize": home / "initialize"}
-finish.run(finish.Params(), home / "finish", **given)
-evaluate.run(evaluate.Params(), home / "evaluate", **given, finish=home / "finish")
+made = {"poses": home / "poses", "fit": home / "fit", "initialize": home / "initialize"}
+finish.run(finish.Params(), home / "finish", **made)
+made |= {"raw_masks": raw_masks, "masks": home / "masks", "finish": home / "finish"}
+evaluate.run(evaluate.Params(), home / "evaluate", **made)
 print(sorted({name.split(".")[0] for name in sys.modules} & set(sys.argv[2].split())))
 """
 

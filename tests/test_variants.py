@@ -341,12 +341,12 @@ def test_the_chain_of_lifted_pictures(masked_scene, lifted_views, tmp_path, monk
         assert facts["inpainter"].startswith("OpenCV") and loss_name == perceptual_name
         assert trace.read_trace(out / "trace.jsonl")[-1]["lift"] > 0
     out = tmp_path / "evaluate"
-    needs = masked_scene | {"raw_masks": masked_scene["poses"].with_name("raw_masks")}
-    needs |= {"initialize": chain["initialize"], "distill": tmp_path / "mse"}
+    stages = {"initialize": chain["initialize"], "distill": tmp_path / "mse"}
     for folder in (tmp_path / "finish", out):
         folder.mkdir()
-    finish.run(finish.Params(), tmp_path / "finish", **needs)
-    evaluate.run(evaluate.Params(), out, **needs, finish=tmp_path / "finish")
+    finish.run(finish.Params(), tmp_path / "finish", poses=masked_scene["poses"], fit=masked_scene["fit"], **stages)
+    raw_masks = masked_scene["poses"].with_name("raw_masks")
+    evaluate.run(evaluate.Params(), out, **masked_scene, **stages, raw_masks=raw_masks, finish=tmp_path / "finish")
     summary = load_json(out / "metrics.json")
     assert summary["inpainter"].startswith("OpenCV") and summary["perceptual"] is None
     assert summary["result"] == "distill" and summary["mean"]["psnr_box"] > 20
@@ -357,7 +357,7 @@ def test_rendered_views_inpainted_in_2d(masked_scene, tmp_path):
     for name in ("finish", "fit", "inpainted"):
         (tmp_path / name).mkdir()
     needs = masked_scene | {"raw_masks": masked_scene["poses"].with_name("raw_masks")}
-    finish.run(finish.Params(), tmp_path / "finish", **needs)
+    finish.run(finish.Params(), tmp_path / "finish", poses=needs["poses"], fit=needs["fit"])
     evaluate.run(evaluate.Params(), tmp_path / "fit", **needs, finish=tmp_path / "finish")
     evaluate.run(evaluate.Params(inpaint=True), tmp_path / "inpainted", **needs, finish=tmp_path / "finish")
     before, after = (load_json(tmp_path / n / "metrics.json") for n in ("fit", "inpainted"))

@@ -19,9 +19,6 @@ from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
-# Leave-one-out share of unseen pixels (`training_coverage`) from which a scene gets its backdrop. It is about twice the
-# share in held-out views: 0.0006 on `demo`, where a backdrop gains nothing; 0.007 to 0.05 on captures of real scenes.
-MIN_UNSEEN_SHARE = 0.01
 SUPPORT = 0.1  # px, blending weight over all training views that a Gaussian needs to stay
 LONGEST = 256  # px, larger side at which training views are rendered
 BLOCK = 16  # px, side of the blocks of a training view whose mean colours the backdrop continues

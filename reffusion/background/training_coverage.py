@@ -18,7 +18,6 @@ TOLERANCE = 0.1  # relative depth by which a point may lie behind a training vie
 COVERED = 0.8  # alpha below which the fit learned nothing at a pixel
 SPECKS = 5  # px, side of the median filter that removes single wrong pixels
 LONGEST = 256  # px, larger side at which training views are rendered
-MOST_LEFT_OUT = 32  # training views that are compared with all others; more hardly change the mean
 
 PROTOCOL = (
     "a pixel is seen where the fit to the photographs covers it (alpha of at least "
@@ -85,21 +84,6 @@ def unseen_pixels(gaussians: Gaussians, camera: Camera, seen_by: Sequence[Covera
         missed.flat[pixels[is_seen]] = False
         pixels, points = pixels[~is_seen], points[~is_seen]
     return ndimage.median_filter(missed | (alpha < COVERED), SPECKS)
-
-
-def leave_one_out_unseen_share(gaussians: Gaussians, views: Sequence[CoverageView]) -> float:
-    """Mean share in [0, 1] of a training view's pixels that show what no other training view saw; 0 without views.
-
-    Estimates from the training views alone what a further view of the same capture would show for the first time.
-    Pixels of the object do not count: what is behind it is the task of the other stages. Of many views
-    `MOST_LEFT_OUT` are left out in turn, evenly spaced in their order.
-    """
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_LEFT_OUT)).round().astype(int))
-    shares = []
-    for index in chosen:
-        others = [*views[:index], *views[index + 1 :]]
-        shares.append((unseen_pixels(gaussians, views[index].camera, others) & ~views[index].hidden).mean())
-    return float(np.mean(shares)) if shares else 0.0
 
 
 @torch.no_grad()

@@ -10,7 +10,7 @@ from reffusion.params.base import Device, Settings
 class Params(Settings):
     backdrop: bool = Field(
         True,
-        description="where the capture leaves parts of the scene unseen, close the scene by a soft backdrop and remove "
-        "the Gaussians that no training view supports",
+        description="close the scene by a soft backdrop where no training view looked, and remove the Gaussians "
+        "that no training view supports",
     )
     device: Device = Field("cpu", description="where the training views are rendered")
