@@ -36,7 +36,8 @@ def make(home: Path) -> tuple[Path, list[str]]:
         raise ValueError(f"{poses}: the scene has no photographs to look at")
     cells = [(name, overlay_masks(poses, raw_masks, name), view_role(name, views)) for name in names]
     save_image(home / "check.png", contact_sheet(cells))
-    return home / "check.png", [*load_warnings(poses), *load_warnings(raw_masks)]
+    folders = (poses, raw_masks, sheet.stage_folder(home, "masks"))
+    return home / "check.png", [line for folder in folders for line in load_warnings(folder)]
 
 
 def view_role(name: str, views: dict[str, list[str]]) -> str:

@@ -117,7 +117,7 @@ def capture_notes(job: JobFiles) -> list[str]:
     if "poses" in job.folders:
         sfm = job.folders["poses"] / "sfm.json"
         lines += [load_json(sfm)["summary"]] if sfm.is_file() else []
-    for stage in ("poses", "raw_masks"):
+    for stage in ("poses", "raw_masks", "masks"):
         lines += load_warnings(job.folders[stage]) if stage in job.folders else []
     return [page.bullets(lines)] if lines else []
 

@@ -51,7 +51,18 @@ def masks_section(job: JobFiles) -> list[str]:
     else:
         words += "Consistent masks come with the stage `masks`. "
     words += f"{len(names)} of {len(views['train'])} training views."
-    return [top, page.paragraph(words, quiet=True), inline_images.picture_grid(list(map(cell, first))), more]
+    grid = inline_images.picture_grid(list(map(cell, first)))
+    return [top, page.paragraph(words, quiet=True), grid, more, *remnant_pictures(job)]
+
+
+def remnant_pictures(job: JobFiles) -> list[str]:
+    """Pictures of the parts of the object that the masks seem to leave out, largest first."""
+    pictures = sorted((job.folders.get("masks", Path()) / "remnants").glob("*.png"), key=lambda path: int(path.stem))
+    if "masks" not in job.folders or not pictures:
+        return []
+    cells = [(inline_images.photo_address(load_image(path), MASK_SIDE), f"part {path.stem}") for path in pictures]
+    words = "Magenta: parts of the object that the masks seem to leave out; the warnings above say what became of each."
+    return [page.paragraph(words, quiet=True), inline_images.picture_grid(cells)]
 
 
 def draw_mask_classes(job: JobFiles, poses: Path, name: str) -> np.ndarray:

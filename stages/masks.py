@@ -3,10 +3,13 @@ mask."""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from reffusion.background.model import Background, surfaces_to_arrays
@@ -15,21 +18,32 @@ from reffusion.clicks.local_segmenter import load_local_segmenter
 from reffusion.clicks.scene_masks import masks_from_clicks
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, load_labels, save_arrays, save_json, save_labels
+from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import list_objects, load_fill_masks, load_raw_masks, load_scene, save_mask_sets
+from reffusion.io.scene import (
+    WARNINGS,
+    list_objects,
+    load_fill_masks,
+    load_raw_masks,
+    load_scene,
+    load_views,
+    save_mask_sets,
+)  # fmt: skip
 from reffusion.masks import consolidation, frame_check, voting
 from reffusion.masks.debris import find_debris
 from reffusion.masks.regions import FillRequest, Region
+from reffusion.masks.remnants import Remnant, find_remnants
 from reffusion.params.masks import Params
 from reffusion.types import Camera, Gaussians, Scene
 from reffusion.workspace import SURFACES
 
+TINT = (255, 0, 160)  # of remnants in their pictures
 CHECKED_VIEWS = 8  # views in which Gaussians that the scene brings are compared with photographs
 
 
 def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -> None:
     """Write labels.npy, debris.npy, background.npz, facts.json, and raw/, consistent/, unobserved/ and
-    invent/<view>.png."""
+    invent/<view>.png; warnings.json and remnants/ where the masks seem to leave out a part of the object."""
     scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply", device=params.device)
     train = [scene.cameras[name] for name in scene.train]
     check_frame(poses, fit, gaussians, train)
@@ -48,6 +62,11 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     # What lies inside the mask in (almost) every view can only be the object, whatever the votes say.
     dirty = {name: consistent[name] for name in scene.train if name not in scene.clean}
     labels = labels | voting.hidden_inside(gaussians, train, dirty, share=params.inside_share)
+    remnants = find_remnants(gaussians, labels, train) if params.remnants and raw else []
+    report_remnants(remnants, out, lambda name: load_views(poses, [name])[name])
+    for remnant in (each for each in remnants if each.floats):
+        labels = labels | torch.as_tensor(remnant.members, device=labels.device)
+        consistent = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
     views = render_depth_views(gaussians, train, hidden)
     background = Background(views, {}, points=scene.points).with_planes(gaussians, labels)
@@ -78,9 +97,28 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
         "unobserved_share": share,
         "invent_views": [name for name in repainted if invent[name].any()],
         "best_reference": voting.best_view(invent, scene.train),
+        "remnants": [{"removed": each.floats, "share": each.share, "view": each.view} for each in remnants],
         "region": region and {"center": list(region.center), "size": list(region.size)},
     }
     save_json(out / "facts.json", facts)
+
+
+def report_remnants(remnants: Sequence[Remnant], out: Path, photo_of: Callable[[str], np.ndarray]) -> None:
+    """Warn of parts of the object that the masks leave out, with a picture of each: remnants/<number>.png."""
+    lines = []
+    for k, remnant in enumerate(remnants, start=1):
+        photo, picture = photo_of(remnant.view).copy(), out / "remnants" / f"{k}.png"
+        photo[remnant.mask] = photo[remnant.mask] // 2 + np.array(TINT) // 2
+        save_image(picture, photo)
+        outcome = (
+            "a part that the masks leave out would float in the air and is removed too (masks.remnants=false keeps it)"
+            if remnant.floats
+            else "part of the object seems to be left; if so, mark it in that view and run again"
+        )
+        lines.append(f"{outcome}: {remnant.describe()}, see {picture.relative_to(out.parent)}")
+        warnings.warn(lines[-1], stacklevel=1)
+    if lines:
+        save_json(out / WARNINGS, lines)
 
 
 def load_region(raw_masks: Path) -> Region | None:

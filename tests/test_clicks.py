@@ -21,6 +21,7 @@ from reffusion.clicks.marks import Mark, confirmed_pixels, stroke_pixels
 from reffusion.clicks.scene_segmentation import Event, FittedViews, correct_scene, segment_scene
 from reffusion.clicks.segmenter import Candidate
 from reffusion.clicks.single_view import ViewEvidence, apply_marks
+from reffusion.gaussians.neighbours import find_neighbours
 from reffusion.graph_cut import min_cut
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, load_mask, save_image, save_mask, to_uint8
@@ -271,7 +272,7 @@ def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
     with torch.no_grad():
         images = {n: to_uint8(rasterizer.render(scene, c).color.clamp(0, 1).numpy()) for n, c in cameras.items()}
     box = torch.arange(len(means)) >= len(parts[0][0])
-    near, mask = all_views.find_neighbours(scene), voting.render_labels(scene, box, cameras["middle"]) > 0.5
+    near, mask = find_neighbours(scene), voting.render_labels(scene, box, cameras["middle"]) > 0.5
     found = all_views.label_gaussians(scene, near, cameras, {"middle": mask}, images.__getitem__)
     assert (found & box).sum() > 0.95 * box.sum() and (found & ~box).sum() < 0.01 * box.sum()
 

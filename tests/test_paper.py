@@ -85,6 +85,7 @@ ABSENT = {
     "masks.tidy": False,
     "masks.inside_share": 1,
     "masks.debris": False,
+    "masks.remnants": False,
     "masks.negligible": 0,
     "personalize.samples.hole_share": 0,
     "personalize.samples.outside_weight": 1,

@@ -4,24 +4,21 @@ photograph."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from reffusion.clicks import color_evidence
 from reffusion.clicks.geodesic_cut import keep_connected, relative_distance
 from reffusion.clicks.marks import UNKNOWN
 from reffusion.clicks.single_view import erode, refine_edges
+from reffusion.gaussians.neighbours import NeighbourGraph
 from reffusion.graph_cut import min_cut
 from reffusion.masks import voting
 from reffusion.splat import rasterizer
-from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
-NEIGHBOURS = 8  # nearest neighbours of each Gaussian
 LARGEST_VOTE = 5.0  # px of blending weight at which votes saturate
 LEAST_VOTE = 1.0  # px of blending weight from which masks determine the label of a Gaussian
 RIM = 0.006  # of the larger side: pixels this near to a mask's border do not vote
@@ -30,37 +27,8 @@ RING = 0.05  # of the larger side: width of the ring around a mask that a test p
 ABSENT, LEVEL = 3.0, 0.02
 ROUNDS = 3  # at most, of colours, each with the labels of the one before
 COLOR = 1.0  # weight of the colours of other views, px of blending weight in the mean view
-UNLIKE = 1.0  # how much longer an edge is where colours differ as neighbours do on average
 NEARER = 3.0  # weight of the distances to object and background, compared with that of colours
 COVERED = 0.5  # alpha from which the object covers a pixel
-
-
-@dataclass(frozen=True)
-class NeighbourGraph:
-    """The graph of neighbouring Gaussians, with the similarity of their colours.
-
-    Attributes:
-        pairs: [E, 2] int, each pair once.
-        likeness: [E] in (0, 1], similarity of colours.
-        way: [E] > 0, length of the edge: the distance, longer where colours differ.
-    """
-
-    pairs: np.ndarray
-    likeness: np.ndarray
-    way: np.ndarray
-
-
-def find_neighbours(gaussians: Gaussians) -> NeighbourGraph:
-    """The graph of neighbouring Gaussians; likeness of colours is relative to the mean difference of neighbours."""
-    means, color = (each.detach().cpu().double().numpy() for each in (gaussians.means, gaussians.sh[:, 0] * SH0))
-    near = cKDTree(means).query(means, min(NEIGHBOURS + 1, len(means)))[1].reshape(len(means), -1)[:, 1:]
-    own = np.repeat(np.arange(len(means)), near.shape[1])
-    pairs = np.unique(np.sort(np.stack([own, near.ravel()], 1), 1), axis=0)
-    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    square = ((color[pairs[:, 0]] - color[pairs[:, 1]]) ** 2).sum(1)
-    unlike = square / (square.sum() / max(len(square), 1) + 1e-12)
-    apart = np.linalg.norm(means[pairs[:, 0]] - means[pairs[:, 1]], axis=1)
-    return NeighbourGraph(pairs, np.exp(-unlike / 2), apart * (1 + UNLIKE * np.sqrt(unlike)) + 1e-12)
 
 
 @torch.no_grad()

@@ -18,6 +18,7 @@ from reffusion.clicks import all_views
 from reffusion.clicks.marks import OBJECT, OTHER, Mark, confirmed_pixels
 from reffusion.clicks.propagation import propagate_masks
 from reffusion.clicks.single_view import ViewEvidence, apply_marks
+from reffusion.gaussians.neighbours import find_neighbours
 from reffusion.morphology import dilate
 from reffusion.types import Camera, Gaussians
 
@@ -112,7 +113,7 @@ def propagate(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
     if views.evidence_of(next(iter(masks))).ask is not None:
         return propagate_masks(views.gaussians, views.cameras, views.evidence_of, masks)
     image_of = lambda name: views.evidence_of(name).image
-    near = all_views.find_neighbours(views.gaussians)
+    near = find_neighbours(views.gaussians)
     labels = all_views.label_gaussians(views.gaussians, near, views.cameras, masks, image_of)
     return dict(masks) | {
         name: all_views.object_mask(views.gaussians, labels, camera, image_of(name))

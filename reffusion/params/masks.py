@@ -37,6 +37,11 @@ class Params(Settings):
         description="also mask Gaussians whose centre is in C in more than this share of views; 1 = none",
     )
     debris: bool = Field(True, description="also mask Gaussians that the removal uncovers and no photograph supports")
+    remnants: bool = Field(
+        True,
+        description="find parts of the object that the masks leave out: remove those that would float in the air, and "
+        "warn of the others",
+    )
     # PAPER leaves open: it always invents. So few pixels are rims of masks and crevices, not worth a diffusion model.
     negligible: float = Field(
         0.005, ge=0, lt=1, description="share of C up to which unobserved pixels are not inpainted"
