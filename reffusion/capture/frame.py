@@ -26,14 +26,15 @@ def depth_ranges(
     The first of these that is available:
     - the points inside the view (1st, 50th and 99th percentile), where there are at least 10;
     - the LLFF bounds (typical: the mean in disparity);
-    - the point where the optical axes meet (near and far: a third and four times its depth);
-    - where the axes are parallel or meet behind the cameras, three times the cameras' spread.
+    - as the typical depth that of the point where the optical axes meet, or three times the cameras' spread where they
+      are parallel or meet behind the cameras; near and far are a third and four times that;
+    - the median of the other views.
 
     Args:
         world_to_camera: [V, 4, 4]. points: [P, 3]. bounds: [V, 2] near and far, or None.
 
     Raises:
-        BadInput: there are no points, no bounds, and all cameras are at one place, so no depth can be estimated.
+        BadInput: no view has 10 points, there are no bounds, and all cameras are at one place.
     """
     guess = _axis_intersection_depths(world_to_camera) if bounds is None else None
     ranges = np.empty((len(lenses), 3))

@@ -76,17 +76,19 @@ class Hints:
         plane_depth: [H, W] depth of planes that continue into the hole, inf where none does
             (`reffusion.background.continuation`).
         planes: depth [H, W] of each of these planes, at every pixel.
-        observed: bool [H, W], pixels of the hole whose rendered depth other views confirm.
-        outer: [H, W] depth that replaces the rendered one where it is above 0, because it is more accurate.
-        confirmed: bool [H, W], pixels of `outer` on which other photographs agree (`reffusion.initialize.sweep`).
+        confirmed: bool [H, W], pixels of the hole whose rendered depth other views confirm.
+        photographed_depth: [H, W] depth of what the photograph shows, 0 where unknown; elsewhere it replaces the
+            rendered depth, because it is more accurate.
+        swept: bool [H, W], pixels of `photographed_depth` on which other photographs agree
+            (`reffusion.initialize.sweep`).
         free_space: depth [H, W] -> bool [H, W], pixels in which other views see past a surface of this depth.
     """
 
     plane_depth: np.ndarray | None = None
     planes: Sequence[np.ndarray] = ()
-    observed: np.ndarray | None = None
-    outer: np.ndarray | None = None
     confirmed: np.ndarray | None = None
+    photographed_depth: np.ndarray | None = None
+    swept: np.ndarray | None = None
     free_space: Callable[[np.ndarray], np.ndarray] | None = None
 
 
@@ -139,12 +141,12 @@ def extract_depth(
 ) -> ViewDepth:
     """The depth of a rendering: known where alpha is high, except in the hole and a margin around it."""
     depth, alpha = (t.detach().double().cpu().numpy() for t in (rendering.depth, rendering.alpha))
-    plane_depth, outer = hints.plane_depth, hints.outer
+    plane_depth, outer = hints.plane_depth, hints.photographed_depth
     if outer is not None:
         depth, alpha = np.where(outer > 0, outer, depth), np.where(outer > 0, 1.0, alpha)
     known = (alpha > settings.explained) & (depth > 0) & ~morphology.dilate_by_distance(hole, settings.margin)
-    if hints.observed is not None:
-        known |= hole & hints.observed
+    if hints.confirmed is not None:
+        known |= hole & hints.confirmed
     anchored = hole & ~known & np.isfinite(plane_depth) if plane_depth is not None else np.zeros_like(hole)
     depth = np.where(anchored, plane_depth, depth) if plane_depth is not None and anchored.any() else depth
     return ViewDepth(camera, depth, known, hole, hidden, anchored, hints)
@@ -292,8 +294,8 @@ def _fit_planar_model(
         values, source = view.disparity[rows, columns], "rendered depth"
         pixels = np.stack([columns, rows], 1) + 0.5
     model = _fit_planes(view, pixels, values, settings)
-    if sparse and view.hints.confirmed is not None and model.explained < CONCLUSIVE_SHARE:
-        rows, columns = np.nonzero(_surroundings(view, settings) & view.known & view.hints.confirmed)
+    if sparse and view.hints.swept is not None and model.explained < CONCLUSIVE_SHARE:
+        rows, columns = np.nonzero(_surroundings(view, settings) & view.known & view.hints.swept)
         every = slice(None, None, max(1, len(rows) // (SWEPT_RATIO * len(values))))
         rows, columns, source = rows[every], columns[every], "sparse points and photographs compared"
         values = np.concatenate([values, view.disparity[rows, columns]])

@@ -28,7 +28,8 @@ def fit_plane(disparity: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def plane_values(coefficients: tuple[float, float, float], shape: tuple[int, int]) -> np.ndarray:
-    """[H, W] values of a x + b y + c with x, y = (column, row) / width."""
+    """[H, W] values of a x + b y + c with x, y = (column, row) / width, where columns and rows are integers: at upper
+    left corners of pixels."""
     rows, columns = np.mgrid[: shape[0], : shape[1]] / shape[1]
     a, b, c = coefficients
     return a * columns + b * rows + c

@@ -18,8 +18,8 @@ class TrainView:
     Attributes:
         camera: the view.
         photo: [H, W, 3], uint8 (a quarter of the memory of float32, with hundreds of views) or float32 in [0, 1].
-        supervises: [H, W] bool, the pixels whose photo may supervise: outside the consistent mask C; all of a clean
-            view.
+        supervises: [H, W] bool, the pixels whose photo may supervise: outside C, I and the object's shadow; all of a
+            clean view.
         repaint: [H, W] bool, the hole: pixels that are made up, and that the UNet repaints. Empty if the view is not
             distilled.
         clean: the object is absent from this view.

@@ -143,8 +143,9 @@ def pixels_in_front(gaussians: Gaussians, depth: np.ndarray, reference: Referenc
 
 
 def beside_depth_edges(depth: np.ndarray, remaining_depth: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels just beyond the edge of something nearer that show what remains there. The nearer thing's
-    colour bleeds into them, and photographs show them clean.
+    """bool [H, W]: pixels at the farther side of a depth edge whose surface belongs to the remaining scene.
+
+    The colour of the nearer surface bleeds into these pixels of a completed view; photographs show them clean.
 
     Args:
         depth, remaining_depth: [H, W] of the completed view, and of the scene that remains.

@@ -97,12 +97,12 @@ def fill_reference(
     near, swept = refine_background(background, camera, hole) if sweep else (background, None)
     uncovered = find_unobserved(remaining, camera, mask, near.views, near.planes, near.mirrors)
     hints = Hints(
-        uncovered.continued_depth,
-        uncovered.plane_depths,
-        uncovered.confirmed,
-        near.photographed_depth(camera),
-        swept,
-        (lambda depth: near.is_empty(camera, depth)) if params.depth.sweep else None,
+        plane_depth=uncovered.continued_depth,
+        planes=uncovered.plane_depths,
+        confirmed=uncovered.confirmed,
+        photographed_depth=near.photographed_depth(camera),
+        swept=swept,
+        free_space=(lambda depth: near.is_empty(camera, depth)) if params.depth.sweep else None,
     )
     depth, estimate, words = unprojection.estimate_depth(
         remaining, reference, hole, mask, background.points, COMPLETION, disparity, log, hints, farthest

@@ -103,7 +103,7 @@ def align_reference_depth(
     """[H, W] the depth map of a reference in world units; 0 where unknown."""
     assert reference.depth is not None
     camera, rendering = reference.camera, rasterizer.render(remaining, reference.camera, sh_degree=0)
-    hints = Hints(outer=background.photographed_depth(camera))
+    hints = Hints(photographed_depth=background.photographed_depth(camera))
     mask = background.masks[camera.name]
     view = background_depth.extract_depth(rendering, camera, reference.mask, mask, completion, hints)
     depth, _ = alignment.align_either(reference.depth, view.depth, view.known)

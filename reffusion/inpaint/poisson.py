@@ -61,7 +61,14 @@ def paste(image: np.ndarray, picture: np.ndarray, mask: np.ndarray, both: np.nda
 
 
 def interpolate(values: np.ndarray, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """[N, 3] float64, values [H, W, 3] of the pixels `beside` a hole, bool [H, W] both, interpolated smoothly (Laplace
-    equation) at the hole's pixels in reading order."""
+    """Fill a hole by the Laplace equation.
+
+    Args:
+        values: [H, W, 3].
+        hole: bool [H, W], the pixels to fill. beside: bool [H, W], the pixels whose values are continued.
+
+    Returns:
+        [N, 3] float64, the hole's pixels in reading order.
+    """
     even = np.zeros(values.shape, np.float32)
     return blend(values, hole, even, even, even, beside, TINY_WEIGHT)

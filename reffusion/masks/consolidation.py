@@ -125,5 +125,5 @@ def count_pixels(kind: str, sets: Mapping[str, MaskSet], names: Sequence[str]) -
 
 
 def unobserved_share(sets: Mapping[str, MaskSet], names: Sequence[str]) -> float:
-    """Share of the consistent masks' pixels that no photograph shows."""
+    """Share of the consistent masks' pixels behind which no photograph shows the background, over the views `names`."""
     return count_pixels("unobserved", sets, names) / max(count_pixels("consistent", sets, names), 1)
