@@ -185,7 +185,7 @@ def skipped_section(job: JobFiles) -> list[str]:
         if entry["word"] != "cached" or entry["reason"]
     ]
     parts = [page.heading("What was left out or taken over, and why")]
-    return parts + ([page.table(["stage", "", "because"], rows, text=(1, 2))] if rows else [page.paragraph("Nothing.")])
+    return parts + ([page.table(["stage", "", "reason"], rows, text=(1, 2))] if rows else [page.paragraph("Nothing.")])
 
 
 def receipts_section(job: JobFiles) -> list[str]:

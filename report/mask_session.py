@@ -108,10 +108,10 @@ class Session:
     kept, so that a further mark, or undoing the last one, computes little.
     """
 
-    def __init__(self, capture: Capture, fitted: Callable[[], bool], segmenter: Segmenter | None = None):
+    def __init__(self, capture: Capture, is_fitted: Callable[[], bool], segmenter: Segmenter | None = None):
         self.capture, self.scene = capture, load_scene(capture.poses)
         self.segmenter, self.unsaved = segmenter, False
-        self.fitted = fitted  # is the fit of these poses finished? the folder may still hold a fit of earlier poses
+        self.is_fitted = is_fitted  # of these poses? the folder may still hold a fit of earlier ones
         self.views = [name for name in self.scene.train if name not in self.scene.clean]
         self.lenses, self.sizes = load_lenses(capture.poses)[0], load_photograph_sizes(capture.poses)
         self.images = load_views(capture.poses, self.views)
@@ -265,7 +265,7 @@ class Session:
             with self.lock:
                 self.lock.wait_for(lambda: self.solved_revision < self.revision, None if self.gaussians else 1.0)
                 revision, events = self.revision, list(self.events)
-            if self.gaussians is None and self.fitted():
+            if self.gaussians is None and self.is_fitted():
                 self._load_fit()
                 continue
             if self.solved_revision == revision:

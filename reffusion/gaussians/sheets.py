@@ -32,7 +32,7 @@ class Sheets:
         under_spread, under_opacity: of the second sheet. Its Gaussians are wider so that they leave no gaps, which a
             nearer view would show as a grid; the colours of the first sheet compensate for the blur.
         color_steps: corrections of the colours, see `reffusion.initialize.unprojection.match_colors`.
-        gloss: make colours depend on the direction as those around them do, see
+        view_dependent: make colours depend on the direction as those around them do, see
             `reffusion.initialize.view_dependent_color`.
     """
 
@@ -44,7 +44,7 @@ class Sheets:
     under_spread: float = 0.6
     under_opacity: float = 0.8
     color_steps: int = 5
-    gloss: bool = False
+    view_dependent: bool = False
 
 
 def sheet_gaussians(

@@ -87,7 +87,7 @@ def fill_reference(
     camera, mask = reference.camera, background.masks[reference.camera.name]
     over = reference.mask & ~mask  # an inserted part, drawn over what remains
     # An inserted part has a shine of its own, and so narrow an extra view tells nothing of it.
-    sheets = Sheets(gloss=params.view_dependent_color and not farthest and not over.any())
+    sheets = Sheets(view_dependent=params.view_dependent_color and not farthest and not over.any())
     hole = unprojection.find_hole(draft, reference, mask, COVERED)
     if farthest and background.mirrors:
         hole |= reference.mask  # also where something is visible, but behind a mirror image

@@ -136,7 +136,7 @@ def add_surface(
     old_count, draft = len(draft.gaussians), draft.add(added.map(lambda p: p.to(draft.gaussians.means)))
     gaussians = draft.gaussians
     is_added = torch.arange(len(gaussians), device=draft.is_new.device) >= old_count
-    if sheets.gloss:
+    if sheets.view_dependent:
         known = background.photographed_depth(camera)
         hole = pixels | background.masks[camera.name]
         change = measure_change(reference.image, known, hole, camera, background.views, background.photos)

@@ -52,9 +52,9 @@ def list_paintings(folder: Path) -> list[Path]:
 
 
 def load_reference_files(
-    folder: Path, views: ViewTable, asked: ReferenceSpec | Sequence[ReferenceSpec] | None
+    folder: Path, views: ViewTable, specs: ReferenceSpec | Sequence[ReferenceSpec] | None
 ) -> list[ReferenceFile]:
-    """The references that scene.yaml names (`asked`) and those in `painted`, sorted by view.
+    """The references that scene.yaml names (`specs`) and those in `painted`, sorted by view.
 
     A painting is called <view>.png, its depth map <view>_depth.*. It replaces one that scene.yaml names for the same
     view.
@@ -65,7 +65,7 @@ def load_reference_files(
     """
     folder = Path(folder)
     found: dict[str, ReferenceFile] = {}
-    for each in reference_list(asked):
+    for each in reference_list(specs):
         path = folder / each.image
         name = resolve_file_view(path, each.view, views, "reference")
         if name in found:

@@ -31,17 +31,17 @@ class FoundMasks:
     warning: str | None = None
 
 
-def find_masks(folder: Path, capture: Capture, asked: str | MaskSpec | None, optional: bool) -> FoundMasks:
+def find_masks(folder: Path, capture: Capture, spec: str | MaskSpec | None, optional: bool) -> FoundMasks:
     """Find the masks of a scene, and check that each has its picture.
 
     Args:
-        asked: the parameter `masks` (`reffusion.params.capture`).
+        spec: the parameter `masks` (`reffusion.params.capture`).
         optional: the scene may lack masks.
 
     Raises:
         BadInput: naming the file or folder and the remedy.
     """
-    named = asked if isinstance(asked, MaskSpec) else MaskSpec(folder=asked)
+    named = spec if isinstance(spec, MaskSpec) else MaskSpec(folder=spec)
     if named.folder is not None and named.folder.lower() == NONE:
         return FoundMasks({})
     values = MaskValues(named.numbers)
