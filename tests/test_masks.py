@@ -142,7 +142,7 @@ def test_gaussians_inside_every_mask_are_the_object_even_if_outvoted(tmp_path, m
     found = {}
     for share in (0.9, 1.0):
         (tmp_path / str(share)).mkdir()
-        params = Params(inside_share=share, debris=False)
+        params = Params(inside_share=share, debris=False, remnants=False)
         _, _, found[share], truth = classify(tmp_path / str(share), NEAR, params, masks=masks)
     lost = truth & ~found[1.0]
     assert lost.sum() >= 4, "the vote alone leaves the spot standing"

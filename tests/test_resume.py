@@ -31,8 +31,9 @@ STAGES = ("fit", "masks", "reference", "personalize", "initialize", "distill", "
 # Those that resume come first.
 IN_TURN = ("fit", "distill", "personalize", "masks", "evaluate", "initialize", "finish", "reference")
 SMALL = (
-    "fit.iterations=120 fit.checkpoint_seconds=0.2 personalize.steps=16 personalize.optimizer.batch=2 "
-    "personalize.checkpoint_seconds=0.2 distill.iterations=40 distill.checkpoint_seconds=0.2"
+    "fit.iterations=60 fit.checkpoint_seconds=0.2 personalize.steps=8 personalize.optimizer.batch=2 "
+    "personalize.checkpoint_seconds=0.2 distill.iterations=20 distill.checkpoint_seconds=0.2 "
+    "initialize.refit_steps=30 initialize.extra_views=1"
 )
 
 
