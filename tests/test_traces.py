@@ -159,7 +159,7 @@ def test_moments_depend_on_the_iteration_only():
     assert [i for i in range(41) if trace.log_spaced(i, 40, 1)] == [0, 1, 2, 4, 8, 16, 32, 40]
 
 
-SLOW = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="as test_personalize.py; set REFFUSION_SLOW=1")
+SLOW = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="see test_personalize; REFFUSION_SLOW=1")
 KILLED = {
     "fit": (fitting, "step", 6),
     "personalize": (personalizing, "train_step", 4),

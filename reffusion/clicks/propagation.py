@@ -8,7 +8,7 @@ better with all votes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ from scipy import ndimage
 from reffusion import trace
 from reffusion.clicks.all_views import remove_rim
 from reffusion.clicks.marks import UNKNOWN, Clicks
-from reffusion.clicks.segmenter import Prompt
+from reffusion.clicks.segmenter import Candidate, Prompt
 from reffusion.clicks.single_view import ViewEvidence, bounding_box, erode, refine_edges
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
@@ -29,6 +29,8 @@ MIN_PIXELS = 20  # px of a silhouette below which a view does not show the objec
 MIN_PART = 0.1  # of the largest connected part of a silhouette: smaller parts are no prompt
 POINTS = 3  # points of a prompt
 MIN_REST = 0.01  # of the visible silhouette: larger parts that the network leaves out are asked for separately
+# Votes exclude a pixel from this blending weight against the object on, up to this one for it.
+SURE, MAX_DOUBT = 0.5, 0.2
 MIN_DEPTH = 0.3  # of the largest distance to the silhouette's border: points nearer to it are no prompt
 MIN_DEPTH_PX = 1.5
 WHOLE_BONUS = 0.03  # of agreement: the network's mask of the largest object is preferred, since votes know parts first
@@ -143,8 +145,9 @@ def order_by_distance(cameras: Mapping[str, Camera], masks: Mapping[str, np.ndar
 def draw_mask(view: ViewEvidence, projection: Projection) -> np.ndarray:
     """bool [H, W]: the network's mask of what votes show in a view.
 
-    What is removed together may be several things to the network, such as a table and what stands on it. So what the
-    first mask leaves out is asked for separately.
+    To the network, the object and what it stands on may be one thing, such as a statue and its plinth. So where its mask
+    covers what votes exclude, it is asked again with points there. What is removed together may be several things, such
+    as a table and what stands on it. So what the mask leaves out is asked for separately.
     """
     silhouette = _drop_small_parts(projection.silhouette)
     visible = _drop_small_parts(silhouette & (projection.inside > projection.outside))
@@ -156,26 +159,37 @@ def draw_mask(view: ViewEvidence, projection: Projection) -> np.ndarray:
         Prompt(inside, bounding_box(visible)),
         Prompt(_deepest_points(silhouette), box),
     ]
-    mask = _select(view, prompts, projection)
+    candidates = _ask(view, prompts)
+    mask = _select(candidates, projection)
+    excluded = mask & (projection.outside > SURE) & (projection.inside < MAX_DOUBT)
+    if excluded.sum() > MIN_REST * silhouette.sum():
+        others = _deepest_points(excluded)
+        points = Clicks(
+            np.concatenate([inside.points, others.points]), np.concatenate([inside.positive, ~others.positive])
+        )
+        candidates += _ask(view, [Prompt(points, box), Prompt(points)], parts=True)
+        mask = _select(candidates, projection)
     for part in _large_parts(erode(visible & ~mask, 1), MIN_REST * visible.sum()):
-        both = mask | _select(view, [Prompt(_deepest_points(part), bounding_box(part))], projection, mask)
+        both = mask | _select(_ask(view, [Prompt(_deepest_points(part), bounding_box(part))]), projection, mask)
         if agreement(both, projection) > agreement(mask, projection):
             mask = both
     return mask
 
 
-def _select(
-    view: ViewEvidence, prompts: list[Prompt], projection: Projection, known: np.ndarray | None = None
-) -> np.ndarray:
-    """bool [H, W]: the network's mask of largest agreement times expected IoU, together with what is known."""
+def _ask(view: ViewEvidence, prompts: Sequence[Prompt], parts: bool = False) -> list[tuple[Candidate, float]]:
+    """The network's masks of an object and of the largest object, or of a part too, each with its bonus."""
     assert view.ask is not None
-    merits, masks = [], []
-    for prompt in prompts:
-        for k, each in enumerate(view.ask(prompt)[-2:]):  # of an object, and of the largest object
-            masks.append(each.mask)
-            both = each.mask if known is None else each.mask | known
-            merits.append(agreement(both, projection) * each.score + WHOLE_BONUS * k)
-    return masks[int(np.argmax(merits))]
+    answers = [view.ask(prompt)[-3 if parts else -2 :] for prompt in prompts]
+    return [(each, WHOLE_BONUS * (each is masks[-1])) for masks in answers for each in masks]
+
+
+def _select(
+    candidates: Sequence[tuple[Candidate, float]], projection: Projection, known: np.ndarray | None = None
+) -> np.ndarray:
+    """bool [H, W]: the mask of largest agreement times expected IoU, plus bonus, together with what is known."""
+    joined = lambda mask: mask if known is None else mask | known
+    merit = lambda pair: agreement(joined(pair[0].mask), projection) * pair[0].score + pair[1]
+    return max(candidates, key=merit)[0].mask
 
 
 def draw_view(view: ViewEvidence, projection: Projection) -> np.ndarray:
