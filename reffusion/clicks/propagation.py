@@ -145,9 +145,9 @@ def order_by_distance(cameras: Mapping[str, Camera], masks: Mapping[str, np.ndar
 def draw_mask(view: ViewEvidence, projection: Projection) -> np.ndarray:
     """bool [H, W]: the network's mask of what votes show in a view.
 
-    To the network, the object and what it stands on may be one thing, such as a statue and its plinth. So where its mask
-    covers what votes exclude, it is asked again with points there. What is removed together may be several things, such
-    as a table and what stands on it. So what the mask leaves out is asked for separately.
+    To the network, the object and what it stands on may be one thing, such as a statue and its plinth. So where its
+    mask covers what votes exclude, it is asked again with points there. What is removed together may be several things,
+    such as a table and what stands on it. So what the mask leaves out is asked for separately.
     """
     silhouette = _drop_small_parts(projection.silhouette)
     visible = _drop_small_parts(silhouette & (projection.inside > projection.outside))
