@@ -62,9 +62,11 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     # What lies inside the mask in (almost) every view can only be the object, whatever the votes say.
     dirty = {name: consistent[name] for name in scene.train if name not in scene.clean}
     labels = labels | voting.hidden_inside(gaussians, train, dirty, share=params.inside_share)
-    remnants = find_remnants(gaussians, labels, train) if params.remnants and raw else []
+    remnants = (
+        find_remnants(gaussians, labels, [c for c in train if c.name in dirty]) if params.remnants and raw else []
+    )
     report_remnants(remnants, out, lambda name: load_views(poses, [name])[name])
-    for remnant in (each for each in remnants if each.floats):
+    for remnant in (each for each in remnants if each.would_float):
         labels = labels | torch.as_tensor(remnant.members, device=labels.device)
         consistent = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
@@ -97,7 +99,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
         "unobserved_share": share,
         "invent_views": [name for name in repainted if invent[name].any()],
         "best_reference": voting.best_view(invent, scene.train),
-        "remnants": [{"removed": each.floats, "share": each.share, "view": each.view} for each in remnants],
+        "remnants": [{"removed": each.would_float, "share": each.share, "view": each.view} for each in remnants],
         "region": region and {"center": list(region.center), "size": list(region.size)},
     }
     save_json(out / "facts.json", facts)
@@ -112,7 +114,7 @@ def report_remnants(remnants: Sequence[Remnant], out: Path, photo_of: Callable[[
         save_image(picture, photo)
         outcome = (
             "a part that the masks leave out would float in the air and is removed too (masks.remnants=false keeps it)"
-            if remnant.floats
+            if remnant.would_float
             else "part of the object seems to be left; if so, mark it in that view and run again"
         )
         lines.append(f"{outcome}: {remnant.describe()}, see {picture.relative_to(out.parent)}")

@@ -88,7 +88,7 @@ class OwnSplats:
 
     Attributes:
         splats: in the scene's own frame; properties: of its .ply, in order.
-        deleted: bool [N], those that `cleaned` lacks; None where the scene has no such file.
+        deleted: bool [N], those missing from the file that the parameter `cleaned` names; None without such a file.
         notes: sentences about both files.
     """
 

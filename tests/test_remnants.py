@@ -32,7 +32,7 @@ def test_a_part_that_the_masks_cut_off_is_found_and_would_float(axis):
     cut = cut_away(labels, scene, axis, 0.2)
     (remnant,) = find_remnants(scene, cut, CAMERAS)
     missing = (labels & ~cut).numpy()
-    assert remnant.floats and (remnant.members == missing).mean() > 0.99
+    assert remnant.would_float and (remnant.members == missing).mean() > 0.99
     assert remnant.share == pytest.approx(0.25, abs=0.06) and remnant.mask.any()
     x, y = remnant.center
     assert remnant.mask[y, x] and remnant.view in remnant.describe()

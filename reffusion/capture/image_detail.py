@@ -57,7 +57,8 @@ def typical_view_count(points: np.ndarray, cameras: Sequence[Camera]) -> int:
 def supported_sh_degree(points: np.ndarray, cameras: Sequence[Camera], most: int) -> tuple[int, int]:
     """The highest supported degree of spherical harmonics, at most `most`, and the `typical_view_count` behind it.
 
-    A degree has (degree + 1)^2 coefficients, as many as the views of a typical point [P, 3] must be to determine them.
+    A degree has (degree + 1)^2 coefficients; at least that many views must contain a typical point [P, 3], occluded or
+    not.
     """
     views = typical_view_count(points, cameras)
     return min(most, max(isqrt(views) - 1, 0)), views

@@ -1,5 +1,5 @@
-"""Propagates masks of a few views to all views through the Gaussians: votes, a cut between neighbours, edges of each
-photograph."""
+"""Propagates masks of a few views to all views without a segmentation network: votes of Gaussians, a cut between
+neighbours, edges of each photograph."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Propagates the object's mask from some views to all: Gaussians vote, and a segmentation network draws each mask.
 
 The masks so far label Gaussians by their votes. The silhouette of these Gaussians in the next view is the prompt: a
-box, and points inside it. The network's mask votes in turn. Views follow each other by distance, so that each shows
-most of what its neighbour shows. At the end each view gets the network's mask or the projected labels, whichever agrees
+box, and points inside it. The network's mask votes in turn. Views follow each other by the distance of their
+cameras, so that each mostly shows what an earlier one shows. At the end each view gets the network's mask or the projected labels, whichever agrees
 better with all votes.
 """
 
@@ -29,11 +29,13 @@ MIN_PIXELS = 20  # px of a silhouette below which a view does not show the objec
 MIN_PART = 0.1  # of the largest connected part of a silhouette: smaller parts are no prompt
 POINTS = 3  # points of a prompt
 MIN_REST = 0.01  # of the visible silhouette: larger parts that the network leaves out are asked for separately
-# Votes exclude a pixel from this blending weight against the object on, up to this one for it.
-SURE, MAX_DOUBT = 0.5, 0.2
+# Votes exclude a pixel with more than this blending weight against the object, and less than this for it.
+MIN_AGAINST, MAX_FOR = 0.5, 0.2
 MIN_DEPTH = 0.3  # of the largest distance to the silhouette's border: points nearer to it are no prompt
 MIN_DEPTH_PX = 1.5
-WHOLE_BONUS = 0.03  # of agreement: the network's mask of the largest object is preferred, since votes know parts first
+WHOLE_BONUS = (
+    0.03  # of agreement, for the network's mask of the largest object, since early votes cover only parts
+)
 MIN_AGREEMENT = 0.8  # of a network's mask with the labels so far, from which it votes
 
 
@@ -98,7 +100,7 @@ def propagate_masks(
 
 
 def count_all_votes(gaussians: Gaussians, cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray]) -> Votes:
-    """The votes of at least one view with a mask."""
+    """Sum the votes of all masks, at least one."""
     counts = [count_votes(gaussians, cameras[name], mask) for name, mask in masks.items()]
     weights = np.concatenate([each.sum(1) for each in counts])
     shown = weights[weights > SHOWN]
@@ -129,7 +131,7 @@ def project_votes(gaussians: Gaussians, camera: Camera, votes: Votes) -> Project
 
 
 def order_by_distance(cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray]) -> list[str]:
-    """The views without masks; each is the nearest to those before it and to the views with masks."""
+    """The views without masks, greedily: next is the view whose camera is nearest to an earlier one or one with a mask."""
     distance = lambda a, b: float(np.linalg.norm(cameras[a].center - cameras[b].center))
     remaining = {
         name: min((distance(name, other) for other in masks), default=0.0) for name in cameras if name not in masks
@@ -161,7 +163,7 @@ def draw_mask(view: ViewEvidence, projection: Projection) -> np.ndarray:
     ]
     candidates = _ask(view, prompts)
     mask = _select(candidates, projection)
-    excluded = mask & (projection.outside > SURE) & (projection.inside < MAX_DOUBT)
+    excluded = mask & (projection.outside > MIN_AGAINST) & (projection.inside < MAX_FOR)
     if excluded.sum() > MIN_REST * silhouette.sum():
         others = _deepest_points(excluded)
         points = Clicks(
@@ -186,7 +188,8 @@ def _ask(view: ViewEvidence, prompts: Sequence[Prompt], parts: bool = False) -> 
 def _select(
     candidates: Sequence[tuple[Candidate, float]], projection: Projection, known: np.ndarray | None = None
 ) -> np.ndarray:
-    """bool [H, W]: the mask of largest agreement times expected IoU, plus bonus, together with what is known."""
+    """bool [H, W]: the mask of largest agreement times expected IoU, plus bonus, judged joined with
+    `known`, bool [H, W]."""
     joined = lambda mask: mask if known is None else mask | known
     merit = lambda pair: agreement(joined(pair[0].mask), projection) * pair[0].score + pair[1]
     return max(candidates, key=merit)[0].mask

@@ -42,9 +42,10 @@ class ColorChange:
 
     Attributes:
         material: [H, W, 3] float32, the completed view, strongly blurred, in [0, 1].
-        points: [R, 3], samples of the surface. colors: [R, 3], `material` at them.
-        change: [R, V, 3], what each view adds to their colours; 0 where it does not show them.
-        visible: bool [R, V], where it does.
+        points: [R, 3], R samples of the surface. colors: [R, 3], `material` at them.
+        change: [R, V, 3], colour in each view minus colour in the completed view, both blurred by `BLUR`; 0 where the
+            view does not show the sample.
+        visible: bool [R, V], whether a view shows a sample.
     """
 
     material: np.ndarray

@@ -68,7 +68,8 @@ def inlined(function: Callable) -> Callable:
 def empty_aligned(*shape: int) -> np.ndarray:
     """Uninitialised float32 array, aligned to cache lines; large ones reuse memory of arrays that no longer exist.
 
-    Otherwise the system provides new pages for large arrays each time, and clearing these takes much of a step.
+    Otherwise the system provides new pages for large arrays each time, and clearing these takes much of an
+    optimisation step.
     """
     size = math.prod(shape)
     if size < _MIN_KEPT:

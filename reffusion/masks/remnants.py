@@ -1,7 +1,7 @@
 """Remnants: parts of the object that the masks leave out, and that would stay when the object is removed.
 
-A part of the object touches the object on a larger area than it touches what stays, and its colours are the object's
-rather than those of the surroundings. A minimum cut through the neighbouring Gaussians finds such parts.
+A part of the object touches the object more than what stays, and its colours are the object's rather than those of the
+surroundings. A minimum cut through the neighbouring Gaussians proposes parts; the sum of both log-ratios selects them.
 """
 
 from __future__ import annotations
@@ -23,17 +23,18 @@ from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
 REACH = 1.0  # of the object's radius: Gaussians farther from the object surely stay
-SURROUNDINGS = 3.0  # of the object's radius: what lies between `REACH` and here stands for what stays
-ATTACHMENT = 2.0  # contact with the object counts this much less than contact with what stays
-LEAST_LIKENESS = 0.3  # of two Gaussians that may both stay: a pattern does not divide a surface
-COLOR_WEIGHT = 0.3  # of the logarithm of the ratio of colour densities, compared with that of contact
+SURROUNDINGS = 3.0  # of the object's radius: what lies between `REACH` and here, or more until there are `SAMPLES`,
+# stands for what stays
+ATTACHMENT = 2.0  # contact with the object is divided by this in the cut
+LEAST_SIMILARITY = 0.3  # of the colours of two Gaussians without labels: a pattern does not divide a surface
+COLOR_WEIGHT = 0.3  # of the log-ratio of colour densities in the cut; in the score it is 1
 LARGEST_LOG_RATIO = 3.0  # bound of that logarithm
 SAMPLES, NEAREST = 2000, 10  # colours that stand for each side; their distance to the nearest ones gives a density
 COLOR_BLUR = 0.02  # of a colour's range: differences below this do not count
 LEAST_SCORE = 2.5  # logarithms of the ratios of contact and of colours, together, from which a part is a remnant
 LEAST_COUNT = 10  # Gaussians of a remnant
 LEAST_SHARE = 0.003  # of the object's visible pixels
-FLOATS = 10.0  # contact with the object over that with what stays, from which a remnant would float
+FLOATING_RATIO = 10.0  # of contact with the object to contact with what stays, from which a part would float
 SOLID = 0.1  # opacity from which a Gaussian belongs to a surface
 TOUCHING = 0.1  # overlap from which two Gaussians touch
 
@@ -44,13 +45,13 @@ class Remnant:
 
     Attributes:
         members: bool [N].
-        floats: without the object it would touch hardly anything.
+        would_float: without the object it would touch hardly anything.
         share: its visible pixels over the object's, all training views together.
         view: the view that shows most of it; mask: bool [H, W], its pixels there.
     """
 
     members: np.ndarray
-    floats: bool
+    would_float: bool
     share: float
     view: str
     mask: np.ndarray
@@ -72,19 +73,21 @@ def find_remnants(gaussians: Gaussians, labels: Tensor, cameras: Sequence[Camera
     if not parts:
         return []
     shown = [render_parts(gaussians, [labels.cpu().numpy(), *(part for part, _ in parts)], c) for c in cameras]
-    object_pixels = sum(masks[0].sum() for masks in shown)
+    object_pixels = sum(int(masks[0].sum()) for masks in shown)
+    if not object_pixels:
+        return []
     found = []
-    for k, (part, floats) in enumerate(parts, start=1):
+    for k, (part, would_float) in enumerate(parts, start=1):
         pixels = [int(masks[k].sum()) for masks in shown]
-        share = sum(pixels) / max(object_pixels, 1)
+        share = sum(pixels) / object_pixels
         if share >= LEAST_SHARE:
             best = int(np.argmax(pixels))
-            found.append(Remnant(part, floats, share, cameras[best].name, shown[best][k]))
+            found.append(Remnant(part, would_float, share, cameras[best].name, shown[best][k]))
     return sorted(found, key=lambda remnant: -remnant.share)
 
 
 def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarray, bool]]:
-    """(bool [N], does it float) for each connected part that continues the labelled object, bool [N]."""
+    """(bool [N], would it float) for each connected part that continues the labelled object, bool [N]."""
     means = gaussians.means.detach().cpu().double().numpy()
     if not labels.any():
         return []
@@ -103,9 +106,9 @@ def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarra
     contact = overlap * np.minimum(*opacities[graph.pairs.T]) * np.minimum(*size[graph.pairs.T])
     color = local.sh[:, 0].detach().cpu().double().numpy() * SH0
     log_ratio = compare_densities(color, inside & solid, stays & solid).clip(-LARGEST_LOG_RATIO, LARGEST_LOG_RATIO)
-    likeness, free = graph.likeness**2, ~inside & ~stays
+    similarity, free = graph.likeness**2, ~inside & ~stays
     strength = contact * np.where(
-        inside[first] | inside[second], likeness / ATTACHMENT, np.maximum(likeness, LEAST_LIKENESS)
+        inside[first] | inside[second], similarity / ATTACHMENT, np.maximum(similarity, LEAST_SIMILARITY)
     )
     unit = max(float(strength.mean()), 1e-12)
     gain = COLOR_WEIGHT * opacities * size * log_ratio * free / unit
@@ -115,13 +118,13 @@ def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarra
     for part in connected_parts(found, graph.pairs[overlap > TOUCHING]):
         to_object = (part[first] & inside[second]) | (part[second] & inside[first])
         to_rest = (part[first] ^ part[second]) & ~inside[first] & ~inside[second]
-        alike = (contact * likeness)[to_object].sum() / max((contact * likeness)[to_rest].sum(), 1e-12)
-        weight = (opacities * size**2)[part]
-        score = np.log(max(alike, 1e-12)) + float((log_ratio[part] * weight).sum() / weight.sum())
+        ratio = (contact * similarity)[to_object].sum() / max((contact * similarity)[to_rest].sum(), 1e-12)
+        weight = (opacities * size**2)[part]  # area that a Gaussian shows
+        score = np.log(max(ratio, 1e-12)) + float((log_ratio[part] * weight).sum() / weight.sum())
         if score >= LEAST_SCORE:
             members = np.zeros(len(gaussians), bool)
             members[near[part]] = True
-            parts.append((members, bool(contact[to_object].sum() > FLOATS * contact[to_rest].sum())))
+            parts.append((members, bool(contact[to_object].sum() > FLOATING_RATIO * contact[to_rest].sum())))
     return parts
 
 

@@ -217,7 +217,8 @@ def score_outside_seen(
     image: np.ndarray, truth: np.ndarray, mask: np.ndarray, unseen: np.ndarray
 ) -> dict[str, float | None]:
     """{"psnr_outside_seen", "unseen_share"}: PSNR over the pixels outside the bool mask [H, W] that some training view
-    saw, and the share of the pixels outside the mask that none saw; None where there are no such pixels."""
+    saw, and the share of the pixels outside the mask that none saw; each is None if
+    it has no pixels."""
     kept = ~mask
     return {
         "psnr_outside_seen": _masked_psnr(image, truth, kept & ~unseen),

@@ -16,8 +16,8 @@ FEED_FORWARD = ("lama", "migan")  # the kinds that read a file
 class Inpainter(Settings, Generic[KindT]):
     """What inpaints in 2D. A stage allows some kinds: `Inpainter[Literal["fsr", "lama"]]`; a plain string is the kind.
 
-    `weights` names no diffusion model: that is the parameter `prior` of `reference` and `lift`, beside its sampler and
-    prompt. A profile sets the model, which has to suit the machine; a scene or a variant sets the kind.
+    `weights` is for lama and migan only. The parameter `prior` of `reference` and `lift` names the diffusion model. A
+    profile sets the model, which has to suit the machine; a scene or a variant sets the kind.
     """
 
     kind: KindT = Field(

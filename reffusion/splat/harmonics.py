@@ -61,18 +61,19 @@ def colors(degree, basis, coefficients):
 
 
 @inlined
-def colors_backward(degree, basis, coefficients, red, green, blue, along):
-    """Overwrite the coefficients by their gradients, given those of the colours (0 where clamped).
+def colors_backward(degree, basis, coefficients, red, green, blue, basis_gradient):
+    """Overwrite the coefficients by dLoss/dcoefficient.
 
     Args:
-        along: output, dLoss/dY_k, LANES values each.
+        red, green, blue: dLoss/dcolour; the caller sets them to 0 where the colour is clamped.
+        basis_gradient: output, dLoss/dY_k, LANES values each.
     """
     for k in range((degree + 1) * (degree + 1)):
         y, place = load(basis, k * LANES), 3 * k * LANES
         slope = red * load(coefficients, place)
         slope = fma(green, load(coefficients, place + LANES), slope)
         slope = fma(blue, load(coefficients, place + 2 * LANES), slope)
-        store(along, k * LANES, slope)
+        store(basis_gradient, k * LANES, slope)
         store(coefficients, place, y * red)
         store(coefficients, place + LANES, y * green)
         store(coefficients, place + 2 * LANES, y * blue)
