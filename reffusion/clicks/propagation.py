@@ -1,9 +1,9 @@
 """Propagates the object's mask from some views to all: Gaussians vote, and a segmentation network draws each mask.
 
 The masks so far label Gaussians by their votes. The silhouette of these Gaussians in the next view is the prompt: a
-box, and points inside it. The network's mask votes in turn. Views follow each other by the distance of their
-cameras, so that each mostly shows what an earlier one shows. At the end each view gets the network's mask or the projected labels, whichever agrees
-better with all votes.
+box, and points inside it. The network's mask votes in turn. Views follow each other by the distance of their cameras,
+so that each mostly shows what an earlier one shows. At the end each view gets the network's mask or the projected
+labels, whichever agrees better with all votes.
 """
 
 from __future__ import annotations
@@ -33,9 +33,7 @@ MIN_REST = 0.01  # of the visible silhouette: larger parts that the network leav
 MIN_AGAINST, MAX_FOR = 0.5, 0.2
 MIN_DEPTH = 0.3  # of the largest distance to the silhouette's border: points nearer to it are no prompt
 MIN_DEPTH_PX = 1.5
-WHOLE_BONUS = (
-    0.03  # of agreement, for the network's mask of the largest object, since early votes cover only parts
-)
+WHOLE_BONUS = 0.03  # of agreement, for the network's mask of the largest object, since early votes cover only parts
 MIN_AGREEMENT = 0.8  # of a network's mask with the labels so far, from which it votes
 
 
@@ -131,7 +129,7 @@ def project_votes(gaussians: Gaussians, camera: Camera, votes: Votes) -> Project
 
 
 def order_by_distance(cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray]) -> list[str]:
-    """The views without masks, greedily: next is the view whose camera is nearest to an earlier one or one with a mask."""
+    """The views without masks; each is the nearest, by its camera, to an earlier one or to a view with a mask."""
     distance = lambda a, b: float(np.linalg.norm(cameras[a].center - cameras[b].center))
     remaining = {
         name: min((distance(name, other) for other in masks), default=0.0) for name in cameras if name not in masks
