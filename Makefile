@@ -214,7 +214,7 @@ sparse: ready $(others)
 
 # Two processes with one thread each. Each gets whole files, so that tests of a file share compiled kernels.
 test test-fast: $(VENV)/.ready-dev
-	$(if $(slow),REFFUSION_SLOW=1) OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses 2 --dist loadfile \
+	$(if $(slow),REFFUSION_SLOW=1) OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses 3 --dist loadfile \
 		--no-loadscope-reorder $(if $(filter test-fast,$@),-m "not integration")
 
 # Every reader on damaged files, ten minutes each.
