@@ -15,7 +15,7 @@ from torch import Tensor
 from reffusion.background.model import Background, surfaces_to_arrays
 from reffusion.background.visibility import render_depth_views
 from reffusion.clicks.local_segmenter import load_local_segmenter
-from reffusion.clicks.scene_masks import masks_from_clicks
+from reffusion.clicks.scene_masks import masks_from_clicks, refine_masks
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, load_labels, save_arrays, save_json, save_labels
 from reffusion.io.images import save_image
@@ -144,6 +144,10 @@ def collect_raw_masks(
         raise ValueError(
             f"{raw_masks / 'masks'}: no view has a mask of each object; add empty ones where one is unseen"
         )
+    if params.refine and any(mask.any() for mask in raw.values()):
+        segmenter = load_local_segmenter(params.segmenter)
+        assert segmenter is not None  # checked by the parameters and, for files, before any work
+        raw = raw | refine_masks(scene, gaussians, poses, raw, segmenter)
     if not params.clicks:
         return raw
     return masks_from_clicks(scene, gaussians, poses, params.clicks, raw, load_local_segmenter(params.segmenter))

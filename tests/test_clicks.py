@@ -18,6 +18,7 @@ from scipy import ndimage
 from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points
 from reffusion.clicks import all_views
 from reffusion.clicks.marks import Mark, confirmed_pixels, stroke_pixels
+from reffusion.clicks.refinement import redraw_masks
 from reffusion.clicks.scene_segmentation import Event, FittedViews, correct_scene, segment_scene
 from reffusion.clicks.segmenter import Candidate
 from reffusion.clicks.single_view import ViewEvidence, apply_marks
@@ -27,6 +28,7 @@ from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, load_mask, save_image, save_mask, to_uint8
 from reffusion.io.scene import load_mask_sets
 from reffusion.masks import voting
+from reffusion.morphology import dilate
 from reffusion.params.poses import Params as Poses
 from reffusion.splat import rasterizer
 from report import mask
@@ -226,6 +228,29 @@ def test_a_network_that_knows_the_object_in_parts_gives_the_whole_in_all_views()
         return answer
 
     found = segment_scene(fitted_views(ask), [], {"a2": square_mask("a2")})
+    assert min(wall_scene.iou(found[name], square_mask(name)) for name in wall_scene.TRAIN) > 0.95
+
+
+def test_rough_masks_are_drawn_anew():
+    """Masks 2 px too large or too small, and one missing; the network knows the square."""
+
+    def ask(name):
+        square = square_mask(name)
+
+        def answer(prompt):
+            column, row = prompt.clicks.points[0].astype(int)
+            mask = square if square[row, column] else ~square
+            return [Candidate(mask & False, 0.5), Candidate(mask, 0.9), Candidate(mask, 0.95)]
+
+        return answer
+
+    width = wall_scene.WIDTH
+    rough = {
+        name: dilate(square_mask(name), 2 / width) if k % 2 else ~dilate(~square_mask(name), 2 / width)
+        for k, name in enumerate(wall_scene.TRAIN[:-1])
+    }
+    assert max(wall_scene.iou(rough[name], square_mask(name)) for name in rough) < 0.8
+    found = redraw_masks(fitted_views(ask), rough)
     assert min(wall_scene.iou(found[name], square_mask(name)) for name in wall_scene.TRAIN) > 0.95
 
 

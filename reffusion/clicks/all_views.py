@@ -47,15 +47,22 @@ def label_gaussians(
     cameras: Mapping[str, Camera],
     masks: Mapping[str, np.ndarray],
     image_of: Callable[[str], np.ndarray],
+    rim: float = RIM,
 ) -> Tensor:
     """bool [N], the object: where the views with masks show the Gaussians by their votes, elsewhere by neighbours and
-    by the colours of the other photographs."""
+    by the colours of the other photographs.
+
+    Args:
+        rim: of the larger side: pixels this near to a mask's border do not vote.
+    """
     sure = np.zeros((len(gaussians), 2))
     for name, mask in masks.items():
-        ballots = torch.as_tensor(np.stack([remove_rim(mask), remove_rim(~mask)], -1), device=gaussians.means.device)
+        ballots = torch.as_tensor(
+            np.stack([remove_rim(mask, rim), remove_rim(~mask, rim)], -1), device=gaussians.means.device
+        )
         sure += rasterizer.accumulate(gaussians, cameras[name], ballots.to(gaussians.means.dtype)).cpu().numpy()
     inside, outside = sure.T
-    margin = max(1, round(RIM * max(next(iter(masks.values())).shape)))
+    margin = max(1, round(rim * max(next(iter(masks.values())).shape)))
     outside_mask = color_evidence.find_outside(gaussians, cameras, masks, margin) & (inside < LEAST_VOTE)
     inside, outside = (
         np.minimum(inside, LARGEST_VOTE),
@@ -98,7 +105,7 @@ def is_visible(gaussians: Gaussians, camera: Camera, image: np.ndarray, mask: np
     return float(off[mask].mean()) < ABSENT * float(off[around].mean()) + LEVEL
 
 
-def remove_rim(mask: np.ndarray) -> np.ndarray:
+def remove_rim(mask: np.ndarray, rim: float = RIM) -> np.ndarray:
     """The mask without its rim, unless that is most of it."""
-    inner = erode(mask, max(1, round(RIM * max(mask.shape))))
+    inner = erode(mask, max(1, round(rim * max(mask.shape))))
     return inner if inner.sum() > 0.25 * mask.sum() else mask

@@ -13,6 +13,7 @@ from reffusion.capture.views import check_outliers
 from reffusion.clicks import all_views
 from reffusion.clicks.marks import Mark
 from reffusion.clicks.propagation import count_all_votes, draw_view, project_votes
+from reffusion.clicks.refinement import redraw_masks
 from reffusion.clicks.scene_segmentation import Event, FittedViews, segment_scene
 from reffusion.clicks.segmenter import ImageFeatures, Segmenter, encode_image, predict_masks
 from reffusion.clicks.single_view import ViewEvidence
@@ -56,6 +57,18 @@ def masks_from_clicks(
     if not any(mask.any() for mask in found.values()):
         raise ValueError("scene.yaml: clicks: the views show nothing there; click in the middle of the object")
     return found | masks_of_test_views(scene, views, found)
+
+
+def refine_masks(
+    scene: Scene, gaussians: Gaussians, poses: Path, masks: Mapping[str, np.ndarray], segmenter: Segmenter
+) -> dict[str, np.ndarray]:
+    """View name -> bool [H, W]: masks of all training views that show the object, drawn anew from rough ones.
+
+    Args:
+        masks: view name -> bool [H, W]; views may lack one. Empty ones are votes, too.
+    """
+    cameras = {name: scene.cameras[name] for name in scene.train if name not in scene.clean}
+    return redraw_masks(FittedViews(gaussians, cameras, evidence_loader(scene, gaussians, poses, segmenter)), masks)
 
 
 def masks_of_test_views(scene: Scene, views: FittedViews, masks: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

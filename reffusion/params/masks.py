@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from reffusion.params.base import Device, Settings
 from reffusion.params.clicks import Clicked
@@ -15,10 +15,15 @@ class Params(Settings):
         None, min_length=1, description="objects to remove, each a folder of masks (masks/<object>/); None: all"
     )
     clicks: Clicked | None = Field(None, description="view -> clicks, from which masks are made if none are given")
+    refine: bool = Field(
+        False,
+        description="draw the given masks anew by the segmentation network: for rough ones, up to 2 % of the image's "
+        "larger side wide of the object, or missing in some views",
+    )
     segmenter: str = Field(
         "auto",
-        description="network that turns clicks into masks: auto (the one that `make weights` fetches, if it is on this "
-        "machine), none, a folder with encoder.onnx and decoder.onnx, or a SAM of transformers",
+        description="network that makes masks from clicks and refines masks: auto (that which `make weights` fetches, "
+        "if it is on this machine), none, a folder with encoder.onnx and decoder.onnx, or a SAM of transformers",
     )
     vote: Literal["weight", "count"] = Field(
         "weight", description="value of a contribution: its blending weight, or 1 (the paper says 'count')"
@@ -50,3 +55,9 @@ class Params(Settings):
         "auto", description="pixels to inpaint; auto: unobserved pixels and those the scene asks to fill"
     )
     device: Device = Field("cpu", description="device for rendering and votes")
+
+    @model_validator(mode="after")
+    def _refining_needs_a_network(self) -> Params:
+        if self.refine and self.segmenter == "none":
+            raise ValueError("refine needs a segmentation network: leave out segmenter: none")
+        return self

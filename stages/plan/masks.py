@@ -7,17 +7,22 @@ from reffusion.params.masks import Params
 from reffusion.weights import local
 from reffusion.weights.segmenters import AUTO, NONE, segmenter_facts
 
-__all__ = ["Params", "lacks", "preview"]
+__all__ = ["Params", "lacks", "needed_weights", "optional_weights", "preview"]
+
+
+def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
+    """The network that refines masks."""
+    return [local.segmenter_need()] if params.segmenter == AUTO and params.refine else []
 
 
 def optional_weights(params: Params) -> list[local.Need]:
     """The network that makes masks from clicks."""
-    return [local.segmenter_need()] if params.segmenter == AUTO else []
+    return [local.segmenter_need()] if params.segmenter == AUTO and not params.refine else []
 
 
 def machine_facts(params: Params) -> dict[str, str]:
     """What masks from clicks depend on besides the parameters: the network's files."""
-    return segmenter_facts(params.segmenter) if params.clicks else {}
+    return segmenter_facts(params.segmenter) if params.clicks or params.refine else {}
 
 
 def preview(params: Params, **_: Path | None) -> list[str]:

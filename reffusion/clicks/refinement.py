@@ -1,0 +1,41 @@
+"""Draws rough masks anew: they label Gaussians, except near their borders, which prompt the network in each view."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from reffusion import trace
+from reffusion.clicks import all_views
+from reffusion.clicks.propagation import combine, count_all_votes, draw_mask, project_votes
+from reffusion.clicks.scene_segmentation import FittedViews
+from reffusion.gaussians.neighbours import find_neighbours
+
+ROUGH_RIM = 0.02  # of the larger side: pixels this near to a rough mask's border do not vote
+
+
+def redraw_masks(views: FittedViews, masks: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The object's mask, bool [H, W], in every view, from rough masks.
+
+    The labels of the Gaussians prompt the network in each view. Its masks vote in turn, and each view gets its mask or
+    the projected votes, whichever agrees better with all votes.
+
+    Args:
+        views: with a segmentation network.
+        masks: view -> bool [H, W]; views may lack one.
+    """
+    gaussians, cameras, names = views.gaussians, views.cameras, list(views.cameras)
+    image_of = lambda name: views.evidence_of(name).image
+    near = find_neighbours(gaussians)
+    labels = all_views.label_gaussians(gaussians, near, cameras, masks, image_of, ROUGH_RIM)
+    drawn = {name: all_views.object_mask(gaussians, labels, cameras[name], image_of(name)) for name in names}
+    votes = count_all_votes(gaussians, cameras, drawn)
+    for k in trace.progress(len(names), "masks drawn anew"):
+        projection = project_votes(gaussians, cameras[names[k]], votes)
+        if projection.silhouette.any():
+            drawn[names[k]] = draw_mask(views.evidence_of(names[k]), projection)
+    votes = count_all_votes(gaussians, cameras, drawn)
+    return {
+        name: combine(image_of(name), project_votes(gaussians, cameras[name], votes), drawn[name]) for name in names
+    }
