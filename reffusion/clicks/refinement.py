@@ -1,4 +1,4 @@
-"""Draws rough masks anew: they label Gaussians, except near their borders, which prompt the network in each view."""
+"""Draws rough masks anew: they label Gaussians, whose silhouettes prompt the network in each view."""
 
 from __future__ import annotations
 
