@@ -23,7 +23,7 @@ from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
 REACH = 1.0  # of the object's radius: Gaussians farther from the object surely stay
-# What lies between `REACH` and here, or the nearest `SAMPLES` beyond `REACH` if those reach farther, stands for what stays.
+# What lies between `REACH` and here stands for what stays; farther, if it has fewer than `SAMPLES` Gaussians.
 SURROUNDINGS = 3.0  # of the object's radius
 ATTACHMENT = 2.0  # contact with the object is divided by this in the cut
 LEAST_SIMILARITY = 0.3  # of the colours of two Gaussians without labels: a pattern does not divide a surface
