@@ -4,6 +4,7 @@ import os
 
 __version__ = "0.1.0"
 
-# Torch's threads go on spinning for about a millisecond after each of its operations, and take the core from those that
-# splat next: a step of `fit` on two cores took 48 ms instead of 31. Read when torch is loaded, so it stands here.
+# Torch's OpenMP threads keep spinning for about a millisecond after each torch operation. They occupy the cores that
+# the splatting kernels need next: a step of `fit` on two cores took 48 ms instead of 31. OpenMP reads this variable
+# when torch is loaded, so the variable is set in this file, before any import of torch.
 os.environ.setdefault("GOMP_SPINCOUNT", "30000")

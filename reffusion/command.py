@@ -1,6 +1,6 @@
-"""The command `reffusion` (or `python -m reffusion.command`): starts the runner or a module of report/.
+"""The command `reffusion` (or `python -m reffusion.command`), which starts the runner or a module of report/.
 
-Imports only the standard library, so that the command starts at once.
+This module imports only the standard library, so that the command starts without delay.
 """
 
 import runpy
@@ -35,23 +35,32 @@ COMMANDS = {
 
 
 def root() -> Path:
-    """The folder with pipeline.yaml, stages/, runner/ and report/: `app` if installed, else the top of a checkout."""
+    """Return the folder that contains pipeline.yaml, stages/, runner/ and report/.
+
+    In an installed package this is the folder `app` beside this file, else the top folder of the checkout.
+    """
     here = Path(__file__).resolve().parent
     return here / "app" if (here / "app").is_dir() else here.parent
 
 
 def is_installed(root: Path) -> bool:
-    """Whether `root` is the folder `app` of an installed package, and not a checkout."""
+    """Return whether `root` is the folder `app` of an installed package, rather than a checkout."""
     return root.parts[-2:] == ("reffusion", "app") and not (root / "reffusion").is_dir()
 
 
 def workplace(root: Path) -> Path:
-    """The folder with data/ and runs/: the top of a checkout, or the current folder for an installed package."""
+    """Return the folder that contains data/ and runs/.
+
+    This is the top folder of a checkout, or the current working directory for an installed package.
+
+    Args:
+        root: the result of `root()`.
+    """
     return Path.cwd() if is_installed(root) else root
 
 
 def overview() -> str:
-    """The text of `reffusion --help`."""
+    """Return the text of `reffusion --help`."""
     width = max(map(len, COMMANDS))
     lines = [f"  {name:<{width}}  {what}" for name, (_, what) in COMMANDS.items()]
     return "\n".join(
@@ -68,7 +77,7 @@ def overview() -> str:
 
 
 def installed_version() -> str:
-    """The text of `reffusion --version`."""
+    """Return the text of `reffusion --version`."""
     try:
         return f"reffusion {version('reffusion')}"
     except PackageNotFoundError:  # a checkout without an installation
@@ -76,6 +85,7 @@ def installed_version() -> str:
 
 
 def main() -> None:
+    """Run the command that the command line names; exit with status 2 if there is no command of this name."""
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name in ("--help", "-h", "help", "--version"):
         with suppress(BrokenPipeError):  # as in `reffusion --help | head`
@@ -87,10 +97,10 @@ def main() -> None:
     module, _ = COMMANDS[name]
     if module != "runner":
         del sys.argv[1]
-    sys.path.insert(0, str(root()))  # not this folder: its `io` and `types` would hide those of Python
+    sys.path.insert(0, str(root()))  # not the folder of this file: its `io` and `types` would hide Python's modules
     try:
         runpy.run_module(module, run_name="__main__", alter_sys=True)
-    except SystemExit as end:  # with a message: one line, without a traceback
+    except SystemExit as end:  # print the message of an exit as one line, without a traceback
         if isinstance(end.code, str):
             print(end.code, file=sys.stderr)
             sys.exit(2)

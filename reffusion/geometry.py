@@ -1,4 +1,7 @@
-"""Pinhole geometry: pure functions on float64 arrays (camera conventions of types)."""
+"""Pinhole geometry: pure functions on NumPy arrays, with coordinates in float64.
+
+`types.Camera` defines the conventions of cameras and pixels.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +13,11 @@ from reffusion.types import Camera
 
 
 class Degenerate(ValueError):
-    """What is known does not determine the result.
+    """Error: the data do not determine the result, e.g. because too few pixels have a known depth.
 
     Attributes:
-        reason: one or two words, to be counted where the loss of one view does no harm.
+        reason: the cause in one or two words, e.g. "few pixels". A caller that can do without one view skips the view
+            and counts the skipped views by this reason.
     """
 
     def __init__(self, reason: str, message: str):
@@ -22,16 +26,16 @@ class Degenerate(ValueError):
 
 
 def to_camera(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """[..., 3] world points in the camera's axes (x right, y down, z forward), float64."""
+    """Transform world points [..., 3] into the camera's axes (x right, y down, z forward), float64 [..., 3]."""
     pose = camera.world_to_camera
     return np.asarray(points, np.float64) @ pose[:3, :3].T + pose[:3, 3]
 
 
 def project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """World points [..., 3] -> pixel coordinates uv [..., 2] and camera depth z [...], float64.
+    """Project world points [..., 3] to pixel coordinates uv [..., 2] and camera depth z [...], both float64.
 
-    The pixel in row j and column i has its centre at uv = (i + 0.5, j + 0.5). Points with z <= 0 are behind the
-    camera: their uv is NaN, never a mirrored position.
+    The pixel in row j and column i has its centre at uv = (i + 0.5, j + 0.5). Points with z <= 0 are not in front of
+    the camera. Their uv is NaN, not a mirrored position.
     """
     x, y, z = np.moveaxis(to_camera(points, camera), -1, 0)
     ahead = np.where(z > 0, z, np.nan)
@@ -40,17 +44,20 @@ def project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]
 
 
 def pixel_rays(camera: Camera) -> np.ndarray:
-    """[H, W, 3] camera-frame directions of the pixel centres, scaled to z = 1, float64."""
+    """Return the ray directions through the pixel centres in the camera's axes, scaled to z = 1: float64 [H, W, 3]."""
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
     return np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], -1)
 
 
 def unproject(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """Depth [H, W] (camera z at pixel centres) -> world points [H, W, 3], float64. Inverse of `project`.
+    """Return the world points, float64 [H, W, 3], that a depth map describes; the inverse of `project`.
+
+    Args:
+        depth: [H, W], camera z at the pixel centres.
 
     Raises:
-        ValueError: the depth map is not of the camera's size.
+        ValueError: the size of the depth map is not the size of the camera's image.
     """
     depth = np.asarray(depth, np.float64)
     if depth.shape != (camera.height, camera.width):
@@ -60,14 +67,27 @@ def unproject(depth: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def reciprocal(values: np.ndarray) -> np.ndarray:
-    """1 / values where they are positive, else 0: disparity of depth, and depth of disparity."""
+    """Return 1 / values where the values are positive, else 0.
+
+    This converts depth to disparity, and disparity to depth.
+
+    Args:
+        values: float array of any shape.
+    """
     return np.divide(1.0, values, out=np.zeros_like(values), where=values > 0)
 
 
 def sample_nearest(image: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The pixels of `image` [H, W, ...] that contain uv [..., 2], and which uv lie inside the image (bool [...]).
+    """Return the values of the pixels that contain the given positions, without interpolation.
 
-    Outside, and for NaN, the value of pixel (0, 0) stands in: mask it with the second result.
+    Args:
+        image: [H, W, ...], values of any type.
+        uv: [..., 2], positions (column, row) in pixel coordinates; NaN is allowed.
+
+    Returns:
+        The values, with the shape of the positions followed by that of a pixel, and bool [...], True where a position
+        lies inside the image. For a position outside the image, or NaN, the first result holds the value of pixel
+        (0, 0), so callers must mask the first result with the second.
     """
     height, width = image.shape[:2]
     with np.errstate(invalid="ignore"):
@@ -77,9 +97,14 @@ def sample_nearest(image: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def angle_between_views(point: np.ndarray, camera: Camera, others: Sequence[Camera]) -> float:
-    """Degrees in [0, 180] at `point` [3] between the direction to `camera` and that to the nearest of `others`.
+    """Return the smallest angle at a point between the direction to `camera` and the direction to any other camera.
 
-    A camera at the point itself has no direction: 180.
+    Args:
+        point: [3], world coordinates of the vertex of the angle.
+        others: at least one camera.
+
+    Returns:
+        Degrees in [0, 180]. A camera whose centre is the point has no direction; its angle counts as 180.
     """
     towards = np.stack([view.center - point for view in (camera, *others)])
     lengths = np.linalg.norm(towards, axis=1)
@@ -89,6 +114,9 @@ def angle_between_views(point: np.ndarray, camera: Camera, others: Sequence[Came
 
 
 def cameras_extent(cameras: Sequence[Camera]) -> float:
-    """3DGS's measure of a scene: 1.1 times the largest distance of a camera's centre from the mean of all."""
+    """Return the extent of a scene as 3DGS defines it.
+
+    This is 1.1 times the largest distance of a camera's centre from the mean of all camera centres, in world units.
+    """
     centers = np.stack([camera.center for camera in cameras])
     return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())

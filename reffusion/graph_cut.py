@@ -6,17 +6,20 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 
-UNIT = 1000  # capacity of a cost of 1, since capacities are integers
-HARD = 1e4  # a cost that no sum of links outweighs
+UNIT = 1000  # integer capacity that stands for a cost of 1: the solver of the cut takes integers only
+HARD = 1e4  # cost that forbids a label, because no sum of the costs of pairs exceeds it
 
 
 def min_cut(true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray) -> np.ndarray:
-    """bool [N], the labels with the smallest total cost, by a minimum cut.
+    """Return bool [N], the labelling of N nodes with the smallest total cost, found by a minimum cut.
+
+    The total cost is the sum of the costs of the nodes' labels and of the pairs whose nodes have different labels.
 
     Args:
-        true_cost, false_cost: [N] >= 0, cost of each label.
-        pairs: [E, 2] int, neighbours, each pair once.
-        strength: [E] >= 0, cost of a pair with different labels.
+        true_cost, false_cost: [N], cost of labelling a node True or False. Only the difference of both matters, and a
+            difference above `HARD` counts as `HARD`.
+        pairs: [E, 2] int, indices of neighbouring nodes, each pair once.
+        strength: [E] >= 0, cost of a pair whose nodes have different labels.
     """
     count = len(true_cost)
     source, sink, nodes = count, count + 1, np.arange(count)
@@ -35,12 +38,17 @@ def min_cut(true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, st
 
 
 def alpha_expansion(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """int [N], labels with a low total cost, by expansion moves (Boykov et al. 2001): each move gives one label to all
-    that gain from it, until no move lowers the cost.
+    """Return int [N] in [0, K), a labelling of N nodes with a low total cost, by expansion moves (Boykov et al. 2001).
+
+    The total cost is that of `min_cut`, with K labels. An expansion move gives one label to the set of nodes for which
+    this lowers the total cost most. The moves of all labels are repeated until none lowers the cost. The result is a
+    local minimum.
 
     Args:
-        cost: [K, N] >= 0 of each label. start: int [N], initial labels.
-        pairs: [E, 2] int, neighbours, each pair once. strength: [E] >= 0, cost of a pair with different labels.
+        cost: [K, N] >= 0, cost of each label at each node.
+        pairs: [E, 2] int, indices of neighbouring nodes, each pair once.
+        strength: [E] >= 0, cost of a pair whose nodes have different labels.
+        start: int [N], initial labels.
     """
     labels, changed = start.copy(), True
     first, second = pairs.T
@@ -49,9 +57,10 @@ def alpha_expansion(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, s
         for label in range(len(cost)):
             apart = labels[first] != labels[second]
             keep = cost[labels, np.arange(len(labels))]
-            # Neighbours with different labels cost once unless both move: each that moves gains half of it.
+            # A node "moves" if it takes `label`. A pair with different labels costs `strength` unless both nodes move.
+            # So each node that moves saves half of this cost, and a pair of which only one node moves pays half.
             gain = np.bincount(pairs[apart].T.ravel(), np.tile(strength[apart] / 2, 2), len(labels))
-            stay = np.where(labels == label, HARD, keep)  # what has the label is as if it had moved
+            stay = np.where(labels == label, HARD, keep)  # a node that has the label counts as moved
             moves = min_cut(cost[label] - gain, stay, pairs, np.where(apart, strength / 2, strength))
             moved = np.where(moves, label, labels)
             if _total(cost, pairs, strength, moved) < _total(cost, pairs, strength, labels) - 1 / UNIT:
@@ -60,5 +69,6 @@ def alpha_expansion(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, s
 
 
 def _total(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, labels: np.ndarray) -> float:
+    """Return the total cost of a labelling."""
     between = strength[labels[pairs[:, 0]] != labels[pairs[:, 1]]]
     return float(cost[labels, np.arange(len(labels))].sum() + between.sum())

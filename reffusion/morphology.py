@@ -1,4 +1,7 @@
-"""Binary morphology of masks: sizes are fractions of the image's width, so that they fit pictures of any resolution."""
+"""Binary morphology of masks, bool [H, W].
+
+Most sizes are given as fractions of the image's width, so that they fit pictures of any resolution.
+"""
 
 from __future__ import annotations
 
@@ -8,32 +11,39 @@ from scipy import ndimage
 
 
 def to_pixels(fraction: float, width: int) -> int:
-    """A fraction of the image's width in pixels, at least 1."""
+    """Convert a fraction of the image's width to pixels, rounded, at least 1."""
     return max(1, round(fraction * width))
 
 
 def disk(radius: int) -> np.ndarray:
-    """The structuring element of a disk, uint8 [2 radius + 1, 2 radius + 1]."""
+    """Return the structuring element of a disk, uint8 [2 radius + 1, 2 radius + 1]."""
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
 
 
 def square(radius: int) -> np.ndarray:
-    """The structuring element of a square, uint8 [2 radius + 1, 2 radius + 1]."""
+    """Return the structuring element of a square, uint8 [2 radius + 1, 2 radius + 1]."""
     return np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
 
 
 def dilate(mask: np.ndarray, fraction: float) -> np.ndarray:
-    """The mask, bool [H, W], dilated by a disk whose radius is `fraction` of the image's width: at least one pixel,
-    unless it is 0."""
+    """Dilate a mask, bool [H, W], by a disk.
+
+    Args:
+        fraction: radius of the disk as a fraction of the image's width. A radius below one pixel is raised to one
+            pixel; with 0 the mask is returned as it is.
+    """
     if not fraction:
         return mask
     return cv2.dilate(mask.astype(np.uint8), disk(to_pixels(fraction, mask.shape[1]))) > 0
 
 
 def dilate_by_distance(mask: np.ndarray, fraction: float) -> np.ndarray:
-    """The mask, bool [H, W], and all pixels within `fraction` of the image's width of it, by exact Euclidean distance.
+    """Dilate a mask, bool [H, W], by an exact Euclidean distance.
 
-    For large radii: unlike that of `dilate`, its cost does not grow with the radius.
+    Unlike `dilate`, this function takes the same time for any radius, so it suits large radii.
+
+    Args:
+        fraction: the distance as a fraction of the image's width.
     """
     if not mask.any():
         return mask
@@ -41,36 +51,61 @@ def dilate_by_distance(mask: np.ndarray, fraction: float) -> np.ndarray:
 
 
 def open_mask(mask: np.ndarray, fraction: float) -> np.ndarray:
-    """The mask, bool [H, W], without parts that are narrower than a disk of this radius; beyond the image's border the
-    mask continues as at the border."""
+    """Remove the parts of a mask, bool [H, W], into which a disk does not fit (morphological opening).
+
+    Beyond the image's border the mask continues with the values at the border.
+
+    Args:
+        fraction: radius of the disk as a fraction of the image's width, at least one pixel.
+    """
     radius = to_pixels(fraction, mask.shape[1])
     padded = np.pad(mask.astype(np.uint8), radius, mode="edge")
     return cv2.morphologyEx(padded, cv2.MORPH_OPEN, disk(radius))[radius:-radius, radius:-radius] > 0
 
 
 def close_mask(mask: np.ndarray, fraction: float) -> np.ndarray:
-    """The mask, bool [H, W], with gaps closed that are narrower than a disk of this radius."""
+    """Fill the gaps of a mask, bool [H, W], into which a disk does not fit (morphological closing).
+
+    Beyond the image's border the mask is False.
+
+    Args:
+        fraction: radius of the disk as a fraction of the image's width, at least one pixel.
+    """
     radius = to_pixels(fraction, mask.shape[1])
     padded = np.pad(mask.astype(np.uint8), radius)
     return cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disk(radius))[radius:-radius, radius:-radius] > 0
 
 
 def remove_slivers(mask: np.ndarray, fraction: float) -> np.ndarray:
-    """The mask, bool [H, W], smoothed by a majority vote in a box, without parts narrower than twice `fraction` of the
-    image's width. Depth edges leave such slivers."""
+    """Remove slivers from a mask, bool [H, W]: smooth it by a majority vote in a square window, then open it.
+
+    Slivers arise along depth edges.
+
+    Args:
+        fraction: half of the least width of the parts that remain, as a fraction of the image's width. This is half of
+            the window's side, and the radius of the disk of the opening.
+    """
     side = 2 * to_pixels(fraction, mask.shape[1]) + 1
     majority = cv2.blur(mask.astype(np.float32), (side, side), borderType=cv2.BORDER_REPLICATE) > 0.5
     return open_mask(majority, fraction)
 
 
 def remove_small_parts(mask: np.ndarray, island_px: float, gap_px: float) -> np.ndarray:
-    """The mask without islands smaller than a disk of diameter `island_px`, and with holes smaller than `gap_px`
-    filled."""
+    """Remove small islands from a mask, bool [H, W], then fill small holes.
+
+    Islands and holes are parts that are connected horizontally or vertically. Background that touches the image's
+    border is a hole, too.
+
+    Args:
+        island_px: islands of a smaller area than a disk of this diameter, in pixels, are removed.
+        gap_px: holes of a smaller area than a disk of this diameter, in pixels, are filled.
+    """
     kept = mask & ~_small_parts(mask, island_px)
     return kept | _small_parts(~kept, gap_px)
 
 
 def _small_parts(mask: np.ndarray, diameter_px: float) -> np.ndarray:
+    """Return bool [H, W], the connected parts of the mask with a smaller area than a disk of this diameter."""
     parts, count = ndimage.label(mask)
     area = np.bincount(parts.ravel(), minlength=count + 1)
     small = area < np.pi / 4 * diameter_px**2
@@ -79,7 +114,7 @@ def _small_parts(mask: np.ndarray, diameter_px: float) -> np.ndarray:
 
 
 def convex_hull(mask: np.ndarray) -> np.ndarray:
-    """bool [H, W]: the convex hull of the mask's pixels."""
+    """Return bool [H, W], the convex hull of the mask's pixels; empty if the mask is empty."""
     rows, columns = np.nonzero(mask)
     found = np.zeros(mask.shape, np.uint8)
     if len(rows):

@@ -1,4 +1,4 @@
-"""Opens ONNX models on the CPU. The only module that imports onnxruntime."""
+"""Loading of ONNX models for the CPU. Only this module imports onnxruntime."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import torch
 
 
 def open_session(model: Path | bytes, name: str) -> Any:
-    """An onnxruntime.InferenceSession that uses as many threads as torch.
+    """Return an onnxruntime.InferenceSession of the model, on the CPU, with as many threads as torch uses.
 
     Args:
-        model: a file, or its content.
-        name: of the file, for messages.
+        model: the path of the model's file, or the content of the file.
+        name: name of the file for error messages.
 
     Raises:
-        ValueError: onnxruntime is not installed, or cannot read the model; one line.
+        ValueError: onnxruntime is not installed, or cannot read the model. The message is one line.
     """
     try:
         import onnxruntime
@@ -24,7 +24,7 @@ def open_session(model: Path | bytes, name: str) -> Any:
         raise ValueError(f"{name} needs onnxruntime: `pip install onnxruntime`") from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()  # onnxruntime does not read OMP_NUM_THREADS
-    options.log_severity_level = 3  # errors only: it would warn of output sizes that exporters misname
+    options.log_severity_level = 3  # errors only, without warnings of output shapes that exporters misname
     source = model if isinstance(model, bytes) else str(model)
     try:
         return onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])

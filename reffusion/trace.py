@@ -1,4 +1,4 @@
-"""What long stages share: error over time, checkpoints, a step budget, progress."""
+"""Tools of the stages that run for long: checkpoints, traces of the error over time, time budgets, progress bars."""
 
 from __future__ import annotations
 
@@ -20,13 +20,18 @@ from reffusion.io.traces import read_trace
 
 CHECKPOINT = "checkpoint.pt"
 LENGTH = "length.json"  # holds the number of steps that fit into a time budget
-# times the duration of the last checkpoint, as the least time between two: under 2 % goes into them
+# The least time between two checkpoints is this many times the time that writing the last one took. So writing takes
+# less than 2 % of the run time.
 WORK_PER_CHECKPOINT = 50
-TRIAL_STEPS = 4  # steps for measuring the speed of a stage
+TRIAL_STEPS = 4  # number of steps with which the speed of a stage is measured
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
-    """Write `folder/checkpoint.pt` atomically. `state` holds tensors and plain Python values."""
+    """Write a state to `folder/checkpoint.pt` atomically.
+
+    Args:
+        state: tensors and plain Python values, also nested.
+    """
     partial = folder / (CHECKPOINT + ".writing")
     with open(partial, "wb") as file:
         torch.save(state, file)
@@ -36,18 +41,20 @@ def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
 
 
 def load_checkpoint(folder: Path) -> dict[str, Any] | None:
-    """The state last saved in `folder`; None without one, and with a message where it is damaged.
+    """Return the state that `save_checkpoint` saved last in `folder`, or None if there is none.
 
-    The runner hands a stage only folders of its own key.
+    A damaged checkpoint is deleted. The function then prints a message and returns None. The state is not compared
+    with the stage's parameters, because the runner gives a stage only folders whose key (the hash of the stage's code,
+    parameters and inputs) is the stage's own.
     """
     path = folder / CHECKPOINT
     if not path.exists():
         return None
     try:
         with zipfile.ZipFile(path) as archive:
-            if archive.testzip() is None:  # torch does not look at the checksums that it writes
+            if archive.testzip() is None:  # torch writes checksums but does not check them
                 return torch.load(path, weights_only=True)
-    except Exception:  # of many kinds: whatever a broken file may be taken for
+    except Exception:  # a broken file causes exceptions of many types
         pass
     print(f"{path} is damaged: from the start", flush=True)
     clear_checkpoint(folder)
@@ -55,14 +62,21 @@ def load_checkpoint(folder: Path) -> dict[str, Any] | None:
 
 
 def clear_checkpoint(folder: Path) -> None:
-    """Remove what `save_checkpoint` wrote, when the stage is done."""
+    """Remove the files that `save_checkpoint` wrote, once the stage is done."""
     (folder / CHECKPOINT).unlink(missing_ok=True)
     (folder / (CHECKPOINT + ".writing")).unlink(missing_ok=True)
 
 
 class Checkpoints:
-    """Decides when a checkpoint is due: `seconds` after the last one, or later where writing took long, as with a
-    million Gaussians or a slow disk. The clock starts anew after writing."""
+    """A schedule of checkpoints that decides when the next one is due, and writes it.
+
+    A checkpoint is due `seconds` after the last one was written. If writing took long, as with a million Gaussians or
+    a slow disk, it is due later: `WORK_PER_CHECKPOINT` times the duration of writing after the last one.
+
+    Args:
+        folder: the folder of the checkpoint.
+        seconds: least time between two checkpoints.
+    """
 
     def __init__(self, folder: Path, seconds: float):
         self._folder, self._seconds = folder, seconds
@@ -70,10 +84,15 @@ class Checkpoints:
 
     @property
     def due(self) -> bool:
+        """Whether it is time to write a checkpoint."""
         return time.monotonic() - self._since > self._wait
 
     def save(self, state: Callable[[], dict[str, Any]]) -> None:
-        """Write the state. It is a function, because assembling the state is part of the duration."""
+        """Write the checkpoint, and restart the time until the next one.
+
+        Args:
+            state: a function that returns the state. The time that it takes counts as part of the time for writing.
+        """
         began = time.monotonic()
         save_checkpoint(self._folder, state())
         self._since = time.monotonic()
@@ -81,10 +100,15 @@ class Checkpoints:
 
 
 class Trace:
-    """Writes `trace.jsonl`, one line per measurement; docs/development.md#traces describes the lines.
+    """A writer of `trace.jsonl`, the error over time of a stage, one line per measurement.
 
-    The clock counts work only: it stops inside `with trace.paused():`, and continues from `start_seconds` after a
-    resume, which drops the lines from `start_iteration` on.
+    docs/development.md#traces describes the lines. The time in the lines is the time of work since the stage began. It
+    excludes the time spent inside `with trace.paused():` and between an interruption and the resumed run.
+
+    Args:
+        folder: the folder of the file. Lines of an earlier run are kept up to `start_iteration`.
+        start_seconds: seconds of work before this run, above 0 if the run is resumed.
+        start_iteration: iteration at which this run starts. Existing lines from this iteration on are dropped.
     """
 
     def __init__(self, folder: Path, start_seconds: float = 0.0, start_iteration: int = 0):
@@ -98,11 +122,12 @@ class Trace:
 
     @property
     def seconds(self) -> float:
+        """Seconds of work so far, without pauses, earlier runs of a resumed stage included."""
         return self._offset + (0.0 if self._is_paused else time.perf_counter() - self._since)
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Stop the clock while something is measured or rendered. May be nested."""
+        """Exclude the time inside the `with` block from the trace, e.g. for a measurement. Blocks may be nested."""
         was_standing = self._is_paused
         self._offset, self._is_paused = self.seconds, True
         try:
@@ -111,7 +136,15 @@ class Trace:
             self._since, self._is_paused = time.perf_counter(), was_standing
 
     def log(self, iteration: int, **errors: float | str) -> None:
-        """Append a line; the clock stands still meanwhile. FloatingPointError naming a value that is not finite."""
+        """Append one line of values to the trace. The time spent in this call is not counted in "seconds".
+
+        Args:
+            iteration: number of finished steps.
+            errors: key of the line -> value, e.g. `psnr=20.1`.
+
+        Raises:
+            FloatingPointError: a value is not finite; the message names it.
+        """
         for name, value in errors.items():
             if not isinstance(value, str) and not isfinite(value):
                 raise FloatingPointError(f"step {iteration}: {name} is {value}")
@@ -122,12 +155,19 @@ class Trace:
 
 
 def decibels(squared_error: float) -> float:
-    """-10 log10 of a mean squared error, at most 100."""
+    """Return -10 log10 of a mean squared error, at most 100. For colours in [0, 1] this is the PSNR in dB."""
     return -10 * log10(max(squared_error, 1e-10))
 
 
 def log_spaced(iteration: int, last: int, per_octave: int = 2, first: int = 1) -> bool:
-    """Is it time to measure? True at iterations 0, 1 and `last`, and `per_octave` times per doubling from `first`."""
+    """Return whether to measure at this iteration, so that measurements are evenly spaced on a logarithmic scale.
+
+    Args:
+        iteration: number of finished steps.
+        last: number of the last step. Iterations 0, 1 and `last` are always measured; -1 if the last is unknown.
+        per_octave: number of measurements while the iteration doubles.
+        first: least iteration of the logarithmically spaced measurements.
+    """
     if iteration in (0, 1, last):
         return True
     step = lambda i: floor(log2(i) * per_octave)
@@ -137,14 +177,19 @@ def log_spaced(iteration: int, last: int, per_octave: int = 2, first: int = 1) -
 def steps_within_budget(
     folder: Path, max_steps: int, seconds: float, elapsed: Callable[[], float], trial: Callable[[Path, int], object]
 ) -> int:
-    """How many steps a stage can do in its `seconds`: between a twentieth of `max_steps` and `max_steps`.
+    """Return the number of steps that a stage can do in a time budget, from a twentieth of `max_steps` to `max_steps`.
 
-    The answer depends on the machine and its load. It is written to `folder/length.json`, and read back on a resume.
+    The speed is measured by a trial of `TRIAL_STEPS` steps, so the result depends on the machine and its load. It is
+    written to `folder/length.json`. A resumed stage reads it from this file.
 
     Args:
-        seconds: for the whole stage; 0: no limit, and nothing is measured or written.
-        elapsed: returns the seconds used up when the steps begin.
-        trial: (folder, count) runs `count` steps with a trace in the folder; must leave everything else unchanged.
+        folder: the stage's folder.
+        max_steps: number of steps without a limit.
+        seconds: time budget of the whole stage. With 0 there is no limit: the result is `max_steps`, and nothing is
+            measured or written.
+        elapsed: returns the seconds that the stage has used so far. It is called after the trial.
+        trial: is called as `trial(folder, count)`. It runs `count` steps, writes their trace to the given folder, and
+            changes nothing else.
     """
     if not seconds:
         return max_steps
@@ -152,7 +197,7 @@ def steps_within_budget(
     if path.exists():
         return json.loads(path.read_text())["steps"]
     tried = folder / ".trial"
-    shutil.rmtree(tried, ignore_errors=True)  # of a run that was killed
+    shutil.rmtree(tried, ignore_errors=True)  # left by a run that was killed
     tried.mkdir(parents=True)
     trial(tried, TRIAL_STEPS)
     at = {line["iteration"]: line["seconds"] for line in read_trace(tried / "trace.jsonl")}
@@ -168,8 +213,13 @@ def steps_within_budget(
 
 
 def progress(total: int, label: str, start: int = 0) -> Iterator[int]:
-    """`range(start, total)` with a progress bar and the remaining time; where output is no terminal, one line every few
-    seconds."""
+    """Yield `range(start, total)`, and show a progress bar with the remaining time on stderr.
+
+    If stderr is not a terminal, one line is printed at most every ten seconds instead.
+
+    Args:
+        label: text before the bar.
+    """
     from tqdm import tqdm
 
     watched = sys.stderr.isatty()

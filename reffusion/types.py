@@ -1,6 +1,7 @@
-"""The data that moves between the parts of the method: frozen, without inheritance, without IO.
+"""The data types that the parts of the method exchange. They are frozen, use no inheritance, and do no IO.
 
-Axes, units and names are those of docs/architecture.md.
+docs/architecture.md defines axes, units and names. The *normalised frame* is the scene's frame, scaled to an extent of
+about 1 and shifted, see `Similarity`.
 """
 
 from __future__ import annotations
@@ -16,14 +17,15 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole view. Pixel (column i, row j) covers [i, i+1) x [j, j+1); its centre is (i+0.5, j+0.5).
+    """A pinhole camera of one view. Pixel (column i, row j) covers [i, i+1) x [j, j+1); its centre is (i+0.5, j+0.5).
 
     Attributes:
         name: the view's name, unique in the scene, without a file ending.
         width, height: image size in pixels.
         fx, fy, cx, cy: focal lengths and principal point in pixels.
-        world_to_camera: [4, 4] float64 rigid transform; the camera looks along +z, x right, y down.
-        every: 1; for a view `sampled` from another, the distance of its pixels in pixels of that view.
+        world_to_camera: [4, 4] float64 rigid transform. In the camera's axes z points forward, x right, y down.
+        every: 1 for a complete view. For a view that consists of every n-th pixel of another view (`sampled`), n. The
+            rasterizer divides the low-pass by n^2, so that it has the same width in the scene as in the other view.
     """
 
     name: str
@@ -38,25 +40,32 @@ class Camera:
 
     @cached_property
     def intrinsics(self) -> np.ndarray:
-        """[3, 3] float64."""
+        """[3, 3] float64, the matrix of focal lengths and principal point."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @cached_property
     def center(self) -> np.ndarray:
-        """[3] float64, the optical centre in the world."""
+        """[3] float64, the optical centre in world coordinates."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return -rotation.T @ translation
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view at another resolution."""
+        """Return the same view at another resolution, with an image of the given size in pixels."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
     def sampled(self, every: int, left: int, top: int) -> Camera:
-        """Every `every`-th pixel of this view in both directions, from (left, top) on. A rendering has the same values
-        at these pixels, since Gaussians keep the width that they have in this view."""
+        """Return the view that consists of every `every`-th pixel of this view in both directions.
+
+        A rendering of the result has the same values as a rendering of this view at these pixels, because Gaussians
+        keep the width that they have in this view (see the attribute `every`).
+
+        Args:
+            every: distance of the selected pixels, in pixels of this view.
+            left, top: column and row of the first selected pixel.
+        """
         sparse = lambda at, first: (at - first - 0.5) / every + 0.5  # the centre of the first pixel stays at 0.5
         return replace(
             self,
@@ -70,13 +79,20 @@ class Camera:
         )
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
-        """The window of this view whose upper left pixel is (left, top); it may extend beyond the image."""
+        """Return the view that shows a window of this view.
+
+        Args:
+            left, top: column and row of the window's upper left pixel. The window may extend beyond the image.
+            width, height: size of the window in pixels.
+        """
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """x_normalised = scale * (x_scene - offset). No rotation, so spherical harmonics pass unchanged.
+    """The map from the scene's own frame to the normalised frame: x_normalised = scale * (x_scene - offset).
+
+    It has no rotation, so spherical harmonics stay the same.
 
     Attributes:
         scale: float64, positive.
@@ -87,11 +103,11 @@ class Similarity:
     offset: np.ndarray
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """[..., 3] in the scene's own frame -> normalised frame, in float64."""
+        """Map points [..., 3] from the scene's own frame to the normalised frame, in float64."""
         return (np.asarray(points, np.float64) - self.offset) * self.scale
 
     def invert(self, points: np.ndarray) -> np.ndarray:
-        """[..., 3] in the normalised frame -> the scene's own frame, in float64."""
+        """Map points [..., 3] from the normalised frame to the scene's own frame, in float64."""
         return np.asarray(points, np.float64) / self.scale + self.offset
 
 
@@ -100,15 +116,18 @@ class Scene:
     """The result of the `poses` stage: pinhole cameras and sparse points in the normalised frame.
 
     Attributes:
-        cameras: view name -> Camera, sorted by name.
+        cameras: view name -> Camera, sorted by name; all views except the outliers.
         train, test: names of the training and test views.
-        clean: names of the training views in which the object is absent (their masked pixels may supervise).
+        clean: names of the training views that were photographed without the object. Their photographs may supervise
+            masked pixels, too.
         points: [P, 3] float64 sparse points.
         point_colors: [P, 3] uint8.
-        similarity: from the scene's own frame to this one.
-        blank: names of further views, without pixels: they are distilled, and supervise nothing.
-        suspects: names of views that stay although their photographs contradict their poses.
-        outliers: names of the views that were left out for that reason; they have no camera here.
+        similarity: the map from the scene's own frame to the normalised frame.
+        blank: names of views that are neither training nor test views and have no photograph. They supervise nothing,
+            but are completed and distilled.
+        suspects: names of the views that are kept although their photographs contradict their poses.
+        outliers: names of the views that were left out because their photographs contradict their poses. `cameras` has
+            no entry for them.
     """
 
     cameras: dict[str, Camera]
@@ -128,14 +147,15 @@ class Gaussians:
     """N anisotropic 3D Gaussians, parametrised as in 3DGS.
 
     Attributes:
-        means: [N, 3], normalised frame.
-        quaternions: [N, 4], wxyz, any length (a zero quaternion is the identity).
+        means: [N, 3], in the normalised frame.
+        quaternions: [N, 4], wxyz, of any length (a zero quaternion is the identity).
         log_scales: [N, 3], natural logarithm of the standard deviations.
         opacity_logits: [N].
         sh: [N, K, 3] spherical harmonics, K = (degree + 1)^2 in {1, 4, 9, 16}; colour = 0.5 + sum_k Y_k sh_k, clamped
             from below at 0.
-        antialiased: they are meant for rendering with Mip-Splatting's 2D filter: what the low-pass widens loses opacity
-            in proportion, so that a Gaussian adds up to the same from any distance. 3DGS: no.
+        antialiased: True if the Gaussians are rendered with the 2D filter of Mip-Splatting. The low-pass widens the
+            footprint of a Gaussian; this filter lowers its opacity in proportion, so that the footprint's total
+            contribution stays the same at any distance. 3DGS has no such filter.
     """
 
     means: Tensor
@@ -150,14 +170,18 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
+        """Degree of the spherical harmonics that `sh` stores, 0 to 3."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
-        """`function` applied to each parameter, e.g. `g.map(lambda p: p[keep])`."""
+        """Return the Gaussians with `function` applied to each parameter tensor, e.g. `g.map(lambda p: p[keep])`."""
         return Gaussians(*(function(getattr(self, name)) for name in PARAMETERS), antialiased=self.antialiased)
 
     def zip_map(self, other: Gaussians, function: Callable[[Tensor, Tensor], Tensor]) -> Gaussians:
-        """`function` applied to each pair of parameters, e.g. concatenation; `antialiased` is that of `self`."""
+        """Return the Gaussians with `function` applied to each pair of parameter tensors of `self` and `other`.
+
+        An example of `function` is concatenation. `antialiased` is taken from `self`.
+        """
         pairs = ((getattr(self, name), getattr(other, name)) for name in PARAMETERS)
         return Gaussians(*(function(*pair) for pair in pairs), antialiased=self.antialiased)
 
@@ -166,14 +190,14 @@ PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 
 class Rendering(NamedTuple):
-    """The result of `splat.render`; every tensor is differentiable in the Gaussians unless stated otherwise.
+    """The result of `splat.rasterizer.render`. All tensors but `radii` are differentiable in the Gaussians.
 
     Attributes:
-        color: [H, W, 3], background included.
-        depth: [H, W] expected camera-z divided by alpha; 0 where alpha is 0.
+        color: [H, W, 3], the blended colours over the background colour.
+        depth: [H, W], the blended camera z, divided by alpha; 0 where alpha is 0.
         alpha: [H, W] in [0, 1).
-        features: [H, W, C] blended features (not divided by alpha), or None.
-        radii: [N] int32, pixel radius of the footprint, 0 where culled. Not differentiable.
+        features: [H, W, C], the blended features, not divided by alpha; None if no features were rendered.
+        radii: [N] int32, radius of each Gaussian's footprint in pixels; 0 for a culled Gaussian.
     """
 
     color: Tensor
@@ -185,13 +209,16 @@ class Rendering(NamedTuple):
 
 @dataclass(frozen=True)
 class MaskSet:
-    """The pixel classes of one view, bool [H, W] each.
+    """The pixel classes of one view, bool [H, W] each; a pixel may be in several classes.
 
     Attributes:
-        raw: the given 2D mask (all False where none was given).
-        consistent: C, rendered back from the labelled Gaussians; it must not supervise.
-        unobserved: U, inside C: no other photograph shows what is visible there without the object.
-        invent: I, the pixels to be invented: U (all of C with `masks.invent: consistent`), and the region to fill.
+        raw: True at the pixels of the object in the given 2D mask; all False if the view has no mask.
+        consistent: C, True at pixels that show the object, rendered from the Gaussians that are labelled as the object.
+            The photograph must not supervise these pixels.
+        unobserved: U, True at those pixels of C where no other photograph shows the background, i.e. what is visible
+            there once the object is removed.
+        invent: I, True at the pixels whose content is invented by reference and prior. These are the pixels of U (of C
+            with `masks.invent: consistent`), and the pixels that the scene asks to fill.
     """
 
     raw: np.ndarray
@@ -202,15 +229,17 @@ class MaskSet:
 
 @dataclass(frozen=True)
 class Reference:
-    """A view completed in 2D.
+    """A view that was completed in 2D: its picture shows the scene without the object, with the hole filled.
 
     Attributes:
-        camera: the view.
-        image: [H, W, 3] uint8.
-        mask: [H, W] bool, the pixels the reference stands for (the view's invent mask).
-        depth: [H, W] float32, depth or disparity of any scale and offset, in the unit of the normalised frame where the
-            scene's was its own, NaN where unknown (`alignment.align_either` aligns it with the scene); None where the
-            scene brings none.
+        camera: the camera of the view.
+        image: [H, W, 3] uint8, the completed picture.
+        mask: [H, W] bool, True at the pixels that this picture fills. These are the view's invent mask I or a part of
+            it, and in `initialize` also the object's shadow.
+        depth: [H, W] float32, the depth map that the scene provides for this picture, NaN where unknown; None if it
+            provides none. The values are depths or disparities with any scale and offset; `alignment.align_either`
+            aligns them with the scene. Values that were depths in the unit of the scene are in the unit of the
+            normalised frame here.
     """
 
     camera: Camera

@@ -1,4 +1,8 @@
-"""What the stages `poses`, `fit` and `masks` leave to later stages, loaded when it is first asked for."""
+"""The results of the stages `poses`, `fit` and `masks`, which later stages load when they first use them.
+
+C is the consistent mask of a view: the pixels that show the object, rendered from the object's Gaussians. The
+*remaining Gaussians* are the Gaussians of the scene without those that are removed.
+"""
 
 from __future__ import annotations
 
@@ -20,16 +24,18 @@ from reffusion.io.scene import load_mask_sets, load_object_labels, load_scene
 from reffusion.prior import inpaint
 from reffusion.types import Gaussians, MaskSet, Scene
 
-SURFACES = "background.npz"  # in the folder of `masks`: the planes and mirrors that were found there
+SURFACES = "background.npz"  # file in the folder of `masks`, with the planes and mirrors that `masks` found
 
 
 @dataclass(frozen=True)
 class Workspace:
-    """The scene, its Gaussians and its masks.
+    """The scene, its Gaussians, its masks and its background, read from the folders of finished stages.
+
+    Each property is loaded or computed when it is first used.
 
     Attributes:
-        poses, fit, masks: folders of finished stages.
-        device: where Gaussians are.
+        poses, fit, masks: folders of the finished stages of these names.
+        device: the torch device on which the Gaussians and labels are.
     """
 
     poses: Path
@@ -39,16 +45,23 @@ class Workspace:
 
     @cached_property
     def scene(self) -> Scene:
+        """Cameras and sparse points in the normalised frame."""
         return load_scene(self.poses)
 
     @cached_property
     def gaussians(self) -> Gaussians:
-        """N Gaussians of the whole scene, with the object."""
+        """The N Gaussians of the whole scene, with the object."""
         return load_ply(self.fit / "gaussians.ply", device=self.device)
 
     @cached_property
     def labels(self) -> Tensor:
-        """bool [N], the Gaussians to remove: the object's, and debris. ValueError where they are of another fit."""
+        """bool [N], True for the Gaussians to remove: those of the object, and debris.
+
+        Debris are Gaussians that the object hides and that no photograph supports (`masks/debris.py`).
+
+        Raises:
+            ValueError: the number of labels is not the number of Gaussians, so the labels belong to another fit.
+        """
         labels = load_labels(self.masks / "labels.npy").to(self.device)
         if len(labels) != len(self.gaussians):
             count = len(self.gaussians)
@@ -57,34 +70,44 @@ class Workspace:
 
     @cached_property
     def object_labels(self) -> Tensor:
-        """bool [N], the object's Gaussians, without debris."""
+        """bool [N], True for the Gaussians of the object; debris is False."""
         return load_object_labels(self.masks).to(self.device)
 
     @cached_property
     def remaining(self) -> Gaussians:
-        """The Gaussians without those to remove."""
+        """The remaining Gaussians: those of the scene without the object and debris."""
         return self.gaussians.map(lambda p: p[~self.labels])
 
     @cached_property
     def mask_sets(self) -> dict[str, MaskSet]:
-        """View name -> its pixel classes, of every view."""
+        """View name -> pixel classes, for every view of the scene."""
         return load_mask_sets(self.masks, self.scene.cameras)
 
     @cached_property
     def facts(self) -> dict[str, Any]:
-        """What `masks` wrote of itself."""
+        """The facts.json of the stage `masks`: numbers and names such as "best_reference"."""
         return load_json(self.masks / "facts.json")
 
     def load_photos(self, names: Iterable[str]) -> dict[str, np.ndarray]:
-        """View name -> uint8 [H, W, 3], in the exposure of the Gaussians; without photographs their renders."""
+        """Return the photographs of some views, corrected to the exposure of the Gaussians.
+
+        Returns:
+            View name -> uint8 [H, W, 3]. A view without a photograph gets a rendering of the Gaussians with the object.
+        """
         return exposure.load_normalized_views(self.poses, self.fit, list(names))
 
     def hidden(self, name: str) -> np.ndarray:
-        """bool [H, W], where a view's photograph shows the object: C, and nothing in a clean view."""
+        """Return bool [H, W], the pixels where a view's photograph shows the object.
+
+        These are the pixels of C. In a clean view (photographed without the object) no pixel is True.
+        """
         return self.mask_sets[name].consistent & (name not in self.scene.clean)
 
     def remove_object(self, name: str) -> np.ndarray:
-        """uint8 [H, W, 3]: the photograph outside C, the remaining Gaussians' render in it."""
+        """Return a view without the object, uint8 [H, W, 3].
+
+        Outside C this is the photograph, inside C a rendering of the remaining Gaussians.
+        """
         photo = self.load_photos([name])[name]
         return inpaint.composite_background(
             self.remaining, self.scene.cameras[name], photo, self.mask_sets[name].consistent
@@ -92,13 +115,19 @@ class Workspace:
 
     @cached_property
     def background(self) -> Background:
-        """What the photographs show around the object, with the planes and mirrors that `masks` found."""
+        """The surroundings of the object as the photographs show them, with the planes and mirrors that `masks` found.
+
+        A mirror is a plane of mirror symmetry of a thing beside the object (`background/mirrors.py`).
+        """
         return surfaces_from_arrays(self.background_views, load_arrays(self.masks / SURFACES), self.device)
 
     @cached_property
     def background_views(self) -> Background:
-        """The background without planes and mirrors. A view without a photograph is rendered instead, and what no
-        photograph shows of it is hidden."""
+        """The background without planes and mirrors.
+
+        For a view without a photograph, a rendering of the Gaussians takes the place of the photograph. The pixels of
+        this view that no photograph shows are in its mask C, so they count as hidden.
+        """
         scene = self.scene
         names = (*scene.train, *scene.blank)
         hidden = {name: self.hidden(name) for name in names}

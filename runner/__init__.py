@@ -1,22 +1,33 @@
-"""The runner: resolves a request, plans what must run, and executes it. It knows files, hashes and YAML, not 3D.
+"""The runner: resolves a request, plans which stages must run, and executes them.
+
+It knows files, hashes and YAML, and nothing about 3D. Terms:
+
+- A *request* is what a user asks for on the command line. A *job* is a request with everything resolved and checked.
+- The *artifact* of a stage is the folder runs/<scene>/<stage>/ with its result. Its *receipt*, receipt.json, records
+  all inputs and the hashes of all files. The *key* of an artifact is a hash of its inputs.
+- A *profile* is a set of parameters in pipeline.yaml. A *variant* (baseline or ablation) overrides some of them, and
+  its folder is runs/<scene>@<variant>/.
+- A *need* of a stage is an earlier stage whose artifact it reads, or `scene`, the folder of the scene.
+
+Modules:
 
 - resolve.py: turns a request into a job with its scene, profile, folders and the parameters of all stages.
   - pipeline.py: the models of pipeline.yaml and scene.yaml, and their checks.
   - user_yaml.py: a YAML reader for files that people write.
   - parameters.py: merges the layers of parameters, and splits a time budget over stages.
-  - frames.py: a video as a scene.
-- plan.py: gives each stage a status and a reason, from what is on disk.
-  - keys.py: hashes of what an artifact depends on: contents of folders, code, parameters.
+  - frames.py: extracts the frames of a video, which become a scene.
+- plan.py: gives each stage a status and a reason, from the files on disk.
+  - keys.py: hashes of everything that an artifact depends on: contents of folders, code, parameters.
   - gpu_costs.py: expected time and memory of stages on a GPU.
-- execute.py: runs stages, each in a fresh process; writes receipts; renames folders into place.
-  - engine.py: where that process runs: on this machine, or on a cluster (ray_engine.py, slurm_engine.py, retry.py).
-  - artifacts.py: compares artifacts with their receipts, and replaces them so that a kill loses nothing.
+- execute.py: runs stages, each in a new process, writes receipts, and renames folders into place.
+  - engine.py: runs the process on this machine; on a cluster: ray_engine.py, slurm_engine.py, retry.py.
+  - artifacts.py: compares artifacts with their receipts, and replaces them so that a killed runner loses nothing.
   - files.py: atomic writes, locks, exported copies.
-- worker.py: the process that imports stages; process.py: starts it and asks it.
-- compare.py: many runs: `compare` and `batch`.
-  - parallel.py: several runs at once; progress.py: how far each one is.
-- results.py: prints scores; calls report/ for tables and pages.
-- maintenance.py: verifies artifacts or removes them; garbage.py: removes those that no plan uses.
+- worker.py: the process that imports stages. process.py: starts this process and sends it questions.
+- compare.py: the commands `compare` and `batch`, which run many jobs.
+  - parallel.py: several runs at once. progress.py: the progress of each.
+- results.py: prints scores, and calls report/ for tables and pages.
+- maintenance.py: verifies or removes artifacts. garbage.py: removes artifacts that no plan uses.
 - weights.py: lists and fetches the weights that stages need.
 - text.py: errors, sizes, times and paths as text.
 """
@@ -27,11 +38,11 @@ from contextvars import ContextVar
 
 
 class Refused(Exception):
-    """The user can fix this. One line, raised before any work."""
+    """An error that the user can correct, with a message of one line. It is mostly raised before any stage runs."""
 
 
 class Failed(Exception):
-    """A stage failed. One line."""
+    """The failure of a stage, with a message of one line."""
 
 
 def say(text: str) -> None:
@@ -42,7 +53,7 @@ def say(text: str) -> None:
 
 @contextmanager
 def redirect_output(redirect: Callable[[str], None]) -> Iterator[None]:
-    """Pass the messages of this thread to `redirect` inside the context."""
+    """Pass the messages that this thread gives to `say` to the function `redirect` instead, inside the context."""
     token = _redirect.set(redirect)
     try:
         yield

@@ -24,7 +24,7 @@ from runner.text import display_path, format_error
 from runner.weights import fetch_weights
 from runner.worker import INTERRUPTED
 
-SOME_FAILED = 3  # exit code of compare: finished, but some runs failed
+SOME_FAILED = 3  # exit code of `compare` if it finished and some runs failed
 
 
 def main() -> int:
@@ -34,13 +34,13 @@ def main() -> int:
     runs = (arguments.runs or workplace(root) / "runs").resolve()
     names = ("scene", "profile", "variant", "trust", "set", "budget", "keep")
     request = Request(root, runs, *(getattr(arguments, name) for name in names))
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # handled as Ctrl-C
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # SIGTERM is handled like Ctrl-C
     try:
         return _COMMANDS[arguments.command](request, arguments)
     except KeyboardInterrupt:
         print("\nstopped; the same command goes on from here", file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:  # as in `plan | head`: the reader is gone
+    except BrokenPipeError:  # the reader of the output has ended, as in `plan | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (Refused, Failed, OSError) as error:
@@ -69,7 +69,7 @@ def _run(request: Request, arguments: argparse.Namespace) -> int:
 
 
 def _compare(request: Request, arguments: argparse.Namespace) -> int:
-    """Then draws the page, also where some runs failed."""
+    """Run a comparison, draw its page (even if some runs failed), and return the exit code."""
     execution, data = _execution(request, arguments), arguments.data
     request = replace(request, cuda=execution.engine.cuda)
     failed = compare(request, arguments.variants, arguments.seeds, data, execution)
@@ -78,7 +78,7 @@ def _compare(request: Request, arguments: argparse.Namespace) -> int:
 
 
 def _batch(request: Request, arguments: argparse.Namespace) -> int:
-    """Then draws the page, also where some scenes failed."""
+    """Run a batch, draw its page (even if some scenes failed), and return the exit code."""
     execution = _execution(request, arguments)
     request = replace(request, cuda=execution.engine.cuda)
     failed = batch(request, arguments.data or Path("data"), execution)

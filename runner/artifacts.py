@@ -1,4 +1,7 @@
-"""Artifacts and their receipts: finds files that differ, and replaces artifacts so that a kill loses nothing."""
+"""Comparison of artifacts with their receipts, and replacement of artifacts so that a killed runner loses nothing.
+
+The artifact of a stage is the folder runs/<scene>/<stage>/; its receipt.json has the hashes of all its files.
+"""
 
 import shutil
 from dataclasses import dataclass
@@ -11,14 +14,18 @@ from runner.files import RECEIPT, read_receipt, write_json
 from runner.keys import Hashes, hash_listing
 from runner.text import display_path, join_names
 
-KEPT = "kept"  # folder in runs/<scene>/: files that people had changed in artifacts that were made again
+KEPT = "kept"  # folder in runs/<scene>/ for files that people had changed in artifacts that were then replaced
 
 
 @dataclass(frozen=True)
 class ArtifactDiff:
-    """Names of the files in which an artifact differs from its receipt.
+    """The differences between an artifact and its receipt, as names of files.
 
-    `by_hand` names files that people changed and that were accepted later: they agree with the receipt.
+    Attributes:
+        missing: files that are in the receipt only.
+        changed: files whose content differs.
+        added: files that are not in the receipt.
+        by_hand: files that people had changed or added, and that were accepted (`keep`). They agree with the receipt.
     """
 
     missing: tuple[str, ...] = ()
@@ -27,13 +34,13 @@ class ArtifactDiff:
     by_hand: tuple[str, ...] = ()
 
     def describe(self) -> list[str]:
-        """A phrase for each kind of difference."""
+        """Return a phrase for each kind of difference that occurs; empty if there is none."""
         parts = (self.missing, "missing"), (self.changed, "changed"), (self.added, "added"), (self.by_hand, "by hand")
         return [f"{join_names(names)} {word}" for names, word in parts if names]
 
 
 def diff_artifact(folder: Path, hashes: Hashes) -> ArtifactDiff:
-    """Compare an artifact with its receipt. Without a receipt all its files are `added`."""
+    """Compare the artifact in a folder with its receipt. Without a receipt all its files count as added."""
     receipt, now = read_receipt(folder), hash_contents(folder, hashes)["files"]
     if not receipt:
         return ArtifactDiff(added=tuple(now))
@@ -47,14 +54,17 @@ def diff_artifact(folder: Path, hashes: Hashes) -> ArtifactDiff:
 
 
 def hash_contents(folder: Path, hashes: Hashes) -> dict[str, Any]:
-    """The part of a receipt on contents: `files`, the hash of each file, and `output`, one hash of what other stages
-    may read."""
+    """Return the part of a receipt that describes the contents of an artifact.
+
+    Returns:
+        "files": name -> hash of each file; "output": one hash of all files that other stages may read.
+    """
     files = {name: file for name, file in hashes.listing(folder).items() if name != RECEIPT}
     return {"files": files, "output": hash_listing(files)}
 
 
 def accept_changes(folder: Path, hashes: Hashes) -> None:
-    """Update the receipt of an artifact to what people changed in it."""
+    """Accept the files that people changed or added in an artifact: its receipt then lists them as `by_hand`."""
     diff = diff_artifact(folder, hashes)
     if diff.changed or diff.added:
         by_hand = sorted({*diff.by_hand, *diff.changed, *diff.added})
@@ -63,7 +73,11 @@ def accept_changes(folder: Path, hashes: Hashes) -> None:
 
 
 def replace_artifact(partial: Path, place: Path, hashes: Hashes) -> None:
-    """Rename a finished folder into place. After a kill between the two renames `recover_swap` restores the old one."""
+    """Replace the artifact at `place` by the finished folder `partial`.
+
+    The old artifact is renamed first. If the runner is killed between the two renames, `recover_swap` restores the old
+    artifact.
+    """
     old = place.with_name(f".old-{place.name}")
     if place.exists():
         place.rename(old)
@@ -72,7 +86,7 @@ def replace_artifact(partial: Path, place: Path, hashes: Hashes) -> None:
 
 
 def recover_swap(home: Path, hashes: Hashes) -> None:
-    """Undo or finish the replacement during which a runner was killed."""
+    """Undo or finish a replacement of an artifact during which a runner was killed, in the folder of a scene."""
     for gone in home.glob(".gone-*"):
         shutil.rmtree(gone)
     for old in home.glob(".old-*"):
@@ -84,8 +98,16 @@ def recover_swap(home: Path, hashes: Hashes) -> None:
 
 
 def _retire(old: Path, place: Path, hashes: Hashes) -> None:
-    """Delete an artifact that `place` replaces. Files that people added move to `place`, those that they changed to
-    kept/."""
+    """Delete an old artifact, but keep what people did in it.
+
+    Files that people added are moved to the new artifact, or to kept/ if it has a file of this name. Files that people
+    changed are moved to kept/<stage>/.
+
+    Args:
+        old: folder of the old artifact; nothing is done if it does not exist.
+        place: folder of the new artifact.
+        hashes: the cache of hashes.
+    """
     if not old.exists():
         return
     diff, kept = diff_artifact(old, hashes), place.parent / KEPT / place.name
@@ -102,7 +124,10 @@ def _retire(old: Path, place: Path, hashes: Hashes) -> None:
 
 
 def delete_folder(folder: Path) -> None:
-    """Delete a folder, renamed first: what a kill leaves of it is never taken for an artifact."""
+    """Delete a folder, or a link to one.
+
+    The folder is renamed first. So the remains that a killed runner may leave are never taken for an artifact.
+    """
     gone = folder.with_name(f".gone-{folder.name}")
     if folder.is_symlink():
         folder.unlink()

@@ -1,4 +1,7 @@
-"""The commands `compare`, the full method and its variants on some scenes, and `batch`, all scenes of a folder."""
+"""The commands `compare`, which runs the full method and its variants, and `batch`, which runs all scenes of a folder.
+
+A variant is a baseline or an ablation of pipeline.yaml. A method is a variant or the full method.
+"""
 
 import os
 import re
@@ -17,30 +20,35 @@ from runner.resolve import Request, resolve_all
 from runner.results import mean_scores, write_table
 from runner.text import display_path
 
-FULL = "full"  # the whole method: a variant of this name, or else the scene's own run
-OWN = "default"  # the scene's own run, where FULL is a variant
-FOLDER_RUN = "compare"  # folder in runs/ of a comparison over a folder of scenes
+FULL = "full"  # name of the full method: a variant of this name, or else the scene's own run
+OWN = "default"  # name of the scene's own run if FULL is a variant
+FOLDER_RUN = "compare"  # folder in runs/ for the comparison over a folder of scenes
 RECORD = "compare.json"
-RESULTS = "results"  # name of the record, table and page of a batch, in runs/
+RESULTS = "results"  # name in runs/ of the record, table and page of a batch
 WAITING, DONE, FAILED = "not run yet", "done", "failed"
 
 
 def compare(
     request: Request, only: str = "", seeds: int = 1, data: Path | None = None, execution: Execution | None = None
 ) -> int:
-    """Bring the full method and its variants up to date, in the profile that `comparisons` of pipeline.yaml names.
+    """Run the full method and its variants on one or more scenes.
 
-    Writes compare.json to runs/<scene>/, or to runs/compare/ for a folder of scenes, and a table of all runs after each
-    one. Cached artifacts are used, so the same command resumes after a kill. A variant that fails stops no other.
+    The profile is the one that `comparisons` of pipeline.yaml names. After each run, compare.json and a table of all
+    runs are written to runs/<scene>/, or to runs/compare/ for a folder of scenes. Artifacts that are up to date are
+    used, so the same command resumes after a kill. If a run fails, the other runs go on.
 
     Args:
-        only: names of variants, separated by commas or blanks; all if empty.
-        seeds: number of scenes: X, X-1, X-2 ...
-        data: a folder whose scenes are compared, where the request names no scene.
+        request: the scene and its options, without a variant.
+        only: names of variants, separated by commas or blanks; empty for all.
+        seeds: number of scenes; for the scene X they are X, X-1, X-2 ...
+        data: a folder whose scenes are compared; the request must then name no scene.
+        execution: settings; None for this machine.
+
     Returns:
-        How many runs failed.
+        Number of failed runs.
+
     Raises:
-        Refused: before any work, where a variant, a scene or a parameter is wrong.
+        Refused: a variant, a scene or a parameter is wrong; nothing has run.
     """
     if request.variant:
         raise Refused(f"variant={request.variant}: compare runs all variants; variants={request.variant} picks some")
@@ -51,7 +59,7 @@ def compare(
     def request_for(scene: str, method: str) -> Request:
         return replace(request, scene=scene, variant=None if method == own else method, compared=method != own)
 
-    ordered = sorted(methods, key=lambda method: method != own)  # the scene's own run first: variants share its stages
+    ordered = sorted(methods, key=lambda method: method != own)  # the scene's own run first, as variants use its stages
     requests = {(scene, method): request_for(scene, method) for scene in names for method in ordered}
     hashes = Hashes(request.runs / HASHES)
     _check_requests(list(names), requests, hashes)
@@ -85,9 +93,18 @@ def compare(
 
 
 def _check_requests(scenes: list[str], requests: dict[tuple[str, str], Request], hashes: Hashes) -> None:
-    """Check the parameters of all variants before the first stage runs, on the first scene that can be read.
+    """Check the parameters of all methods on the first scene that can be resolved, before any stage runs.
 
-    Raises Refused where none can be read, or a parameter is wrong; other scenes fail in their turn."""
+    Errors of other scenes appear when these scenes run.
+
+    Args:
+        scenes: the scenes, as requests name them.
+        requests: (scene, method) -> request.
+        hashes: the cache of hashes.
+
+    Raises:
+        Refused: no scene can be resolved, e.g. because a parameter is wrong. The error is that of the first scene.
+    """
     refusals = []
     for each in scenes:
         try:
@@ -99,7 +116,16 @@ def _check_requests(scenes: list[str], requests: dict[tuple[str, str], Request],
 
 
 def _choose_methods(only: str, pipeline: Pipeline, own: str) -> list[str]:
-    """The methods besides FULL: those named in `only`, or else the scene's own run and all variants."""
+    """Return the names of the methods to run besides FULL, which always runs.
+
+    Args:
+        only: names, separated by commas or blanks; empty for the scene's own run and all variants.
+        pipeline: has the variants.
+        own: name of the scene's own run.
+
+    Raises:
+        Refused: a name is unknown.
+    """
     known = [name for name in dict.fromkeys((own, *pipeline.variants)) if name != FULL]
     methods = [name for name in re.split(r"[,\s]+", only) if name and name != FULL]
     for name in (name for name in methods if name not in known):
@@ -108,7 +134,14 @@ def _choose_methods(only: str, pipeline: Pipeline, own: str) -> list[str]:
 
 
 def _scenes(request: Request, seeds: int, data: Path | None) -> dict[str, str]:
-    """The text that a request uses for each scene -> the scene's name."""
+    """Find the scenes of a comparison; for the arguments see `compare`.
+
+    Returns:
+        Name or path that a request uses for the scene -> name of the scene.
+
+    Raises:
+        Refused: a scene does not exist, or the options contradict each other.
+    """
     if seeds < 1:
         raise Refused(f"seeds={seeds}: on how many scenes; 1 or more")
     if data:
@@ -126,7 +159,7 @@ def _scenes(request: Request, seeds: int, data: Path | None) -> dict[str, str]:
 
 
 def _scene_folders(data: Path) -> list[Path]:
-    """The scenes in a folder. Raises Refused where there are none."""
+    """Return the scenes in a folder: its subfolders, sorted, but hidden ones. Raises Refused if there are none."""
     data = data.expanduser()
     found = sorted(p for p in data.iterdir() if p.is_dir() and p.name[0] not in "._") if data.is_dir() else []
     if not found:
@@ -135,10 +168,20 @@ def _scene_folders(data: Path) -> list[Path]:
 
 
 def batch(request: Request, folder: Path, execution: Execution | None = None) -> int:
-    """Run every scene in `folder`; writes runs/results.json and its table after each one.
+    """Run all scenes of a folder, and write runs/results.json and a table after each one.
+
+    With a variant, the files are named results@<variant>. If a scene fails, the others go on.
+
+    Args:
+        request: the options; its scene is not used.
+        folder: the folder of scenes.
+        execution: settings; None for this machine.
 
     Returns:
-        How many scenes failed.
+        Number of failed scenes.
+
+    Raises:
+        Refused: the folder has no scenes.
     """
     scenes, hashes = _scene_folders(folder), Hashes(request.runs / HASHES)
     execution = execution or Execution(LocalEngine())

@@ -1,5 +1,7 @@
-"""Engines run the processes of stages with given cores, memory and GPUs: here on this machine, in ray_engine.py and
-slurm_engine.py on clusters."""
+"""Engines, which run the processes of stages with given cores, memory and GPUs.
+
+The engine of this module uses this machine; those of ray_engine.py and slurm_engine.py use clusters.
+"""
 
 import importlib
 import json
@@ -16,15 +18,22 @@ from typing import Any, Protocol
 from runner import Refused, say
 from runner.process import start_worker
 
-ALL_MEMORY_MB = 2**40  # more than any machine has: the stage runs alone
-GRACE = 20.0  # seconds that an interrupted stage has to end by itself
+ALL_MEMORY_MB = 2**40  # more than any machine has, so that the stage runs alone
+GRACE = 20.0  # seconds after which an interrupted stage that has not ended is killed
+# (limit, usage) of the memory of this process's control group, in versions 2 and 1 of cgroups
 CGROUPS = (("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
            ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"))  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Resources:
-    """What a stage gets: cores (None: all), GPUs, CPU memory in MB."""
+    """The resources of one stage.
+
+    Attributes:
+        cores: number of CPU cores; None for all.
+        gpus: number of GPUs.
+        memory_mb: CPU memory to reserve, MB.
+    """
 
     cores: int | None
     gpus: int
@@ -36,9 +45,9 @@ class Task:
     """The work of one stage.
 
     Attributes:
-        root: the folder with pipeline.yaml and stages/.
-        line: what `worker.run` reads, without what `run_process` adds; paths are text.
-        output: the file to which the stage appends what it prints; None: the runner's own output.
+        root: folder with pipeline.yaml and stages/.
+        line: the job description that `worker.run` reads, without the fields that `run_process` adds; paths are text.
+        output: the file to which everything that the stage prints is appended; None for the runner's own output.
     """
 
     root: Path
@@ -48,12 +57,12 @@ class Task:
 
 @dataclass(frozen=True)
 class StageResult:
-    """How a stage's process ended.
+    """The result of a stage's process.
 
     Attributes:
-        answer: see `worker.run`; empty where the process gave none.
-        code: exit code; negative for a signal.
-        interrupted: the wait for it was interrupted.
+        answer: the answer of the process, see `worker.run`; empty if it gave none.
+        code: exit code; the negative number of a signal that ended the process.
+        interrupted: True if the runner was interrupted (Ctrl-C) while it waited for the process.
     """
 
     answer: dict[str, Any]
@@ -62,12 +71,12 @@ class StageResult:
 
 
 class Engine(Protocol):
-    """Where stages run.
+    """The interface of an engine: a place where stages run.
 
     Attributes:
-        cuda: whether it has a GPU; None: see `resolve.has_cuda`.
-        cores: in all.
-        is_remote: whether other machines work in the folder of results.
+        cuda: whether its machines have a GPU; None if it is this machine, see `resolve.has_cuda`.
+        cores: total number of CPU cores.
+        is_remote: True if stages run on other machines, which write to the folder of results.
     """
 
     cuda: bool | None
@@ -75,7 +84,14 @@ class Engine(Protocol):
     is_remote: bool
 
     def run(self, task: Task, resources: Resources, lock: int, on_start: Callable[[], None]) -> StageResult:
-        """Run a task; calls `on_start` when it has its resources. The process holds the file descriptor `lock` open.
+        """Wait for the resources, run a task in a process, and wait for its end.
+
+        Args:
+            task: the work.
+            resources: the resources that the process gets.
+            lock: open file descriptor of the lock of the scene's folder in runs/. A local process keeps it open, so
+                that the lock is held until the process ends.
+            on_start: called when the task has its resources.
 
         Raises:
             KeyboardInterrupt: the engine was stopped.
@@ -83,18 +99,27 @@ class Engine(Protocol):
         ...
 
     def stop(self) -> None:
-        """Interrupt what runs, and start nothing more. May be called from another thread."""
+        """Interrupt the running tasks, and start no further ones. May be called from any thread."""
         ...
 
 
 class LocalEngine:
-    """Runs stages on this machine. Any number of threads may call `run`; each waits for its resources."""
+    """The engine that runs stages on this machine.
+
+    Any number of threads may call `run`; each call waits for its resources.
+    """
 
     cuda: bool | None = None
     is_remote = False
 
     def __init__(self, cores: list[int] | None = None, memory_mb: int | None = None, gpus: list[str] | None = None):
-        """Numbers of the cores, memory, and numbers of the GPUs to use; by default all that this process may use."""
+        """Select the resources to use; None for all that this process may use.
+
+        Args:
+            cores: numbers of the CPU cores.
+            memory_mb: CPU memory in MB. With None, free memory is also checked before each stage.
+            gpus: numbers of the GPUs.
+        """
         self._cores = sorted(os.sched_getaffinity(0)) if cores is None else list(cores)
         self._gpus = visible_gpus() if gpus is None else list(gpus)
         self.cores, self._gpu_count = len(self._cores), len(self._gpus)
@@ -107,14 +132,14 @@ class LocalEngine:
     def run(self, task: Task, resources: Resources, lock: int, on_start: Callable[[], None]) -> StageResult:
         """See `Engine.run`."""
         result, others = self._run_once(task, resources, lock, on_start)
-        if result.code == -signal.SIGKILL and others:  # probably out of memory: it resumes alone
+        if result.code == -signal.SIGKILL and others:  # probably out of memory: resume the stage while no other runs
             result, _ = self._run_once(task, replace(resources, memory_mb=ALL_MEMORY_MB), lock, on_start)
         return result
 
     def _run_once(
         self, task: Task, resources: Resources, lock: int, on_start: Callable[[], None]
     ) -> tuple[StageResult, int]:
-        """The result, and how many other stages ran at its end."""
+        """Run a task once, and return its result and the number of other stages that ran when it ended."""
         with self._reserve(resources) as (cores, gpus):
             on_start()
             where = {"cores": len(cores), "on": cores} if resources.cores is not None else {}
@@ -122,7 +147,7 @@ class LocalEngine:
             result = run_process(replace(task, line=task.line | where), lock, self._follow)
             others = len(self._reserved) - 1
         if result.interrupted:
-            self._stopped = True  # a finished artifact is still moved into place; nothing starts after it
+            self._stopped = True  # nothing starts any more, but the artifact of a finished stage is moved into place
         if self._stopped and result.code != 0:
             raise KeyboardInterrupt
         return result, others
@@ -138,6 +163,7 @@ class LocalEngine:
 
     @contextmanager
     def _follow(self, process: "subprocess.Popen[str]") -> Iterator[None]:
+        """Register a process inside the context, so that `stop` can interrupt it."""
         with self._change:
             self._running.add(process)
             if self._stopped:
@@ -150,15 +176,20 @@ class LocalEngine:
 
     @contextmanager
     def _reserve(self, resources: Resources) -> Iterator[tuple[list[int], list[str]]]:
-        """Wait for a stage's cores, GPUs and memory, and hold them. A stage that asks for more memory than there is
-        runs alone."""
+        """Wait until a stage's cores, GPUs and memory are free, and reserve them inside the context.
+
+        A stage that asks for more memory than there is waits until no other stage runs.
+
+        Yields:
+            The numbers of the cores and of the GPUs.
+        """
         core_count = min(resources.cores or self.cores, self.cores)
         gpu_count = min(resources.gpus, self._gpu_count)
         with self._change:
             self._number += 1
             number = self._number
             while not (self._stopped or self._fits(core_count, gpu_count, resources.memory_mb)):
-                self._change.wait(1.0)  # free memory changes without a notification
+                self._change.wait(1.0)  # a timeout, because free memory changes without a notification
             if self._stopped:
                 raise KeyboardInterrupt
             cores, self._cores = self._cores[:core_count], self._cores[core_count:]
@@ -173,6 +204,7 @@ class LocalEngine:
                 self._change.notify_all()
 
     def _fits(self, cores: int, gpus: int, memory_mb: int) -> bool:
+        """Return whether the resources are free. They always are if no stage runs."""
         if not self._reserved:
             return True
         reserved = sum(self._reserved.values()) + memory_mb
@@ -181,19 +213,19 @@ class LocalEngine:
 
 
 def free_memory_mb() -> int:
-    """Free memory of this machine, or of the control group of this process if that is less."""
+    """Return the free memory of this machine in MB, or that of this process's control group if it is less."""
     found = []
     with suppress(OSError, ValueError, StopIteration):
         lines = Path("/proc/meminfo").read_text().splitlines()
         found.append(int(next(line for line in lines if line.startswith("MemAvailable:")).split()[1]) * 1024)
     for limit, used in CGROUPS:
-        with suppress(OSError, ValueError):  # "max": no limit
+        with suppress(OSError, ValueError):  # the limit "max" is no number and means none
             found.append(int(Path(limit).read_text()) - int(Path(used).read_text()))
     return min(found, default=2**50) // 2**20
 
 
 def visible_gpus() -> list[str]:
-    """Numbers of the GPUs that this process may use."""
+    """Return the numbers of the GPUs that this process may use, as text."""
     listed = os.environ.get("CUDA_VISIBLE_DEVICES")
     if listed is not None:
         return [number for number in listed.split(",") if number not in ("", "-1")]
@@ -206,44 +238,46 @@ def run_process(
     follow: Callable[[Any], Any] = nullcontext,
     should_stop: Callable[[], bool] | None = None,
 ) -> StageResult:
-    """Run a task in a fresh process on this machine, and wait for its end.
+    """Run a task in a new process on this machine, and wait for its end.
 
-    Passes an interrupt on to the process and does not raise it, as the stage may have finished.
+    An interrupt (Ctrl-C) is passed on to the process. It is not raised here, because the stage may have finished; see
+    `StageResult.interrupted`.
 
     Args:
-        lock: an open file that the process holds, too.
-        follow: a context that gets the process, entered while it runs.
-        should_stop: called every second; where it returns True the process is interrupted.
+        task: the work.
+        lock: file descriptor of a lock that the process keeps open, too; None for no lock.
+        follow: makes a context from the process, which is entered while the process runs.
+        should_stop: called every second; if it returns True, the process is interrupted. None: never.
     """
-    reader, writer = os.pipe()  # not a file: the answer may be that the disk is full
+    reader, writer = os.pipe()  # a pipe and not a file, because the answer may be that the disk is full
     line = json.dumps(task.line | {"result": writer, "lock": lock})
     answer: dict[str, Any] = {}
     interrupted = False
     with open(task.output, "a") if task.output else nullcontext() as output:
-        # A process group of its own: Ctrl-C reaches it once, from here.
+        # The process has a process group of its own, so that Ctrl-C reaches it only once, passed on from here.
         descriptors = (writer,) if lock is None else (lock, writer)
         process = start_worker(task.root, "run", pass_fds=descriptors, process_group=0, stdout=output, stderr=output)
     assert process.stdin
     os.close(writer)
     try:
         with follow(process):
-            with suppress(BrokenPipeError):  # a worker that is gone already has its code below
+            with suppress(BrokenPipeError):  # the worker may have ended already; its exit code is read below
                 process.stdin.write(line + "\n")
-                process.stdin.flush()  # and stays open: the worker ends when this process does
+                process.stdin.flush()  # the pipe stays open: when this process ends, it closes and the worker ends too
             code = _poll(process, should_stop) if should_stop else process.wait()
     except KeyboardInterrupt:
         code, interrupted = _interrupt(process), True
     finally:
         with suppress(BrokenPipeError):
             process.stdin.close()
-        os.set_blocking(reader, False)  # processes that the stage started may still hold the other end
+        os.set_blocking(reader, False)  # else reading could wait for processes that the stage started
         with suppress(BlockingIOError), open(reader, "rb", buffering=0) as file:
             answer = json.loads(file.read(1 << 16) or "{}")
     return StageResult(answer, code, interrupted)
 
 
 def _poll(process: "subprocess.Popen[str]", should_stop: Callable[[], bool]) -> int:
-    """Wait for a process, or interrupt it; its exit code."""
+    """Wait for a process, interrupt it as soon as `should_stop` returns True, and return its exit code."""
     while not should_stop():
         with suppress(subprocess.TimeoutExpired):
             return process.wait(1.0)
@@ -251,7 +285,7 @@ def _poll(process: "subprocess.Popen[str]", should_stop: Callable[[], bool]) -> 
 
 
 def _interrupt(process: "subprocess.Popen[str]") -> int:
-    """Interrupt a process, and kill it after GRACE seconds; its exit code."""
+    """Interrupt a process, kill it if it has not ended after GRACE seconds, and return its exit code."""
     process.send_signal(signal.SIGINT)
     try:
         return process.wait(GRACE)
@@ -260,12 +294,22 @@ def _interrupt(process: "subprocess.Popen[str]") -> int:
         return process.wait()
 
 
-# name -> class in <name>_engine.py, the package that it imports
+# name of the engine -> (its class in <name>_engine.py, the package that this module imports)
 ENGINES = {"ray": ("RayEngine", "ray"), "slurm": ("SlurmEngine", "submitit")}
 
 
 def make_engine(name: str | None, address: str | None, root: Path, runs: Path) -> Engine:
-    """The engine of this name, of this machine by default. Raises Refused where it is unknown or unreachable."""
+    """Make the engine of this name.
+
+    Args:
+        name: "local", "ray" or "slurm"; None or "" for this machine (local).
+        address: of the cluster, see the engine's class; None for its default.
+        root: folder with pipeline.yaml and stages/.
+        runs: folder of all results.
+
+    Raises:
+        Refused: the engine is unknown, its package is not installed, or the cluster cannot be reached.
+    """
     if name in (None, "", "local"):
         if address:
             raise Refused(f"address={address}: of which engine? For example engine=ray address={address}")

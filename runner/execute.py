@@ -1,4 +1,8 @@
-"""The third step: runs the stages of a plan, each in a fresh process, and renames their folders into place."""
+"""The third step of the runner: runs the stages of a plan, each in a new process.
+
+A stage works in a folder of its own, which is renamed to its final place when the stage is done. Terms are explained in
+`runner`.
+"""
 
 import errno
 import functools
@@ -45,19 +49,21 @@ from runner.resolve import Request, ResolvedJob, resolve
 from runner.retry import take_over
 from runner.text import REMEDIES, display_path
 
+# packages whose versions a receipt records
 PACKAGES = ("reffusion", "numpy", "torch", "numba", "diffusers", "transformers", "peft", "pycolmap", "gsplat")
 FULL_DISK_BYTES = 2**20  # a disk with less free space counts as full
 
 
 @dataclass(frozen=True)
 class Execution:
-    """How stages are run.
+    """Settings for the execution of stages.
 
     Attributes:
-        engine: where.
-        cores: for each stage; None: all, or with several scenes an equal part for each.
-        output: the file to which stages append what they print; None: the runner's own output.
-        on_change: called with a stage and its new state: waits, runs or done (also where it need not run).
+        engine: the engine that runs them.
+        cores: number of cores of each stage. None for all cores, or for an equal part of them if several scenes run.
+        output: the file to which stages append what they print; None for the runner's own output.
+        on_change: called with the name of a stage and its new state: "waits", "runs" or "done". A stage that need not
+            run is done at once.
     """
 
     engine: Engine
@@ -69,18 +75,37 @@ class Execution:
 def _run_stage(
     job: ResolvedJob, stage: str, decision: Decision, earlier: dict[str, Decision], lock: int, execution: Execution
 ) -> Decision:
-    """Run a stage in `.partial-<stage>-<key>`, which may hold the state of an earlier try, and move it into place."""
+    """Run one stage of a job, and move its artifact into place.
+
+    The stage works in the folder `.partial-<stage>-<key>`. If an interrupted run with the same key left this folder,
+    the stage resumes from its state. If another variant of the scene has an artifact with the same key, that one is
+    copied and nothing runs.
+
+    Args:
+        job: the job.
+        stage: name of the stage.
+        decision: the decision to run it.
+        earlier: decisions about all earlier stages, which are done.
+        lock: file descriptor of the lock of the job's folder.
+        execution: settings.
+
+    Returns:
+        The new decision about the stage, `cached`.
+
+    Raises:
+        Failed: the stage fails.
+    """
     assert decision.inputs
     partial, place = partial_folder(job, stage, decision.inputs.key), job.home / stage
     take_over(partial)
     if not partial.exists() and (other := _copy_from_variant(job, stage, decision.inputs.key, partial)):
         say(f"{stage}: the same as in {other}: copied")
-    if not read_receipt(partial):  # there is one if the runner was killed just before the renames
+    if not read_receipt(partial):  # a receipt is there if it was copied, or the runner was killed before the renames
         resumed = partial.exists()
         partial.mkdir(parents=True, exist_ok=True)
         seconds = expected_seconds(job, stage)
         say(f"{stage}: {decision.reason}" + (f"; about {seconds:.0f} s" if seconds is not None else ""))
-        result = _run_in_engine(execution, job, stage, partial, earlier, lock)  # seconds of the last try only
+        result = _run_in_engine(execution, job, stage, partial, earlier, lock)  # its seconds are of the last try only
         say(f"{stage}: done in {result['seconds']:.1f} s, {result['peak_memory_mb']} MB")
         check_lock(lock)
         write_json(partial / RECEIPT, _receipt(job, stage, decision.inputs, partial, {"resumed": resumed} | result))
@@ -94,7 +119,17 @@ def _run_stage(
 
 
 def _copy_from_variant(job: ResolvedJob, stage: str, key: str, to: Path) -> str | None:
-    """Copy the artifact with this key from another variant of the scene; returns that variant's folder, or None."""
+    """Copy an artifact from another variant of the scene, if one has an undamaged artifact with the same key.
+
+    Args:
+        job: the job.
+        stage: name of the stage.
+        key: key of the artifact.
+        to: folder to which it is copied.
+
+    Returns:
+        Name of the folder of the variant; None if no variant has such an artifact.
+    """
     for home in sorted(job.runs.glob(f"{job.base.name}@*")):
         if home != job.home and (read_receipt(home / stage) or {}).get("key") == key:
             with suppress(Refused), hold_lock(job.runs, home.name, shared=True, wait=False):
@@ -110,11 +145,19 @@ def _copy_from_variant(job: ResolvedJob, stage: str, key: str, to: Path) -> str 
 def _run_in_engine(
     execution: Execution, job: ResolvedJob, stage: str, partial: Path, earlier: dict[str, Decision], lock: int
 ) -> dict[str, Any]:
-    """Run the stage's process; returns its answer, see `worker.run`.
+    """Run the process of a stage by the engine, and return the answer of the process, see `worker.run`.
+
+    Args:
+        execution: settings.
+        job: the job.
+        stage: name of the stage.
+        partial: the folder in which the stage works.
+        earlier: decisions about all earlier stages.
+        lock: file descriptor of the lock of the job's folder.
 
     Raises:
-        Failed: with the stage's error.
-        KeyboardInterrupt: it was interrupted.
+        Failed: the stage failed; the message has its error.
+        KeyboardInterrupt: the stage was interrupted.
     """
     log = job.home / f"{stage}.log"
     needs = dict.fromkeys(job.pipeline.stages[stage].all_needs)
@@ -132,16 +175,23 @@ def _run_in_engine(
     hint = "; out of memory?" if code == -signal.SIGKILL else ""
     error = answer.get("error", how + hint)
     is_full = shutil.disk_usage(job.home).free < FULL_DISK_BYTES
-    if is_full and REMEDIES[errno.ENOSPC] not in error:  # libraries do not report it
+    if is_full and REMEDIES[errno.ENOSPC] not in error:  # many libraries do not say that the disk is full
         error += f"; the disk is full: {REMEDIES[errno.ENOSPC]}"
     raise Failed(f"{stage}: {error} (all of it in {display_path(log)})")
 
 
 def expected_memory_mb(job: ResolvedJob, stage: str, needs: dict[str, Path | None]) -> int:
-    """MB of CPU memory to reserve for a stage.
+    """Estimate the CPU memory in MB to reserve for a stage.
 
-    10% above its last peak on this scene or a variant of it; before its first run by `memory` of pipeline.yaml, from
-    the size of the files that it reads."""
+    It is 10 % above the largest peak in the receipts of this scene and its variants. Before the first run it follows
+    from the size of the files that the stage reads, by the table `memory` of pipeline.yaml; 0 if the stage is not in
+    the table.
+
+    Args:
+        job: the job.
+        stage: name of the stage.
+        needs: need -> folder; None if the need is skipped.
+    """
     if peaks := [r["peak_memory_mb"] for r in earlier_receipts(job, stage) if r.get("peak_memory_mb")]:
         return round(1.1 * max(peaks))
     each = job.pipeline.memory.get(stage)
@@ -150,6 +200,7 @@ def expected_memory_mb(job: ResolvedJob, stage: str, needs: dict[str, Path | Non
 
 
 def _receipt(job: ResolvedJob, stage: str, inputs: Inputs, folder: Path, result: dict[str, Any]) -> dict[str, Any]:
+    """Return the receipt of a finished stage whose files are in `folder`; `result` is added to it."""
     return {
         "stage": stage,
         "scene": job.base.name,
@@ -168,6 +219,7 @@ def _receipt(job: ResolvedJob, stage: str, inputs: Inputs, folder: Path, result:
 
 @functools.cache
 def _installed() -> dict[str, str]:
+    """Return the versions of the installed packages among `PACKAGES`."""
     found = {}
     for name in PACKAGES:
         with suppress(importlib.metadata.PackageNotFoundError):
@@ -178,12 +230,19 @@ def _installed() -> dict[str, str]:
 def run_scene(
     request: Request, target: str, hashes: Hashes | None = None, execution: Execution | None = None
 ) -> dict[str, Path | None]:
-    """Bring `target` and what it needs up to date.
+    """Run a stage of a scene and everything that it needs, as far as artifacts are not up to date.
+
+    Args:
+        request: the scene and its options.
+        target: name of the stage; "all" for all stages.
+        hashes: the cache of hashes; None reads it from runs/.
+        execution: settings; None for this machine with all its cores.
 
     Returns:
-        stage -> its artifact's folder, None where it is skipped.
+        Stage -> folder of its artifact; None if it is skipped.
+
     Raises:
-        Refused: before any work.
+        Refused: something that the user can correct is wrong or missing. Mostly this is raised before any stage runs.
         Failed: a stage fails.
     """
     execution = execution or Execution(LocalEngine())
@@ -199,14 +258,14 @@ def run_scene(
         say(plan_table(job, planned))
         _refuse_missing(job, planned)
         write_text(job.home / "profile", job.profile + "\n")
-        inside = job.folder.is_relative_to(job.root)  # then relative to it
+        inside = job.folder.is_relative_to(job.root)  # the path of such a scene is recorded relative to the root
         write_text(job.home / "source", f"{job.folder.relative_to(job.root) if inside else job.folder}\n")
         done: dict[str, Decision] = {}
         for position, stage in enumerate(stages):
             done[stage] = decide(job, stage, done)
             if job.keep and done[stage].status == "cached" and done[stage].path == job.home / stage:
                 accept_changes(job.home / stage, job.hashes)
-            if done[stage].status == "cached":  # a stage that runs prints its warnings itself
+            if done[stage].status == "cached":  # repeat the stage's warnings; a stage that runs prints them itself
                 for warning in read_json(done[stage].path / "warnings.json") or ():
                     say(f"warning: {warning}")
             if done[stage].status == "run":
@@ -222,7 +281,7 @@ def run_scene(
 
 
 def _refuse_missing(job: ResolvedJob, planned: dict[str, Decision]) -> None:
-    """Raise Refused where something is missing for a stage."""
+    """Raise Refused if a stage of the plan has the status `missing`."""
     for stage, decision in planned.items():
         if decision.status == "missing":
             raise Refused(f"{job.home.name}: {stage}: {decision.reason}")

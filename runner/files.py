@@ -1,4 +1,4 @@
-"""Files on disk: listing, atomic writes, receipts, locks, and exported copies that people work with."""
+"""Files on disk: listing, atomic writes, receipts, locks, and exported copies for users."""
 
 import fcntl
 import filecmp
@@ -15,15 +15,15 @@ from runner import Failed, Refused, say
 from runner.text import display_path
 
 RECEIPT = "receipt.json"
-RECEIPT_KEYS = {"key", "params", "needs", "weights", "code", "output", "files"}  # what a receipt holds at least
+RECEIPT_KEYS = {"key", "params", "needs", "weights", "code", "output", "files"}  # keys that every receipt has
 MACHINE = platform.node()
 
 
 def list_files(folder: Path) -> Iterator[Path]:
-    """All files below a folder, sorted. Follows links, and leaves out hidden names and __pycache__.
+    """List all files below a folder, sorted. Links are followed; hidden names and __pycache__ are left out.
 
     Raises:
-        Refused: a pipe or a device lies there.
+        Refused: there is a pipe or a device.
     """
     seen = set()
     for place, folders, names in os.walk(folder, followlinks=True):
@@ -39,7 +39,7 @@ def list_files(folder: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file atomically, and create its folder."""
+    """Write a UTF-8 text file atomically, and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.writing")
     try:
@@ -51,12 +51,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write a JSON file atomically."""
+    """Write a JSON file atomically, and create its folder."""
     write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def read_text(path: Path) -> str:
-    """The stripped text of a file; "" where there is no file, or it is not text."""
+    """Read a text file, stripped of white space at both ends; "" if it cannot be read or is not UTF-8 text."""
     try:
         return path.read_text(encoding="utf-8").strip()
     except (OSError, ValueError):
@@ -64,7 +64,7 @@ def read_text(path: Path) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file; None where there is no file, or it is not valid."""
+    """Read a JSON file; None if it cannot be read or is not valid JSON."""
     try:
         return json.loads(path.read_text())
     except (OSError, ValueError):
@@ -72,19 +72,28 @@ def read_json(path: Path) -> Any:
 
 
 def read_receipt(artifact: Path) -> dict[str, Any] | None:
-    """The receipt of an artifact; None where it is missing or not complete."""
+    """Read the receipt in the folder of an artifact; None if it is missing or lacks one of `RECEIPT_KEYS`."""
     found = read_json(artifact / RECEIPT)
     return found if isinstance(found, dict) and found.keys() >= RECEIPT_KEYS else None
 
 
 @contextmanager
 def hold_lock(runs: Path, name: str, shared: bool = False, wait: bool = True) -> Iterator[int]:
-    """Hold the lock `runs/.locks/<name>`. The system releases it when all processes that hold it have ended.
+    """Hold the lock `runs/.locks/<name>` inside the context.
+
+    If this process is killed, the operating system releases the lock when all processes that hold it have ended.
+
+    Args:
+        runs: folder of all results.
+        name: name of the folder in runs/ that is locked.
+        shared: True allows other processes to hold the lock at the same time, if they ask for it as shared too.
+        wait: True waits until other processes release the lock; False raises Refused instead.
 
     Yields:
-        Its file descriptor.
+        The file descriptor of the lock.
+
     Raises:
-        Refused: another process holds it and `wait` is False, or the file system has no locks.
+        Refused: another process holds the lock and `wait` is False, or the file system has no locks.
     """
     path = runs / ".locks" / name
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -103,6 +112,7 @@ def hold_lock(runs: Path, name: str, shared: bool = False, wait: bool = True) ->
 
 
 def _lock(lock: int, name: str, mode: int, wait: bool) -> None:
+    """Acquire a lock (see `hold_lock`) of the given `mode`, fcntl.LOCK_SH or fcntl.LOCK_EX."""
     try:
         fcntl.flock(lock, mode | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -117,34 +127,48 @@ def _lock(lock: int, name: str, mode: int, wait: bool) -> None:
 
 
 def _holder(lock: int) -> tuple[str, str]:
-    """Process and machine of the last holder of a lock, as it wrote them into the file; a killed one leaves them."""
+    """Read the process id and the machine that the last holder of a lock wrote into its file.
+
+    Both are "" if the last holder released the lock. A killed holder leaves them in the file.
+    """
     process, _, host = os.pread(lock, 999, 0).decode(errors="replace").strip().partition(" ")
     return process, host
 
 
 def _sign(lock: int, text: str) -> None:
-    with suppress(OSError):  # a full disk: the holder is for messages only
+    """Write the holder of a lock into the lock's file."""
+    with suppress(OSError):  # the disk may be full, and the holder only serves messages
         os.ftruncate(lock, 0)
         os.write(lock, text.encode())
 
 
 def check_lock(lock: int) -> None:
-    """Check that the file of a lock still exists: if not, another process may hold a new one of the same name.
+    """Check that the file of a lock still exists. If it does not, another process may hold a new lock of this name.
+
+    Args:
+        lock: file descriptor of the lock.
 
     Raises:
-        Failed: it was removed.
+        Failed: the file was removed.
     """
     if not os.fstat(lock).st_nlink:
         raise Failed("its lock in .locks was removed, so another process may be at work here; the same command goes on")
 
 
 def export_folders(new: Path, old: Path, home: Path, names: tuple[str, ...]) -> Iterator[str]:
-    """Copy the folders `names` of the artifact `new`, which replaces `old`, to `home`.
+    """Copy folders of a new artifact to `home`, where people work with them.
 
-    Removes exported files of `old` that `new` does not have. Files that a person changed or added stay.
+    Earlier exported files that nobody changed are replaced, or removed if the new artifact does not have them. Files
+    that a person changed or added are kept.
+
+    Args:
+        new: folder of the new artifact.
+        old: folder of the artifact that `new` will replace.
+        home: folder of the results of the scene, to which the folders are copied.
+        names: the folders to copy.
 
     Yields:
-        A message for each file that stays although `new` has another version.
+        A message for each file that is kept.
     """
     for name in names:
         for path in list(list_files(home / name)):

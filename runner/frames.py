@@ -1,4 +1,4 @@
-"""A video as a scene: keeps the folder of its frames up to date."""
+"""Scenes that are videos: extraction of the frames into a folder, which is then used as the scene."""
 
 import json
 import subprocess
@@ -10,16 +10,22 @@ from runner.keys import Hashes
 from runner.process import start_worker
 from runner.text import display_path
 
-FRAMES = "frames"  # folder in runs/<video>/
-FRAME_FILES = ("frames.json", "frames.csv")  # what extraction writes there beside images/
+FRAMES = "frames"  # name of the folder of frames in runs/<video>/
+FRAME_FILES = ("frames.json", "frames.csv")  # files that the extraction writes to this folder, beside images/
 
 
 def update_frames(video: Path, folder: Path, root: Path, hashes: Hashes) -> None:
-    """Extract a video's frames into the folder of a scene, unless they are there.
+    """Extract a video's frames into the folder of a scene, unless the folder already has the frames of this video.
+
+    Args:
+        video: the video.
+        folder: the folder to fill.
+        root: folder with pipeline.yaml and stages/.
+        hashes: the cache of hashes; the video's hash decides whether its frames are up to date.
 
     Raises:
-        Refused: it is not a usable video, or the folder holds frames of another one, or files that people added for the
-            frames of an earlier version.
+        Refused: the video is not usable, or the folder has frames of another video, or the video has changed and the
+            folder has files that people added for the earlier frames.
     """
     content, found = hashes.file(video), read_json(folder / FRAME_FILES[0]) or {}
     if found.get("content") == content:

@@ -1,4 +1,4 @@
-"""The command `gc`: lists artifacts that no current plan uses, with their sizes, and removes them."""
+"""The command `gc`, which lists and removes artifacts that no plan uses any more."""
 
 import sys
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ from runner.text import display_path, format_bytes
 
 @dataclass(frozen=True)
 class Unused:
-    """An artifact that no plan uses: its folder, its size in bytes, and why no plan uses it."""
+    """An artifact that no plan uses: its folder, its size in bytes, and the reason why no plan uses it."""
 
     folder: Path
     size: int
@@ -27,12 +27,17 @@ class Unused:
 
 
 def collect_garbage(request: Request, yes: bool) -> None:
-    """List artifacts that no plan of the scenes in runs/, or of one scene and its variants, uses.
+    """List the artifacts that no plan uses, with their sizes, and remove them after confirmation.
 
-    Removes them with `yes`, or after a question on a terminal.
+    The plans are those of all scenes and variants in runs/ (or of one scene and its variants, if the request names it)
+    with the current scene.yaml, pipeline.yaml and options. An artifact that only differs by its code counts as used.
+    Only files that agree with receipts are removed, so files that people added or changed are kept. Artifacts of a
+    scene whose folder does not exist are kept too.
 
-    Plans follow the current scene.yaml, pipeline.yaml and options; artifacts of older code count as used. Only files in
-    receipts are removed. Files that people added or changed stay, and so do artifacts of a scene that is not there."""
+    Args:
+        request: the options.
+        yes: True removes the artifacts without asking. Otherwise the user is asked if the input is a terminal.
+    """
     hashes = Hashes(request.runs / HASHES)
     found = list(_unused(request, hashes))
     for each in found:
@@ -50,6 +55,11 @@ def collect_garbage(request: Request, yes: bool) -> None:
 
 
 def _unused(request: Request, hashes: Hashes) -> Iterator[Unused]:
+    """Yield the unused artifacts, see `collect_garbage`.
+
+    Raises:
+        Refused: the request names a scene for which nothing was computed.
+    """
     homes = sorted(path for path in request.runs.glob("*") if is_home(path)) if request.runs.is_dir() else []
     name = Path(request.scene).name
     scenes = dict.fromkeys(home.name.partition("@")[0] for home in homes)
@@ -74,7 +84,17 @@ def _unused(request: Request, hashes: Hashes) -> Iterator[Unused]:
 
 
 def _planned(request: Request, home: Path, reasons: dict[Path, str], hashes: Hashes) -> set[Path]:
-    """The artifacts that the plan of a run uses or may use; adds to `reasons` why it does not use its others."""
+    """Return the folders of the artifacts that the plan of one run uses or may use.
+
+    Args:
+        request: the options.
+        home: folder of the run in runs/, of a scene or a variant.
+        reasons: folder -> reason why the plan does not use its artifact; filled here.
+        hashes: the cache of hashes.
+
+    Raises:
+        Refused: the scene's folder does not exist, or the run cannot be planned.
+    """
     name, _, variant = home.name.partition("@")
     pipeline = load_pipeline(request.root)
     receipts = [path.parent for path in home.glob(f"*/{RECEIPT}")]
@@ -101,7 +121,10 @@ def _planned(request: Request, home: Path, reasons: dict[Path, str], hashes: Has
 
 
 def _remove(runs: Path, folder: Path, hashes: Hashes) -> None:
-    """Remove the files of an artifact that agree with its receipt, and its folder if it is then empty."""
+    """Remove the files of an artifact that agree with its receipt, and its folder if it is empty then.
+
+    An artifact that another process uses is kept, with a message.
+    """
     try:
         with hold_lock(runs, folder.parent.name, wait=False):
             recover_swap(folder.parent, hashes)

@@ -1,4 +1,4 @@
-"""Expected time and memory of a job's stages on a GPU, as the stages report them; printed by `plan`."""
+"""Expected time and memory of a job's stages on a GPU, which the stages estimate and `plan` prints."""
 
 from __future__ import annotations
 
@@ -10,7 +10,14 @@ from runner.text import format_seconds
 
 
 def cost_table(job: ResolvedJob, decisions: dict[str, Decision], gpu: str | None) -> str:
-    """A line for each stage that would run on CUDA, for the named GPU or else this machine's; "" where none is known.
+    """Return a table with the expected time and memory of each stage of a plan that would run on CUDA.
+
+    Args:
+        decisions: the plan, stage -> decision. Stages that need not run are left out.
+        gpu: name of the GPU; None for this machine's.
+
+    Returns:
+        The lines of the table; "" if no estimate is known.
 
     Raises:
         Refused: the GPU is unknown.

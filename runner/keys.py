@@ -1,4 +1,4 @@
-"""Hashes of what an artifact depends on: contents of folders, code, parameters, weights."""
+"""Hashes of everything that an artifact depends on: contents of folders, code, parameters and weights."""
 
 import ast
 import hashlib
@@ -16,14 +16,15 @@ from reffusion.command import is_installed
 from runner import Refused
 from runner.files import RECEIPT, list_files, read_json, write_text
 
-CODE_PACKAGES = ("reffusion", "stages")  # modules of these packages are part of a stage's code where it imports them
-HASHES = ".hashes.json"  # in runs/: the cache of hashes
+CODE_PACKAGES = ("reffusion", "stages")  # modules of these packages that a stage imports are part of its code
+HASHES = ".hashes.json"  # file in runs/ with the cache of hashes
+# files of an artifact on which other stages do not depend
 NOT_CONTENT = (RECEIPT, "trace.jsonl", "warnings.json", "checkpoint.pt", "checkpoint.pt.writing")
-NOT_WEIGHTS = (".md", ".py", ".png", ".jpg")  # a model's card, pictures and training scripts
+NOT_WEIGHTS = (".md", ".py", ".png", ".jpg")  # endings of a model's card, pictures and training scripts
 
 
 def digest(*parts: str) -> str:
-    """A hash of a sequence of texts, 20 hexadecimal digits."""
+    """Hash a sequence of texts to 20 hexadecimal digits."""
     state = hashlib.blake2b(digest_size=10)
     for part in parts:
         data = part.encode()
@@ -32,22 +33,36 @@ def digest(*parts: str) -> str:
 
 
 def hash_listing(listing: dict[str, str], exclude: tuple[str, ...] = NOT_CONTENT) -> str:
-    """One hash of file names and their hashes, without the files and folders in `exclude`."""
+    """Hash a listing of files to one hash.
+
+    Args:
+        listing: name of each file, relative to a folder -> hash of its content.
+        exclude: names of files and folders, directly in the folder, that are left out.
+    """
     kept = {name: file for name, file in listing.items() if name.partition("/")[0] not in exclude}
     return digest(*(part for item in kept.items() for part in item))
 
 
 class Hashes:
-    """Hashes of files, cached in a JSON file while inode, size and modification time stay the same.
+    """A cache of the hashes of files, kept in a JSON file.
 
-    The cache also holds the descriptions of stages (`resolve.resolve_all`)."""
+    A cached hash is valid while device, inode, size and modification time of the file stay the same. The cache also
+    holds the answers of stages to questions about their parameters (`resolve.resolve_all`).
 
-    LIMIT = 1_000_000  # the newest entries are kept; a demo scene and its results have 1,000
-    # A save that took more than SLOW seconds is not repeated before WAIT times its duration.
+    Attributes:
+        path: the JSON file.
+        recompute: True ignores cached hashes.
+        corrupt: files whose content differs from the cached hash, although size and time are the same. They are only
+            found with `recompute`.
+        known: the entries of the cache.
+    """
+
+    LIMIT = 1_000_000  # number of entries that are saved, the newest ones; a demo scene and its results have 1,000
+    # If a save took more than SLOW seconds, the next one waits WAIT times as long as that save took.
     SLOW, WAIT = 0.1, 50
 
     def __init__(self, path: Path, recompute: bool = False):
-        """With `recompute` ignores cached hashes; `corrupt` lists files whose content changed and nothing else."""
+        """Load the cache from `path`; it starts empty if there is no such file. For the arguments see the class."""
         self.path, self.recompute = path, recompute
         self.corrupt: list[Path] = []
         found = read_json(path)
@@ -57,6 +72,7 @@ class Hashes:
         self._imports: dict[tuple[Path, str], list[Path]] = {}  # (module, fingerprint) -> see `module`
 
     def _remember(self, kind: str, path: Path, compute: Any) -> Any:
+        """Return the cached value of a `kind` ("file" or "module") for a file, or compute it by `compute(path)`."""
         stat = os.stat(path)
         name = f"{kind} {stat.st_dev} {stat.st_ino} {stat.st_size} {stat.st_mtime_ns}"
         if name not in self.known or self.recompute:
@@ -66,7 +82,7 @@ class Hashes:
         return self.known[name]
 
     def file(self, path: Path) -> str:
-        """The hash of a file's content."""
+        """Return the hash of a file's content."""
 
         def content(path: Path) -> str:
             with open(path, "rb") as file:
@@ -75,39 +91,55 @@ class Hashes:
         return self._remember("file", path, content)
 
     def module(self, path: Path, root: Path) -> tuple[str, list[Path]]:
-        """The fingerprint of a Python file, and the files below `root` that it imports."""
+        """Return the fingerprint of a Python file, and the files of CODE_PACKAGES that it imports.
+
+        Args:
+            path: the Python file.
+            root: folder with stages/.
+
+        Raises:
+            Refused: the file is not valid Python.
+        """
         names, fingerprint = self._remember("module", path, _read_module)
         if (path, fingerprint) not in self._imports:
             self._imports[path, fingerprint] = list(_imported_files(names, path, root))
         return fingerprint, self._imports[path, fingerprint]
 
     def folder(self, folder: Path, exclude: tuple[str, ...] = NOT_CONTENT) -> str:
-        """One hash of all files below `folder`, without hidden ones and those at its top in `exclude`."""
+        """Return one hash of all files below a folder. Hidden files are left out.
+
+        Args:
+            folder: the folder.
+            exclude: names of files and folders, directly in the folder, that are left out too.
+        """
         return hash_listing(self.listing(folder), exclude)
 
     def listing(self, folder: Path) -> dict[str, str]:
-        """Name, relative to `folder`, -> hash of all files below, without hidden ones."""
+        """Return name -> hash of all files below a folder, without hidden ones. Names are relative to the folder."""
         top = os.path.join(folder, "")
         return {str(path)[len(top) :]: self.file(path) for path in list_files(folder)}
 
     def files(self, folder: Path, files: Iterable[Path]) -> str:
-        """One hash of these files: names relative to `folder`, and contents, in this order."""
+        """Return one hash of the contents of some files, and of their names relative to `folder`, in this order."""
         top = os.path.join(folder, "")
         name = lambda path: path[len(top) :] if path.startswith(top) else os.path.relpath(path, folder)
         return digest(*(part for path in files for part in (name(str(path)), self.file(path))))
 
     def weights(self, folder: Path) -> str:
-        """The hash of a file of weights, or of a model's folder without its card: an edit there reruns nothing."""
+        """Return the hash of a file of weights, or of the folder of a model.
+
+        The model's card, pictures and scripts in the folder are left out, so that editing them reruns no stage.
+        """
         read = [path for path in list_files(folder) if path.suffix not in NOT_WEIGHTS]
         return self.file(folder) if folder.is_file() else self.files(folder, read)
 
     def save(self) -> None:
-        """Write the cache, unless nothing is new or the last save was slow and recent."""
+        """Write the cache to its file, unless it has no new entries, or the last save was slow and recent."""
         started = time.monotonic()
         if len(self.known) == self._saved or (self._took > self.SLOW and started - self._at < self.WAIT * self._took):
             return
         kept = dict(list(self.known.copy().items())[-self.LIMIT :])  # other threads may add to it
-        # A full or read-only disk: the hashes are computed again the next time.
+        # If the disk is full or read-only, nothing is saved, and the hashes are computed again the next time.
         with suppress(OSError), self._saving:
             partial = self.path.with_name(f"{self.path.name}.{os.getpid()}")  # runners of other scenes write here too
             write_text(partial, json.dumps(kept))
@@ -117,7 +149,12 @@ class Hashes:
 
 
 def paths_outside(value: Any, folder: Path) -> Iterator[Path]:
-    """Existing files and folders that `value` names anywhere, relative to the scene, outside the scene's folder."""
+    """Yield the existing files and folders outside the scene's folder that parameters name.
+
+    Args:
+        value: a parameter or nested parameters; texts in it are tried as paths relative to `folder`.
+        folder: folder of the scene.
+    """
     if isinstance(value, dict | list):
         for part in value.values() if isinstance(value, dict) else value:
             yield from paths_outside(part, folder)
@@ -128,13 +165,13 @@ def paths_outside(value: Any, folder: Path) -> Iterator[Path]:
 
 
 def files_outside(files: Iterable[str], folder: Path) -> list[Path]:
-    """Those of `files` that are not reached through the folder."""
+    """Return the files whose path, relative to `folder`, leads out of this folder. Links are not resolved."""
     paths = (Path(os.path.normpath(os.path.join(folder, file))) for file in files)
     return [path for path in paths if not path.is_relative_to(folder)]
 
 
 def fingerprint(tree: ast.Module) -> str:
-    """A hash of Python code that ignores comments, docstrings, layout and descriptions of fields."""
+    """Hash Python code without its comments, docstrings, layout and descriptions of fields. Changes `tree`."""
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
         if isinstance(body, list):
@@ -145,17 +182,19 @@ def fingerprint(tree: ast.Module) -> str:
 
 
 def _read_module(path: Path) -> list[Any]:
+    """Return the names that a Python file imports, and its fingerprint. Raises Refused if it is not valid Python."""
     try:
         tree = ast.parse(path.read_text(encoding="utf-8"))
     except SyntaxError as error:
         raise Refused(f"{path}:{error.lineno}: not valid Python: {error.msg}") from None
-    return [sorted(set(_imported(tree))), fingerprint(tree)]  # changes the tree, so it comes last
+    return [sorted(set(_imported(tree))), fingerprint(tree)]  # `fingerprint` changes the tree, so it comes last
 
 
 def _imported(tree: ast.AST) -> Iterator[str]:
-    """Every imported name that may be a module (`.name` if relative), also inside functions.
+    """Yield every imported name that may be a module (`.name` if relative), also of imports inside functions.
 
-    Leaves out imports under `if TYPE_CHECKING`, which never run."""
+    Imports under `if TYPE_CHECKING` are left out, because they never run.
+    """
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -168,13 +207,22 @@ def _imported(tree: ast.AST) -> Iterator[str]:
 
 
 def _module_path(path: Path, root: Path) -> Path:
-    """The path of a module relative to the root. An installed library contains the root, so its modules are relative to
-    the library's parent."""
+    """Return the path of a module relative to the root, such as reffusion/types.py.
+
+    In an installed package the root lies inside the library `reffusion`. The path of a module of the library is then
+    relative to the folder that contains the library.
+    """
     return path.relative_to(root if path.is_relative_to(root) else root.parents[1])
 
 
 def _imported_files(names: Iterable[str], path: Path, root: Path) -> Iterator[Path]:
-    """Files of CODE_PACKAGES that run when the file at `path` imports `names`."""
+    """Yield the files of CODE_PACKAGES that Python runs when the file at `path` imports `names`.
+
+    Args:
+        names: imported names, see `_imported`.
+        path: the importing file.
+        root: folder with stages/.
+    """
     places = set()
     for name in names:
         level = len(name) - len(name.lstrip("."))
@@ -187,9 +235,20 @@ def _imported_files(names: Iterable[str], path: Path, root: Path) -> Iterator[Pa
 
 
 def code_fingerprints(root: Path, stage: str, hashes: Hashes, folder: str = "stages") -> dict[str, str]:
-    """File -> fingerprint, of stages/<stage>.py and of all modules of CODE_PACKAGES that it imports, directly or not.
+    """Return the fingerprints of a stage's code: of <folder>/<stage>.py and of everything that it imports.
 
-    The description of a stage (stages/plan/<stage>.py) counts only where the stage imports it."""
+    Only modules of CODE_PACKAGES count, imported directly or indirectly. The description of a stage
+    (stages/plan/<stage>.py) does not count unless the stage imports it.
+
+    Args:
+        root: folder with stages/.
+        stage: name of the stage.
+        hashes: the cache.
+        folder: folder of the stage's file, relative to `root`.
+
+    Returns:
+        File relative to the root -> fingerprint.
+    """
     found: dict[Path, str] = {}
     waiting = [root / folder / f"{stage}.py"]
     while waiting:
@@ -202,27 +261,34 @@ def code_fingerprints(root: Path, stage: str, hashes: Hashes, folder: str = "sta
 
 @dataclass(frozen=True)
 class Inputs:
-    """All that an artifact depends on. The receipt stores it, so that a plan can say what changed."""
+    """Everything that an artifact depends on. The receipt stores it, so that a plan can say what changed."""
 
     params: dict[str, Any]  # every parameter of the stage, resolved
-    needs: dict[str, str | None]  # need -> hash of its content, None where the need was skipped
+    needs: dict[str, str | None]  # need -> hash of its content; None if the need was skipped
     weights: dict[str, str]  # parameter -> hash of the folder or file that it names, or the name if it is not local
     code: dict[str, str]  # file -> fingerprint
     unkeyed: tuple[str, ...] = ()  # parameters that do not change the artifact
-    unavailable: tuple[str, ...] = ()  # optional things that were missing; when they are there it is made again
+    # optional features, such as LPIPS, that the machine lacked; the stage runs again once one is available
+    unavailable: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
+        """The hash of the parameters (without `unkeyed`), needs, weights and code."""
         return digest(json.dumps([self.keyed(self.params), self.needs, self.weights, self.code], sort_keys=True))
 
     def keyed(self, params: dict[str, Any]) -> dict[str, Any]:
-        """Dotted name -> value, of the parameters that are part of the key."""
+        """Return the parameters that are part of the key, as dotted name -> value."""
         inside = tuple(f"{name}." for name in self.unkeyed)
         return {n: v for n, v in flatten_params(params).items() if n not in self.unkeyed and not n.startswith(inside)}
 
 
 def flatten_params(params: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested parameters as dotted name -> value."""
+    """Flatten nested parameters to a dict dotted name -> value.
+
+    Args:
+        params: parameters, in which groups are nested dicts.
+        prefix: text before each name.
+    """
     found = {}
     for name, value in params.items():
         inner = isinstance(value, dict) and value
@@ -231,7 +297,7 @@ def flatten_params(params: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def list_changes(old: dict[str, Any], new: Inputs) -> list[str]:
-    """The differences between a receipt and the current inputs, a phrase each; code comes last."""
+    """Describe the differences between a receipt, `old`, and the current inputs, a phrase each; code comes last."""
     found, before, after = [], new.keyed(old["params"]), new.keyed(new.params)
     for name in sorted({*before, *after}):
         if name not in after:
@@ -247,7 +313,7 @@ def list_changes(old: dict[str, Any], new: Inputs) -> list[str]:
 
 
 def list_code_changes(old: dict[str, Any], new: Inputs) -> list[str]:
-    """The files of code that differ between a receipt and the current inputs, a phrase each."""
+    """Describe which files of code differ between a receipt, `old`, and the current inputs, a phrase each."""
     files = sorted({*old["code"], *new.code})
     return [f"code of {name} changed" for name in files if old["code"].get(name) != new.code.get(name)]
 

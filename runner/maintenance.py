@@ -1,4 +1,7 @@
-"""The commands `verify`, which hashes all artifacts of a scene, and `clean`, which removes them and nothing else."""
+"""The commands `verify`, which checks all artifacts of a scene by their hashes, and `clean`, which removes them.
+
+Files that people added or changed are never removed.
+"""
 
 import os
 from collections.abc import Iterator
@@ -25,17 +28,18 @@ PAGES = (*(f"compare.{kind}" for kind in ("json", "csv", "md", "html")), "compar
          "export/scene.ply", "export/scene.compressed.ply", "export/lora/pytorch_lora_weights.safetensors",
          "export/cameras/transforms.json", "export/cameras/sparse_pc.ply", "export/cameras/sparse/0/*.bin",
          "export/cameras/images/*.png", "**/.*.writing")  # fmt: skip
-# Folders that a kill may leave.
+# Folders that a killed runner may leave.
 TEMPORARY = (".partial-*", ".copying-*", ".gone-*")
 
 
 def verify(request: Request) -> int:
-    """Hash all files of a scene, and of its artifacts and its variants'.
+    """Hash all files of a scene, of its artifacts and of its variants' artifacts, and compare them with the receipts.
 
-    The hashes are cached, so that the next run makes again what is missing or changed.
+    The hashes are cached, so that the next run repeats the stages whose artifacts are damaged.
 
     Returns:
-        How many artifacts and files are not as they were made.
+        Number of damaged artifacts, plus number of files of the scene whose content changed while size and time did
+        not.
     """
     hashes, homes, damaged = Hashes(request.runs / HASHES, recompute=True), _homes(request), 0
     for home in homes:
@@ -57,7 +61,10 @@ def verify(request: Request) -> int:
 
 
 def clean(request: Request) -> None:
-    """Remove what was computed for a scene and its variants, or for one variant, but no file that people put there."""
+    """Remove everything that was computed for a scene and its variants, or for one variant if the request names it.
+
+    Files that people added or changed are kept.
+    """
     homes, pipeline, hashes = _homes(request), load_pipeline(request.root), Hashes(request.runs / HASHES)
     with ExitStack() as locks:
         for home in homes:
@@ -79,9 +86,13 @@ def clean(request: Request) -> None:
 
 
 def _homes(request: Request) -> list[Path]:
-    """The folders in runs/ of a scene and its variants, or of one variant; none for a scene that was not run.
+    """Return the folders in runs/ of a scene and its variants, or of one variant if the request names it.
 
-    The scene itself may be gone. Raises Refused where there is neither a scene nor a folder of that name."""
+    The list is empty for a scene that was not run. The folder of the scene itself may have been removed.
+
+    Raises:
+        Refused: there is neither a scene nor a folder in runs/ of this name, or the variant is unknown.
+    """
     name, runs = scene_name(Path(request.scene).expanduser()), request.runs
     existing = sorted(path.name for path in (runs.iterdir() if runs.is_dir() else ()) if is_home(path))
     scenes = list(dict.fromkeys(each.partition("@")[0] for each in existing))
@@ -106,18 +117,21 @@ def _homes(request: Request) -> list[Path]:
 
 
 def is_home(folder: Path) -> bool:
-    """Whether the runner made this folder in runs/: it has a receipt or a file `source`."""
+    """Return whether the runner made this folder in runs/, which then has an artifact's receipt or a file `source`."""
     own = folder.is_dir() and not folder.is_symlink() and folder.name[0] != "."
     return own and ((folder / "source").is_file() or any(folder.glob(f"*/{RECEIPT}")))
 
 
 def _find_artifact_files(home: Path, pipeline: Pipeline, hashes: Hashes) -> Iterator[Path]:
-    """The files of a scene's results that the runner or report/ wrote and nobody changed; receipts come last."""
+    """Yield the files in a scene's folder in runs/ that the runner or report/ wrote and nobody changed.
+
+    The receipt of an artifact comes after its other files. Some of the paths may not exist.
+    """
     yield from (home / name for name in RECORDS)
     yield from (home / f"{stage}.log" for stage in pipeline.stages)
     yield from (path for pattern in PAGES for path in home.glob(pattern))
     for folder in sorted(path.parent for path in home.glob(f"*/{RECEIPT}")):
-        if folder.is_symlink():  # made by a person: its target may belong to another scene
+        if folder.is_symlink():  # a person made this link, and its target may belong to another scene
             yield folder
             continue
         listing = hashes.listing(folder)
@@ -128,7 +142,7 @@ def _find_artifact_files(home: Path, pipeline: Pipeline, hashes: Hashes) -> Iter
 
 
 def artifact_files(folder: Path, hashes: Hashes) -> Iterator[Path]:
-    """The files of an artifact that agree with its receipt, and then the receipt."""
+    """Yield the files of an artifact that agree with its receipt and nobody changed, and then the receipt."""
     diff = diff_artifact(folder, hashes)
     by_people = {*diff.changed, *diff.added, *diff.by_hand}
     yield from (folder / name for name in hashes.listing(folder) if name not in by_people and name != RECEIPT)
@@ -136,7 +150,7 @@ def artifact_files(folder: Path, hashes: Hashes) -> Iterator[Path]:
 
 
 def remove_empty(home: Path) -> None:
-    """Remove all empty folders in `home`, and itself if it is empty."""
+    """Remove all empty folders in `home`, and `home` itself if it is empty then."""
     for place, _, _ in os.walk(home, topdown=False):
         if not any(os.scandir(place)):
             os.rmdir(place)

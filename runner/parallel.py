@@ -1,4 +1,4 @@
-"""Runs several scenes at once, as cores and memory allow."""
+"""Parallel execution of several scenes, as far as cores and memory allow."""
 
 import sys
 import threading
@@ -17,20 +17,21 @@ from runner.progress import Progress
 from runner.resolve import Request
 from runner.text import format_error
 
-OUTPUT = "output.log"  # in a run's folder: what it printed while others ran at the same time
-MAX_SCENES = 256  # scenes at once, at most, on a cluster
+OUTPUT = "output.log"  # file in a run's folder with everything that it prints, if runs are parallel
+MAX_SCENES = 256  # largest number of scenes at once, on a cluster
 
 
 @dataclass(frozen=True)
 class SceneRun:
-    """One scene, or a variant of it, to be run.
+    """A run that is to be done: one scene, or one variant of it.
 
     Attributes:
-        name: for people.
-        group: runs of a group, which are neighbours, run one after another, as they share artifacts.
-        home: the folder in runs/.
-        request: what to run.
-        announcement: printed first where runs are not parallel.
+        name: name for messages.
+        group: name of a group. Runs of a group share artifacts and thus run one after another; they must be neighbours
+            in the list of runs.
+        home: folder of the run in runs/.
+        request: the scene and its options.
+        announcement: text that is printed before the run if runs are not parallel.
     """
 
     name: str
@@ -42,7 +43,13 @@ class SceneRun:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of a run: stage -> artifact, the error if it failed, and seconds of wall clock."""
+    """The result of a run.
+
+    Attributes:
+        stages: stage -> folder of its artifact, None if it was skipped; empty if the run failed.
+        error: message of the error; None if the run succeeded.
+        seconds: duration, wall clock.
+    """
 
     stages: dict[str, Path | None]
     error: str | None
@@ -56,13 +63,17 @@ def run_all(
     stages: list[str],
     on_end: Callable[[int, Outcome], None],
 ) -> None:
-    """Bring each run up to date; one that fails stops no other.
+    """Do several runs, in parallel if cores allow. If one fails, the others go on.
 
-    By default each group gets an equal part of the engine's cores, at least one. The number of cores of a stage stays
-    the same to the end, so that no result depends on which run ended first.
+    By default each group gets an equal part of the engine's cores, at least one. The number of cores of a stage does
+    not change when other runs end, so that no result depends on the order in which runs end.
 
     Args:
-        on_end: called with the place of a run among `runs` and its outcome, by one thread at a time.
+        runs: the runs; those of a group must be neighbours.
+        execution: engine, and number of cores of each stage.
+        hashes: the cache of hashes.
+        stages: names of all stages, for the display of progress.
+        on_end: called after each run with its index in `runs` and its outcome, never by two threads at once.
     """
     engine, cores = execution.engine, execution.cores
     groups = [list(places) for _, places in groupby(range(len(runs)), key=lambda place: runs[place].group)]
@@ -89,7 +100,19 @@ def _run_in_threads(
     on_end: Callable[[int, Outcome], None],
     engine: Engine,
 ) -> None:
-    """Run the groups in `at_once` threads. An interrupt stops the engine; an error of `on_end` is raised at the end."""
+    """Do the runs of all groups in several threads.
+
+    On an interrupt (Ctrl-C) the engine is stopped, and KeyboardInterrupt is raised. An error in `on_end` is raised
+    after all threads have ended.
+
+    Args:
+        runs: all runs.
+        groups: for each group the indices of its runs.
+        at_once: number of threads, each of which does one group at a time.
+        run_one: does one run, given its index and the run.
+        on_end: see `run_all`.
+        engine: the engine to stop.
+    """
     order, one_at_a_time = count(), threading.Lock()
 
     def run_groups() -> None:
@@ -110,7 +133,7 @@ def _run_in_threads(
     except KeyboardInterrupt:
         say("stopping")
         engine.stop()
-        until = time.monotonic() + GRACE + 5  # a thread that waits for a lock is left behind
+        until = time.monotonic() + GRACE + 5  # after that, e.g. a thread that waits for a lock is abandoned
         for thread in threads:
             thread.join(max(0, until - time.monotonic()))
         raise
@@ -119,7 +142,10 @@ def _run_in_threads(
 
 
 def _collect_errors(function: Callable[[], None], errors: list[BaseException]) -> None:
-    """Call a function and append its error: not one of a stage, but such as a table on a full disk."""
+    """Call a function, and append the error that it raises to `errors`.
+
+    Errors of stages are part of an outcome and are not raised. An error here is e.g. a table that could not be written.
+    """
     try:
         function()
     except BaseException as error:
@@ -127,7 +153,7 @@ def _collect_errors(function: Callable[[], None], errors: list[BaseException]) -
 
 
 def _run_with_progress(progress: Progress, hashes: Hashes, execution: Execution, place: int, run: SceneRun) -> Outcome:
-    """Run one with its output in a file, and report its progress."""
+    """Do one run, with its output in a file, and report its progress. `place` is the index of the run."""
     run.home.mkdir(parents=True, exist_ok=True)
     output = run.home / OUTPUT
     with open(output, "w", encoding="utf-8") as file, redirect_output(lambda text: print(text, file=file, flush=True)):
@@ -138,7 +164,7 @@ def _run_with_progress(progress: Progress, hashes: Hashes, execution: Execution,
 
 
 def _run(run: SceneRun, hashes: Hashes, execution: Execution) -> Outcome:
-    """Run one; an error of any kind is part of the outcome, as other runs go on."""
+    """Do one run. An error of any kind is not raised but becomes part of the outcome, because other runs go on."""
     started = time.monotonic()
     try:
         return Outcome(run_scene(run.request, "all", hashes, execution), None, time.monotonic() - started)

@@ -1,4 +1,8 @@
-"""Merges the layers of parameters, and splits a time budget over stages (docs/development.md#traces)."""
+"""Merging of the layers of parameters, and splitting of a time budget over stages (docs/development.md#traces).
+
+Each source of parameters, such as a profile or scene.yaml, is a layer. Overrides are a dict stage -> parameter ->
+value, in which groups of parameters are nested dicts.
+"""
 
 import re
 import shlex
@@ -11,17 +15,28 @@ from runner.keys import flatten_params
 from runner.pipeline import Overrides, Pipeline, SceneFile, unknown_name
 from runner.user_yaml import parse_value
 
-SECONDS = "seconds"  # the parameter of a stage that takes its share of the budget
+SECONDS = "seconds"  # name of the parameter that is set to the stage's share of the time budget
 
 
 def merge_params(below: dict[str, Any], above: dict[str, Any], atomic: Collection[str] = ()) -> dict[str, Any]:
-    """`below` updated with `above`. Mappings merge, except those named in `atomic`; all else is replaced."""
+    """Return `below` overridden by `above`.
+
+    A value that is a mapping in both is merged recursively, unless its key is in `atomic`. All other values of `above`
+    replace those of `below`.
+    """
     both = {k for k, v in above.items() if isinstance(v, dict) and isinstance(below.get(k), dict)}.difference(atomic)
     return below | {k: merge_params(below[k], v) if k in both else v for k, v in above.items()}
 
 
 def parse_set(text: str, pipeline: Pipeline) -> Overrides:
-    """Parse `fit.iterations=500 distill.sds.weight=1`; values are YAML."""
+    """Parse the text of `set=`, such as `fit.iterations=500 distill.sds.weight=1`, whose values are YAML.
+
+    Returns:
+        Overrides: stage -> parameter, or group of parameters -> value.
+
+    Raises:
+        Refused: a word has another form, a stage is unknown, or a value is not valid YAML.
+    """
     overrides: Overrides = {}
     try:
         words = shlex.split(text)
@@ -46,16 +61,25 @@ def parse_set(text: str, pipeline: Pipeline) -> Overrides:
 
 @dataclass(frozen=True)
 class Layers:
-    """Parameters as they were asked for.
+    """The parameters as they were asked for, before stages add defaults and check them.
 
-    `values`: the merged parameters of each stage. `layers`: (name, overrides) of each layer; later ones win.
+    Attributes:
+        values: stage -> its merged parameters.
+        layers: (name, overrides) of each layer; a later layer overrides an earlier one.
     """
 
     values: Overrides
     layers: tuple[tuple[str, Overrides], ...]
 
     def origin(self, stage: str, name: str) -> str:
-        """The last layer that sets a dotted name, a group that contains it, or a part of it."""
+        """Return the name of the last layer that sets a parameter, for error messages.
+
+        A layer also counts if it sets a group that contains the parameter, or a part of the parameter.
+
+        Args:
+            stage: the stage.
+            name: dotted name of the parameter.
+        """
         near = lambda other: f"{other}.".startswith(f"{name}.") or f"{name}.".startswith(f"{other}.")
         sets_it = lambda layer: any(map(near, flatten_params(layer.get(stage, {}))))
         return next((label for label, layer in reversed(self.layers) if sets_it(layer)), "pipeline.yaml")
@@ -66,9 +90,17 @@ def stack_layers(
 ) -> Layers:
     """Merge the layers of parameters.
 
-    Later ones win: stage defaults of pipeline.yaml, profile, shares of a budget, scene.yaml, variant, `set=`.
-    Groups of parameters merge. A key of scene.yaml is one value, even where it is a mapping (`reference: {view, image,
-    depth}`), and is replaced as a whole."""
+    The layers are, from low to high priority: defaults of stages in pipeline.yaml, the profile, shares of a time
+    budget, scene.yaml, the variant, and `set=`. Groups of parameters are merged. A key of scene.yaml is one value, even
+    if it is a mapping (`reference: {view, image, depth}`), and is replaced as a whole.
+
+    Args:
+        scene: the content of scene.yaml.
+        profile: name of the profile.
+        variant: name of the variant; None for the scene's own run.
+        asked: overrides of `set=`.
+        shares: overrides that give each stage its share of a time budget; empty without a budget.
+    """
     keys, brings = pipeline.scene_keys, scene.brings
     scene_params = {stage: {key: brings[key] for key in keys[stage] if key in brings} for stage in keys}
     layers = (
@@ -88,7 +120,10 @@ def stack_layers(
 
 
 def copy_scene_keys(pipeline: Pipeline, overrides: Overrides) -> Overrides:
-    """`overrides`, with each key of scene.yaml that is set for one stage also set for all others that read it."""
+    """Copy each key of scene.yaml that `overrides` sets for one stage to all other stages that read this key.
+
+    A stage for which the key is already set keeps its value.
+    """
     found = {stage: dict(params) for stage, params in overrides.items()}
     for stage, params in overrides.items():
         for key in (key for key in params if key in pipeline.scene_keys.get(stage, ())):
@@ -98,7 +133,15 @@ def copy_scene_keys(pipeline: Pipeline, overrides: Overrides) -> Overrides:
 
 
 def parse_duration(text: object, origin: str) -> float:
-    """Seconds of `5m`, `90s`, `1h30m`, `2.5m`, or plain seconds. Raises Refused, naming `origin`, for anything else."""
+    """Convert a duration such as `5m`, `90s`, `1h30m`, `2.5m`, or a plain number of seconds, to seconds.
+
+    Args:
+        text: the duration.
+        origin: where the duration was given, for the message.
+
+    Raises:
+        Refused: the text has another form, or the duration is 0.
+    """
     number = r"(\d+(?:\.\d+)?)"
     found = re.fullmatch(rf"(?:{number}h)?(?:{number}m)?(?:{number}s)?|{number}", str(text).strip().lower())
     parts = zip(found.groups(), (3600, 60, 1, 1), strict=True) if found else ()
@@ -109,7 +152,20 @@ def parse_duration(text: object, origin: str) -> float:
 
 
 def split_budget(pipeline: Pipeline, values: Overrides, seconds: float) -> Overrides:
-    """stage -> {"seconds": its share}. The shares of stages that `values` lets skip go to the others."""
+    """Split a time budget over the stages, in the proportions of the table `budget` in pipeline.yaml.
+
+    Stages that are skipped because of their parameters get nothing, and the other stages get correspondingly more.
+
+    Args:
+        values: stage -> its merged parameters.
+        seconds: the budget.
+
+    Returns:
+        Overrides: stage -> {"seconds": its share}.
+
+    Raises:
+        Refused: pipeline.yaml has no table `budget`.
+    """
     if not pipeline.budget:
         raise Refused("pipeline.yaml: a budget is asked for, and there is no table `budget` that shares it out")
     set_params = {f"{stage}.{name}": value for stage in values for name, value in flatten_params(values[stage]).items()}

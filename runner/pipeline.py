@@ -1,4 +1,7 @@
-"""Reads and checks `pipeline.yaml` and `scene.yaml`, and finds scenes."""
+"""Models of `pipeline.yaml` and `scene.yaml`, with their checks, and the search for scenes.
+
+Parameters are named `<stage>.<name>` here, with dots for groups, such as `distill.sds.weight`.
+"""
 
 import difflib
 import re
@@ -15,27 +18,27 @@ from runner import Refused
 from runner.user_yaml import read_user_yaml
 
 SCENE = "scene"  # the need that stands for the scene's own folder
-NAME = re.compile(r"[\w'][\w'\" .,()+\-]*")  # names of scenes, without the characters of patterns and variants
-LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the C one takes a tenth of the time
+NAME = re.compile(r"[\w'][\w'\" .,()+\-]*")  # names of scenes; they have no characters of file patterns, and no @
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the loader in C takes a tenth of the time
 
 Overrides = dict[str, dict[str, Any]]  # stage -> parameter, or group of parameters -> value
 
 
 class Strict(BaseModel, extra="forbid", frozen=True):
-    """A part of pipeline.yaml; unknown keys are errors."""
+    """Base class of the parts of pipeline.yaml, in which unknown keys are errors."""
 
 
 class Condition(Strict):
-    """A condition under which a stage is skipped: a test of one of `fact`, `param` and `empty`."""
+    """A condition under which a stage is skipped. It tests exactly one of `fact`, `param` and `empty`."""
 
-    reason: str  # may name facts of that stage in braces
-    fact: str | None = None  # <stage>.<name>: a value of an earlier stage's facts.json is `equals`
-    # <stage>.<name>, or a list of them: parameters of any stage are all `equals`
+    reason: str  # why the stage is skipped, for the user; may name facts of the tested stage in braces
+    fact: str | None = None  # <stage>.<name>: true if this value of an earlier stage's facts.json equals `equals`
+    # <stage>.<name>, or a list of such names: true if all these parameters, of any stages, equal `equals`
     param: Annotated[tuple[str, ...], BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)] = ()
     equals: Any = None
-    empty: str | None = None  # <stage>/<folder>: a folder of an earlier artifact has no files
-    unless: tuple[str, ...] = ()  # never true where scene.yaml has one of these keys
-    only: dict[str, Any] = {}  # true only while each of these parameters, <stage>.<name>, has its value
+    empty: str | None = None  # <stage>/<folder>: true if this folder of an earlier artifact has no files
+    unless: tuple[str, ...] = ()  # the condition is false if scene.yaml has one of these keys
+    only: dict[str, Any] = {}  # <stage>.<name> -> value: false unless each of these parameters has its value
 
     @model_validator(mode="after")
     def _has_one_test(self) -> Self:
@@ -45,20 +48,28 @@ class Condition(Strict):
 
     @property
     def names(self) -> tuple[str, str]:
-        """The stage that the condition tests, and the name of the fact, parameter or folder."""
+        """The stage that the condition tests, and the name of the (first) fact, parameter or folder."""
         stage, name = re.split(r"[./]", self.fact or self.empty or self.param[0], maxsplit=1)
         return stage, name
 
     @property
     def depends_on(self) -> tuple[str, ...]:
-        """The stage, if any, that must be done before the condition can be tested."""
+        """The stage that must be done before the condition can be tested; empty for a test of parameters."""
         return () if self.param else self.names[:1]
 
 
 class Substitute(Strict):
-    """The scene's own file replaces the stage: where scene.yaml has the key `by`, `artifact` is used instead.
+    """The replacement of a stage by a file that the scene brings.
 
-    With `param: <stage>.<name>` only while that parameter is `equals`."""
+    If scene.yaml has the key `by`, the artifact of the earlier stage `artifact` is used instead of the stage's own.
+
+    Attributes:
+        by: key of scene.yaml.
+        artifact: name of the earlier stage.
+        param: a parameter `<stage>.<name>`; the stage is only replaced while this parameter equals `equals`. None:
+            always.
+        equals: see `param`.
+    """
 
     by: str
     artifact: str
@@ -67,9 +78,10 @@ class Substitute(Strict):
 
 
 class IgnoredNeed(Strict):
-    """An optional need that the stage does not read while the parameter `param: <stage>.<name>` is `equals`.
+    """An optional need that a stage does not read while the parameter `param`, `<stage>.<name>`, equals `equals`.
 
-    The stage then gets None, and does not run again when the need changes."""
+    The stage then gets None instead of the need's folder, and does not run again when the need changes.
+    """
 
     need: str
     param: str
@@ -77,16 +89,17 @@ class IgnoredNeed(Strict):
 
 
 class Stage(Strict):
-    """A stage of the pipeline.
+    """A stage of the pipeline, as pipeline.yaml describes it.
 
     Attributes:
-        needs: earlier stages, or `scene`.
-        optional: needs that may be skipped; the stage then gets None.
-        provided: the scene's own file that replaces the stage.
+        needs: earlier stages whose artifacts the stage reads, and `scene` for the folder of the scene. If one of them
+            is skipped, the stage is skipped too.
+        optional: further needs that may be skipped; the stage then gets None instead of a folder.
+        provided: the file of the scene that may replace the stage.
         ignore: an optional need that the stage does not always read.
-        skip_if: conditions; the stage is skipped where one is true.
-        export: folders of the artifact that people work with, copied to runs/<scene>/, where they stay.
-        params: defaults of parameters.
+        skip_if: the stage is skipped if one of these conditions is true.
+        export: folders of the artifact that are copied to runs/<scene>/, where people work with the files.
+        params: defaults of the stage's parameters, below those of profiles.
     """
 
     needs: tuple[str, ...]
@@ -99,12 +112,12 @@ class Stage(Strict):
 
     @property
     def all_needs(self) -> tuple[str, ...]:
-        """The keyword arguments of run()."""
+        """All needs, optional ones last. They are the keyword arguments of the stage's run()."""
         return (*self.needs, *self.optional)
 
 
 class Memory(Strict):
-    """CPU memory of a stage: `mb`, and `each` MB more per MB of files that it reads."""
+    """The expected CPU memory of a stage: `mb` MB, and `each` MB more per MB of files that the stage reads."""
 
     mb: Annotated[float, Field(gt=0)]
     each: Annotated[float, Field(ge=0)] = 0
@@ -114,12 +127,12 @@ class Pipeline(Strict):
     """The content of pipeline.yaml.
 
     Attributes:
-        stages: name -> stage, in order.
-        scene_keys: stage -> keys of scene.yaml that are parameters of it.
-        profiles, variants: name -> parameters.
-        comparisons: profile -> the profile in which `compare` runs its methods.
-        budget: stage -> its part of a time budget.
-        memory: stage -> expected memory, where no earlier run has measured it.
+        stages: name -> stage, in the order in which they run.
+        scene_keys: stage -> keys of scene.yaml that are parameters of this stage.
+        profiles, variants: name -> parameters by stage.
+        comparisons: profile of a scene -> profile in which `compare` runs its methods.
+        budget: stage -> its part of a time budget, as a fraction of 1.
+        memory: stage -> expected memory, used while no earlier run has measured it.
     """
 
     stages: dict[str, Stage]
@@ -159,7 +172,14 @@ class Pipeline(Strict):
         return self
 
     def closure(self, target: str) -> list[str]:
-        """`target` and the stages that it needs, in order; every stage for `all`."""
+        """Return a stage and all stages that it needs directly or indirectly, in order.
+
+        Args:
+            target: name of the stage; "all" for all stages.
+
+        Raises:
+            Refused: the stage is unknown.
+        """
         if target == "all":
             return list(self.stages)
         if target not in self.stages:
@@ -173,14 +193,20 @@ class Pipeline(Strict):
 
 
 def unknown_name(kind: str, name: object, known: Any) -> str:
-    """The message for an unknown name, with the nearest known one or all that are known."""
+    """Return the message for an unknown name, with the most similar known name or else all known names.
+
+    Args:
+        kind: what is named, e.g. "stage".
+        name: the unknown name.
+        known: the known names.
+    """
     known = [str(k) for k in known]
     near = difflib.get_close_matches(str(name), known, n=1)
     return f"unknown {kind} {name!r}; " + (f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}")
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file of the project. Raises Refused where it is not valid or not a mapping."""
+    """Read a YAML file of the project as a dict. Raises Refused if it is not valid YAML or not a mapping."""
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), LOADER)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -191,7 +217,11 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def load_pipeline(root: Path) -> Pipeline:
-    """Read pipeline.yaml. Raises Refused where it is missing, ill-formed, or names an unknown stage."""
+    """Read pipeline.yaml in the folder `root`.
+
+    Raises:
+        Refused: the file is missing or ill-formed, or names an unknown stage or profile.
+    """
     path = root / "pipeline.yaml"
     if not path.is_file():
         raise Refused(f"{path}: no such file; the runner's --root is the folder that holds it")
@@ -207,15 +237,19 @@ def load_pipeline(root: Path) -> Pipeline:
 class SceneFile:
     """The content of a scene's optional scene.yaml."""
 
-    path: Path  # of the file, whether it exists or not
+    path: Path  # path of the file, which need not exist
     profile: str | None
-    brings: dict[str, Any]  # key -> value, of the keys that describe the scene
-    stages: Overrides
-    budget: Any = None
+    brings: dict[str, Any]  # the keys that describe the scene, such as `reference`, with their values
+    stages: Overrides  # parameters by stage
+    budget: Any = None  # time budget, as written
 
 
 def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
-    """Read the scene.yaml of a scene's folder. Raises Refused where a key, stage or type is wrong."""
+    """Read the scene.yaml in a scene's folder; its content is empty if it does not exist.
+
+    Raises:
+        Refused: a key or stage is unknown, or a value has a wrong type.
+    """
     path = folder / "scene.yaml"
     content = read_user_yaml(path, typed=("stages",))
     keys = [key for names in pipeline.scene_keys.values() for key in names]
@@ -234,12 +268,20 @@ def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
 
 
 def scene_name(scene: Path) -> str:
-    """The name of a scene: of its folder, or of a video without the ending."""
+    """Return the name of a scene: that of its folder, or that of its video without the ending."""
     return scene.stem if scene.is_file() else scene.name
 
 
 def find_scene(text: str, root: Path) -> Path:
-    """The folder or video that `scene=` means: a name under data/, or a path. Raises Refused where there is none."""
+    """Find the folder or video that `scene=` means.
+
+    Args:
+        text: a name under data/, or a path.
+        root: folder with pipeline.yaml.
+
+    Raises:
+        Refused: there is no such folder or video, or its name has characters that are not allowed.
+    """
     data = workplace(root) / "data"
     for scene in (data / text, Path(text).expanduser()):
         if text and (scene.is_dir() or scene.is_file()):

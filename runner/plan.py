@@ -1,4 +1,7 @@
-"""The second step: gives each stage a status and a reason, from what is on disk. Imports nothing heavy."""
+"""The second step of the runner: gives each stage a status and a reason, from the files on disk.
+
+Terms are explained in `runner`. This module imports nothing heavy.
+"""
 
 import json
 import os
@@ -27,30 +30,46 @@ from runner.process import ask_stages
 from runner.resolve import ResolvedJob, has_cuda
 from runner.text import format_bytes, join_names
 
-TO_DO, FINAL = ("run", "stale", "pending"), ("cached", "provided", "skip")  # statuses
+TO_DO, FINAL = ("run", "stale", "pending"), ("cached", "provided", "skip")  # statuses: may run, and will not run
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What a plan says of a stage.
+    """The decision of a plan about one stage.
 
-    Statuses: `run`; `cached`: its artifact is up to date; `provided`: the scene's own file takes its place; `skip`: it
-    is not needed; `missing`: it cannot run, as something is not there; `stale`: it waits for needs that run first, and
-    runs if they come out different; `pending`: known only after an earlier stage has run.
+    The status is one of:
+
+    - `run`: the stage must run.
+    - `cached`: its artifact is up to date.
+    - `provided`: a file of the scene replaces the stage.
+    - `skip`: the stage is not needed.
+    - `missing`: the stage cannot run, because something that it needs is not there.
+    - `stale`: the artifact is up to date so far, but some of its needs run first. The stage runs if their contents
+    change.
+    - `pending`: whether the stage runs is only known after an earlier stage has run.
     """
 
     status: str
     reason: str
-    path: Path | None = None  # the artifact as it is now; None where there is none or the stage is skipped
+    path: Path | None = None  # the current artifact; None if there is none or the stage is skipped
     is_final: bool = False  # this artifact, or its absence, will not change in this run
-    inputs: Inputs | None = None  # what the artifact depends on, where known
-    notes: tuple[str, ...] = ()  # what the stage reports before it runs
-    needed: tuple[dict[str, Any], ...] = ()  # the weights that it will use: reffusion.weights.Need
-    lacks: tuple[str, ...] = ()  # what this machine lacks for CUDA: a line each, with a remedy
+    inputs: Inputs | None = None  # everything that the artifact depends on; None if not yet known
+    notes: tuple[str, ...] = ()  # notes of the stage's preview
+    needed: tuple[dict[str, Any], ...] = ()  # the weights that it will use: fields of reffusion.weights.local.Need
+    lacks: tuple[str, ...] = ()  # what this machine lacks for CUDA, a line each with the remedy
 
 
 def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decision:
-    """The decision for `stage`, given those of the stages before it."""
+    """Decide about one stage, without asking the stage itself.
+
+    Args:
+        job: the job.
+        stage: name of the stage.
+        earlier: decisions about all earlier stages.
+
+    Raises:
+        Refused: the stage's file is broken, or a condition of pipeline.yaml cannot be evaluated.
+    """
     spec = job.pipeline.stages[stage]
     if stage in job.broken:
         raise Refused(job.broken[stage])
@@ -92,14 +111,14 @@ def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decisi
 
 
 def used_needs(job: ResolvedJob, stage: str) -> list[str]:
-    """The needs of a stage, without one that it ignores with these parameters."""
+    """Return the needs of a stage, without one that it ignores with its parameters (`pipeline.IgnoredNeed`)."""
     spec = job.pipeline.stages[stage]
     ignored = spec.ignore and _has_value(job, spec.ignore.param, spec.ignore.equals) and spec.ignore.need
     return [need for need in spec.all_needs if need != ignored]
 
 
 def _is_true(job: ResolvedJob, condition: Condition, earlier: dict[str, Decision]) -> bool | None:
-    """Whether a condition holds; None where this is not known yet."""
+    """Evaluate a condition of pipeline.yaml; None if an earlier stage must run before the answer is known."""
     stage, name = condition.names
     if job.brings.intersection(condition.unless):
         return False
@@ -118,7 +137,7 @@ def _is_true(job: ResolvedJob, condition: Condition, earlier: dict[str, Decision
 
 
 def _fact(folder: Path, name: str) -> Any:
-    """A value of an artifact's facts.json."""
+    """Return the value `name` of an artifact's facts.json. Raises Refused if there is no such value."""
     try:
         return json.loads((folder / "facts.json").read_text())[name]
     except (OSError, ValueError, KeyError):
@@ -126,14 +145,14 @@ def _fact(folder: Path, name: str) -> Any:
 
 
 def _format_reason(condition: Condition, earlier: dict[str, Decision]) -> str:
-    """The reason of a condition, with the facts that it names."""
+    """Return a condition's reason, in which the names of facts in braces are replaced by their values."""
     names = [name for _, name, _, _ in string.Formatter().parse(condition.reason) if name]
     folder = earlier[condition.names[0]].path if names else None
     return condition.reason.format(**{name: _fact(folder, name) for name in names}) if folder else condition.reason
 
 
 def _has_value(job: ResolvedJob, param: str, value: Any) -> bool:
-    """Whether the parameter `<stage>.<name>` has this value."""
+    """Return whether the parameter `<stage>.<name>` has this value. Raises Refused if there is no such parameter."""
     params = flatten_params(job.params)
     if param not in params:
         raise Refused(f"{job.root / 'pipeline.yaml'}: a condition asks for {param}, which is not there")
@@ -141,12 +160,20 @@ def _has_value(job: ResolvedJob, param: str, value: Any) -> bool:
 
 
 def _existing_artifact(job: ResolvedJob, stage: str) -> Path | None:
-    """The stage's artifact of this run, else of the scene's own run, up to date or not."""
+    """Return the stage's artifact in the job's folder, or else in that of the scene's own run (for a variant).
+
+    The artifact may be out of date. None if there is none.
+    """
     return next((home / stage for home in (job.home, job.base) if (home / stage / RECEIPT).is_file()), None)
 
 
 def _weights(job: ResolvedJob, stage: str) -> Iterator[tuple[str, str, Path | None]]:
-    """For each parameter that names weights: its name, its value, and the local path, None for a published id."""
+    """Yield the parameters of a stage that name weights.
+
+    Yields:
+        (name of the parameter, its value, path). The path is None if the value is the id of a published model, and may
+        not exist otherwise. Parameters without a value are left out.
+    """
     for param in job.stages[stage].weights:
         if name := flatten_params(job.params[stage])[param]:
             path = job.root / Path(name).expanduser()
@@ -155,7 +182,17 @@ def _weights(job: ResolvedJob, stage: str) -> Iterator[tuple[str, str, Path | No
 
 
 def _inputs(job: ResolvedJob, stage: str, needs: dict[str, Path | None], code: dict[str, str]) -> Inputs:
-    """What the stage's artifact depends on, with its needs at these paths."""
+    """Compute the inputs of a stage: everything on which its artifact depends.
+
+    Args:
+        job: the job.
+        stage: name of the stage.
+        needs: need -> folder of its artifact; None if the need is skipped.
+        code: file -> fingerprint, see `keys.code_fingerprints`.
+
+    Raises:
+        Refused: scene.yaml names a folder that contains the scene itself.
+    """
     own = job.stages[stage]
     hashes = {need: job.hashes.folder(path) if path else None for need, path in needs.items()}
     hashes |= {f"{SCENE}: {name}": digest(json.dumps(fact)) for name, fact in own.facts.items()}
@@ -173,9 +210,12 @@ def _inputs(job: ResolvedJob, stage: str, needs: dict[str, Path | None], code: d
 
 
 def _compare_receipts(job: ResolvedJob, stage: str, inputs: Inputs) -> Decision:
-    """Cached where a receipt (the variant's own, else the scene's) agrees with the inputs and with its artifact.
+    """Decide between `cached` and `run` by comparing receipts with the current inputs.
 
-    Else run, with the differences as reason."""
+    The stage is cached if a receipt, that of the variant or else that of the scene's own run, agrees with the inputs,
+    and the files of its artifact agree with the receipt. Otherwise it runs, and the reason names the differences. With
+    `trust`, differences of code alone are accepted.
+    """
     places = [home / stage for home in dict.fromkeys((job.home, job.base))]
     receipts = [(place, list_changes(found, inputs), found) for place in places if (found := read_receipt(place))]
     reasons = []
@@ -195,14 +235,20 @@ def _compare_receipts(job: ResolvedJob, stage: str, inputs: Inputs) -> Decision:
 
 
 def _damage(job: ResolvedJob, diff: ArtifactDiff) -> list[str]:
-    """Why an artifact cannot be used, a phrase each: files are missing or changed."""
+    """Return why an artifact cannot be used, a phrase each; empty if it can.
+
+    Reasons are missing files and, unless the job has `keep`, changed files.
+    """
     missing = [f"{join_names(diff.missing)} missing"] if diff.missing else []
     changed = [f"{join_names(diff.changed)} changed since (keep=1 keeps it)"] if diff.changed and not job.keep else []
     return missing + changed
 
 
 def _check_device(job: ResolvedJob, stage: str, decision: Decision) -> Decision:
-    """The decision, or `missing` for a stage on CUDA without a GPU; cached artifacts are valid on any machine."""
+    """Return the decision, or the decision `missing` if the stage would run on CUDA and there is no GPU.
+
+    A cached artifact is not affected, because it is valid on any machine.
+    """
     if decision.status not in TO_DO or job.params[stage].get("device") != "cuda":
         return decision
     if has_cuda() if job.cuda is None else job.cuda:
@@ -213,21 +259,33 @@ def _check_device(job: ResolvedJob, stage: str, decision: Decision) -> Decision:
 
 
 def partial_folder(job: ResolvedJob, stage: str, key: str) -> Path:
-    """The folder in which the stage works; the same key resumes there."""
+    """Return the folder in which a stage works until it is finished. A run with the same key resumes there."""
     return job.home / f".partial-{stage}-{key}"
 
 
 def plan(job: ResolvedJob, stages: list[str], done: dict[str, Decision] | None = None) -> dict[str, Decision]:
-    """The decisions for `stages`, in order; `done` has those already made.
+    """Decide about stages, and ask those that may run for notes, needed weights and missing hardware.
 
-    Asks each stage that may run for its notes and the weights that it needs; these answers are not cached."""
+    The answers of the stages are not cached.
+
+    Args:
+        job: the job.
+        stages: the stages, in order.
+        done: decisions that are already made, while the job runs.
+
+    Returns:
+        Stage -> decision, in the order of `stages`.
+
+    Raises:
+        Refused: a stage is broken or a condition cannot be evaluated.
+    """
     decisions = dict(done or {})
     for stage in stages:
         if stage not in decisions:
             decisions[stage] = _check_device(job, stage, decide(job, stage, decisions))
     questions = [_stage_question(job, stage, decisions) for stage in stages if decisions[stage].status not in FINAL]
     for question, answer in zip(questions, ask_stages(job.root, questions), strict=True):
-        if "broken" in answer and not done:  # while a job runs, it may be mended before its turn comes
+        if "broken" in answer and not done:  # while a job runs, the user may still repair the stage
             raise Refused(answer["broken"])
         decisions[question["stage"]] = _apply_answer(job, question, decisions[question["stage"]], answer)
     job.hashes.save()
@@ -235,9 +293,12 @@ def plan(job: ResolvedJob, stages: list[str], done: dict[str, Decision] | None =
 
 
 def _stage_question(job: ResolvedJob, stage: str, decisions: dict[str, Decision]) -> dict[str, Any]:
-    """The question to a stage, see `worker.describe`. A stage that may run gets the paths of its needs, for a preview.
-    A stage that reads the scene is asked before its other needs are made, so that it can refuse early; it gets the
-    paths of the needs that are final already."""
+    """Build the question to a stage, see `worker.describe`.
+
+    If the stage may run, the question has the paths of its needs, and thereby asks for a preview. A stage that reads
+    the scene is asked for a preview even if its other needs have not run yet, so that it can refuse the scene early.
+    Then only needs that are final have a path.
+    """
     spec, question = job.pipeline.stages[stage], job.question(stage)
     others = {need: decisions[need] for need in spec.all_needs if need != SCENE}
     needs = {need: each.path for need, each in others.items() if each.is_final or SCENE not in spec.all_needs}
@@ -248,11 +309,21 @@ def _stage_question(job: ResolvedJob, stage: str, decisions: dict[str, Decision]
 
 
 def _apply_answer(job: ResolvedJob, question: dict[str, Any], decision: Decision, answer: dict[str, Any]) -> Decision:
-    """The decision with the stage's notes; `missing` where the stage refuses or something is not there."""
+    """Add a stage's answer to the decision about it.
+
+    The decision becomes `missing` if the machine lacks something for CUDA, if weights are missing that the stage cannot
+    do without, or if the stage refuses.
+
+    Args:
+        job: the job.
+        question: the question to the stage, from `_stage_question`.
+        decision: the decision so far.
+        answer: the answer, see `worker._describe`.
+    """
     needed, notes = (tuple(answer.get(name, ())) for name in ("needed", "notes"))
     if decision.status not in TO_DO:
         return replace(decision, needed=needed)
-    if job.cuda is None and (absent := tuple(answer.get("lacks", ()))):  # this machine runs the stages
+    if job.cuda is None and (absent := tuple(answer.get("lacks", ()))):  # None: stages run on this machine
         reason = f"{question['stage']}.device is cuda, and {absent[0]}"
         return Decision("missing", reason, needed=needed, lacks=absent)
     cure, lacks = f"`make weights profile={job.profile}` fetches it", [need for need in needed if need["problem"]]
@@ -261,14 +332,17 @@ def _apply_answer(job: ResolvedJob, question: dict[str, Any], decision: Decision
         return Decision("missing", need["problem"] + fetch, needed=needed)
     if lacks:
         notes += (f"{lacks[0]['problem']}; {cure} ({format_bytes(sum(need['bytes'] or 0 for need in lacks))})",)
-    if "refusal" in answer and (decision.inputs or SCENE in question["takes"]):  # its preview saw the final needs
+    if "refusal" in answer and (decision.inputs or SCENE in question["takes"]):  # the needs are final
         decision = replace(decision, status="missing", reason=answer["refusal"])
     return replace(decision, notes=notes, needed=needed)
 
 
 def plan_table(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
-    """The plan as text: the profile and its reason; a line per stage with status, expected time, reason and notes; the
-    weights to fetch; files that are read outside the scene's folder."""
+    """Format a plan as text.
+
+    It has a line with the profile and the reason for it, a line per stage with status, expected time and reason, the
+    notes of the stages, the weights to fetch, and the folders outside the scene's folder from which files are read.
+    """
     lines = [f"{job.home.name} (profile {job.profile}: {job.why})"]
     for stage, decision in decisions.items():
         seconds = expected_seconds(job, stage) if decision.status in TO_DO else None
@@ -288,7 +362,10 @@ def plan_table(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
 
 
 def _paths_outside_scene(job: ResolvedJob, stages: list[str]) -> list[Path]:
-    """Paths outside the scene's folder that the stages read, as scene.yaml or the capture's own files name them."""
+    """Return the paths outside the scene's folder that the stages read, sorted.
+
+    scene.yaml or files of the capture name such paths.
+    """
     readers = [stage for stage in stages if stage in job.stages and SCENE in job.pipeline.stages[stage].all_needs]
     reads = [path for stage in readers for path in files_outside(job.stages[stage].reads or (), job.folder)]
     named = [
@@ -301,8 +378,16 @@ def _paths_outside_scene(job: ResolvedJob, stages: list[str]) -> list[Path]:
 
 
 def plan_record(job: ResolvedJob, decisions: dict[str, Decision], unset: ResolvedJob) -> dict[str, Any]:
-    """The plan for plan.json, which the report reads: for each stage its status, reason, notes and folder below runs/;
-    and the parameters of `unset`, the same job without `set=` and `budget=`."""
+    """Return the content of plan.json, which the report reads.
+
+    It has the profile; for each stage its status, reason, notes and folder relative to runs/; and the parameters
+    without the user's options.
+
+    Args:
+        job: the job.
+        decisions: the plan, stage -> decision.
+        unset: the same job without `set=` and `budget=`, whose parameters are recorded.
+    """
     folder = lambda path: path and os.path.relpath(path, job.runs)
     entry = lambda d: {"word": d.status, "reason": d.reason, "notes": list(d.notes), "folder": folder(d.path)}
     stages = {stage: entry(decision) for stage, decision in decisions.items()}
@@ -310,12 +395,15 @@ def plan_record(job: ResolvedJob, decisions: dict[str, Decision], unset: Resolve
 
 
 def earlier_receipts(job: ResolvedJob, stage: str) -> list[dict[str, Any]]:
-    """Receipts of the stage on this scene and on its variants."""
+    """Return the receipts of a stage in the scene's own run and in its variants."""
     places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
     return [receipt for place in places if (receipt := read_receipt(place / stage))]
 
 
 def expected_seconds(job: ResolvedJob, stage: str) -> float | None:
-    """Seconds of the stage's last run on this scene or a variant of it, on this machine with this profile."""
+    """Return how many seconds the stage took in its last run on this scene or a variant of it; None if unknown.
+
+    Only runs on this machine and with this profile count.
+    """
     here = [r for r in earlier_receipts(job, stage) if r.get("machine") == MACHINE and r.get("profile") == job.profile]
     return max(here, key=lambda r: r["date"])["seconds"] if here else None

@@ -1,4 +1,7 @@
-"""Shows the progress of many runs: a live table on a terminal, a line for each event elsewhere."""
+"""Display of the progress of many runs: a live table on a terminal, or else a line per event.
+
+A run is one scene, or a variant of one, with all stages.
+"""
 
 import shutil
 import sys
@@ -12,14 +15,22 @@ from runner import say
 from runner.files import read_receipt
 from runner.text import format_seconds
 
-MAX_RECEIPTS = 50  # runs, at most, whose receipts give expected seconds of stages
-REDRAW_SECONDS = 1.0  # between drawings of the table
-WAITS, RUNS = "waits", "runs"  # states of a stage: until it has cores and memory; until its end
+MAX_RECEIPTS = 50  # largest number of runs whose receipts are read for the expected duration of stages
+REDRAW_SECONDS = 1.0  # time between two drawings of the table
+WAITS, RUNS = "waits", "runs"  # states of a stage: it waits for cores and memory; its process runs
 
 
 @dataclass
 class _Row:
-    """One run: its current stage, the time since when (monotonic seconds), and the stages that it has finished."""
+    """The progress of one run.
+
+    Attributes:
+        name: name of the run.
+        stage: the current stage; "" between stages and after the end.
+        state: state of the current stage, or a text such as "not started", "done in ..." or "failed: ...".
+        since: when this state began, in seconds of the monotonic clock.
+        finished: the stages that are done.
+    """
 
     name: str
     stage: str = ""
@@ -29,10 +40,21 @@ class _Row:
 
 
 class Progress:
-    """A context manager that threads, whose own output goes elsewhere, inform of events."""
+    """A context manager that shows the progress of runs while it is entered.
+
+    The threads of the runs report events by `update` and `end`. Their own output must not go to the terminal.
+    """
 
     def __init__(self, names: list[str], homes: list[Path], stages: list[str], at_once: int, header: str):
-        """`header` is printed above the table."""
+        """Prepare the table of progress.
+
+        Args:
+            names: name of each run. In `update` and `end`, a run is identified by its index here.
+            homes: folder of each run, whose receipts tell how long stages took before.
+            stages: all stages, in order.
+            at_once: number of runs that run at the same time.
+            header: text above the table.
+        """
         self._rows = [_Row(name) for name in names]
         self._stages, self._at_once, self._header = stages, at_once, header
         self._seconds: dict[str, list[float]] = {stage: [] for stage in stages}
@@ -57,7 +79,12 @@ class Progress:
             self._draw()
 
     def update(self, place: int, stage: str, state: str) -> None:
-        """The stage of a run waits, runs, or is done (also where it need not run)."""
+        """Report the new state of a stage of a run.
+
+        Args:
+            place: index of the run.
+            state: WAITS, RUNS, or any other text if the stage is done or need not run.
+        """
         with self._lock:
             row, now = self._rows[place], time.monotonic()
             if state in (WAITS, RUNS):
@@ -73,7 +100,13 @@ class Progress:
             print(f"{time.strftime('%H:%M:%S')} {row.name}: {stage}{about}", flush=True)
 
     def end(self, place: int, error: str | None, seconds: float) -> None:
-        """A run has ended, with an error or without."""
+        """Report the end of a run.
+
+        Args:
+            place: index of the run.
+            error: message of the error; None if the run succeeded.
+            seconds: duration of the run.
+        """
         with self._lock:
             row = self._rows[place]
             row.stage, row.state = "", f"failed: {error}" if error else f"done in {format_seconds(seconds)}"
@@ -83,7 +116,10 @@ class Progress:
             print(f"{time.strftime('%H:%M:%S')} {row.name}: {row.state} ({ended} of {len(self._rows)})", flush=True)
 
     def table(self, width: int, height: int) -> list[str]:
-        """The lines of the table, cut to the terminal's size: first the runs in progress, then those that failed."""
+        """Return the lines of the table, cut to a terminal of `width` columns and `height` lines.
+
+        A line with totals comes first, then the runs in progress, then the runs that failed.
+        """
         with self._lock:
             ended = [row for row in self._rows if row.finished == set(self._stages)]
             failed = [row for row in ended if row.state.startswith("failed")]
@@ -106,7 +142,10 @@ class Progress:
         return f"for {since}" + ("" if seconds is None else f"; {format_seconds(seconds)} left of all its stages")
 
     def _seconds_left(self, row: _Row) -> float | None:
-        """Expected seconds to the end of a run, from earlier runs of its stages on any scene; None: not known."""
+        """Estimate the seconds to the end of a run, from the mean duration of each stage in earlier runs.
+
+        Returns None if the duration of a remaining stage is unknown.
+        """
         total = 0.0
         for stage in self._stages:
             if stage not in row.finished:
@@ -122,7 +161,7 @@ class Progress:
             self._draw()
 
     def _draw(self) -> None:
-        """Draw the table over the last one: move the cursor up and clear what is below."""
+        """Print the table in place of the one before: move the cursor up, clear the lines below, and print."""
         size = shutil.get_terminal_size()
         lines = self.table(size.columns, size.lines)
         up = f"\x1b[{self._line_count}A" if self._line_count else ""

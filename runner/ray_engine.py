@@ -1,6 +1,8 @@
-"""Runs stages on a Ray cluster whose machines share results, scenes and this checkout at equal paths.
+"""The engine for Ray clusters, whose machines must share the results, the scenes and this checkout at equal paths.
 
-Ray places each stage's process by its cores, GPUs and memory, and again where a machine is lost (retry.py)."""
+Ray selects a machine for each stage's process by cores, GPUs and memory. If a machine is lost, the stage runs again on
+another one (retry.py).
+"""
 
 import logging
 import os
@@ -17,13 +19,15 @@ from runner.engine import GRACE, Resources, StageResult, Task
 from runner.retry import run_attempt
 from runner.text import format_error
 
-RETRIES = 3  # times that a stage is started again after its machine was lost
+RETRIES = 3  # number of times that a stage is started again after its machine was lost
 
 
 class RayEngine:
-    """See `engine.Engine`.
+    """The engine for Ray, see `engine.Engine`.
 
-    `address` is that of a running cluster, as ray.init takes it; None: $RAY_ADDRESS, or one on this machine."""
+    Its `address` is that of a running cluster, as ray.init takes it; None for $RAY_ADDRESS, or a cluster on this
+    machine.
+    """
 
     is_remote = True
 
@@ -48,8 +52,13 @@ class RayEngine:
         self._stopped = False
 
     def run(self, task: Task, resources: Resources, lock: int, on_start: Callable[[], None]) -> StageResult:
-        """See `Engine.run`. The lock stays with the runner. A stage that asks for more memory than any machine has gets
-        all of one."""
+        """Run a task on a machine of the cluster, see `Engine.run`. Only the runner holds the lock.
+
+        A stage that asks for more memory than any machine has reserves 95 % of the memory of the largest machine.
+
+        Raises:
+            Failed: the machine of the stage was lost more than `RETRIES` times.
+        """
         if self._stopped:
             raise KeyboardInterrupt
         cores = resources.cores or 1
@@ -58,12 +67,12 @@ class RayEngine:
         line = task.line | {"cores": cores}
         ref = _remote_task.options(**options, name=str(line["stage"])).remote(Task(task.root, line, task.output))
         self._refs.add(ref)
-        if self._stopped:  # meanwhile
+        if self._stopped:  # `stop` was called while the task was submitted
             ray.cancel(ref)
         on_start()
         try:
             result = self._wait(ref)
-        except TaskCancelledError:  # before it started
+        except TaskCancelledError:  # the task was cancelled before it started
             raise KeyboardInterrupt from None
         except RayError as error:
             if self._stopped:
@@ -78,7 +87,11 @@ class RayEngine:
         return result
 
     def _wait(self, ref: "ray.ObjectRef[StageResult]") -> StageResult:
-        """The result. Interrupted, waits for the end of the stage, as Ray kills it at once when this process ends."""
+        """Wait for a task, and return its result.
+
+        On an interrupt (Ctrl-C) the engine is stopped, and this method waits for the stage to end, because Ray kills
+        the stage as soon as this process ends.
+        """
         try:
             return ray.get(ref)
         except KeyboardInterrupt:
@@ -92,14 +105,15 @@ class RayEngine:
             ray.cancel(ref)
 
 
-_stop = threading.Event()  # set in a process of Ray that works for a stopped runner
+_stop = threading.Event()  # in a process of Ray: set when the runner was stopped
 
 
 def run_task(task: Task) -> StageResult:
-    """Run a task, on the machine that works.
+    """Run a task on the machine that Ray selected; this function runs there.
 
-    Ray cancels by a KeyboardInterrupt at any point of this thread, which would discard a finished result. The signal
-    only sets a flag instead, which is read while there is a process to interrupt."""
+    Ray cancels a task by a KeyboardInterrupt, which may be raised anywhere in this thread and could discard a finished
+    result. So the signal only sets a flag here, which is read while the stage's process runs.
+    """
     signal.signal(signal.SIGINT, lambda *_: _stop.set())
     if _stop.is_set():
         return StageResult({}, -signal.SIGINT)

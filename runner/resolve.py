@@ -1,4 +1,7 @@
-"""The first step: turns a request into a job, with everything that it names read and checked."""
+"""The first step of the runner: turns a request into a job, with everything that it names read and checked.
+
+Terms are explained in `runner`.
+"""
 
 import json
 import os
@@ -24,14 +27,14 @@ from runner.pipeline import (
 )
 from runner.process import ask_stages
 
-AUTO = "auto"  # the profile that suits this machine
+AUTO = "auto"  # stands for the profile that suits this machine
 WORKER = Path(__file__).with_name("worker.py")
-CACHED = "answer "  # prefix of the keys of answers that are cached
+CACHED = "answer "  # prefix of the keys in the cache of hashes under which answers of stages are cached
 
 
 @dataclass(frozen=True)
 class Request:
-    """What the command line asks for: texts as typed, None where not given."""
+    """The options of a command line, as typed; None if an option is not given."""
 
     root: Path
     runs: Path
@@ -42,26 +45,26 @@ class Request:
     set: str = ""
     budget: str | None = None
     keep: bool = False
-    cuda: bool | None = None  # do the machines that run stages have a GPU? None: stages run here, see `has_cuda`
-    compared: bool = False  # use the profile that `comparisons` of pipeline.yaml names
+    cuda: bool | None = None  # whether the cluster has GPUs; None if stages run on this machine, see `has_cuda`
+    compared: bool = False  # True uses the profile that `comparisons` of pipeline.yaml names
 
 
 @dataclass(frozen=True)
 class StageInfo:
-    """A stage's description of itself."""
+    """The description of a stage with given parameters, as the stage's own code gives it."""
 
     params: dict[str, Any]  # all parameters, groups nested
     weights: tuple[str, ...] = ()  # dotted names of the parameters that name weights
     unkeyed: tuple[str, ...] = ()  # dotted names of the parameters that do not change the artifact
-    reads: tuple[str, ...] | None = None  # the files of the scene that it reads; None: all
-    facts: dict[str, Any] = field(default_factory=dict)  # what it uses of other files, such as their names
-    machine: dict[str, str] = field(default_factory=dict)  # properties of this machine that it depends on
-    unavailable: tuple[str, ...] = ()  # optional things that this machine does not have
+    reads: tuple[str, ...] | None = None  # the files of the scene that it reads; None for all
+    facts: dict[str, Any] = field(default_factory=dict)  # facts about files that it does not read, e.g. their names
+    machine: dict[str, str] = field(default_factory=dict)  # facts about this machine on which the artifact depends
+    unavailable: tuple[str, ...] = ()  # optional features, such as LPIPS, that this machine does not have
 
 
 @dataclass(frozen=True)
 class ResolvedJob:
-    """One scene with all its settings, resolved and checked."""
+    """A job: one scene, or a variant of it, with all its settings, resolved and checked."""
 
     root: Path
     runs: Path
@@ -69,41 +72,53 @@ class ResolvedJob:
     home: Path  # runs/<scene>, or runs/<scene>@<variant>
     base: Path  # runs/<scene>: artifacts that variants share
     pipeline: Pipeline
-    layers: Layers  # parameters as they were asked for
+    layers: Layers  # the parameters as the user and the files ask for them, without defaults of stages
     profile: str
     why: str  # the reason for this profile
     trust: bool
     brings: frozenset[str]  # the keys of scene.yaml that have values
     hashes: Hashes
-    keep: bool = False  # keep artifacts that people changed
+    keep: bool = False  # True accepts artifacts that people changed
     cuda: bool | None = None  # as in Request
     stages: dict[str, StageInfo] = field(default_factory=dict)
-    broken: dict[str, str] = field(default_factory=dict)  # stages that cannot be imported -> what is wrong
+    broken: dict[str, str] = field(default_factory=dict)  # stages that cannot be imported -> the error
 
     @property
     def params(self) -> dict[str, dict[str, Any]]:
-        """stage -> all its parameters."""
+        """Stage -> all its parameters, defaults included; groups are nested dicts."""
         return {stage: each.params for stage, each in self.stages.items()}
 
     def question(self, stage: str) -> dict[str, Any]:
-        """The question to a stage about its weights, see `worker.describe`. They depend on what the scene brings: keys
-        of its scene.yaml and its folders. The answer is not cached, as weights come and go."""
+        """Build the question to a stage about the weights that it needs, see `worker.describe`.
+
+        The weights depend on what the scene brings, so the question has the keys of scene.yaml and the names of the
+        scene's folders. The answer is not cached, because weights may be downloaded or removed at any time.
+        """
         folders = [path.name for path in self.folder.iterdir() if path.is_dir()] if self.folder != self.root else ()
         question = {"stage": stage, "params": self.stages[stage].params, "takes": self.pipeline.stages[stage].all_needs}
         return question | {"brings": sorted({*self.brings, *folders})}
 
 
 def resolve(request: Request, hashes: Hashes | None = None, scene: bool = True) -> ResolvedJob:
-    """Read and check everything that a request names; with `scene=False` for no scene in particular.
+    """Read and check everything that a request names.
+
+    Args:
+        request: the request.
+        hashes: the cache of hashes; None reads it from runs/.
+        scene: False for a job without a scene, such as the download of weights.
 
     Raises:
-        Refused: something is wrong; the message says how to fix it.
+        Refused: something is wrong; the message says how to correct it.
     """
     return resolve_all([request], hashes or Hashes(request.runs / HASHES), scene)[0]
 
 
 def resolve_all(requests: list[Request], hashes: Hashes, scene: bool = True) -> list[ResolvedJob]:
-    """Resolve several requests with one root. Asks all stages at once, and only what is not in the cache."""
+    """Resolve several requests, which must have the same root.
+
+    All questions to stages whose answers are not in the cache are sent to one process. For the arguments and errors see
+    `resolve`.
+    """
     drafts = [_draft(request, hashes, scene) for request in requests]
     questions = [_questions(job) for job in drafts]
     new = {name: question for each in questions for name, question in each.items() if name not in hashes.known}
@@ -119,7 +134,7 @@ def resolve_all(requests: list[Request], hashes: Hashes, scene: bool = True) -> 
 
 
 def _draft(request: Request, hashes: Hashes, scene: bool) -> ResolvedJob:
-    """A job without the descriptions of its stages."""
+    """Resolve everything of a request but the descriptions of the stages; for the arguments see `resolve`."""
     root, runs, variant, pipeline = request.root, request.runs, request.variant, load_pipeline(request.root)
     source = find_scene(request.scene, root) if scene else None
     base = runs / (scene_name(source) if source else "")
@@ -147,7 +162,20 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> ResolvedJob:
 def choose_profile(
     asked: str | None, scene: SceneFile, pinned: list[Path], pipeline: Pipeline, cuda: bool | None = None
 ) -> tuple[str, str]:
-    """The profile, and why: the one asked for, else of scene.yaml, else of the scene's last run, else by machine."""
+    """Choose the profile: the one asked for, else that of scene.yaml, else that of the last run, else by the machine.
+
+    Args:
+        asked: the option `profile`; None if not given.
+        scene: the content of scene.yaml.
+        pinned: files that record the profile of the last run; the first one with a text counts.
+        cuda: as in `Request`.
+
+    Returns:
+        Name of the profile, and the reason for it in words.
+
+    Raises:
+        Refused: the profile is unknown.
+    """
     origin = "profile" if asked else f"{scene.path}: profile"
     why = "asked for" if asked else f"{scene.path.name} says so"
     profile = asked or scene.profile or AUTO
@@ -165,14 +193,23 @@ def choose_profile(
 
 
 def has_cuda() -> bool:
-    """Is there an NVIDIA driver with a visible device? Looks at the system, without importing torch."""
+    """Return whether this machine has an NVIDIA driver and CUDA_VISIBLE_DEVICES does not hide all devices.
+
+    Only files of the system are looked at; torch is not imported.
+    """
     if os.environ.get("CUDA_VISIBLE_DEVICES", "unset") in ("", "-1"):
         return False
     return any(Path(p).exists() for p in ("/proc/driver/nvidia/version", "/dev/nvidia0", "/usr/lib/wsl/lib/libcuda.so"))
 
 
 def check_unique_name(base: Path, folder: Path | None, root: Path) -> None:
-    """Raise Refused where the artifacts in `base` were made from another scene of the same name."""
+    """Raise Refused if the artifacts in `base` were made from another scene with the same name.
+
+    Args:
+        base: folder of the scene's artifacts, runs/<scene>.
+        folder: folder of the scene; None for a job without a scene.
+        root: folder with pipeline.yaml.
+    """
     before = root / read_text(base / "source")
     if folder and before not in (root, folder) and before.is_dir():
         raise Refused(
@@ -182,7 +219,11 @@ def check_unique_name(base: Path, folder: Path | None, root: Path) -> None:
 
 
 def _questions(job: ResolvedJob) -> dict[str, dict[str, Any]]:
-    """Key of the answer -> question, for each stage that has a file; see `worker.describe`."""
+    """Build the questions to all stages that have a file, see `worker.describe`.
+
+    Returns:
+        Key under which the answer may be cached -> question.
+    """
     questions = {}
     for stage, spec in job.pipeline.stages.items():
         if (job.root / "stages" / f"{stage}.py").is_file():
@@ -194,15 +235,17 @@ def _questions(job: ResolvedJob) -> dict[str, dict[str, Any]]:
 
 
 def _answer_key(job: ResolvedJob, question: dict[str, Any]) -> str:
-    """A key that changes with everything that the answer depends on; answers under a CACHED key are cached.
+    """Return a key for the answer to a question, which changes with everything on which the answer depends.
 
-    A process that imports stages takes half a second to start, and so may listing the files that a stage reads."""
+    The answer is cached if the key begins with CACHED. Caching saves half a second, which a process that imports stages
+    takes to start, and as much for finding the files that a stage reads.
+    """
     stage, plan, listed = question["stage"], "stages/plan", list_files(job.folder) if "scene" in question else ()
     try:
         folder = plan if (job.root / plan / f"{stage}.py").is_file() else "stages"
         code = code_fingerprints(job.root, stage, job.hashes, folder)
         code["run"] = job.hashes.module(job.root / "stages" / f"{stage}.py", job.root)[0]
-    except Refused:  # not valid Python: reported as broken
+    except Refused:  # the code is not valid Python, which the answer reports as broken
         return json.dumps(question)
     if "scene" in question and any(paths_outside(question["params"], job.folder)):
         return json.dumps(question)  # the answer may depend on files outside the scene
@@ -211,7 +254,16 @@ def _answer_key(job: ResolvedJob, question: dict[str, Any]) -> str:
 
 
 def _add_descriptions(job: ResolvedJob, questions: dict[str, dict[str, Any]], answers: dict[str, Any]) -> ResolvedJob:
-    """The job with the descriptions of its stages. Raises Refused for the first parameter that is wrong."""
+    """Add the descriptions of the stages to a job.
+
+    Args:
+        job: the job from `_draft`.
+        questions: from `_questions`.
+        answers: key -> answer, see `worker._describe`.
+
+    Raises:
+        Refused: a parameter is wrong; the message is about the first one.
+    """
     broken = {name: f"stages/{name}.py: no such file, and pipeline.yaml names it" for name in job.pipeline.stages}
     stages = {}
     for name, question in questions.items():
@@ -228,7 +280,13 @@ def _add_descriptions(job: ResolvedJob, questions: dict[str, dict[str, Any]], an
 
 
 def _refusal(stage: str, error: dict[str, Any], known: list[str]) -> str:
-    """The message for a parameter that is wrong."""
+    """Return the message for a wrong parameter.
+
+    Args:
+        stage: the stage.
+        error: see `worker._error`.
+        known: dotted names of all parameters of the stage.
+    """
     if error["unknown"]:
         return f"stage {stage}: {unknown_name('parameter', error['where'], known)}"
     return f"{stage}.{error['where']} = {error['value']}: {error['message']}"

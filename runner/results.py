@@ -1,4 +1,4 @@
-"""Prints the scores of a run, and calls report/ for tables and pages."""
+"""Printing of a run's scores, and calls of report/ for tables and pages."""
 
 import os
 import subprocess
@@ -13,16 +13,28 @@ from runner.process import PROJECT
 from runner.resolve import Request
 from runner.text import display_path
 
-SCENE_FILE = "scene.ply"  # of the stage `evaluate`
+SCENE_FILE = "scene.ply"  # file with the result in the artifact of the stage `evaluate`
 
 
 def mean_scores(evaluate: Path | None, key: str = "mean") -> dict[str, float | None]:
-    """The mean scores in an artifact of `evaluate`; with `key="initialize"` those of the initialization."""
+    """Read the mean scores from an artifact of the stage `evaluate`.
+
+    Args:
+        evaluate: folder of the artifact; None if the stage was skipped.
+        key: "mean" for the scores of the result, "initialize" for those of the initialization.
+
+    Returns:
+        Name of the score -> mean over the views, None where no view has this score; empty without an artifact.
+    """
     return (read_json(evaluate / "metrics.json") or {}).get(key, {}) if evaluate else {}
 
 
 def show_results(stage: str, folder: Path | None, request: Request) -> None:
-    """Print where the results of a stage are; after `evaluate` also the mean scores and the commands to open them."""
+    """Print the folder and the files of a stage's result.
+
+    For `evaluate`, also print the mean scores and the commands that open the scene and the report. A skipped stage,
+    whose folder is None, prints nothing.
+    """
     if folder is None:
         return
     if stage == "evaluate":
@@ -41,8 +53,11 @@ def show_results(stage: str, folder: Path | None, request: Request) -> None:
 
 
 def format_command(request: Request, command: str) -> str:
-    """What to type for another command on the same scene and results: `make` in a checkout, where it also installs what
-    the command needs, else `reffusion`."""
+    """Return the command line that runs another command on the scene and results of `request`.
+
+    In a checkout it is a `make` command, which also installs what the command needs. For an installed package it is a
+    `reffusion` command.
+    """
     runs = "" if request.runs == workplace(request.root) / "runs" else display_path(request.runs)
     options = {"scene": request.scene, "variant": request.variant, "runs": runs}
     if is_installed(request.root):
@@ -51,13 +66,20 @@ def format_command(request: Request, command: str) -> str:
 
 
 def write_table(record: Path) -> None:
-    """Let report/table.py write the table of a batch or a comparison beside its record."""
+    """Run report/table.py, which writes the table of a batch or a comparison to the folder of its record.
+
+    Args:
+        record: the JSON file with the record.
+
+    Raises:
+        Failed: the table could not be written.
+    """
     if call_report("table", str(record)):
         raise Failed(f"the table of {display_path(record)} could not be written (see above)")
 
 
 def call_report(module: str, *arguments: str) -> int:
-    """Run `python -m report.<module>`; its exit code."""
+    """Run `python -m report.<module>` with these arguments, and return its exit code."""
     path = os.pathsep.join(filter(None, [str(PROJECT), os.environ.get("PYTHONPATH", "")]))
     command = [sys.executable, "-m", f"report.{module}", *arguments]
     return subprocess.run(command, env={**os.environ, "PYTHONPATH": path}).returncode

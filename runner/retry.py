@@ -1,7 +1,8 @@
-"""Runs a task again after its machine was lost, in a folder shared by all machines.
+"""Repeated attempts at a task on a cluster, whose machines may be lost and share the folder of results.
 
-Each attempt works in a folder with a name of its own, so that a machine that was given up and still works writes to a
-folder that is gone. Only the runner holds locks, never the machines that work."""
+Each attempt works in a folder with a name of its own. So a machine that was taken for lost, but still works, writes to
+a folder that is no longer used. Only the runner holds locks; the machines that run stages hold none.
+"""
 
 import shutil
 import uuid
@@ -13,9 +14,15 @@ from runner.engine import StageResult, Task, run_process
 
 
 def run_attempt(task: Task, should_stop: Callable[[], bool] | None = None) -> StageResult:
-    """Run a task on this machine, in a folder that no other attempt writes to, from the state that an earlier one left.
+    """Run a task on this machine, from the state that an earlier attempt left.
 
-    The folder has the task's own name again at the end. `should_stop`: see `engine.run_process`."""
+    The attempt works in a folder that no other attempt writes to. At the end this folder is renamed to the task's own
+    folder.
+
+    Args:
+        task: the work.
+        should_stop: see `engine.run_process`.
+    """
     out = Path(task.line["out"])
     own = out.with_name(f"{out.name}.{uuid.uuid4().hex[:8]}")
     take_over(out)
@@ -24,14 +31,16 @@ def run_attempt(task: Task, should_stop: Callable[[], bool] | None = None) -> St
     try:
         return run_process(replace(task, line=task.line | {"out": str(own)}), should_stop=should_stop)
     finally:
-        if own.exists() and not out.exists():  # else it was given up, and another attempt works
+        if own.exists() and not out.exists():  # else this attempt was taken for lost, and another one works
             own.rename(out)
 
 
 def take_over(folder: Path) -> None:
-    """Make `folder` what the newest attempt left, where its runner or machine was lost.
+    """Restore `folder` from the newest attempt whose runner or machine was lost, if there is one.
 
-    It is a copy, as the lost attempt may still write to its own folder, which is removed."""
+    The attempt's folder is copied and then removed, because the lost attempt may still write to it. Nothing is copied
+    if `folder` exists.
+    """
     attempts = sorted(folder.parent.glob(f"{folder.name}.*"), key=lambda path: path.stat().st_mtime)
     for attempt in reversed(attempts):
         if not folder.exists():

@@ -1,7 +1,8 @@
-"""Runs each stage as a job of Slurm, by submitit. All nodes share results, scenes and this checkout.
+"""The engine for Slurm: each stage is a job that the library submitit submits.
 
-A stage whose node was lost is submitted again. No cluster has run this: tests use submitit's local executor
-(address=local)."""
+All nodes must share the results, the scenes and this checkout at equal paths. A stage whose node was lost is submitted
+again. This engine was not tried on a cluster: tests use submitit's local executor (address=local).
+"""
 
 import math
 import os
@@ -19,15 +20,18 @@ from runner.engine import GRACE, Resources, StageResult, Task
 from runner.retry import run_attempt
 from runner.text import display_path, format_error
 
-RETRIES = 3  # times that a stage is submitted again after its node was lost
-TIMEOUT_MINUTES = 24 * 60  # time limit of a job; the next one resumes from its checkpoint
-MAX_JOBS = 64  # jobs submitted at a time
-POLL_SECONDS = 1.0  # between looks at a job
-FOLDER = ".slurm"  # in runs/: submitit's files of each job
+RETRIES = 3  # number of times that a stage is submitted again after its node was lost
+TIMEOUT_MINUTES = 24 * 60  # time limit of a job; the next job of the stage resumes from its checkpoint
+MAX_JOBS = 64  # reported as the number of cores: it limits how many jobs are submitted at a time
+POLL_SECONDS = 1.0  # time between two checks of a job's state
+FOLDER = ".slurm"  # folder in runs/ with submitit's files of each job
 
 
 class SlurmEngine:
-    """See `engine.Engine`. `address` is a partition, None the default one, `local` processes of this machine."""
+    """The engine for Slurm, see `engine.Engine`.
+
+    Its `address` is the name of a partition, None for the default partition, or "local" for processes on this machine.
+    """
 
     is_remote = True
 
@@ -44,7 +48,11 @@ class SlurmEngine:
         self._stopped = False
 
     def run(self, task: Task, resources: Resources, lock: int, on_start: Callable[[], None]) -> StageResult:
-        """See `Engine.run`. The lock stays with the runner."""
+        """Run a task as a job of Slurm, see `Engine.run`. Only the runner holds the lock, not the job.
+
+        Raises:
+            Failed: the job was lost more than `RETRIES` times.
+        """
         cores = resources.cores or 1
         options = {"cpus_per_task": cores, "gpus_per_node": resources.gpus, "mem_gb": resources.memory_mb / 1024 or 1}
         options |= {"timeout_min": TIMEOUT_MINUTES, "name": str(task.line["stage"])}
@@ -73,7 +81,11 @@ class SlurmEngine:
         raise Failed(f"{task.line['stage']}: its job was lost {RETRIES + 1} times: {reason}")
 
     def _wait(self, job: submitit.Job[Any]) -> StageResult:
-        """The result. Interrupted, gives the stage time to end."""
+        """Wait for a job, and return its result.
+
+        On an interrupt (Ctrl-C) the engine is stopped, and the job has GRACE + 5 seconds to end; after that
+        KeyboardInterrupt is raised.
+        """
         until = math.inf
         while not job.done() and time.monotonic() < until:
             try:
@@ -94,6 +106,6 @@ class SlurmEngine:
 
 
 def _has_gpus(partition: str | None) -> bool:
-    """Whether nodes of Slurm, or of one of its partitions, have GPUs."""
+    """Return whether the nodes of a partition (None: all nodes) have GPUs."""
     command = ["sinfo", "--noheader", "--format=%G", *(["--partition", partition] if partition else [])]
     return "gpu" in subprocess.run(command, capture_output=True, text=True).stdout

@@ -1,4 +1,4 @@
-"""Errors, sizes, times and paths as text for people."""
+"""Formatting of errors, sizes, durations and paths as text for users."""
 
 import errno
 import os
@@ -7,14 +7,17 @@ from pathlib import Path
 
 from runner import Failed, Refused
 
-# errno -> what the user can do about it
+# errno -> what the user can do about the error
 REMEDIES = dict.fromkeys(
     (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "make room, and the same command goes on from here"
 ) | dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "runs=FOLDER puts results elsewhere")
 
 
 def format_error(error: BaseException) -> str:
-    """An error in one line, with a remedy where one is known."""
+    """Return the message of an error as one line, with a remedy if one is known.
+
+    The type of the error is named, too, unless the message is meant for users (ValueError, Refused, Failed).
+    """
     text = " ".join(str(error).split())
     if isinstance(error, OSError) and error.errno in REMEDIES:
         return f"{error.filename or 'a file'}: {error.strerror}; {REMEDIES[error.errno]}"
@@ -22,7 +25,7 @@ def format_error(error: BaseException) -> str:
 
 
 def format_bytes(count: int | None) -> str:
-    """A size in bytes, kB, MB or GB; "size unknown" for None."""
+    """Format a number of bytes as bytes, kB, MB or GB; "size unknown" for None."""
     if count is None:
         return "size unknown"
     unit, size = next(((u, s) for u, s in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)) if count >= s), ("bytes", 1))
@@ -30,18 +33,18 @@ def format_bytes(count: int | None) -> str:
 
 
 def format_seconds(seconds: float) -> str:
-    """A duration in seconds, minutes or hours."""
+    """Format a duration as seconds, minutes or hours."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def join_names(names: Iterable[str]) -> str:
-    """The first three names with commas between, and how many more there are."""
+    """Join the first three names by commas, and say how many more there are."""
     names = list(names)
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def display_path(path: Path) -> str:
-    """A path relative to the current folder where it lies inside it, else as it is."""
+    """Return a path as text: relative to the current folder if it lies inside this folder, else unchanged."""
     return os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)

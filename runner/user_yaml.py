@@ -1,4 +1,7 @@
-"""Reads YAML that people write, above all scene.yaml: keeps names as text, and bounds size, depth and aliases."""
+"""Reading of YAML that people write, mainly scene.yaml.
+
+Names of views stay text even if they look like numbers or dates. Size, depth and number of values are limited.
+"""
 
 from collections import Counter
 from pathlib import Path
@@ -8,14 +11,14 @@ import yaml
 
 from runner import Refused
 
-MAX_BYTES = 1_000_000  # size of a file
-MAX_DEPTH = 20  # nested lists and mappings
-MAX_VALUES = 10_000  # values, with those that aliases repeat
+MAX_BYTES = 1_000_000  # largest size of a file
+MAX_DEPTH = 20  # largest number of nested lists and mappings
+MAX_VALUES = 10_000  # largest number of values; a value counts again for each alias that repeats it
 TAGS = tuple(f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "seq", "map"))
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Reads no dates: nothing in these files is one."""
+    """A YAML loader that reads dates as text, because no value in these files is a date."""
 
 
 _Loader.yaml_implicit_resolvers = {
@@ -25,12 +28,19 @@ _Loader.yaml_implicit_resolvers = {
 
 
 def read_user_yaml(path: Path, typed: tuple[str, ...]) -> dict[str, Any]:
-    """The `key: value` lines of a file. Values of keys outside `typed` stay text as written, or None: in
-    `view: 20220819_104425` and `test: [2022-08-19, 007, on]` YAML would read names of views as numbers and dates.
+    """Read a YAML file of `key: value` lines as a dict; empty if the file does not exist or is empty.
+
+    YAML would read the names of views in `view: 20220819_104425` and `test: [2022-08-19, 007, on]` as numbers, dates
+        and
+    booleans. So values stay text as written, or None, except for some keys.
+
+    Args:
+        path: the file.
+        typed: the keys below which values are read with YAML's types.
 
     Raises:
-        Refused: it is not a regular file, UTF-8 text, YAML or a mapping; a key comes twice; it exceeds a limit of this
-            module. The message names the file and, where known, the line.
+        Refused: the path is no regular file; the file is not UTF-8 text, valid YAML or a mapping; a key occurs twice;
+            or a limit of this module is exceeded. The message names the file and, where known, the line.
     """
     if not path.is_file():
         if path.exists() or path.is_symlink():
@@ -50,10 +60,14 @@ def read_user_yaml(path: Path, typed: tuple[str, ...]) -> dict[str, Any]:
 
 
 def parse_value(text: str, is_text: bool) -> Any:
-    """Parse a value of the command line; `is_text` keeps it as text, see `read_user_yaml`.
+    """Parse a value of the command line as YAML.
+
+    Args:
+        text: the value.
+        is_text: True keeps scalars as text, see `read_user_yaml`.
 
     Raises:
-        ValueError: it is not valid YAML.
+        ValueError: the text is not valid YAML, or a limit of this module is exceeded.
     """
     try:
         node, loader = _tree(text)
@@ -63,9 +77,17 @@ def parse_value(text: str, is_text: bool) -> Any:
 
 
 def _tree(text: str) -> tuple[Any, Any]:
-    """The checked nodes of a document, and their loader."""
+    """Parse a YAML document, and check the limits of this module.
+
+    Returns:
+        The root node, None for an empty document; and the loader that constructs values from nodes.
+
+    Raises:
+        ValueError: a limit is exceeded, or there is a tag that is no basic type.
+        yaml.YAMLError: the text is not valid YAML.
+    """
     depth = 0
-    for event in yaml.parse(text, _Loader):  # event by event: checks the depth before nodes are built
+    for event in yaml.parse(text, _Loader):  # event by event, so that the depth is checked before nodes are built
         starts = isinstance(event, yaml.CollectionStartEvent)
         depth += starts - isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_DEPTH:
@@ -86,7 +108,11 @@ def _tree(text: str) -> tuple[Any, Any]:
 
 
 def _pairs(loader: Any, node: yaml.MappingNode) -> list[tuple[str, Any]]:
-    """Keys, as text, and values of a mapping, with those that it merges by `<<`."""
+    """Return the (key as text, node of the value) pairs of a mapping, with those that `<<` merges into it.
+
+    Raises:
+        ValueError: a key occurs twice, or is a list or a mapping.
+    """
     keys = Counter(_key(key) for key, _ in node.value)
     if twice := [key for key, count in keys.items() if count > 1]:
         raise ValueError(f"line {node.start_mark.line + 1}: the key {twice[0]!r:.60} comes twice; keep one")
@@ -105,6 +131,7 @@ def _is_null(node: Any) -> bool:
 
 
 def _value(loader: Any, node: Any, is_text: bool) -> Any:
+    """Construct the value of a node; with `is_text` scalars stay text as written, or None."""
     if isinstance(node, yaml.SequenceNode):
         return [_value(loader, each, is_text) for each in node.value]
     if isinstance(node, yaml.MappingNode):

@@ -1,4 +1,4 @@
-"""The command `weights`: lists the weights that stages need, and fetches what is missing."""
+"""The command `weights`, which lists the weights that stages need and downloads missing ones."""
 
 import json
 import sys
@@ -10,10 +10,15 @@ from runner.text import format_bytes
 
 
 def fetch_weights(request: Request, offline: bool) -> int:
-    """List the weights of all stages, of a scene where one is named, and fetch what is missing unless `offline`.
+    """List the weights that all stages need, and download missing ones.
+
+    Args:
+        request: the options. If they name a scene, its scene.yaml counts too.
+        offline: True only lists the weights.
 
     Returns:
-        How many weights that a stage cannot do without are still missing.
+        Number of missing weights. Weights that cannot be downloaded and failed downloads count; with `offline`, also
+        weights that could be downloaded, unless they are optional.
     """
     job = resolve(request, scene=bool(request.scene))
     answers = list(zip(job.stages, ask_stages(job.root, list(map(job.question, job.stages))), strict=True))
@@ -43,7 +48,11 @@ def fetch_weights(request: Request, offline: bool) -> int:
 
 
 def _print_problems(missing: list[dict[str, Any]]) -> None:
-    """Print why weights cannot be fetched, and where each one was looked for."""
+    """Print why weights cannot be downloaded, and in which folders each one was searched.
+
+    Args:
+        missing: the missing weights, as fields of reffusion.weights.local.Need.
+    """
     for need in missing:
         if not need["fetched"]:
             print(f"error: {need['problem']}", file=sys.stderr)

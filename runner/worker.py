@@ -1,8 +1,11 @@
-"""The process that imports stages: `describe` reads their parameters, `fetch` downloads the weights that they name,
-`frames` extracts the frames of a video, `run` runs a stage.
+"""The process that imports stages, started as `python -m runner.worker <command>`.
 
-The description of a stage (Params, needed_weights, lacks, unavailable, optional_weights, cost, preview, scene_files,
-scene_facts, machine_facts) is in stages/plan/<stage>.py, which imports nothing heavy, or else in stages/<stage>.py.
+The command is `describe` (answers questions about stages), `fetch` (downloads the weights that stages need), `frames`
+(extracts the frames of a video) or `run` (runs a stage). Input is read from the standard input.
+
+The description of a stage is a module with the class Params and optional functions (needed_weights, lacks, unavailable,
+optional_weights, cost, preview, scene_files, scene_facts, machine_facts). It is stages/plan/<stage>.py, which imports
+nothing heavy, or else stages/<stage>.py.
 """
 
 import ast
@@ -30,35 +33,53 @@ from pydantic import BaseModel, ValidationError
 from runner.files import list_files
 from runner.text import format_error
 
-INTERRUPTED = 130
-THREADS = ("OMP", "MKL", "OPENBLAS", "NUMBA")  # <each>_NUM_THREADS
+INTERRUPTED = 130  # exit code after Ctrl-C
+THREADS = ("OMP", "MKL", "OPENBLAS", "NUMBA")  # <name>_NUM_THREADS is the number of threads of a library
 
 
 def _description_file(stage: str) -> Path:
-    """The file that describes a stage, relative to the root, where this process starts."""
+    """Return the file that describes a stage, relative to the root, which is the working directory."""
     path = Path(f"stages/plan/{stage}.py")
     return path if path.is_file() else Path(f"stages/{stage}.py")
 
 
 def _import_file(path: Path) -> Any:
+    """Import a Python file, whose path is relative to the root, as a module."""
     return importlib.import_module(".".join(path.with_suffix("").parts))
 
 
 def describe() -> None:
-    """Describe stages. Standard input: a list of {"stage", "params": asked for, "takes": names of needs, "needs": their
-    paths (for a preview), "brings": keys of scene.yaml and folders of the scene, "scene": its folder}; standard output:
-    the list of `_describe` of each.
+    """Answer questions about stages. Reads a JSON list of questions and prints the JSON list of their answers.
+
+    A question has the following fields. Only the first three are mandatory; each other one asks for more, see
+    `_describe`:
+
+    - "stage": name of the stage;
+    - "params": the parameters as they were asked for;
+    - "takes": names of its needs in pipeline.yaml;
+    - "scene": folder of the scene;
+    - "brings": keys of scene.yaml and names of the scene's folders;
+    - "gpu": name of a GPU, "" for this machine's;
+    - "needs": need -> path, or null.
     """
     questions = json.load(sys.stdin)
-    output, sys.stdout = sys.stdout, sys.stderr  # what a module prints must not mix with the answer
+    output, sys.stdout = sys.stdout, sys.stderr  # modules may print, which must not mix with the answer
     json.dump([_describe(question) for question in questions], output)
 
 
 def _describe(question: dict[str, Any]) -> dict[str, Any]:
-    """The fields of `resolve.StageInfo`, or {"broken": why}, or {"errors": in params, "known": names of parameters}.
+    """Answer one question about a stage (see `describe`).
 
-    A question with `scene` adds what the stage reads of it; with `brings` the weights that are "needed" and what this
-    machine "lacks" for CUDA; with `gpu` its "cost" on that GPU; with `needs` the preview's "notes" or "refusal"."""
+    Returns:
+        The fields of `resolve.StageInfo`; or only {"broken": error} if the stage's code has an error; or only
+        {"errors": list of `_error`, "known": names of all parameters} if parameters are wrong. Some fields of the
+        question add fields to the answer:
+
+        - "scene" adds "reads" and "facts", see `resolve.StageInfo`;
+        - "brings" adds "needed" and "optional", lists of weights, and "lacks", what this machine lacks for CUDA;
+        - "gpu" adds "cost", the cost on this GPU, or "unknown gpu", an error;
+        - "needs" adds "notes" of the stage's preview, or its "refusal".
+    """
     stage = question["stage"]
     needs, brings, scene = (question.get(name) for name in ("needs", "brings", "scene"))
     path = _description_file(stage)
@@ -100,7 +121,7 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
     if scene is not None and hasattr(planned, "scene_facts"):
         try:
             answer["facts"] = planned.scene_facts(resolved, Path(scene))
-        except ValueError:  # its preview reports this
+        except ValueError:  # the stage's preview reports this error
             answer["facts"] = {}
     if needs is not None and hasattr(planned, "preview"):
         try:
@@ -113,7 +134,17 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_run(path: Path, takes: list[str]) -> None:
-    """Raise ValueError where `run` does not take these needs; reads its source, as a stage may import much."""
+    """Check that a stage's function run() takes its needs as arguments.
+
+    The source is parsed and not imported, because stages may import heavy modules.
+
+    Args:
+        path: the stage's file.
+        takes: names of its needs in pipeline.yaml.
+
+    Raises:
+        ValueError: the arguments are other ones.
+    """
     named = {n.name: n.args for n in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(n, ast.FunctionDef)}
     run = named["run"]
     plain, needs = [a.arg for a in run.args][2:], [a.arg for a in run.kwonlyargs]
@@ -124,7 +155,7 @@ def _check_run(path: Path, takes: list[str]) -> None:
 
 
 def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted name and json_schema_extra of each parameter, with those in groups."""
+    """Yield the dotted name and the json_schema_extra of each parameter of a model, and of those in its groups."""
     for name, info in model.model_fields.items():
         yield prefix + name, info.json_schema_extra
         if _is_group(info.annotation):
@@ -132,11 +163,21 @@ def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any
 
 
 def _is_group(annotation: Any) -> TypeGuard[type[BaseModel]]:
+    """Return whether a parameter with this annotation is a group of parameters."""
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
 def _error(error: Any, model: type[BaseModel]) -> dict[str, Any]:
-    """An error of pydantic as {where: dotted name, unknown: no parameter has this name, value, message}."""
+    """Convert an error of pydantic to a dict.
+
+    Args:
+        error: an entry of `ValidationError.errors()`.
+        model: the model of the parameters.
+
+    Returns:
+        "where": dotted name of the parameter; "unknown": True if no parameter has this name; "value": the wrong value
+        as text; "message".
+    """
     where, value, group = _place(error["loc"], model), error["input"], model
     for part in where[:-1]:
         group = _is_group(group) and part in group.model_fields and group.model_fields[part].annotation
@@ -149,7 +190,11 @@ def _error(error: Any, model: type[BaseModel]) -> dict[str, Any]:
 
 
 def _place(loc: tuple[Any, ...], model: type[BaseModel]) -> list[str]:
-    """The path to what is wrong, without the alternative (of `str | list[str]`) that pydantic tried."""
+    """Return the names that lead to a wrong value in a model.
+
+    Of a parameter with alternative types, such as `str | list[str]`, pydantic's location also names the type that was
+    tried. This part is left out.
+    """
     field = model.model_fields.get(loc[0]) if loc else None
     alternatives = [kind for kind in get_args(field.annotation) if kind is not NoneType] if field else []
     tried = isinstance(field and field.annotation, UnionType) and len(alternatives) > 1
@@ -157,10 +202,12 @@ def _place(loc: tuple[Any, ...], model: type[BaseModel]) -> list[str]:
 
 
 def fetch() -> int:
-    """Download the missing weights that stages need, each once. Standard input: {stage: {"params", "brings"}}.
+    """Download the missing weights that stages need or could use, each once.
+
+    Reads a JSON object: stage -> {"params", "brings"}, see `describe`.
 
     Returns:
-        How many could not be fetched; their errors go to standard error.
+        Number of failed downloads. Their errors are printed to the standard error.
     """
     downloads = {}
     for stage, question in json.load(sys.stdin).items():
@@ -183,8 +230,10 @@ def fetch() -> int:
 
 
 def frames() -> int:
-    """Extract the frames of a video. Standard input: {"video", "folder", "content": its hash}; standard output: a
-    sentence on the result, or on the error."""
+    """Extract the frames of a video. Prints a sentence about the result or the error, and returns the exit code.
+
+    Reads a JSON object: {"video": path, "folder": path of the folder to fill, "content": hash of the video}.
+    """
     question = json.load(sys.stdin)
     video = importlib.import_module("reffusion.capture.layouts.video")
     try:
@@ -196,16 +245,25 @@ def frames() -> int:
 
 
 def run() -> int:
-    """Run a stage. Standard input: one line of JSON, then nothing; its end means that the runner is gone.
+    """Run a stage, and return the exit code.
 
-    The line has "stage", "params", "out", "needs": {need: path or null}, "log", "result", "lock" or null, and the
-    arguments of `_limit_resources`. Writes {"seconds", "peak_memory_mb", "machine"} or {"error": one line} to the file
-    descriptor `result`, and the traceback to `log`.
+    Reads one line of JSON from the standard input. The runner keeps the input open; when it closes, the runner has
+    ended, and this process ends too. The line has:
+
+    - "stage", "params": name and parameters of the stage;
+    - "out": the folder in which the stage writes;
+    - "needs": need -> path, or null for a skipped one;
+    - "log": path of the log file, which also gets tracebacks;
+    - "result": file descriptor for the answer;
+    - "lock": file descriptor of a lock, which stays open until this process ends, or null;
+    - optionally the arguments of `_limit_resources`.
+
+    The answer is {"seconds", "peak_memory_mb", "machine"}, or {"error": one line}.
     """
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # blocked in processes of Ray and their children
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # Ray blocks this signal in its processes
     signal.signal(signal.SIGINT, signal.default_int_handler)
     job = json.loads(sys.stdin.readline())
-    for number in (job["lock"], job["result"]):  # not inherited: the lock is held until this very process ends
+    for number in (job["lock"], job["result"]):  # children must not inherit them, or they would hold the lock longer
         if number is not None:
             os.set_inheritable(number, False)
     _limit_resources(job.get("cores"), job.get("on"), job.get("gpus"))
@@ -221,47 +279,62 @@ def run() -> int:
             faulthandler.disable()
     except KeyboardInterrupt:
         return INTERRUPTED
-    except OSError as error:  # of the log file
+    except OSError as error:  # the log file could not be written
         result = result or {"error": format_error(error)}
     os.write(job["result"], json.dumps(result).encode())
     return int("error" in result)
 
 
 def _limit_resources(cores: int | None, on: list[int] | None, gpus: str | None) -> None:
-    """Limit the number of threads, the cores and the GPUs of libraries that are imported later; None: no limit."""
+    """Limit the resources of the libraries that are imported later. None means no limit.
+
+    Args:
+        cores: number of threads.
+        on: numbers of the CPU cores on which this process may run.
+        gpus: numbers of the visible GPUs, separated by commas.
+    """
     if cores is not None:
         os.environ |= {f"{library}_NUM_THREADS": str(cores) for library in THREADS}
         os.environ["OPENCV_FOR_THREADS_NUM"] = str(cores)
-    if on and hasattr(os, "sched_setaffinity"):  # for libraries that ask the system and read no variable
+    if on and hasattr(os, "sched_setaffinity"):  # some libraries read no variable, but ask the system for its cores
         os.sched_setaffinity(0, on)
     if gpus is not None:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpus
 
 
 def _run_stage(job: dict[str, Any], log: TextIO) -> dict[str, Any]:
-    """Run a stage in this process; its result, see `run`."""
+    """Run a stage in this process, and return the answer that `run` describes.
+
+    Args:
+        job: the description of the job, see `run`.
+        log: file for the traceback of an error.
+    """
     started = time.perf_counter()
     try:
         params = _import_file(_description_file(job["stage"])).Params(**job["params"])
         stage = importlib.import_module(f"stages.{job['stage']}")
         needs = {name: path and Path(path) for name, path in job["needs"].items()}
         stage.run(params, Path(job["out"]), **needs)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is done, and the result must be written
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the stage is done, and Ctrl-C must not lose its result
     except Exception as error:
         log.write(traceback.format_exc())
-        return {"error": format_error(error)[:9999]}  # less than a pipe holds
+        return {"error": format_error(error)[:9999]}  # short enough for the buffer of a pipe
     seconds = round(time.perf_counter() - started, 2)
     return {"seconds": seconds, "peak_memory_mb": _peak_memory_mb(), "machine": platform.node()}
 
 
 def _end_with_runner(fd: int) -> None:
-    """Kill this process when the runner is gone: the next runner takes over its folder."""
+    """Wait until the runner has ended, which closes the pipe `fd`, and then kill this process.
+
+    Otherwise the process would go on writing to its folder, while the next runner works there.
+    """
     while os.read(fd, 4096):
         pass
     os.kill(os.getpid(), signal.SIGKILL)
 
 
 def _peak_memory_mb() -> int:
+    """Return the peak memory of this process, or of its largest child process if that is more, in MB."""
     unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss is in bytes there, in kB elsewhere
     largest = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return round(largest * unit / 2**20)

@@ -1,4 +1,7 @@
-"""distill: optimises the initialization by reconstruction, score distillation and a critic (RefFusion section 4)."""
+"""The stage `distill`: the initialization is optimised by the loss of RefFusion, section 4.
+
+Its main terms are reconstruction, score distillation (SDS), depth and a critic; see docs/method.md#distillation.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,19 @@ def run(
     initialize: Path,
     lift: Path | None = None,
 ) -> None:
-    """Write gaussians.ply, labels.npy (the masked Gaussians), facts.json, trace.jsonl and snapshots/."""
+    """Run the stage: optimise the initialized Gaussians.
+
+    Writes gaussians.ply, labels.npy (bool [N], True for the masked Gaussians, which `initialize` added), facts.json,
+    trace.jsonl and snapshots/ (the masked Gaussians at some steps).
+
+    Args:
+        out: folder of this stage.
+        poses, fit, masks, reference, personalize, initialize, lift: folders of the stages of these names; `personalize`
+            and `lift` are None if the stage was skipped.
+
+    Raises:
+        ValueError: the memory does not suffice; the message names the parameter to lower.
+    """
     rasterizer.prepare(params.device)
     began = time.monotonic()
     params, sds_decision = resolve_sds(params, initialize)

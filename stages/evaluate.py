@@ -1,4 +1,7 @@
-"""Render the test views by fit, initialization and result, and score the latter two where there is ground truth."""
+"""The stage `evaluate`: test views are rendered from the fit, the initialization and the result.
+
+Renders of the initialization and of the result are compared with ground truth if there is any.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +28,8 @@ from reffusion.metrics.view_renders import ViewRenderer, ViewRenders
 from reffusion.params.evaluate import Params
 from reffusion.types import Gaussians, Scene
 
-FOLDERS = {"fit": "renders_fit", "initialize": "renders_initialize", "distill": "renders"}
-MAX_PARALLEL_VIEWS = 4  # each holds all its pictures in memory
+FOLDERS = {"fit": "renders_fit", "initialize": "renders_initialize", "distill": "renders"}  # stage -> its renders
+MAX_PARALLEL_VIEWS = 4  # views that are evaluated at once; all pictures of each are in memory
 
 
 def run(
@@ -41,10 +44,18 @@ def run(
     initialize: Path | None = None,
     distill: Path | None = None,
 ) -> None:
-    """Write renders*/, side_by_side/, metrics.json, per_view.csv and a copy of scene.ply.
+    """Run the stage: render and score the test views.
 
-    The result and the initialization are rendered as `finish` completed them. Training views and test views without a
-    picture are rendered and not scored; nothing is scored where an object is kept, for test photographs show none.
+    Writes renders*/<view>.png, side_by_side/<view>.png, metrics.json (means), per_view.csv and a copy of scene.ply. The
+    result and the initialization are rendered with the backdrop that the stage `finish` added.
+
+    A test view without a picture, and a training view, is rendered but not scored. If the scene keeps one of several
+    objects, nothing is scored, because the test photographs show no object at all.
+
+    Args:
+        out: folder of this stage.
+        poses, raw_masks, fit, finish, masks, initialize, distill: folders of the stages of these names; the last three
+            are None if the stage was skipped.
     """
     scene, facts = load_scene(poses), load_json(finish / "facts.json")
     names, kind = views_to_render(scene)
@@ -86,7 +97,8 @@ def run(
         "rendered": f"{len(names)} {kind} views",
         "result": facts["result"],
         "backdrop": facts["backdrop"],
-        "suspects": [name for name in names if name in scene.suspects] or None,  # their photographs contradict poses
+        # views that were kept although their photographs contradict their poses
+        "suspects": [name for name in names if name in scene.suspects] or None,
         "consistency": rows.summarize_consistency(scored),
         **networks_used(painter.name if painter else None, distill),
         "exposure": exposure.PROTOCOL if exposures else None,
@@ -98,7 +110,11 @@ def run(
 
 
 def views_to_render(scene: Scene) -> tuple[tuple[str, ...], str]:
-    """The names of the test views and their kind; without any, every 8th training view (all if fewer than 8)."""
+    """Return the names of the views to render, and what kind of views they are, in words.
+
+    They are the test views. Without test views they are every 8th training view, or all training views if that would
+    give fewer than 8.
+    """
     if scene.test:
         return scene.test, "test"
     eighth = scene.train[::8]
@@ -106,7 +122,15 @@ def views_to_render(scene: Scene) -> tuple[tuple[str, ...], str]:
 
 
 def load_stages(finish: Path, folders: dict[str, Path | None], device: str) -> dict[str, Gaussians]:
-    """Stage -> its Gaussians, as `finish` completed them where it did."""
+    """Read the Gaussians that each stage made, with the backdrop of the stage `finish` if it added one to them.
+
+    Args:
+        finish: folder of the stage `finish`.
+        folders: stage -> its folder; None if it was skipped.
+
+    Returns:
+        Stage -> Gaussians in the normalised frame, without the skipped stages.
+    """
     gaussians = {}
     for stage, folder in folders.items():
         if folder:
@@ -119,7 +143,14 @@ def load_stages(finish: Path, folders: dict[str, Path | None], device: str) -> d
 def unseen_by_training(
     scene: Scene, fit: Path, raw_masks: Path, masks: Path | None, device: str
 ) -> dict[str, np.ndarray]:
-    """Test view -> bool [H, W], pixels that show what no training view saw."""
+    """Find the pixels of the test views that show surfaces which no training view saw.
+
+    Args:
+        fit, raw_masks, masks: folders of the stages of these names; `masks` is None if the stage was skipped.
+
+    Returns:
+        Test view -> bool [H, W], True = unseen.
+    """
     if not scene.test:
         return {}
     gaussians = load_ply(fit / "gaussians.ply", device=device)
@@ -131,7 +162,12 @@ def unseen_by_training(
 
 
 def save_renders(out: Path, renders: ViewRenders, truth: np.ndarray | None) -> None:
-    """Write the renders of a view, and fit, ground truth and result side by side."""
+    """Write the renders of a view to the folder of each stage, and fit, ground truth and result side by side.
+
+    Args:
+        out: folder of this stage.
+        truth: uint8 [H, W, 3]; None if there is no ground truth.
+    """
     view = renders.result
     file = f"{view.camera.name}.png"
     pictures = {FOLDERS[stage]: picture for stage, picture in renders.by_stage.items()} | {"renders": view.picture}
@@ -142,7 +178,13 @@ def save_renders(out: Path, renders: ViewRenders, truth: np.ndarray | None) -> N
 
 
 def reduced_side(params: Params, raw_masks: Path) -> int:
-    """Larger side in px at which boxes are scored beside their own size; 0: at none."""
+    """Return the larger side in px to which pictures are reduced for a second set of scores; 0 for no second set.
+
+    It is `params.longest`, or else the size of the test masks' files.
+
+    Args:
+        raw_masks: folder of the stage `raw_masks`.
+    """
     if params.longest is not None:
         return params.longest
     facts = raw_masks / "facts.json"
@@ -150,7 +192,16 @@ def reduced_side(params: Params, raw_masks: Path) -> int:
 
 
 def networks_used(painter: str | None, distill: Path | None) -> dict[str, str | None]:
-    """{"inpainter", "perceptual"}: what inpainted in 2D and what compared patches; None where nothing did."""
+    """Return the names of the networks that took part in the result.
+
+    Args:
+        painter: name of the 2D inpainter of this stage; None if it inpainted nothing.
+        distill: folder of the stage `distill`; None if it was skipped.
+
+    Returns:
+        "inpainter" (of this stage, or else of the stage `lift`) and "perceptual" (the network of the perceptual
+        distance in `distill`) -> name; None if no such network was used.
+    """
     facts = distill / "facts.json" if distill else None
     said = load_json(facts) if facts and facts.exists() else {}
     return {"inpainter": painter or said.get("inpainter"), "perceptual": said.get("perceptual")}

@@ -1,4 +1,4 @@
-"""Write the deliverable `scene.ply`: the result of the last stage, closed by a backdrop."""
+"""The stage `finish`: the final Gaussians get a backdrop behind the scene, and are written as `scene.ply`."""
 
 from __future__ import annotations
 
@@ -21,11 +21,17 @@ def run(
     initialize: Path | None = None,
     distill: Path | None = None,
 ) -> None:
-    """Write scene.ply, in the scene's own frame, and facts.json.
+    """Run the stage: write scene.ply, in the scene's own frame, and facts.json.
 
-    The result is what `distill` made, else `initialize`, else `fit` (nothing to remove). Gaussians that the scene
-    brings get no backdrop, for they may know more than its views do. With a backdrop, completed/<stage>.ply holds the
-    result in the normalised frame, and the initialization completed in the same way.
+    The result is that of `distill`; if this stage was skipped, that of `initialize`; and if nothing was removed, that
+    of `fit`. Gaussians that the scene brings get no backdrop, because they may cover places that its views do not show.
+    If a backdrop is added, completed/<stage>.ply holds the result in the normalised frame, and also the initialization
+    with the same backdrop.
+
+    Args:
+        out: folder of this stage.
+        poses, fit, reference, initialize, distill: folders of the stages of these names; the last three are None if the
+            stage was skipped.
     """
     scene = load_scene(poses)
     folders = {"fit": fit, "initialize": initialize, "distill": distill}
@@ -34,7 +40,8 @@ def run(
     counts = {stage: len(each) for stage, each in gaussians.items()}
     has_backdrop = params.backdrop and not (poses / "gaussians.ply").exists()
     if has_backdrop:
-        # What was invented in views without photographs counts as seen.
+        # If the stage `reference` ran, pixels were invented in views without photographs (`blank`), so that these views
+        # count as training views.
         views = (*scene.train, *scene.blank) if reference else scene.train
         stages = [stage for stage in dict.fromkeys((result, "initialize")) if stage in gaussians]
         completed = complete_scene([gaussians[stage] for stage in stages], [scene.cameras[name] for name in views])

@@ -1,4 +1,7 @@
-"""fit: reconstruct the photographed scene, object included, as Gaussians; a scene's own .ply is used as it is."""
+"""The stage `fit`: 3D Gaussians are fitted to the photographs, object included.
+
+If the scene brings Gaussians, these are used as they are instead.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,16 @@ from reffusion.types import Scene
 
 
 def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None) -> None:
-    """Write gaussians.ply and trace.jsonl; exposures.json where exposures are fitted."""
+    """Run the stage: fit Gaussians to the training views.
+
+    Writes gaussians.ply (normalised frame), trace.jsonl and, if exposures are fitted, exposures.json. An interrupted
+    fit resumes from the checkpoint in `out`.
+
+    Args:
+        out: folder of this stage.
+        poses, raw_masks: folders of the stages of these names. `raw_masks` is only used for the baseline with
+            `params.pixels` = "unmasked", which ignores masked pixels, and is None otherwise.
+    """
     if (poses / "gaussians.ply").exists() and params.pixels == "all":
         save_ply(out / "gaussians.ply", load_ply(poses / "gaussians.ply"))
         return
@@ -44,7 +56,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None
     if params.pixels == "unmasked":
         assert raw_masks is not None
         hidden = load_hidden_pixels(raw_masks, scene)
-    # Optical flow reads these pixels, too.
+    # Masked pixels are inpainted (Telea), because optical flow reads them although they do not supervise.
     images |= {name: classical.telea(images[name], mask) for name, mask in hidden.items()}
     gains = estimate_exposures(params, scene, cameras, images)
     equalized = images if gains is None else equalize_exposure(images, cameras, gains)
@@ -52,7 +64,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None
     rates = None
     if initial is not None:
         params, rates = few_views.shorten_schedule(params), REFIT_RATES
-    elif (out / trace.CHECKPOINT).exists():  # only degree and device of the initial Gaussians matter then
+    elif (out / trace.CHECKPOINT).exists():  # on a resume only the degree and the device of the initial ones matter
         initial = make_gaussians(params, scene.points, scene.point_colors)
     else:
         initial = make_gaussians(params, *collect_points(params, scene, cameras, equalized, hidden))
@@ -69,7 +81,18 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None
 
 
 def load_hidden_pixels(raw_masks: Path, scene: Scene) -> dict[str, np.ndarray]:
-    """View name -> bool [H, W], its raw mask; no entry for views without one or marked clean."""
+    """Read the pixels that do not supervise in the baseline `pixels: unmasked`: the raw masks of the training views.
+
+    Args:
+        raw_masks: folder of the stage `raw_masks`.
+
+    Returns:
+        View name -> bool [H, W], True = the object. Views without a mask, and clean views (without the object), have no
+        entry.
+
+    Raises:
+        ValueError: no view has a mask.
+    """
     masks = load_raw_masks(raw_masks, [name for name in scene.train if name not in scene.clean])
     if not masks:
         raise ValueError(f"{raw_masks / 'masks'}: fit.pixels is 'unmasked', but the scene has no masks")

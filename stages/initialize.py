@@ -1,4 +1,7 @@
-"""initialize: masked Gaussians are removed, and the references' pixels, on estimated depth, added in their place."""
+"""The stage `initialize`: the object's Gaussians are removed, and the pixels of the references become new Gaussians.
+
+A pixel of a reference is unprojected at its estimated depth.
+"""
 
 from __future__ import annotations
 
@@ -30,23 +33,38 @@ from reffusion.trace import Trace
 from reffusion.types import MaskSet, Reference
 from reffusion.workspace import Workspace
 
-WARN_SHARE = 0.01  # uncovered share of C from which a view is named
+WARN_SHARE = 0.01  # share of uncovered pixels of C above which a view is named in a message
 
 
 def run(
     params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path | None, lift: Path | None = None
 ) -> None:
-    """Write gaussians.ply, labels.npy (the new ones), facts.json, depth/<view>.exr, extra_views/<view>.png, and masks:
-    shadows/ and invent/<view>.png."""
+    """Run the stage: remove the object, fill the hole from the references, and refit.
+
+    Writes:
+
+    - gaussians.ply, and labels.npy, bool [N]: True for the new Gaussians;
+    - facts.json;
+    - depth/<view>.exr: the depth at which each reference and each extra view was unprojected;
+    - extra_views/<view>.png: views that were completed besides the references, because gaps were left;
+    - shadows/<view>.png: masks of the object's shadow;
+    - invent/<view>.png: invent masks I, of views in which the references drew less than was asked for;
+    - trace.jsonl: the convergence of the depth solvers.
+
+    Args:
+        out: folder of this stage.
+        poses, fit, masks, reference, lift: folders of the stages of these names; `reference` and `lift` are None if the
+            stage was skipped.
+    """
     space = Workspace(poses, fit, masks, params.device)
     draft, scene, sets = Draft.start(space.remaining), space.scene, space.mask_sets
     train = [scene.cameras[name] for name in scene.train]
     references = load_completed(params, space, reference, lift)
-    if params.tidy and params.start != "nothing":  # where nothing takes their place, floaters are better than a hole
+    if params.tidy and params.start != "nothing":  # if nothing is filled in, floaters look better than a hole
         unobserved = {camera.name: sets[camera.name].unobserved for camera in train}
         draft = draft.drop(voting.find_floaters(draft.gaussians, train, unobserved, FLOATER_RATIO))
     floaters = len(space.remaining) - len(draft.gaussians)
-    is_method = bool(references) and params.start == "reference"  # not a baseline
+    is_method = bool(references) and params.start == "reference"  # else this is a baseline, or nothing is invented
     extra: list[Reference] = []
     trusted: list[Reference] = []
     if references:
@@ -76,7 +94,7 @@ def run(
     if params.start == "random" and any(each.invent.any() for each in sets.values()):
         draft = add_random(draft, space)
     if is_method and params.refit_steps:
-        work = out / ".refit"  # hidden: its trace holds seconds, which are no part of the artifact's content
+        work = out / ".refit"  # a hidden folder, because its trace holds run times, which must not enter the hash
         work.mkdir(exist_ok=True)
         has_exact_depth = all(each.depth is not None for each in references)
         draft = refit_draft(draft, params.refit_steps, scene, background, trusted, sets, has_exact_depth, work)
@@ -98,11 +116,19 @@ def summarize(
     trusted: Sequence[Reference],
     photos: Mapping[str, np.ndarray] | None,
 ) -> dict[str, Any]:
-    """The stage's facts: what was added and removed, what nothing covers, and whether SDS may gain; warns of views with
-    uncovered pixels.
+    """Compute the contents of facts.json: counts of Gaussians, uncovered pixels, and whether SDS may help.
+
+    A pixel of C is uncovered if the initialization shows no surface there. Views with many such pixels are printed.
 
     Args:
-        photos: view -> uint8 [H, W, 3], without the shadows that were removed; None for a baseline.
+        space: results of the stages `poses`, `fit` and `masks`.
+        draft: the initialized scene.
+        floaters: number of Gaussians that were removed as floaters.
+        sets: view name -> pixel classes.
+        extra: the extra views that were completed.
+        trusted: all completed views that supervise: references and extra views.
+        photos: view name -> uint8 [H, W, 3], photographs from which the object's shadow was removed; None for a
+            baseline.
     """
     train = [space.scene.cameras[name] for name in space.scene.train]
     uncovered = {
@@ -132,7 +158,19 @@ def summarize(
 
 
 def load_completed(params: Params, space: Workspace, reference: Path | None, lift: Path | None) -> list[Reference]:
-    """The completed views from which the hole is filled: the references, or a baseline's."""
+    """Read the completed views from which the hole is filled, according to `params.start`.
+
+    Args:
+        space: results of the stages `poses`, `fit` and `masks`.
+        reference: folder of the stage `reference`, for start "reference"; None if it was skipped.
+        lift: folder of the stage `lift`, for the baseline with start "lift"; None if it was skipped.
+
+    Returns:
+        The references; empty for any other start.
+
+    Raises:
+        ValueError: start is "lift" and that stage was skipped.
+    """
     if params.start == "lift" and lift is None:
         raise ValueError("initialize.start is 'lift', but the stage lift was left out: set distill.lift.weight")
     folder = {"reference": reference, "lift": lift}.get(params.start)
@@ -140,8 +178,15 @@ def load_completed(params: Params, space: Workspace, reference: Path | None, lif
 
 
 def trusted_references(reference: Path, references: list[Reference], background: Background) -> list[Reference]:
-    """The references with the pixels of which they know more than the Gaussians do: all of C where the scene brings the
-    picture, what was invented where it was completed here."""
+    """Extend the masks of the references to all pixels that they show better than the Gaussians do.
+
+    A reference that the scene brings is trusted in all of the consistent mask C. One that was completed here is trusted
+    only where it was invented, its own mask.
+
+    Args:
+        reference: folder of the stage `reference`.
+        background: holds C of each view as its masks.
+    """
     facts = reference / "facts.json"
     given = load_json(facts)["given"] if facts.exists() else []
     extend = lambda each: replace(each, mask=each.mask | background.masks[each.camera.name])
@@ -149,5 +194,6 @@ def trusted_references(reference: Path, references: list[Reference], background:
 
 
 def save_depths(out: Path, depths: dict[str, np.ndarray]) -> None:
+    """Write depth maps, view name -> [H, W], as depth/<view>.exr."""
     for name, depth in depths.items():
         save_exr(out / "depth" / f"{name}.exr", depth.astype("float32"))

@@ -1,6 +1,6 @@
-"""lift: inpaint the hole of each training view in 2D, independently, as NeRF-In and SPIn-NeRF do.
+"""The stage `lift`: the hole of each training view is inpainted in 2D, independently, as NeRF-In and SPIn-NeRF do.
 
-A stage of baselines, not part of the method.
+Only baselines use this stage; it is not part of the method.
 """
 
 from __future__ import annotations
@@ -23,14 +23,19 @@ from reffusion.prior.model import load_prior
 from reffusion.types import Reference
 from reffusion.workspace import Workspace
 
-GUIDANCE, SEED = 0.0, 0  # GUIDANCE is a of the paper
+GUIDANCE, SEED = 0.0, 0  # GUIDANCE is the paper's a; the guidance scale of libraries is 1 + a
 DTYPE = torch.float32
 
 
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> None:
-    """Write images/<view>.png, inpainted in the invent mask; the best view as a reference; and facts.json.
+    """Run the stage: inpaint the invent mask I of each training view that has one.
 
-    Views finished by an earlier run are not painted again.
+    Writes images/<view>.png, the best view also as a reference (as the stage `reference` does), and facts.json. Views
+    that an interrupted run finished are not inpainted again.
+
+    Args:
+        out: folder of this stage.
+        poses, fit, masks: folders of the stages of these names.
     """
     space = Workspace(poses, fit, masks)
     scene, sets, best_view = space.scene, space.mask_sets, space.facts["best_reference"]
@@ -48,7 +53,12 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> No
 
 
 def load_painter(params: Params) -> tuple[str, Callable[[np.ndarray, np.ndarray, str], np.ndarray]]:
-    """The inpainter's name, and a function (image uint8 [H, W, 3], hole bool [H, W], view name) -> uint8 [H, W, 3]."""
+    """Load the 2D inpainter that the parameters name.
+
+    Returns:
+        Its name, and a function that inpaints a view: (image uint8 [H, W, 3], hole bool [H, W], view name) -> uint8
+        [H, W, 3]. The view's name determines the random numbers of the diffusion prior.
+    """
     if painter := feedforward.load_inpainter(params.inpainter, params.device):
         return painter.name, lambda image, hole, _: painter.paint(image, hole)
     prior = load_prior(params.prior, device=params.device, dtype=DTYPE)

@@ -1,5 +1,9 @@
-"""masks: votes label the object's Gaussians; rendered back they give each view's consistent, unobserved and invent
-mask."""
+"""The stage `masks`: raw masks vote on which Gaussians are the object, and the pixels of every view are classified.
+
+The labelled Gaussians are rendered into each view, which gives its consistent mask C. Pixels of C behind which no other
+photograph shows the background are unobserved (U). Pixels to be invented are the invent mask I, see
+`reffusion.types.MaskSet`.
+"""
 
 from __future__ import annotations
 
@@ -37,13 +41,29 @@ from reffusion.params.masks import Params
 from reffusion.types import Camera, Gaussians, Scene
 from reffusion.workspace import SURFACES
 
-TINT = (255, 0, 160)  # of remnants in their pictures
-CHECKED_VIEWS = 8  # views in which Gaussians that the scene brings are compared with photographs
+TINT = (255, 0, 160)  # RGB colour that marks a remnant (a part of the object that the masks leave out) in its picture
+CHECKED_VIEWS = 8  # number of views in which Gaussians that the scene brings are compared with the photographs
 
 
 def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -> None:
-    """Write labels.npy, debris.npy, background.npz, facts.json, and raw/, consistent/, unobserved/ and
-    invent/<view>.png; warnings.json and remnants/ where the masks seem to leave out a part of the object."""
+    """Run the stage: label the Gaussians to remove, and classify the pixels of every view.
+
+    Writes:
+
+    - labels.npy, bool [N]: the Gaussians to remove, which are the object's and debris;
+    - debris.npy, bool [N], if debris is searched: Gaussians that the object had hidden and that photographs contradict;
+    - background.npz: planes and mirror planes around the object;
+    - raw/, consistent/, unobserved/ and invent/<view>.png: the pixel classes;
+    - facts.json;
+    - warnings.json and remnants/<number>.png, if the masks seem to leave out parts of the object.
+
+    Args:
+        out: folder of this stage.
+        poses, raw_masks, fit: folders of the stages of these names.
+
+    Raises:
+        ValueError: nothing says what is to be changed, or the Gaussians that the scene brings do not fit its cameras.
+    """
     scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply", device=params.device)
     train = [scene.cameras[name] for name in scene.train]
     check_frame(poses, fit, gaussians, train)
@@ -59,7 +79,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
 
     labels = deleted if deleted is not None else consolidation.label_object(params, gaussians, train, ballots, region)
     consistent = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
-    # What lies inside the mask in (almost) every view can only be the object, whatever the votes say.
+    # A Gaussian whose centre lies inside C in (almost) every view can only belong to the object, whatever its votes.
     dirty = {name: consistent[name] for name in scene.train if name not in scene.clean}
     labels = labels | voting.hidden_inside(gaussians, train, dirty, share=params.inside_share)
     remnants = (
@@ -106,7 +126,15 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
 
 
 def report_remnants(remnants: Sequence[Remnant], out: Path, photo_of: Callable[[str], np.ndarray]) -> None:
-    """Warn of parts of the object that the masks leave out, with a picture of each: remnants/<number>.png."""
+    """Warn of remnants, the parts of the object that the masks leave out, and draw each as remnants/<number>.png.
+
+    The warnings are also written to warnings.json.
+
+    Args:
+        remnants: the parts; those that would float in the air are removed, and the text says so.
+        out: folder of this stage.
+        photo_of: view name -> uint8 [H, W, 3].
+    """
     lines = []
     for k, remnant in enumerate(remnants, start=1):
         photo, picture = photo_of(remnant.view).copy(), out / "remnants" / f"{k}.png"
@@ -124,13 +152,23 @@ def report_remnants(remnants: Sequence[Remnant], out: Path, photo_of: Callable[[
 
 
 def load_region(raw_masks: Path) -> Region | None:
+    """Read the region in space that the scene names, in the normalised frame; None if it names none."""
     path = raw_masks / "region.json"
     return Region(**load_json(path)) if path.exists() else None
 
 
 def load_deleted(poses: Path, device: str) -> Tensor | None:
-    """bool [N], what was deleted from the Gaussians that the scene brings, which stands for votes; None where nothing
-    was."""
+    """Read which of the Gaussians that the scene brings were deleted by the user in a splat editor, as bool [N].
+
+    These deletions are taken as the object's labels instead of votes.
+
+    Args:
+        poses: folder of the stage `poses`.
+        device: device of the result.
+
+    Returns:
+        bool [N], True = deleted; None if the scene has no such file.
+    """
     path = poses / "deleted.npy"
     return load_labels(path).to(device) if path.exists() else None
 
@@ -138,7 +176,17 @@ def load_deleted(poses: Path, device: str) -> Tensor | None:
 def collect_raw_masks(
     params: Params, scene: Scene, gaussians: Gaussians, poses: Path, raw_masks: Path
 ) -> dict[str, np.ndarray]:
-    """View name -> bool [H, W]: the masks that the scene brings, and those made from clicks."""
+    """Return the raw masks of the views, as a dict view name -> bool [H, W], True = the object.
+
+    They are the masks that the scene brings, redrawn by the segmentation network if `params.refine`, and masks that are
+    made from clicks.
+
+    Args:
+        poses, raw_masks: folders of the stages of these names.
+
+    Raises:
+        ValueError: several objects have masks of their own, and no view has a mask of each.
+    """
     raw = load_raw_masks(raw_masks, scene.train, params.remove)
     if list_objects(raw_masks) and not raw:
         raise ValueError(
@@ -146,7 +194,7 @@ def collect_raw_masks(
         )
     if params.refine and any(mask.any() for mask in raw.values()):
         segmenter = load_local_segmenter(params.segmenter)
-        assert segmenter is not None  # checked by the parameters and, for files, before any work
+        assert segmenter is not None  # `refine` requires a network, and missing files are reported before the run
         raw = raw | refine_masks(scene, gaussians, poses, raw, segmenter)
     if not params.clicks:
         return raw
@@ -154,7 +202,19 @@ def collect_raw_masks(
 
 
 def check_frame(poses: Path, fit: Path, gaussians: Gaussians, train: list[Camera]) -> None:
-    """ValueError where the Gaussians that the scene brings are not in the frame of its cameras."""
+    """Check that the Gaussians that the scene brings are in the frame of its cameras.
+
+    Renderings of some training views are compared with the photographs. A scene whose Gaussians were fitted here is not
+    checked.
+
+    Args:
+        poses, fit: folders of the stages of these names.
+        gaussians: in the normalised frame.
+        train: the training views.
+
+    Raises:
+        ValueError: the Gaussians are elsewhere, or in another orientation or scale.
+    """
     if not (poses / "gaussians.ply").exists():
         return
     some = train[:: max(1, len(train) // CHECKED_VIEWS)]

@@ -1,4 +1,4 @@
-"""personalize: fine-tunes the prior on the references by LoRA (RefFusion section 4.1)."""
+"""The stage `personalize`: the diffusion prior is fine-tuned on the references by LoRA (RefFusion section 4.1)."""
 
 from __future__ import annotations
 
@@ -15,11 +15,21 @@ from reffusion.prior.inpaint import to_input
 from reffusion.prior.model import enable_checkpointing, load_prior
 from reffusion.prior.personalize import personalize
 
-MEMORY_PARAM = "personalize.memory_gb"  # named in errors
+MEMORY_PARAM = "personalize.memory_gb"  # the parameter that out-of-memory errors name
 
 
 def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, reference: Path) -> None:
-    """Write pytorch_lora_weights.safetensors, which diffusers reads, and trace.jsonl."""
+    """Run the stage: train the LoRA, and write pytorch_lora_weights.safetensors (for diffusers) and trace.jsonl.
+
+    Some photographs that are no references are used to measure the progress; the LoRA is not trained on them.
+
+    Args:
+        out: folder of this stage.
+        poses, raw_masks, reference: folders of the stages of these names.
+
+    Raises:
+        ValueError: `params.steps` is 0, or the memory does not suffice.
+    """
     start = time.monotonic()
     if not params.steps:
         raise ValueError("personalize.steps is 0: there is nothing to learn, leave the stage out")

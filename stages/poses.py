@@ -1,4 +1,7 @@
-"""poses: undistorted pictures, cameras and sparse points in the normalised frame, and the roles of the views."""
+"""The stage `poses`: undistorted pictures, cameras and sparse points in the normalised frame, and roles of the views.
+
+A role says whether a view is a training or a test view, clean (without the object), or a camera without pixels.
+"""
 
 from __future__ import annotations
 
@@ -35,17 +38,32 @@ from reffusion.splat.conventions import SH0
 from reffusion.types import Scene
 
 LEAST_POINTS = 100  # with fewer sparse points, some from optical flow are added
-MORE_POINTS = 10_000  # at most, that are added; random ones, where flow finds too few
+MORE_POINTS = 10_000  # largest number of added points; if flow finds too few, random points are added
 SEED = 0
-SFM_FACTS = "sfm.json"  # `sfm.Reconstruction.facts`
+SFM_FACTS = "sfm.json"  # file with the `facts` of `sfm.Reconstruction`
 
 
 def run(params: Params, out: Path, *, scene: Path) -> None:
-    """Write images/, sparse/0/, lenses.json, transform.json, views.json; refine.json where cameras were adjusted;
-    gaussians.ply and deleted.npy where the scene brings them; warnings.json where something is odd."""
-    own_splats = _load_own_splats(params, scene)  # before the work, not after it
+    """Run the stage: undistort the pictures, normalise the frame, and check the cameras.
+
+    Writes:
+
+    - images/<view>.png, sparse/0/, lenses.json, transform.json and views.json;
+    - sfm.json, if poses are estimated by structure from motion;
+    - refine.json, if cameras are compared with optical flow and adjusted to it where needed;
+    - gaussians.ply and deleted.npy, if the scene brings Gaussians, and a file from which some were deleted;
+    - warnings.json, if something looks wrong.
+
+    Args:
+        out: folder of this stage.
+        scene: folder of the scene.
+
+    Raises:
+        BadInput: the scene cannot be used; the message names the file and the remedy.
+    """
+    own_splats = _load_own_splats(params, scene)  # first, so that errors in these files are found before the work
     if is_gaussians_only(params, scene):
-        assert own_splats is not None  # such a scene has `cleaned`, and `gaussians` with it
+        assert own_splats is not None  # a scene without photographs has `cleaned`, which requires `gaussians`
         _save_gaussians_only(params, out, scene, own_splats)
         return
     capture, roles = read_scene(params, scene, params.longest)
@@ -84,12 +102,14 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
 
 @dataclass(frozen=True)
 class OwnSplats:
-    """The Gaussians that a scene brings.
+    """The N Gaussians that a scene brings.
 
     Attributes:
-        splats: in the scene's own frame; properties: of its .ply, in order.
-        deleted: bool [N], those missing from the file that the parameter `cleaned` names; None without such a file.
-        notes: sentences about both files.
+        splats: the Gaussians in the scene's own frame.
+        properties: names of the properties of the .ply, in order; empty for other formats.
+        deleted: bool [N], True for Gaussians that are missing from the file that the parameter `cleaned` names. None if
+            the scene has no such file.
+        notes: sentences about both files, for the user.
     """
 
     splats: Splats
@@ -99,7 +119,14 @@ class OwnSplats:
 
 
 def _load_own_splats(params: Params, scene: Path) -> OwnSplats | None:
-    """The Gaussians that the scene brings, or None. BadInput where `gaussians` or `cleaned` cannot be used."""
+    """Read the Gaussians that the scene brings, and find which of them were deleted; None if it brings none.
+
+    Args:
+        scene: folder of the scene.
+
+    Raises:
+        BadInput: a file that the keys `gaussians` or `cleaned` name cannot be used.
+    """
     check_gaussian_files(params, scene)
     if params.gaussians is None:
         return None
@@ -114,13 +141,28 @@ def _load_own_splats(params: Params, scene: Path) -> OwnSplats | None:
 
 
 def _load_positions(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    """[M, 3], and what reading changed. The other parameters of millions of splats are freed before matching."""
+    """Read the positions [M, 3] of the Gaussians in a file, and the notes on what reading changed.
+
+    The other parameters are freed on return, before positions are matched, because a file may have millions of splats.
+    """
     splats = load_splats(path)
     return splats.rows.means, splats.notes
 
 
 def _find_deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -> np.ndarray:
-    """bool [N]: which of the whole scene's positions [N, 3] are missing from the cleaned scene's [M, 3]."""
+    """Find the Gaussians that the user deleted, by matching positions. The counts are printed.
+
+    Args:
+        files: the file of the whole scene and the cleaned file, for messages.
+        whole: [N, 3] positions of the whole scene.
+        cleaned: [M, 3] positions of the cleaned scene.
+
+    Returns:
+        bool [N], True for Gaussians of the whole scene that are missing from the cleaned one.
+
+    Raises:
+        BadInput: the files are of different scenes, or nothing was deleted.
+    """
     match = matching.match_gaussians(whole, cleaned)
     if match.found < matching.MIN_MATCHED_SHARE:
         raise BadInput(
@@ -136,16 +178,29 @@ def _find_deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarr
 
 
 def _save_own_splats(out: Path, placed: Scene, own_splats: OwnSplats) -> None:
-    """Write the scene's own Gaussians in the normalised frame, with properties in the order of its file, and which were
-    deleted."""
+    """Write the Gaussians that the scene brings: gaussians.ply in the normalised frame, and deleted.npy.
+
+    The properties of gaussians.ply have the order of the scene's file. deleted.npy is written if Gaussians were
+    deleted.
+
+    Args:
+        placed: the scene in the normalised frame.
+    """
     save_ply(out / "gaussians.ply", own_splats.splats.gaussians(placed.similarity), properties=own_splats.properties)
     if own_splats.deleted is not None:
         save_labels(out / "deleted.npy", own_splats.deleted)
 
 
 def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: OwnSplats) -> None:
-    """The stage for a scene without photographs: cameras that a capture left, or some around the hole; nothing in
-    images/."""
+    """Run the stage for a scene without photographs, which brings Gaussians from which an object was deleted.
+
+    The cameras are those in the scene's folder; without any, some are placed around the hole. The sparse points are a
+    random sample of opaque Gaussians. No picture is written.
+
+    Args:
+        out: folder of this stage.
+        scene: folder of the scene.
+    """
     rows, found = own_splats.splats.rows, cameras.read(scene)
     assert own_splats.deleted is not None
     means, opaque, sizes = rows.means, rows.opacity_logits > 0, np.exp(np.median(rows.log_scales, axis=1))
@@ -172,10 +227,17 @@ def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: Own
 def _drop_outliers(params: Params, roles: Roles, scene: Scene, out: Path) -> tuple[Scene, list[str]]:
     """Leave out the training views whose photographs contradict their poses, and adjust the cameras of the others.
 
+    Args:
+        scene: the scene in the normalised frame.
+        out: folder of this stage, with the undistorted pictures.
+
     Returns:
-        the scene, and sentences about these views.
+        The scene, and sentences about the views that contradict their poses.
+
+    Raises:
+        BadInput: scene.yaml uses a view that is left out, e.g. for a reference.
     """
-    # Without sparse points, those of flow connect the views.
+    # The check compares views at shared points. A scene with too few sparse points gets points from optical flow first.
     connected = scene if len(scene.points) >= LEAST_POINTS else _adjust_cameras(params, scene, out)
     shown = [camera for name, camera in connected.cameras.items() if name not in connected.blank]
     check = check_poses(shown, connected.points, lambda name: load_views(out, [name])[name])
@@ -190,18 +252,28 @@ def _drop_outliers(params: Params, roles: Roles, scene: Scene, out: Path) -> tup
 
 
 def _adjust_cameras(params: Params, scene: Scene, out: Path) -> Scene:
-    """The scene with cameras adjusted to flow where asked for, and with points of flow where it has few."""
+    """Adjust the cameras to optical flow if `params.refine`, and add points from flow if the scene has few points.
+
+    Cameras of a scene that brings Gaussians are not adjusted.
+
+    Args:
+        out: folder of this stage, with the undistorted pictures.
+    """
     if params.refine and params.gaussians is None:  # Gaussians that the scene brings were fitted with its cameras
         scene = _refine_cameras(scene, out)
     return scene if len(scene.points) >= LEAST_POINTS else _add_flow_points(scene, out)
 
 
 def _oddities(scene: Scene, out: Path) -> list[str]:
+    """Return sentences about photographs whose exposure is odd."""
     return sanity.find_odd_exposures(scene, lambda name: load_views(out, [name])[name])
 
 
 def _save_warnings(out: Path, messages: list[str]) -> None:
-    """Print warnings, and keep them for `make check` and for runs that find this stage done."""
+    """Print warnings, and write them to warnings.json if there are any.
+
+    `make check` reads this file. A run in which this stage is cached prints its warnings again.
+    """
     for line in messages:
         warnings.warn(line, stacklevel=1)
     if messages:
@@ -209,7 +281,11 @@ def _save_warnings(out: Path, messages: list[str]) -> None:
 
 
 def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
-    """The larger image side that the training views' pictures support, at most `longest`."""
+    """Return the larger image side in px at which the pictures are used: `params.longest`, or half of their side.
+
+    Pictures that are blurred or were enlarged show no more detail at full size than at half size, and are halved. Up to
+    15 training views are tested.
+    """
     if params.min_detail == 0:
         return params.longest
     chosen = roles.train[:: max(1, len(roles.train) // 8)]
@@ -222,7 +298,14 @@ def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
 
 
 def _refine_cameras(scene: Scene, out: Path) -> Scene:
-    """The scene with cameras adjusted to optical flow, test views too, as in structure from motion."""
+    """Adjust the cameras to optical flow between the views, if the flow shows that they need adjustment.
+
+    Test views are adjusted too, as in structure from motion. The residuals before and after, in px, are printed and
+    written to refine.json.
+
+    Args:
+        out: folder of this stage, with the undistorted pictures.
+    """
     shown = {name: camera for name, camera in scene.cameras.items() if name not in scene.blank}
     found = refine_cameras(list(shown.values()), load_views(out, shown))
     if np.isnan(found.before):
@@ -237,10 +320,15 @@ def _refine_cameras(scene: Scene, out: Path) -> Scene:
 
 
 def _add_flow_points(scene: Scene, out: Path) -> Scene:
-    """The scene with points triangulated from its training views' optical flow."""
+    """Add up to `MORE_POINTS` points to the scene, triangulated from optical flow between the training views.
+
+    Args:
+        out: folder of this stage, with the undistorted pictures.
+    """
     cameras = [scene.cameras[name] for name in scene.train]
     pixels = sum(camera.width * camera.height for camera in cameras)
-    cell = max(2, round((pixels / MORE_POINTS / 4) ** 0.5))  # most views' points were seen by another already
+    # A view adds points only where no earlier view has any. So four times as many cells as wanted points are used.
+    cell = max(2, round((pixels / MORE_POINTS / 4) ** 0.5))
     points, colors = stereo.triangulate_points(cameras, load_views(out, scene.train), cell)
     kept = np.arange(len(points))
     if len(points) > MORE_POINTS:
@@ -254,7 +342,13 @@ def _add_flow_points(scene: Scene, out: Path) -> Scene:
 
 
 def _run_sfm(params: Params, out: Path, capture: Capture) -> Capture:
-    """The capture with poses by structure from motion, reduced to the views that were placed."""
+    """Estimate the poses of a capture by structure from motion, and leave out the views that could not be placed.
+
+    A summary is printed and written to sfm.json.
+
+    Args:
+        out: folder of this stage.
+    """
     found = sfm.reconstruct(capture.pictures, params.longest, out / "sfm", SEED)
     facts = found.facts()
     print(facts["summary"], flush=True)

@@ -1,6 +1,6 @@
-"""raw_masks: the masks that a scene brings, undistorted like its views; and the region to change.
+"""The stage `raw_masks`: the masks that a scene brings, undistorted like its views, and the region to change.
 
-They are not part of `poses`, so new masks rerun neither cameras nor structure from motion.
+This stage is separate from `poses`, so that new masks do not repeat structure from motion and the work on cameras.
 """
 
 from __future__ import annotations
@@ -27,9 +27,21 @@ FACTS = "facts.json"
 
 
 def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
-    """Write masks/ (with masks of several objects, masks/<object>/), test_masks/ and fill/, <view>.png each;
-    region.json where the scene names a region; facts.json, the size of the test masks' files; warnings.json where masks
-    are odd."""
+    """Run the stage: undistort the masks that the scene brings.
+
+    Writes:
+
+    - masks/<view>.png, or masks/<object>/<view>.png if several objects have masks of their own;
+    - test_masks/<view>.png and fill/<view>.png (pixels to fill), if the scene has such masks;
+    - region.json, if the scene names a region in space that holds the object or is to be filled;
+    - facts.json with the larger side of the test masks' files in px, if there are test masks;
+    - warnings.json, if masks look wrong.
+
+    Args:
+        out: folder of this stage.
+        scene: folder of the scene.
+        poses: folder of the stage `poses`.
+    """
     placed, lenses = load_scene(poses), load_lenses(poses)[0]
     notes: tuple[str, ...] = ()
     if not is_gaussians_only(params, scene):
@@ -50,7 +62,14 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
 
 
 def _save_region(params: Params, out: Path, scene: Scene) -> None:
-    """Write the region as region.json, or as masks of what lies outside it."""
+    """Write the region that the scene names, in the normalised frame.
+
+    A region that holds the object, or is to be filled, is written as region.json. If `outside` is set, everything
+    beyond the sphere is masked instead: a mask is written for each training view, united with the view's given mask.
+
+    Args:
+        out: folder of this stage, with the masks of the views.
+    """
     region, scale = params.region, scene.similarity.scale
     if region.view is not None:
         check_outliers("region", [region.view], scene.outliers)

@@ -1,4 +1,7 @@
-"""reference: views completed in 2D; the scene's own pictures, or one view inpainted here."""
+"""The stage `reference`: one or more views completed in 2D, which guide the filling of the hole.
+
+The references are pictures that the scene brings, or else one view that is inpainted here.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +25,21 @@ from reffusion.references.files import load_reference_files
 from reffusion.types import MaskSet, Reference
 from reffusion.workspace import Workspace
 
-TO_PAINT, VIEWS_TO_PAINT = "to_paint", 4
+TO_PAINT, VIEWS_TO_PAINT = "to_paint", 4  # folder of templates for painting by hand, and the number of views in it
 
 
 def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks: Path) -> None:
-    """Write references/, masks/, depth/ and facts.json; to_paint/, unless scene.yaml names the references; and
-    candidates.png and candidates.json, where a view is inpainted here."""
+    """Run the stage: align the references that the scene brings, or inpaint one view.
+
+    Writes references/<view>.png, masks/<view>.png, depth/<view>.exr (for references with a depth map) and facts.json.
+    Writes also to_paint/ unless scene.yaml names references, and candidates.png and candidates.json if a view is
+    inpainted.
+
+    Args:
+        out: folder of this stage.
+        scene: folder of the scene.
+        poses, fit, masks: folders of the stages of these names.
+    """
     space = Workspace(poses, fit, masks)
     files = load_reference_files(scene, load_placed_views(poses), params.reference)
     if files:
@@ -41,8 +53,16 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks
 
 
 def save_views_to_paint(folder: Path, painted: list[str], space: Workspace) -> None:
-    """Write what people can paint over: <view>.png and <view>_mask.png of the views that cover most of what has to be
-    invented, those in `painted` first, and ranked.txt."""
+    """Write templates over which people can paint a reference, for the views that cover most of the hole.
+
+    A view's template is <view>.png, the view without the object and grey where it has to be invented, and
+    <view>_mask.png, these pixels (its invent mask I). ranked.txt lists the views and how much of the hole each adds.
+
+    Args:
+        folder: where the files are written.
+        painted: names of the views that have a reference already; they come first.
+        space: results of the stages `poses`, `fit` and `masks`.
+    """
     train = space.scene.train
     consistent, invent = (
         {name: getattr(space.mask_sets[name], kind) for name in train} for kind in ("consistent", "invent")
@@ -59,8 +79,18 @@ def save_views_to_paint(folder: Path, painted: list[str], space: Workspace) -> N
 
 
 def inpaint_reference(params: Params, out: Path, space: Workspace) -> Reference:
-    """The view that `masks` found best: the photograph outside C, in C the remaining Gaussians' render where other
-    views show the background, and the inpainter's picture in I."""
+    """Inpaint the view that the stage `masks` selected as the best one, and return it as a reference.
+
+    Outside the consistent mask C the reference is the photograph. In C it is a rendering of the remaining Gaussians
+    (those without the object). In the invent mask I it is the inpainter's picture.
+
+    Args:
+        out: folder of this stage, for the candidates.
+        space: results of the stages `poses`, `fit` and `masks`.
+
+    Raises:
+        ValueError: `params.choose` is not the number of a candidate.
+    """
     name = space.facts["best_reference"]
     if params.choose is not None and params.choose >= params.candidates:
         raise ValueError(f"reference.choose is {params.choose}, but candidates are counted 0..{params.candidates - 1}")
@@ -77,7 +107,19 @@ def inpaint_reference(params: Params, out: Path, space: Workspace) -> Reference:
 
 
 def inpaint_by_patches(params: Params, out: Path, base: np.ndarray, name: str, space: Workspace) -> np.ndarray:
-    """uint8 [H, W, 3]: the view with I put together from patches of the photographs."""
+    """Fill the hole of a view from patches of the photographs, once per seed, and return the chosen candidate.
+
+    The candidate of least misfit is chosen, unless `params.choose` names another one. All candidates are written.
+
+    Args:
+        out: folder of this stage, for the candidates.
+        base: uint8 [H, W, 3], the view without the object.
+        name: name of the view.
+        space: results of the stages `poses`, `fit` and `masks`.
+
+    Returns:
+        uint8 [H, W, 3].
+    """
     camera, masks = space.scene.cameras[name], space.mask_sets[name]
     hole = exemplar.mask_to_paint(masks.consistent, masks.invent)
     seeds = [params.seed + index for index in range(params.candidates)]
@@ -89,7 +131,20 @@ def inpaint_by_patches(params: Params, out: Path, base: np.ndarray, name: str, s
 
 
 def inpaint_by_prior(params: Params, out: Path, base: np.ndarray, name: str, masks: MaskSet) -> np.ndarray:
-    """uint8 [H, W, 3]: the view with I inpainted by the diffusion prior."""
+    """Inpaint the invent mask I of a view by the diffusion prior, once per seed, and return the chosen candidate.
+
+    The candidate with the least visible seam is chosen, unless `params.choose` names another one. All candidates are
+    written.
+
+    Args:
+        out: folder of this stage, for the candidates.
+        base: uint8 [H, W, 3], the view without the object.
+        name: name of the view.
+        masks: pixel classes of the view.
+
+    Returns:
+        uint8 [H, W, 3].
+    """
     prior = load_prior(params.prior, params.device, params.dtype)
     prior = memory.fit_to_memory(prior, params.memory_gb, "reference.memory_gb")
     hole = torch.from_numpy(masks.invent)
@@ -111,6 +166,6 @@ def inpaint_by_prior(params: Params, out: Path, base: np.ndarray, name: str, mas
 
 
 def save_candidates(out: Path, images: list[np.ndarray], facts: dict) -> None:
-    """Write the pictures side by side, and which one was chosen."""
+    """Write all candidates side by side as candidates.png, and `facts` about them as candidates.json."""
     save_image(out / "candidates.png", np.concatenate(images, 1))
     save_json(out / "candidates.json", facts)

@@ -1,8 +1,9 @@
-"""Closes a scene where no training view looked: removes unsupported Gaussians and adds a soft backdrop behind the rest.
+"""The backdrop: a sphere of soft disks that closes the scene in directions in which no training view looked.
 
-Beyond the frames of the capture and around its corners a fit has no Gaussians, or some that no photograph supervised.
-Views that look there show black holes and blobs. A sphere behind everything, in the blurred colours that lie in about
-the same direction, continues the scene softly instead. (What else was measured: docs/results.md#backdrop.)
+Outside the image areas of all training views a fit has no Gaussians, or Gaussians that no photograph supervised. New
+views that look in these directions show black holes and blobs. Gaussians that the training views hardly see are
+therefore removed, and the sphere is added behind everything. Each of its disks has the blurred colour of the surfaces
+that lie in about the same direction. (Alternatives that were measured: docs/results.md#backdrop.)
 """
 
 from __future__ import annotations
@@ -19,24 +20,27 @@ from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
-SUPPORT = 0.1  # px, blending weight over all training views that a Gaussian needs to stay
+SUPPORT = 0.1  # px, total blending weight in all training views above which a Gaussian is supported and stays
 LONGEST = 256  # px, larger side at which training views are rendered
-BLOCK = 16  # px, side of the blocks of a training view whose mean colours the backdrop continues
-DISKS = 2000  # Gaussians of the sphere: 4.5 degrees from one to the next
+BLOCK = 16  # px, side of the blocks of a training view whose mean colours determine the colours of the backdrop
+DISKS = 2000  # number of Gaussians of the sphere: neighbours are 4.5 degrees apart
 SPACING = math.sqrt(4 * math.pi / DISKS)  # radians between neighbouring disks
-# Radius of the sphere over the distance of the farthest Gaussian or camera. Closer, disks at a frame's edge would stand
-# in front of what they must lie behind.
+# Radius of the sphere, divided by the distance of the farthest Gaussian or camera from the middle of the cameras. On a
+# smaller sphere, disks at the edge of a training view would lie in front of Gaussians that they must lie behind.
 CLEARANCE = 1.5
-VIEW_BLUR = 0.06  # radians around a block of a view in which its colour is hardly mixed with others
-POINT_BLUR = 0.2  # the same around a point that no view shows: a single stray one must not colour its neighbourhood
+VIEW_BLUR = 0.06  # radians, `Patches.blur` of a block of a view
+POINT_BLUR = 0.2  # radians, `Patches.blur` of a point that no view shows: one stray point must not colour a whole area
 
 
 class Patches(NamedTuple):
-    """Coloured rays: S patches, each seen from an origin along a direction; float64.
+    """S coloured patches of the scene, each given by the ray along which it is seen; float64.
 
     Attributes:
-        origins, directions, colors: [S, 3].
-        blur: [S] radians around the ray in which the colour is hardly mixed with others.
+        origins: [S, 3], where the rays start, in world coordinates.
+        directions: [S, 3], directions of the rays, of any length.
+        colors: [S, 3] in [0, 1].
+        blur: [S], radius in radians around the ray. When colours are averaged, the weight of the patch is about
+            constant within this radius, and decreases with the sixth power of the distance beyond.
     """
 
     origins: np.ndarray
@@ -46,14 +50,19 @@ class Patches(NamedTuple):
 
 
 def complete_scene(scenes: Sequence[Gaussians], cameras: Sequence[Camera]) -> list[Gaussians]:
-    """The supported Gaussians of each scene, in their order, followed by the backdrop of the first scene.
+    """Return each scene with its unsupported Gaussians removed and the backdrop of the first scene appended.
 
-    Pixels that the training views see keep their colours: what is removed does not show there, and what is added lies
+    A Gaussian is supported if its blending weight, summed over all pixels of the training views, exceeds `SUPPORT`. The
+    training views look the same as before: the removed Gaussians hardly contribute to them, and the backdrop lies
     behind everything.
 
     Args:
-        scenes: states of one scene, the final one first.
-        cameras: its training views; without any, the scenes come back unchanged.
+        scenes: states of one scene (e.g. after `distill` and after `initialize`), the final state first.
+        cameras: the training views.
+
+    Returns:
+        The completed scenes, in the order of `scenes`: first the supported Gaussians in their order, then the backdrop.
+        The scenes are returned unchanged if there are no cameras, or if the first scene shows nothing in them.
     """
     if not cameras:
         return list(scenes)
@@ -70,10 +79,12 @@ def complete_scene(scenes: Sequence[Gaussians], cameras: Sequence[Camera]) -> li
 
 
 def blending_weights(gaussians: Gaussians, cameras: Sequence[Camera], pixels: Sequence[float]) -> torch.Tensor:
-    """[N] the blending weight of each Gaussian, summed over the pixels of all views.
+    """Return [N], the blending weight of each Gaussian, summed over the pixels of all views.
 
     Args:
-        pixels: for each camera, how many pixels of the full view one of its pixels stands for.
+        cameras: the views, at reduced resolution.
+        pixels: for each camera, the number of pixels of the full-size view that one pixel of the camera represents. The
+            result is in pixels of the full-size views.
     """
     total = gaussians.means.new_zeros(len(gaussians))
     for camera, share in zip(cameras, pixels, strict=True):
@@ -84,17 +95,22 @@ def blending_weights(gaussians: Gaussians, cameras: Sequence[Camera], pixels: Se
 
 @torch.no_grad()
 def patches_of_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> Patches:
-    """The blocks of all rendered views."""
+    """Render the views, and return their blocks of `BLOCK` x `BLOCK` pixels as patches."""
     renders = ((camera, rasterizer.render(gaussians, camera)) for camera in cameras)
     return concatenate([_blocks(c, r.color.double().cpu().numpy(), r.alpha.double().cpu().numpy()) for c, r in renders])
 
 
 def patches_outside_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> Patches:
-    """The unsupported Gaussians that lie in no view's frame, as seen from the middle of the cameras.
+    """Return the Gaussians that project into no view as patches, seen from the middle of the cameras.
 
-    These are points that the scene brought, coloured by photographs that are not among the training views. As Gaussians
-    they show as blobs, since nothing formed a surface of them, but their colours are true. Unsupported Gaussians within
-    a frame lie behind or inside something and tell nothing.
+    These Gaussians come from the scene's sparse points, whose colours are those of photographs that are not among the
+    training views. They look like blobs when rendered, because no training view supervised them, but their colours are
+    correct. Unsupported Gaussians that project into a view are left out: they lie behind or inside a surface, and their
+    colours are arbitrary.
+
+    Args:
+        gaussians: the unsupported Gaussians (see `complete_scene`).
+        cameras: the training views.
     """
     means = gaussians.means.double().cpu().numpy()
     outside = np.ones(len(means), bool)
@@ -107,18 +123,23 @@ def patches_outside_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> Pa
 
 
 def concatenate(patches: Sequence[Patches]) -> Patches:
-    """All patches in one."""
+    """Concatenate several sets of patches."""
     return Patches(*(np.concatenate(column) for column in zip(*patches, strict=True)))
 
 
 def shrink_camera(camera: Camera, longest: int) -> Camera:
-    """The same view with no side longer than `longest` px."""
+    """Return the view at a reduced resolution, with no side longer than `longest` px; small views stay as they are."""
     share = min(1.0, longest / max(camera.width, camera.height))
     return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
 
 
 def _blocks(camera: Camera, color: np.ndarray, alpha: np.ndarray) -> Patches:
-    """The blocks of a view, `BLOCK` px a side, at least half of which is covered."""
+    """Return the blocks of a view, `BLOCK` px a side, as patches; blocks with a mean alpha up to 0.5 are left out.
+
+    Args:
+        color: [H, W, 3], the rendering over a black background.
+        alpha: [H, W].
+    """
     rows, columns = (np.arange(0, size, BLOCK) for size in color.shape[:2])
     total = lambda values: np.add.reduceat(np.add.reduceat(values, rows, 0), columns, 1)
     covered, size = total(alpha), total(np.ones_like(alpha))
@@ -130,9 +151,14 @@ def _blocks(camera: Camera, color: np.ndarray, alpha: np.ndarray) -> Patches:
 
 
 def build_backdrop(scenes: Sequence[Gaussians], cameras: Sequence[Camera], patches: Patches) -> Gaussians:
-    """`DISKS` soft disks, float32 on the CPU, on a sphere behind all Gaussians of the scenes and all cameras.
+    """Return the backdrop: `DISKS` soft disks on a sphere around all Gaussians and cameras, float32 on the CPU.
 
-    A disk's colour is a mean of the patches' colours, weighted by how near a patch's ray meets the sphere.
+    The colour of a disk is the weighted mean of the patches' colours. The weight of a patch is larger the nearer to the
+    disk the patch's ray meets the sphere.
+
+    Args:
+        scenes: the Gaussians that lie inside the sphere. The first scene sets the number of spherical harmonics.
+        cameras: the cameras that lie inside the sphere. Its centre is the mean of their centres.
     """
     centers = np.stack([camera.center for camera in cameras])
     middle = centers.mean(0)
@@ -144,7 +170,7 @@ def build_backdrop(scenes: Sequence[Gaussians], cameras: Sequence[Camera], patch
     sh = np.zeros((DISKS, scenes[0].sh.shape[1], 3))
     sh[:, 0] = (colors - 0.5) / SH0
     sizes = radius * SPACING * np.array([0.8, 0.8, 0.05])
-    # The shortest rotation from z to the direction of the disk; for -z any half turn will do.
+    # The shortest rotation from the z axis to the direction of the disk; no disk lies exactly at -z, where this is 0.
     quaternions = np.concatenate([1 + disks[:, 2:], np.cross([0.0, 0.0, 1.0], disks)], 1)
     logits = np.full(DISKS, math.log(0.98 / 0.02))
     arrays = (middle + radius * disks, quaternions, np.log(np.tile(sizes, (DISKS, 1))), logits, sh)
@@ -152,7 +178,7 @@ def build_backdrop(scenes: Sequence[Gaussians], cameras: Sequence[Camera], patch
 
 
 def _fibonacci_sphere(count: int) -> np.ndarray:
-    """[count, 3] unit vectors about equally far apart, on a spiral of the golden ratio."""
+    """Return [count, 3] unit vectors that are about evenly spaced, on a spiral of the golden ratio."""
     index = np.arange(count) + 0.5
     height, turn = 1 - 2 * index / count, math.pi * (1 + math.sqrt(5)) * index
     level = np.sqrt(1 - height**2)
@@ -160,10 +186,11 @@ def _fibonacci_sphere(count: int) -> np.ndarray:
 
 
 def _intersect_unit_sphere(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """[S, 3] unit vectors: where rays that start inside the unit sphere leave it.
+    """Return [S, 3] unit vectors, the points where rays that start inside the unit sphere leave it.
 
     Args:
-        origins, directions: [S, 3]; a ray without length gives its origin.
+        origins: [S, 3], inside the unit sphere.
+        directions: [S, 3], of any length. For a direction of length 0 the result is the ray's origin.
     """
     length = np.linalg.norm(directions, axis=1, keepdims=True)
     directions = directions / np.maximum(length, np.finfo(np.float64).tiny)
@@ -173,8 +200,17 @@ def _intersect_unit_sphere(origins: np.ndarray, directions: np.ndarray) -> np.nd
 
 
 def _interpolate_colors(disks: np.ndarray, hits: np.ndarray, colors: np.ndarray, blur: np.ndarray) -> np.ndarray:
-    """[D, 3] colours at the unit vectors `disks` [D, 3]: means of `colors` [S, 3], weighted by distance to the power -6
-    from `hits` [S, 3], and equally within `blur` [S] radians."""
+    """Return [D, 3], the colours of the disks: weighted means of the patches' colours.
+
+    The weight of a patch is (d^2 + blur^2)^-3, where d is the distance between the unit vectors of disk and patch. So
+    the weight decreases with the sixth power of the distance, and is about constant within `blur`.
+
+    Args:
+        disks: [D, 3], directions of the disks, unit vectors.
+        hits: [S, 3], directions of the points where the patches' rays meet the sphere, unit vectors.
+        colors: [S, 3], colours of the patches.
+        blur: [S] radians, see `Patches`.
+    """
     mixed = np.empty_like(disks)
     for part in np.array_split(np.arange(len(disks)), 10):  # all at once would take gigabytes
         squared_distance = 2 - 2 * disks[part] @ hits.T

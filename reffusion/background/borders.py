@@ -1,4 +1,8 @@
-"""Where a surface ends in unobserved space: its visible borders are extended straight."""
+"""The borders of a plane in unobserved space, found by extending the plane's visible borders straight.
+
+A plane has a map of square cells (`plane.Plane`). A cell is *seen* where views show the plane, *free* where views see
+through the plane, so that it does not exist there, and *unknown* otherwise.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +10,23 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
 
-RIM = 1  # cells: a strip of seen cells that is no wider on either side is blurred by the masks' margin
+RIM = 1  # cells: strips of seen cells up to 2 RIM wide are ignored, because they arise at the margins of the masks
 
 
 def extend_borders(unknown: np.ndarray, seen: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """[H, W] in [0, 1]: on unknown cells the harmonic function that is 1 next to seen cells and 0 next to free ones.
+    """Return the harmonic function on unknown cells that is 1 at adjacent seen cells and 0 at adjacent free cells.
 
-    Its level set at one half extends the visible border between seen and free cells, straight where it can.
+    The function solves Laplace's equation on the cells. Its level set at 1/2 continues the visible border between seen
+    and free cells into the unknown cells, straight where possible.
+
+    Args:
+        unknown: bool [H, W], the cells to solve for. Cells up to 2 RIM + 1 steps away that are neither seen nor free
+            are solved for, too.
+        seen: bool [H, W], cells where the plane is seen.
+        free: bool [H, W], cells where views see through the plane.
+
+    Returns:
+        [H, W] in [0, 1]; 0 on all cells that are not solved for, and everywhere if no seen cell is adjacent.
     """
     unknown = unknown | (ndimage.binary_dilation(unknown, iterations=2 * RIM + 1) & ~seen & ~free)
     index = np.full(unknown.shape, -1)

@@ -1,4 +1,8 @@
-"""Find the planes around a hole, and where each continues into space that no photograph shows."""
+"""Search for the planes around a hole, and for the cells into which each of them continues behind the object.
+
+Each plane has a map of square cells (`plane.Plane`). A cell is *seen* where views show the plane, *free* where views
+see through the plane, and unknown otherwise. The plane continues into some of the unknown cells.
+"""
 
 from __future__ import annotations
 
@@ -18,39 +22,48 @@ from reffusion.background.visibility import SURFACE, DepthView, count_views, is_
 from reffusion.gaussians.surfels import surface_normals
 from reffusion.types import Camera
 
-REACH = 2.5  # radii of the object: surfaces this close to its middle are considered
-INLIER = 0.08  # of the object's radius: distance within which a sample belongs to a plane
-MIN_SPREAD = 0.25  # of the object's radius: least standard deviation, in every direction, of points that refine a plane
-MIN_SHARE = 0.1  # of all samples that a plane must explain
+REACH = 2.5  # in radii of the object: surfaces up to this distance from the middle of the object are considered
+INLIER = 0.08  # in radii of the object: distance within which a sample belongs to a plane
+MIN_SPREAD = 0.25  # in radii of the object: `min_spread` of `plane_fit.refine_by_points`
+MIN_SHARE = 0.1  # least share of all samples that must lie on a plane
 MAX_PLANES = 5
-MIN_PATCH = 0.05  # of the largest patch of seen cells: smaller patches do not belong to the plane
-ALIGN_INLIER = (0.05, 0.03, 0.015, 0.015)  # relative depth within which a view's pixels belong to a plane, step by step
-ALIGN_PIXELS = 200  # pixels that must belong to it
-ALIGN_LIMIT = 0.08  # relative depth: a plane that would move further anywhere in the hole stays where it is
-ALIGN_PRIOR = 0.05  # weight of the plane's old position inside the hole, against the pixels around it
-CROSSING = 0.9  # cosine of the angle between two planes below which they cross
-NORMAL_RATIO = 1.0  # cosine to one plane over that to another, from which a surface belongs to the first
-NORMAL_SMOOTHING = 0.01  # of the image's width: scale at which a surface's normal is measured
-WIDER_MAP = 2.0  # factor by which the map is wider on which enclosed patches are detected
-MIN_REFLECTION = 0.03  # of the seen cells: smaller enclosed patches are unevenness, not mirrors
-MIN_HOLE = 0.01  # of the seen cells: smaller patches that views see through are depth errors
-ENCLOSED = 0.8  # share of a free patch's border that must be seen for it to be enclosed: a recess has less
-TOUCHING = 0.25  # share of an unobserved patch's border that must be seen for the plane to continue into it
+MIN_PATCH = 0.05  # area relative to the largest patch of seen cells, below which a patch does not belong to the plane
+ALIGN_INLIER = (0.05, 0.03, 0.015, 0.015)  # relative depth error below which a pixel is an inlier, in successive fits
+ALIGN_PIXELS = 200  # least number of inlier pixels
+ALIGN_LIMIT = 0.08  # relative depth: a plane that would move further anywhere in the hole is not moved
+ALIGN_PRIOR = 0.05  # weight of all pixels of the plane's old position in the hole; all inliers around have weight 1
+CROSSING = 0.9  # cosine of the angle between two planes' normals below which they cross
+# A surface belongs to a plane, and not to another one, if the cosine between its normal and that of the plane is more
+# than this many times the cosine with the other normal.
+NORMAL_RATIO = 1.0
+NORMAL_SMOOTHING = 0.01  # of the image's width: standard deviation of the blur with which normals are measured
+WIDER_MAP = 2.0  # enclosed patches are detected on a map that is wider by this factor
+MIN_REFLECTION = 0.03  # of the area of the seen cells: smaller enclosed patches are uneven places, not mirrors
+MIN_HOLE = 0.01  # of the area of the seen cells: smaller patches of free cells are depth errors
+ENCLOSED = 0.8  # a free patch is enclosed if a larger share of its border is seen; for a recess the share is smaller
+TOUCHING = 0.25  # a plane continues into an unknown patch only if a larger share of the patch's border is seen
 
 
 def find_planes(
     center: np.ndarray, radius: float, views: Sequence[DepthView], points: np.ndarray, seed: int = 0
 ) -> list[Plane]:
-    """The planes around the removed object, those with most samples first.
+    """Find the planes around the removed object, with the cells into which they continue.
 
-    Planes are fitted in the world to the surfaces that several views show around their masks: the depth of one view is
-    rough, and a plane that is oblique in one view is frontal in another. Sparse points refine a plane's position where
-    enough of them lie sharply on it (`plane_fit.refine_by_points`).
+    Planes are fitted by RANSAC to samples, i.e. points of the surfaces that several views show around their masks. One
+    view would not suffice, because its depth is rough, and a plane that is oblique in one view is frontal in another.
+    Sparse points refine a plane's position if enough of them lie sharply on it (`plane_fit.refine_by_points`). Third
+    faces of corners are added (`corners.find_third_faces`).
 
     Args:
-        center: [3], the middle of the removed object. radius: the radius of most of it.
+        center: [3], the middle of the removed object.
+        radius: radius around the center that contains most of the removed object.
+        views: depth of the training views, rendered with the object.
         points: [P, 3], the scene's sparse points; P = 0 is allowed.
-        seed: of the RANSAC draws.
+        seed: seed of the random draws.
+
+    Returns:
+        Up to `MAX_PLANES` planes in the order in which RANSAC found them, about by decreasing number of samples; then
+        the third faces.
     """
     samples = sample_surfaces(center, REACH * radius, views, seed)
     points = points[np.linalg.norm(points - center, axis=1) < REACH * radius]
@@ -66,7 +79,7 @@ def find_planes(
         new_normal, new_offset = refined or (normal, offset)
         if refined or not _is_duplicate(normal, offset, found, center, SURFACE * distance):
             found.append((new_normal, new_offset))
-        # The points of a plane lie about its refined position, its samples about the rendered one.
+        # Sparse points lie around the refined plane, samples around the plane that was fitted to them.
         points = points[np.abs(points @ new_normal - new_offset) >= 1.5 * inlier]
         unexplained &= np.abs(samples @ normal - offset) >= 1.5 * inlier
     thirds = find_third_faces(samples, unexplained, found, center, radius, inlier)
@@ -78,8 +91,8 @@ def find_planes(
     ]
     planes = [plane for plane, _ in maps]
     grounds = [_crossing(plane, planes[:k]) for k, plane in enumerate(planes)]
-    # Cells near a crossing could belong to either plane. They belong to the one with more samples, unless most views
-    # show a surface there that faces as the other plane does.
+    # Cells near the intersection of two planes could belong to either of them. They belong to the plane with more
+    # samples, unless most views show a surface there with the normal of the other plane.
     facing = _cells_facing(planes, grounds, views)
     complete: list[Plane] = []
     for (plane, occluded), own_grounds, own_cells, third in zip(maps, grounds, facing, is_third, strict=True):
@@ -93,8 +106,16 @@ def find_planes(
 def _is_duplicate(
     normal: np.ndarray, offset: float, planes: Sequence[tuple[np.ndarray, float]], center: np.ndarray, distance: float
 ) -> bool:
-    """Whether a plane without sparse points repeats one of `planes`, parallel to it within the `distance` that views
-    can tell apart."""
+    """Return whether a plane coincides with one of `planes`, up to the precision of the views.
+
+    It is called for planes that sparse points could not refine, whose position is less precise.
+
+    Args:
+        normal, offset: the plane normal . x = offset.
+        planes: (normal, offset) of the planes found so far.
+        center: [3], point near which the distance of the planes is measured.
+        distance: distance below which parallel planes coincide.
+    """
     for other, other_offset in planes:
         foot = center - (center @ other - other_offset) * other
         if abs(normal @ other) > MAX_TURN and abs(normal @ foot - offset) < distance:
@@ -103,15 +124,24 @@ def _is_duplicate(
 
 
 def _crossing(plane: Plane, others: Sequence[Plane]) -> list[Plane]:
+    """Return those of the other planes that cross the plane, i.e. that are not about parallel to it."""
     return [other for other in others if abs(other.normal @ plane.normal) < CROSSING]
 
 
 def align_plane(plane: Plane, depth: np.ndarray, camera: Camera, hole: np.ndarray) -> Plane:
-    """The plane moved onto the depth that one view knows around a hole; unchanged where too few pixels tell.
+    """Move a plane onto the depth of one view around a hole.
+
+    The disparity of a plane is an affine function of the pixel. The function is fitted to the pixels around the hole
+    that are inliers, with the plane's old position inside the hole as a weak prior.
 
     Args:
-        depth: [H, W], accurate where above 0.
-        hole: bool [H, W], where the plane may continue. There its old position is a weak prior.
+        depth: [H, W], accurate camera z of the pixels around the hole; 0 where unknown.
+        camera: the view.
+        hole: bool [H, W], True where the plane may continue.
+
+    Returns:
+        The moved plane with the same cells; the given plane if fewer than `ALIGN_PIXELS` pixels are inliers, or if the
+        depth in the hole would change by `ALIGN_LIMIT` or more.
     """
     plane_depth = plane.depth(camera)
     known = (depth > 0) & np.isfinite(plane_depth)
@@ -139,8 +169,18 @@ def align_plane(plane: Plane, depth: np.ndarray, camera: Camera, hole: np.ndarra
 
 
 def _continued_hull(plane: Plane, seen: np.ndarray, grounds: Sequence[Plane]) -> np.ndarray:
-    """bool [CELLS, CELLS]: the convex hull of the large patches of seen cells, since a surface ends where its visible
-    borders, extended, do. What stands on one of the `grounds`, planes that it crosses, reaches down to it."""
+    """Return the region in which a plane may continue: the convex hull of the large patches of seen cells.
+
+    Seen cells are also projected down onto the planes on which the surface may stand, so that e.g. a wall continues
+    down to the floor.
+
+    Args:
+        seen: bool [CELLS, CELLS], cells where the plane is seen.
+        grounds: planes that cross this plane and have more samples. The surface may stand on them.
+
+    Returns:
+        bool [CELLS, CELLS].
+    """
     patches, count = ndimage.label(_without_rims(seen))
     areas = np.bincount(patches.ravel(), minlength=count + 1)
     areas[0] = 0
@@ -154,27 +194,37 @@ def _continued_hull(plane: Plane, seen: np.ndarray, grounds: Sequence[Plane]) ->
 
 
 def _without_rims(seen: np.ndarray) -> np.ndarray:
-    """bool [CELLS, CELLS]: seen cells without thin strips."""
+    """Return the seen cells, bool [CELLS, CELLS], without strips up to 2 RIM cells wide."""
     return cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_OPEN, morphology.square(RIM)) > 0
 
 
 def _map_plane(
     normal: np.ndarray, offset: float, center: np.ndarray, reach: float, views: Sequence[DepthView], third: bool
 ) -> tuple[Plane, np.ndarray]:
-    """The plane with its map of seen, free and reflective cells; and bool [CELLS, CELLS], cells that the object
-    occludes in some view."""
+    """Build a plane with its map of seen, free and reflective cells.
+
+    Args:
+        normal, offset: the plane normal . x = offset.
+        center: [3], the middle of the removed object. Its projection onto the plane is the middle of the map.
+        reach: half of the map's side, in world units.
+        third: True for a third face of a corner.
+
+    Returns:
+        The plane, which does not continue anywhere yet, and bool [CELLS, CELLS], True for cells that the object's mask
+        covers in some view.
+    """
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     axes = np.stack([first / np.linalg.norm(first), np.cross(normal, first / np.linalg.norm(first))])
     origin, cell_size = center - (center @ normal - offset) * normal, 2 * reach / CELLS
     empty = np.zeros((CELLS, CELLS), bool)
     plane = Plane(normal, offset, origin, axes, cell_size, empty, empty, empty, empty, empty)
-    # The plane is looked at from the object's side: the underside of a table, seen from below, is not the top under the
-    # object. Where no camera is on that side (a table's top beside something lower), from the other side.
+    # Only views on one side of the plane count, because the underside of a table is no evidence of its top. This is the
+    # object's side, or the other side if no camera is on the object's side (e.g. a table's top beside a lower object).
     facing = normal if center @ normal > offset else -normal
     if not any(view.camera.center @ facing > plane.origin @ facing for view in views):
         facing = -facing
     seen, free, occluded = _cell_visibility(plane, facing, views)
-    # An object in front of a wall's edge is on both sides of a third face: the side from which more is seen counts.
+    # An object at the edge of a wall lies on both sides of a third face. Then the side counts from which more is seen.
     if third and (other := _cell_visibility(plane, -facing, views))[0].sum() > seen.sum():
         facing, (seen, free, occluded) = -facing, other
     wide = replace(plane, cell_size=WIDER_MAP * cell_size)
@@ -187,8 +237,12 @@ def _map_plane(
 
 
 def _small_holes(free: np.ndarray, min_cells: float) -> np.ndarray:
-    """bool [CELLS, CELLS]: patches of fewer than `min_cells` free cells. Depth errs beside the object's edge."""
-    patches, count = ndimage.label(np.pad(free, 1, constant_values=True))  # a patch may continue beyond the map
+    """Return bool [CELLS, CELLS], the patches of fewer than `min_cells` free cells.
+
+    Such patches arise from depth errors beside the object's edge. A patch at the border of the map is never small,
+    because it may continue beyond the map.
+    """
+    patches, count = ndimage.label(np.pad(free, 1, constant_values=True))  # joins all patches at the map's border
     areas = np.bincount(patches.ravel(), minlength=count + 1)
     return free & (areas < min_cells)[patches][1:-1, 1:-1]
 
@@ -196,8 +250,15 @@ def _small_holes(free: np.ndarray, min_cells: float) -> np.ndarray:
 def _cell_visibility(
     plane: Plane, facing: np.ndarray, views: Sequence[DepthView]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """bool [CELLS, CELLS] each: cells where views on the side of `facing`, [3], show the plane, where views see through
-    it, and where the object occludes it in some view."""
+    """Classify the cells of a plane as seen, free or occluded by the object, for the views on one side of the plane.
+
+    Args:
+        facing: [3], normal that points to this side.
+
+    Returns:
+        Three arrays, bool [CELLS, CELLS]: the cells where views show the plane, the cells where views see through the
+        plane (from either side), and the cells that the object's mask covers in some view.
+    """
     normals = np.broadcast_to(facing, (CELLS * CELLS, 3))
     visibility = count_views(plane.cell_centers.reshape(-1, 3), views, normals)
     seen = (visibility.seen >= 1) & (visibility.seen >= visibility.free)
@@ -206,7 +267,11 @@ def _cell_visibility(
 
 
 def _enclosed_patches(seen: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """bool [CELLS, CELLS]: the large patches of free cells that seen cells surround."""
+    """Return bool [CELLS, CELLS], the large patches of free cells that seen cells enclose.
+
+    A mirror or a window in the plane is such a patch. Views seem to see through the plane there. Patches that touch the
+    border of the map are not enclosed.
+    """
     patches, count = ndimage.label(np.pad(free, 1, constant_values=True))
     found = np.zeros(patches.shape, bool)
     padded = np.pad(seen, 1)
@@ -221,18 +286,22 @@ def _enclosed_patches(seen: np.ndarray, free: np.ndarray) -> np.ndarray:
 def _continue_plane(
     plane: Plane, occluded: np.ndarray, grounds: Sequence[Plane], others: Sequence[Plane], band: float, third: bool
 ) -> Plane:
-    """The plane with the cells into which it continues.
+    """Return the plane with its attributes `continued` and `enclosed`, the cells into which it continues.
 
-    It continues into an unobserved patch that the object occludes and that touches seen cells, up to its extended
-    border; not where views see through it.
+    The plane continues into a patch of unknown cells that the object occludes, if enough of the patch's border is seen.
+    Within the patch the plane ends at its visible borders, which are extended straight (`borders.extend_borders`), and
+    at the border of the region of `_continued_hull`.
 
     Args:
-        occluded: bool [CELLS, CELLS], cells that the object occludes.
-        others: planes that cross it. grounds: those of them with more samples.
-        band: distance to `others` within which a view that seems to show this plane may show the other.
-        third: only known cells of a patch's border decide whether it touches: most of the rest is inside walls.
+        occluded: bool [CELLS, CELLS], True for cells that the object occludes.
+        grounds: those planes of `others` that have more samples than this plane. This plane may stand on them.
+        others: planes that cross this plane.
+        band: distance to a plane of `others` within which a view may confuse the two planes, in world units.
+        third: True for a third face of a corner. Most cells around its patches are inside walls and unknown, so only
+            the seen and free cells of a patch's border count.
     """
-    # Neither thin rims nor crossings tell where the plane continues.
+    # Reflective cells, through which views see only because the plane is a mirror there, count as seen.
+    # Seen cells near another plane, and thin strips of seen cells, do not determine the borders of the plane.
     seen, free = plane.seen | plane.reflective, plane.free & ~plane.reflective
     own = seen.copy()
     for other in others if not third else ():
@@ -256,11 +325,19 @@ def _continue_plane(
 def _cells_facing(
     planes: Sequence[Plane], grounds: Sequence[Sequence[Plane]], views: Sequence[DepthView]
 ) -> list[np.ndarray]:
-    """For each plane bool [CELLS, CELLS]: cells where most views that show a surface show one whose normal is closer to
-    the plane's than to that of its grounds, which cross it; all cells where it has none.
+    """Return for each plane the cells where the visible surface has about the normal of the plane.
 
-    The normals of one view take more memory than everything else of it, so they exist for one view at a time.
+    A cell is True if most views that show a surface there show a normal that is closer to the plane's normal than to
+    the normals of its grounds.
+
+    Args:
+        grounds: for each plane, the planes that cross it and have more samples. For a plane without grounds all cells
+            are True.
+
+    Returns:
+        bool [CELLS, CELLS] for each plane.
     """
+    # The normals of a view take more memory than all its other data, so only those of one view exist at a time.
     cells = [plane.cell_centers.reshape(-1, 3) for plane in planes]
     agreeing, visible = ([np.zeros(len(points), np.int64) for points in cells] for _ in range(2))
     for view in views if any(grounds) else ():
@@ -280,7 +357,7 @@ def _cells_facing(
 
 
 def _smooth_normals(view: DepthView) -> np.ndarray:
-    """[H, W, 3] unit normals of a view's surface, smoothed over rough ground."""
+    """Return [H, W, 3], unit normals of the surface that a view shows, blurred because the ground may be rough."""
     sigma = NORMAL_SMOOTHING * view.depth.shape[1]
     known = (view.depth > 0) & ~view.masked
     weight = ndimage.gaussian_filter(known.astype(np.float64), sigma)

@@ -1,4 +1,8 @@
-"""The third face of a corner: oblique views give it few samples, but two planes at right angles fix its direction."""
+"""The third face of a corner, e.g. of a box or a room, found from its two other faces.
+
+Views often show this face obliquely, so few samples of visible surfaces lie on it. But two planes at right angles
+determine its normal.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +15,13 @@ from reffusion import geometry
 from reffusion.background.plane import IN_FRONT, Plane
 from reffusion.background.visibility import DepthView
 
-MAX_COSINE = 0.2  # between two normals up to which they may be two faces of a box or a room
-REACH = 0.75  # of the object's radius: how far from its middle the third face may pass
-MIN_SAMPLES, MIN_SHARE = 50, 0.01  # samples that the face must explain, and their share of all samples
-SHARPNESS = 4.0  # times as many samples as in the slabs beside it: no face in a cloud of leaves is that sharp
-STEPS = 4  # offsets that are tried within a plane's thickness
+MAX_COSINE = 0.2  # cosine between two normals up to which their planes may be two faces of a box or a room
+REACH = 0.75  # of the object's radius: largest distance of the third face from the middle of the object
+MIN_SAMPLES, MIN_SHARE = 50, 0.01  # least number of samples on the face, and least share of all samples
+# A face must have more than this many times the samples of the equally thick slabs beside it. A cloud of leaves has no
+# slab with so many samples.
+SHARPNESS = 4.0
+STEPS = 4  # number of offsets that are tried within the distance of an inlier
 
 
 def find_third_faces(
@@ -26,16 +32,21 @@ def find_third_faces(
     radius: float,
     inlier_distance: float,
 ) -> list[tuple[np.ndarray, float]]:
-    """(normal, offset) of the planes at right angles to two of `planes` that samples show sharply.
+    """Find the planes at right angles to two of the given planes on which many of the remaining samples lie sharply.
 
-    With the direction fixed, few samples determine the offset. RANSAC over three samples would find a hundred planes
-    that are as good.
+    The normal of such a plane is known, so few samples suffice to determine its offset. RANSAC, which draws three
+    samples per plane, would find a hundred planes with as many inliers.
 
     Args:
-        samples: [S, 3]. unexplained: bool [S], samples on none of the planes.
-        planes: (normal, offset) of those found.
-        center: [3], the middle of the removed object; radius: the radius of most of it.
-        inlier_distance: distance within which a sample belongs to a plane.
+        samples: [S, 3], points of the visible surfaces around the object.
+        unexplained: bool [S], True for samples that lie on none of the planes.
+        planes: the planes found so far, each (normal [3], offset), with normal . x = offset.
+        center: [3], the middle of the removed object.
+        radius: radius around the center that contains most of the removed object.
+        inlier_distance: distance within which a sample belongs to a plane, in world units.
+
+    Returns:
+        (normal, offset) of each plane found.
     """
     enough, faces = max(MIN_SAMPLES, MIN_SHARE * len(samples)), []
     for (one, _), (other, _) in combinations(planes, 2):
@@ -61,8 +72,18 @@ def find_third_faces(
 
 
 def visible_past(plane: Plane, nearer: Sequence[Plane], views: Sequence[DepthView]) -> np.ndarray:
-    """bool [CELLS, CELLS]: cells that the object occludes in some view, and that this view would see past everything
-    that is known of the `nearer` planes: the face of a box does not continue inside the box."""
+    """Return the cells of a plane that some view would show if the object were removed.
+
+    A cell is True if in some view the object's mask covers the cell, and no `nearer` plane occludes the cell. A plane
+    occludes only with its known cells (seen or continued). So the face of a box does not continue inside the box,
+    because there the box's other faces occlude it.
+
+    Args:
+        nearer: the planes that may occlude `plane`, with their cells.
+
+    Returns:
+        bool [CELLS, CELLS].
+    """
     points, found = plane.cell_centers.reshape(-1, 3), np.zeros(plane.seen.size, bool)
     for view in views:
         uv, z = geometry.project(points, view.camera)

@@ -1,4 +1,8 @@
-"""Mirror images of things beside the object: what no photograph shows of a symmetric thing is like what they show."""
+"""Mirror images of symmetric things beside the object.
+
+A *thing* is a connected part of the scene beside the removed object. If a plane of mirror symmetry maps the thing onto
+itself, the part of the thing that the photographs show also tells how the part looks that no photograph shows.
+"""
 
 from __future__ import annotations
 
@@ -15,22 +19,23 @@ from reffusion.depth.inpaint_depth import inpaint_depth
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
-COVERED = 0.5  # alpha from which a pixel shows a thing's image
-GAP = 0.01  # of the image's width: radius of gaps in the observed part of a thing that are ignored
-WINDOW = 0.025  # of the image's width: radius of gaps that the image itself does not have, only its texture
-DEEPER = 1.02  # times the depth around a small place, from which the place is such a gap
+COVERED = 0.5  # alpha above which a pixel shows a thing's mirror image
+GAP = 0.01  # of the image's width: gaps of this radius in the observed part of a thing are closed in `is_observed`
+WINDOW = 0.025  # of the image's width: gaps of this radius in the observed part of a thing are closed in its depth
+DEEPER = 1.02  # a place of up to radius `WINDOW` that is deeper than its surroundings by this factor is such a gap
 
 
 @dataclass(frozen=True)
 class MirrorImage:
-    """What a view shows of a thing's mirror image.
+    """The mirror image of a thing, rendered in a view.
 
     Attributes:
-        depth: [H, W] float64 of the whole image; inf elsewhere.
-        plausible_depth: [H, W] float64, the same where the mirrored part of the thing is observed and no view sees past
-            the image; inf elsewhere.
-        is_observed: bool [H, W], where `picture` shows what photographs show of the mirrored part.
-        picture: [H, W, 3] uint8.
+        depth: [H, W] float64, camera z of the mirror image; inf at pixels without mirror image.
+        plausible_depth: [H, W] float64, equal to `depth` where photographs show the part of the thing that is mirrored
+            and the views do not see past the mirror image (`Visibility.is_empty`); inf elsewhere.
+        is_observed: bool [H, W], True where photographs show the part of the thing that is mirrored, so that `picture`
+            has reliable colours.
+        picture: [H, W, 3] uint8, the mirror image.
     """
 
     depth: np.ndarray
@@ -41,11 +46,14 @@ class MirrorImage:
 
 @dataclass(frozen=True)
 class Mirror:
-    """A thing, and a mirror plane that maps it onto itself as far as photographs tell.
+    """A connected part of the scene beside the object (a thing), and its plane of mirror symmetry.
+
+    The photographs do not contradict this symmetry.
 
     Attributes:
-        thing: its Gaussians.
-        normal: [3], unit length. offset: the mirror is the plane normal . x = offset.
+        thing: the Gaussians of the thing.
+        normal: [3], unit normal of the mirror plane.
+        offset: the mirror plane is normal . x = offset.
     """
 
     thing: Gaussians
@@ -53,12 +61,14 @@ class Mirror:
     offset: float
 
     def reflect(self, points: np.ndarray) -> np.ndarray:
-        """The mirror images of points [..., 3]."""
+        """Return the mirror images of world points [..., 3]."""
         return reflect_points(points, self.normal, self.offset)
 
     def reflect_camera(self, camera: Camera) -> Camera:
-        """The camera's mirror image. It sees the thing as the camera sees the thing's image, with left and right
-        swapped."""
+        """Return the mirror image of a camera.
+
+        It sees the thing as the given camera sees the mirror image of the thing, with left and right swapped.
+        """
         swap, turn = np.diag([-1.0, 1.0, 1.0, 1.0]), np.eye(4)
         turn[:3, :3] -= 2 * np.outer(self.normal, self.normal)
         turn[:3, 3] = 2 * self.offset * self.normal
@@ -66,10 +76,12 @@ class Mirror:
 
     @torch.no_grad()
     def render(self, camera: Camera, pixels: np.ndarray, views: Sequence[DepthView]) -> MirrorImage:
-        """What a view shows of the thing's mirror image.
+        """Render the mirror image of the thing.
 
         Args:
-            pixels: bool [H, W], where photographs are asked whether the image is plausible.
+            camera: the view.
+            pixels: bool [H, W], True at the pixels for which `plausible_depth` and `is_observed` are computed.
+            views: depth of the training views, rendered with the object.
         """
         mirrored = self.reflect_camera(camera)
         rendering = rasterizer.render(self.thing, mirrored)
@@ -92,14 +104,17 @@ class Mirror:
 
 
 def reflect_points(points: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
-    """The images of points [..., 3] in the mirror normal . x = offset."""
+    """Return the mirror images of points [..., 3] in the plane normal . x = offset."""
     return points - 2 * (points @ normal - offset)[..., None] * normal
 
 
 def render_mirrors(
     mirrors: Sequence[Mirror], camera: Camera, pixels: np.ndarray, views: Sequence[DepthView]
 ) -> MirrorImage:
-    """What a view shows of all mirror images, at each pixel the nearest plausible one; see `Mirror.render`."""
+    """Render all mirror images into one view; at each pixel the nearest plausible one, else the nearest one.
+
+    The arguments are those of `Mirror.render`. A mirror image is plausible where `plausible_depth` is finite.
+    """
     nowhere = np.full(pixels.shape, np.inf)
     found = MirrorImage(nowhere, nowhere, np.zeros_like(pixels), np.zeros((*pixels.shape, 3), np.uint8))
     for mirror in mirrors:
@@ -117,7 +132,11 @@ def render_mirrors(
 
 
 def _fill_pits(depth: np.ndarray, fraction: float) -> np.ndarray:
-    """[H, W]: a depth map, 0 where unknown, in which small places deeper than their surroundings have the depth of
-    these."""
+    """Replace the depth of small places that are deeper than their surroundings by the depth of the surroundings.
+
+    Args:
+        depth: [H, W], 0 where unknown; unknown pixels count as the farthest depth of the map.
+        fraction: radius of the places as a fraction of the image's width.
+    """
     radius = morphology.to_pixels(fraction, depth.shape[1])
     return cv2.morphologyEx(np.where(depth > 0, depth, depth.max()), cv2.MORPH_OPEN, morphology.disk(radius))

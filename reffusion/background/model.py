@@ -1,4 +1,4 @@
-"""The background: what the photographs show around the removed object, and how its surfaces continue behind it."""
+"""The background: the surfaces that photographs show around the removed object, and their continuation behind it."""
 
 from __future__ import annotations
 
@@ -34,18 +34,21 @@ _PLANE_ARRAYS = (
 
 @dataclass(frozen=True)
 class Background:
-    """What the photographs show around the removed object.
+    """The surroundings of the removed object, as the photographs show them.
 
     Attributes:
-        views: the training views' depth, with the object; a view without a photograph may be among them.
-        photos: view name -> uint8 [H, W, 3], in the exposure of the Gaussians.
-        masks: view name -> bool [H, W], C.
-        planes, mirrors: surfaces and symmetric things around the object, which continue behind it.
-        center: [3], the middle of the object. radius: the radius of most of it; infinite where nothing is removed.
+        views: depth of the training views, rendered with the object. Views without a photograph may be among them.
+        photos: view name -> uint8 [H, W, 3], the photographs in the exposure of the Gaussians.
+        masks: view name -> bool [H, W], the consistent masks C, True at pixels that show the object.
+        planes: planes around the object, with the cells in which they continue behind the object.
+        mirrors: things beside the object, with their planes of mirror symmetry.
+        center: [3], the middle of the object.
+        radius: radius around the center that contains most of the object; infinite if nothing is removed.
         points: [P, 3], the scene's sparse points.
-        unobserved: view name -> bool [H, W], pixels of C that no photograph shows.
+        unobserved: view name -> bool [H, W], True at pixels of C whose background no photograph shows.
         without_photo: names of the views without a photograph.
-        completed: views completed before, as depth views without the object, and their pictures, uint8 [H, W, 3].
+        completed: the views that were completed earlier. For each, its depth without the object, and its picture, uint8
+            [H, W, 3].
     """
 
     views: Sequence[DepthView]
@@ -62,21 +65,42 @@ class Background:
 
     @property
     def cameras(self) -> list[Camera]:
+        """The cameras of `views`, in the same order."""
         return [view.camera for view in self.views]
 
     def photographed_depth(self, camera: Camera) -> np.ndarray:
-        """[H, W] depth that a training view shows outside its mask, a mirror's that of its plane; 0 elsewhere."""
+        """Return the depth that a view shows outside its mask, [H, W] float64.
+
+        Where the view looks into a mirror, e.g. a polished table, this is the depth of the mirror's plane. Inside the
+        mask, and where nothing is visible, the depth is 0.
+
+        Args:
+            camera: one of `cameras`; for another view the depth is 0 everywhere.
+        """
         nothing = np.zeros((camera.height, camera.width))
         depth = with_photographed_depth(nothing, camera, self.views)
         return remove_reflected_depth(depth, camera, self.planes)
 
     def is_empty(self, camera: Camera, depth: np.ndarray) -> np.ndarray:
-        """bool [H, W]: pixels at which other views see past a surface of this depth, [H, W], and few show it."""
+        """Return bool [H, W], the pixels at which a surface of the given depth would contradict the views.
+
+        There at least two views see past the surface, and more than show a surface there (`Visibility.is_empty`).
+
+        Args:
+            camera: the view of the surface.
+            depth: [H, W], camera z of the surface.
+        """
         points = geometry.unproject(depth, camera).reshape(-1, 3)
         return count_views(points, self.views).is_empty.reshape(depth.shape)
 
     def with_planes(self, gaussians: Gaussians, labels: Tensor, seed: int = 0) -> Background:
-        """The background with the planes around the labelled Gaussians, bool [N]; none where nothing is labelled."""
+        """Return the background with the planes around the object, and its center and radius.
+
+        Args:
+            gaussians: the N Gaussians of the whole scene.
+            labels: bool [N], True for the Gaussians of the object. If none is True, the background stays as it is.
+            seed: seed of the random draws.
+        """
         if not labels.any():
             return self
         center, radius = robust_extent(gaussians.means[labels])
@@ -84,15 +108,23 @@ class Background:
         return replace(self, planes=planes, center=center, radius=radius)
 
     def with_mirrors(self, remaining: Gaussians) -> Background:
-        """The background with the mirrors of the things that the remaining Gaussians show around the object."""
+        """Return the background with the planes of mirror symmetry of the things around the object.
+
+        Args:
+            remaining: the Gaussians of the scene without the removed ones.
+        """
         mirrors = find_mirrors(remaining, self.center, self.radius, self.views, self.planes, self.photos)
         return replace(self, mirrors=mirrors)
 
 
 def robust_extent(means: Tensor) -> tuple[np.ndarray, float]:
-    """Middle [3] and radius of most of the points [N, 3], N at least 1, float64.
+    """Return the middle [3] and the radius of most of the points, float64.
 
-    From medians: a tenth of the labels may be wrong, and as far away as the sky.
+    The middle is the median of the coordinates; the radius is 1.5 times the median distance from the middle. Medians
+    are used because a tenth of the labels may be wrong, and such points may be as far away as the sky.
+
+    Args:
+        means: [N, 3], N at least 1.
     """
     points = means.detach().double().cpu().numpy()
     center = np.median(points, 0)
@@ -100,7 +132,10 @@ def robust_extent(means: Tensor) -> tuple[np.ndarray, float]:
 
 
 def surfaces_to_arrays(background: Background) -> dict[str, np.ndarray]:
-    """The planes and mirrors as arrays, which `surfaces_from_arrays` reads: finding them takes seconds."""
+    """Return planes, mirrors, center and radius as named arrays, for a file that `surfaces_from_arrays` reads.
+
+    They are stored because finding them takes seconds.
+    """
     arrays: dict[str, Any] = {"center": background.center, "radius": np.float64(background.radius)}
     for name in _PLANE_ARRAYS if background.planes else ():
         arrays[f"plane_{name}"] = np.stack([np.asarray(getattr(plane, name)) for plane in background.planes])
@@ -112,7 +147,11 @@ def surfaces_to_arrays(background: Background) -> dict[str, np.ndarray]:
 
 
 def surfaces_from_arrays(background: Background, arrays: Mapping[str, np.ndarray], device: str) -> Background:
-    """The background with the planes and mirrors of `surfaces_to_arrays`."""
+    """Return the background with the planes, mirrors, center and radius that `surfaces_to_arrays` stored.
+
+    Args:
+        device: the torch device for the Gaussians of the mirrors.
+    """
     columns = [arrays[f"plane_{name}"] for name in _PLANE_ARRAYS] if "plane_normal" in arrays else []
     fields: list[dict[str, Any]] = [
         {name: float(each) if each.ndim == 0 else each for name, each in zip(_PLANE_ARRAYS, row, strict=True)}

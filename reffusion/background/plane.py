@@ -1,4 +1,4 @@
-"""A plane in the world, with a map of where photographs show it, see through it, and where it continues unseen."""
+"""Planes in the world, each with a map: where photographs show it, where they see through it, where it continues."""
 
 from __future__ import annotations
 
@@ -11,24 +11,28 @@ from reffusion import geometry
 from reffusion.types import Camera
 
 CELLS = 160  # side of a plane's map, in cells
-LARGE = 0.5  # of the seen cells of the largest plane: a smaller plane may only cut through a round thing
-IN_FRONT = 0.97  # of a depth: a plane nearer than this occludes it
+LARGE = 0.5  # of the seen cells of the largest plane: a plane with fewer may merely cut through a round thing
+IN_FRONT = 0.97  # a plane occludes a surface if its depth is less than this many times the surface's depth
 
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane in the world, and what is known of it, cell by cell.
+    """A plane in the world, with a map of square cells that tells where the plane exists.
 
     Attributes:
-        normal: [3], unit length. offset: normal . x of the points x on the plane.
-        origin: [3], the point on the plane at the middle of the map. axes: [2, 3], unit axes of the map.
+        normal: [3], unit normal.
+        offset: the plane is normal . x = offset.
+        origin: [3], the point on the plane at the middle of the map.
+        axes: [2, 3], unit vectors of the map's rows (the direction in which the row index grows) and columns.
         cell_size: side of a cell, in world units.
-        continued: bool [CELLS, CELLS], unobserved cells into which the plane continues.
-        enclosed: bool [CELLS, CELLS], `continued`, and what it encloses together with `seen`: reflections make a
-            polished part look like a pit.
-        free: bool [CELLS, CELLS], views see through the plane there: it does not exist there.
-        seen: bool [CELLS, CELLS], views show the plane there.
-        reflective: bool [CELLS, CELLS], `free` cells that the plane surrounds: a mirror in it, or a window.
+        seen: bool [CELLS, CELLS], True where views show the plane.
+        free: bool [CELLS, CELLS], True where views see through the plane, so that the plane does not exist there.
+        reflective: bool [CELLS, CELLS], True for cells through which views see and which seen cells surround. The plane
+            has a mirror or a window there.
+        continued: bool [CELLS, CELLS], True for cells that no view shows and into which the plane continues.
+        enclosed: bool [CELLS, CELLS], True for the cells of `continued`, and for further cells behind the object that
+            the cells of `continued` and `seen` surround. Views may see through these further cells, because reflections
+            make a polished surface look like a pit.
     """
 
     normal: np.ndarray
@@ -43,15 +47,24 @@ class Plane:
     reflective: np.ndarray
 
     def depth(self, camera: Camera) -> np.ndarray:
-        """[H, W] camera z at which the rays of a view meet the plane; inf where they do not."""
+        """Return [H, W], the camera z at which the rays of a view meet the plane; inf where a ray does not meet it.
+
+        The whole plane counts, without regard to its cells.
+        """
         rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = (self.offset - camera.center @ self.normal) / (rays @ self.normal)
         return np.where(np.isfinite(depth) & (depth > 0), depth, np.inf)
 
     def pixels_on(self, cells: np.ndarray, depth: np.ndarray, camera: Camera, pixels: np.ndarray) -> np.ndarray:
-        """bool [H, W]: those of `pixels`, bool [H, W], whose rays meet the plane, at `depth`, in one of `cells`, bool
-        [CELLS, CELLS]."""
+        """Return bool [H, W], the pixels of a view whose rays meet the plane in some of its cells.
+
+        Args:
+            cells: bool [CELLS, CELLS], the cells in question.
+            depth: [H, W], the plane's depth in the view, see `Plane.depth`.
+            camera: the view.
+            pixels: bool [H, W], the pixels to test; all others are False in the result.
+        """
         pixels = pixels & np.isfinite(depth)
         rays = geometry.pixel_rays(camera)[pixels] @ camera.world_to_camera[:3, :3]
         found = np.zeros_like(pixels)
@@ -59,28 +72,45 @@ class Plane:
         return found
 
     def contains(self, cells: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """bool [P]: points [P, 3] that project into one of `cells`, bool [CELLS, CELLS]."""
+        """Return bool [P], which of the world points [P, 3] project orthogonally into a True cell of `cells`.
+
+        Args:
+            cells: bool [CELLS, CELLS].
+        """
         index = self.cell_index(points)
         inside = ((index >= 0) & (index < CELLS)).all(-1)
         row, column = np.where(inside[:, None], index, 0).T
         return inside & cells[row, column]
 
     def cell_index(self, points: np.ndarray) -> np.ndarray:
-        """[P, 2], row and column of the cells into which points [P, 3] project; may lie outside the map."""
+        """Return int64 [P, 2], row and column of the cells into which world points [P, 3] project orthogonally.
+
+        They may lie outside the map.
+        """
         return np.floor((points - self.origin) @ self.axes.T / self.cell_size + CELLS / 2).astype(np.int64)
 
     @property
     def cell_centers(self) -> np.ndarray:
-        """[CELLS, CELLS, 3], the middle of each cell in the world."""
+        """[CELLS, CELLS, 3], the middle of each cell in world coordinates."""
         steps = (np.arange(CELLS) + 0.5 - CELLS / 2) * self.cell_size
         return self.origin + steps[:, None, None] * self.axes[0] + steps[None, :, None] * self.axes[1]
 
 
 def remove_reflected_depth(depth: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
-    """[H, W] float64: the depth that a view shows, with the depth of a plane where the view looks into a mirror in it.
+    """Replace the depth of reflections by the depth of the plane that reflects.
 
-    A polished surface continues, and repeats itself, along its plane. The same holds where this view sees past a large
-    plane that most views show.
+    A pixel that shows a reflection in a polished surface has the depth of the reflected scene, which lies behind the
+    plane of the surface. The surface itself, and its texture, continue along the plane. So a pixel gets the plane's
+    depth if its depth lies behind a reflective cell of the plane. A pixel whose depth lies behind a seen cell of a
+    large plane also gets the plane's depth, because most views show the plane there.
+
+    Args:
+        depth: [H, W], the depth that the view shows; 0 where unknown.
+        camera: the view.
+        planes: the planes around the object.
+
+    Returns:
+        [H, W] float64.
     """
     depth, most = depth.astype(np.float64), max((plane.seen.sum() for plane in planes), default=0)
     for plane in planes:

@@ -1,4 +1,7 @@
-"""Fit planes to samples of the visible surfaces, and refine them by sparse points."""
+"""Fits of planes to samples of the visible surfaces, and their refinement by sparse points.
+
+A plane is given by its unit normal [3] and its offset: it consists of the points x with normal . x = offset.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +13,29 @@ from reffusion import geometry, seeding
 from reffusion.background.visibility import DepthView
 from reffusion.morphology import dilate_by_distance
 
-RING = 0.12  # of the image's width: how far around the masks surfaces are sampled
-VIEWS = 12  # views that are sampled
-SAMPLES = 1500  # samples of each view
+RING = 0.12  # of the image's width: largest distance from the masks at which surfaces are sampled
+VIEWS = 12  # approximate number of views that are sampled
+SAMPLES = 1500  # largest number of samples of each view
 TRIALS = 300  # RANSAC trials for each plane
-# Sparse points refine a plane in steps, each with a smaller inlier distance, as fractions of that of the samples.
-# MIN_INLIERS points must lie within the last distance, and they must be at least MIN_SHARPNESS of those within the
-# whole distance (a quarter of them would where there is no plane). MAX_TURN is the cosine of the largest turn they may
-# cause.
+# Sparse points refine a plane in steps with decreasing inlier distances. INLIER_STEPS are these distances, as fractions
+# of the inlier distance of the samples. At least MIN_INLIERS points must lie within the last distance. They must also
+# be at least the share MIN_SHARPNESS of the points within the full distance. (If the points lay on no plane, this share
+# would be about a quarter.) MAX_TURN is the cosine of the largest angle by which the refinement may turn the plane.
 INLIER_STEPS, MIN_INLIERS, MIN_SHARPNESS, MAX_TURN = (1.0, 0.5, 0.25), 50, 0.5, 0.98
 
 
 def sample_surfaces(center: np.ndarray, radius: float, views: Sequence[DepthView], seed: int) -> np.ndarray:
-    """[S, 3] points of the surfaces that views show around their masks, within `radius` of `center`."""
+    """Return samples of the visible surfaces: random points of the surfaces that views show around their masks.
+
+    Args:
+        center: [3], the middle of the removed object.
+        radius: largest distance of a sample from the center.
+        views: depth of the training views, rendered with the object.
+        seed: seed of the random choice of pixels.
+
+    Returns:
+        [S, 3], world points; S may be 0.
+    """
     generator, found = np.random.default_rng(seeding.seed_for(seed, "surfaces around")), [np.zeros((0, 3))]
     for view in views[:: max(1, len(views) // VIEWS)]:
         rows, columns = np.nonzero(dilate_by_distance(view.masked, RING) & ~view.masked & (view.depth > 0))
@@ -36,7 +49,15 @@ def sample_surfaces(center: np.ndarray, radius: float, views: Sequence[DepthView
 def ransac_plane(
     points: np.ndarray, inlier_distance: float, generator: np.random.Generator
 ) -> tuple[np.ndarray, float, int]:
-    """Normal, offset and number of inliers of the plane with most inliers, refitted to them."""
+    """Find the plane with most inliers by RANSAC, and refit it to its inliers by least squares.
+
+    Args:
+        points: [P, 3], P at least 1.
+        inlier_distance: distance from the plane below which a point is an inlier.
+
+    Returns:
+        Normal [3], offset, and the number of inliers. The number is 0 if all drawn triples of points are collinear.
+    """
     first, second, third = (points[generator.integers(len(points), size=TRIALS)] for _ in range(3))
     normals = np.cross(second - first, third - first)
     length = np.linalg.norm(normals, axis=1)
@@ -53,15 +74,22 @@ def ransac_plane(
 def refine_by_points(
     normal: np.ndarray, offset: float, points: np.ndarray, inlier_distance: float, min_spread: float
 ) -> tuple[np.ndarray, float] | None:
-    """Normal and offset of the plane, refitted to the sparse points [P, 3] near it.
+    """Refit a plane, which was fitted to rendered depth, to the sparse points near it.
 
-    None unless there are enough, they spread in all directions, and they lie sharply on the plane: grass is no plane,
-    though some of its points lie on any. Rendered depth is biased towards the camera wherever haze hangs before a
-    plain surface, the more the more oblique the view; this turns a plane by a degree or more.
+    Rendered depth is biased towards the camera wherever faint Gaussians float before a plain surface, the more so the
+    more oblique the view. This may turn a plane by a degree or more.
 
     Args:
+        normal, offset: the plane.
+        points: [P, 3], sparse points.
         inlier_distance: distance within which a sample of the rendered surface belongs to the plane.
-        min_spread: least standard deviation of the points, in the direction in which they spread least.
+        min_spread: least standard deviation of the points within the plane, in the direction in which they spread
+            least.
+
+    Returns:
+        Normal [3] and offset of the refitted plane. None if too few points lie near the plane, if they do not spread in
+        both directions of the plane, if they do not lie sharply on the plane (grass is no plane, although some of its
+        points lie near any plane), or if the plane would turn too far.
     """
     new_normal, new_offset = normal, offset
     for share in INLIER_STEPS:
@@ -76,7 +104,10 @@ def refine_by_points(
 
 
 def _refit(normal: np.ndarray, offset: float, points: np.ndarray, inlier_distance: float) -> tuple[np.ndarray, float]:
-    """Normal and offset of the plane, refitted five times by least squares to its inliers."""
+    """Refit a plane to its inliers by least squares, five times, and return its normal and offset.
+
+    The plane is returned as it is if it has fewer than three inliers.
+    """
     for _ in range(5):
         inliers = points[np.abs(points @ normal - offset) < inlier_distance]
         if len(inliers) < 3:

@@ -1,4 +1,9 @@
-"""Find things beside the object that are their own mirror images, and the mirrors that show it."""
+"""Search for things beside the object that are mirror-symmetric, and for their planes of mirror symmetry.
+
+A *thing* is a connected part of the scene that stands on the largest plane (the ground) beside the removed object. The
+thing is described by small cubic cells of space that contain points of its surface. A *mirror* is an upright plane that
+maps a thing onto itself. It is given by (normal [3], offset) and consists of the points x with normal . x = offset.
+"""
 
 from __future__ import annotations
 
@@ -19,25 +24,25 @@ from reffusion.splat.conventions import SH0
 from reffusion.splat.pure_torch import colors
 from reffusion.types import Gaussians
 
-REACH = 3.0  # radii of the object around its middle within which a thing must end
-TOP = 1.25  # radii above the object's middle up to which things are considered: flowers in a vase are not its shape
-CELL = 0.05  # of the object's radius: side of the cells that make up a thing
-CLEARANCE = 2.5  # cells above the ground, and off planes parallel to it, from which something stands there
-VIEWS = 12  # views in which things are looked for, at every second row and column
+REACH = 3.0  # in radii of the object: distance from the vertical line through its middle within which a thing must end
+TOP = 1.25  # in radii of the object: height above its middle at which things are cut, e.g. flowers in a vase
+CELL = 0.05  # in radii of the object: side of a cell
+CLEARANCE = 2.5  # cells: a point at most this far above the ground, or from a parallel plane, belongs to no thing
+VIEWS = 12  # approximate number of views that are searched for things, at every second row and column
 PARALLEL = 0.9  # cosine between normals above which a plane is parallel to the ground
-MIN_POINTS = 3  # points in a cell of a thing
-MIN_CELLS = 200  # cells of a thing
-CUT_SHARE = 0.02  # of its cells at the border of the search region, from which a thing may continue beyond
-TEST_CELLS = 400  # cells of a thing on which a mirror is tested
-ANGLES, OFFSETS = 24, 17  # of the mirrors that are tried
-REFINED = 12  # best mirrors that are refined by minimisation
-NEAR = 1.5  # cells: a mirror image this close to the thing lies on it
-MIN_AGREEMENT = 0.93  # share of the known part of the mirror image that must lie on the thing, not in free space
-MIN_OVERLAP = 0.3  # share of a thing's cells whose images must lie elsewhere on it
-FREE_COST = 3.0  # cost of a cell in free space, in cells that lie on the thing
-COLOR_RATIO = 0.8  # of the colour difference between random places of a thing, below which its image has its colours
-MIN_GAIN = 0.02  # share of a thing's cells whose images must lie where no photograph shows anything
-MAX_MIRRORS = 3  # of a thing
+MIN_POINTS = 3  # least number of points in a cell of a thing
+MIN_CELLS = 200  # least number of cells of a thing
+CUT_SHARE = 0.02  # a thing with this share of its cells at the border of the search region may continue beyond it
+TEST_CELLS = 400  # approximate number of cells of a thing with which a mirror is tested
+ANGLES, OFFSETS = 24, 17  # number of angles and of offsets in the grid of mirrors that are tried
+REFINED = 12  # number of mirrors of the grid, the best ones, that are refined by minimisation
+NEAR = 1.5  # in cells: a mirror image within this distance of a cell of the thing lies on the thing
+MIN_AGREEMENT = 0.93  # of the images that lie on the thing or in free space, least share that lie on the thing
+MIN_OVERLAP = 0.3  # least share of a thing's cells whose mirror images lie on the thing, away from the mirror
+FREE_COST = 3.0  # cost of an image in free space, relative to the gain of an image on the thing
+COLOR_RATIO = 0.8  # images agree in colour if they differ by less than this many times what random places differ by
+MIN_GAIN = 0.02  # least share of a thing's cells whose mirror images lie where no photograph shows anything
+MAX_MIRRORS = 3  # largest number of mirrors of a thing
 
 
 def find_mirrors(
@@ -48,14 +53,22 @@ def find_mirrors(
     planes: Sequence[Plane],
     photos: Mapping[str, np.ndarray],
 ) -> list[Mirror]:
-    """Upright mirrors of the things that stand on the largest plane around the removed object, and end there.
+    """Find the upright mirrors of the things that stand on the largest plane around the removed object.
 
-    A mirror is accepted where the image of the thing's observed part lies on the thing or where no view looks, but not
-    in free space; where its colours agree; and where it shows something unobserved.
+    Things that may continue beyond the search region are left out. A mirror is accepted if the mirror image of the
+    thing's visible part lies on the thing or where no view looks, but not in free space; if the colours of the mirror
+    image agree with the thing's colours; and if the mirror image shows something that no photograph shows.
 
     Args:
-        gaussians: those that remain. center: [3], the middle of the removed object. radius: the radius of most of it.
+        gaussians: the Gaussians of the scene without the removed ones.
+        center: [3], the middle of the removed object.
+        radius: radius around the center that contains most of the removed object.
+        views: depth of the training views, rendered with the object.
+        planes: the planes around the object.
         photos: view name -> uint8 [H, W, 3].
+
+    Returns:
+        The mirrors of all things; none if there is no plane or the radius is infinite (nothing is removed).
     """
     if not planes or not np.isfinite(radius):
         return []
@@ -75,8 +88,13 @@ def find_mirrors(
 
 
 def _with_mean_colors(gaussians: Gaussians, views: Sequence[DepthView]) -> Gaussians:
-    """The Gaussians in the mean colours that views show of them: their harmonics are arbitrary in directions from which
-    no photograph was taken."""
+    """Replace view-dependent colours by the mean of a Gaussian's colours in the views that show it.
+
+    A mirror image shows a Gaussian from directions in which there is no photograph, where its harmonics are arbitrary.
+
+    Returns:
+        The Gaussians with harmonics of degree 0. A Gaussian that no view shows keeps its constant harmonic.
+    """
     means = gaussians.means.double().cpu().numpy()
     total, count = torch.zeros_like(gaussians.means), torch.zeros_like(gaussians.means[:, :1])
     for view in views[:: max(1, len(views) // VIEWS)]:
@@ -90,7 +108,14 @@ def _with_mean_colors(gaussians: Gaussians, views: Sequence[DepthView]) -> Gauss
 def _find_things(
     center: np.ndarray, radius: float, up: np.ndarray, views: Sequence[DepthView], planes: Sequence[Plane]
 ) -> list[np.ndarray]:
-    """The cell centres [P, 3] of each thing: connected parts of what views show above the ground, within reach."""
+    """Find things: connected groups of cells with surface points that several views show.
+
+    Args:
+        up: [3], unit normal of the ground, towards the object.
+
+    Returns:
+        For each thing [P, 3], the mean surface point of each of its cells in world coordinates.
+    """
     cell, points = CELL * radius, _standing_points(center, radius, up, views, planes)
     if not len(points):
         return []
@@ -115,7 +140,10 @@ def _find_things(
 def _standing_points(
     center: np.ndarray, radius: float, up: np.ndarray, views: Sequence[DepthView], planes: Sequence[Plane]
 ) -> np.ndarray:
-    """[P, 3], points that views show within reach, above the largest plane and off those parallel to it."""
+    """Return [P, 3], the surface points near the object that may belong to things that stand on the ground.
+
+    These are points that views show outside their masks, above the ground, but not close to a plane parallel to it.
+    """
     found = [np.zeros((0, 3))]
     for view in views[:: max(1, len(views) // VIEWS)]:
         depth = remove_reflected_depth(view.depth, view.camera, planes)
@@ -131,11 +159,12 @@ def _standing_points(
 
 
 def _largest_plane(planes: Sequence[Plane]) -> Plane:
+    """Return the plane with most seen cells, which is taken for the ground."""
     return max(planes, key=lambda plane: int(plane.seen.sum()))
 
 
 def _distance_from_axis(points: np.ndarray, center: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """[P], distance of points [P, 3] from the vertical line through the centre."""
+    """Return [P], the distances of points [P, 3] from the line through `center` along the unit vector `up`."""
     delta = points - center
     return np.linalg.norm(delta - (delta @ up)[:, None] * up, axis=1)
 
@@ -143,7 +172,16 @@ def _distance_from_axis(points: np.ndarray, center: np.ndarray, up: np.ndarray) 
 def _select_mirrors(
     points: np.ndarray, up: np.ndarray, cell: float, views: Sequence[DepthView], photos: Mapping[str, np.ndarray]
 ) -> list[tuple[np.ndarray, float]]:
-    """(normal, offset) of a thing's mirrors, the one that shows most unobserved cells first."""
+    """Return (normal, offset) of the accepted mirrors of a thing, first the one that shows most unobserved cells.
+
+    The following mirrors must show unobserved cells that the mirrors before them do not show.
+
+    Args:
+        points: [P, 3], the cells of the thing.
+        up: [3], unit normal of the ground.
+        cell: side of a cell in world units.
+        photos: view name -> uint8 [H, W, 3].
+    """
     candidates, found, known = _search_mirrors(points, up, cell, views), [], points
     if candidates:
         candidates = _with_matching_colors(points, candidates, cell, _mean_colors(points, views, photos))
@@ -166,7 +204,15 @@ def _select_mirrors(
 def _search_mirrors(
     points: np.ndarray, up: np.ndarray, cell: float, views: Sequence[DepthView]
 ) -> list[tuple[np.ndarray, float]]:
-    """(normal, offset) of upright mirrors that agree with what is known: grid search, then Nelder-Mead."""
+    """Return (normal, offset) of upright mirrors whose images lie on the thing, hardly in free space.
+
+    Mirrors are found by a grid search over angles and offsets, and refined by Nelder-Mead. Colours are not compared.
+
+    Args:
+        points: [P, 3], the cells of the thing.
+        up: [3], unit normal of the ground.
+        cell: side of a cell in world units.
+    """
     first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     first /= np.linalg.norm(first)
     second, tree = np.cross(up, first), cKDTree(points)
@@ -175,7 +221,10 @@ def _search_mirrors(
     normal_at = lambda angle: np.cos(angle) * first + np.sin(angle) * second
 
     def overlap_and_free(angle: float, offset: float) -> tuple[float, float]:
-        """Shares of the cells whose images lie elsewhere on the thing, and in free space."""
+        """Return the share of cells whose images lie on the thing, and the share whose images lie in free space.
+
+        Cells close to the mirror count in neither share, because their images are almost where the cells are.
+        """
         normal = normal_at(angle)
         moved = np.abs(tested @ normal - offset) > NEAR * cell
         images = reflect_points(tested, normal, offset)
@@ -184,6 +233,7 @@ def _search_mirrors(
         return float((on_thing & moved).mean()), float(free.mean())
 
     def cost(mirror: Sequence[float]) -> float:
+        """Return the cost of a mirror, given by (angle in radians, offset); a good mirror has a low cost."""
         overlap, free = overlap_and_free(*mirror)
         return FREE_COST * free - overlap
 
@@ -204,7 +254,17 @@ def _search_mirrors(
 def _with_matching_colors(
     points: np.ndarray, mirrors: Sequence[tuple[np.ndarray, float]], cell: float, colors: np.ndarray
 ) -> list[tuple[np.ndarray, float]]:
-    """Those of the mirrors whose images agree with the colours [P, 3] at their places better than random places do."""
+    """Return those of the mirrors whose mirror images agree with the thing in colour.
+
+    The median colour difference between mirror images and the cells on which they lie must be less than `COLOR_RATIO`
+    times that between random cells.
+
+    Args:
+        points: [P, 3], the cells of the thing.
+        mirrors: (normal, offset) of each mirror.
+        cell: side of a cell in world units.
+        colors: [P, 3], the colours of the cells.
+    """
     tree, shuffled, found = cKDTree(points), np.random.default_rng(0).permutation(len(points)), []
     for normal, offset in mirrors:
         moved = np.abs(points @ normal - offset) > NEAR * cell
@@ -220,7 +280,7 @@ def _with_matching_colors(
 
 
 def _mean_colors(points: np.ndarray, views: Sequence[DepthView], photos: Mapping[str, np.ndarray]) -> np.ndarray:
-    """[P, 3], mean colours of points over the views that show a surface there."""
+    """Return [P, 3], the mean colours, 0 to 255, of the points in the views that show them; 0 if no view does."""
     total, count = np.zeros((len(points), 3)), np.zeros(len(points))
     for view in views[:: max(1, len(views) // VIEWS)]:
         seen = is_seen(view, points)

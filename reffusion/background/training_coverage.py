@@ -1,4 +1,7 @@
-"""Which pixels of a view show what some training view saw: those can be checked, the others are guesses."""
+"""The coverage of a view by the training views: which of its pixels show a point that some training view saw.
+
+Only these pixels can be checked against photographs; the content of the other pixels is a guess.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
 TOLERANCE = 0.1  # relative depth by which a point may lie behind a training view's surface and still count as seen
-COVERED = 0.8  # alpha below which the fit learned nothing at a pixel
+COVERED = 0.8  # alpha below which a pixel counts as unseen, because the fit has no surface there
 SPECKS = 5  # px, side of the median filter that removes single wrong pixels
 LONGEST = 256  # px, larger side at which training views are rendered
 
@@ -29,12 +32,12 @@ PROTOCOL = (
 
 
 class CoverageView(NamedTuple):
-    """What a training view saw, at small size.
+    """The surfaces that a training view saw, at reduced resolution.
 
     Attributes:
-        camera: of the size of the other two.
-        depth: [H, W] camera z of the rendered surface, 0 where nothing is rendered.
-        hidden: bool [H, W], pixels that show the object to be removed.
+        camera: the camera at this resolution.
+        depth: [H, W], camera z of the rendered surface; 0 where nothing is rendered.
+        hidden: bool [H, W], True at pixels that show the object to be removed.
     """
 
     camera: Camera
@@ -45,11 +48,13 @@ class CoverageView(NamedTuple):
 def render_coverage_views(
     gaussians: Gaussians, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray]
 ) -> list[CoverageView]:
-    """The training views as a fit renders them.
+    """Render the depth of the training views, at most `LONGEST` px wide or high.
 
     Args:
-        gaussians: the fit, the object included: it hid what is behind it.
-        masks: view name -> bool [H, W], the object; a view without an entry shows none.
+        gaussians: the fitted Gaussians with the object, because the object hides the surfaces behind it.
+        cameras: the training views.
+        masks: view name -> bool [H, W] at full size, True at pixels that show the object. A view without an entry does
+            not show the object.
     """
     views = []
     for camera in cameras:
@@ -64,16 +69,20 @@ def render_coverage_views(
 
 
 def unseen_pixels(gaussians: Gaussians, camera: Camera, seen_by: Sequence[CoverageView]) -> np.ndarray:
-    """bool [H, W]: the pixels of a view that show what none of the training views saw; see `PROTOCOL`.
+    """Return bool [H, W], the pixels of a view that show no point that any training view saw.
+
+    `PROTOCOL` defines which points a training view saw. Pixels without a surface are unseen, too.
 
     Args:
-        gaussians: the fit from which the training views were rendered.
+        gaussians: the Gaussians from which the training views were rendered.
+        camera: the view, not necessarily a training view.
+        seen_by: the training views.
     """
     depth, alpha = _render_depth(gaussians, camera)
     pixels = np.flatnonzero(depth > 0)
     points = geometry.unproject(np.where(depth > 0, depth, 1.0), camera).reshape(-1, 3)[pixels]
     missed = np.ones(depth.shape, bool)
-    # The nearest view comes first: it saw most of the points, and the other views are asked for the rest only.
+    # The nearest view comes first, because it saw most of the points. Each view tests only the points still unseen.
     for view in sorted(seen_by, key=lambda v: float(np.linalg.norm(v.camera.center - camera.center))):
         if not len(pixels):
             break
@@ -88,6 +97,6 @@ def unseen_pixels(gaussians: Gaussians, camera: Camera, seen_by: Sequence[Covera
 
 @torch.no_grad()
 def _render_depth(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Camera z, 0 where nothing is rendered, and alpha, both [H, W]."""
+    """Render a view, and return its depth (camera z, 0 where nothing is rendered) and alpha, both [H, W]."""
     rendered = rasterizer.render(gaussians, camera, sh_degree=0)
     return rendered.depth.double().cpu().numpy(), rendered.alpha.cpu().numpy()

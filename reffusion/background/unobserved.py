@@ -1,4 +1,8 @@
-"""Which pixels behind the object are unobserved: no other photograph shows what would be visible there."""
+"""The split of a view's consistent mask C (the pixels that show the object) into observed and unobserved pixels.
+
+A pixel is *unobserved* if no other photograph shows the background there, i.e. the surface that becomes visible once
+the object is removed.
+"""
 
 from __future__ import annotations
 
@@ -25,25 +29,30 @@ from reffusion.background.visibility import (
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
-RING = 0.03  # of the image's width: how far around a plane's patch it is compared with the rendered depth
-DEPTH_EDGE = 0.06  # of the depth: a wider range around a pixel is a depth edge, not a rough surface
-CONFIRMING_VIEWS = 3  # views that must show a surface for it to exist although most around it is unobserved
-MIN_AGREEMENT = 0.6  # share of the pixels beside a plane's patch that must lie on it, of those that are not occluded
-MIN_SHARE = 0.3  # the same, of all pixels beside the patch
+RING = 0.03  # of the image's width: distance from a patch of a plane up to which the plane is compared with the depth
+# Relative depth by which a pixel on a plane may differ from the plane. At a depth edge the depth range around a pixel
+# is wider. There a plane may lie within this range without agreeing.
+DEPTH_EDGE = 0.06
+CONFIRMING_VIEWS = 3  # number of views that must show a surface to confirm it
+MIN_AGREEMENT = 0.6  # least share of pixels on the plane, of the pixels beside a patch where nothing occludes the plane
+MIN_SHARE = 0.3  # least share of pixels on the plane, of all pixels beside a patch
 
 
 @dataclass(frozen=True)
 class HoleGeometry:
-    """What one view shows once the object is removed.
+    """The surfaces that one view shows once the object is removed.
 
     Attributes:
-        unobserved: bool [H, W], inside C: no photograph tells what is visible there.
-        continued_depth: [H, W], on `unobserved` pixels the depth of the plane that continues there, or of a mirror
-            image; inf where there is none, and elsewhere.
-        depth, alpha: [H, W] float64, rendered; outside the mask the photographed depth.
-        plane_depths: [H, W] each, the depth of every plane that continues in this view, at all pixels; inf where a ray
-            does not meet it.
-        confirmed: bool [H, W], inside C: a few views show the rendered surface; without small specks.
+        unobserved: bool [H, W], True at the pixels of C whose background no photograph shows.
+        continued_depth: [H, W], at unobserved pixels the camera z of the plane that continues there, or of the mirror
+            image of a symmetric thing; inf where there is neither, and at all other pixels.
+        depth: [H, W] float64, rendered from the remaining Gaussians (those without the object). Outside the mask it is
+            the depth that the view shows with the object.
+        alpha: [H, W] float64, rendered from the remaining Gaussians.
+        plane_depths: [H, W] each, for every plane that continues in this view its depth at all pixels, inf where a ray
+            does not meet it. If there are mirrors, the last entry is the depth of their mirror images, inf elsewhere.
+        confirmed: bool [H, W], True at the pixels of C where at least `CONFIRMING_VIEWS` views show the rendered
+            surface, and no plane or mirror image lies in front of this surface. Small specks are removed.
     """
 
     unobserved: np.ndarray
@@ -63,17 +72,20 @@ def find_unobserved(
     planes: Sequence[Plane],
     mirrors: Sequence[Mirror] = (),
 ) -> HoleGeometry:
-    """Split the pixels of C into observed and unobserved ones.
+    """Split the pixels of C, the mask of the object in a view, into observed and unobserved pixels.
 
-    The remaining Gaussians are rendered, each pixel is unprojected, and the views count that see this point unmasked,
-    at the same depth and from the same side. A pixel is observed if at least a quarter of the views that could see the
-    point do (`Visibility.is_observed`), and if no plane or mirror image continues in front of it. The quarter excludes
-    Gaussians that most views place below a surface; these are fitting artifacts.
+    The remaining Gaussians are rendered, and each pixel of C is unprojected to a point of the background. A view shows
+    the point if it sees the point outside its mask, at the same depth and from the same side. The pixel is observed if
+    at least a quarter of the views that could see the point show it (`Visibility.is_observed`), and if no plane or
+    mirror image continues in front of the point. The quarter excludes Gaussians that most views place below a surface;
+    these are fitting artifacts. Pixels where the remaining Gaussians are not opaque are unobserved.
 
     Args:
         remaining: the M Gaussians without the object.
+        camera: the view.
         mask: bool [H, W], C of the view.
-        planes, mirrors: of the surroundings, see `background.model`.
+        views: depth of the training views, rendered with the object.
+        planes, mirrors: planes and symmetric things around the object, see `background.model`.
     """
     rendering = rasterizer.render(remaining, camera, sh_degree=0)
     depth, alpha = (t.double().cpu().numpy() for t in (rendering.depth, rendering.alpha))
@@ -90,7 +102,7 @@ def find_unobserved(
         at = plane.depth(camera)
         in_front = at < IN_FRONT * np.where(depth > 0, depth, np.inf)
         before = plane.pixels_on(plane.continued, at, camera, mask & in_front)
-        # A plane also continues where nothing is known, but not behind something that stands in front of it.
+        # A plane also continues into unobserved pixels, but not behind an opaque surface in front of the plane.
         beneath = plane.pixels_on(
             plane.enclosed, at, camera, unobserved & ((at < depth / IN_FRONT) | (alpha <= OPAQUE))
         )
@@ -102,7 +114,7 @@ def find_unobserved(
         image = render_mirrors(mirrors, camera, mask, views)
         occluding |= image.plausible_depth < IN_FRONT * np.where((depth > 0) & (alpha > OPAQUE), depth, np.inf)
         plane_depths.append(image.depth)
-        # A plane may cut through a round thing: the image wins where both are about as near.
+        # A plane may cut through a round thing. So the mirror image takes precedence if both are about equally near.
         wins = (occluding | unobserved) & (image.plausible_depth < (1 + SURFACE) * nearest)
         nearest = np.where(wins, image.plausible_depth, nearest)
     unobserved = morphology.remove_slivers(unobserved | occluding, MASK_MARGIN) & mask
@@ -113,7 +125,12 @@ def find_unobserved(
 
 
 def _below_planes(planes: Sequence[Plane], camera: Camera, depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """bool [H, W]: those of `pixels` that show something below a plane, or reflected in it."""
+    """Return bool [H, W], the pixels whose depth lies behind a plane, because they show a reflection or an artifact.
+
+    Args:
+        depth: [H, W], camera z of the visible surface.
+        pixels: bool [H, W], the pixels to test.
+    """
     found = np.zeros_like(pixels)
     for plane in planes:
         at = plane.depth(camera)
@@ -125,9 +142,17 @@ def _below_planes(planes: Sequence[Plane], camera: Camera, depth: np.ndarray, pi
 def _continues_surroundings(
     patch: np.ndarray, plane: Plane, plane_depth: np.ndarray, camera: Camera, depth: np.ndarray, known: np.ndarray
 ) -> bool:
-    """Whether the plane agrees with the rendered depth around a patch of it, bool [H, W], or most views show it there.
+    """Return whether a plane agrees with the surfaces around one of its patches in a view, so that it may continue.
 
-    A plane that only cuts through what stands there does not. Pixels at which views see through the plane are ignored.
+    A pixel beside the patch agrees if the plane is near the pixel's depth, or if most views show the plane there.
+    Pixels at which views see through the plane are ignored. A plane that merely cuts through a solid thing does not
+    agree.
+
+    Args:
+        patch: bool [H, W], the pixels into which the plane would continue.
+        plane_depth: [H, W], camera z of the plane; inf where a ray does not meet the plane.
+        depth: [H, W], camera z of the visible surface.
+        known: bool [H, W], True where `depth` can be compared.
     """
     if not patch.any():
         return False
@@ -140,8 +165,8 @@ def _continues_surroundings(
     nearest, farthest = depth_range(depth)
     agrees = (plane_depth > nearest * (1 - SURFACE)) & (plane_depth < farthest * (1 + SURFACE))
     agrees &= np.abs(plane_depth - depth) < DEPTH_EDGE * depth
-    # One view may be wrong about rough ground, or see through a reflection; the other views decide.
+    # The depth of one view may be wrong on rough ground and in reflections. There the other views decide.
     agrees |= plane.pixels_on(plane.seen, plane_depth, camera, ring)
-    disagrees = ~agrees & (depth > plane_depth)  # where something occludes the plane it may continue
+    disagrees = ~agrees & (depth > plane_depth)  # a surface in front of the plane merely occludes it
     share, against = float(agrees[ring].mean()), float(disagrees[ring].mean())
     return share > MIN_SHARE and share > MIN_AGREEMENT * (share + against)

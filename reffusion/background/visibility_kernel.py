@@ -1,4 +1,4 @@
-"""The compiled kernel of `background.visibility`: classify millions of points in every training view."""
+"""The compiled kernel of the visibility test (`background.visibility`), for millions of points per view."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from reffusion.kernels.compiled import kernel, parallel_for
 from reffusion.kernels.vectors import take_ticket
 from reffusion.types import Camera
 
-SEEN, FREE, OCCLUDED, MASKED = range(4)  # rows of the counts, see `visibility.Visibility`
-UNIT_RATIO = 65535  # the uint16 that stands for a ratio of 1
-_CHUNK = 2048  # points that a thread takes at once
+SEEN, FREE, OCCLUDED, MASKED = range(4)  # rows of the counts, one per class, see `visibility.Visibility`
+UNIT_RATIO = 65535  # the uint16 value that represents a ratio of 1
+_CHUNK = 2048  # number of points in one piece of a thread's work
 
 
 def count_in_view(
@@ -21,13 +21,19 @@ def count_in_view(
     margins: tuple[float, float],
     counts: np.ndarray,
 ) -> None:
-    """Classify points in one view, and add 1 to the count of each class that applies.
+    """Classify points in one view, and add 1 to the count of each point's class.
+
+    A point has no class e.g. if it projects outside the image, if it lies behind the camera, or if the view shows
+    nothing at its pixel.
 
     Args:
-        points: [P, 3] float64. normals: [P, 3] or None, see `visibility.count_views`.
+        points: [P, 3], world coordinates.
+        normals: [P, 3] or None, see `visibility.count_views`.
+        camera: the view.
         maps: `depth`, `near_ratio`, `far_ratio` and `masked` of a `DepthView`.
-        margins: relative depth within which a point lies on the surface, and beyond which the view sees past it.
-        counts: [4, P] int64, updated in place.
+        margins: the relative depth within which a point lies on the surface, and the relative depth by which a point in
+            free space lies in front of the surface.
+        counts: [4, P] int64, the rows are `SEEN`, `FREE`, `OCCLUDED`, `MASKED`; updated in place.
     """
     facing = np.empty((0, 3)) if normals is None else np.ascontiguousarray(normals, np.float64)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
@@ -41,9 +47,10 @@ def count_in_view(
 def _classify(
     tickets, points, normals, intrinsics, pose, center, depth, near_ratio, far_ratio, masked, surface, free, counts
 ):
+    """Classify points in one view on several threads, see `count_in_view`; each thread takes chunks of points."""
     height, width = masked.shape
     fx, fy, cx, cy = intrinsics
-    # Depth maps are compared in their own precision.
+    # Depth maps are float32, so they are compared in float32.
     before, after = np.float32(1 - surface), np.float32(1 + surface)
     while True:
         begin = take_ticket(tickets) * _CHUNK

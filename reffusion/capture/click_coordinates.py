@@ -1,4 +1,7 @@
-"""Checks the clicks that a scene brings, and maps points and masks between photographs and undistorted views."""
+"""Checks the clicks in scene.yaml, and maps points and masks between photographs and their undistorted pictures.
+
+A click is a point in a photograph that the user marks as on the object (+) or not on the object (-).
+"""
 
 from __future__ import annotations
 
@@ -18,11 +21,12 @@ from reffusion.params.clicks import Clicked
 
 
 def check_clicks(clicks: Clicked, capture: Capture, roles: Roles) -> None:
-    """Check clicks against the capture.
+    """Check that the clicks in scene.yaml can be used with the capture.
 
     Raises:
-        BadInput: a view is unknown or not trained on, a click lies outside its photograph, no click is on the object,
-            or the masks tell objects apart, which clicks do not.
+        BadInput: a view is unknown, named twice, not a training view, clean (without the object), or has a mask; a
+            click lies outside its photograph; there are no masks and no click is on the object; or the masks
+            distinguish between objects, which clicks cannot.
     """
     if set(roles.masks) - {""}:
         raise BadInput("scene.yaml: clicks: the masks tell objects apart, and clicks do not; leave one of them out")
@@ -46,9 +50,16 @@ def check_clicks(clicks: Clicked, capture: Capture, roles: Roles) -> None:
 
 
 def undistort_clicks(poses: Path, clicks: Clicked) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """View -> points [K, 2] in its undistorted picture, and bool [K]: the click is on the object.
+    """Map clicks from photographs to undistorted pictures.
 
-    Clicks that the undistorted picture does not show are left out, and views that could not be placed.
+    Clicks outside the undistorted picture are left out, and so are views that the stage `poses` left out.
+
+    Args:
+        poses: the folder of the stage `poses`.
+        clicks: view -> clicks, in pixels of its photograph.
+
+    Returns:
+        View -> points [K, 2], pixels of its undistorted picture; and bool [K], True if the click is on the object.
     """
     lenses, _ = load_lenses(poses)
     sizes, found = load_photograph_sizes(poses), {}
@@ -61,22 +72,37 @@ def undistort_clicks(poses: Path, clicks: Clicked) -> dict[str, tuple[np.ndarray
 
 
 def undistort_points(points: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
-    """Pixels [K, 2] of the photograph of `size` (width, height) -> pixels of its undistorted picture."""
+    """Map pixels [K, 2] of a photograph to pixels [K, 2] of its undistorted picture.
+
+    Args:
+        lens: lens of the photograph, at the size of the undistorted picture.
+        size: (width, height) of the photograph.
+    """
     pinhole, _ = _undistortion(lens)
     directions = to_directions(points * (lens.width / size[0], lens.height / size[1]), lens)
     return directions * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
 
 
 def distort_points(points: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
-    """Inverse of `undistort_points`."""
+    """Map pixels [K, 2] of an undistorted picture to pixels of its photograph: the inverse of `undistort_points`."""
     pinhole, _ = _undistortion(lens)
     directions = (points - (pinhole.cx, pinhole.cy)) / (pinhole.fx, pinhole.fy)
     return to_pixels(directions, lens) * (size[0] / lens.width, size[1] / lens.height)
 
 
 def distort_mask(mask: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
-    """A mask [H, W] of the undistorted picture resampled to its photograph of `size` (width, height). Where the
-    undistorted picture does not reach, the mask's border is repeated."""
+    """Resample a mask [H, W] of an undistorted picture to its photograph.
+
+    The photograph shows more than the undistorted picture. Outside the undistorted picture, the mask's border pixels
+    are repeated.
+
+    Args:
+        lens: lens of the photograph, at the size of the undistorted picture.
+        size: (width, height) of the photograph.
+
+    Returns:
+        bool [height, width].
+    """
     import cv2
 
     at = _undistortion(lens)[1]
@@ -88,17 +114,19 @@ def distort_mask(mask: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndar
 
 @lru_cache(maxsize=4)
 def _undistortion(lens: Lens) -> tuple[Lens, np.ndarray | None]:
-    """The pinhole that replaces a lens, and `_distortion_map`; None for the map where nothing moves.
+    """Return the pinhole that replaces a lens, and the `_distortion_map`; the map is None if it would move nothing.
 
-    Cached, since one lens took most captures, and inverting it takes longer than everything else here.
+    The result is cached, because most captures have a single lens, and most of the time is spent on its inversion.
     """
     pinhole, where = undistortion_map(lens)
     return pinhole, None if where is None else _distortion_map(lens, pinhole)
 
 
 def _distortion_map(lens: Lens, pinhole: Lens) -> np.ndarray:
-    """float32 [H, W, 2]: for each pixel of the photograph, where to read in the undistorted picture, counted from the
-    centre of the first pixel."""
+    """Return float32 [H, W, 2], for each pixel of the photograph its coordinates in the undistorted picture.
+
+    The coordinates are OpenCV's: the centre of the first pixel is (0, 0).
+    """
     columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     directions = to_directions(np.stack([columns, rows], -1), lens)
     return (directions * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy) - 0.5).astype(np.float32)

@@ -1,4 +1,7 @@
-"""The normalised frame: the similarity that brings a scene to it, and random points for scenes with few."""
+"""The normalised frame of a scene: the similarity into this frame, which follows from estimates of the scene's depth.
+
+For scenes with few sparse points, random points are added.
+"""
 
 from __future__ import annotations
 
@@ -21,17 +24,24 @@ if TYPE_CHECKING:
 def depth_ranges(
     world_to_camera: np.ndarray, lenses: Sequence[Lens], points: np.ndarray, bounds: np.ndarray | None
 ) -> np.ndarray:
-    """Near, typical and far camera depth of every view, [V, 3] float64 in the scene's units, all positive.
+    """Estimate the near, typical and far camera depth of each view.
 
-    The first of these that is available:
-    - the points inside the view (1st, 50th and 99th percentile), where there are at least 10;
-    - the LLFF bounds (typical: the mean in disparity);
-    - as the typical depth that of the point where the optical axes meet, or three times the cameras' spread where they
-      are parallel or meet behind the cameras; near and far are a third and four times that;
-    - the median of the other views.
+    Each view takes the first of these estimates that is available:
+    - If at least 10 points lie inside its picture: the 1st, 50th and 99th percentile of their depths.
+    - If there are LLFF bounds: near and far as given. The typical depth is their mean in disparity.
+    - From all cameras: the typical depth is the depth of the point nearest to all optical axes. If these are parallel
+      or meet behind the cameras, the typical depth is three times the spread of the cameras (root mean square distance
+      of their centres from the mean centre). Near and far are a third of the typical depth and four times as much.
+    - If all cameras are at one place: the median over the views that have enough points.
 
     Args:
-        world_to_camera: [V, 4, 4]. points: [P, 3]. bounds: [V, 2] near and far, or None.
+        world_to_camera: [V, 4, 4].
+        lenses: V lenses; their distortion is ignored.
+        points: [P, 3] sparse points.
+        bounds: [V, 2] near and far depth of each view; None if the capture has none.
+
+    Returns:
+        [V, 3] float64: near, typical and far, all positive, in the scene's units.
 
     Raises:
         BadInput: no view has 10 points, there are no bounds, and all cameras are at one place.
@@ -55,7 +65,10 @@ def depth_ranges(
 
 
 def depths_in_view(points: np.ndarray, world_to_camera: np.ndarray, lens: Lens) -> np.ndarray:
-    """Camera depths [Q] of those of the points [P, 3] that fall inside the picture, distortion ignored."""
+    """Return the camera depths [Q] of those Q of the points [P, 3] that project into the picture.
+
+    Distortion is ignored.
+    """
     at = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
     at = at[at[:, 2] > 0]
     uv = at[:, :2] / at[:, 2:] * (lens.fx, lens.fy) + (lens.cx, lens.cy)
@@ -63,10 +76,11 @@ def depths_in_view(points: np.ndarray, world_to_camera: np.ndarray, lens: Lens) 
 
 
 def nearest_depths(cells: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """[P] for each point the depth of the nearest point in its cell.
+    """Return [P], for each point the smallest depth of all points in the same cell.
 
     Args:
-        cells: int [P], the cell of each point. depths: [P].
+        cells: int [P], any number that identifies the point's cell of the picture.
+        depths: [P], camera depths of the points.
     """
     order = np.argsort(depths)
     found, first = np.unique(cells[order], return_index=True)
@@ -74,12 +88,16 @@ def nearest_depths(cells: np.ndarray, depths: np.ndarray) -> np.ndarray:
 
 
 def camera_centers(world_to_camera: np.ndarray) -> np.ndarray:
-    """[V, 3] centres of world-to-camera poses [V, 4, 4]."""
+    """Return the camera centres [V, 3] of world-to-camera poses [V, 4, 4]."""
     return -np.einsum("vji,vj->vi", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3])
 
 
 def _axis_intersection_depths(world_to_camera: np.ndarray) -> np.ndarray:
-    """[V] depth of the point nearest to all optical axes; NaN where all cameras are at one place."""
+    """Return [V], the camera depth in each view of the point nearest to all optical axes.
+
+    Depths are at least 0.2 times their median. If the axes are parallel or meet behind the cameras, all depths are
+    three times the spread of the cameras. If all cameras are at one place, all depths are NaN.
+    """
     centers, axes = camera_centers(world_to_camera), world_to_camera[:, 2, :3]
     perpendicular = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     middle = centers.mean(axis=0)
@@ -97,14 +115,18 @@ def _axis_intersection_depths(world_to_camera: np.ndarray) -> np.ndarray:
 
 
 def normalizing_similarity(world_to_camera: np.ndarray, typical: np.ndarray) -> Similarity:
-    """The similarity into the normalised frame, where the scene's middle is at 0 and its typical distance from the
-    cameras 1.
+    """Return the similarity into the normalised frame.
 
-    The scale is one over the median of the views' typical depths [V]. The offset is the median, axis by axis, of the
-    points at typical depth on the optical axes. So for photographs from one side the object is near the origin and the
-    cameras about 1 away; for photographs from all around, the cameras stand on a ring of radius about 1. Scaling or
-    moving the scene changes nothing in the normalised frame. Everything is float64, so a geo-referenced offset of a
-    million extents still leaves ten digits. There is no rotation.
+    In this frame the middle of the scene is at the origin, and the typical distance of the cameras from it is 1. The
+    scale is one over the median of the typical depths. The offset is the median, axis by axis, of the points at typical
+    depth on the optical axes. So for photographs from one side the object is near the origin, and the cameras are at a
+    distance of about 1. For photographs from all around, the cameras lie on a ring of radius about 1. A scaled or
+    translated scene has the same normalised frame. There is no rotation. All numbers are float64, so coordinates that
+    are offset by a million times the scene's extent (geo-referenced ones) keep ten digits.
+
+    Args:
+        world_to_camera: [V, 4, 4] in the scene's own frame.
+        typical: [V], typical depth of each view, see `depth_ranges`.
     """
     from reffusion.types import Similarity
 
@@ -113,14 +135,14 @@ def normalizing_similarity(world_to_camera: np.ndarray, typical: np.ndarray) -> 
 
 
 def normalize_pose(world_to_camera: np.ndarray, similarity: Similarity) -> np.ndarray:
-    """World-to-camera [4, 4] of the scene's own frame -> of the normalised frame."""
+    """Convert a world-to-camera pose [4, 4] of the scene's own frame to one of the normalised frame."""
     pose = world_to_camera.copy()
     pose[:3, 3] = similarity.scale * (world_to_camera[:3, :3] @ similarity.offset + world_to_camera[:3, 3])
     return pose
 
 
 def view_depth_ranges(poses: Poses, pinholes: Mapping[str, Lens]) -> np.ndarray:
-    """`depth_ranges` [V, 3] of the views that have a pinhole, in its order, in the scene's units."""
+    """Return `depth_ranges` [V, 3] of the views in `pinholes`, in the order of `pinholes` and in the scene's units."""
     bounds = np.array([poses.bounds[name] for name in pinholes]) if poses.bounds else None
     return depth_ranges(_stack_poses(poses, pinholes), list(pinholes.values()), poses.points, bounds)
 
@@ -132,10 +154,12 @@ def _stack_poses(poses: Poses, names: Mapping[str, Lens]) -> np.ndarray:
 def normalize_scene(
     poses: Poses, pinholes: Mapping[str, Lens], train: Sequence[str], test: Sequence[str], clean: frozenset[str]
 ) -> Scene:
-    """The scene in the normalised frame (`normalizing_similarity`): cameras, and the points that the capture brings.
+    """Return a capture's cameras and sparse points as a Scene in the normalised frame (`normalizing_similarity`).
 
     Args:
-        pinholes: view name -> undistorted lens.
+        poses: poses and points in the scene's own frame.
+        pinholes: view name -> lens of the undistorted picture; only these views are in the scene.
+        train, test, clean: names of the training views, the test views, and the training views without the object.
     """
     from reffusion.types import Camera, Scene
 
@@ -159,11 +183,13 @@ def normalize_scene(
 def add_random_points(
     scene: Scene, ranges: np.ndarray, count: int, generator: Generator, image_of: Callable[[str], np.ndarray]
 ) -> Scene:
-    """The scene with `count` more random points, coloured by the pictures they were drawn in.
+    """Return the scene with `count` more points, drawn at random in the views' frusta (`sample_frustum_points`).
+
+    Each point has the colour of the pixel for which it was drawn.
 
     Args:
-        ranges: [V, 3] near, typical and far depths in the normalised frame.
-        image_of: view name -> uint8 [H, W, 3].
+        ranges: [V, 3] near, typical and far depth of each view, in the normalised frame, in the order of the cameras.
+        image_of: function from a view's name to its picture, uint8 [H, W, 3].
     """
     names = list(scene.cameras)
     points, views, pixels = sample_frustum_points(list(scene.cameras.values()), ranges, count, generator)
@@ -179,12 +205,17 @@ def add_random_points(
 def sample_frustum_points(
     cameras: Sequence[Camera], ranges: np.ndarray, count: int, generator: Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Random points in the views' frusta, uniform over pixels, and over disparity between near and far.
+    """Draw random points in the views' frusta: uniform over pixels, and over disparity between near and far depth.
 
-    Four times as many are drawn. Those that a second view sees too are preferred, so that few float in front of a lens.
+    Four times `count` points are drawn. Points inside the pictures of at least two views are kept first, so that few
+    points float in front of a single camera.
+
+    Args:
+        ranges: [V, 3] near, typical and far depth of each view.
 
     Returns:
-        points [count, 3]; the view each was drawn in, int [count]; its pixel there, (column, row), int [count, 2].
+        points [count, 3]; int [count], the index of the view for which each point was drawn; int [count, 2], the
+        (column, row) of its pixel in this view.
     """
     import torch
 

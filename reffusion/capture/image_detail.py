@@ -1,5 +1,7 @@
-"""How much detail the views of a capture support: resolution, degree of spherical harmonics; and sampling pictures at
-visible points."""
+"""The detail that the views of a capture support: resolution of pictures, and degree of spherical harmonics.
+
+Also samples pictures at the points that are visible in them.
+"""
 
 from __future__ import annotations
 
@@ -12,29 +14,30 @@ from reffusion import geometry
 from reffusion.capture.frame import nearest_depths
 from reffusion.types import Camera
 
-CELLS = 40  # cells along a view's width; the nearest point of each hides those behind it
-NEARLY = 1.15  # relative depth, over the nearest point's, up to which a point is visible too
+CELLS = 40  # cells along a view's width; the nearest point of a cell hides the points behind it
+NEARLY = 1.15  # ratio to the nearest depth in a cell up to which other points of the cell are visible too
 
 
 def is_enlarged(images: Iterable[np.ndarray], detail: float) -> bool:
-    """Do the pictures show no more than pictures of half their size would?
+    """Return whether pictures show no more detail than pictures of half their size would.
 
-    A picture that is sharp to the pixel has about as much energy between a half and the whole of its highest frequency
-    as in the octave below (0.25 to 0.8 of it in photographs tried, 0.4 to 0.7 in the demo's). A picture enlarged twice,
-    by whatever filter, or out of focus, has 0.01 to 0.08 of it.
+    The test is the energy in the highest octave of spatial frequencies (above half of the highest frequency), divided
+    by the energy in the octave below. The ratio is 0.25 to 0.8 in the sharp photographs that were tried, and 0.4 to 0.7
+    in those of the demo. In pictures that were enlarged to twice their size by any filter, or are out of focus, it is
+    0.01 to 0.08.
 
     Args:
-        images: uint8 [H, W, 3], as large as they would be used; some views are enough.
-        detail: ratio of the energies of the two octaves, median over the pictures, below which the answer is yes.
+        images: uint8 [H, W, 3], at the size at which they would be used; some of the views are enough.
+        detail: threshold for the median ratio of the pictures; below it the result is True.
     """
     return float(np.median([_octave_ratio(image) for image in images])) < detail
 
 
 def _octave_ratio(image: np.ndarray) -> float:
-    """Energy above half of the highest frequency, over that of the octave below; infinite for a plain picture."""
+    """Return the energy in a picture's highest octave of frequencies over that in the octave below; inf if plain."""
     gray = image.mean(-1)
     height, width = gray.shape
-    # windowed, or the step from one border to the opposite one counts as detail
+    # without the window, the step from one border to the opposite border would count as detail
     windowed = (gray - gray.mean()) * np.outer(np.hanning(height), np.hanning(width))
     power = np.abs(np.fft.rfft2(windowed)) ** 2
     frequency = np.maximum(np.abs(np.fft.fftfreq(height))[:, None], np.fft.rfftfreq(width)[None])
@@ -43,8 +46,10 @@ def _octave_ratio(image: np.ndarray) -> float:
 
 
 def typical_view_count(points: np.ndarray, cameras: Sequence[Camera]) -> int:
-    """Median over points [P, 3] of the number of views that contain them; the number of cameras where there are no
-    points."""
+    """Return the median over points [P, 3] of the number of views whose pictures contain the point, occluded or not.
+
+    Without points, it is the number of cameras.
+    """
     seen = np.zeros(len(points), int)
     for camera in cameras:
         uv, z = geometry.project(points, camera)
@@ -55,19 +60,35 @@ def typical_view_count(points: np.ndarray, cameras: Sequence[Camera]) -> int:
 
 
 def supported_sh_degree(points: np.ndarray, cameras: Sequence[Camera], most: int) -> tuple[int, int]:
-    """The highest supported degree of spherical harmonics, at most `most`, and the `typical_view_count` behind it.
+    """Return the highest degree of spherical harmonics that the number of views supports, at most `most`.
 
-    A degree has (degree + 1)^2 coefficients; at least that many views must contain a typical point [P, 3], occluded or
-    not.
+    A degree has (degree + 1)^2 coefficients per colour. The degree is supported if at least that many views contain a
+    typical point (`typical_view_count`).
+
+    Args:
+        points: [P, 3] sparse points.
+        most: largest degree that may be returned.
+
+    Returns:
+        The degree, and the `typical_view_count`.
     """
     views = typical_view_count(points, cameras)
     return min(most, max(isqrt(views) - 1, 0)), views
 
 
 def sample_visible(camera: Camera, points: np.ndarray, picture: np.ndarray, cells: int = CELLS) -> np.ndarray:
-    """[P, C] values of a view's picture [H, W, C] at the visible points among [P, 3]; NaN at the others.
+    """Sample a view's picture at the projections of those points that are visible.
 
-    A point is hidden outside the picture, and behind the nearest point of its cell; there are `cells` along the width.
+    The picture is divided into square cells. A point is visible if it projects into the picture, and its depth is below
+    `NEARLY` times the smallest depth among the points in the same cell.
+
+    Args:
+        points: [P, 3].
+        picture: [H, W, C], of the camera's size.
+        cells: number of cells along the picture's width.
+
+    Returns:
+        [P, C] values of the nearest pixels; NaN for points that are not visible.
     """
     uv, depth = geometry.project(points, camera)
     values, inside = geometry.sample_nearest(picture, uv)

@@ -1,6 +1,7 @@
-"""Lenses: distortion models, and the pinhole that replaces a distorted lens.
+"""Lenses: distortion models, and undistortion, which replaces a distorted lens by a pinhole.
 
-Directions are [..., 2] camera x/z and y/z (x right, y down); pixels as in docs/architecture.md.
+A *direction* is [..., 2], the camera coordinates (x/z, y/z) of a ray, with x right and y down. Pixel coordinates are as
+in docs/architecture.md: the centre of pixel (column i, row j) is (i + 0.5, j + 0.5).
 """
 
 from __future__ import annotations
@@ -12,25 +13,26 @@ import numpy as np
 
 from reffusion.io.files import BadInput
 
-PINHOLE_ENOUGH = 0.05  # px: a lens that moves no border pixel further counts as a pinhole
+PINHOLE_ENOUGH = 0.05  # px: a lens whose distortion moves no border pixel by more counts as a pinhole
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics with distortion.
+    """Camera intrinsics with distortion.
 
-    With r the length of the direction (x, y), or for a fisheye r = atan of it, the direction is multiplied by
+    Let l be the length of the direction (x, y), and r = l, or r = atan(l) for a fisheye. Distortion multiplies the
+    direction by
 
         (1 + radial[0] r^2 + radial[1] r^4 + ...) / (1 + denominator[0] r^2 + denominator[1] r^4 + ...)
 
-    (for a fisheye also by r over its length); then Brown's tangential terms p1, p2 are added (not to a fisheye).
+    and for a fisheye also by r / l. For other lenses Brown's tangential terms with p1 and p2 are then added.
 
     Attributes:
         width, height: image size in pixels.
         fx, fy, cx, cy: focal lengths and principal point in pixels.
-        radial, denominator: polynomial coefficients, lowest power first, any number.
-        tangential: p1, p2 as in OpenCV.
-        fisheye: equidistant projection instead of perspective.
+        radial, denominator: any number of polynomial coefficients, lowest power first.
+        tangential: p1 and p2 as in OpenCV.
+        fisheye: True for an equidistant projection, False for a perspective one.
         model: COLMAP's name of the model, for messages.
     """
 
@@ -47,7 +49,7 @@ class Lens:
     model: str = "PINHOLE"
 
     def resized(self, width: int, height: int) -> Lens:
-        """The same lens for a picture of another size. Distortion acts on directions and stays."""
+        """Return the lens for a picture of another size. The coefficients stay, since distortion acts on directions."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
@@ -55,18 +57,26 @@ class Lens:
 
     @property
     def pinhole(self) -> Lens:
-        """The same intrinsics without distortion."""
+        """The lens with the same size, focal lengths and principal point, and without distortion."""
         return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def coefficients(self) -> str:
-        """The model and its coefficients for messages: `SIMPLE_RADIAL k1=0.0124`."""
+        """Return the model and its coefficients that are not 0, for messages: `SIMPLE_RADIAL k1=0.0124`."""
         names = [(f"k{i}", k) for i, k in enumerate((*self.radial, *self.denominator), start=1)]
         names += [("p1", self.tangential[0]), ("p2", self.tangential[1])]
         return " ".join([self.model, *(f"{name}={value:.4g}" for name, value in names if value)])
 
 
 def from_colmap(model: str, width: int, height: int, params: tuple[float, ...]) -> Lens:
-    """The lens of a COLMAP camera. BadInput naming the model where it is not supported."""
+    """Return the lens of a COLMAP camera.
+
+    Args:
+        model: COLMAP's name of the camera model.
+        params: the parameters in COLMAP's order.
+
+    Raises:
+        BadInput: the model is not supported; the message names it.
+    """
     if model not in _COLMAP:
         raise BadInput(f"camera model {model} is not understood; convert it to one of {', '.join(_COLMAP)}")
     single_focal, fisheye, names = _COLMAP[model]
@@ -104,7 +114,7 @@ _COLMAP = {
 
 
 def distort(directions: np.ndarray, lens: Lens) -> np.ndarray:
-    """Apply the lens's distortion: true directions [..., 2] -> distorted directions [..., 2], float64."""
+    """Apply the distortion of a lens to directions [..., 2]. Returns the distorted directions [..., 2], float64."""
     xy = np.asarray(directions, np.float64)
     length = np.linalg.norm(xy, axis=-1, keepdims=True)
     angle = np.arctan(length) if lens.fisheye else length
@@ -121,6 +131,7 @@ def distort(directions: np.ndarray, lens: Lens) -> np.ndarray:
 
 
 def _polynomial(coefficients: tuple[float, ...], square: np.ndarray) -> np.ndarray:
+    """Return 1 + c[0] s + c[1] s^2 + ... for the coefficients c and s = `square`, any shape."""
     value = np.zeros_like(square)
     for k in reversed(coefficients):
         value = (value + k) * square
@@ -128,7 +139,10 @@ def _polynomial(coefficients: tuple[float, ...], square: np.ndarray) -> np.ndarr
 
 
 def undistort(distorted: np.ndarray, lens: Lens) -> np.ndarray:
-    """Inverse of `distort`, by Newton's method; NaN where it does not converge, outside the range of the lens."""
+    """Remove the distortion of a lens from directions [..., 2]: the inverse of `distort`, by Newton's method.
+
+    The result is NaN where the method does not converge, or where the distortion folds over.
+    """
     distorted = np.asarray(distorted, np.float64)
     xy, step = distorted.copy(), 1e-6
     if lens.fisheye:
@@ -149,17 +163,17 @@ def undistort(distorted: np.ndarray, lens: Lens) -> np.ndarray:
 
 
 def to_pixels(directions: np.ndarray, lens: Lens) -> np.ndarray:
-    """True directions [..., 2] -> pixels [..., 2] of the distorted picture."""
+    """Project undistorted directions [..., 2] to pixels [..., 2] of the distorted picture."""
     return distort(directions, lens) * (lens.fx, lens.fy) + (lens.cx, lens.cy)
 
 
 def to_directions(pixels: np.ndarray, lens: Lens) -> np.ndarray:
-    """Pixels [..., 2] of the distorted picture -> true directions [..., 2]; NaN outside the range of the lens."""
+    """Return the undistorted directions [..., 2] of pixels [..., 2] of the distorted picture; NaN as in `undistort`."""
     return undistort((np.asarray(pixels, np.float64) - (lens.cx, lens.cy)) / (lens.fx, lens.fy), lens)
 
 
 def _border(lens: Lens) -> tuple[np.ndarray, ...]:
-    """Left, top, right and bottom edge of the picture, [65, 2] pixels each."""
+    """Return points on the left, top, right and bottom edge of the picture, as pixels [65, 2] each."""
     along = np.linspace(0.0, 1.0, 65)
     across, down = along * lens.width, along * lens.height
     left, right = np.zeros_like(along), np.full_like(along, lens.width)
@@ -170,8 +184,10 @@ def _border(lens: Lens) -> tuple[np.ndarray, ...]:
 
 @lru_cache(maxsize=4096)
 def largest_shift(lens: Lens) -> float:
-    """px, the largest displacement of a border pixel by the distortion; 0 for a pinhole, inf where the border is out of
-    range."""
+    """Return the largest displacement, in pixels, of a point on the picture's border by the distortion.
+
+    It is 0 for a pinhole, and infinite if the distortion cannot be inverted at the border.
+    """
     border = np.concatenate(_border(lens))
     seen = to_directions(border, lens)
     if not np.isfinite(seen).all():
@@ -181,14 +197,15 @@ def largest_shift(lens: Lens) -> float:
 
 @lru_cache(maxsize=4096)
 def undistorted_pinhole(lens: Lens) -> Lens:
-    """The pinhole of the undistorted picture, of the same size.
+    """Return the pinhole that takes the undistorted picture, of the same size as the distorted one.
 
-    It shows the largest window that lies wholly inside the distorted picture, so that no black border remains. Both
-    axes are zoomed alike, so pixels keep their shape. A lens that moves no pixel by more than `PINHOLE_ENOUGH` px only
-    loses its coefficients.
+    The undistorted picture shows the largest window that lies wholly inside the distorted picture, so that no black
+    border remains. Both axes are zoomed by the same factor, so pixels keep their aspect ratio. If the distortion moves
+    no border pixel by more than `PINHOLE_ENOUGH` px, the pinhole is the lens without its coefficients.
 
     Raises:
-        BadInput: inside the picture the distortion folds over, or a fisheye reaches 85 degrees.
+        BadInput: the distortion cannot be inverted on the picture's border, or the border is more than 85 degrees from
+            the optical axis.
     """
     shift = largest_shift(lens)
     if shift <= PINHOLE_ENOUGH:
@@ -209,7 +226,7 @@ def undistorted_pinhole(lens: Lens) -> Lens:
 
 
 def sampling_map(lens: Lens, pinhole: Lens) -> np.ndarray:
-    """[H, W, 2] float64: for each pixel of the pinhole's picture, the coordinates to read in the distorted one."""
+    """Return [H, W, 2] float64, for each pixel of the pinhole's picture its coordinates in the distorted picture."""
     columns, rows = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
     directions = np.stack([(columns - pinhole.cx) / pinhole.fx, (rows - pinhole.cy) / pinhole.fy], axis=-1)
     return to_pixels(directions, lens)
@@ -217,13 +234,20 @@ def sampling_map(lens: Lens, pinhole: Lens) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def undistortion_map(lens: Lens) -> tuple[Lens, np.ndarray | None]:
-    """The pinhole that replaces the lens, and the `sampling_map`; None for the map where nothing moves."""
+    """Return how to undistort pictures of a lens: the pinhole that replaces the lens, and the `sampling_map`.
+
+    The map is None if the distortion is so small that pictures need no resampling.
+    """
     pinhole = undistorted_pinhole(lens)
     return pinhole, None if pinhole == lens.pinhole else sampling_map(lens, pinhole)
 
 
 def undistort_image(image: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Resample uint8 [h, w, 3] at `where` [H, W, 2] (`sampling_map`) by Lanczos interpolation."""
+    """Resample a picture, uint8 [h, w, 3], to uint8 [H, W, 3] by Lanczos interpolation.
+
+    Args:
+        where: [H, W, 2], for each pixel of the result its coordinates in `image` (`sampling_map`).
+    """
     import cv2
 
     at = (where - 0.5).astype(np.float32)  # OpenCV counts from the centre of the first pixel
@@ -231,7 +255,11 @@ def undistort_image(image: np.ndarray, where: np.ndarray) -> np.ndarray:
 
 
 def undistort_mask(mask: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Resample bool [h, w] at `where` [H, W, 2] bilinearly, with a threshold of one half."""
+    """Resample a mask, bool [h, w], to bool [H, W] by bilinear interpolation and a threshold of one half.
+
+    Args:
+        where: [H, W, 2], for each pixel of the result its coordinates in `mask` (`sampling_map`).
+    """
     import cv2
 
     at = (where - 0.5).astype(np.float32)

@@ -1,4 +1,4 @@
-"""lenses.json of a `poses` folder: what is needed to undistort a picture of one of its views."""
+"""Reads and writes lenses.json in the folder of the stage `poses`: lenses for undistorting pictures of its views."""
 
 from __future__ import annotations
 
@@ -16,14 +16,28 @@ LENSES = "lenses.json"
 def save_lenses(
     poses_dir: Path, lenses: Mapping[str, Lens], upright: bool, photographs: Mapping[str, tuple[int, int]]
 ) -> None:
-    """Write lenses.json: the lenses at the size of the undistorted pictures, and (width, height) of the photographs."""
+    """Write lenses.json.
+
+    Args:
+        poses_dir: the folder that the stage `poses` writes.
+        lenses: view name -> lens of its photograph with distortion, at the size of its undistorted picture.
+        upright: True if the EXIF orientation tags of photographs are obeyed.
+        photographs: view name -> (width, height) of its photograph in the scene's folder.
+    """
     views = {name: asdict(lens) for name, lens in lenses.items()}
     save_json(Path(poses_dir) / LENSES, {"upright": upright, "photographs": dict(photographs), "views": views})
 
 
 def load_lenses(poses_dir: Path) -> tuple[dict[str, Lens], bool]:
-    """View name -> its photograph's lens, at the size of the undistorted picture; and whether orientation tags are
-    obeyed."""
+    """Read the lenses from lenses.json.
+
+    Returns:
+        View name -> lens of its photograph with distortion, at the size of its undistorted picture; and whether the
+        EXIF orientation tags of photographs are obeyed.
+
+    Raises:
+        BadInput: there is no lenses.json.
+    """
     path = Path(poses_dir) / LENSES
     if not path.is_file():
         raise BadInput(f"{path}: missing; {poses_dir} is no finished `poses` folder")
@@ -37,5 +51,5 @@ def load_lenses(poses_dir: Path) -> tuple[dict[str, Lens], bool]:
 
 
 def load_photograph_sizes(poses_dir: Path) -> dict[str, tuple[int, int]]:
-    """View name -> (width, height) of its photograph in the scene's folder."""
+    """Return view name -> (width, height) of its photograph in the scene's folder, from lenses.json."""
     return {name: tuple(size) for name, size in load_json(Path(poses_dir) / LENSES)["photographs"].items()}

@@ -1,8 +1,9 @@
-"""Reads captures in the layouts they come in: SPIn-NeRF/LLFF, COLMAP, nerfstudio's transforms.json, or photographs
+"""Reads a scene folder in one of four layouts: SPIn-NeRF/LLFF, COLMAP, nerfstudio's transforms.json, or photographs
 only.
 
-Every reader returns the same: pictures by view name and, where the folder has them, lenses and poses in the scene's own
-frame. Of pictures only headers are read.
+Every layout is read into a `Capture`: pictures by view name and, if the folder holds poses, lenses and poses in the
+scene's own frame. Of pictures only headers are read, except for a few, whose colours are compared with the colours of
+the sparse points.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from reffusion.capture.layouts.capture import Capture
 from reffusion.io.files import BadInput, as_bad_input, is_file
 
 LAYOUTS = ("llff", "colmap", "transforms", "photos")
-LONGEST = 1600  # px: the paper's
+LONGEST = 1600  # px, longer side of the pictures in the paper
 
 
 def load_capture(
@@ -24,17 +25,18 @@ def load_capture(
     longest: int = LONGEST,
     references: frozenset[Path] = frozenset(),
 ) -> Capture:
-    """Read a scene folder, detecting its layout unless it is given.
+    """Read a scene folder: its pictures and, if it holds poses, its cameras and sparse points.
 
     Args:
-        layout: one of LAYOUTS, or None.
-        images: the folder of pictures, relative to the scene, where it is not the usual one.
-        longest: requested size of the larger image side in px; chooses among folders of the same pictures (LLFF).
-        references: pictures that may lie among the photographs and are none.
+        layout: one of LAYOUTS; None to detect the layout.
+        images: folder of pictures, relative to the scene; None for the layout's usual folders.
+        longest: requested longer side of the pictures in pixels. The layout "llff" may hold the same pictures in
+            several sizes; the smallest size that is large enough is taken.
+        references: files of references (inpainted views). They may lie among the photographs, but are not views.
 
     Raises:
-        BadInput: naming the file and the remedy, where the folder is no capture, two pictures share a view name, a
-            picture is unreadable, a pose is not finite or no rotation, or the files contradict each other.
+        BadInput: the folder is no capture, two pictures share a view name, a picture is unreadable, a pose is not
+            finite or not a rotation, or the files contradict each other. The message names the file and the remedy.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -53,16 +55,17 @@ def load_capture(
 
 
 def _source(folder: Path, layout: str) -> Path:
-    """The file or folder that the poses come from, for messages."""
+    """Return the file or folder from which a layout's poses are read, for messages."""
     known = {"llff": "poses_bounds.npy", "transforms": "transforms.json"}
     return folder / known[layout] if layout in known else folder
 
 
 def detect_layout(folder: Path) -> str:
-    """Detect the layout from the files of a folder.
+    """Return the layout of a folder, one of LAYOUTS, from the files it holds.
 
-    The first of: poses_bounds.npy; transforms.json, or Blender's transforms_train.json; a COLMAP model; else photos. A
-    COLMAP model beside masks of `images_4` is a scene of SPIn-NeRF, which does not need its poses_bounds.npy then.
+    The first match decides: "llff" for poses_bounds.npy, or for a COLMAP model with masks in images_4/label (a scene of
+    SPIn-NeRF without its poses_bounds.npy); "transforms" for transforms.json or Blender's transforms_train.json;
+    "colmap" for a COLMAP model; else "photos".
     """
     if is_file(folder / "poses_bounds.npy"):
         return "llff"

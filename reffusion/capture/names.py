@@ -1,7 +1,8 @@
-"""View names, and which picture another program means by a name or a path.
+"""View names, and the search for the picture that another program means by a name or a path.
 
 Programs write the same picture as `A.jpg`, `images/A.jpg`, `day0\\A.jpg` or `A.jpg.png` (COLMAP's masks), and macOS
-decomposes accents. Names are compared in Unicode's NFC form with forward slashes.
+decomposes accents. So names are compared in Unicode's NFC form with forward slashes. An *ending* is a file name's
+suffix, such as `.jpg`.
 """
 
 from __future__ import annotations
@@ -14,30 +15,33 @@ from typing import TypeVar
 from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS
 
-MASK_FOLDERS = ("label", "test_label", "masks", "mask")  # folders of these names inside a folder of pictures hold none
-MASK_SUFFIXES = ("_mask", ".mask", "-mask")  # `A_mask.png` beside `A.png` is its mask
+MASK_FOLDERS = ("label", "test_label", "masks", "mask")  # sub-folders of a folder of pictures that hold masks
+MASK_SUFFIXES = ("_mask", ".mask", "-mask")  # `A_mask.png` is the mask of `A.png` in the same folder
 
 K = TypeVar("K")
 V = TypeVar("V")
 
 
 def normalize_path(path: str) -> str:
-    """The path in NFC, with forward slashes, without `./`, and without the drive or root of an absolute path."""
+    """Return the path in NFC, with forward slashes, without `./`, and without the drive or root of an absolute path."""
     parts = unicodedata.normalize("NFC", path).replace("\\", "/").split("/")
     return "/".join(part for part in parts if part not in ("", ".") and not part.endswith(":"))
 
 
 def strip_ending(path: str) -> str:
-    """The path without its ending, if that is one of pictures; any other ending is part of the name."""
+    """Return the path without the ending of a picture format (`ENDINGS`). Other endings count as part of the name."""
     stem, dot, ending = path.rpartition(".")
     return stem if dot and PurePosixPath(stem).name and f".{ending}".lower() in ENDINGS else path
 
 
 def list_pictures(folder: Path, nested: bool = False) -> list[str]:
-    """Paths of the pictures in a folder, relative to it, sorted; without masks beside their pictures (`MASK_SUFFIXES`).
+    """Return the paths of the pictures in a folder, sorted, relative to the folder.
+
+    Hidden files are left out, and masks that lie beside their pictures (`A_mask.png` beside `A.png`, `MASK_SUFFIXES`).
+    A folder that does not exist gives an empty list.
 
     Args:
-        nested: also those in sub-folders other than `MASK_FOLDERS`.
+        nested: True to include pictures in sub-folders, except in folders of masks (`MASK_FOLDERS`).
     """
     found = [path.relative_to(folder).as_posix() for path in _walk(folder, nested)]
     stems = {strip_ending(path) for path in found}
@@ -55,18 +59,18 @@ def _walk(folder: Path, nested: bool) -> Iterable[Path]:
 
 
 def is_mask_of_another(stem: str, stems: Collection[str]) -> bool:
-    """Is a picture of this path, without its ending, the mask of one of `stems`?"""
+    """Return whether the path `stem`, without ending, names a mask (`A_mask`) of a picture in `stems` (`A`)."""
     return any(stem.endswith(suffix) and stem.removesuffix(suffix) in stems for suffix in MASK_SUFFIXES)
 
 
 def name_views(paths: Collection[str]) -> dict[str, str]:
-    """View name -> path, in the order of the paths.
+    """Return view name -> path of its picture, sorted by path.
 
-    A view has the file name of its picture without the ending. Where two of these are equal, all views have the path as
-    name, with `-` for `/`: `cam0/0001.png` is the view `cam0-0001`.
+    A view is named by the file name of its picture without the ending. If two of these names are equal, all views are
+    named by their paths instead, with `-` for `/`: `cam0/0001.png` is the view `cam0-0001`.
 
     Raises:
-        BadInput: two paths give the same name even so.
+        BadInput: two views have the same name even then.
     """
     plain = {path: strip_ending(normalize_path(path)) for path in paths}
     flat = {path: PurePosixPath(name).name for path, name in plain.items()}
@@ -83,18 +87,22 @@ def name_views(paths: Collection[str]) -> dict[str, str]:
 
 
 def flatten(path: str) -> str:
-    """The path as a single name, with `-` for `/`."""
+    """Return the path as a single name, with `-` for `/`."""
     return path.replace("/", "-")
 
 
 def pair_names(wanted: Mapping[K, Iterable[str]], known: Mapping[V, Iterable[str]]) -> dict[K, V]:
-    """Pair each of `wanted` with the one of `known` that it means; ambiguous and unknown ones are left out.
+    """Pair each entry of `wanted` with the entry of `known` that has the same path, or the same end of a path.
 
-    Whole paths are compared first, then paths without their first folder, and so on down to file names; then all of
-    that without regard to case. A pair needs a key that no other entry on either side has.
+    Whole paths are compared first, then paths without their first folder, and so on down to file names. Then all
+    comparisons are repeated without regard to case. Two entries are paired if they agree in a path (or end of a path)
+    that no other entry of `wanted` or of `known` has. An entry is part of at most one pair.
 
     Args:
-        wanted, known: identity -> the paths by which it may be called.
+        wanted, known: key of an entry -> the paths by which the entry may be called.
+
+    Returns:
+        Key in `wanted` -> key in `known`. Entries without a partner, or with several possible partners, are left out.
     """
     pairs: dict[K, V] = {}
     used: set[V] = set()
@@ -114,12 +122,12 @@ def pair_names(wanted: Mapping[K, Iterable[str]], known: Mapping[V, Iterable[str
 
 
 def _split(paths: Mapping[K, Iterable[str]], fold: Callable[[str], str]) -> dict[K, list[list[str]]]:
-    """The parts of each path, as `fold` writes them."""
+    """Return for each entry its paths, split at `/`, after `fold` was applied to them."""
     return {identity: [fold(normalize_path(p)).split("/") for p in spellings] for identity, spellings in paths.items()}
 
 
 def _index(paths: Mapping[K, Iterable[list[str]]], depth: int) -> dict[tuple[str, ...], set[K]]:
-    """The last `depth` parts of each path -> the identities that have them."""
+    """Return the last `depth` parts of a path -> keys of the entries with such a path."""
     found: dict[tuple[str, ...], set[K]] = {}
     for identity, spellings in paths.items():
         for parts in spellings:
@@ -128,7 +136,14 @@ def _index(paths: Mapping[K, Iterable[list[str]]], depth: int) -> dict[tuple[str
 
 
 def pair_pictures(wanted: Mapping[K, str], files: Collection[str]) -> dict[K, str]:
-    """Key -> the file that another program's path means: by its name with ending, else without."""
+    """Return key -> the file that a path written by another program means.
+
+    Paths are compared with their endings first, then without. Keys for which no single file fits are left out.
+
+    Args:
+        wanted: key -> the path that the other program wrote.
+        files: paths of the files that exist.
+    """
     pairs = pair_names({key: [path] for key, path in wanted.items()}, {file: [file] for file in files})
     rest = {key: [strip_ending(normalize_path(path))] for key, path in wanted.items()}
     by_stem = pair_names(rest, {file: [strip_ending(file)] for file in files})
@@ -137,13 +152,14 @@ def pair_pictures(wanted: Mapping[K, str], files: Collection[str]) -> dict[K, st
 
 
 def pair_masks(masks: Collection[str], views: Mapping[V, Iterable[str]]) -> dict[str, V]:
-    """Mask file -> the view it belongs to, for masks that belong to one.
+    """Return mask file -> key of the view to which the mask belongs. Masks that fit no single view are left out.
 
-    A mask is called like its picture (`A.png`), like its picture with the ending (COLMAP: `A.jpg.png`), or with one of
-    `MASK_SUFFIXES`.
+    The mask of the picture `A.jpg` may be called `A.png`, `A.jpg.png` (as COLMAP does), or `A` with one of
+    `MASK_SUFFIXES`, such as `A_mask.png`.
 
     Args:
-        views: identity -> the paths by which its picture may be called, with their endings.
+        masks: paths of mask files.
+        views: key of a view -> the paths by which its picture may be called, with their endings.
     """
     stems = {mask: strip_ending(normalize_path(mask)) for mask in masks}
     bare = {view: [strip_ending(normalize_path(path)) for path in paths] for view, paths in views.items()}
@@ -157,6 +173,6 @@ def pair_masks(masks: Collection[str], views: Mapping[V, Iterable[str]]) -> dict
 
 
 def _strip_mask_suffix(stem: str) -> str:
-    """The stem without the ending of COLMAP's masks and without a suffix for masks."""
+    """Return a mask's stem without a second ending (`A.jpg` -> `A`) and without a mask suffix (`A_mask` -> `A`)."""
     stem = strip_ending(stem)
     return next((stem.removesuffix(suffix) for suffix in MASK_SUFFIXES if stem.endswith(suffix)), stem)

@@ -1,10 +1,11 @@
-"""Tests whether cameras fit their photographs, and adjusts them where they do not.
+"""Tests whether cameras fit their photographs, and adjusts the cameras if they do not.
 
-Poses that come with a capture were solved with one lens for all views. But a phone's stabiliser shifts its lens from
-shot to shot: distant objects then end up a pixel or two from where near ones put them, and no Gaussian is sharp in all
-views. Optical flow between neighbours shows this everywhere in the picture. Pose and principal point of each view are
-then adjusted to the flow by bundle adjustment (Ceres, through COLMAP). Focal lengths stay fixed: adjusted as well, they
-drift where the views see little of each other (`fox`: by half), and give `statue` next to nothing (0.097 -> 0.091 px).
+Poses that come with a capture were solved with one lens for all views. But a phone's stabiliser shifts the lens from
+shot to shot. Then no pose fits near and distant objects at once: distant objects are off by a pixel or two, and no
+Gaussian is sharp in all views. Optical flow between neighbouring views shows such errors everywhere in the picture. The
+pose and the principal point of each view are then adjusted to the flow by bundle adjustment (Ceres, through COLMAP).
+Focal lengths stay fixed. If they are adjusted too, they drift in captures whose views share little (`fox`: by half),
+and gain almost nothing elsewhere (`statue`: 0.097 -> 0.091 px).
 
 PAPER leaves open: it takes the cameras as given.
 """
@@ -21,21 +22,22 @@ from reffusion.capture import stereo
 from reffusion.capture.sfm import bundle_adjust
 from reffusion.types import Camera
 
-# px of `flow_residual` up to which cameras stay as they are; exact ones show 0.08, COLMAP's own 0.10
+# px of `flow_residual` up to which cameras stay as given; exact cameras have 0.08, COLMAP's own poses 0.10
 GOOD_RESIDUAL = 0.15
-# Largest ratio of the residuals after and before adjustment. Where stabilisers moved principal points (`statue`) a
-# fifth remains. Where more than half remains (`fox`, `bear`, `garden`, `dinosaur`: 0.7 to 0.85) something else moves in
-# the pictures; adjustment bends the cameras to it, and held-out views get worse (docs/method.md#cameras-and-fit).
+# Largest accepted ratio of the residuals after and before adjustment. If stabilisers moved principal points (`statue`),
+# the ratio is 0.2. If the ratio is above a half (`fox`, `bear`, `garden`, `dinosaur`: 0.7 to 0.85), the residuals come
+# from something else that moves in the pictures. The adjusted cameras then follow this motion, and held-out views get
+# worse (docs/method.md#cameras-and-fit).
 LARGEST_RATIO = 0.5
 TRACKS = 10_000  # number of points for bundle adjustment
-ROUNDS = 2  # of bundle adjustment; the second uses the matches that agree with the cameras of the first
-BLOCK = 8  # cells along a side of a block, over which the median averages out the noise of flow
-LEAST_IN_BLOCK = 15  # vectors in a block
+ROUNDS = 2  # of bundle adjustment; the second round uses the matches that agree with the cameras of the first
+BLOCK = 8  # cells along each side of a block of the picture; the median over a block removes the noise of flow
+LEAST_IN_BLOCK = 15  # residual vectors that a block must have
 PROBE_VIEWS = 8  # views for the first, quick test
-# of the test, along a picture's longer side; in larger pictures the noise of flow, too, is more pixels wide
+# cells of this test along a picture's longer side: cells grow with the picture, as the noise of flow does
 PROBE_CELLS = 64
 LEAST_CELL = 8  # px: smallest cell of the test
-# of the longer side: a principal point that moves further, beyond what stabilisers do, is held fixed
+# share of the longer side: a principal point that would move further, more than stabilisers do, is held fixed
 LARGEST_SHIFT = 0.02
 
 
@@ -45,7 +47,8 @@ class Refinement:
 
     Attributes:
         cameras: view name -> camera, adjusted or as given.
-        before, after: px, `flow_residual`; `after` is None where nothing was adjusted.
+        before: `flow_residual` of the given cameras in pixels; NaN if no views match.
+        after: `flow_residual` of the adjusted cameras in pixels; None if the cameras are as given.
     """
 
     cameras: dict[str, Camera]
@@ -54,13 +57,14 @@ class Refinement:
 
 
 def refine_cameras(cameras: Sequence[Camera], images: Mapping[str, np.ndarray]) -> Refinement:
-    """Adjust the cameras where flow shows that they need it and that it helped.
+    """Adjust cameras to optical flow, if the flow contradicts the given cameras and the adjustment reduces the error.
 
-    Half of the matches are used for adjustment; the residual of the other half must fall below `LARGEST_RATIO` of what
-    it was.
+    Cameras stay as given if their residual (`flow_residual`) is at most `GOOD_RESIDUAL`, first in a quick test of a few
+    views, then over all views. Otherwise half of the matches are used for bundle adjustment. The adjusted cameras are
+    accepted if they reduce the residual of the other half to less than `LARGEST_RATIO` times its value.
 
     Args:
-        cameras: undistorted views in the normalised frame.
+        cameras: cameras of undistorted views in the normalised frame.
         images: view name -> uint8 [H, W, 3].
     """
     initial = {camera.name: camera for camera in cameras}
@@ -74,7 +78,8 @@ def refine_cameras(cameras: Sequence[Camera], images: Mapping[str, np.ndarray]) 
     odd = [((m.pixels // cell).sum(1) % 2).astype(bool) for m in matches]
     fitting = [_select(m, ~o) for m, o in zip(matches, odd, strict=True)]
     checking = [_select(m, o) for m, o in zip(matches, odd, strict=True)]
-    before = flow_residual(checking, initial, cell)  # of neighbours: those of the few views lie farther apart
+    # again, to be comparable with `after`: in the quick test the cells are larger, and the views few
+    before = flow_residual(checking, initial, cell)
     if not before > GOOD_RESIDUAL:
         return Refinement(initial, before, None)
     adjusted = _align(_adjust(fitting, initial), initial)
@@ -83,7 +88,11 @@ def refine_cameras(cameras: Sequence[Camera], images: Mapping[str, np.ndarray]) 
 
 
 def _adjust(matches: Sequence[stereo.Matches], initial: Mapping[str, Camera]) -> dict[str, Camera]:
-    """`bundle_adjust` in rounds. It restarts while principal points leave their range, with these held fixed."""
+    """Return the cameras after `ROUNDS` rounds of `bundle_adjust`.
+
+    If the principal points of some views move by more than `LARGEST_SHIFT`, the adjustment starts again with these
+    points fixed.
+    """
     fixed: set[str] = set()
     while True:
         cameras = dict(initial)
@@ -96,16 +105,22 @@ def _adjust(matches: Sequence[stereo.Matches], initial: Mapping[str, Camera]) ->
 
 
 def _shift(camera: Camera, initial: Camera) -> float:
-    """Displacement of the principal point, in units of the picture's longer side."""
+    """Return the distance between two cameras' principal points, in units of the picture's longer side."""
     return float(np.hypot(camera.cx - initial.cx, camera.cy - initial.cy) / max(initial.width, initial.height))
 
 
 def flow_residual(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camera], cell: int) -> float:
-    """The systematic error of the cameras in px, NaN where nothing matches.
+    """Return the systematic reprojection error of cameras in pixels; NaN if there are too few matches.
 
-    Each block of a picture contributes the length of its median residual vector, between flow and the points
-    triangulated from it; the result is the mean over blocks. The noise of flow has no preferred direction, so the
-    median leaves what the cameras get wrong.
+    Points are triangulated from the flow. A residual vector leads from the place where flow finds a point in a
+    neighbouring view to the point's projection. For each block of a picture and each neighbour, the median of the
+    residual vectors is taken. The result is the mean length of these medians. The noise of flow has no preferred
+    direction, so that the median leaves the error of the cameras.
+
+    Args:
+        matches: matches of each view with its neighbours.
+        cameras: view name -> camera.
+        cell: side in pixels of the cells in which the matches were made; a block has `BLOCK` x `BLOCK` cells.
     """
     lengths = []
     for match in matches:
@@ -121,7 +136,11 @@ def flow_residual(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camer
 
 
 def _build_tracks(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camera]):
-    """Observations and points as `bundle_adjust` takes them."""
+    """Return the arguments `sightings` and `points` of `bundle_adjust`, from matches that agree with the cameras.
+
+    Each matched pixel is triangulated to one point. The observation of the point in a neighbouring view is used if its
+    reprojection error in x and in y is below `stereo.RESIDUAL`.
+    """
     seen_at: dict[str, list[np.ndarray]] = {name: [] for name in cameras}
     points = []
     for match in matches:
@@ -142,14 +161,14 @@ def _build_tracks(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camer
 
 
 def _select(matches: stereo.Matches, chosen: np.ndarray) -> stereo.Matches:
-    """The chosen ones of the matches, bool [P]."""
+    """Return the matches of the pixels for which `chosen`, bool [P], is True."""
     return replace(
         matches, pixels=matches.pixels[chosen], places=matches.places[:, chosen], seen=matches.seen[:, chosen]
     )
 
 
 def _align(cameras: Mapping[str, Camera], initial: Mapping[str, Camera]) -> dict[str, Camera]:
-    """Align adjusted cameras with the given ones by a similarity: adjustment does not fix the frame."""
+    """Return adjusted cameras, aligned with the given ones by a similarity: the adjustment does not fix the frame."""
     names = list(cameras)
     turns = [initial[n].world_to_camera[:3, :3].T @ cameras[n].world_to_camera[:3, :3] for n in names]
     turn = Rotation.from_matrix(turns).mean().as_matrix()

@@ -1,4 +1,8 @@
-"""Assigns roles to the views of a capture (training, test, clean, cameras only), and masks to views."""
+"""Assigns roles to the views of a capture, and masks to views.
+
+A training view supervises the fit. A test view is held out, for scores. A clean view is a training view in which the
+object is absent. A camera-only view (`cameras_only` in scene.yaml) is a camera whose pixels are not used.
+"""
 
 from __future__ import annotations
 
@@ -15,25 +19,26 @@ from reffusion.io.files import BadInput
 from reffusion.io.images import WHITE, MaskValues, image_size
 from reffusion.params.capture import MaskSpec
 
-LEAST_TRAINING_VIEWS = 3  # for a scene without views that are cameras only
+LEAST_TRAINING_VIEWS = 3  # for a scene without camera-only views; with such views, one is enough
 OTHERS = "others"
 
 
 @dataclass(frozen=True)
 class Roles:
-    """The role of each view. Names are sorted.
+    """The views of each role, and the files of their masks. A view without a role is left out of the scene.
 
     Attributes:
-        train, test, clean: names of views.
-        masks: object -> view -> file of the mask, for training views, and test views that show the object too. "" is
-            the object of masks that tell no objects apart.
-        test_masks: test view -> file of a mask of where it shows the object, or would show it; the test box comes from
-            it.
+        train, test: names of the training views and of the test views.
+        clean: names of the training views in which the object is absent.
+        masks: object -> view -> file of the mask of this object. Views are training views, and test views whose
+            photographs show the object. The object is "" if the masks do not distinguish between objects.
+        test_masks: test view -> file of a mask of where the view shows the object, or would show it. Scores are
+            computed in the bounding box of this mask.
         warnings: sentences for the user.
-        blank: names of views whose pixels are not used, beside training and test views.
-        values: the pixel values of `masks` that are the object.
-        fill: training view -> file of a mask of what is to be filled, whatever its photograph shows there.
-        keep: names of views that stay, even where their photographs contradict their poses.
+        blank: names of the camera-only views. They are neither training nor test views.
+        values: the pixel values in `masks` that mark the object.
+        fill: training view -> file of a mask of the pixels to fill, whatever the photograph shows there.
+        keep: names of views that stay in the scene even if their photographs contradict their poses.
     """
 
     train: tuple[str, ...]
@@ -49,16 +54,18 @@ class Roles:
 
     @property
     def mask_files(self) -> dict[str, dict[str, Path]]:
-        """Folder of the stage `raw_masks` -> view -> file; folders are "masks/" or "masks/<object>", "test_masks",
-        "fill"."""
+        """All mask files, by the folder into which the stage `raw_masks` writes them: folder -> view -> file.
+
+        Folders are "masks/" or "masks/<object>", "test_masks", and "fill".
+        """
         masks = {f"masks/{thing}": files for thing, files in self.masks.items()}
         return {**masks, "test_masks": self.test_masks, "fill": self.fill}
 
     def restrict(self, names: set[str]) -> Roles:
-        """The roles of the views in `names`, such as those that structure from motion placed.
+        """Return the roles of the views in `names` only, for example of the views that structure from motion placed.
 
         Raises:
-            BadInput: fewer than 3 training views are left.
+            BadInput: fewer than 3 training views are left (with camera-only views: none is left).
         """
         kept = lambda values: {name: value for name, value in values.items() if name in names}
         roles = replace(
@@ -88,24 +95,38 @@ def load_roles(
     cameras_only: Sequence[str] | str | None = None,
     remove: Sequence[str] | None = None,
 ) -> Roles:
-    """Assign roles from scene.yaml's keys and the folder's usual places.
+    """Assign a role to each view, from the keys of scene.yaml and the masks in the folder.
 
-    Test views are those named; else, where the folder has test masks (`<pictures>/test_label`), the views without a
-    mask, or where some training masks are missing the first views in order of names; else those that the layout holds
-    out. Training views are those named, else all others. A view that is neither is left out of the scene.
+    Test views are the first of these that exist:
+    - the views that `test` names;
+    - the views of the test masks (usually in `<pictures>/test_label`). If the test masks are named like views, their
+      names decide. Otherwise they belong, in order, to the views without a training mask; or, if some training masks
+      are missing too, to the first views of the capture;
+    - the views that the layout itself holds out (`Capture.test`).
+
+    Training views are the views that `train` names, else all views that are neither test nor camera-only views. All
+    other views are left out of the scene, unless they are camera-only views.
 
     Args:
-        masks: folder of masks, and the numbers in them that are the object; "none" for a scene without. None looks into
-            <pictures>/label, masks, mask, label, for `A_mask.png` beside `A.png`, and for masks that the layout names.
-        test_masks: folder of the test views' masks, named like the views or in their order; "none"; None looks.
-        train, test: names, or "every 8" (the first of each eight in order of names), or None.
-        region: the scene names a 3D region, so it may lack masks.
-        cameras_only: views whose pixels are not used: names, "every 8", or "others": all not in train or test.
-        remove: objects, each a folder of masks; only checked here.
+        folder: the scene's folder.
+        masks: folder of masks, and optionally the numbers in them that mark the object. "none" if the scene has no
+            masks. None searches <pictures>/label, masks, mask, label, then `A_mask.png` beside `A.png`, then the masks
+            that the layout names.
+        test_masks: folder of the masks of test views, named like the views or sorted like them. "none" if there are
+            none; None searches `<pictures>/test_label`.
+        train, test: names of views, or "every 8" for the first of each eight in the order of `Capture.pictures`; None
+            if not given.
+        clean: names of training views in which the object is absent.
+        region: True if scene.yaml tells in another way what to change (a region, masks to fill, clicks, cleaned
+            Gaussians). Masks are then optional.
+        cameras_only: the camera-only views: names, "every 8", or "others" for all that are neither in train nor in
+            test. Masks are then optional too.
+        remove: names of the objects to remove. Each must be a folder of masks; they are only checked here.
 
     Raises:
-        BadInput: naming the file and the remedy: a mask for no picture, of other proportions (over 10%), no mask at
-            all, an unknown view, a view for both training and test, fewer than 3 training views.
+        BadInput: a mask belongs to no picture, or its aspect ratio differs from that of its view by more than 10%;
+            there is no mask at all; a view is unknown, or is both a training and a test view; there are fewer than 3
+            training views. The message names the file and the remedy.
     """
     folder = Path(folder)
     found = find_masks(folder, capture, masks, optional=region or cameras_only is not None)
@@ -138,7 +159,7 @@ def load_roles(
 
 
 def _clean_views(clean: Sequence[str], train: list[str], capture: Capture) -> frozenset[str]:
-    """The views that the scene names as clean, without the object."""
+    """Return the clean views (training views without the object). Raises BadInput if one is not in `train`."""
     views = frozenset(resolve_view(name, capture.pictures, "clean") for name in clean)
     if views - set(train):
         raise BadInput(f"scene.yaml: clean: {', '.join(sorted(views - set(train)))} is no training view")
@@ -148,9 +169,15 @@ def _clean_views(clean: Sequence[str], train: list[str], capture: Capture) -> fr
 def _split_masks(
     test: list[str], masks: dict[str, Path], labels: dict[str, Path]
 ) -> tuple[dict[str, Path], dict[str, Path]]:
-    """The masks of test views that show the object (view -> file), and `Roles.test_masks`.
+    """Return two mappings from test view to file: masks of the object in its photograph, and `Roles.test_masks`.
 
-    Test views with a mask among the training masks are held out, but their photographs are no ground truth inside it.
+    A test view with a mask among `masks`, and none among `labels`, shows the object: its photograph is no ground truth
+    inside this mask. The mask is then both the mask of the object and the test mask.
+
+    Args:
+        test: names of the test views.
+        masks: view -> mask of the object.
+        labels: view -> test mask.
     """
     held_out = {name: path for name, path in masks.items() if name in set(test)}
     own = {name: path for name, path in labels.items() if name in set(test)}
@@ -162,6 +189,7 @@ def _restrict_files(files: dict[str, Path], names: set[str]) -> dict[str, Path]:
 
 
 def _check_objects(remove: Sequence[str] | None, found: dict[str, dict[str, Path]]) -> None:
+    """Raise BadInput if an object in `remove` has no masks in `found` (object -> view -> file)."""
     if remove is None:
         return
     if "" in found or not found:
@@ -171,7 +199,7 @@ def _check_objects(remove: Sequence[str] | None, found: dict[str, dict[str, Path
 
 
 def capture_views(capture: Capture, roles: Roles) -> ViewTable:
-    """The views of a capture, for checking what people bring for them."""
+    """Return the table of all views of a capture, against which files that the user made for a view are checked."""
     return ViewTable(capture.pictures, roles.train, roles.test, lambda name: _size_of(name, capture), capture.upright)
 
 
@@ -182,8 +210,13 @@ def _size_of(name: str, capture: Capture) -> tuple[int, int]:
 def _split_views(
     train: list[str] | None, test: list[str] | None, labelled: list[str] | None, blank: list[str], capture: Capture
 ) -> tuple[list[str], list[str]]:
-    """Training and test views, from the named ones (None where none are named), the test masks', and the layout's test
-    views."""
+    """Return the names of the training views and of the test views, see `load_roles`.
+
+    Args:
+        train, test: the views that scene.yaml names; None if it names none.
+        labelled: the views of the test masks; None without test masks.
+        blank: the camera-only views that scene.yaml names.
+    """
     test_views = test if test is not None else (labelled or [*capture.test])
     if train is None:
         train = [name for name in capture.pictures if name not in {*test_views, *blank}]
@@ -198,7 +231,13 @@ def _split_views(
 def _camera_only_views(
     cameras_only: Sequence[str] | str | None, named: Sequence[str] | None, used: set[str], capture: Capture
 ) -> tuple[str, ...]:
-    """The views whose pixels are not used."""
+    """Return the names of the camera-only views.
+
+    Args:
+        cameras_only: the key of scene.yaml.
+        named: the views that it names; None for "others".
+        used: training and test views.
+    """
     if cameras_only is None:
         return ()
     if named is None:
@@ -210,6 +249,7 @@ def _camera_only_views(
 
 
 def _check_enough(train: Sequence[str], sparse: bool = False) -> None:
+    """Raise BadInput for fewer than 3 training views, or fewer than 1 if `sparse` (there are camera-only views)."""
     if len(train) < (1 if sparse else LEAST_TRAINING_VIEWS):
         raise BadInput(
             f"{len(train)} training view{'' if len(train) == 1 else 's'} ({', '.join(train) or 'none'}): "
@@ -218,7 +258,7 @@ def _check_enough(train: Sequence[str], sparse: bool = False) -> None:
 
 
 def _select_views(value: Sequence[str] | str | None, capture: Capture, key: str) -> list[str] | None:
-    """View names, sorted, from a list of names or from "every N"."""
+    """Return the views that a list of names (sorted) or "every N" in scene.yaml's `key` selects; None for None."""
     if value is None:
         return None
     if isinstance(value, str):
@@ -234,7 +274,14 @@ def _select_views(value: Sequence[str] | str | None, capture: Capture, key: str)
 
 
 def _test_mask_files(found: Path, test_masks: str | None) -> list[Path] | None:
-    """The test views' masks in a folder, in order of their paths; None where the scene has none."""
+    """Return the files of test masks in the folder `found`, sorted by path; None if the scene has no test masks.
+
+    Args:
+        test_masks: the key of scene.yaml that names the folder, or "none"; None if scene.yaml does not have it.
+
+    Raises:
+        BadInput: scene.yaml names the folder, and there are no masks in it.
+    """
     if test_masks is not None and test_masks.lower() == NONE:
         return None
     files = [found / path for path in list_pictures(found, nested=True)]
@@ -246,7 +293,20 @@ def _test_mask_files(found: Path, test_masks: str | None) -> list[Path] | None:
 def _test_mask_views(
     capture: Capture, masks: dict[str, Path], place: Path, labels: list[Path], test_named: list[str] | None
 ) -> list[str]:
-    """The view of each test mask in a folder, in the order of the masks."""
+    """Return the view of each test mask, in the order of `labels`.
+
+    The first possibility that fits decides: the names of the masks; all views without a training mask, in order; the
+    first views of the capture, if none of them has a training mask; the views that scene.yaml names as `test`.
+
+    Args:
+        masks: view -> training mask.
+        place: the folder of the test masks.
+        labels: files of the test masks, sorted.
+        test_named: the views that scene.yaml names as `test`, or None.
+
+    Raises:
+        BadInput: nothing fits, because the numbers differ.
+    """
     files = [path.relative_to(place).as_posix() for path in labels]
     named = match_masks(place, files, capture, strict=False)
     if all(view in capture.pictures for view in named.values()) and len(named) == len(labels):

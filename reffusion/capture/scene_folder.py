@@ -1,4 +1,4 @@
-"""Reads a scene folder as the keys of scene.yaml ask."""
+"""Reads a scene folder as the keys of its scene.yaml tell, and checks these keys against the folder."""
 
 from __future__ import annotations
 
@@ -21,13 +21,15 @@ from reffusion.params.reference import reference_list
 
 
 def read_scene(params: SceneKeys, scene: Path, longest: int = LONGEST) -> tuple[Capture, Roles]:
-    """The capture and the roles of its views.
+    """Read a scene folder: return the capture (pictures and cameras) and the roles of its views.
 
     Args:
-        longest: requested size of the larger image side in px, see `load_capture`; no role depends on it.
+        params: the keys of scene.yaml.
+        scene: the scene's folder.
+        longest: requested longer side of the pictures in pixels, see `load_capture`; no role depends on it.
 
     Raises:
-        BadInput: naming the file and the remedy where one is wrong.
+        BadInput: a file or a key of scene.yaml is wrong; the message names it and the remedy.
     """
     specs = reference_list(params.reference)
     references = frozenset(scene / name for each in specs for name in (each.image, each.depth) if name is not None)
@@ -57,7 +59,7 @@ def read_scene(params: SceneKeys, scene: Path, longest: int = LONGEST) -> tuple[
 
 
 def _exclude(params: SceneKeys, capture: Capture, roles: Roles) -> tuple[Capture, Roles]:
-    """The capture and its roles without the views that the scene excludes."""
+    """Return the capture and the roles without the views in `exclude` of scene.yaml, and with `keep` in the roles."""
     excluded, kept = (
         {resolve_view(n, capture.pictures, key) for n in getattr(params, key)} for key in ("exclude", "keep")
     )
@@ -71,13 +73,14 @@ def _exclude(params: SceneKeys, capture: Capture, roles: Roles) -> tuple[Capture
 
 
 def check_gaussian_files(params: SceneKeys, scene: Path) -> list[str]:
-    """Check the Gaussians that the scene brings, as far as the headers of their files allow.
+    """Check the files of Gaussians that scene.yaml names (`gaussians` and `cleaned`), mostly by their headers.
 
     Returns:
-        what reading will change in them, a sentence each.
+        A sentence for each thing that will be changed when the files are read.
 
     Raises:
-        BadInput: they cannot be used.
+        BadInput: a file is missing or holds no Gaussians; `cleaned` is given without `gaussians`, or has as many
+            Gaussians as `gaussians`, so that nothing was deleted.
     """
     counts, notes = {}, []
     for key, name in (("gaussians", params.gaussians), ("cleaned", params.cleaned)):
@@ -94,7 +97,7 @@ def check_gaussian_files(params: SceneKeys, scene: Path) -> list[str]:
     if params.gaussians is None:
         raise BadInput("scene.yaml: cleaned: name the scene before anything was deleted too, as `gaussians`")
     files = [scene / name for name in (params.gaussians, params.cleaned)]
-    if counts["cleaned"] >= counts["gaussians"]:  # rows that cannot be drawn count in neither
+    if counts["cleaned"] >= counts["gaussians"]:  # recount without the rows that cannot be drawn
         counts["gaussians"], counts["cleaned"] = (len(load_splats(path).rows) for path in files)
     if counts["cleaned"] >= counts["gaussians"]:
         raise BadInput(
@@ -105,10 +108,13 @@ def check_gaussian_files(params: SceneKeys, scene: Path) -> list[str]:
 
 
 def is_gaussians_only(params: SceneKeys, scene: Path) -> bool:
-    """Has the scene no photographs, but a cleaned scene of Gaussians whose renders stand for them?
+    """Return whether the scene consists only of Gaussians, without photographs.
+
+    Then scene.yaml names a fitted scene of Gaussians as `gaussians`, and as `cleaned` the same scene after the user
+    deleted the object. Renders of these Gaussians are used in place of photographs.
 
     Raises:
-        BadInput: it has, and scene.yaml holds a key about photographs.
+        BadInput: the scene is of this kind, and scene.yaml has a key about photographs.
     """
     named = [each.image for each in reference_list(params.reference)]
     if params.cleaned is None or params.images is not None or has_pictures(scene, frozenset(named)):
@@ -121,7 +127,11 @@ def is_gaussians_only(params: SceneKeys, scene: Path) -> bool:
 
 
 def _find_fill_masks(folder: Path, capture: Capture, roles: Roles) -> dict[str, Path]:
-    """Training view -> mask of what is to be filled; BadInput where a view has none."""
+    """Return training view -> file of the mask of pixels to fill, from the folder that scene.yaml names as `fill`.
+
+    Raises:
+        BadInput: a training view that is not clean has no such mask.
+    """
     found = group_by_object(folder, list_pictures(folder, nested=True), capture)
     files = {name: path for views in found.values() for name, path in views.items()}
     if lacking := [name for name in roles.train if name not in {*files, *roles.clean}]:
@@ -133,7 +143,7 @@ def _find_fill_masks(folder: Path, capture: Capture, roles: Roles) -> dict[str, 
 
 
 def _check_lenses(capture: Capture) -> None:
-    """BadInput for a lens whose distortion cannot be removed."""
+    """Raise BadInput if the distortion of a lens cannot be removed inside its picture."""
     lenses = capture.poses.lenses.items() if capture.poses else ()
     of = {lens: name for name, lens in lenses if replace(lens.pinhole, model=lens.model) != lens}
     for lens, name in of.items():

@@ -1,4 +1,4 @@
-"""Structure from motion through COLMAP: SIFT on the CPU, exhaustive matching, incremental mapping."""
+"""Structure from motion with COLMAP: SIFT on the CPU, exhaustive matching, incremental mapping; bundle adjustment."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from reffusion.types import Camera
 if TYPE_CHECKING:
     import pycolmap
 
-LEAST_VIEWS = 3  # that must be placed
-LEAST_SIGHTINGS = 100  # observations, below which a view is not adjusted
+LEAST_VIEWS = 3  # smallest number of views for which poses must be found
+LEAST_SIGHTINGS = 100  # a view with fewer observations is not adjusted
 SAME_FOCAL = 1.01  # ratio of EXIF focal lengths up to which photographs count as taken at one zoom
-EXIF_PART, MAKER, MODEL = 0x8769, 0x010F, 0x0110  # EXIF tags: the camera's part, and what names the camera
-FOCAL_TAGS = (0x920A, 0xA405, 0xA20E, 0xA210)  # mm; mm of 35 mm film; pixels per unit of the sensor; that unit
+EXIF_PART, MAKER, MODEL = 0x8769, 0x010F, 0x0110  # EXIF tags: camera settings (a part of the tags), maker, model
+FOCAL_TAGS = (0x920A, 0xA405, 0xA20E, 0xA210)  # focal length: mm; mm for 35 mm film; sensor pixels per unit; that unit
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,12 @@ class Reconstruction:
     """The result of structure from motion.
 
     Attributes:
-        poses: lenses, poses and points, in an arbitrary frame, of the views that were placed.
-        photographs: number of photographs.
-        lenses: number of different lenses that were estimated.
-        track_length: mean number of views that show a point.
-        residual: mean reprojection error in px of the reduced pictures.
+        poses: lenses, poses and sparse points in an arbitrary frame. They include only the placed views, for which
+            COLMAP found a pose.
+        photographs: number of photographs that were given, placed or not.
+        lenses: number of different lenses of the placed views.
+        track_length: mean number of views in which a point is observed.
+        residual: mean reprojection error in pixels of the reduced pictures.
     """
 
     poses: Poses
@@ -49,7 +50,7 @@ class Reconstruction:
     residual: float
 
     def facts(self) -> dict[str, float | str]:
-        """The figures by name, and a line for people."""
+        """Return the numbers of this reconstruction by name, and under "summary" a sentence with all of them."""
         lenses = "1 lens" if self.lenses == 1 else f"{self.lenses} lenses"
         placed, points = len(self.poses.lenses), len(self.poses.points)
         return {
@@ -65,22 +66,24 @@ class Reconstruction:
 
 
 def reconstruct(photographs: Mapping[str, Path], longest: int, work: Path, seed: int = 0) -> Reconstruction:
-    """Estimate lenses, poses and sparse points of photographs, which are turned as their orientation tags say.
+    """Estimate lenses, poses and sparse points of photographs. Their EXIF orientation tags are obeyed.
 
-    Photographs of one size and one EXIF focal length share a SIMPLE_RADIAL lens; portrait pictures are turned to
-    landscape for this. The same pictures give the same poses: order, seeds and, where it matters, a single thread are
-    fixed.
+    Photographs of equal size and equal EXIF focal length share one SIMPLE_RADIAL lens. So that portrait and landscape
+    pictures can share a lens, portrait pictures are turned by 90 degrees; the results are turned back. The result is
+    reproducible: the order of pictures and the random seeds are fixed, and the mapping uses a single thread.
 
     Args:
         photographs: view name -> file; sizes may differ.
-        longest: px to which the longer side is reduced.
-        work: a folder for pictures and the database; created, and removed at the end.
+        longest: longer side in pixels to which the pictures are reduced; smaller pictures keep their size.
+        work: temporary folder for pictures and the database. The folder is emptied first, and deleted after success.
+        seed: random seed of COLMAP.
 
     Returns:
-        The reconstruction at the reduced size; with fewer views than `photographs` where some were not placed.
+        The reconstruction, with lenses for the reduced pictures. Photographs for which COLMAP finds no pose are not in
+        `poses`.
 
     Raises:
-        BadInput: naming the views that were not placed, where fewer than 3 were.
+        BadInput: COLMAP finds poses for fewer than 3 views; the message names the views without a pose.
     """
     import pycolmap
 
@@ -115,7 +118,12 @@ def reconstruct(photographs: Mapping[str, Path], longest: int, work: Path, seed:
 
 
 def _register(database: Path, folder: Path, files: Sequence[str], focal: float | None) -> None:
-    """Add pictures that share a lens to the database; `focal`: focal length over the longer side, where it is known."""
+    """Add pictures that share one lens to COLMAP's database.
+
+    Args:
+        files: names of the pictures in `folder`.
+        focal: focal length divided by the picture's longer side; None if unknown.
+    """
     import pycolmap
 
     reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
@@ -127,7 +135,10 @@ def _register(database: Path, folder: Path, files: Sequence[str], focal: float |
 
 
 def _match(database: Path, folder: Path, seed: int) -> None:
-    """SIFT features of the registered pictures, and matches of all pairs; the same for any number of threads."""
+    """Write the SIFT features of the registered pictures, and the matches of all pairs, to the database.
+
+    The result is the same for any number of threads.
+    """
     import pycolmap
 
     threads, cpu = torch.get_num_threads(), pycolmap.Device.cpu
@@ -135,17 +146,17 @@ def _match(database: Path, folder: Path, seed: int) -> None:
     pycolmap.extract_features(database, folder, extraction_options=features, device=cpu)
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=threads)
     geometry = pycolmap.TwoViewGeometryOptions()
-    geometry.ransac.random_seed = seed  # of each pair
+    geometry.ransac.random_seed = seed  # of the RANSAC of each pair
     pycolmap.match_exhaustive(database, matching, verification_options=geometry, device=cpu)
 
 
 def _reconstruct(database: Path, pictures: Path, work: Path, seed: int):
-    """COLMAP's reconstruction with most views; None where it finds none."""
+    """Return the `pycolmap.Reconstruction` with the most views, or None if COLMAP finds no reconstruction."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed, min_model_size=LEAST_VIEWS)
     options.mapper.random_seed = options.triangulation.random_seed = seed
-    options.mapper.num_threads = 1  # the order of sums, and so the result, is fixed
+    options.mapper.num_threads = 1  # fixes the order of sums, and so the result
     models = pycolmap.incremental_mapping(database, pictures, work, options)
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
@@ -155,17 +166,20 @@ def _is_portrait(size: tuple[int, int]) -> bool:
 
 
 def _file_of(view: str) -> str:
-    """File name of a view's picture in the database; a view may be called by its path."""
+    """Return the file name of a view's picture in the database. The view's name may be a path."""
     return f"{view}.png"
 
 
 def _poses_of(model, images: Mapping[str, pycolmap.Image], turned: Collection[str]) -> Poses:
-    """Lenses, poses and points of a COLMAP reconstruction.
+    """Return the lenses, poses and points of a COLMAP reconstruction, for the pictures before they were turned.
 
     Args:
-        images: view name -> its image. turned: views whose pictures were turned by 90 degrees counterclockwise.
+        model: a `pycolmap.Reconstruction`.
+        images: view name -> its image in the model.
+        turned: names of the views whose pictures were turned by 90 degrees counterclockwise.
     """
-    back = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], np.float64)  # x right, y down
+    # turns by 90 degrees clockwise (x right, y down)
+    back = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], np.float64)
     poses, lenses = {}, {}
     for name, image in images.items():
         camera = model.cameras[image.camera_id]
@@ -173,7 +187,7 @@ def _poses_of(model, images: Mapping[str, pycolmap.Image], turned: Collection[st
         matrix[:3] = image.cam_from_world().matrix()
         poses[name] = back @ matrix if name in turned else matrix
         lens = from_colmap(camera.model.name, camera.width, camera.height, tuple(map(float, camera.params)))
-        # a radial lens with its axis in the middle stays what it is when it is turned
+        # a radial lens with its principal point in the middle keeps its focal length and k1 when turned
         across = replace(lens, width=lens.height, height=lens.width, cx=lens.cy, cy=lens.cx)
         lenses[name] = across if name in turned else lens
     points = [model.points3D[k] for k in sorted(model.points3D)]
@@ -187,10 +201,18 @@ def _poses_of(model, images: Mapping[str, pycolmap.Image], turned: Collection[st
 
 
 def group_by_lens(photographs: Mapping[str, Path], work: Path) -> list[tuple[list[str], float | None]]:
-    """Names of views that share a lens, and its focal length over the longer side where EXIF has it.
+    """Group photographs that were taken with one lens at one zoom.
 
-    They have the same size, portrait or landscape, and EXIF focal lengths that agree within 1%. `work`: see
-    `relative_focal_length`.
+    Photographs of a group have equal sizes, apart from portrait or landscape, and EXIF focal lengths that agree within
+    1%. Photographs of equal size without an EXIF focal length are one group.
+
+    Args:
+        photographs: view name -> file.
+        work: an existing folder for a temporary file, see `relative_focal_length`.
+
+    Returns:
+        For each group the names of its views, and the focal length divided by the picture's longer side; None if
+        EXIF does not tell.
     """
     groups: list[tuple[list[str], float | None]] = []
     last: tuple[list[int], float] | None = None
@@ -204,10 +226,11 @@ def group_by_lens(photographs: Mapping[str, Path], work: Path) -> list[tuple[lis
 
 
 def relative_focal_length(photograph: Path, work: Path) -> float | None:
-    """Focal length over the longer side, from EXIF and COLMAP's table of sensors; None where unknown.
+    """Return a photograph's focal length divided by its longer side, or None if unknown.
 
-    COLMAP does not read every kind of picture (WebP, HEIC). So it gets a blank JPEG with the photograph's tags, which
-    is written to the folder `work`.
+    COLMAP computes the focal length from the EXIF tags and its table of sensors. COLMAP cannot read every picture
+    format (not WebP or HEIC). So a blank JPEG with the photograph's tags is written to the existing folder `work` for
+    COLMAP to read, and deleted.
     """
     with open_image(photograph) as image:
         exif = image.getexif()
@@ -219,6 +242,12 @@ def relative_focal_length(photograph: Path, work: Path) -> float | None:
 
 @lru_cache(maxsize=64)  # most photographs of a capture have the same tags
 def _focal_of_tags(size: tuple[int, int], camera: tuple, focal: tuple, work: Path) -> float | None:
+    """Return `relative_focal_length` for EXIF tags.
+
+    Args:
+        size: (width, height) of the photograph.
+        camera, focal: pairs of tag and value, which name the camera, or tell the focal length (`FOCAL_TAGS`).
+    """
     import pycolmap
 
     tags = Image.Exif()
@@ -237,16 +266,21 @@ def bundle_adjust(
     points: Sequence[tuple[np.ndarray, Sequence[tuple[str, int]]]],
     fixed: Collection[str] = (),
 ) -> dict[str, Camera]:
-    """Adjust poses, and the principal point of each view, to the least robust reprojection error.
+    """Adjust the poses and principal points of cameras by bundle adjustment. Focal lengths stay fixed.
+
+    The sum of a robust loss (soft L1) of the reprojection errors is minimised over poses, principal points and points.
 
     Args:
-        cameras: view name -> camera, to start from; a view with fewer than `LEAST_SIGHTINGS` observations stays fixed.
-        sightings: view name -> pixels [2] in it.
-        points: of each point the position [3] and track: pairs of view name and index of its pixel in `sightings`.
-        held: names of views whose principal points stay fixed.
+        cameras: view name -> camera to start from. A view with fewer than `LEAST_SIGHTINGS` observations keeps its
+            pose and principal point.
+        sightings: view name -> the observed pixels [2] of this view.
+        points: position [3] and track of each point. A track is a list of observations: pairs of a view name and
+            the index of the pixel in `sightings` of this view.
+        fixed: names of views whose principal points stay fixed.
 
     Returns:
-        The cameras, in a frame that is only roughly the given one.
+        The adjusted cameras by view name. Their frame agrees only roughly with the given one, since reprojection errors
+        do not change under a similarity.
     """
     import pycolmap
 
@@ -278,12 +312,13 @@ def bundle_adjust(
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length, options.refine_principal_point, options.print_summary = False, True, False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.solver_options.num_threads = 1  # the order of sums, and so the result, is fixed
+    options.ceres.solver_options.num_threads = 1  # fixes the order of sums, and so the result
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     return {name: _camera(cameras[name], model.images[k], model.cameras[k]) for name, k in identities.items()}
 
 
 def _camera(camera: Camera, image, lens) -> Camera:
+    """Return `camera` with the pose of a `pycolmap.Image` and the intrinsics of a PINHOLE `pycolmap.Camera`."""
     pose, (fx, fy, cx, cy) = np.eye(4), (float(value) for value in lens.params)
     pose[:3] = image.cam_from_world().matrix()
     return replace(camera, world_to_camera=pose, fx=fx, fy=fy, cx=cx, cy=cy)

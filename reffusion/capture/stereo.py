@@ -1,9 +1,11 @@
-"""Dense matches between views: optical flow to the neighbours, triangulated where several agree.
+"""Dense matches between views: optical flow to neighbouring views, and points triangulated from this flow.
 
-Sparse points come from corners that a matcher is sure of. Where there are none, in foliage, on distant facades, in the
-sky, 3DGS has to grow Gaussians from distant ones, and a short run does not get there. Flow gives points everywhere in
-seconds. The cameras tell which flow vectors are right, and the vectors in turn reveal wrong cameras
-(`reffusion.capture.refine`).
+The sparse points of structure from motion come from distinctive corners, which are rare in foliage, on distant facades
+and in the sky. In such areas 3DGS would have to grow Gaussians from distant Gaussians, and a short run has too few
+steps for this growth. Flow gives points everywhere within seconds. Flow vectors that contradict the cameras are
+dropped. Systematic contradictions reveal wrong cameras (`reffusion.capture.refine`).
+
+Matches are made for one pixel per cell, a square of `cell` x `cell` pixels of a view.
 """
 
 from __future__ import annotations
@@ -19,25 +21,29 @@ import torch
 
 from reffusion.types import Camera
 
-NEIGHBOURS = 4  # views that a view is matched with
+NEIGHBOURS = 4  # number of views with which each view is matched
 TURN = np.cos(np.radians(40))  # cosine of 40 degrees: views whose axes differ by more are not matched
-ROUND_TRIP = 1.5  # px: largest distance between a pixel and where forward and backward flow lead
+ROUND_TRIP = 1.5  # px: largest distance between a pixel and the end of forward flow followed by backward flow
 RESIDUAL = 1.5  # px: largest reprojection error of a point against the flow
-LEAST_CONTRAST = 0.7  # levels of 255: standard deviation in a window of 9 px under which nothing can be matched
-NOISE = 0.3  # px: assumed standard deviation of flow; depths that it cannot tell from infinity are dropped
-FARTHEST = 20.0  # frame units: points beyond, the sky too, are moved to this depth
-ZOOM = 1.1  # ratio of focal lengths from which a neighbour is resampled through this view's lens
-SAME_DEPTH = 0.1  # relative difference of depth under which two views' points show the same surface
+LEAST_CONTRAST = 0.7  # levels of 255: standard deviation in a window of 9 px, below which flow is not trusted
+# px: assumed standard deviation of flow. A point is dropped if its inverse depth is negative by more than two of the
+# standard deviations that follow from it, so that it would lie behind the camera.
+NOISE = 0.3
+FARTHEST = 20.0  # units of the normalised frame: points farther away, as in the sky, are moved to this depth
+ZOOM = 1.1  # ratio of focal lengths from which a neighbour's picture is resampled to this view's focal length
+SAME_DEPTH = 0.1  # relative difference of depth, below which a new point lies on the surface of an existing one
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Pixels of a view, and where its neighbours show the same.
+    """The pixels of a view, and the pixels in its neighbours that show the same points, by optical flow.
 
     Attributes:
-        view: name of the view; pixels: [P, 2] float64 coordinates (x, y) in it.
-        others: names of K neighbours; places: [K, P, 2] coordinates in them; seen: [K, P] bool, forward and backward
-            flow agree, so the coordinates are valid.
+        view: name of the view.
+        pixels: [P, 2] float64, coordinates (x, y) of pixels in the view.
+        others: names of the K neighbours.
+        places: [K, P, 2], coordinates (x, y) of the matching pixels in the neighbours.
+        seen: [K, P] bool, True if the match is valid: forward and backward flow agree, and the pixel has contrast.
     """
 
     view: str
@@ -50,15 +56,17 @@ class Matches:
 def triangulate_points(
     cameras: Sequence[Camera], images: Mapping[str, np.ndarray], cell: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A point per `cell` x `cell` pixels of the first view, and of every further view where there is no point yet.
+    """Triangulate points from the optical flow between views, about one point per cell of the pictures.
+
+    A cell of a view gets no point if its match is unreliable, or if points of earlier views already cover it.
 
     Args:
-        cameras: undistorted views in the normalised frame; with fewer than two there are no points.
+        cameras: cameras of undistorted views in the normalised frame. Fewer than two give no points.
         images: view name -> uint8 [H, W, 3].
-        cell: px, at least 1.
+        cell: side of a cell in pixels, at least 1.
 
     Returns:
-        points [P, 3] float64 and their colours [P, 3] uint8.
+        The points [P, 3] float64 and their colours [P, 3] uint8. A colour is the mean over a square of the cell's size.
     """
     by_name = {camera.name: camera for camera in cameras}
     points, colors = np.empty((0, 3)), [np.empty((0, 3), np.uint8)]
@@ -80,8 +88,12 @@ def triangulate_points(
 def match_views(
     chosen: Sequence[Camera], cameras: Sequence[Camera], images: Mapping[str, np.ndarray], cell: int
 ) -> Iterator[Matches]:
-    """Match the `chosen` views with their neighbours among `cameras`, one pixel per cell; yields in the order of
-    `chosen`."""
+    """Yield the matches of each of the `chosen` views with its neighbours among `cameras`, one pixel per cell.
+
+    Args:
+        images: view name -> uint8 [H, W, 3].
+        cell: side of a cell in pixels.
+    """
     gray = {camera.name: cv2.cvtColor(images[camera.name], cv2.COLOR_RGB2GRAY) for camera in cameras}
     neighbours_of = {camera.name: tuple(other.name for other in find_neighbours(camera, cameras)) for camera in chosen}
     pairs = list(dict.fromkeys(tuple(sorted((name, other))) for name in neighbours_of for other in neighbours_of[name]))
@@ -103,7 +115,10 @@ def match_views(
 
 
 def find_neighbours(camera: Camera, cameras: Sequence[Camera]) -> list[Camera]:
-    """The `NEIGHBOURS` nearest views at other places that look in about the same direction."""
+    """Return the cameras at other places whose axes are within 40 degrees (`TURN`) of that of `camera`.
+
+    These are the nearest ones, at most `NEIGHBOURS`, sorted by distance.
+    """
     away = {other.name: float(np.linalg.norm(other.center - camera.center)) for other in cameras}
     axis = camera.world_to_camera[2, :3]
     others = [o for o in cameras if away[o.name] > 1e-6 and o.world_to_camera[2, :3] @ axis > TURN]
@@ -111,7 +126,7 @@ def find_neighbours(camera: Camera, cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def _pixels(gray: np.ndarray, cell: int) -> np.ndarray:
-    """[h, w, 2], the pixel (x, y) that stands for each cell."""
+    """Return [h, w, 2], the coordinates (x, y) of one pixel per cell, for h x w cells."""
     rows, columns = np.arange(cell // 2, gray.shape[0], cell), np.arange(cell // 2, gray.shape[1], cell)
     return np.stack(np.meshgrid(columns, rows), -1) + 0.5
 
@@ -119,8 +134,14 @@ def _pixels(gray: np.ndarray, cell: int) -> np.ndarray:
 def _flow_both_ways(
     one: tuple[Camera, np.ndarray], other: tuple[Camera, np.ndarray], cell: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For each of two views, camera and picture, the coordinates [P, 2] of its pixels in the other, and whether they
-    are valid [P]."""
+    """Match the pixels of each of two views with the other view, see `_follow_flow`.
+
+    Args:
+        one, other: camera and grey picture [H, W] of each view.
+
+    Returns:
+        For `one`, then for `other`: coordinates [P, 2] of its pixels in the other view; and bool [P], True if valid.
+    """
     if not _has_same_scale(one[0], other[0]):
         return [_follow_resampled(*one, *other, cell), _follow_resampled(*other, *one, cell)]
     forward, back = _flow(one[1], other[1]), _flow(other[1], one[1])
@@ -128,11 +149,12 @@ def _flow_both_ways(
 
 
 def _flow(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the optical flow [H, W, 2] from one grey picture, uint8 [H, W], to another of the same size."""
     return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(one, other, None)
 
 
 def _has_same_scale(one: Camera, other: Camera) -> bool:
-    """Do both views show things at about the same size, in pictures of the same size?"""
+    """Return whether two views have pictures of the same size and about equal focal lengths (`ZOOM`)."""
     zoom = max(one.fx / other.fx, other.fx / one.fx, one.fy / other.fy, other.fy / one.fy)
     return (one.width, one.height) == (other.width, other.height) and zoom < ZOOM
 
@@ -140,8 +162,14 @@ def _has_same_scale(one: Camera, other: Camera) -> bool:
 def _follow_resampled(
     camera: Camera, gray: np.ndarray, other: Camera, picture: np.ndarray, cell: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`_follow_flow` for a neighbour of another size or lens: its picture is resampled as this view's lens would have
-    shown it."""
+    """Return `_follow_flow` to a neighbour with another picture size or focal length.
+
+    The neighbour's picture is first resampled to the intrinsics of this view; the coordinates are then mapped back.
+
+    Args:
+        camera, gray: this view and its grey picture.
+        other, picture: the neighbour and its grey picture.
+    """
     scale = np.array([camera.fx / other.fx, camera.fy / other.fy])
     # pixel coordinates as in docs/architecture.md; OpenCV counts from the centre of the first pixel
     shift = np.array([camera.cx, camera.cy]) - scale * (other.cx, other.cy)
@@ -155,13 +183,22 @@ def _follow_resampled(
 
 
 def _follow_flow(gray: np.ndarray, forward: np.ndarray, back: np.ndarray, cell: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates [P, 2] that flow leads to, one pixel per cell, and [P] bool: the way back agrees and the place has
-    contrast."""
+    """Follow the flow from one pixel per cell into the other view.
+
+    Args:
+        gray: grey picture of this view.
+        forward: flow [H, W, 2] from this view to the other.
+        back: flow [H, W, 2] from the other view to this one.
+
+    Returns:
+        Coordinates [P, 2] in the other view; and bool [P], True if the backward flow leads back to the pixel and the
+        picture has contrast around the pixel.
+    """
     pixels = _pixels(gray, cell)
     columns, rows = pixels.astype(int).transpose(2, 0, 1)
     moved = forward[rows, columns]
     at = (pixels + moved - 0.5).astype(np.float32)
-    # beyond the border no way back agrees
+    # 1e6: outside the picture, backward flow never leads back to the pixel
     returned = cv2.remap(back, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e6,) * 4)
     agree = np.linalg.norm(moved + returned, axis=-1) < ROUND_TRIP
     seen = (_local_contrast(gray)[rows, columns] > LEAST_CONTRAST) & agree
@@ -169,7 +206,7 @@ def _follow_flow(gray: np.ndarray, forward: np.ndarray, back: np.ndarray, cell: 
 
 
 def _local_contrast(gray: np.ndarray) -> np.ndarray:
-    """[H, W] standard deviation in a window around each pixel."""
+    """Return [H, W], the standard deviation of grey levels in a window of 9 x 9 pixels around each pixel."""
     wide = gray.astype(np.float32)
     return np.sqrt(np.maximum(cv2.blur(wide**2, (9, 9)) - cv2.blur(wide, (9, 9)) ** 2, 0))
 
@@ -178,18 +215,19 @@ def _local_contrast(gray: np.ndarray) -> np.ndarray:
 
 
 def triangulate(matches: Matches, cameras: Mapping[str, Camera]) -> tuple[np.ndarray, np.ndarray]:
-    """Depths of a view's pixels from where other views see the same things.
+    """Compute the depths of a view's pixels from their matches in neighbouring views.
 
-    A point at inverse depth r on a pixel's ray (whose z is 1) is R ray + r t, up to scale, in another view. Its
-    reprojection error times its depth there is linear in r. Each neighbour proposes an r. The proposal that most
-    neighbours agree with, within `RESIDUAL` px, is refined by least squares over those.
+    Let R and t be the rotation and translation from this view to a neighbour, and let a pixel's ray have z = 1. The
+    point of inverse depth r on the ray is R ray + r t in the neighbour, up to scale. Its reprojection error times its
+    depth in the neighbour is linear in r. So each neighbour proposes an r. The proposal with which most neighbours
+    agree (reprojection error below `RESIDUAL` px) is refined by least squares over the neighbours that agree.
 
     Args:
         cameras: view name -> camera, of the view and its neighbours.
 
     Returns:
-        depth [P], very large where there is no parallax; and [P] bool, whether at least two neighbours agree on it
-        (one, if there is only one).
+        Depth [P], very large if there is no parallax; and bool [P], True if the depth is reliable. It is reliable if
+        at least two neighbours agree (one, if there is only one), and if the point is not clearly behind the camera.
     """
     count = len(matches.pixels)
     if not matches.others:
@@ -211,8 +249,14 @@ def triangulate(matches: Matches, cameras: Mapping[str, Camera]) -> tuple[np.nda
 
 
 def flow_residuals(matches: Matches, cameras: Mapping[str, Camera], depth: np.ndarray) -> np.ndarray:
-    """[K, P, 2] px from where flow saw a pixel's point to where the neighbours' cameras project it; NaN behind a
-    camera."""
+    """Return the residual vectors [K, P, 2] in pixels of a view's points in its K neighbours.
+
+    A vector leads from the pixel that flow found in the neighbour to the projection of the point there. It is NaN if
+    the point is behind the neighbour.
+
+    Args:
+        depth: [P], depths of the pixels of `matches`; the points lie there on their rays.
+    """
     found = []
     for line in _reprojection_lines(matches, cameras):
         z = _neighbour_depth(line, 1 / depth)
@@ -222,7 +266,11 @@ def flow_residuals(matches: Matches, cameras: Mapping[str, Camera], depth: np.nd
 
 
 class _ReprojectionLine(NamedTuple):
-    """In a neighbour, a point at inverse depth r misses its flow by (slope r + offset) / (z + shift r) px."""
+    """The residuals in one neighbour of P points on the rays of a view's pixels, as functions of inverse depth.
+
+    At inverse depth r the residual vector, in pixels, is (slope r + offset) / (z + shift r). The denominator is the
+    point's depth in the neighbour over its depth in the view.
+    """
 
     slope: np.ndarray  # [P, 2]
     offset: np.ndarray  # [P, 2]
@@ -231,6 +279,7 @@ class _ReprojectionLine(NamedTuple):
 
 
 def _reprojection_lines(matches: Matches, cameras: Mapping[str, Camera]) -> list[_ReprojectionLine]:
+    """Return the residuals of the matched pixels in each neighbour as functions of inverse depth."""
     camera, lines = cameras[matches.view], []
     ray = _rays(camera, matches.pixels)
     for name, place in zip(matches.others, matches.places, strict=True):
@@ -245,18 +294,30 @@ def _reprojection_lines(matches: Matches, cameras: Mapping[str, Camera]) -> list
 
 
 def _neighbour_depth(line: _ReprojectionLine, inverse: np.ndarray) -> np.ndarray:
-    """Depth in the neighbour, in units of the depth in this view."""
+    """Return [P], each point's depth in the neighbour over its depth in this view, at inverse depths [P]."""
     return line.z + line.shift * inverse
 
 
 def _agrees(line: _ReprojectionLine, inverse: np.ndarray) -> np.ndarray:
+    """Return bool [P], True if the point at inverse depth [P] fits its match in the neighbour.
+
+    It fits if it lies in front of the neighbour, and its reprojection error in x and in y is below `RESIDUAL` px.
+    """
     z = _neighbour_depth(line, inverse)
-    miss_x, miss_y = np.abs(line.slope * inverse[:, None] + line.offset).T  # numpy reduces an axis of 2 slowly
+    miss_x, miss_y = np.abs(line.slope * inverse[:, None] + line.offset).T  # numpy is slow to reduce an axis of 2
     return (z > 1e-3) & (np.maximum(miss_x, miss_y) < RESIDUAL * z)
 
 
 def _solve_inverse_depth(lines: Sequence[_ReprojectionLine], weights: Sequence) -> tuple[np.ndarray, np.ndarray]:
-    """The inverse depth with the least weighted sum of squares, and the denominator of that solution."""
+    """Return the inverse depths [P] that minimise the weighted sum of squares of slope r + offset, and a denominator.
+
+    The denominator [P] is the weighted sum of squared slopes. If each weight is one over the squared depth in the
+    neighbour, the variance of the inverse depth is the variance of flow in px^2 divided by the denominator.
+
+    Args:
+        lines: one per neighbour.
+        weights: [P] or a number for each neighbour.
+    """
     square = sum(_dot(line.slope, line.slope) * weight for line, weight in zip(lines, weights, strict=True))
     square = np.maximum(square, 1e-12)
     return -sum(_dot(line.slope, line.offset) * w for line, w in zip(lines, weights, strict=True)) / square, square
@@ -270,7 +331,13 @@ def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _is_covered(camera: Camera, points: np.ndarray, pixels: np.ndarray, depth: np.ndarray, cell: int) -> np.ndarray:
-    """[P] bool: one of the points is in the pixel's cell, at about its depth or in front of it."""
+    """Return bool [P], True if an existing point projects into the pixel's cell, in front of the pixel or at its depth.
+
+    Args:
+        points: [N, 3] existing points.
+        pixels: [P, 2] pixels of the camera's view.
+        depth: [P] depths of these pixels; up to `SAME_DEPTH` more counts as the same depth.
+    """
     local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     local = local[local[:, 2] > 1e-3]
     column = np.floor((local[:, 0] / local[:, 2] * camera.fx + camera.cx) / cell)
@@ -284,11 +351,12 @@ def _is_covered(camera: Camera, points: np.ndarray, pixels: np.ndarray, depth: n
 
 
 def unproject(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """[P, 3] the points at these depths behind these pixels [P, 2]."""
+    """Return the world points [P, 3] at depths [P] on the rays of pixels [P, 2]."""
     local = _rays(camera, pixels) * depth[:, None] - camera.world_to_camera[:3, 3]
     return local @ camera.world_to_camera[:3, :3]
 
 
 def _rays(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Return the camera-frame rays [P, 3] of pixels [P, 2], with z = 1."""
     x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
     return np.stack([x, y, np.ones_like(x)], 1)

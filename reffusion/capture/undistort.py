@@ -1,4 +1,4 @@
-"""Writes the pictures and masks of a capture for the `poses` and `raw_masks` folders: resized and undistorted."""
+"""Resizes and undistorts the pictures and masks of a capture, for the stages `poses` and `raw_masks`."""
 
 from __future__ import annotations
 
@@ -24,32 +24,44 @@ from reffusion.io.images import (
 
 
 def fitting_size(width: int, height: int, longest: int) -> tuple[int, int]:
-    """(width, height) with the longer side at most `longest`; proportions stay, nothing is enlarged."""
+    """Return the (width, height) of a picture reduced so that its longer side is at most `longest`; never enlarged."""
     factor = min(1.0, longest / max(width, height))
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
 def load_resized(path: Path, longest: int, upright: bool) -> np.ndarray:
-    """The picture, uint8 [H, W, 3], at its `fitting_size`, downscaled by area averaging."""
+    """Read a picture as uint8 [H, W, 3], reduced to its `fitting_size` by area averaging.
+
+    Args:
+        longest: largest length of the longer side in pixels.
+        upright: True to obey the EXIF orientation tag.
+    """
     image = load_image(path, upright)
     return resize_image(image, fitting_size(image.shape[1], image.shape[0], longest))
 
 
 def resized_lens(name: str, capture: Capture, longest: int) -> tuple[Lens, Lens]:
-    """The lens of a view whose pixels are not used, and its pinhole, at the size its picture would have."""
+    """Return the lens of a view's photograph and the pinhole of its undistorted picture, without writing the picture.
+
+    Both are for the size that the picture has after reduction to `longest` (`fitting_size`). This is for camera-only
+    views (views whose pixels are not used).
+    """
     width, height = image_size(capture.pictures[name], upright=capture.upright)
     lens = capture.poses.lenses[name].resized(*fitting_size(width, height, longest))
     return lens, undistortion_map(lens)[0]
 
 
 def save_undistorted_view(out: Path, name: str, capture: Capture, longest: int) -> tuple[Lens, Lens]:
-    """Write the undistorted picture of a view, images/<view>.png.
+    """Write the undistorted picture of the view `name` to `out`/images/<view>.png.
+
+    Args:
+        longest: largest length of the picture's longer side in pixels; larger photographs are reduced first.
 
     Returns:
-        the photograph's lens at this size, and the pinhole.
+        The photograph's lens with distortion, resized to the written picture; and the pinhole of the written picture.
 
     Raises:
-        BadInput: naming the file, where it is unreadable, or its distortion cannot be removed.
+        BadInput: the photograph is unreadable, or its distortion cannot be removed; the message names the file.
     """
     image = load_resized(capture.pictures[name], longest, capture.upright)
     lens = capture.poses.lenses[name].resized(image.shape[1], image.shape[0])
@@ -62,14 +74,16 @@ def save_undistorted_view(out: Path, name: str, capture: Capture, longest: int) 
 
 
 def save_undistorted_masks(out: Path, name: str, roles: Roles, lens: Lens) -> None:
-    """Write the undistorted masks of a view: masks/, test_masks/ and fill/<view>.png, those that the view has; with
-    several objects masks/<object>/<view>.png.
+    """Write the undistorted masks of the view `name` below `out`, as far as the view has such masks.
+
+    The files are masks/<view>.png (masks/<object>/<view>.png if masks distinguish between objects),
+    test_masks/<view>.png and fill/<view>.png. They have the size of `lens`.
 
     Args:
-        lens: of the view's photograph, see `reffusion.capture.lenses`.
+        lens: lens of the view's photograph at the size of the undistorted picture, see `reffusion.capture.lenses`.
 
     Raises:
-        BadInput: naming the file, where it is unreadable.
+        BadInput: a mask is unreadable; the message names the file.
     """
     own = {path for files in roles.masks.values() for path in files.values()}
     for folder, files in roles.mask_files.items():
@@ -80,7 +94,15 @@ def save_undistorted_masks(out: Path, name: str, roles: Roles, lens: Lens) -> No
 
 
 def check_masks(masks: Mapping[str, Path], values: MaskValues = WHITE) -> None:
-    """Check that masks are readable, and not all empty or all full; BadInput naming the folder."""
+    """Check that masks are readable, and that not all of them are empty and not all of them are full.
+
+    Args:
+        masks: view name -> file.
+        values: the pixel values that mark the object.
+
+    Raises:
+        BadInput: a mask is unreadable, or all are empty or full; the message names the file or the folder.
+    """
     shares = [load_mask(path, values=values).mean() for path in masks.values()]
     if shares and (max(shares) == 0 or min(shares) == 1):
         state, folder = "empty" if max(shares) == 0 else "full", next(iter(masks.values())).parent

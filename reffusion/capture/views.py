@@ -1,4 +1,8 @@
-"""Looks up the views of a scene by the names that people write: in scene.yaml, for references, clicks and regions."""
+"""Looks up views by the names that users write in scene.yaml, for references, clicks and regions.
+
+A *placed* view is one for which the stage `poses` has a camera. `poses` leaves out views that structure from motion
+could not place, views that have no role, and *outliers*: views whose photographs contradict their poses.
+"""
 
 from __future__ import annotations
 
@@ -16,15 +20,17 @@ from reffusion.io.images import image_size
 
 @dataclass(frozen=True)
 class ViewTable:
-    """The views of a capture (`reffusion.capture.roles.capture_views`), or those that `poses` placed.
+    """The names and picture sizes of a scene's views.
+
+    They are either all views of a capture (`reffusion.capture.roles.capture_views`), or only the placed views.
 
     Attributes:
-        names: all views.
-        train, test: training and test views.
-        size_of: name -> (width, height) of its picture.
-        upright: the orientation tag of pictures is obeyed.
-        placed: the views are those that `poses` wrote (`load_placed_views`), so the capture may have others.
-        outliers: views that `poses` left out because their photographs contradict their poses.
+        names: names of all these views.
+        train, test: names of the training views and of the test views.
+        size_of: function from a view's name to the (width, height) of its picture.
+        upright: True if the EXIF orientation tags of pictures are obeyed.
+        placed: True if the table holds only the placed views (`load_placed_views`), so that the capture may have more.
+        outliers: names of the views that `poses` left out because their photographs contradict their poses.
     """
 
     names: Collection[str]
@@ -37,7 +43,7 @@ class ViewTable:
 
 
 def load_placed_views(poses_dir: Path) -> ViewTable:
-    """The views of a finished `poses` folder, at the sizes of its undistorted pictures."""
+    """Return the views of the folder that the stage `poses` wrote, with the sizes of its undistorted pictures."""
     lenses, upright = load_lenses(poses_dir)
     roles = load_json(Path(poses_dir) / "views.json")
     size_of = lambda name: (lenses[name].width, lenses[name].height)
@@ -45,14 +51,31 @@ def load_placed_views(poses_dir: Path) -> ViewTable:
 
 
 def resolve_view(name: str, names: Collection[str], key: str) -> str:
-    """The view of that name, or of the picture of that path; BadInput with the most similar names for none."""
+    """Return the name of the view that the user means by `name` (see `find_view`).
+
+    Args:
+        name: a view's name, or a path of its picture.
+        names: names of the views that exist.
+        key: the key of scene.yaml in which `name` is written, for the message.
+
+    Raises:
+        BadInput: there is no such view; the message shows the most similar names.
+    """
     if found := find_view(name, names):
         return found
     raise BadInput(f"scene.yaml: {key}: there is no view '{name}'; views are named like {_similar_names(name, names)}")
 
 
 def resolve_file_view(path: Path, name: str, views: ViewTable, key: str) -> str:
-    """`resolve_view`, for the view that the file at `path` is made for."""
+    """Return the name of the view for which the file at `path` was made.
+
+    Args:
+        name: the view's name, or a path of its picture.
+        key: the key of scene.yaml in which `name` is written, for the message.
+
+    Raises:
+        BadInput: there is no such view, or it is not placed.
+    """
     if not views.placed:
         return resolve_view(name, views.names, key)
     if found := find_view(name, views.names):
@@ -61,7 +84,7 @@ def resolve_file_view(path: Path, name: str, views: ViewTable, key: str) -> str:
 
 
 def not_placed_error(path: Path, name: str, views: ViewTable) -> BadInput:
-    """The error for a file whose view is not among those that `poses` placed."""
+    """Return the error for the file at `path`, which was made for a view `name` that is not placed."""
     if outlier := find_view(name, views.outliers):
         return outlier_error(str(path), outlier)
     return BadInput(
@@ -71,14 +94,23 @@ def not_placed_error(path: Path, name: str, views: ViewTable) -> BadInput:
 
 
 def check_outliers(key: str, names: Iterable[str], outliers: Collection[str]) -> None:
-    """BadInput where a key of scene.yaml names a view that is left out because its photograph contradicts its pose."""
+    """Check that a key of scene.yaml names no outlier (a view left out because its photograph contradicts its pose).
+
+    Args:
+        key: the key of scene.yaml, for the message.
+        names: the names of views that stand under this key.
+        outliers: names of the outliers.
+
+    Raises:
+        BadInput: one of `names` is an outlier.
+    """
     for name in names:
         if outlier := find_view(name, outliers):
             raise outlier_error(f"scene.yaml: {key}", outlier)
 
 
 def outlier_error(where: str, name: str) -> BadInput:
-    """The error for a file or key (`where`) that stands for a view which is left out."""
+    """Return the error for `where`, a file or a key of scene.yaml that refers to the outlier `name`."""
     return BadInput(
         f"{where}: it is for the view '{name}', which is left out: its photograph contradicts its pose; choose another "
         f'view, or add `keep: ["{name}"]` to scene.yaml'
@@ -86,25 +118,32 @@ def outlier_error(where: str, name: str) -> BadInput:
 
 
 def find_view(name: str, names: Collection[str]) -> str | None:
-    """The view that a name, a file name or a path means: `cam0/0001.png` is `cam0-0001`; None where there is none."""
+    """Return the view in `names` that a user means by a view name, a file name or a path; None if there is none.
+
+    A path may mean a view that is named by its path: `cam0/0001.png` is the view `cam0-0001`, or `0001`.
+    """
     path = strip_ending(normalize_path(name))
     spellings = (name, path, flatten(path), path.rpartition("/")[2], Path(name).stem)
     return next((candidate for candidate in spellings if candidate in names), None)
 
 
 def _similar_names(name: str, names: Collection[str]) -> str:
+    """Return the three of `names` that are most similar to `name`, joined by commas."""
     return ", ".join(get_close_matches(name, names, 3, 0.0))
 
 
 def check_proportions(
     path: Path, name: str, of_size: tuple[int, int], tolerance: float, what: str, upright: bool = False
 ) -> None:
-    """Checks that a picture has the aspect ratio of its view.
+    """Check that a picture has the aspect ratio of its view.
 
     Args:
-        name: of the view. of_size: (width, height) of the view.
-        tolerance: largest relative difference of the aspect ratios.
-        what: the kind of picture, for the message. upright: whether the picture's EXIF orientation is applied.
+        path: file of the picture.
+        name: name of the view.
+        of_size: (width, height) of the view.
+        tolerance: largest allowed relative difference of the aspect ratios.
+        what: the kind of picture, such as "mask", for the message.
+        upright: True to obey the picture's EXIF orientation tag.
 
     Raises:
         BadInput: the ratios differ by more than `tolerance`.

@@ -1,5 +1,10 @@
-"""Propagates masks of a few views to all views without a segmentation network: votes of Gaussians, a cut between
-neighbours, edges of each photograph."""
+"""Propagation of the object's masks from a few views to all views, without a segmentation network.
+
+The masks vote on the Gaussians: the vote of a mask is the blending weight of a Gaussian, summed over the pixels inside
+the mask (for the object) or outside the mask (against the object). A minimum cut between neighbouring Gaussians labels
+the Gaussians that have no votes. In each view the silhouette of the labelled Gaussians is moved to the edges of the
+photograph.
+"""
 
 from __future__ import annotations
 
@@ -19,22 +24,26 @@ from reffusion.masks import voting
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
-LARGEST_VOTE = 5.0  # px of blending weight at which votes saturate
-LEAST_VOTE = 1.0  # px of blending weight from which masks determine the label of a Gaussian
-RIM = 0.006  # of the larger side: pixels this near to a mask's border do not vote
-RING = 0.05  # of the larger side: width of the ring around a mask that a test photograph is compared in
-# times the difference in that ring, plus a share of white: the object is not in the photograph
+LARGEST_VOTE = 5.0  # px, upper limit of the votes for one Gaussian (blending weight summed over pixels)
+LEAST_VOTE = 1.0  # px of blending weight that votes must exceed to determine the label of a Gaussian
+RIM = 0.006  # share of the larger image side: pixels this near to a mask's border do not vote
+RING = 0.05  # share of the larger image side: width of the ring around a mask in which `is_visible` compares colours
+# A photograph does not show the object if the colour difference (1 = white against black) between photograph and
+# rendering inside the mask is at least ABSENT times the difference in the ring, plus LEVEL.
 ABSENT, LEVEL = 3.0, 0.02
-ROUNDS = 3  # at most, of colours, each with the labels of the one before
-COLOR = 1.0  # weight of the colours of other views, px of blending weight in the mean view
-NEARER = 3.0  # weight of the distances to object and background, compared with that of colours
-COVERED = 0.5  # alpha from which the object covers a pixel
+ROUNDS = 3  # largest number of cuts; each takes the object's colours from the labels of the cut before
+COLOR = 1.0  # votes per px of blending weight that a Gaussian has in the mean of the views without masks
+NEARER = 3.0  # weight of the relative distance to object and background, where the log ratio of colours has weight 1
+COVERED = 0.5  # rendered label (1 = object) above which a pixel shows the object
 
 
 @torch.no_grad()
 def surface_relief(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """float64 [H, W] px, logarithm of the depth times the focal length, so that its slope does not depend on the
-    distance of a surface. Empty pixels get the largest depth."""
+    """Return float64 [H, W] in pixels: the natural logarithm of the rendered depth, times the focal length.
+
+    The slope of this relief in px per px depends on the tilt of a surface, but not on the distance of the surface.
+    Pixels without Gaussians get the largest depth of the view. The relief is 0 everywhere if the view shows nothing.
+    """
     depth = rasterizer.render(gaussians, camera, sh_degree=0).depth.double().cpu().numpy()
     if not (depth > 0).any():
         return np.zeros_like(depth)
@@ -49,11 +58,19 @@ def label_gaussians(
     image_of: Callable[[str], np.ndarray],
     rim: float = RIM,
 ) -> Tensor:
-    """bool [N], the object: where the views with masks show the Gaussians by their votes, elsewhere by neighbours and
-    by the colours of the other photographs.
+    """Return bool [N], True = the Gaussian belongs to the object.
+
+    Votes of the masks label the Gaussians that the views with masks show. Gaussians whose centres project beside a mask
+    count as background. A minimum cut labels all other Gaussians. The cut uses the distances to labelled Gaussians, the
+    colours of the photographs without masks, and the similarity of neighbours. The result contains only Gaussians that
+    a chain of object neighbours connects with a Gaussian that votes label as the object.
 
     Args:
-        rim: of the larger side: pixels this near to a mask's border do not vote.
+        near: the graph of neighbouring Gaussians, from `find_neighbours`.
+        cameras: view -> Camera, all views.
+        masks: view -> bool [H, W], True = the object; at least one view.
+        image_of: view -> photograph, uint8 [H, W, 3].
+        rim: share of the larger image side; pixels this near to a mask's border do not vote.
     """
     sure = np.zeros((len(gaussians), 2))
     for name, mask in masks.items():
@@ -88,14 +105,27 @@ def label_gaussians(
 
 
 def object_mask(gaussians: Gaussians, labels: Tensor, camera: Camera, image: np.ndarray) -> np.ndarray:
-    """bool [H, W]: the labelled Gaussians in a view, with the border moved to the edges of its photograph."""
+    """Return bool [H, W], the object's mask in a view: the silhouette of the labelled Gaussians, with the border moved
+    to the edges of the photograph.
+
+    Args:
+        labels: bool [N], True = the object.
+        image: uint8 [H, W, 3], the photograph.
+    """
     mask = voting.render_labels(gaussians, labels, camera) > COVERED
     return refine_edges(image, mask, np.full(mask.shape, UNKNOWN, np.int8))
 
 
 def is_visible(gaussians: Gaussians, camera: Camera, image: np.ndarray, mask: np.ndarray) -> bool:
-    """Does the photograph show the object inside its mask [H, W], as the Gaussians do, or was it taken without the
-    object?"""
+    """Return True if a photograph shows the object inside its mask, False if the photograph was taken without it.
+
+    The photograph is compared with the rendering of the Gaussians, which contain the object. The object is visible if
+    the mean colour difference inside the mask is not much larger than in a ring around the mask.
+
+    Args:
+        image: uint8 [H, W, 3], the photograph.
+        mask: bool [H, W], the object. The result is False if the mask is empty, and True if it leaves no ring.
+    """
     around = ~erode(~mask, max(2, round(RING * max(mask.shape)))) & ~mask
     if not mask.any() or not around.any():
         return bool(mask.any())
@@ -106,6 +136,12 @@ def is_visible(gaussians: Gaussians, camera: Camera, image: np.ndarray, mask: np
 
 
 def remove_rim(mask: np.ndarray, rim: float = RIM) -> np.ndarray:
-    """The mask without its rim, unless that is most of it."""
+    """Return the mask, bool [H, W], without the pixels next to its border, whose labels are uncertain.
+
+    The mask is returned unchanged if at most a quarter of its pixels would remain.
+
+    Args:
+        rim: width of the removed rim as a share of the larger image side.
+    """
     inner = erode(mask, max(1, round(rim * max(mask.shape))))
     return inner if inner.sum() > 0.25 * mask.sum() else mask

@@ -1,8 +1,9 @@
-"""Evidence from views without clicks, for Gaussians that the views with clicks do not see: the colours of each
-photograph.
+"""Colours as evidence for the labels of Gaussians that the views with masks do not see.
 
-A view with a mask shows nothing of the object's far side. Gaussians there are unknown: they may be the object's back,
-its top, or what stands behind it. The other photographs tell, by the colours that the known Gaussians have in them.
+A view with a mask shows nothing of the object's far side. The labels of Gaussians on the far side are unknown: they may
+be the object's back or top, or the background behind the object. In each photograph without a mask the pixels of
+Gaussians with known labels give the colours of object and background. These colours are compared with the colours at
+the unknown Gaussians.
 """
 
 from __future__ import annotations
@@ -21,17 +22,22 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
 LONGEST = 256  # px, the larger side at which photographs are compared
-VIEWS = 24  # at most, that are compared
-LEAST_COVERAGE = 0.6  # share of a pixel that known Gaussians must cover for its colour to count
-RING = 0.12  # of the larger side: how far around the object background colours are collected
-FRONT_PERCENTILE = 5  # percentile of the depth of the object's pixels that stands for its front
-OCCLUDER_DEPTH = 0.98  # times the front's depth: what is nearer may hide the object
+VIEWS = 24  # largest number of photographs that are compared
+LEAST_COVERAGE = 0.6  # blending weight that Gaussians of one label must exceed at a pixel for its colour to count
+RING = 0.12  # share of the larger side: how far around the object background colours are collected
+FRONT_PERCENTILE = 5  # percentile of the depths in a mask that is taken as the depth of the object's front
+OCCLUDER_DEPTH = 0.98  # share of the front's depth: a surface nearer than this may hide the object
 LARGEST_LOG_RATIO = 3.0  # bound of the natural logarithm of a ratio of likelihoods
 
 
 @dataclass(frozen=True)
 class KnownLabels:
-    """Labels that masks of some views determine: bool [N] each; neither where they do not."""
+    """Labels of the N Gaussians as far as they are known. A Gaussian in neither array has no known label.
+
+    Attributes:
+        inside: bool [N], True = belongs to the object.
+        outside: bool [N], True = does not belong to the object.
+    """
 
     inside: np.ndarray
     outside: np.ndarray
@@ -40,11 +46,15 @@ class KnownLabels:
 def find_outside(
     gaussians: Gaussians, cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray], margin: int
 ) -> np.ndarray:
-    """bool [N]: Gaussians whose centres a view with a mask sees beside the object, or behind what it sees there, unless
-    that is nearer than the object and may hide it.
+    """Return bool [N], True = the Gaussian's centre projects beside the mask in at least one view, at any depth.
+
+    Such a Gaussian cannot be part of the object, because a mask covers the whole visible object. Pixels whose rendered
+    depth is nearer than the object's front are not used: the surface there may hide a part of the object. Views in
+    which no depth is rendered inside the mask are skipped.
 
     Args:
-        masks: view -> bool [H, W]; margin: px around a mask that are ignored.
+        masks: view -> bool [H, W], True = the object.
+        margin: px; pixels this near to a mask are not used.
     """
     points, found = gaussians.means.detach().cpu().double().numpy(), np.zeros(len(gaussians), bool)
     for name, mask in masks.items():
@@ -63,11 +73,19 @@ def find_outside(
 def color_votes(
     gaussians: Gaussians, known: KnownLabels, cameras: Mapping[str, Camera], image_of: Callable[[str], np.ndarray]
 ) -> np.ndarray:
-    """[N, 2]: the mean log ratio of the likelihoods that each Gaussian's colours are the object's, in [-MOST, MOST];
-    and its blending weight in the mean view, px.
+    """Return float [N, 2]: for each Gaussian how much its colours resemble the object, and how well views show it.
+
+    Up to `VIEWS` views, evenly spaced in the order of their names, are compared at a larger side of at most `LONGEST`.
 
     Args:
-        image_of: view -> uint8 [H, W, 3].
+        known: the Gaussians whose pixels give the colours of object and background.
+        cameras: view -> Camera, the views without masks.
+        image_of: view -> photograph, uint8 [H, W, 3].
+
+    Returns:
+        Column 0: the mean of `color_log_ratio` over all views, weighted by the Gaussian's blending weights, within
+        +-`LARGEST_LOG_RATIO`; positive = like the object. Column 1: blending weight summed over the pixels (px), mean
+        over the compared views; a view that shows too little of the object counts as 0.
     """
     names = sorted(cameras)
     sums, means = np.zeros((len(gaussians), 2)), gaussians.means
@@ -88,8 +106,18 @@ def color_votes(
 
 
 def color_log_ratio(image: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray | None:
-    """float [H, W]: natural logarithm of how much more frequent each pixel's colour is in the object than around it, in
-    [-MOST, MOST]; None where the picture shows too little of the object."""
+    """Return float [H, W]: the natural logarithm of the ratio of two frequencies of each pixel's colour, that among the
+    object's pixels to that among the pixels around the object.
+
+    Args:
+        image: uint8 [H, W, 3].
+        inside: bool [H, W], pixels that are known to show the object.
+        outside: bool [H, W], pixels that are known not to show the object. Only those within `RING` of the object, or
+            of pixels of unknown label, are used.
+
+    Returns:
+        Values within +-`LARGEST_LOG_RATIO`, or None if the picture shows fewer than 10 pixels of the object.
+    """
     if inside.sum() < 10:
         return None
     lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).reshape(-1, 3).astype(float)

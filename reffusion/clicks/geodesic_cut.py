@@ -1,4 +1,7 @@
-"""Segments pixels or Gaussians by cuts through the graph of their neighbours."""
+"""Segmentation of a graph by geodesic distances (lengths of shortest paths) and minimum cuts.
+
+The N nodes of the graph are the pixels of a picture, or Gaussians. Its E pairs are neighbours.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +12,19 @@ from scipy.sparse import csgraph
 from reffusion.clicks.marks import OBJECT, OTHER
 from reffusion.graph_cut import HARD, min_cut
 
-BINS = 20  # of colours, along each axis of L*a*b* with 8 bits
-ROUNDS = 3  # of distances and colours, each with the labels of the one before
-COLOR_COST, LIKELIHOOD_COST = 0.3, 100.0  # cost of a path from the second round on, per step of colour, of likelihood
-# Where surfaces are known: weight of a step of colour on a surface, and cost of leaving it.
+BINS = 20  # bins of a colour histogram along each axis of 8-bit L*a*b*
+ROUNDS = 3  # rounds of `grow_object`; each takes its colour models from the labels of the round before
+# Cost of a path from the second round on: per unit of `color_steps`, and per unit of change in the probability [0, 1]
+# that a colour is the object's.
+COLOR_COST, LIKELIHOOD_COST = 0.3, 100.0
+# Where depth is known: weight of a colour difference within a surface, and cost of an edge between surfaces.
 COLOR_ON_SURFACE, DEPTH_EDGE_COST = 0.35, 60.0
-SMOOTH = 5.0  # cost of a border between two that look alike
-REACHES = 0.5, 0.44, 0.37, 0.3  # shares of the path from a click to what is not the object
-CORRECTION_REACH = 150.0  # of colour and pixels: how far a correcting click reaches
-EDGE_CONTRAST = 10.0  # of colour, in L*a*b* with 8 bits, at the edge of an object
+SMOOTH = 5.0  # cost of a border between two neighbours of the same colour
+# A candidate contains the nodes that lie within this share of the path from a click to the background.
+REACHES = 0.5, 0.44, 0.37, 0.3
+# Path cost (units of 8-bit L*a*b* plus pixels) over which the influence of a correcting click falls to 1/e.
+CORRECTION_REACH = 150.0
+EDGE_CONTRAST = 10.0  # colour difference in 8-bit L*a*b* that counts as a full edge of an object
 SIZE_PENALTY = 0.05  # subtracted from the score per natural logarithm of the object's size
 LARGEST_LOG_RATIO = 3.0  # bound of the natural logarithm of a ratio of colour frequencies
 
@@ -30,15 +37,21 @@ def grow_object(
     weak: np.ndarray,
     depth_edges: np.ndarray | None = None,
 ) -> np.ndarray:
-    """bool [N]: the object, grown from few seeds by a geodesic graph cut, whose colour models follow from its own
-    labels.
+    """Return bool [N], True = the object, grown from a few seeds by geodesic graph cuts.
+
+    Each of `ROUNDS` rounds measures the geodesic distances of all nodes to the object's seeds and to the other seeds,
+    estimates the colours of object and background from the labels of the round before (from the distances in the first
+    round), and labels all nodes by a minimum cut. The result contains only nodes that are connected with a seed of the
+    object.
 
     Args:
-        lab: [N, 3] float, colours in L*a*b* with 8 bits.
-        pairs: [E, 2] int, neighbours, each pair once; length: [E] > 0, distance of neighbours, 1 = adjacent.
+        lab: float [N, 3], colours in L*a*b*, each axis in [0, 255] as in 8-bit pictures.
+        pairs: int [E, 2], neighbours, each pair once.
+        length: [E] > 0, distance of the two neighbours of a pair; 1 for adjacent pixels.
         seeds: int8 [N], OBJECT, OTHER or UNKNOWN; at least one OBJECT.
-        weak: bool [N], unlikely to be the object.
-        torn: [E] in [0, 1], 1 where two do not lie on one surface; None: not known.
+        weak: bool [N], True = unlikely to be the object, such as the picture's border. Distances treat these nodes as
+            OTHER, but the cut may still label them as object.
+        depth_edges: [E] in [0, 1], 1 where the two neighbours lie on different surfaces; None if depth is unknown.
     """
     step = color_steps(lab, pairs, depth_edges)
     smooth = _smoothness(step, length)
@@ -63,11 +76,13 @@ def grow_object(
 def nested_candidates(
     lab: np.ndarray, pairs: np.ndarray, length: np.ndarray, seeds: np.ndarray, weak: np.ndarray, depth_edges: np.ndarray
 ) -> list[np.ndarray]:
-    """What clicks may mean by surfaces alone, from the largest to the smallest: bool [N] each, each within the one
-    before.
+    """Return candidates for the object that clicks mean, bool [N] each, from the largest to the smallest.
+
+    There is one candidate for each share in `REACHES`, and each lies within the one before. The cuts use geodesic
+    distances along surfaces and colours, but no colour models.
 
     Args:
-        lab, pairs, length, seeds, weak, torn: as for `grow_object`.
+        lab, pairs, length, seeds, weak, depth_edges: as for `grow_object`; `depth_edges` is required.
     """
     step = color_steps(lab, pairs, depth_edges)
     smooth = _smoothness(step, length)
@@ -79,7 +94,7 @@ def nested_candidates(
         gain = 2 * (side - (1 - 2 * share))
         cost_object = np.where(seeds == OTHER, HARD, np.maximum(-gain, 0) * (seeds != OBJECT))
         cost_other = np.where(seeds == OBJECT, HARD, np.maximum(gain, 0) * (seeds != OTHER))
-        # What costs more to take is part of what costs less.
+        # A smaller share raises the cost of the label "object", so the new cut is searched within the one before.
         inside_of = _cut_within(inside_of, cost_object, cost_other, pairs, smooth)
         found.append(keep_connected(inside_of, pairs, seeds == OBJECT))
     return found
@@ -88,7 +103,11 @@ def nested_candidates(
 def _cut_within(
     inside_of: np.ndarray, true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray
 ) -> np.ndarray:
-    """bool [N]: `least_cut` of those in `inside_of`; the others are False."""
+    """Return bool [N], the result of `min_cut` if only the nodes in `inside_of`, bool [N], may become True.
+
+    Args:
+        true_cost, false_cost, pairs, strength: as for `min_cut`.
+    """
     ends, at = inside_of[pairs], np.cumsum(inside_of) - 1
     both, crossing = ends.all(1), ends[:, 0] != ends[:, 1]
     inner = np.where(ends[crossing, 0], pairs[crossing, 0], pairs[crossing, 1])
@@ -101,13 +120,18 @@ def _cut_within(
 def object_score(
     labels: np.ndarray, around: np.ndarray, lab: np.ndarray, pairs: np.ndarray, depth_edges: np.ndarray
 ) -> float:
-    """How well labels stand for an object of its own; -inf for an empty one.
+    """Score how well labels outline one complete object; a higher score is better.
 
-    High if the border follows edges of surfaces or colours, no surface ends inside, and its colours differ from those
-    around it. Of two that are as good the smaller one wins.
+    The score is high if the border follows edges of surfaces or of colours, if no edge of a surface lies inside, and if
+    the colours inside differ from the colours around. A penalty on size prefers the smaller of two equal candidates.
 
     Args:
-        labels: bool [N]; around: bool [N], the surroundings.
+        labels: bool [N], True = the object.
+        around: bool [N], True = the surroundings whose colours are compared.
+        lab, pairs, depth_edges: as for `grow_object`; `depth_edges` is required.
+
+    Returns:
+        The score, or -inf if the labels contain no two neighbours, have no border, or nothing is around them.
     """
     ends = labels[pairs]
     inside, rim = ends.all(1), ends[:, 0] != ends[:, 1]
@@ -120,7 +144,11 @@ def object_score(
 
 
 def color_steps(lab: np.ndarray, pairs: np.ndarray, depth_edges: np.ndarray | None) -> np.ndarray:
-    """[E] >= 0, difference of neighbours: in colour; where surfaces are known, mainly across their edges."""
+    """Return [E] >= 0, how different the two neighbours of each pair are.
+
+    This is the colour difference in 8-bit L*a*b* if `depth_edges` is None. Otherwise it is a weighted sum of the colour
+    difference and `depth_edges`, in which edges of surfaces dominate.
+    """
     color = np.linalg.norm(lab[pairs[:, 0]] - lab[pairs[:, 1]], axis=1)
     return color if depth_edges is None else COLOR_ON_SURFACE * color + DEPTH_EDGE_COST * depth_edges
 
@@ -133,17 +161,21 @@ def correct_labels(
     before: np.ndarray,
     depth_edges: np.ndarray | None = None,
 ) -> np.ndarray:
-    """bool [N]: the labels `before`, changed where contradicting seeds reach without crossing a change of colour.
+    """Return bool [N]: the labels `before`, changed around the seeds that contradict them.
+
+    The influence of a contradicting seed falls with the geodesic distance, which grows at changes of colour and at
+    edges of surfaces. A contradicting seed has no influence on nodes that are nearer to a seed which agrees with
+    `before`.
 
     Args:
-        lab, pairs, length, seeds, torn: as for `grow_object`.
-        was: bool [N].
+        lab, pairs, length, seeds, depth_edges: as for `grow_object`; no seed of the object is required.
+        before: bool [N], the labels to correct.
     """
     step = color_steps(lab, pairs, depth_edges)
     smooth = _smoothness(step, length)
     wrong = (seeds == OBJECT) & ~before | (seeds == OTHER) & before
     right = (seeds == OBJECT) & before | (seeds == OTHER) & ~before
-    across = before[pairs[:, 0]] != before[pairs[:, 1]]  # what is changed lies on one side of the former border
+    across = before[pairs[:, 0]] != before[pairs[:, 1]]  # a correction should not cross the former border
     graph = sparse.coo_array(
         ((step + 1.0) * length + CORRECTION_REACH * across, tuple(pairs.T)), (len(lab),) * 2
     ).tocsr()
@@ -157,13 +189,20 @@ def correct_labels(
 
 
 def _smoothness(step: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """[E], cost of a border between neighbours; lower where colours change more than on average."""
+    """Return [E], the cost of a border between two neighbours; it is lower where `step` (from `color_steps`) is large
+    compared with its root mean square."""
     usual = float((step**2).sum()) / max(len(step), 1)
     return SMOOTH * np.exp(-(step**2) / (2 * usual + 1e-9)) / length
 
 
 def keep_connected(labels: np.ndarray, pairs: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """bool [N]: the labelled ones that are connected with a seed."""
+    """Return bool [N], the labelled nodes that a path of labelled nodes connects with a labelled seed.
+
+    Args:
+        labels: bool [N].
+        pairs: int [E, 2], neighbours.
+        seeds: bool [N].
+    """
     kept = pairs[labels[pairs].all(1)]
     links = sparse.coo_array((np.ones(len(kept)), tuple(kept.T)), (len(labels),) * 2)
     part = csgraph.connected_components(links, directed=False)[1]
@@ -171,14 +210,26 @@ def keep_connected(labels: np.ndarray, pairs: np.ndarray, seeds: np.ndarray) -> 
 
 
 def relative_distance(pairs: np.ndarray, length: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
-    """[N] in [-1, 1]: 1 at `these`, -1 at `those` (bool [N]), in between by the shortest paths along pairs."""
+    """Return [N] in [-1, 1], how much nearer each node is to the nodes in `these` than to the nodes in `those`.
+
+    With the lengths a and b of the shortest paths to `these` and `those`, the value is (b - a) / (a + b): 1 at `these`,
+    -1 at `those`.
+
+    Args:
+        pairs: int [E, 2], neighbours.
+        length: [E] > 0, length of each pair.
+        these, those: bool [N].
+    """
     graph = sparse.coo_array((length, tuple(pairs.T)), (len(these),) * 2).tocsr()
     near, far = (_distance(graph, start) for start in (these, those))
     return (far - near) / (far + near + 1e-9)
 
 
 def _distance(graph: sparse.csr_array, start: np.ndarray) -> np.ndarray:
-    """[N], length of the shortest path from any of `start`; unreachable ones get more than the longest."""
+    """Return [N], the length of the shortest path from any node of `start`, bool [N].
+
+    Nodes that no path reaches get more than twice the largest length. All nodes get 1 if `start` is empty.
+    """
     if not start.any():
         return np.ones(graph.shape[0])
     found = csgraph.dijkstra(graph, directed=False, indices=np.flatnonzero(start), min_only=True)
@@ -187,13 +238,18 @@ def _distance(graph: sparse.csr_array, start: np.ndarray) -> np.ndarray:
 
 
 def color_frequency(lab: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """[N], weighted frequency of each one's colour among all; never 0. lab: [N, 3], L*a*b* with 8 bits."""
+    """Return [N] > 0, for each node the relative frequency of its colour among all nodes.
+
+    Args:
+        lab: float [N, 3], colours in 8-bit L*a*b*.
+        weight: [N] >= 0, how much each node counts in the frequencies.
+    """
     count = color_histogram(lab, weight)
     return (count / max(count.sum(), 1e-9))[_bins(lab)] + 1e-5
 
 
 def color_histogram(lab: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """[BINS, BINS, BINS], blurred weighted histogram of colours."""
+    """Return [BINS, BINS, BINS], a slightly blurred histogram of colours; arguments as for `color_frequency`."""
     count = np.zeros((BINS,) * 3)
     np.add.at(count, _bins(lab), weight)
     return ndimage.gaussian_filter(count, 0.7, mode="nearest")

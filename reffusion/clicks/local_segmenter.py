@@ -1,4 +1,4 @@
-"""Opens the segmentation network of a setting."""
+"""Loading of the segmentation network that the parameter `segmenter` names."""
 
 from __future__ import annotations
 
@@ -8,11 +8,18 @@ from reffusion.weights.segmenters import AUTO, NONE, segmenter_folder
 
 
 def load_local_segmenter(source: str = AUTO) -> Segmenter | None:
-    """The network of the setting `segmenter`: "auto" is the one that `reffusion weights` fetches, or None if it is not
-    on this machine; "none" is None; else a folder, or a hub id whose files are on this machine.
+    """Load the segmentation network that the parameter `segmenter` names.
+
+    Args:
+        source: "auto" for the network that `reffusion weights` fetches; "none" for no network; otherwise a folder
+            (encoder.onnx and decoder.onnx, or a SAM of transformers) or a hub id whose files are on this machine.
+
+    Returns:
+        The network. None for "none", and for "auto" if the network is not on this machine.
 
     Raises:
-        ValueError: there is no network at a source that is named, or it is damaged; one line.
+        ValueError: a named source holds no network, its files are damaged, or onnxruntime is missing. The message has
+            one line.
     """
     if source == NONE:
         return None

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-OBJECT, OTHER, UNKNOWN = 1, -1, 0
-_SHIFT = 4  # fractional bits of coordinates when strokes are painted
+OBJECT, OTHER, UNKNOWN = 1, -1, 0  # values of a pixel: marked as object, marked as background, not marked
+_SHIFT = 4  # fractional bits of the coordinates that OpenCV gets when strokes are painted
 
 
 @dataclass(frozen=True)
@@ -17,8 +17,8 @@ class Clicks:
     """Clicks on a view in the order in which they were made.
 
     Attributes:
-        points: [K, 2] float64, pixels of the view, as in docs/architecture.md.
-        positive: [K] bool, True = on the object, False = on the background.
+        points: float64 [K, 2], (x, y) in pixels of the view; the first pixel's centre is (0.5, 0.5).
+        positive: bool [K], True = on the object, False = on the background.
     """
 
     points: np.ndarray
@@ -30,12 +30,14 @@ class Clicks:
 
 @dataclass(frozen=True)
 class Mark:
-    """A click, which selects or deselects a whole region, or a stroke of a brush, which changes just the pixels below.
+    """A click or a brush stroke on a view.
+
+    A click adds a whole region to the mask or removes one. A stroke changes only the pixels that the brush covers.
 
     Attributes:
-        points: [K, 2] float64, pixels of the view; one point of a click, the path of a stroke.
+        points: float64 [K, 2], (x, y) in pixels of the view: the position of a click (K = 1), or the path of a stroke.
         positive: True = on the object, False = on the background.
-        radius: of the brush, px; 0 = a click.
+        radius: px, radius of the brush; 0 for a click.
     """
 
     points: np.ndarray
@@ -44,15 +46,21 @@ class Mark:
 
 
 def clicks_of(marks: Sequence[Mark]) -> Clicks:
-    """The clicks among marks."""
+    """Return the clicks among marks, without the strokes."""
     clicks = [mark for mark in marks if not mark.radius]
     points = np.concatenate([np.zeros((0, 2)), *(mark.points for mark in clicks)])
     return Clicks(points, np.array([mark.positive for mark in clicks for _ in mark.points], bool))
 
 
 def mark_pixels(clicks: Clicks, shape: tuple[int, int]) -> np.ndarray:
-    """int8 [H, W], OBJECT, OTHER or UNKNOWN. Only the clicked pixels are marked, since a click may be next to the
-    object's border; the later click wins."""
+    """Return int8 [H, W] with OBJECT or OTHER at the clicked pixels, and UNKNOWN at all other pixels.
+
+    Only the clicked pixel itself is marked, because a click may lie next to the object's border. Of two clicks on one
+    pixel the later one counts. Clicks outside the image mark the nearest pixel of its border.
+
+    Args:
+        shape: (H, W).
+    """
     found = np.full(shape, UNKNOWN, np.int8)
     columns, rows = (clicks.points[:, axis].astype(int).clip(0, shape[1 - axis] - 1) for axis in (0, 1))
     for column, row, positive in zip(columns, rows, clicks.positive, strict=True):
@@ -61,7 +69,13 @@ def mark_pixels(clicks: Clicks, shape: tuple[int, int]) -> np.ndarray:
 
 
 def confirmed_pixels(marks: Sequence[Mark], shape: tuple[int, int]) -> np.ndarray:
-    """int8 [H, W], OBJECT, OTHER or UNKNOWN: the pixels of clicks and below strokes; the later mark wins."""
+    """Return int8 [H, W] with OBJECT or OTHER at the pixels of clicks and below strokes, and UNKNOWN elsewhere.
+
+    Where marks overlap, the later one counts.
+
+    Args:
+        shape: (H, W).
+    """
     found = np.full(shape, UNKNOWN, np.int8)
     for mark in marks:
         sign = OBJECT if mark.positive else OTHER
@@ -74,7 +88,11 @@ def confirmed_pixels(marks: Sequence[Mark], shape: tuple[int, int]) -> np.ndarra
 
 
 def stroke_pixels(stroke: Mark, shape: tuple[int, int]) -> np.ndarray:
-    """bool [H, W]: the pixels whose centres lie within the brush's radius of the stroke's path."""
+    """Return bool [H, W], the pixels whose centres lie within the brush's radius of the stroke's path.
+
+    Args:
+        shape: (H, W).
+    """
     painted, scale = np.zeros(shape, np.uint8), 2**_SHIFT
     path = np.round((stroke.points - 0.5) * scale).astype(np.int32)
     for point in path:

@@ -1,9 +1,11 @@
-"""Propagates the object's mask from some views to all: Gaussians vote, and a segmentation network draws each mask.
+"""Propagation of the object's mask from some views to all views by votes of masks and a segmentation network.
 
-The masks so far label Gaussians by their votes. The silhouette of these Gaussians in the next view is the prompt: a
-box, and points inside it. The network's mask votes in turn. Views follow each other by the distance of their cameras,
-so that each mostly shows what an earlier one shows. At the end each view gets the network's mask or the projected
-labels, whichever agrees better with all votes.
+The masks so far vote on the Gaussians: the vote of a mask is the blending weight of a Gaussian, summed over the pixels
+inside the mask (for the object) or outside the mask (against the object). Votes label the Gaussians. The silhouette of
+the object's Gaussians in the next view gives the prompt for the network: a box, and points inside the silhouette. The
+network's mask votes in turn. The next view is the one whose camera is nearest to a view with a mask, so that both views
+show mostly the same surfaces. At the end each view gets the network's mask or the projected labels, whichever agrees
+better with all votes.
 """
 
 from __future__ import annotations
@@ -23,44 +25,49 @@ from reffusion.clicks.single_view import ViewEvidence, bounding_box, erode, refi
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
-LEAST_WEIGHT = 0.5  # of the mean blending weight of the Gaussians that a view shows, from which votes label one
-SHOWN = 0.05  # px of blending weight from which a view shows a Gaussian
-MIN_PIXELS = 20  # px of a silhouette below which a view does not show the object
-MIN_PART = 0.1  # of the largest connected part of a silhouette: smaller parts are no prompt
-POINTS = 3  # points of a prompt
-MIN_REST = 0.01  # of the visible silhouette: larger parts that the network leaves out are asked for separately
-# Votes exclude a pixel with more than this blending weight against the object, and less than this for it.
+# Votes label a Gaussian if their sum exceeds this share of the mean sum over the Gaussians that a view shows.
+LEAST_WEIGHT = 0.5
+SHOWN = 0.05  # px of blending weight (summed over pixels) above which a view shows a Gaussian
+MIN_PIXELS = 20  # a view whose silhouette has fewer pixels does not show the object
+MIN_PART = 0.1  # share of the largest connected part of a silhouette; smaller parts are not used for prompts
+POINTS = 3  # largest number of points in a prompt
+MIN_REST = 0.01  # share of the visible silhouette; the network gets a further prompt for larger parts that it left out
+# Votes exclude a pixel whose `Projection.outside` is above MIN_AGAINST and whose `Projection.inside` is below MAX_FOR.
 MIN_AGAINST, MAX_FOR = 0.5, 0.2
-MIN_DEPTH = 0.3  # of the largest distance to the silhouette's border: points nearer to it are no prompt
+# Points of a prompt are at least this far from the mask's border: as a share of the largest such distance, and in px.
+MIN_DEPTH = 0.3
 MIN_DEPTH_PX = 1.5
-WHOLE_BONUS = 0.03  # of agreement, for the network's mask of the largest object, since early votes cover only parts
-MIN_AGREEMENT = 0.8  # of a network's mask with the labels so far, from which it votes
+WHOLE_BONUS = 0.03  # added to the merit of the network's mask of the largest object: early votes cover only parts
+MIN_AGREEMENT = 0.8  # `agreement` with the votes so far that a network's mask must exceed to vote itself
 
 
 @dataclass(frozen=True)
 class Votes:
-    """What masks say of Gaussians.
+    """The votes of masks on N Gaussians.
 
     Attributes:
-        counts: [N, 2] px of blending weight, inside and outside the masks.
-        least: px of blending weight from which votes label a Gaussian.
+        counts: [N, 2], each Gaussian's blending weight summed over the pixels inside the masks (column 0, for the
+            object) and outside the masks (column 1, against the object), in px.
+        least: px; votes label a Gaussian if the sum of its two counts exceeds this value.
     """
 
     counts: np.ndarray
     least: float
 
     def plus(self, counts: np.ndarray) -> Votes:
-        """These votes and those of a further view."""
+        """Return the sum of these votes and of `counts` [N, 2], the votes of a further view."""
         return Votes(self.counts + counts, self.least)
 
 
 @dataclass(frozen=True)
 class Projection:
-    """What votes show in a view.
+    """The votes on Gaussians, rendered into a view.
 
     Attributes:
-        silhouette: bool [H, W], the object's Gaussians alone, without what stands before them.
-        inside, outside: float [H, W], blending weight of votes for and against the object; the rest is unknown.
+        silhouette: bool [H, W], True where the object's Gaussians cover the pixel if rendered alone, so that nothing
+            occludes them.
+        inside, outside: float [H, W] in [0, 1], each Gaussian's share of votes for and against the object, rendered
+            with all Gaussians. Gaussians with too few votes add to neither, so the sum may be below the alpha.
     """
 
     silhouette: np.ndarray
@@ -74,12 +81,13 @@ def propagate_masks(
     evidence_of: Callable[[str], ViewEvidence],
     masks: Mapping[str, np.ndarray],
 ) -> dict[str, np.ndarray]:
-    """The object's mask, bool [H, W], in every view.
+    """Return the object's mask in every view, view -> bool [H, W].
 
     Args:
-        cameras: all views.
-        evidence_of: view -> its photograph; without a segmentation network a mask is the projection of the votes.
-        masks: view -> bool [H, W], at least one; they stay as they are.
+        cameras: view -> Camera, all views.
+        evidence_of: function from a view to its photograph and segmentation network. For a view without a network
+            (`ask` is None) the mask is the projection of the votes.
+        masks: view -> bool [H, W], the known masks, at least one. They are returned unchanged.
     """
     drawn, votes = dict(masks), count_all_votes(gaussians, cameras, masks)
     order = order_by_distance(cameras, masks)
@@ -98,7 +106,11 @@ def propagate_masks(
 
 
 def count_all_votes(gaussians: Gaussians, cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray]) -> Votes:
-    """Sum the votes of all masks, at least one."""
+    """Sum the votes of all masks on the N Gaussians.
+
+    Args:
+        masks: view -> bool [H, W], True = the object; at least one view.
+    """
     counts = [count_votes(gaussians, cameras[name], mask) for name, mask in masks.items()]
     weights = np.concatenate([each.sum(1) for each in counts])
     shown = weights[weights > SHOWN]
@@ -107,14 +119,23 @@ def count_all_votes(gaussians: Gaussians, cameras: Mapping[str, Camera], masks: 
 
 @torch.no_grad()
 def count_votes(gaussians: Gaussians, camera: Camera, mask: np.ndarray) -> np.ndarray:
-    """[N, 2] px of blending weight, inside and outside a mask; pixels at its border do not vote."""
+    """Return [N, 2], each Gaussian's blending weight summed over the pixels inside and outside a mask, in px.
+
+    Pixels at the mask's border do not count.
+
+    Args:
+        mask: bool [H, W], True = the object.
+    """
     ballots = torch.as_tensor(np.stack([remove_rim(mask), remove_rim(~mask)], -1), dtype=gaussians.means.dtype)
     return rasterizer.accumulate(gaussians, camera, ballots.to(gaussians.means.device)).cpu().numpy()
 
 
 @torch.no_grad()
 def project_votes(gaussians: Gaussians, camera: Camera, votes: Votes) -> Projection:
-    """Project the labels of the Gaussians that enough votes know."""
+    """Render the votes on Gaussians into a view, as far as Gaussians have more than `votes.least` votes.
+
+    A Gaussian belongs to the object's silhouette if more than half of its votes are for the object.
+    """
     weight = votes.counts.sum(1)
     known = weight > votes.least
     share = np.where(known, votes.counts[:, 0] / np.maximum(weight, votes.least), 0.0)
@@ -129,7 +150,14 @@ def project_votes(gaussians: Gaussians, camera: Camera, votes: Votes) -> Project
 
 
 def order_by_distance(cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray]) -> list[str]:
-    """The views without masks; each is the nearest, by its camera, to an earlier one or to a view with a mask."""
+    """Return the names of the views without masks, in the order in which masks are propagated.
+
+    The next view is always the one whose camera centre is nearest to any view with a mask or earlier in this order.
+
+    Args:
+        cameras: view -> Camera, all views.
+        masks: the views with masks.
+    """
     distance = lambda a, b: float(np.linalg.norm(cameras[a].center - cameras[b].center))
     remaining = {
         name: min((distance(name, other) for other in masks), default=0.0) for name in cameras if name not in masks
@@ -143,11 +171,17 @@ def order_by_distance(cameras: Mapping[str, Camera], masks: Mapping[str, np.ndar
 
 
 def draw_mask(view: ViewEvidence, projection: Projection) -> np.ndarray:
-    """bool [H, W]: the network's mask of what votes show in a view.
+    """Return bool [H, W], the segmentation network's mask of the object in a view, prompted by projected votes.
 
-    To the network, the object and what it stands on may be one thing, such as a statue and its plinth. So where its
-    mask covers what votes exclude, it is asked again with points there. What is removed together may be several things,
-    such as a table and what stands on it. So what the mask leaves out is asked for separately.
+    The network may take the object and its support for one thing, such as a statue and its plinth. So if the network's
+    mask covers pixels that votes exclude, the network is prompted again with negative points at these pixels. The
+    object to remove may consist of several things, such as a table and the dishes on the table. So for each large part
+    of the visible silhouette that the mask leaves out, the network is prompted separately, and its answer is added if
+    this raises the agreement with the votes.
+
+    Args:
+        view: a view with a network (`ask` is not None).
+        projection: the projected votes; the silhouette is not empty.
     """
     silhouette = _drop_small_parts(projection.silhouette)
     visible = _drop_small_parts(silhouette & (projection.inside > projection.outside))
@@ -177,7 +211,11 @@ def draw_mask(view: ViewEvidence, projection: Projection) -> np.ndarray:
 
 
 def _ask(view: ViewEvidence, prompts: Sequence[Prompt], parts: bool = False) -> list[tuple[Candidate, float]]:
-    """The network's masks of an object and of the largest object, or of a part too, each with its bonus."""
+    """Return the network's masks for all prompts as pairs (mask, bonus to its merit).
+
+    Of its masks from part to whole the last two are taken for each prompt, or the last three if `parts` is True. The
+    last mask, that of the largest object, gets the bonus `WHOLE_BONUS`; all other masks get 0.
+    """
     assert view.ask is not None
     answers = [view.ask(prompt)[-3 if parts else -2 :] for prompt in prompts]
     return [(each, WHOLE_BONUS * (each is masks[-1])) for masks in answers for each in masks]
@@ -186,30 +224,51 @@ def _ask(view: ViewEvidence, prompts: Sequence[Prompt], parts: bool = False) -> 
 def _select(
     candidates: Sequence[tuple[Candidate, float]], projection: Projection, known: np.ndarray | None = None
 ) -> np.ndarray:
-    """bool [H, W]: the mask of largest agreement times expected IoU, plus bonus, judged joined with
-    `known`, bool [H, W]."""
+    """Return bool [H, W], the candidate mask with the largest merit.
+
+    The merit is the agreement with the votes, times the IoU that the network expects of its mask, plus the bonus.
+
+    Args:
+        candidates: pairs of mask and bonus, from `_ask`.
+        known: bool [H, W], a mask that is united with each candidate before the agreement is computed; None for no
+            such mask. The returned mask does not contain it.
+    """
     joined = lambda mask: mask if known is None else mask | known
     merit = lambda pair: agreement(joined(pair[0].mask), projection) * pair[0].score + pair[1]
     return max(candidates, key=merit)[0].mask
 
 
 def draw_view(view: ViewEvidence, projection: Projection) -> np.ndarray:
-    """bool [H, W]: the mask of a view that did not vote; empty where votes show too little of the object."""
+    """Return bool [H, W], the object's mask in a view whose masks did not vote, such as a test view.
+
+    The mask is all False if the votes project to fewer than `MIN_PIXELS` pixels of the object.
+    """
     if projection.silhouette.sum() < MIN_PIXELS:
         return np.zeros_like(projection.silhouette)
     return combine(view.image, projection, draw_mask(view, projection) if view.ask else None)
 
 
 def agreement(mask: np.ndarray, projection: Projection) -> float:
-    """In [0, 1]: the larger of the IoU with what votes show of the object, pixels without votes aside, and the IoU with
-    its silhouette. The latter counts where Gaussians that only this view shows stand before the object."""
+    """Return the agreement of a mask, bool [H, W], with the projected votes, in [0, 1].
+
+    This is the larger of two IoUs. The first compares the mask with the projected votes for and against the object,
+    without the pixels that have no votes. The second compares the mask with the object's silhouette. The second one is
+    needed where Gaussians without votes, which only this view shows, occlude the object.
+    """
     for_it, against = projection.inside, projection.outside
     shown = float((mask * for_it).sum() / max(for_it.sum() + (mask * against).sum(), 1e-9))
     return max(shown, iou(mask, projection.silhouette))
 
 
 def combine(image: np.ndarray, projection: Projection, drawn: np.ndarray | None) -> np.ndarray:
-    """bool [H, W]: the projected labels with their border on the photograph's edges, or the network's mask."""
+    """Return bool [H, W], the projected labels or the network's mask, whichever agrees better with the votes.
+
+    The border of the projected labels is moved to the photograph's edges first.
+
+    Args:
+        image: uint8 [H, W, 3], the photograph.
+        drawn: bool [H, W], the network's mask; None if there is none.
+    """
     labelled = projection.inside > projection.outside
     masks = [refine_edges(image, labelled, np.full(labelled.shape, UNKNOWN, np.int8))]
     if drawn is not None:
@@ -218,13 +277,13 @@ def combine(image: np.ndarray, projection: Projection, drawn: np.ndarray | None)
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:
-    """Intersection over union of bool [H, W] masks; 1 if both are empty."""
+    """Return the intersection over union of two masks, bool [H, W]; 1 if both are empty."""
     union = (a | b).sum()
     return float((a & b).sum() / union) if union else 1.0
 
 
 def _large_parts(mask: np.ndarray, least: float) -> list[np.ndarray]:
-    """The connected parts of a mask that have at least so many pixels, the largest first."""
+    """Return the connected parts of a mask that have at least `least` pixels, bool [H, W] each, the largest first."""
     parts, _ = ndimage.label(mask)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
@@ -232,7 +291,7 @@ def _large_parts(mask: np.ndarray, least: float) -> list[np.ndarray]:
 
 
 def _drop_small_parts(mask: np.ndarray) -> np.ndarray:
-    """The mask without connected parts below `MIN_PART` of the largest one."""
+    """Return the mask without connected parts that are smaller than the share `MIN_PART` of the largest part."""
     parts, _ = ndimage.label(mask)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
@@ -240,7 +299,7 @@ def _drop_small_parts(mask: np.ndarray) -> np.ndarray:
 
 
 def _deepest_points(mask: np.ndarray) -> Clicks:
-    """Up to `POINTS` positive points deep inside a mask, apart from each other."""
+    """Return up to `POINTS` positive clicks inside a mask, far from its border and from each other; at least one."""
     depth = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
     least, points = max(MIN_DEPTH * depth.max(), MIN_DEPTH_PX), []
     rows, columns = np.ogrid[: mask.shape[0], : mask.shape[1]]

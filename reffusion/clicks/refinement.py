@@ -1,4 +1,7 @@
-"""Draws rough masks anew: they label Gaussians, whose silhouettes prompt the network in each view."""
+"""Refinement of rough masks by a segmentation network.
+
+The rough masks label Gaussians. The silhouette of the object's Gaussians in each view is the prompt for the network.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +15,19 @@ from reffusion.clicks.propagation import combine, count_all_votes, draw_mask, pr
 from reffusion.clicks.scene_segmentation import FittedViews
 from reffusion.gaussians.neighbours import find_neighbours
 
-ROUGH_RIM = 0.02  # of the larger side: pixels this near to a rough mask's border do not vote
+ROUGH_RIM = 0.02  # share of the larger image side: pixels this near to a rough mask's border do not vote
 
 
 def redraw_masks(views: FittedViews, masks: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The object's mask, bool [H, W], in every view, from rough masks.
+    """Return the object's mask in every view, view -> bool [H, W], drawn anew from rough masks.
 
-    The labels of the Gaussians prompt the network in each view. Its masks vote in turn, and each view gets its mask or
-    the projected votes, whichever agrees better with all votes.
+    The rough masks label Gaussians. In each view the silhouette of the object's Gaussians is the prompt for the
+    network. The network's masks vote on the Gaussians in turn. Finally each view gets the network's mask or the
+    projected votes, whichever agrees better with all votes.
 
     Args:
-        views: with a segmentation network.
-        masks: view -> bool [H, W]; views may lack one.
+        views: the fitted scene; its views have a segmentation network.
+        masks: view -> bool [H, W], the rough masks, at least one. Views may lack a mask.
     """
     gaussians, cameras, names = views.gaussians, views.cameras, list(views.cameras)
     image_of = lambda name: views.evidence_of(name).image

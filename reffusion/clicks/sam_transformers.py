@@ -1,6 +1,6 @@
-"""SAM through transformers, where its weights are on this machine.
+"""Segment Anything Model (SAM) of the library transformers, from weights on this machine.
 
-The network's own processor needs torchvision, so pictures are prepared in `reffusion.clicks.segmenter`.
+Pictures are prepared in `reffusion.clicks.segmenter`, because the library's own processor needs torchvision.
 """
 
 from __future__ import annotations
@@ -21,10 +21,17 @@ KIND = "sam"
 
 
 def load_sam(source: str | Path = SOURCE) -> Segmenter | None:
-    """The model in a local folder, or of a hub id; None where its weights are not on this machine.
+    """Load a SAM from this machine.
+
+    Args:
+        source: a folder of transformers, or a hub id.
+
+    Returns:
+        The network, or None if `source` is a hub id whose weights are not on this machine.
 
     Raises:
-        ValueError: a folder without a model, an incomplete one, or a model of another kind.
+        ValueError: `source` is neither a folder nor a hub id, or the folder holds no model, an incomplete one, or a
+            model of another kind.
     """
     from transformers import AutoConfig, SamModel
     from transformers.utils import logging as transformers_logging
@@ -48,7 +55,11 @@ def load_sam(source: str | Path = SOURCE) -> Segmenter | None:
 
 
 def wrap_model(model: nn.Module, name: str = SOURCE) -> Segmenter:
-    """A Segmenter from a SamModel in memory."""
+    """Return a Segmenter that runs a SamModel of transformers which is already in memory.
+
+    Args:
+        name: name of the network for messages.
+    """
     config: Any = model.config
     model = model.requires_grad_(False).eval()
 

@@ -1,4 +1,4 @@
-"""Masks of all views from clicks on some, for the stage `masks`."""
+"""Masks of all views from clicks on some views, for the stage `masks`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from reffusion.io.scene import load_views
 from reffusion.params.clicks import Clicked
 from reffusion.types import Camera, Gaussians, Scene
 
-KEPT_VIEWS = 96  # whose network features stay in memory, 4 MB each
+KEPT_VIEWS = 96  # number of views whose network features stay in memory, 4 MB each
 
 
 def masks_from_clicks(
@@ -32,15 +32,21 @@ def masks_from_clicks(
     masks: Mapping[str, np.ndarray],
     segmenter: Segmenter | None = None,
 ) -> dict[str, np.ndarray]:
-    """View name -> bool [H, W]: masks of all training views, and of the test views that show the object.
+    """Make the object's masks from clicks: view name -> bool [H, W], True = the object.
+
+    The result holds all training views except `scene.clean` (views without the object, unless they have a mask), and
+    the test views whose photographs show the object. The view with most clicks on the object is segmented first.
 
     Args:
-        clicks: of scene.yaml; those of the view with most clicks on the object come first.
-        masks: those that the scene brings; they stay as they are.
-        segmenter: a segmentation network; None: colours and surfaces alone.
+        poses: folder of the stage `poses`, which holds the undistorted photographs.
+        clicks: the key `clicks` of scene.yaml: view -> clicks in pixels of the photograph before undistortion.
+        masks: view name -> bool [H, W], masks that the scene provides. They are returned unchanged.
+        segmenter: the segmentation network; None to segment by colours and surfaces alone.
 
     Raises:
-        ValueError: the clicks lie where undistorted views show nothing, or on nothing that the Gaussians show.
+        ValueError: clicks are on a view that is not a training view showing the object, or that was left out because
+            its photograph contradicts its pose; or all masks are empty, because the clicks lie outside the undistorted
+            photographs or where the Gaussians show nothing.
     """
     check_outliers("clicks", clicks, scene.outliers)
     points = undistort_clicks(poses, clicks)
@@ -62,17 +68,27 @@ def masks_from_clicks(
 def refine_masks(
     scene: Scene, gaussians: Gaussians, poses: Path, masks: Mapping[str, np.ndarray], segmenter: Segmenter
 ) -> dict[str, np.ndarray]:
-    """View name -> bool [H, W]: masks of all training views that show the object, drawn anew from rough ones.
+    """Draw rough masks anew: view name -> bool [H, W], for all training views that show the object.
 
     Args:
-        masks: view name -> bool [H, W]; views may lack one. Empty ones are votes, too.
+        poses: folder of the stage `poses`, which holds the undistorted photographs.
+        masks: view name -> bool [H, W], the rough masks. Views may lack a mask. An empty mask votes, too: nothing in
+            its view is the object.
+        segmenter: the segmentation network.
     """
     cameras = {name: scene.cameras[name] for name in scene.train if name not in scene.clean}
     return redraw_masks(FittedViews(gaussians, cameras, evidence_loader(scene, gaussians, poses, segmenter)), masks)
 
 
 def masks_of_test_views(scene: Scene, views: FittedViews, masks: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """View name -> bool [H, W]: what the masks of training views show in test views whose photographs show it, too."""
+    """Return the masks of the test views whose photographs show the object: view name -> bool [H, W].
+
+    The masks of the training views vote on the Gaussians, and the votes are projected into the test views. Test views
+    whose photographs were taken without the object are left out.
+
+    Args:
+        masks: view name -> bool [H, W], the masks of the training views.
+    """
     votes = count_all_votes(views.gaussians, views.cameras, masks)
     found = {}
     for name in scene.test:
@@ -84,7 +100,14 @@ def masks_of_test_views(scene: Scene, views: FittedViews, masks: Mapping[str, np
 
 
 def evidence_loader(scene: Scene, gaussians: Gaussians, poses: Path, segmenter: Segmenter | None):
-    """Function view -> ViewEvidence, which loads and encodes a photograph when it is first needed."""
+    """Return a function from a view's name to its ViewEvidence, which loads a photograph at the first call for a view.
+
+    The segmentation network encodes the photograph at the first prompt. The last `KEPT_VIEWS` views stay in memory.
+
+    Args:
+        poses: folder of the stage `poses`, which holds the undistorted photographs.
+        segmenter: the segmentation network; None for none.
+    """
 
     @lru_cache(KEPT_VIEWS)
     def evidence_of(name: str) -> ViewEvidence:
@@ -100,12 +123,14 @@ def load_evidence(
     segmenter: Segmenter | None,
     features_of: Callable[[], ImageFeatures] | None = None,
 ) -> ViewEvidence:
-    """What is known of a view.
+    """Build the ViewEvidence of a view: its photograph, its relief, and the segmentation network.
 
     Args:
-        image: uint8 [H, W, 3].
-        gaussians: None if the scene is not fitted yet.
-        features_of: gives the network's features of the photograph; by default it is encoded at the first prompt.
+        image: uint8 [H, W, 3], the undistorted photograph.
+        gaussians: the fitted scene; None if the scene is not fitted yet, which leaves out the relief.
+        segmenter: the segmentation network; None for none.
+        features_of: function that returns the network's features of the photograph. By default the network encodes the
+            photograph at the first prompt.
     """
     relief = None if gaussians is None else all_views.surface_relief(gaussians, camera)
     if segmenter is None:

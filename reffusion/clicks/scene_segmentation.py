@@ -1,8 +1,9 @@
-"""Masks of all views from marks in some: the first marked view is segmented and propagated, later marks correct.
+"""Masks of all views from marks (clicks and brush strokes) in some views.
 
-A correction adds a region to the mask of its view or removes one, and does the same where other views show the surface
-of that region, except where marks confirm the contrary. So nothing changes away from it. A click on another object adds
-that object to all views.
+The view of the first mark is segmented, and its mask is propagated to all views. Each later mark is a correction. A
+correction adds a region to the mask of its own view, or removes one. In each other view it changes only the pixels that
+show the surface of this region, without pixels that earlier marks confirm to be the opposite. A click on another object
+adds that object to all views.
 """
 
 from __future__ import annotations
@@ -23,30 +24,35 @@ from reffusion.morphology import dilate
 from reffusion.types import Camera, Gaussians
 
 Masks = Mapping[str, np.ndarray]  # view -> bool [H, W]
-Recall = Callable[[Hashable, Callable[[], Masks]], Masks]
-SAME_SURFACE = 0.02  # of the depth: a marked point is visible in another view up to this difference
+Recall = Callable[[Hashable, Callable[[], Masks]], Masks]  # (key, compute) -> masks, see `segment_scene`
+SAME_SURFACE = 0.02  # relative difference of depth below which two views show the same surface point
 
 
 @dataclass(frozen=True)
 class Event:
-    """A mark that a person makes in a view."""
+    """A mark (click or brush stroke) that a person makes in a view.
+
+    Attributes:
+        view: name of the view.
+    """
 
     view: str
     mark: Mark
 
     @property
     def key(self) -> tuple[str, bool, float, bytes]:
-        """Equal for equal events."""
+        """A hashable key, which is equal for equal events."""
         return self.view, self.mark.positive, self.mark.radius, self.mark.points.tobytes()
 
 
 @dataclass(frozen=True)
 class FittedViews:
-    """A fitted scene, and what is known of its views.
+    """A fitted scene and its views.
 
     Attributes:
-        cameras: of the views whose photographs show the object.
-        evidence_of: view -> its photograph, relief and segmentation network.
+        gaussians: the fit, including the object.
+        cameras: view -> Camera, for the views whose photographs show the object.
+        evidence_of: function from a view's name to its photograph, relief and segmentation network.
     """
 
     gaussians: Gaussians
@@ -55,19 +61,23 @@ class FittedViews:
 
 
 def compute_always(_: Hashable, compute: Callable[[], Masks]) -> Masks:
-    """Remember nothing: the default `recall` of `segment_scene`."""
+    """Compute the masks without a cache: the default `recall` of `segment_scene`."""
     return compute()
 
 
 def segment_scene(
     views: FittedViews, events: Sequence[Event], given: Masks, recall: Recall = compute_always
 ) -> dict[str, np.ndarray]:
-    """The object's mask, bool [H, W], in every view; empty if nothing marks the object.
+    """Return the object's mask in every view, view -> bool [H, W]; all False if no mark is on the object.
+
+    Without given masks, the first clicks select the object in their own view (see `count_first`), and this mask is
+    propagated. With given masks, these are propagated, and all events are corrections.
 
     Args:
-        events: in the order in which they are made.
-        given: view -> bool [H, W]; they stay as they are.
-        recall: (key, compute) -> an earlier result with this key, or that of compute().
+        events: the marks, in the order in which they were made.
+        given: view -> bool [H, W], masks that the scene provides. Only an event in the same view changes such a mask.
+        recall: cache of the results after each event, so that a further event does not repeat the work for the earlier
+            events. It maps (key, compute) to the stored masks for this key, or else to the result of compute().
     """
     count = 0 if given else count_first(events)
     masks = given
@@ -84,7 +94,13 @@ def segment_scene(
 def segment_own_view(
     evidence_of: Callable[[str], ViewEvidence], events: Sequence[Event], recall: Recall = compute_always
 ) -> Masks:
-    """The mask of a view from its own marks alone, under its name; `events`: at least one, all of this view."""
+    """Return the mask of one view from its own marks alone, as {view name: bool [H, W]}.
+
+    Args:
+        evidence_of: function from the view's name to its photograph, relief and segmentation network.
+        events: the marks in this view, at least one, in the order in which they were made.
+        recall: cache of results, as for `segment_scene`.
+    """
     name, marks = events[0].view, [event.mark for event in events]
     masks: Masks = {}
     for k in range(1, len(events) + 1):
@@ -100,13 +116,21 @@ def _apply_last_mark(
 
 
 def count_first(events: Sequence[Event]) -> int:
-    """The number of events that select the object: those in the view of the first one, until a stroke follows."""
+    """Return how many of the first events select the object in its own view before masks are propagated.
+
+    These are the first event and the clicks after it, up to the first event that is a stroke or lies in another view.
+    """
     apart = lambda event: event.view != events[0].view or event.mark.radius > 0
     return next((k for k, event in enumerate(events) if k and apart(event)), len(events))
 
 
 def propagate(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
-    """The object's mask, bool [H, W], in every view; the masks that are given stay."""
+    """Propagate masks to all views: view -> bool [H, W], by the segmentation network if there is one.
+
+    Args:
+        masks: view -> bool [H, W], the known masks, which are returned unchanged. If all are empty or there are none,
+            the masks of all other views are all False.
+    """
     if not any(mask.any() for mask in masks.values()):
         empty = lambda camera: np.zeros((camera.height, camera.width), bool)
         return {name: empty(camera) for name, camera in views.cameras.items()} | dict(masks)
@@ -123,14 +147,25 @@ def propagate(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
 
 
 def correct_scene(views: FittedViews, events: Sequence[Event], masks: Masks, given: Masks) -> dict[str, np.ndarray]:
-    """The masks of all views after the last event, from those before it."""
+    """Return the masks of all views after the last event, view -> bool [H, W].
+
+    Args:
+        events: all marks so far; the last one is applied.
+        masks: view -> bool [H, W], the masks of all views before the last event.
+        given: view -> bool [H, W], masks that the scene provides; they do not change by events in other views.
+    """
     name = events[-1].view
     after = correct_view(views, events, masks[name])
     return spread_change(views, events, dict(masks) | {name: after}, masks[name], given)
 
 
 def correct_view(views: FittedViews, events: Sequence[Event], before: np.ndarray) -> np.ndarray:
-    """bool [H, W]: the mask of the last event's view after that event, from the mask before it."""
+    """Return bool [H, W], the mask of the last event's view after this event.
+
+    Args:
+        events: all marks so far; the last one is applied.
+        before: bool [H, W], the mask of the same view before the last event.
+    """
     name = events[-1].view
     marks = [event.mark for event in events if event.view == name]
     marks = [*transfer_marks(views, events, name), *marks]
@@ -138,7 +173,14 @@ def correct_view(views: FittedViews, events: Sequence[Event], before: np.ndarray
 
 
 def transfer_marks(views: FittedViews, events: Sequence[Event], name: str) -> list[Mark]:
-    """Clicks where a view shows points that are marked in other views: a correction keeps what they confirm."""
+    """Return the marks of other views as clicks in one view, where this view shows the marked surface points.
+
+    A correction of this view leaves pixels unchanged that these clicks confirm.
+
+    Args:
+        events: all marks so far; those in the view `name` itself are not used.
+        name: the view to which marks are transferred.
+    """
     camera, found = views.cameras[name], []
     depth = _depth(views.evidence_of(name), camera)
     for event in events:
@@ -155,7 +197,11 @@ def transfer_marks(views: FittedViews, events: Sequence[Event], name: str) -> li
 
 
 def transfer_region(views: FittedViews, name: str, region: np.ndarray, other: str) -> np.ndarray:
-    """bool [H, W]: where another view shows the surface that a view shows inside a region, bool [H, W]."""
+    """Return bool [H, W], the pixels of the view `other` that show the surface inside a region of the view `name`.
+
+    Args:
+        region: bool [H, W], pixels of the view `name`.
+    """
     camera, there = views.cameras[name], views.cameras[other]
     uv, z = geometry.project(geometry.unproject(_depth(views.evidence_of(other), there), there), camera)
     hit, inside = geometry.sample_nearest(region, uv)
@@ -175,18 +221,24 @@ def spread_change(
     before: np.ndarray,
     given: Masks,
 ) -> dict[str, np.ndarray]:
-    """The masks of all views after the last event changed the mask of its own view.
+    """Apply the change that the last event made in its own view to all other views: view -> bool [H, W].
+
+    If a click on the object added a region that does not touch the mask before, the region is another object. Its mask
+    is propagated to all views. Otherwise the changed region is transferred by depth. Pixels that marks of a view
+    confirm to be the opposite do not change.
 
     Args:
-        masks: of all views; that of the event's view is changed already.
-        before: bool [H, W], the mask of the event's view before it.
+        events: all marks so far; the last one made the change.
+        masks: view -> bool [H, W], all views; the mask of the last event's view is changed already.
+        before: bool [H, W], the mask of the last event's view before the event.
+        given: view -> bool [H, W], masks that the scene provides; they do not change by events in other views.
     """
     name, mark = events[-1].view, events[-1].mark
     change = masks[name] != before
     if not change.any():
         return dict(masks)
     apart = mark.positive and not mark.radius and not dilate(before, 1 / before.shape[1])[change].any()
-    if apart:  # another object, of which other views show more than this one
+    if apart:  # other views may show parts of the new object that this view hides, so depth alone is not enough
         regions = propagate_masks(views.gaussians, views.cameras, views.evidence_of, {name: change})
     else:
         regions = {other: transfer_region(views, name, change, other) for other in views.cameras}

@@ -1,6 +1,7 @@
-"""One interface to promptable segmentation networks: SAM through transformers, a distilled SAM through onnxruntime.
+"""Common interface of two promptable segmentation networks: SAM of transformers, and a distilled SAM in ONNX files.
 
-Both take a square picture and prompts in its pixels, and answer with several masks: of a part, and of the whole.
+Both networks take a square picture and a prompt in pixels of this square. Both answer with several masks, from a part
+of an object to the whole object.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from reffusion.clicks.marks import Clicks
 
-# Mean and standard deviation of ImageNet's pixels, with which these networks are trained.
+# Mean and standard deviation of ImageNet's pixels, by which the inputs of these networks are normalised.
 MEAN, DEVIATION = np.array((0.485, 0.456, 0.406), np.float32), np.array((0.229, 0.224, 0.225), np.float32)
 NEGATIVE, POSITIVE, UPPER_LEFT, LOWER_RIGHT = 0, 1, 2, 3  # SAM's labels of points and of a box's corners
 
@@ -24,11 +25,12 @@ class Segmenter:
     """A promptable segmentation network.
 
     Attributes:
-        name: for messages.
-        side: of its square input, px.
-        encode: float32 [1, 3, side, side], normalised -> features of the picture.
-        decode: (features, points float32 [K, 2] px of the input, labels [K]) -> (logits float32 [M, h, w] of the whole
-            square, estimated IoU [M]); the last mask is that of the largest object.
+        name: name of the network for messages.
+        side: side of the square input, px.
+        encode: normalised picture float32 [1, 3, side, side] -> features of the picture.
+        decode: (features, points float32 [K, 2] in pixels of the input, labels int [K]: NEGATIVE, POSITIVE, UPPER_LEFT
+            or LOWER_RIGHT) -> (logits float32 [M, h, w] of M masks of the whole square, expected IoU [M]). The masks
+            go from a part to the whole; the last one is that of the largest object.
     """
 
     name: str
@@ -39,11 +41,12 @@ class Segmenter:
 
 @dataclass(frozen=True)
 class ImageFeatures:
-    """The network's features of a picture, independent of prompts; computing them takes most of the time.
+    """The network's features of a picture. They do not depend on a prompt, and computing them takes most of the time.
 
     Attributes:
-        values: whatever the network's `decode` takes.
-        shape: (height, width) of the picture; size: the same inside the network's square input.
+        values: the features that `encode` returns and `decode` takes.
+        shape: (height, width) of the picture, px.
+        size: (height, width) of the picture inside the network's square input, px.
     """
 
     values: Any
@@ -53,11 +56,11 @@ class ImageFeatures:
 
 @dataclass(frozen=True)
 class Prompt:
-    """What a mask shall contain, in pixels of the picture.
+    """A prompt for the network: clicks and a box, in pixels of the picture.
 
     Attributes:
-        clicks: points on the object, and on what is not.
-        box: (left, top, right, bottom) around the object; None: unknown.
+        clicks: points on the object and on the background; may be empty if there is a box.
+        box: (left, top, right, bottom) around the object; None for no box.
     """
 
     clicks: Clicks
@@ -66,15 +69,26 @@ class Prompt:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A mask, bool [H, W], and the IoU that the network expects of it."""
+    """A mask that the network proposes.
+
+    Attributes:
+        mask: bool [H, W], True = the object.
+        score: the network's own estimate of the IoU between this mask and the true one.
+    """
 
     mask: np.ndarray
     score: float
 
 
 def encode_image(segmenter: Segmenter, image: np.ndarray) -> ImageFeatures:
-    """Encode a picture, uint8 [H, W, 3]: its larger side is scaled to the network's; it is padded below and to the
-    right."""
+    """Compute the network's features of a picture.
+
+    The picture is scaled so that its larger side fills the network's square input, and padded with zeros below or to
+    the right.
+
+    Args:
+        image: uint8 [H, W, 3].
+    """
     shape = image.shape[:2]
     height, width = (max(1, round(side * segmenter.side / max(shape))) for side in shape)
     resampling = cv2.INTER_AREA if segmenter.side < max(shape) else cv2.INTER_LINEAR
@@ -86,10 +100,10 @@ def encode_image(segmenter: Segmenter, image: np.ndarray) -> ImageFeatures:
 
 
 def predict_masks(segmenter: Segmenter, features: ImageFeatures, prompt: Prompt) -> list[Candidate]:
-    """The network's masks for a prompt, from parts of an object to the whole.
+    """Return the network's masks for a prompt, ordered from a part of the object to the whole object.
 
     Raises:
-        ValueError: the prompt is empty.
+        ValueError: the prompt has neither clicks nor a box.
         FloatingPointError: the network's answer is not finite.
     """
     points = [prompt.clicks.points]
@@ -111,7 +125,11 @@ def predict_masks(segmenter: Segmenter, features: ImageFeatures, prompt: Prompt)
 
 
 def _to_picture(logits: np.ndarray, side: int, features: ImageFeatures) -> np.ndarray:
-    """float32 [H, W]: logits [h, w] of the square input at the picture's pixels."""
+    """Resample logits [h, w] of the network's square input to the picture's pixels, float32 [H, W].
+
+    Args:
+        side: side of the square input, px.
+    """
     height, width = features.size
     square = cv2.resize(logits.astype(np.float32), (side, side), interpolation=cv2.INTER_LINEAR)
     inside = np.ascontiguousarray(square[:height, :width])

@@ -1,7 +1,7 @@
-"""Segments a photograph by clicks and strokes, and moves the borders of masks to its edges.
+"""Segmentation of one photograph by clicks and strokes, and refinement of a mask's border along edges of a photograph.
 
-Regions are proposed by colours and edges of surfaces, and by a segmentation network if there is one. The region is
-selected whose border follows edges of surfaces and colours.
+Cuts along colours and edges of surfaces propose regions, and so does a segmentation network if there is one. The
+proposed region whose border best follows edges of surfaces and of colours is selected.
 """
 
 from __future__ import annotations
@@ -19,22 +19,26 @@ from reffusion.clicks.segmenter import Candidate, Prompt
 from reffusion.morphology import disk
 
 LONGEST = 192  # px, the larger side of the picture that is segmented
-BAND = 0.008  # of the larger side: how far a photograph's edges may lie from the mask's border
-DEPTH_SLOPE = 4.0, 10.0  # px of depth per px: largest slope of a surface, smallest slope of an edge between surfaces
+BAND = 0.008  # share of the larger side: how far `refine_edges` may move a mask's border
+# Slope of the relief (`ViewEvidence.relief`) in px per px: the largest within a surface, and the smallest of a certain
+# edge between two surfaces.
+DEPTH_SLOPE = 4.0, 10.0
 LEAST_EDGE_SHARE = 0.25  # share of an object's border that must be an edge between surfaces, for depth to be used
-LEAST_REGION = 12  # px of the segmented picture that a region with a click must have
-RING = 0.25  # of the square root of a mask's pixels: width of the ring around it in which colours are compared
-MARGIN = 3  # bands around a mask whose colours are used
+LEAST_REGION = 12  # number of pixels (at the size for segmentation) that a region with a click must have
+RING = 0.25  # width of the ring around a mask in which colours are compared, per square root of the mask's pixels
+MARGIN = 3  # `refine_edges` uses the colours up to this many bands (`BAND`) away from a mask
 
 
 @dataclass(frozen=True)
 class ViewEvidence:
-    """What is known of a view before anything is marked in it.
+    """The data of a view from which it is segmented.
 
     Attributes:
-        image: uint8 [H, W, 3].
-        relief: [H, W], logarithm of the depth times the focal length in pixels; None: the scene is not fitted yet.
-        ask: the masks of a segmentation network for a prompt, from parts to the whole; None: there is no network.
+        image: uint8 [H, W, 3], the undistorted photograph.
+        relief: float [H, W], the natural logarithm of the depth, times the focal length in pixels; None if the scene is
+            not fitted yet.
+        ask: function from a prompt to the masks of a segmentation network, ordered from a part of the object to the
+            whole object; None if there is no network.
     """
 
     image: np.ndarray
@@ -45,15 +49,16 @@ class ViewEvidence:
 def apply_marks(
     view: ViewEvidence, marks: Sequence[Mark], before: np.ndarray | None = None, first: int = 0
 ) -> np.ndarray:
-    """bool [H, W]: the mask after marks are applied one after the other.
+    """Return bool [H, W], the mask after marks are applied one after the other.
 
-    A stroke changes the pixels below it. The first click on the object selects it; each later click adds or removes one
-    connected region, which contains no pixel that earlier marks confirm to be otherwise. So a click never changes what
-    is not connected with it.
+    A stroke changes the pixels below the brush. While the mask is empty, a click on the object selects the object. Each
+    later click adds or removes one connected region around the clicked pixel. The region contains no pixel that
+    earlier marks confirm to be the opposite. So a click never changes pixels that are not connected with it.
 
     Args:
-        before: bool [H, W], the mask that the marks correct; None: empty.
-        first: index of the first mark that `before` does not contain.
+        marks: all marks of the view, in the order in which they were made.
+        before: bool [H, W], the mask after the marks before `first`; None for an empty mask.
+        first: index of the first mark that is not yet applied in `before`.
     """
     shape = view.image.shape[:2]
     mask = np.zeros(shape, bool) if before is None else before
@@ -73,20 +78,26 @@ def apply_marks(
 
 
 def segment_view(view: ViewEvidence, clicks: Clicks) -> np.ndarray:
-    """bool [H, W], True = the object that clicks are on; empty without a click on the object."""
+    """Return bool [H, W], True = the object that the positive clicks are on; all False without a positive click."""
     if not clicks.positive.any():
         return np.zeros(view.image.shape[:2], bool)
     own, *others = _propose(view, clicks)
-    # The network's first mask is of a part; one click rarely means that.
+    # The network's first mask shows a part of an object. A click rarely means a part, so this mask is left out.
     best = _most_object(view, clicks, [own, *others[1:]])
     return own if best is None else best
 
 
 def correct_mask(view: ViewEvidence, before: np.ndarray, clicks: Clicks, confirmed: np.ndarray) -> np.ndarray:
-    """bool [H, W]: the mask `before` [H, W] with one region added or removed by the last click, if that contradicts it.
+    """Return bool [H, W], the mask `before` with one connected region added or removed around the last click.
+
+    A positive click adds a region, a negative click removes one. The mask is returned unchanged if it agrees with the
+    last click already, or if no region is found.
 
     Args:
-        confirmed: int8 [H, W], the pixels of all marks, see `marks.confirmed_pixels`.
+        before: bool [H, W], the mask to correct.
+        clicks: all clicks of the view; the last one is applied.
+        confirmed: int8 [H, W], the pixels of all marks, from `marks.confirmed_pixels`. Pixels that are confirmed to be
+            the opposite of the last click do not change.
     """
     at, positive = clicks.points[-1], bool(clicks.positive[-1])
     if _value_at(before, at) == positive:
@@ -110,7 +121,11 @@ def correct_mask(view: ViewEvidence, before: np.ndarray, clicks: Clicks, confirm
 
 
 def _propose(view: ViewEvidence, clicks: Clicks) -> list[np.ndarray]:
-    """bool [H, W] each: the object by colours and surfaces, and by the network; empty without a click on the object."""
+    """Return masks of the object that the positive clicks are on, bool [H, W] each; no mask without a positive click.
+
+    The first mask is found by colours and surfaces. The network's masks follow, if there is a network: all masks for
+    the clicks, from part to whole, and the mask of the whole object for the clicks and the first mask's bounding box.
+    """
     if not clicks.positive.any():
         return []
     own = segment_by_surfaces(view.image, clicks, view.relief)
@@ -121,7 +136,11 @@ def _propose(view: ViewEvidence, clicks: Clicks) -> list[np.ndarray]:
 
 
 def _most_object(view: ViewEvidence, clicks: Clicks, masks: Sequence[np.ndarray]) -> np.ndarray | None:
-    """The mask that is most an object of its own, of those that agree with the clicks; None if none does."""
+    """Return the mask that best outlines one complete object, among the masks that agree with all clicks.
+
+    The merit of a mask is its `object_score`, plus the share of its border that lies on edges of surfaces. None if no
+    mask agrees with all clicks.
+    """
     agreeing = [
         mask
         for mask in masks
@@ -150,7 +169,12 @@ def _value_at(mask: np.ndarray, at: np.ndarray) -> bool:
 
 
 def _part_at(mask: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """bool [H, W]: the connected part of a mask that a point lies in; empty if the point lies outside."""
+    """Return bool [H, W], the connected part of a mask that contains a point; all False if the mask does not contain
+    the point.
+
+    Args:
+        at: (x, y) in pixels.
+    """
     if not _value_at(mask, at):
         return np.zeros_like(mask)
     parts, _ = ndimage.label(mask, np.ones((3, 3)))
@@ -158,18 +182,21 @@ def _part_at(mask: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def bounding_box(mask: np.ndarray) -> tuple[float, float, float, float]:
-    """(left, top, right, bottom) of a mask that is not empty, px."""
+    """Return (left, top, right, bottom) of a mask that is not empty, in pixels; right and bottom are exclusive."""
     rows, columns = np.nonzero(mask)
     return float(columns.min()), float(rows.min()), float(columns.max() + 1), float(rows.max() + 1)
 
 
 def segment_by_surfaces(image: np.ndarray, clicks: Clicks, relief: np.ndarray | None = None) -> np.ndarray:
-    """bool [H, W], True = the object that clicks are on, by colours and edges of surfaces; at least one is positive.
+    """Return bool [H, W], True = the object that the positive clicks are on, found without a segmentation network.
+
+    Colours and edges of surfaces are used. Colours alone are used if depth is unknown, or shows no edge around the
+    object.
 
     Args:
         image: uint8 [H, W, 3].
-        clicks: in its pixels.
-        relief: [H, W], logarithm of the depth times the focal length in pixels, where the scene has been fitted.
+        clicks: clicks in pixels of the image, at least one of them positive.
+        relief: float [H, W] as in `ViewEvidence`; None if the scene is not fitted yet.
     """
     shape = image.shape[:2]
     lab, small, marks = _downscale(image, clicks)
@@ -188,10 +215,14 @@ def segment_by_surfaces(image: np.ndarray, clicks: Clicks, relief: np.ndarray | 
 def _select_object(
     candidates: list[np.ndarray], marks: np.ndarray, lab: np.ndarray, pairs: np.ndarray, depth_edges: np.ndarray
 ) -> np.ndarray | None:
-    """bool [h, w]: the labels among several that are most an object of its own; None where depth shows no edge around
-    it.
+    """Return bool [h, w], the candidate that best outlines one complete object by `object_score`.
 
-    Arguments as in `geodesic_cut`; marks are [h, w].
+    None if depth shows no edge around this candidate, or if no candidate has regions as large as `_has_regions` asks.
+
+    Args:
+        candidates: labels of the pixels, bool [h * w] each.
+        marks: int8 [h, w], OBJECT, OTHER or UNKNOWN.
+        lab, pairs, depth_edges: as in `geodesic_cut.grow_object`.
     """
     whole = [each for each in (_fill_holes(labels, marks) for labels in candidates) if _has_regions(each, marks)]
     if not whole:
@@ -203,7 +234,11 @@ def _select_object(
 
 
 def _has_regions(mask: np.ndarray, marks: np.ndarray) -> bool:
-    """Is the region around each mark larger than the mark itself?"""
+    """Return True if each marked pixel lies in a connected region of at least `LEAST_REGION` pixels.
+
+    Positive marks are looked up in the regions of the mask, negative marks in the regions outside the mask. A mark that
+    the mask contradicts is not counted.
+    """
     for side, kind in ((mask, OBJECT), (~mask, OTHER)):
         parts, _ = ndimage.label(side, np.ones((3, 3)))
         if np.bincount(parts.ravel())[parts[(marks == kind) & side]].min(initial=LEAST_REGION) < LEAST_REGION:
@@ -212,20 +247,27 @@ def _has_regions(mask: np.ndarray, marks: np.ndarray) -> bool:
 
 
 def _fill_holes(labels: np.ndarray, marks: np.ndarray) -> np.ndarray:
-    """bool [h, w]: labels with those holes filled that no mark lies in."""
+    """Return bool [h, w], the labels with holes filled, except holes that contain a negative mark.
+
+    Args:
+        labels: bool [h * w].
+        marks: int8 [h, w], OBJECT, OTHER or UNKNOWN.
+    """
     mask = labels.reshape(marks.shape)
     return mask | (ndimage.binary_fill_holes(mask) & ~_marked_holes(marks == OTHER, mask))
 
 
 def _ring(mask: np.ndarray) -> np.ndarray:
-    """bool [h, w], a ring around a mask whose width grows with its size."""
+    """Return bool [h, w], a ring around a mask, wider for larger masks and one pixel away from the mask."""
     far = max(3, round(RING * float(np.sqrt(mask.sum()))))
     return ~erode(~mask, far) & erode(~mask, 1)
 
 
 def _reach_of_click(view: ViewEvidence, before: np.ndarray, clicks: Clicks) -> np.ndarray:
-    """bool [H, W]: the mask `before`, corrected by clicks that contradict it. A correction extends to where colours
-    change, and to the edges of surfaces where their relief is known."""
+    """Return bool [H, W], the mask `before`, corrected around the clicks that contradict it.
+
+    A correction extends up to changes of colour, and up to edges of surfaces if the view has a relief.
+    """
     lab, small, marks = _downscale(view.image, clicks)
     before_small = cv2.resize(before.astype(np.float32), small[::-1], interpolation=cv2.INTER_AREA) > 0.5
     grid = _pixel_pairs(small)
@@ -236,7 +278,11 @@ def _reach_of_click(view: ViewEvidence, before: np.ndarray, clicks: Clicks) -> n
 
 
 def _downscale(image: np.ndarray, clicks: Clicks) -> tuple[np.ndarray, tuple[int, int], np.ndarray]:
-    """The picture at the size for segmentation: colours [P, 3] in L*a*b*, (height, width), marks int8 [h, w]."""
+    """Reduce a picture and its clicks to the size for segmentation, at most `LONGEST` px on the larger side.
+
+    Returns:
+        Colours float64 [h * w, 3] in 8-bit L*a*b*; (h, w); marks int8 [h, w], OBJECT, OTHER or UNKNOWN.
+    """
     factor = min(1.0, LONGEST / max(image.shape[:2]))
     height, width = (max(1, round(side * factor)) for side in image.shape[:2])
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
@@ -250,7 +296,16 @@ def _upscale(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def refine_edges(image: np.ndarray, mask: np.ndarray, marks: np.ndarray) -> np.ndarray:
-    """bool [H, W]: the mask with its border moved to where colours change, at most by `BAND`; marks [H, W] stay."""
+    """Return bool [H, W], the mask with its border moved to changes of colour by GrabCut.
+
+    The border moves by at most `BAND`. The mask is returned unchanged if the mask or its surroundings have fewer than
+    10 pixels.
+
+    Args:
+        image: uint8 [H, W, 3].
+        mask: bool [H, W].
+        marks: int8 [H, W]; GrabCut keeps the pixels marked OBJECT inside the mask and those marked OTHER outside.
+    """
     if not mask.any():
         return mask
     band = max(1, round(BAND * max(mask.shape)))
@@ -271,6 +326,7 @@ def refine_edges(image: np.ndarray, mask: np.ndarray, marks: np.ndarray) -> np.n
 
 
 def erode(mask: np.ndarray, by: int) -> np.ndarray:
+    """Return the mask, bool [H, W], eroded by a disk with a radius of `by` px. The image's border does not erode it."""
     kernel = disk(by)
     return cv2.erode(mask.astype(np.uint8), kernel, borderValue=1) > 0
 
@@ -278,7 +334,14 @@ def erode(mask: np.ndarray, by: int) -> np.ndarray:
 def _find_depth_edges(
     relief: np.ndarray | None, small: tuple[int, int], pairs: np.ndarray, length: np.ndarray
 ) -> np.ndarray | None:
-    """[E] in [0, 1]: how surely neighbours lie on two surfaces, one behind the other; relief as for `segment_view`."""
+    """Return [E] in [0, 1], how surely the two pixels of a pair lie on different surfaces, one behind the other.
+
+    Args:
+        relief: float [H, W] as in `ViewEvidence`; None if the scene is not fitted yet, which gives None.
+        small: (h, w), the size for segmentation.
+        pairs: int [E, 2], neighbouring pixels at this size.
+        length: [E], their distances in pixels.
+    """
     if relief is None:
         return None
     size = small[::-1]
@@ -289,13 +352,24 @@ def _find_depth_edges(
 
 
 def _marked_holes(marks: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """bool [H, W]: the holes of the mask that marks lie in."""
+    """Return bool [H, W], the connected parts outside the mask that contain a marked pixel.
+
+    Args:
+        marks: bool [H, W], True = marked.
+        mask: bool [H, W].
+    """
     holes, _ = ndimage.label(~mask)
     return np.isin(holes, holes[marks & ~mask])
 
 
 def _pixel_pairs(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs [E, 2] of neighbouring pixels (8-neighbourhood), and their distances [E] in pixels."""
+    """Return the pairs int [E, 2] of neighbouring pixels (8-neighbourhood), and their distances [E] in pixels.
+
+    Pixels are numbered row by row.
+
+    Args:
+        shape: (height, width).
+    """
     index, pairs, length = np.arange(shape[0] * shape[1]).reshape(shape), [], []
     for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
         width = shape[1] - abs(right)

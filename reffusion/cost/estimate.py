@@ -1,8 +1,10 @@
-"""Estimates the cost of a stage on a GPU: operations and bytes counted at full size (counts.py), over its peak rates.
+"""Estimate of the time and the memory that a stage needs on a GPU.
 
-Two fifths of each peak are assumed, without overlap of computation and memory traffic. On the only kind of GPU that was
-timed, an H200, this is within a tenth to a fifth (docs/gpu.md). `BASIS` states the assumed scene, which a plan
-cannot know yet. The CPU time of a stage is not included.
+The time is the number of operations and bytes of a stage, counted at full size (counts.py), over the GPU's peak rates.
+The estimate assumes two fifths of each peak rate, and no overlap of computation and memory traffic. On the only kind of
+GPU that was timed, an H200, the estimate is within a tenth to a fifth of the measured time (docs/gpu.md). A plan does
+not know the size of the scene yet, so an example scene is assumed, which `BASIS` states. The CPU time of a stage is not
+included.
 """
 
 from __future__ import annotations
@@ -19,23 +21,25 @@ from reffusion.params.fit import Params as Fit
 from reffusion.params.personalize import Params as Personalize
 from reffusion.params.reference import Params as Reference
 
-PEAK_SHARE = 0.4  # of the peak rates of a GPU
-VIEWS, WIDTH, HEIGHT, GAUSSIANS = 60, 1600, 1200, 1_000_000
-MEAN_SHARE = 0.6  # mean number of Gaussians during a fit / final number
-HOLE_SHARE = 0.2  # of a view is inpainted
+PEAK_SHARE = 0.4  # share of a GPU's peak rates that is reached
+VIEWS, WIDTH, HEIGHT, GAUSSIANS = 60, 1600, 1200, 1_000_000  # the assumed scene
+MEAN_SHARE = 0.6  # mean number of Gaussians during a fit, as a share of the final number
+HOLE_SHARE = 0.2  # share of a view's pixels that is inpainted
 BASIS = (
     f"counted operations, {PEAK_SHARE:.0%} of the GPU's peak as timed on an H200; {VIEWS} views of {WIDTH} x "
     f"{HEIGHT} px, {GAUSSIANS:,} Gaussians"
 )
-# Floats of a Gaussian of degree 3; and copies in memory: parameters, gradient, two moments of Adam.
+# Floats of a Gaussian with harmonics of degree 3, and copies in memory: parameters, gradient, two moments of Adam.
 FLOATS, COPIES = 59, 4
-# Bytes that gsplat moves per Gaussian, forward and backward (parameters, footprint, 10 list entries), and per pixel.
-# Operations per pixel: 100 per Gaussian; views of the demo blend 36, and three times as many are evaluated.
+# SPLAT_BYTES, PIXEL_BYTES: bytes that gsplat moves per Gaussian and per pixel, forward and backward (parameters,
+# footprint, 10 list entries). SPLAT_FLOPS: operations per pixel, 100 per Gaussian. Views of the demo blend 36 Gaussians
+# per pixel and evaluate three times as many.
 SPLAT_BYTES, PIXEL_BYTES, SPLAT_FLOPS = 3000, 200, 3 * 36 * 100
-# GB: `python -m benchmarks.gpu.full_size --count`, SD2 in half precision at 512 px
+# GB of SD2's weights, and of one sample in inpainting, SDS and personalization, in half precision at 512 px, from
+# `python -m benchmarks.gpu.full_size --count`.
 WEIGHTS, PAINTED, DISTILLED, TRAINED = 2.7, 0.8, 3.3, 3.9
 SDXL = "diffusers/stable-diffusion-xl-1.0-inpainting-0.1"
-PRIORS = {PRIOR: ("SD2", 512), SDXL: ("SDXL", 1024)}  # hub id: name in the counts, native size in pixels
+PRIORS = {PRIOR: ("SD2", 512), SDXL: ("SDXL", 1024)}  # hub id -> (name in the counts, native size in pixels)
 
 
 @dataclass(frozen=True)
@@ -43,11 +47,11 @@ class Gpu:
     """Peak rates of a GPU, as stated by its manufacturer.
 
     Attributes:
-        half, single: 1e12 operations per second of matrix products in half precision and in float32 (TF32 if
-            available, which torch's convolutions use).
-        plain: 1e12 operations per second of other float32 arithmetic.
-        bandwidth: 1e12 bytes per second.
-        gigabytes: of memory.
+        half: rate of matrix products in half precision, 1e12 operations per second.
+        single: the same in float32 (in TF32 if the GPU has it, which torch's convolutions use).
+        plain: rate of other float32 arithmetic, 1e12 operations per second.
+        bandwidth: memory bandwidth, 1e12 bytes per second.
+        gigabytes: size of the memory, GB.
     """
 
     half: float
@@ -67,7 +71,13 @@ GPUS = {
 
 
 def find_gpu(name: str) -> str | None:
-    """The GPU called `name`, or that of this machine if `name` is empty; None if there is none in the table.
+    """Find a GPU in the table `GPUS` by its name in any spelling, such as "NVIDIA GeForce RTX 4090".
+
+    Args:
+        name: name of the GPU; "" for the GPU of this machine.
+
+    Returns:
+        The key in `GPUS`. None if `name` is "" and this machine has no GPU of the table.
 
     Raises:
         ValueError: `name` is not in the table.
@@ -82,7 +92,14 @@ def find_gpu(name: str) -> str | None:
 
 @dataclass(frozen=True)
 class Work:
-    """Operations in half precision, in float32 and outside products, and bytes moved; 1e12 each."""
+    """An amount of computation and memory traffic.
+
+    Attributes:
+        half: operations of matrix products and convolutions in half precision, 1e12.
+        single: the same in float32, 1e12.
+        plain: other float32 operations, 1e12.
+        moved: bytes read and written, 1e12.
+    """
 
     half: float = 0.0
     single: float = 0.0
@@ -93,46 +110,71 @@ class Work:
         return Work(*(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__))
 
     def times(self, count: float) -> Work:
+        """Return `count` times this work."""
         return Work(*(getattr(self, name) * count for name in self.__dataclass_fields__))
 
     def seconds(self, gpu: Gpu) -> float:
+        """Return the estimated time of this work on a GPU at the share `PEAK_SHARE` of its peak rates."""
         computing = self.half / gpu.half + self.single / gpu.single + self.plain / gpu.plain
         return (computing + self.moved / gpu.bandwidth) / PEAK_SHARE
 
 
 def network(name: str, half: bool = False) -> Work:
-    """One pass of a network of the table."""
+    """Return the work of one pass of an entry of `COUNTS`.
+
+    Args:
+        name: key of `COUNTS`.
+        half: True if the operations run in half precision, False if they run in float32.
+    """
     tera = COUNTS[name]["tflop"]
     return Work(tera * half, tera * (not half), 0.0, COUNTS[name]["gb"] / 1e3)
 
 
 def rendering(pixels: float, gaussians: float) -> Work:
-    """Rendering of a view, forward and backward."""
+    """Return the work of rendering a view, forward and backward.
+
+    Args:
+        pixels: number of pixels.
+        gaussians: number of Gaussians.
+    """
     return Work(plain=SPLAT_FLOPS * pixels / 1e12, moved=(SPLAT_BYTES * gaussians + PIXEL_BYTES * pixels) / 1e12)
 
 
 def reconstruction(gaussians: float) -> Work:
-    """Rendering of a view and the loss, without Adam."""
+    """Return the work of one reconstruction step on a view: rendering and loss, without Adam."""
     return rendering(WIDTH * HEIGHT, gaussians) + network("loss, a million pixels").times(WIDTH * HEIGHT / 1e6)
 
 
 def adam(gaussians: float) -> Work:
+    """Return the work of one step of Adam on all parameters of the Gaussians."""
     return network("Adam, a million Gaussians").times(gaussians / 1e6)
 
 
 def inpainting(prior: str, half: bool, steps: float, guided: bool) -> Work:
-    """Inpainting of a picture at native size with `steps` evaluations of the UNet, with encoding and decoding."""
+    """Return the work of inpainting a picture at the prior's native size, with encoding and decoding.
+
+    Args:
+        prior: "SD2" or "SDXL".
+        half: True if the UNet runs in half precision.
+        steps: steps of the sampler.
+        guided: True for classifier-free guidance, which evaluates the UNet twice per step.
+    """
     known = network(f"{prior} encode").times(2) + network(f"{prior} decode")
     return known + network(f"{prior} unet", half).times(steps * (1 + guided))
 
 
 def fit(params: Fit) -> tuple[Work, float]:
+    """Return the work of the stage `fit` and the GPU memory that it needs, in GB."""
     number = min(GAUSSIANS, params.densify.cap_max)
     step = reconstruction(MEAN_SHARE * number) + adam(MEAN_SHARE * number)
     return step.times(params.iterations), _scene(number)
 
 
 def reference(params: Reference) -> tuple[Work, float] | None:
+    """Return the work of the stage `reference` and the GPU memory that it needs, in GB.
+
+    None if no diffusion prior inpaints, or if the prior is not in `PRIORS`.
+    """
     if params.prior not in PRIORS or params.inpainter.kind != "diffusion":
         return None
     prior, size = PRIORS[params.prior]
@@ -149,6 +191,8 @@ def reference(params: Reference) -> tuple[Work, float] | None:
 
 
 def personalize(params: Personalize) -> tuple[Work, float] | None:
+    """Return the work of the stage `personalize` and the GPU memory that it needs, in GB; None if the prior is not the
+    default SD2."""
     if params.prior != PRIOR:
         return None
     rate = (params.samples.size or 512) / 512
@@ -161,6 +205,8 @@ def personalize(params: Personalize) -> tuple[Work, float] | None:
 
 
 def distill(params: Distill) -> tuple[Work, float] | None:
+    """Return the work of the stage `distill` and the GPU memory that it needs, in GB; None if the prior is not the
+    default SD2."""
     if params.prior != PRIOR:
         return None
     half, samples = params.dtype != "float32", 1 + params.sds.patches
@@ -182,7 +228,13 @@ def distill(params: Distill) -> tuple[Work, float] | None:
 
 
 def _critic(width: int, pixels: int) -> Work:
-    """Counted at two widths; interpolated and extrapolated linearly."""
+    """Return the work of one step of the critic, interpolated linearly between the two widths that were counted, and
+    extrapolated beyond.
+
+    Args:
+        width: number of channels of the critic, `distill.adversarial.width`.
+        pixels: number of pixels of all real patches of the step.
+    """
     low, high = network("critic 256"), network("critic 512")
     share = (width - 256) / 256
     extrapolation = max(share, -0.95)
@@ -190,18 +242,34 @@ def _critic(width: int, pixels: int) -> Work:
 
 
 def _scene(gaussians: float) -> float:
-    """GB of the Gaussians, their gradients and moments, and of the backward pass of a view."""
+    """Return the GB of the Gaussians with their gradients and moments of Adam, and of the backward pass of a view."""
     return gaussians * FLOATS * COPIES * 4 / 1e9 + WIDTH * HEIGHT * PIXEL_BYTES / 1e9
 
 
 def _samples_per_pass(memory_gb: float, sample: float, most: int) -> int:
+    """Return how many samples a pass of the prior takes, 1 to `most`.
+
+    Args:
+        memory_gb: memory limit of the prior, GB; 0 for no limit.
+        sample: memory of one sample, GB.
+    """
     if not memory_gb:
         return most
     return max(1, min(most, int((0.9 * memory_gb - WEIGHTS) / sample)))
 
 
 def format_estimate(name: str, device: str, found: tuple[Work, float] | None) -> Mapping[str, object] | None:
-    """What a plan prints: seconds, gigabytes, the GPU and the assumptions; None if the stage does not run on a GPU."""
+    """Return the estimate that a plan prints for a stage.
+
+    Args:
+        name: name of the GPU; "" for the GPU of this machine.
+        device: the stage's device.
+        found: the stage's work and GPU memory in GB; None if they are unknown.
+
+    Returns:
+        "gpu": key in `GPUS`; "seconds"; "gb"; "basis": the assumptions. None if the stage does not run on "cuda", its
+        work is unknown, or there is no known GPU.
+    """
     gpu = find_gpu(name)
     if gpu is None or device != "cuda" or found is None:
         return None

@@ -21,20 +21,20 @@ TRIALS = 1000  # lines through two pixels: with 10% inliers 1 in 100 has two; th
 VOTERS = 500
 SUPPORT_LEVELS = 32  # numbers of agreeing pixels that are compared
 MAX_ERROR_RATIO = 0.7  # median error / spread of the known disparity, above which a map does not fit the scene
-# A map without alignment counts as being in the scene's unit up to this many times the best fit's error.
+# A map counts as being in the scene's unit if its error without alignment is at most this many times the best fit's,
 SAME_UNIT_RATIO = 1.5
 SAME_UNIT_ERROR = 0.03  # or up to this relative error, which a map in another unit would hardly reach by chance
-# Relative; a scene whose disparity varies less counts as flat, and any map within this error fits.
+# A scene whose disparity varies less than this, relative to its median, is treated as varying this much.
 MIN_DISPARITY_SPREAD = 0.02
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """target ~ scale * estimate + offset.
+    """A linear fit, target ~ scale * estimate + offset.
 
     Attributes:
-        scale, offset: the fitted coefficients.
-        residual: weighted root mean square of target - fit, in the unit of the target.
+        scale, offset: The fitted coefficients.
+        residual: Weighted root mean square of target - fit, in the unit of the target.
     """
 
     scale: float
@@ -42,7 +42,7 @@ class Alignment:
     residual: float
 
     def apply(self, estimate: np.ndarray) -> np.ndarray:
-        """scale * estimate + offset, float64."""
+        """Return scale * estimate + offset, float64."""
         return self.scale * np.asarray(estimate, np.float64) + self.offset
 
 
@@ -55,17 +55,17 @@ def align(
     large offset nor a large unit loses digits.
 
     Args:
-        estimate, target: arrays of one shape, any unit.
-        weights: same shape, >= 0, or bool to select pixels; None: all ones.
-        robust: reject outliers, up to 90% of a few hundred pixels or more if these form no line themselves. Starts
-            from the line that chance explains least, then iteratively reweighted least squares with Geman-McClure
-            weights.
-        seed: of the random samples of the robust fit.
+        estimate, target: Arrays of the same shape, in any unit.
+        weights: The same shape, >= 0, or bool to select pixels. None: all weights are 1.
+        robust: Whether outliers are rejected. Up to 90 % of the pixels may be outliers, if there are at least a few
+            hundred pixels and the outliers form no line themselves. The fit starts from the line whose support is least
+            likely by chance, and continues by iteratively reweighted least squares with Geman-McClure weights.
+        seed: Seed of the random samples of the robust fit.
 
     Raises:
-        Degenerate: fewer than 4 pixels of positive weight, or an estimate whose spread there is below 1e-6 of its
-            magnitude (a constant determines no scale).
-        ValueError: shapes differ, or values are not finite.
+        Degenerate: Fewer than 4 pixels have positive weight, or the spread of the estimate at these pixels is below
+            1e-6 of its magnitude (a constant determines no scale).
+        ValueError: Shapes differ, or values are not finite.
     """
     estimate, target = np.asarray(estimate, np.float64), np.asarray(target, np.float64)
     weights = np.ones(estimate.shape) if weights is None else np.asarray(weights, np.float64)
@@ -82,12 +82,13 @@ def align(
 
 
 def condition_numbers(estimate: np.ndarray, weights: np.ndarray | None = None) -> tuple[float, float]:
-    """Condition numbers of the normal equations: in plain form, and in the form that `align` solves.
+    """Return two condition numbers of the normal equations: in plain form, and in the form that `align` solves.
 
     `align` works about the weighted mean and in units of the weighted spread, which decouples the two equations. Only
     the rounding of the mean relative to the spread remains.
 
-    Args: as `align`; the estimate is not constant.
+    Args:
+        estimate, weights: As in `align`. The estimate is not constant.
     """
     estimate = np.asarray(estimate, np.float64)
     weights = np.ones(estimate.shape) if weights is None else np.asarray(weights, np.float64)
@@ -101,7 +102,14 @@ def condition_numbers(estimate: np.ndarray, weights: np.ndarray | None = None) -
 def _robust_line(
     x: np.ndarray, y: np.ndarray, w: np.ndarray, plain: Alignment, generator: torch.Generator
 ) -> Alignment:
-    """M-estimation starting from a consensus line, or from `plain` where there is none."""
+    """Fit a line by M-estimation, starting from the line of `_consensus`, or from `plain` if there is none.
+
+    Args:
+        x, y: [S] estimate and target of each pixel.
+        w: [S] weights > 0.
+        plain: The least-squares fit.
+        generator: Draws the random samples.
+    """
     result, share = _consensus(x, y, w, generator) or (plain, 1.0)
     for _ in range(MAX_REWEIGHTINGS):
         error = np.abs(y - result.apply(x))
@@ -119,19 +127,32 @@ def _robust_line(
 
 
 def geman_mcclure_weights(error: np.ndarray, spread: float) -> np.ndarray:
-    """Geman-McClure weights in (0, 1] of absolute residuals with standard deviation `spread` > 0."""
+    """Return the Geman-McClure weights, in (0, 1], of absolute residuals.
+
+    Args:
+        error: The absolute residuals, of any shape.
+        spread: Standard deviation of the residuals of inliers, > 0.
+    """
     return (1.0 + (error / (2.0 * spread)) ** 2) ** -2
 
 
 def _consensus(
     x: np.ndarray, y: np.ndarray, w: np.ndarray, generator: torch.Generator
 ) -> tuple[Alignment, float] | None:
-    """The line through two random pixels whose support is least likely by chance, and its share of the pixels.
+    """Return the line through two random pixels whose support is least likely by chance, and the share of support.
 
-    A contrario, so that no noise level has to be known: suppose x carried no information about y, and a share q of
-    the residuals to shuffled targets is within r. Then h of n residuals are within r with probability
-    exp(-n KL(h/n || q)) (Chernoff). The line and the r of the largest exponent win. None where no line does better
-    than chance.
+    The criterion is a contrario, so no noise level has to be known. Suppose that x carries no information about y. Let
+    q be the share of pixels whose residual is at most r after the targets were shuffled. Then h of n residuals are at
+    most r with probability exp(-n KL(h/n || q)) (Chernoff). The line and the r with the largest exponent are chosen.
+    The pixels whose residual is at most r support the line.
+
+    Args:
+        x, y: [S] estimate and target of each pixel.
+        w: [S] weights > 0.
+        generator: Draws the random samples.
+
+    Returns:
+        None if no line is better than chance.
     """
     uniform = lambda count: torch.rand(count, generator=generator, dtype=torch.float64).numpy()
     edges = np.cumsum(w) / w.sum()
@@ -182,23 +203,25 @@ def _check_not_constant(x: np.ndarray, mean: float, spread: float) -> None:
 def align_depth(
     estimate: np.ndarray, depth: np.ndarray, known: np.ndarray, *, space: Space = "disparity", robust: bool = False
 ) -> np.ndarray:
-    """A monocular estimate aligned to the scene's depth, [H, W] float64 camera z.
+    """Return a monocular estimate aligned with the depth of the scene, [H, W] float64 camera z.
 
-    PAPER leaves open: whether scale and offset act on depth or on its inverse. Both are offered; it must be the space
+    PAPER leaves open: whether scale and offset act on depth or on its inverse. Both are offered. It must be the space
     of the estimator's output (Depth Anything returns disparity), since an offset in one is no offset in the other.
 
     Args:
-        estimate: [H, W], affine in the scene's depth or disparity, according to `space`.
+        estimate: [H, W], an affine function of the scene's depth or disparity, according to `space`.
         depth: [H, W] the scene's depth, read where `known`.
-        known: bool or weights [H, W]; pixels of depth <= 0 do not count.
-        space: what the estimate is affine in.
-        robust: see `align`.
+        known: bool or weights [H, W]. Pixels with depth <= 0 do not count.
+        space: The quantity of which the estimate is an affine function.
+        robust: See `align`.
 
     Returns:
-        depth; the largest known depth where the aligned disparity is not positive (beyond infinity).
+        Depth at all pixels. Where the aligned disparity is not positive or is close to 0, the depth is the largest
+            known depth. With `space` "depth", the smallest known depth replaces aligned depths that are not positive.
 
     Raises:
-        ValueError: as `align`; or the fitted scale is not positive, i.e. the estimate is of the other space.
+        Degenerate: As `align`.
+        ValueError: As `align`, or the fitted scale is negative, i.e. the estimate is of the other space.
     """
     depth = np.asarray(depth, np.float64)
     weights = np.asarray(known, np.float64) * (depth > 0)
@@ -217,24 +240,27 @@ def align_depth(
 
 
 def align_either(estimate: np.ndarray, depth: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, Space]:
-    """A map of unknown kind, aligned to the scene: (depth [H, W] float64 camera z, what the map is affine in).
+    """Align a map, of which it is unknown whether it is depth or disparity, with the depth of the scene.
 
     The map is aligned robustly both as depth and as disparity. Of the alignments with a positive scale, the one with
-    the smaller error in disparity is kept. A map that is already in the scene's unit stays unchanged if its error is
-    hardly larger, or within `SAME_UNIT_ERROR`: two such maps agree with each other, while separate alignments would
-    add noise to each.
+    the smaller error in disparity is kept. The map stays unchanged if it is positive and, read as depth in the scene's
+    unit, fits about as well (`SAME_UNIT_RATIO`) or within `SAME_UNIT_ERROR`. Two maps in the scene's unit agree with
+    each other, while separate alignments would add noise to each.
 
     Args:
-        estimate: [H, W], depth or disparity of any scale and offset; NaN where it is missing.
+        estimate: [H, W], depth or disparity of any scale and offset, NaN where unknown.
         depth: [H, W] the scene's depth, read where `known`.
-        known: bool or weights [H, W]; pixels of depth <= 0 do not count.
+        known: bool or weights [H, W]. Pixels with depth <= 0 do not count.
 
     Returns:
-        depth, NaN where the estimate is NaN; the largest known depth beyond infinity, the smallest behind the camera.
+        depth: [H, W] float64 camera z, NaN where the estimate is NaN. The largest known depth replaces depths beyond
+            infinity. The smallest known depth replaces depths behind the camera.
+        space: The quantity of which the map is an affine function, "depth" or "disparity".
 
     Raises:
-        Degenerate: too few known pixels, or the map is constant there.
-        ValueError: the map falls where the scene's depth and disparity grow, or fits neither.
+        Degenerate: There are too few known pixels, or the map is constant there.
+        ValueError: The map falls where the scene's depth grows and also where the scene's disparity grows, or the map
+            fits neither.
     """
     valid = np.isfinite(estimate)
     estimate, depth = np.where(valid, estimate, 0.0).astype(np.float64), np.asarray(depth, np.float64)

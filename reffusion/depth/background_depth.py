@@ -1,6 +1,8 @@
-"""Depth inside a hole, where a view shows nothing yet: the surroundings are continued through it.
+"""Depth inside a hole: the surfaces around the hole are continued through it.
 
-`reffusion.depth.estimates` fits the depth map of a network or of a reference instead.
+`reffusion.depth.estimates` fits the depth map of a network or of a reference instead. The *surroundings* are the pixels
+in a ring around the hole. *Sparse points* are those of structure from motion. *Swept depth* is the depth that plane
+sweep stereo finds around the hole.
 """
 
 from __future__ import annotations
@@ -20,11 +22,11 @@ from reffusion.types import Camera, Rendering
 
 MIN_POINTS = 50  # with fewer sparse points around the hole, the rendered depth is used instead
 CONCLUSIVE_SHARE = 0.8  # share of the sparse points explained by planes, above which no further samples are added
-SWEPT_RATIO = 3  # pixels of swept depth that join the search for planes, for each sparse point
+SWEPT_RATIO = 3  # pixels of swept depth for each sparse point that are added to the samples of planes
 OCCLUSION_RATIO = 1.03  # a sparse point this many times as deep as the rendering is occluded
 MAX_EXTRAPOLATION = 1.15  # a continued surface exceeds the range of its known disparities by this factor at most
 MAX_REFUTED_SHARE = 0.05  # share of the hole in which intersecting planes are refuted, above which they are rejected
-IN_FRONT_RATIO = 1.03  # they are refuted where their disparity exceeds that of a continued plane by this factor
+IN_FRONT_RATIO = 1.03  # planes are refuted where their disparity exceeds that of a continued plane by this factor
 FARTHEST_RATIO = 2.0  # depth is limited to this many times the farthest known depth
 
 
@@ -33,19 +35,20 @@ class CompletionSettings:
     """Settings for finding the depth behind the object.
 
     PAPER leaves open: the depth model. Without one the surroundings are continued under one of two hypotheses:
-    intersecting planes (rooms), where these explain the surroundings, else a smooth completion.
+    intersecting planes (rooms), if these explain the surroundings, else a smooth completion.
 
     Attributes:
-        explained: alpha above which the rendered depth counts as known.
-        margin: pixels within this distance of the hole do not count as known, / image width: the object's depth is
-            blended into theirs.
-        ring: width of the surroundings that are continued, / image width.
-        planar_share: share of the surroundings that planes must explain to be used; above 1 they never are.
-        planar_tolerance: relative disparity within which planes explain a sample.
-        stiffness, edge, unknowns: see `completion.Plate`.
-        solver_smoothness, solver_spatial, solver_luma, solver_chroma: see `bilateral.Solver`.
-        robust: reject outliers when an estimate is aligned, see `alignment.align`.
-        seed: of the random samples that find planes.
+        explained: Alpha above which the rendered depth counts as known.
+        margin: Distance as a fraction of the image's width. Pixels nearer to the hole do not count as known, because
+            their rendered depth is blended with that of the object.
+        ring: Width of the surroundings, as a fraction of the image's width.
+        planar_share: Share of the surroundings that planes must explain to be used. A value above 1 excludes planes.
+        planar_tolerance: Relative difference in disparity up to which planes explain a sample.
+        stiffness, edge: See `completion.Plate`.
+        unknowns: `most_unknowns` of `completion.Plate`.
+        solver_smoothness, solver_spatial, solver_luma, solver_chroma: See `bilateral.Solver`.
+        robust: Whether outliers are rejected when a monocular estimate is aligned, see `alignment.align`.
+        seed: Seed of the random samples in the search for planes.
     """
 
     explained: float = 0.5
@@ -70,18 +73,19 @@ class CompletionSettings:
 
 @dataclass(frozen=True)
 class Hints:
-    """Further knowledge of a view's depth; None where it was not computed.
+    """Further knowledge of the depth in a view. A field is None, and `planes` is empty, if it was not computed.
 
     Attributes:
-        plane_depth: [H, W] depth of planes that continue into the hole, inf where none does
-            (`reffusion.background.continuation`).
-        planes: depth [H, W] of each of these planes, at every pixel.
-        confirmed: bool [H, W], pixels of the hole whose rendered depth other views confirm.
-        photographed_depth: [H, W] depth of what the photograph shows, 0 where unknown; elsewhere it replaces the
+        plane_depth: [H, W] depth of planes that continue into the hole (`reffusion.background.continuation`), inf where
+            no plane continues. Mirror images of symmetric objects count as planes.
+        planes: Depth [H, W] of each of these planes at all pixels, inf where the pixel's ray does not meet the plane.
+        confirmed: bool [H, W], True at pixels of the hole whose rendered depth is confirmed by other views.
+        photographed_depth: [H, W] depth of the surfaces in the photograph, 0 where unknown. Where known it replaces the
             rendered depth, because it is more accurate.
-        swept: bool [H, W], pixels of `photographed_depth` on which other photographs agree
+        swept: bool [H, W], True at pixels of `photographed_depth` that were found by comparing photographs
             (`reffusion.initialize.sweep`).
-        free_space: depth [H, W] -> bool [H, W], pixels in which other views see past a surface of this depth.
+        free_space: Function of a depth map [H, W] that returns bool [H, W], True at pixels where other views see past a
+            surface of this depth.
     """
 
     plane_depth: np.ndarray | None = None
@@ -97,17 +101,17 @@ NO_HINTS = Hints()
 
 @dataclass(frozen=True)
 class ViewDepth:
-    """The scene's depth in one view, and where it is known.
+    """The depth of the scene in one view, and the pixels at which it is known.
 
     Attributes:
-        camera: the view.
-        depth: [H, W] float64 camera z as rendered.
-        known: bool [H, W], the pixels whose depth is that of the scene: covered by Gaussians and not beside the hole,
-            or inside it and confirmed by other views.
-        hole: bool [H, W], the pixels to be filled.
-        hidden: bool [H, W], C: the pixels of the removed object.
-        anchored: bool [H, W], pixels of the hole whose `depth` is that of a plane which continues there.
-        hints: further knowledge of the depth.
+        camera: The camera of the view.
+        depth: [H, W] float64 camera z of the rendering, replaced where `hints` know a better depth.
+        known: bool [H, W], True where `depth` is the depth of the scene: outside the hole and its margin where
+            Gaussians or photographs show a surface, and inside the hole where other views confirm the rendered depth.
+        hole: bool [H, W], True at the pixels to fill.
+        hidden: bool [H, W], True at pixels that show the removed object (the consistent mask C).
+        anchored: bool [H, W], True at pixels of the hole whose `depth` is that of a plane that continues there.
+        hints: Further knowledge of the depth.
     """
 
     camera: Camera
@@ -120,12 +124,16 @@ class ViewDepth:
 
     @property
     def disparity(self) -> np.ndarray:
-        """[H, W] float64; 0 where there is no depth."""
+        """Return the disparity 1/depth, [H, W] float64; 0 where there is no depth."""
         return geometry.reciprocal(self.depth)
 
     @property
     def least_disparity(self) -> float:
-        """The disparity of the farthest depth that is allowed. Raises Degenerate where no depth is known."""
+        """Return the smallest disparity that is allowed: that of `FARTHEST_RATIO` times the farthest known depth.
+
+        Raises:
+            Degenerate: No depth is known.
+        """
         if not self.known.any():
             raise geometry.Degenerate("few pixels", "no depth is known around the hole")
         return 1.0 / (FARTHEST_RATIO * self.depth[self.known].max())
@@ -139,7 +147,19 @@ def extract_depth(
     settings: CompletionSettings,
     hints: Hints = NO_HINTS,
 ) -> ViewDepth:
-    """The depth of a rendering: known where alpha is high, except in the hole and a margin around it."""
+    """Return the depth of the scene in one view from a rendering of its Gaussians and from `hints`.
+
+    Depth counts as known where alpha is high, except in the hole and in a margin around it. In the hole the depth is
+    known only where `hints.confirmed` is True.
+
+    Args:
+        rendering: The rendering of the Gaussians without the object.
+        camera: The camera of the view.
+        hole: bool [H, W], True at the pixels to fill.
+        hidden: bool [H, W], True at pixels that show the removed object.
+        settings: Gives the threshold of alpha and the width of the margin.
+        hints: Further knowledge of the depth.
+    """
     depth, alpha = (t.detach().double().cpu().numpy() for t in (rendering.depth, rendering.alpha))
     plane_depth, outer = hints.plane_depth, hints.photographed_depth
     if outer is not None:
@@ -160,21 +180,29 @@ def continue_depth(
     log: SolverLog = NO_LOG,
     farthest: bool = False,
 ) -> tuple[np.ndarray, str]:
-    """The scene's disparity continued through the hole, [H, W] float64, and a description of the method used.
+    """Return the disparity of the scene, continued through the hole, and a description of the method used.
 
-    Planes are fitted to the sparse points where there are enough of them, else to the rendered depth. (Sparse points
-    are unbiased, while the expected depth of splats is too small wherever haze floats in front of a plain surface.)
-    Where planes do not explain the surroundings, these are continued smoothly, with creases at edges of the guide.
+    Intersecting planes are fitted to the sparse points around the hole, or to the rendered depth if there are few
+    points. (Sparse points are unbiased, while the expected depth of splats is too small wherever haze floats in front
+    of a plain surface.) If the planes do not explain the surroundings, or if other views see past the planes, each
+    surface around the hole is continued smoothly instead, with creases at edges of the guide.
 
     Args:
-        guide: [H, W, 3] uint8 or [0, 1], the view's picture without the object; or a function that returns it, called
-            only if it is needed.
+        view: The depth around the hole.
+        guide: [H, W, 3] picture of the view without the object, uint8 or in [0, 1]; or a function that returns this
+            picture and is called only if it is needed.
         points: [P, 3] sparse points of the scene; P = 0 is allowed.
-        log: records the result of each solver.
-        farthest: continue only the farthest of several surfaces around the hole, for a hole one looks through.
+        settings: Settings of the fits.
+        log: Records the result of each solver.
+        farthest: If True and several surfaces surround the hole, only the farthest one is continued. This suits a gap
+            through which the view looks at the background.
+
+    Returns:
+        disparity: [H, W] float64, also outside the hole.
+        description: The method, and the share of the samples that planes explain, in words.
 
     Raises:
-        Degenerate: too few known pixels around the hole.
+        Degenerate: There are too few known pixels around the hole.
     """
     planar, description = _fit_planar_model(view, points, settings)
     log.log_result("planes", planar.disparity)
@@ -203,7 +231,7 @@ def continue_depth(
             _complete_layers(view, surfaces, planes, guide, plate),
             f"{description}: {surfaces.max()} surfaces continued",
         )
-        # Planes that continue have depth maps of their own; and views do see "past" a mirror that is part of one.
+        # Planes that continue have a depth of their own. Other views do see "past" a mirror that is part of a plane.
         refuted = (
             _in_free_space(view, layered) & ~view.anchored & (surfaces != _farthest_surface(view, surfaces, usable))
         )
@@ -213,7 +241,7 @@ def continue_depth(
         return layered, description
     smooth = complete(view.disparity, usable, guide, plate, keep=False)
     log.log_result("completion", smooth)
-    # The bilateral solver spreads the residuals of known pixels into the hole, so that there is no step at its rim.
+    # The bilateral solver spreads the residuals of known pixels into the hole, so that its border shows no step.
     refined = bilateral.refine(
         smooth, view.disparity, usable.astype(np.float64), guide, settings.solver, log.log_iteration
     )
@@ -224,7 +252,13 @@ def continue_depth(
 
 
 def _farthest_surface(view: ViewDepth, surfaces: np.ndarray, usable: np.ndarray) -> int:
-    """The surface of the smallest median disparity."""
+    """Return the label of the surface with the smallest median disparity.
+
+    Args:
+        view: The depth of the view.
+        surfaces: int [H, W], the surface 1, 2, ... of each pixel.
+        usable: bool [H, W], True at pixels whose disparity is read, unless a plane is only assumed to continue there.
+    """
     median_disparity = lambda surface: float(np.median(view.disparity[usable & ~view.anchored & (surfaces == surface)]))
     present = [k for k in range(1, surfaces.max() + 1) if (usable & ~view.anchored & (surfaces == k)).any()]
     return min(present, key=median_disparity)
@@ -233,9 +267,16 @@ def _farthest_surface(view: ViewDepth, surfaces: np.ndarray, usable: np.ndarray)
 def _complete_layers(
     view: ViewDepth, surfaces: np.ndarray, planes: Sequence[np.ndarray], guide: np.ndarray, plate: Plate
 ) -> np.ndarray:
-    """[H, W] disparity: each surface is continued smoothly by itself, with a step between two surfaces.
+    """Return [H, W] disparity in which each surface is continued smoothly by itself, with a step between two surfaces.
 
-    A surface that was given pixels of a continued plane lies in front of that plane.
+    The graph cut may give a surface pixels at which a plane was assumed to continue. There the surface's disparity is
+    at least that of the plane, so that the surface lies in front of the plane.
+
+    Args:
+        surfaces: int [H, W], the surface of each pixel (`layers.label_surfaces`).
+        planes: Depth [H, W] of each plane.
+        guide: [H, W, 3] picture.
+        plate: Settings of the smooth continuation.
     """
     reassigned = view.anchored & (plane_labels(view.disparity, view.anchored, surfaces, planes) != surfaces)
     usable = view.known | (view.anchored & ~reassigned)
@@ -254,23 +295,29 @@ def _complete_layers(
 
 
 def _refuted_share(view: ViewDepth, disparity: np.ndarray) -> float:
-    """The share of the hole in which a surface of this disparity occludes a continued plane or fills free space.
+    """Return the share of the hole, in [0, 1], in which other knowledge contradicts a surface of this disparity.
 
-    This rejects, for example, the planes of a post and of the ground, which meet before the ground behind the post.
+    The surface is contradicted where the surface would hide a plane that continues there, or where other views see past
+    the surface. For example, the planes of a post and of the ground behind the post intersect in front of ground that
+    other views see, so these planes are rejected.
+
+    Args:
+        view: The depth of the view.
+        disparity: [H, W] of the surface.
     """
     refuted = (view.anchored & (disparity > view.disparity * IN_FRONT_RATIO)) | _in_free_space(view, disparity)
     return float(refuted[view.hole].mean()) if view.hole.any() else 0.0
 
 
 def _in_free_space(view: ViewDepth, disparity: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels of the hole in which other views see past a surface of this disparity."""
+    """Return bool [H, W], the pixels of the hole in which other views see past a surface of this disparity, [H, W]."""
     if view.hints.free_space is None:
         return np.zeros_like(view.hole)
     return view.hole & view.hints.free_space(1 / np.maximum(disparity, view.least_disparity))
 
 
 def points_around(view: ViewDepth, points: np.ndarray, settings: CompletionSettings) -> tuple[np.ndarray, np.ndarray]:
-    """Image points [S, 2] and disparities [S] of the sparse points that are visible around the hole."""
+    """Return the sparse points that are visible around the hole: image points [S, 2] in pixels, and disparities [S]."""
     return visible_points(points, view.camera, _surroundings(view, settings), view.disparity)
 
 
@@ -282,10 +329,11 @@ def _surroundings(view: ViewDepth, settings: CompletionSettings) -> np.ndarray:
 def _fit_planar_model(
     view: ViewDepth, points: np.ndarray, settings: CompletionSettings
 ) -> tuple[planes.PlanarModel, str]:
-    """The planes fitted to the surroundings, and a description: how many explain what share of the samples.
+    """Fit planes to the surroundings of the hole, and describe how many planes explain which share of the samples.
 
-    The samples are the sparse points where there are enough. Where planes explain most of these but not all, so that
-    their noise decides, pixels of swept depth are added.
+    The samples are the sparse points if there are enough of them, else the rendered depth. If planes explain less than
+    `CONCLUSIVE_SHARE` of the sparse points, the noise of these points would decide whether the planes are accepted.
+    Pixels of swept depth are then added to the samples.
     """
     (pixels, values), source = points_around(view, points, settings), "sparse points"
     sparse = len(values) >= MIN_POINTS
@@ -314,7 +362,14 @@ def _fit_planes(
 def visible_points(
     points: np.ndarray, camera: Camera, pixels: np.ndarray, disparity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Image points [S, 2] and disparities [S] of the points that project to `pixels`, bool [H, W], and are visible."""
+    """Return the points that project to `pixels` and are visible there: image points [S, 2] and disparities [S].
+
+    Args:
+        points: [P, 3] points in the world.
+        camera: The camera of the view.
+        pixels: bool [H, W].
+        disparity: [H, W] of the view, 0 where unknown. A point that is clearly farther is hidden.
+    """
     uv, z = geometry.project(points, camera)
     on_pixels, inside = geometry.sample_nearest(pixels, uv)
     rendered, _ = geometry.sample_nearest(disparity, uv)

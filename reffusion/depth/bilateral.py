@@ -1,4 +1,4 @@
-"""The fast bilateral solver (Barron and Poole 2016): smooths a map except across the edges of an image."""
+"""The fast bilateral solver (Barron and Poole 2016). It smooths a map, except across the edges of an image."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from scipy.sparse.linalg import cg
 from reffusion.depth.completion import check_maps, extremes_ratio, unit_range
 from reffusion.geometry import Degenerate
 
-UNREACHED = 1e-9  # added to every pixel's confidence: keeps cells without data regular, at 0
+UNREACHED = 1e-9  # added to every pixel's confidence: keeps the system regular, and cells without data at the mean
 
 
 @dataclass(frozen=True)
 class Solver:
-    """The solver's parameters.
+    """Parameters of the bilateral solver.
 
     PAPER leaves open: their values. These are the defaults of its authors and of OpenCV.
 
     Attributes:
-        smoothness: lambda, weight of smoothness relative to the data.
-        spatial: cell size in pixels.
-        luma, chroma: cell sizes in levels of 8-bit YUV.
-        rounds: bistochastisation steps.
+        smoothness: The weight lambda of the smoothness term relative to the data term.
+        spatial: Size of the bilateral grid's cells in pixels.
+        luma, chroma: Size of the cells in levels of 8-bit YUV.
+        rounds: Number of bistochastisation steps.
     """
 
     smoothness: float = 128.0
@@ -48,12 +48,24 @@ def refine(
     solver: Solver = DEFAULT_SOLVER,
     watch: Watch | None = None,
 ) -> np.ndarray:
-    """An aligned estimate plus its residuals on known pixels, which the solver spreads along the guide.
+    """Return an aligned estimate of the disparity, corrected so that it agrees better with the known pixels.
 
-    Args, errors: as `solve`; estimate and disparity are [H, W], the latter read where confidence > 0.
+    The residuals of the known pixels are spread by `solve` to all pixels, up to edges of the guide, and added to the
+    estimate.
+
+    Args:
+        estimate: [H, W] disparity.
+        disparity: [H, W], the known disparity, read where `confidence` > 0.
+        confidence: [H, W] >= 0.
+        guide: [H, W, 3] image, uint8 or in [0, 1].
+        solver: Parameters of the solver.
+        watch: Called after each iteration of the solver, with the corrected estimate.
 
     Returns:
-        [H, W] float64 disparity: an estimate without residuals is returned unchanged.
+        [H, W] float64. An estimate without residuals is returned unchanged.
+
+    Raises:
+        Degenerate, ValueError: As `solve`.
     """
     misfit = np.where(confidence > 0, disparity - np.asarray(estimate, np.float64), 0.0)
     callback = watch and (lambda step, get_state: watch(step, lambda: (estimate + (state := get_state())[0], state[1])))
@@ -67,25 +79,26 @@ def solve(
     solver: Solver = DEFAULT_SOLVER,
     watch: Watch | None = None,
 ) -> np.ndarray:
-    """Minimises  sum_p c_p (x_p - t_p)^2 + smoothness/2 sum_pq W_pq (x_p - x_q)^2.
+    """Minimize  sum_p c_p (x_p - t_p)^2 + smoothness/2 sum_pq W_pq (x_p - x_q)^2  over maps x.
 
-    W is the bistochastic bilateral affinity; the unknowns are the vertices of the guide's bilateral grid. The result is
-    constant in each cell of the grid, so pass a correction to be spread, not the depth itself (see `refine`).
-    OpenCV's implementation is not used because wheels built without Eigen lack it.
+    Here t is the target, c is the confidence and W is the bistochastic bilateral affinity of the guide. The unknowns
+    are the vertices of the guide's bilateral grid. The result is constant in each cell of the grid, so pass a
+    correction to be spread, not the depth itself (see `refine`). OpenCV's implementation is not used because wheels
+    built without Eigen lack it.
 
     Args:
-        target: [H, W], read where confidence > 0.
+        target: [H, W], read where `confidence` > 0.
         confidence: [H, W] >= 0.
-        guide: [H, W, 3] uint8 or [0, 1].
-        solver: parameters.
-        watch: called after each iteration.
+        guide: [H, W, 3] image, uint8 or in [0, 1].
+        solver: Parameters of the solver.
+        watch: Called after each iteration.
 
     Returns:
-        [H, W] float64. Cells that no confidence reaches hold the confidence-weighted mean of the target.
+        [H, W] float64. Cells that no confidence reaches have the confidence-weighted mean of the target.
 
     Raises:
-        Degenerate: no convergence.
-        ValueError: no pixel has positive confidence; the target is not finite there; shapes differ.
+        Degenerate: The solver does not converge.
+        ValueError: No pixel has positive confidence, the target is not finite at such a pixel, or shapes differ.
     """
     target, confidence = np.asarray(target, np.float64), np.asarray(confidence, np.float64)
     check_maps(target, confidence, guide)
@@ -122,7 +135,15 @@ def solve(
 def build_system(
     confidence: np.ndarray, guide: np.ndarray, solver: Solver = DEFAULT_SOLVER
 ) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """The solver's matrix [V, V], symmetric and positive definite, and the vertex of each pixel [H * W]."""
+    """Return the matrix of the solver's linear system, [V, V], and the vertex of each pixel, int [H * W].
+
+    The matrix is symmetric and positive definite. V is the number of vertices of the bilateral grid.
+
+    Args:
+        confidence: [H, W] >= 0.
+        guide: [H, W, 3] image, uint8 or in [0, 1].
+        solver: Parameters of the solver.
+    """
     cell, coordinates = _grid(guide, solver)
     gather = lambda values: np.bincount(cell, values.ravel(), minlength=len(coordinates))
     mass = gather(np.ones(confidence.shape))
@@ -132,12 +153,13 @@ def build_system(
 
 
 def condition_numbers(confidence: np.ndarray, guide: np.ndarray) -> tuple[float, float]:
-    """Condition numbers (largest over smallest eigenvalue) of the system: plain, and with the Jacobi preconditioner.
+    """Return two condition numbers of the solver's system: without preconditioner, and with the Jacobi preconditioner.
 
-    `solve` uses the preconditioner. The square root of the number is about the number of steps that conjugate
-    gradients take.
+    The condition number is the largest eigenvalue over the smallest. Its square root is about the number of iterations
+    of conjugate gradients. `solve` uses the preconditioner.
 
-    Args: as `solve`.
+    Args:
+        confidence, guide: As in `solve`.
     """
     system, _ = build_system(np.asarray(confidence, np.float64), guide)
     root = sparse.diags(1.0 / np.sqrt(system.diagonal()))
@@ -145,7 +167,10 @@ def condition_numbers(confidence: np.ndarray, guide: np.ndarray) -> tuple[float,
 
 
 def _grid(guide: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray]:
-    """(vertex of each pixel [H*W], integer coordinates of the vertices [V, 5])."""
+    """Return the bilateral grid of a guide: the vertex of each pixel, int [H * W], and the vertices, int [V, 5].
+
+    A vertex has the coordinates x, y, luma and two chroma components, in units of the cell sizes.
+    """
     levels = 255.0 * unit_range(guide)
     luma = levels @ (0.299, 0.587, 0.114)
     chroma = (levels[..., [2, 0]] - luma[..., None]) * (0.564, 0.713)
@@ -159,7 +184,13 @@ def _grid(guide: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _keys(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(one key per row [V, 5] of integers, in lexicographic order; the key's increment along each axis [5])."""
+    """Return one integer key per row of coordinates, [V], and the increment of the key along each axis, [5].
+
+    The keys have the lexicographic order of the rows.
+
+    Args:
+        coordinates: int [V, 5].
+    """
     low = coordinates.min(0) - 1
     sides = coordinates.max(0) - low + 2
     strides = np.concatenate([np.cumprod(sides[:0:-1])[::-1], [1]])
@@ -167,7 +198,10 @@ def _keys(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _blur(coordinates: np.ndarray) -> sparse.csr_matrix:
-    """[V, V]: sum over the five axes of the kernel (1, 2, 1) between occupied vertices."""
+    """Return the sparse matrix [V, V] that blurs the grid: the kernel (1, 2, 1) along each axis, summed over the axes.
+
+    Only vertices that contain pixels exist; the kernel skips missing neighbours.
+    """
     keys, strides = _keys(coordinates)  # increasing, because `_grid` sorts them
     blur = sparse.diags(np.full(len(keys), 2.0 * len(strides)))
     for stride in strides:
@@ -179,7 +213,15 @@ def _blur(coordinates: np.ndarray) -> sparse.csr_matrix:
 
 
 def _laplacian(blur: sparse.csr_matrix, mass: np.ndarray, rounds: int) -> sparse.csr_matrix:
-    """[V, V]: graph Laplacian of the blur after bistochastisation, with row sums `mass` [V], the pixels per cell."""
+    """Return the graph Laplacian [V, V] of the blur matrix after bistochastisation.
+
+    Bistochastisation scales the blur matrix symmetrically so that its row sums become `mass`.
+
+    Args:
+        blur: [V, V], see `_blur`.
+        mass: [V], number of pixels of each vertex.
+        rounds: Number of bistochastisation steps.
+    """
     balance = np.ones(len(mass))
     for _ in range(rounds):
         balance = np.sqrt(balance * mass / (blur @ balance))

@@ -1,4 +1,4 @@
-"""Depth for an object that a reference draws in front of the scene, when it is unknown: a billboard with thickness."""
+"""Depth of an object that a reference inserts without a depth map: an upright billboard with thickness."""
 
 from __future__ import annotations
 
@@ -9,22 +9,25 @@ from reffusion import geometry
 from reffusion.gaussians.surfels import surface_normals
 from reffusion.types import Camera
 
-FOOT_SHARE = 0.05  # of the height: the lowest pixels, which stand on the surface below
+FOOT_SHARE = 0.05  # of the object's height: pixels this far above the bottom still stand on the surface below
 BULGE = 0.5  # of the half width: how far the middle bulges towards the camera
-# Between viewing direction and surface, below which the billboard faces the camera instead of standing upright.
+# Sine of the angle between the viewing direction and the surface's normal. Below it the camera looks at the surface
+# head-on, as at a wall, and the billboard faces the camera instead of standing upright.
 MIN_SINE = 0.3
 MAX_ANGLE_DEG = 30  # degrees from the reference's view; beyond this the missing back becomes visible
 
 
 def billboard_depth(object_pixels: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """[H, W] camera z: `depth`, and at `object_pixels` that of upright billboards.
+    """Return [H, W] camera z, which is `depth`, and at `object_pixels` the depth of upright billboards.
 
-    Each connected component stands upright where its lowest pixels meet the surface below, and bulges towards the
-    camera inside its outline. Its sides and its back are not known.
+    Each connected component of the object becomes one billboard. It stands upright on the surface below its lowest
+    pixels, and bulges towards the camera inside its outline. The sides and the back of the object remain unknown.
+    Nowhere is the billboard farther than `depth`.
 
     Args:
-        object_pixels: bool [H, W], pixels of the object.
-        depth: [H, W] float64 > 0, of the scene without it.
+        object_pixels: bool [H, W], True at pixels of the inserted object.
+        depth: [H, W] float64 > 0, of the scene without the object.
+        camera: The camera of the view.
     """
     components, count = ndimage.label(object_pixels, np.ones((3, 3)))
     normals, rays = surface_normals(depth, camera), geometry.pixel_rays(camera)
@@ -45,7 +48,16 @@ def billboard_depth(object_pixels: np.ndarray, depth: np.ndarray, camera: Camera
 def _foot(
     component: np.ndarray, depth: np.ndarray, normals: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The median surface point [3] under the lowest pixels of a component, and the unit normal [3] there."""
+    """Return the point where an object meets the surface below it, and the unit normal of this surface, [3] each.
+
+    Both are medians over the surface one pixel below the lowest pixels of the object.
+
+    Args:
+        component: bool [H, W], True at the object.
+        depth: [H, W] of the scene without the object.
+        normals: [H, W, 3], the normals of this depth map.
+        camera: The camera of the view.
+    """
     rows, columns = np.nonzero(component)
     lowest = np.full(component.shape[1], -1)
     np.maximum.at(lowest, columns, rows)
@@ -56,19 +68,26 @@ def _foot(
 
 
 def _billboard_normal(view_direction: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """[3] unit normal, towards the camera, of a plane upright on a surface; on a wall the plane faces the camera."""
+    """Return the unit normal [3] of a plane that stands upright on a surface and is turned towards the camera.
+
+    If the camera looks at the surface almost head-on, as at a wall, the plane faces the camera instead.
+
+    Args:
+        view_direction: [3], unit vector from the camera to the foot of the object.
+        normal: [3], unit normal of the surface.
+    """
     across = view_direction - (view_direction @ normal) * normal
     length = np.linalg.norm(across)
     return -view_direction if length < MIN_SINE else -across / length
 
 
 def _profile(component: np.ndarray) -> np.ndarray:
-    """[H, W] in [0, 1]: a rounded profile, 0 at the outline and 1 in the middle."""
+    """Return [H, W] in [0, 1], the height of a rounded bulge: 0 at the outline of a component and 1 in its middle."""
     distance = np.maximum(ndimage.distance_transform_edt(np.pad(component, 1))[1:-1, 1:-1] - 1, 0)
     normalized = distance / max(distance.max(), 1.0)
     return np.sqrt(1 - (1 - normalized) ** 2)
 
 
 def _half_width_px(component: np.ndarray) -> float:
-    """Half the width of the widest row, in pixels."""
+    """Return half the width of the component's widest row, in pixels."""
     return component.sum(1).max() / 2

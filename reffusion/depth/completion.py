@@ -1,6 +1,6 @@
 """Smooth completion of depth behind a removed object, with creases where an image has edges.
 
-All computation is in disparity (1/z): the disparity of a plane is an affine function of the pixel, so that penalising
+All computation is in disparity (1/z). The disparity of a plane is an affine function of the pixel, so a penalty on
 second differences continues floors and walls exactly.
 """
 
@@ -15,7 +15,7 @@ from scipy.sparse.linalg import eigsh, splu
 from reffusion.depth.planes import fit_plane
 from reffusion.geometry import Degenerate
 
-CREASE_FLOOR = 1e-4  # weight left to a second difference across the strongest guide edge: keeps the system regular
+CREASE_FLOOR = 1e-4  # weight of a second difference across the strongest edge of the guide: keeps the system regular
 STENCILS = (  # (row, column, factor) of the second differences along x, along y, and mixed
     ((0, 0, 1), (0, 1, -2), (0, 2, 1)),
     ((0, 0, 1), (1, 0, -2), (2, 0, 1)),
@@ -28,10 +28,10 @@ class Plate:
     """Settings of the thin plate that is fitted through a hole.
 
     Attributes:
-        ring: width of the surroundings that take part, as a fraction of the image's width.
-        stiffness: weight of bending against the data, px^4; about 3 px are averaged at 100.
-        edge: guide step (in [0, 1]) at which the weight of a second difference has fallen to 1/e.
-        most_unknowns: above this number of pixels a coarser grid is solved, and its solution interpolated.
+        ring: Width of the ring of known pixels around the hole that take part, as a fraction of the image's width.
+        stiffness: Weight of bending relative to the data, in px^4. At 100 the fit averages over about 3 px.
+        edge: Colour step in the guide (in [0, 1]) at which the weight of a second difference has fallen to 1/e.
+        most_unknowns: Number of pixels above which a coarser grid is solved and its solution interpolated.
     """
 
     ring: float = 0.05
@@ -40,8 +40,11 @@ class Plate:
     most_unknowns: float = 60_000
 
     def coarser(self, factor: int) -> Plate:
-        """The same plate on blocks of `factor` x `factor` pixels, solved directly whatever their number."""
-        # A second difference over blocks is factor^2 larger, and there are factor^2 fewer.
+        """Return the settings of the same plate on blocks of `factor` x `factor` pixels.
+
+        The coarser plate is always solved directly (`most_unknowns` is infinite).
+        """
+        # Between blocks, a squared second difference is factor^4 times as large, and there are factor^2 times fewer.
         return replace(self, stiffness=self.stiffness / factor**2, most_unknowns=np.inf)
 
 
@@ -56,28 +59,31 @@ def complete(
     *,
     keep: bool = True,
 ) -> np.ndarray:
-    """Fill the pixels of zero confidence by second-order, edge-aware completion in disparity.
+    """Fill the pixels of zero confidence in a disparity map by a thin plate that may crease at edges of the guide.
 
-    Minimises  sum_p c_p (d_p - D_p)^2 + stiffness * sum w (d_xx^2 + 2 d_xy^2 + d_yy^2)  over the hole and a ring
-    of known pixels around it. w is small across edges of the guide, so that a crease may lie there. An affine D makes
-    both sums zero: planes are continued exactly (up to rounding), whatever the guide's texture.
+    The result minimizes  sum_p c_p (d_p - D_p)^2 + stiffness * sum w (d_xx^2 + 2 d_xy^2 + d_yy^2)  over the hole and a
+    ring of known pixels around it. D is the disparity and c is the confidence. The weight w is small across edges of
+    the guide, so that a crease may lie there. An affine D makes both sums zero: planes are continued exactly (up to
+    rounding), whatever the guide's texture.
 
-    PAPER leaves open: how the depth of a hole is found without a monocular estimator. Second order in disparity,
-    because first-order filling bends every plane.
+    PAPER leaves open: how the depth of a hole is found without a monocular estimator. Second differences of the
+    disparity are penalised, because a penalty on first differences bends every plane.
 
     Args:
-        disparity: [H, W], read where confidence > 0.
-        confidence: [H, W] >= 0, or bool; 0 = unknown.
-        guide: [H, W, 3] or [H, W] image, uint8 or [0, 1], or None.
-        plate: parameters.
-        keep: known pixels keep their values; else those of the ring take the minimiser's, which has no step at the rim.
+        disparity: [H, W], read where `confidence` > 0.
+        confidence: [H, W] >= 0, or bool; 0 marks the pixels to fill.
+        guide: Image [H, W, 3] or [H, W], uint8 or in [0, 1]. None: the weight w is the same everywhere.
+        plate: Settings of the plate.
+        keep: If True, known pixels keep their values. If False, known pixels in the ring get the values of the plate,
+            so that there is no step at the hole's border.
 
     Returns:
-        [H, W] float64: the completion where confidence is 0, elsewhere the input (see `keep`).
+        [H, W] float64, the plate where the confidence is 0, and elsewhere the input (but see `keep`).
 
     Raises:
-        Degenerate: fewer than 3 known pixels next to some hole, or all on one line (they determine no plane).
-        ValueError: known values are not finite, or shapes differ.
+        Degenerate: A hole has fewer than 3 known pixels around it, or all of them lie on one line. Such pixels
+            determine no plane.
+        ValueError: Known values are not finite, or shapes differ.
     """
     disparity, confidence = np.asarray(disparity, np.float64), np.asarray(confidence, np.float64)
     check_maps(disparity, confidence, guide)
@@ -98,7 +104,11 @@ def complete(
 
 
 def check_maps(disparity: np.ndarray, confidence: np.ndarray, guide: np.ndarray | None) -> None:
-    """Raise ValueError unless the maps are [H, W], the guide has their size, and the values to be read are finite."""
+    """Raise ValueError if the maps are not fit for a solver.
+
+    Both maps must be [H, W], the guide must have the same height and width, the confidence must be finite and not
+    negative, and the disparity must be finite where the confidence is positive.
+    """
     if disparity.ndim != 2 or disparity.shape != confidence.shape:
         raise ValueError(f"disparity {disparity.shape} and confidence {confidence.shape} must both be [H, W]")
     if guide is not None and guide.shape[:2] != disparity.shape:
@@ -110,7 +120,14 @@ def check_maps(disparity: np.ndarray, confidence: np.ndarray, guide: np.ndarray 
 
 
 def _complete_region(disparity, confidence, guide, domain, plate: Plate) -> np.ndarray:
-    """[H, W]: disparity of one hole and its ring, both in `domain` (bool [H, W]); elsewhere the best fitting plane."""
+    """Return [H, W], the completed disparity inside `domain`, and elsewhere the plane that fits the known pixels best.
+
+    Args:
+        disparity, confidence: [H, W].
+        guide: [H, W, C] in [0, 1], or None.
+        domain: bool [H, W], True at the pixels of a hole and of the ring around it.
+        plate: Settings of the plate.
+    """
     known = domain & (confidence > 0)
     _check_determines_plane(known)
     # Solve for a correction to the best plane, in units of the data's spread: few digits are lost to the offset.
@@ -130,23 +147,31 @@ def _complete_region(disparity, confidence, guide, domain, plate: Plate) -> np.n
 
 
 def build_system(confidence: np.ndarray, guide: np.ndarray | None, domain: np.ndarray, plate: Plate = DEFAULT_PLATE):
-    """The completion's sparse matrix over the pixels of `domain`, bool [H, W]; symmetric and positive definite."""
+    """Return the sparse matrix of the completion over the P pixels of `domain`, [P, P], symmetric positive definite.
+
+    Args:
+        confidence: [H, W].
+        guide: [H, W, C] in [0, 1], or None.
+        domain: bool [H, W].
+        plate: Settings of the plate.
+    """
     bend = _bending(domain, guide, plate.edge)
     return (sparse.diags(confidence[domain]) + plate.stiffness * bend.T @ bend).tocsc()
 
 
 def factorize(system: sparse.csc_matrix):
-    """Sparse LU factors of a symmetric matrix."""
+    """Return the sparse LU factors of a symmetric matrix."""
     return splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 def condition_number(confidence: np.ndarray, guide: np.ndarray | None = None, plate: Plate = DEFAULT_PLATE) -> float:
-    """Condition number (largest over smallest eigenvalue) of the completion's system over a whole map [H, W].
+    """Return the condition number of the completion's system over a whole map [H, W]: largest over smallest eigenvalue.
 
-    Rounding errors of the right hand side's largest value are amplified by up to this factor, which is why `complete`
-    solves for the correction to a plane.
+    Rounding errors of the largest value on the right-hand side are amplified by up to this factor. Therefore `complete`
+    solves for a correction to a plane, whose values are small.
 
-    Args: as `complete`.
+    Args:
+        confidence, guide, plate: As in `complete`.
     """
     confidence = np.asarray(confidence, np.float64)
     colors = None if guide is None else unit_range(guide)
@@ -154,7 +179,7 @@ def condition_number(confidence: np.ndarray, guide: np.ndarray | None = None, pl
 
 
 def extremes_ratio(matrix: sparse.spmatrix) -> float:
-    """Largest over smallest eigenvalue of a symmetric positive definite matrix."""
+    """Return the largest over the smallest eigenvalue of a symmetric positive definite matrix."""
     if matrix.shape[0] < 16:
         values = np.linalg.eigvalsh(matrix.toarray())
         return float(values[-1] / values[0])
@@ -167,9 +192,17 @@ def extremes_ratio(matrix: sparse.spmatrix) -> float:
 
 
 def _solve_coarsely(residual, data, guide, domain, plate: Plate) -> np.ndarray:
-    """[H, W]: correction to the plane, solved over blocks and interpolated.
+    """Return [H, W], the correction to the plane, solved over blocks of pixels and interpolated.
 
-    Blocks may be averaged off-centre because `residual` is the difference from the plane.
+    A block's mean may come from pixels on one side of the block. This does little harm, because `residual` is the small
+    difference from the plane.
+
+    Args:
+        residual: [H, W], disparity minus plane, 0 where unknown.
+        data: [H, W] confidence, 0 where unknown.
+        guide: [H, W, C] in [0, 1], or None.
+        domain: bool [H, W].
+        plate: Settings of the plate.
     """
     factor = int(np.ceil(np.sqrt(domain.sum() / plate.most_unknowns)))
     blocks = lambda array: _block_sum(array, factor)
@@ -201,7 +234,10 @@ def _check_determines_plane(known: np.ndarray) -> None:
 
 
 def _bending(domain: np.ndarray, guide: np.ndarray | None, edge: float) -> sparse.csr_matrix:
-    """[equations, pixels of the domain] weighted second differences: xx, yy, and xy counted twice."""
+    """Return the sparse matrix [equations, P] of weighted second differences over the P pixels of the domain.
+
+    The differences are d_xx, d_yy and d_xy, of which d_xy has the weight 2.
+    """
     index = np.full(domain.shape, -1)
     index[domain] = np.arange(domain.sum())
     return sparse.vstack([_stencil_rows(index, guide, stencil, edge) for stencil in STENCILS]).tocsr()
@@ -226,6 +262,6 @@ def _stencil_rows(index: np.ndarray, guide: np.ndarray | None, stencil, edge: fl
 
 
 def unit_range(guide: np.ndarray) -> np.ndarray:
-    """A guide [H, W] or [H, W, C], uint8 or in [0, 1], as float64 [H, W, C] in [0, 1]."""
+    """Return a guide [H, W] or [H, W, C], uint8 or in [0, 1], as float64 [H, W, C] in [0, 1]."""
     guide = guide / 255.0 if guide.dtype == np.uint8 else np.asarray(guide, np.float64)
     return guide[..., None] if guide.ndim == 2 else guide

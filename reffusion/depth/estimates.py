@@ -1,4 +1,4 @@
-"""Depth maps of a network or of a reference, aligned to the scale of the scene."""
+"""Alignment of depth maps, from a network or from a reference, with the scale of the scene."""
 
 from __future__ import annotations
 
@@ -13,21 +13,28 @@ from reffusion.depth.solverlog import NO_LOG, SolverLog
 def align_estimate(
     view: ViewDepth, guide: np.ndarray, estimate: np.ndarray, settings: CompletionSettings, log: SolverLog = NO_LOG
 ) -> tuple[np.ndarray, str]:
-    """A monocular estimate aligned to the scene, [H, W] float64 disparity, and a description of how well it fits.
+    """Return a monocular estimate aligned with the scene, and a description of the error of the fit.
 
-    As in the paper: scale and offset are fitted by least squares on the known pixels; then the fast bilateral solver
-    spreads the remaining residuals along the picture into the hole.
+    As in the paper, scale and offset are fitted by least squares on the known pixels. Then the fast bilateral solver
+    spreads the remaining residuals of these pixels into the hole, up to edges of the picture.
 
-    PAPER leaves open: whether the alignment acts on depth or on disparity. It acts on disparity here, because that is
-    what the estimators return, and an offset in one is no offset in the other.
+    PAPER leaves open: whether the alignment acts on depth or on disparity. It acts on disparity here, because the
+    estimators return disparity, and an offset in one is no offset in the other.
 
     Args:
-        guide: [H, W, 3] uint8 or [0, 1], the picture.
+        view: The scene's depth and the pixels at which it is known.
+        guide: [H, W, 3] the picture, uint8 or in [0, 1].
         estimate: [H, W], disparity up to scale and offset.
-        log: records the result of each solver.
+        settings: Settings of alignment and solver.
+        log: Records the result of the solver.
+
+    Returns:
+        disparity: [H, W] float64.
+        description: The error of the alignment, in words.
 
     Raises:
-        Degenerate: fewer than 4 known pixels; a constant estimate; an estimate that falls where the disparity grows.
+        Degenerate: There are fewer than 4 known pixels, the estimate is constant there, or it falls where the disparity
+            grows.
     """
     fitted = alignment.align(estimate, view.disparity, view.known, robust=settings.robust)
     if fitted.scale <= 0:
@@ -50,14 +57,23 @@ def align_depth_map(
     settings: CompletionSettings,
     log: SolverLog = NO_LOG,
 ) -> tuple[np.ndarray, str]:
-    """A reference's own depth map aligned to the scene, [H, W] float64 disparity, and a description of the method.
+    """Return the depth map of a reference as disparity aligned with the scene, and a description of the method.
 
     Args:
-        depth: [H, W] depth or disparity of any scale and offset; NaN where it is missing, and there the surroundings
-            are continued.
+        view: The scene's depth and the pixels at which it is known.
+        guide: [H, W, 3] the reference's picture, uint8 or in [0, 1].
+        depth: [H, W] depth or disparity of any scale and offset, NaN where unknown. Where the depth is unknown in the
+            hole, the surroundings are continued (`background_depth.continue_depth`).
+        points: [P, 3] sparse points of the scene, for this continuation.
+        settings: Settings of this continuation.
+        log: Records the results of its solvers.
+
+    Returns:
+        disparity: [H, W] float64.
+        description: The method, in words.
 
     Raises:
-        ValueError: see `alignment.align_either`.
+        Degenerate, ValueError: As `alignment.align_either`.
     """
     aligned, space = alignment.align_either(depth, view.depth, view.known)
     result, description = (

@@ -1,4 +1,4 @@
-"""A quick completion of depth maps, for decisions that need no accuracy."""
+"""Fast completion of depth maps, for decisions that need no accuracy."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ import numpy as np
 
 
 def inpaint_depth(depth: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """[H, W] depth whose unknown pixels continue the disparity around them (Telea); 0 where that is about infinity.
+    """Return [H, W], the depth map with its unknown pixels filled by Telea's method, which acts on disparity here.
+
+    A filled pixel is 0 where its disparity is about 0, i.e. its depth about infinite.
 
     Args:
-        known: bool [H, W], pixels whose depth is kept.
+        depth: [H, W] > 0, read where `known`.
+        known: bool [H, W], True at pixels whose depth is kept.
     """
     disparity = np.where(known, 1 / np.where(known, depth, 1.0), 0.0)
     top = max(float(disparity.max()), 1e-12)

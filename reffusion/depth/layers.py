@@ -1,4 +1,8 @@
-"""Splits a hole among the surfaces around it, along the edges of a picture, so that each can be continued by itself."""
+"""Division of a hole among the surfaces around it, along the edges of a picture.
+
+Each surface can then be continued through its own part of the hole. A *surface* is a set of pixels with an integer
+label 1, 2, ...; label 0 means that a pixel has no surface.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +16,16 @@ from reffusion.depth.completion import unit_range
 from reffusion.graph_cut import HARD, alpha_expansion
 
 JUMP = 0.025  # relative disparity step between neighbours that separates two surfaces
-MIN_SHARE = 0.03  # of the known pixels around a hole: smaller segments are not surfaces of their own
+MIN_SHARE = 0.03  # of the known pixels around a hole: smaller segments are no surfaces
 COLOR_WEIGHT = 0.1  # weight of a pixel's colour relative to an edge between neighbours
 MIN_EDGE_COST = 0.05  # minimum cost of separating neighbours, relative to the cost where the picture is uniform
-COLOR_BINS = 12  # of a colour histogram, along each of red, green and blue
+COLOR_BINS = 12  # bins of a colour histogram along each of red, green and blue
 PLANE_TOLERANCE = 0.02  # relative disparity within which a pixel lies on a plane
 MAX_UNEVENNESS = 0.04  # a segment whose median relative disparity from a plane is below this belongs to that plane
 BAND_WIDTH = 0.03  # of the width: the band around a hole in which its surfaces are compared
 CONTACT_PX = 3  # px within which two segments in the band touch
 IN_FRONT_RATIO = 1.05  # a segment whose disparity exceeds that of all it touches by this factor is in the foreground
-PLANE_PRIOR_COST = 0.5  # cost of giving a pixel another surface than the plane assumed to continue there
+PLANE_PRIOR_COST = 0.5  # cost of giving a pixel another surface than that of the plane assumed to continue there
 
 
 def label_surfaces(
@@ -33,21 +37,29 @@ def label_surfaces(
     assumed: np.ndarray | None = None,
     forbidden: np.ndarray | None = None,
 ) -> np.ndarray:
-    """The surface that each pixel belongs to, int [H, W]: 1, 2, ... where known or in the hole, 0 elsewhere.
+    """Return int [H, W], the surface of each pixel around and inside a hole.
 
-    Known pixels are segmented by the planes they lie on, and elsewhere at jumps in disparity. A graph cut extends the
-    segments into the hole: boundaries follow edges of the picture, and each pixel prefers a surface of its colour.
+    The known pixels are divided into surfaces by `segment_surfaces`: by the planes on which they lie, elsewhere at
+    jumps in disparity. A graph cut extends the surfaces into the hole. Its boundaries follow edges of the picture, and
+    each pixel prefers a surface of its own colour.
 
     PAPER leaves open: the completion of depth.
 
     Args:
-        disparity: [H, W], read where known.
-        known: bool [H, W], the pixels around or inside the hole from which surfaces are continued.
-        hole: bool [H, W], including any gap between the hole and the known pixels.
-        guide: [H, W, 3] picture, uint8 or [0, 1].
-        planes: depth [H, W] of planes around the hole.
-        assumed: bool [H, W], the known pixels whose plane is only assumed to continue there.
-        forbidden: int [H, W], a surface that a pixel must not belong to, numbered as in a call without it; 0: none.
+        disparity: [H, W], read where `known`.
+        known: bool [H, W], True at the pixels around or inside the hole from which surfaces are continued.
+        hole: bool [H, W], True at the pixels to label, including any gap between the hole and the known pixels.
+        guide: [H, W, 3] picture, uint8 or in [0, 1].
+        planes: Depth [H, W] of each plane around the hole, inf where the plane is absent.
+        assumed: bool [H, W], True at known pixels whose depth is only an assumption: a plane is assumed to continue
+            there. The graph cut may give such a pixel to another surface, at a cost. None if there are no such pixels.
+        forbidden: int [H, W], the surface that a pixel of the hole must not get, 0 if it may get any. The numbers are
+            those that a call without `forbidden` returns. None allows all surfaces.
+
+    Returns:
+        Labels 1, 2, ..., by decreasing size of the surface among the known pixels. The label is 0 at pixels that are
+            neither known nor in the hole, and at known pixels whose surface is too small (`MIN_SHARE`). If there are
+            fewer than two surfaces, all known pixels and all pixels of the hole have label 1.
     """
     assumed = np.zeros_like(hole) if assumed is None else assumed & known
     surfaces = segment_surfaces(disparity, known & ~assumed, planes, hole)
@@ -75,10 +87,15 @@ def label_surfaces(
 
 
 def _remove_islands(labels: np.ndarray, surfaces: np.ndarray, missing: np.ndarray) -> np.ndarray:
-    """int [H, W]: the labels without islands.
+    """Return the labels, int [H, W], after each island in the hole has taken the nearest label around it.
 
-    A component of `missing` pixels, bool [H, W], that is not connected to known pixels of its surface, int [H, W],
-    takes the nearest other label: a pattern may have the colours of something else.
+    An island is a connected component of one label that contains no known pixel of this surface. It arises where a
+    pattern in the hole has the colours of another surface.
+
+    Args:
+        labels: int [H, W], the surface of each pixel.
+        surfaces: int [H, W], the surfaces of the known pixels, 0 elsewhere.
+        missing: bool [H, W], True at the pixels that may change their label.
     """
     island = np.zeros_like(missing)
     for surface in range(1, int(surfaces.max()) + 1):
@@ -92,9 +109,14 @@ def _remove_islands(labels: np.ndarray, surfaces: np.ndarray, missing: np.ndarra
 
 
 def _weighted_edges(index: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs [E, 2] of neighbours among the pixels numbered by `index` [H, W], and the cost [E] of separating them.
+    """Return pairs of neighbouring pixels, [E, 2], and the cost of giving the two pixels of a pair different labels,
+    [E].
 
-    The cost is low across edges of the picture.
+    The cost is low across edges of the picture. Each pixel has up to eight neighbours.
+
+    Args:
+        index: int [H, W], the number of each pixel, -1 at pixels that take no part. The pairs consist of these numbers.
+        colors: [H, W, 3] picture in [0, 1].
     """
     firsts, seconds, apart = [], [], []
     for offset in ((0, 1), (1, 0), (1, 1), (1, -1)):
@@ -108,7 +130,15 @@ def _weighted_edges(index: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _color_cost(colors: np.ndarray, surfaces: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """[K, P]: -log posterior of each of K surfaces given the colours of P pixels, under equal priors."""
+    """Return [K, P], the cost -log p(surface | colour) of each of K surfaces at each of P pixels.
+
+    The probabilities come from a colour histogram of each surface; all surfaces are equally probable a priori.
+
+    Args:
+        colors: [H, W, 3] picture in [0, 1].
+        surfaces: int [H, W], the surfaces 1 to K of the known pixels.
+        pixels: bool [H, W], True at the P pixels.
+    """
     cells = (colors * COLOR_BINS).astype(np.int64).clip(0, COLOR_BINS - 1)
     counts = np.zeros((int(surfaces.max()), COLOR_BINS, COLOR_BINS, COLOR_BINS))
     for k in range(len(counts)):
@@ -121,7 +151,17 @@ def _color_cost(colors: np.ndarray, surfaces: np.ndarray, pixels: np.ndarray) ->
 def plane_labels(
     disparity: np.ndarray, pixels: np.ndarray, surfaces: np.ndarray, planes: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """int [H, W]: the surface that lies on the same plane as each of `pixels`, bool [H, W]; 0 where there is none."""
+    """Return int [H, W], for each of `pixels` the surface that lies on the same plane; 0 at all other pixels.
+
+    If several surfaces have pixels on a plane, the one with the most pixels counts.
+
+    Args:
+        disparity: [H, W].
+        pixels: bool [H, W], True at the pixels to label.
+        surfaces: int [H, W], the surface of each pixel, 0 where there is none.
+        planes: Depth [H, W] of each plane, inf where the plane is absent. If a pixel lies on several planes, the first
+            that has a surface counts.
+    """
     labels = np.zeros_like(surfaces)
     for depth in planes:
         nearby = surfaces[_is_on_plane(disparity, depth) & (surfaces > 0)]
@@ -135,7 +175,14 @@ def _at(values: np.ndarray, domain: np.ndarray) -> np.ndarray:
 
 
 def _neighbor_pairs(index: np.ndarray, offset: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of pixels and of their neighbours at `offset` (row, column), where both are numbered."""
+    """Return int [E] and int [E], the numbers of pixels and the numbers of their neighbours at `offset`.
+
+    Only pairs in which both pixels have a number are returned.
+
+    Args:
+        index: int [H, W], the number of each pixel, -1 at pixels without a number.
+        offset: (row, column) of the neighbour relative to the pixel, row >= 0.
+    """
     height, width = index.shape
     rows_down, right = offset
     first_column = max(0, -right)
@@ -148,11 +195,24 @@ def _neighbor_pairs(index: np.ndarray, offset: tuple[int, int]) -> tuple[np.ndar
 def segment_surfaces(
     disparity: np.ndarray, known: np.ndarray, planes: Sequence[np.ndarray] = (), hole: np.ndarray | None = None
 ) -> np.ndarray:
-    """int [H, W]: segments of the known pixels, numbered 1, 2, ... by decreasing size; 0: too small.
+    """Return int [H, W], the surfaces of the known pixels, numbered 1, 2, ... by decreasing size.
 
-    A segment lies on one of the planes (depth [H, W] each), or else is connected without jumps in disparity. A plinth
-    is connected to the lawn at its foot; where it is nearer than everything it touches around the hole, bool [H, W],
-    it is a segment of its own.
+    All pixels on one of the `planes` are one surface, even if they are not connected. The remaining pixels are divided
+    into segments that are connected without jumps in disparity. A segment that deviates little from a plane joins the
+    plane's surface.
+
+    An object that stands on the ground is connected with the ground at its foot, without a jump in disparity. Therefore
+    a segment that is nearer than everything it touches in a band around the hole is separated from everything behind
+    the segment (see `_label_foreground`).
+
+    Args:
+        disparity: [H, W], read where `known`.
+        known: bool [H, W].
+        planes: Depth [H, W] of each plane, inf where the plane is absent.
+        hole: bool [H, W]. If None, objects in front are not separated.
+
+    Returns:
+        0 at unknown pixels, and at pixels of segments with less than `MIN_SHARE` of the known pixels.
     """
     index = np.full(known.shape, -1)
     index[known] = np.arange(known.sum())
@@ -187,9 +247,15 @@ def segment_surfaces(
 
 
 def segment_foreground(disparity: np.ndarray, known: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """int [H, W]: foreground objects, 1, 2, ..., nearer than all they touch around the hole (see `segment_surfaces`).
+    """Return int [H, W], the foreground objects around a hole, numbered 1, 2, ...; 0 at all other pixels.
 
-    0 for the remaining pixels and where the depth is not known.
+    A foreground object is a connected segment that is nearer than everything it touches in a band around the hole (see
+    `segment_surfaces`).
+
+    Args:
+        disparity: [H, W], read where `known`.
+        known: bool [H, W].
+        hole: bool [H, W].
     """
     result, index = np.zeros(known.shape, np.int64), np.full(known.shape, -1)
     index[known] = np.arange(known.sum())
@@ -201,7 +267,12 @@ def segment_foreground(disparity: np.ndarray, known: np.ndarray, hole: np.ndarra
 
 
 def _smooth_neighbor_pairs(index: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of neighbouring pixels, numbered by `index` [H, W], without a jump between their disparities [P]."""
+    """Return int [E] and int [E], the numbers of pairs of neighbouring pixels without a jump in disparity between them.
+
+    Args:
+        index: int [H, W], the number of each pixel, -1 at pixels without a number.
+        values: [P] disparities of the numbered pixels.
+    """
     firsts, seconds = [], []
     for offset in ((0, 1), (1, 0)):
         first, second = _neighbor_pairs(index, offset)
@@ -213,10 +284,17 @@ def _smooth_neighbor_pairs(index: np.ndarray, values: np.ndarray) -> tuple[np.nd
 def _label_foreground(
     smooth: sparse.csr_matrix, disparity: np.ndarray, known: np.ndarray, hole: np.ndarray
 ) -> np.ndarray:
-    """[P], for each known pixel: the foreground object, 1, 2, ..., that it belongs to, or 0.
+    """Return int [P], for each known pixel the number of the foreground object to which it belongs, or 0.
 
-    An object is a segment in the band around the hole that is nearer than everything it touches there. A pixel belongs
-    to the segment that is nearest along the links of `smooth` [P, P].
+    The known pixels in a band around the hole are divided into segments without jumps in disparity. A segment that is
+    nearer than all segments it touches is a foreground object. Every known pixel then belongs to the segment that is
+    nearest along the links of `smooth`.
+
+    Args:
+        smooth: Sparse [P, P], nonzero for neighbouring known pixels without a jump in disparity between them.
+        disparity: [H, W].
+        known: bool [H, W], True at the P pixels.
+        hole: bool [H, W].
     """
     in_band = known & (ndimage.distance_transform_edt(~hole) <= BAND_WIDTH * hole.shape[1])
     band = np.flatnonzero(in_band[known])
@@ -239,9 +317,13 @@ def _label_foreground(
 
 
 def _is_in_front(k: int, masks: np.ndarray, dilated: Sequence[np.ndarray], disparity: np.ndarray) -> bool:
-    """Does the k-th of the masks, bool [K, H, W], touch others, and is it nearer than each of them there?
+    """Return True if the k-th mask touches others and is nearer than each of them at the contact.
 
-    `dilated` holds each mask with its margin of contact.
+    Args:
+        k: Index of the mask.
+        masks: bool [K, H, W], the segments in the band around the hole.
+        dilated: K masks [H, W], each dilated by the distance within which two segments touch.
+        disparity: [H, W].
     """
     touching = [
         j for j in range(len(masks)) if j != k and (dilated[k] & masks[j]).any() and (dilated[j] & masks[k]).any()
@@ -253,5 +335,10 @@ def _is_in_front(k: int, masks: np.ndarray, dilated: Sequence[np.ndarray], dispa
 
 
 def _is_on_plane(disparity: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """bool [H, W]: the pixels on a surface of this depth [H, W]; inf where the surface is absent."""
+    """Return bool [H, W], the pixels whose disparity agrees with that of a plane within `PLANE_TOLERANCE`.
+
+    Args:
+        disparity: [H, W].
+        depth: [H, W] of the plane, inf where the plane is absent.
+    """
     return np.isfinite(depth) & (np.abs(disparity * np.where(np.isfinite(depth), depth, 0) - 1) < PLANE_TOLERANCE)

@@ -25,13 +25,13 @@ MAX_DEPTH_M = 1e6  # metres: the depth of a metric network is clamped here befor
 
 @dataclass(frozen=True)
 class DepthNetwork:
-    """A network on one device, frozen, in evaluation mode.
+    """A Depth Anything network on one device, frozen and in evaluation mode.
 
     Attributes:
-        model: transformers' DepthAnythingForDepthEstimation.
-        patch: side of a patch in pixels; the input is a whole number of patches.
-        side: side of the square training pictures in pixels.
-        metric: the output is depth in metres, not disparity up to scale and offset.
+        model: DepthAnythingForDepthEstimation of transformers.
+        patch: Side of a patch in pixels. The network's input consists of whole patches.
+        side: Side of the square training pictures in pixels.
+        metric: True if the network's output is depth in metres, False if it is disparity up to scale and offset.
     """
 
     model: nn.Module
@@ -41,10 +41,14 @@ class DepthNetwork:
 
 
 def load_network(source: str | Path, device: str = "cpu") -> DepthNetwork:
-    """Load the model, in float32, from a local folder or by a hub id (depth-anything/Depth-Anything-V2-Small-hf).
+    """Load the network, in float32, from a local folder or by its hub id, whose weights must be on this machine.
+
+    Args:
+        source: Folder, or hub id such as depth-anything/Depth-Anything-V2-Small-hf.
+        device: The device of the network.
 
     Raises:
-        ValueError: the model is not on this machine, the folder has no model, or the model is of another type.
+        ValueError: The model is not on this machine, the folder has no model, or the model is of another type.
     """
     from transformers import AutoConfig, AutoModelForDepthEstimation
     from transformers.utils import logging as transformers_logging
@@ -67,7 +71,7 @@ def load_network(source: str | Path, device: str = "cpu") -> DepthNetwork:
 
 
 def _load_or_explain(folder: Path, advice: str, load: Callable[[], Any]) -> Any:
-    """Call a loader of transformers; its errors become one line with advice."""
+    """Call a loader of transformers, and turn its errors into a ValueError of one line that ends with `advice`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -85,7 +89,11 @@ def _check_kind(config, name: str) -> None:
 
 
 def make_network(model: nn.Module, device: str = "cpu") -> DepthNetwork:
-    """Build a DepthNetwork from a model in memory."""
+    """Build a DepthNetwork from a model in memory. The model is frozen and moved to `device`.
+
+    Raises:
+        ValueError: The model is of another type.
+    """
     config: Any = model.config
     _check_kind(config, config.name_or_path)
     model.requires_grad_(False).eval().to(device)
@@ -95,16 +103,17 @@ def make_network(model: nn.Module, device: str = "cpu") -> DepthNetwork:
 
 @torch.no_grad()
 def predict_disparity(network: DepthNetwork, image: Tensor) -> Tensor:
-    """[H, W] float32 disparity of a picture, up to scale and offset, on the picture's device.
+    """Return the disparity of a picture up to scale and offset, [H, W] float32, on the picture's device.
 
-    The depth of a metric network is inverted.
+    The output of a metric network is inverted.
 
     Args:
+        network: The depth network.
         image: [3, H, W] in [0, 1].
 
     Raises:
-        ValueError: the picture does not have three channels.
-        FloatingPointError: the output is not finite.
+        ValueError: The picture does not have three channels.
+        FloatingPointError: The output is not finite.
     """
     if image.ndim != 3 or image.shape[0] != 3:
         raise ValueError(f"the depth model takes one picture [3, H, W], not {list(image.shape)}")
@@ -119,9 +128,14 @@ def predict_disparity(network: DepthNetwork, image: Tensor) -> Tensor:
 
 
 def preprocess(network: DepthNetwork, image: Tensor) -> Tensor:
-    """The network's input [1, 3, h, w] for a picture [3, H, W] in [0, 1]: resized to whole patches and normalised.
+    """Return the network's input for a picture: resized to whole patches and normalised, [1, 3, h, w].
 
-    The aspect ratio is kept up to this rounding. The side that needs less resizing is scaled to the training size.
+    The picture is scaled so that one of its sides has about the size of the training pictures: the side that needs less
+    scaling. Both sides are then rounded to whole patches, which changes the aspect ratio slightly.
+
+    Args:
+        network: The depth network.
+        image: [3, H, W] in [0, 1].
     """
     height, width = image.shape[1:]
     scale = min((network.side / height, network.side / width), key=lambda s: abs(1 - s))

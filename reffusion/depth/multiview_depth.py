@@ -1,9 +1,9 @@
 """Multi-view stereo for a few photographs: depth from sparse points, refined and cross-checked between views.
 
-Smooth surfaces have few sparse points, and some points lie on surfaces that a photograph does not show (the far side of
-an object, seen in others). So the depth interpolated between the points is refined by PatchMatch stereo. Pixels for
-which another view finds the same surface are confirmed. Confirmed pixels replace the sparse points they contradict, and
-the rest is interpolated anew.
+Smooth surfaces have few sparse points. Some points lie on surfaces that a photograph does not show, for example on the
+far side of an object, which other photographs show. So the depth is first interpolated between the sparse points, and
+then refined by PatchMatch stereo. A pixel is *confirmed* if another view finds the same surface. Confirmed pixels
+replace the sparse points that they contradict, and the depth of the remaining pixels is interpolated anew.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from reffusion.types import Camera
 MAX_NEIGHBORS, MAX_ANGLE_DEG = (
     3,
     70.0,
-)  # other views that a view is compared with, and how far their axes may turn from its own
+)  # number of other views that a view is compared with, and largest angle between their optical axes and its own
 SAME_SURFACE = 0.01  # relative depth within which the surfaces of two views are the same
 SEEN_PAST = 0.05  # relative depth by which another view must see farther to refute a surface
-GRID_SPACING = 3  # px of a picture `REFERENCE_WIDTH` wide: grid of the confirmed pixels that become samples
+GRID_SPACING = 3  # of the grid of confirmed pixels that become samples, in px of a picture `REFERENCE_WIDTH` wide
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,9 @@ class MultiviewDepth:
 
     Attributes:
         depth: [H, W] float64 camera z.
-        confirmed: bool [H, W], another view finds the same surface.
-        refuted: bool [H, W], not confirmed, and a confirmed pixel of another view sees past the surface.
+        confirmed: bool [H, W], True where another view finds the same surface.
+        refuted: bool [H, W], True at pixels that are not confirmed and whose surface is contradicted: a confirmed pixel
+            of another view sees past the surface.
     """
 
     depth: np.ndarray
@@ -56,11 +57,14 @@ def estimate_multiview_depth(
     hidden: Mapping[str, np.ndarray],
     seed: int,
 ) -> dict[str, MultiviewDepth]:
-    """View name -> its depth, for the views that show enough points.
+    """Return the depth of each view in which enough sparse points are visible, by the view's name.
 
     Args:
-        images: view name -> uint8 [H, W, 3], with equal exposure.
-        hidden: view name -> bool [H, W], pixels that are never confirmed.
+        points: The scene's sparse points with normals.
+        cameras: The cameras of the views.
+        images: View name -> photograph, uint8 [H, W, 3]. All have the same exposure.
+        hidden: View name -> bool [H, W], True at pixels that are never confirmed. A view without an entry has none.
+        seed: Seed of PatchMatch.
     """
     samples = {camera.name: visible_samples(points, camera, images[camera.name]) for camera in cameras}
     interpolate = lambda camera: interpolate_depth(samples[camera.name], camera, images[camera.name])
@@ -88,7 +92,11 @@ def estimate_multiview_depth(
 def _refine_planes(
     view: Camera, views: Sequence[Camera], images: Mapping[str, np.ndarray], initial: np.ndarray, seed: int
 ) -> np.ndarray:
-    """[H, W, 3] planes of a view, from its initial depth refined by stereo with the most similar views."""
+    """Return [H, W, 3], the plane of each pixel: the initial depth, refined by stereo with the most similar views.
+
+    The most similar views are those with the smallest angle between their optical axes and that of the view. If no view
+    is within `MAX_ANGLE_DEG`, the planes are the tangent planes of the initial depth.
+    """
     axis_cosine = lambda other: float(view.world_to_camera[2, :3] @ other.world_to_camera[2, :3])
     near = [
         other for other in views if other.name != view.name and axis_cosine(other) > np.cos(np.radians(MAX_ANGLE_DEG))
@@ -105,7 +113,7 @@ def _depth_of_planes(planes: np.ndarray, view: Camera) -> np.ndarray:
 
 
 def _confirmed_pixels(view: Camera, depth: Mapping[str, np.ndarray], views: Sequence[Camera]) -> np.ndarray:
-    """bool [H, W]: pixels for which another view finds the same surface."""
+    """Return bool [H, W], the pixels of a view at which another view finds the same surface."""
     result = np.zeros(depth[view.name].shape, bool)
     for other_depth, z, inside, _ in _compare_views(view, depth, depth, views):
         result |= inside & (np.abs(other_depth - z) < SAME_SURFACE * z)
@@ -115,7 +123,7 @@ def _confirmed_pixels(view: Camera, depth: Mapping[str, np.ndarray], views: Sequ
 def _refuted_pixels(
     view: Camera, depth: Mapping[str, np.ndarray], confirmed: Mapping[str, np.ndarray], views: Sequence[Camera]
 ) -> np.ndarray:
-    """bool [H, W]: pixels that are not confirmed and that a confirmed pixel of another view sees past."""
+    """Return bool [H, W], the unconfirmed pixels whose surface is contradicted by a confirmed pixel of another view."""
     result = np.zeros(depth[view.name].shape, bool)
     for other_depth, z, inside, other_confirmed in _compare_views(view, depth, confirmed, views):
         result |= inside & other_confirmed & (other_depth > z * (1 + SEEN_PAST))
@@ -127,9 +135,16 @@ def _compare_views(
 ):
     """Project the pixels [H, W] of a view into each other view.
 
+    Args:
+        view: The view whose pixels are projected.
+        depth: View name -> depth [H, W].
+        values: View name -> array [H, W] that is looked up in the other views.
+        views: All views.
+
     Yields:
-        for each other view: its depth there, the point's depth in it, whether the point is in its frame, and its
-        `values` there.
+        For each other view four arrays [H, W]: the other view's depth where a pixel's surface point projects to, the
+            depth of the point in the other view, whether the point is in the frame of the other view, and the other
+            view's `values` where the point projects to.
     """
     points = geometry.unproject(depth[view.name], view)
     for other in views:
@@ -142,12 +157,22 @@ def _compare_views(
 def _complete_depth(
     view: Camera, image: np.ndarray, samples: DepthSamples, planes: np.ndarray, depth: np.ndarray, confirmed: np.ndarray
 ) -> np.ndarray:
-    """[H, W]: the depth where it is confirmed; elsewhere it is interpolated from confirmed pixels and from the sparse
-    points that these do not refute."""
+    """Return [H, W], the depth of a view in which the unconfirmed pixels are interpolated anew.
+
+    They are interpolated from confirmed pixels, and from the sparse points that project to unconfirmed pixels.
+
+    Args:
+        view: The camera of the view.
+        image: uint8 [H, W, 3], its photograph.
+        samples: The sparse points that are visible in the view.
+        planes: [H, W, 3], the planes found by stereo.
+        depth: [H, W], the depth of these planes.
+        confirmed: bool [H, W].
+    """
     if not confirmed.any():
         return depth
     columns, rows = samples.pixels.astype(int).T
-    refuted = confirmed[rows, columns]  # or redundant beside the confirmed pixel itself
+    refuted = confirmed[rows, columns]  # such a point contradicts the confirmed pixel, or adds nothing to it
     spacing = max(1, round(GRID_SPACING * view.width / REFERENCE_WIDTH))
     grid = np.zeros(confirmed.shape, bool)
     grid[::spacing, ::spacing] = True

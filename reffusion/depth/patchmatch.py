@@ -1,8 +1,9 @@
-"""PatchMatch stereo, compiled: a plane at each pixel of a photograph that maximises its similarity with other views.
+"""PatchMatch stereo in compiled code. It finds the plane at each pixel of a photograph that matches other views best.
 
-Slanted support windows (Bleyer, Rhemann, Rother 2011) in several views (Galliani, Lasinger, Schindler 2015), compared
-by bilaterally weighted normalised cross-correlation (Schönberger et al. 2016). A plane is parametrised by disparity:
-plane . (x, y, 1) = 1/z along the ray (x, y, 1) of a pixel.
+A plane maps a window around the pixel to windows in the other views (slanted support windows, Bleyer, Rhemann, Rother
+2011; several views, Galliani, Lasinger, Schindler 2015). The windows are compared by bilaterally weighted normalised
+cross-correlation (Schönberger et al. 2016). A plane is a vector [3] of its coefficients in disparity: plane . (x, y, 1)
+= 1/z, the disparity at which the ray (x, y, 1) of a pixel meets the plane, in camera axes.
 """
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ ITERATIONS = 3
 WINDOW_HALF, WINDOW_STRIDE = (
     5,
     2,
-)  # px of a picture `REFERENCE_WIDTH` wide: half side of a window, and spacing of its samples
+)  # half side of a window and spacing of its samples, in px of a picture `REFERENCE_WIDTH` wide
 COLOR_SCALE, DISTANCE_SCALE = 36.0, 8.0  # levels (sum of three channels) and px at which a sample's weight is 1/e
 MIN_DEVIATION = 2.0  # levels of 255, regularises the correlation of windows with less contrast
-PRIOR_COST, PRIOR_TOLERANCE = 0.1, 0.02  # cost of leaving the initial depth; in full from this relative disparity on
+# The cost of leaving the initial depth, and the relative difference in disparity at which it reaches this value.
+PRIOR_COST, PRIOR_TOLERANCE = 0.1, 0.02
 DISPARITY_CHANGE, SLOPE_CHANGE = (
     0.02,
     0.16,
@@ -34,11 +36,11 @@ DISPARITY_CHANGE, SLOPE_CHANGE = (
 CHANGE_DECAY, SMALL_CHANGE = (
     0.4,
     0.2,
-)  # factor on these from one iteration to the next, and for the second random change of each pixel
+)  # factors on both changes: from one iteration to the next, and for the second random change of each pixel
 _SAMPLES = (2 * WINDOW_HALF // WINDOW_STRIDE + 1) ** 2
 _NEIGHBORS = np.array(
     [(0, 1), (0, -1), (1, 0), (-1, 0), (0, 5), (0, -5), (5, 0), (-5, 0)]
-)  # odd steps lead to the other colour, see `_spread`
+)  # (row, column) offsets: each is odd, which leads to the other colour of a chessboard, see `_spread`
 _CANDIDATES = len(_NEIGHBORS) + 2  # planes tried at a pixel: those of its neighbours, and two random changes of its own
 
 
@@ -49,13 +51,17 @@ def estimate_planes(
     initial: np.ndarray,
     generator: np.random.Generator,
 ) -> np.ndarray:
-    """[H, W, 3] planes, starting from the tangent planes of an initial depth map.
+    """Return [H, W, 3], for each pixel of a photograph the plane that matches the other views best (see the module).
+
+    The search starts from the tangent planes of an initial depth map.
 
     Args:
-        image: uint8 [H, W, 3] of the camera.
-        others: at least one other camera with its image.
-        initial: [H, W] camera z > 0; kept where the photographs do not determine the depth.
-        generator: of the random changes of planes.
+        camera: The camera of the photograph.
+        image: uint8 [H, W, 3], the photograph.
+        others: At least one other camera with its photograph.
+        initial: [H, W] camera z > 0. A plane pays a cost for leaving this depth, so the initial depth is kept where the
+            photographs do not determine the depth.
+        generator: Draws the random changes of planes.
     """
     rays = np.ascontiguousarray(geometry.pixel_rays(camera))
     initial_disparity = 1 / np.asarray(initial, np.float64)
@@ -82,7 +88,15 @@ def estimate_planes(
 
 
 def tangent_planes(disparity: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """[H, W, 3]: the tangent planes of a disparity map [H, W]; at a step, those of the flatter side."""
+    """Return [H, W, 3], the tangent plane of a disparity map at each pixel.
+
+    The slopes are one-sided differences. Of the two sides of a pixel the flatter one is taken, so that a plane beside a
+    depth step does not bridge the step. The slopes are then smoothed by a median filter of 5 x 5 pixels.
+
+    Args:
+        disparity: [H, W], 1/z.
+        rays: [H, W, 3], the rays of the pixels (`geometry.pixel_rays`).
+    """
     slopes = []
     for axis, pixel_distance in ((1, rays[0, 1, 0] - rays[0, 0, 0]), (0, rays[1, 0, 1] - rays[0, 0, 1])):
         slope = np.diff(disparity, axis=axis) / pixel_distance
@@ -95,9 +109,11 @@ def tangent_planes(disparity: np.ndarray, rays: np.ndarray) -> np.ndarray:
 
 
 def _homography(camera: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """(rotation [3, 3], translation [3]) that map a ray to the other view's homogeneous pixel.
+    """Return a matrix [3, 3] and a vector [3] that map a pixel's ray and disparity to a pixel of another view.
 
-    The pixel is rotation @ ray + translation * disparity.
+    The homogeneous pixel in the view `other` is matrix @ ray + vector * disparity, where ray = (x, y, 1) in `camera`.
+    The matrix is the relative rotation and the vector is the relative translation, both multiplied by the intrinsics of
+    `other`.
     """
     inner = np.array([[other.fx, 0, other.cx], [0, other.fy, other.cy], [0, 0, 1]])
     relative = other.world_to_camera @ np.linalg.inv(camera.world_to_camera)
@@ -105,7 +121,10 @@ def _homography(camera: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _stack_padded(pictures: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """[K, H, W], padded to the largest height and width, and the original sizes [K, 2]."""
+    """Return pictures [H_k, W_k] of different sizes as one array [K, H, W], and their sizes (height, width) as [K, 2].
+
+    H and W are the largest height and width. Smaller pictures are padded with zeros at the right and below.
+    """
     sizes = np.array([picture.shape for picture in pictures])
     result = np.zeros((len(pictures), *sizes.max(0)), np.float32)
     for whole, picture in zip(result, pictures, strict=True):
@@ -115,7 +134,17 @@ def _stack_padded(pictures: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarra
 
 @kernel
 def _bilateral_weights(colour, row, column, spacing, weights):
-    """Write the bilateral weight of each sample of a window (0 outside the picture), and return their sum."""
+    """Write the bilateral weights of the samples of a window, and return their sum.
+
+    A sample has a high weight if it is near the window's centre and has a similar colour. A sample outside the picture
+    has weight 0.
+
+    Args:
+        colour: [H, W, 3] picture, in levels from 0 to 255.
+        row, column: The pixel at the centre of the window.
+        spacing: Factor on the window's size in pixels: 1 for a picture `REFERENCE_WIDTH` wide, 2 for one twice as wide.
+        weights: [_SAMPLES], the output.
+    """
     height, width = colour.shape[:2]
     n, total = 0, 0.0
     for down in range(-WINDOW_HALF, WINDOW_HALF + 1, WINDOW_STRIDE):
@@ -136,7 +165,19 @@ def _bilateral_weights(colour, row, column, spacing, weights):
 
 @kernel
 def _matching_cost(grey, rays, rotation, translation, picture, size, row, column, plane, spacing, weights, total):
-    """1 - correlation of a window with the other view, warped by the plane; 1 if less than half of it is in frame."""
+    """Return 1 - the correlation of a window with the corresponding window of another view, at most 1.
+
+    The plane maps each sample of the window to the other view. The cost is 1 if samples with less than half of the
+    total weight lie in the frame of the other view.
+
+    Args:
+        grey: [H, W], the photograph in grey.
+        rotation, translation: The matrix and the vector of `_homography` for the other view.
+        picture, size: The other view in grey, padded by `_stack_padded`, and its size before padding.
+        row, column, spacing: See `_bilateral_weights`.
+        plane: [3].
+        weights, total: The weights of the samples, and their sum.
+    """
     height, width = size
     n, covered = 0, 0.0
     mean_here, mean_there, square_here, square_there, product = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -180,9 +221,10 @@ def _matching_cost(grey, rays, rotation, translation, picture, size, row, column
 def _plane_cost(
     grey, rays, initial_disparity, rotations, translations, pictures, sizes, row, column, plane, spacing, weights, total
 ):
-    """Cost of a plane at a pixel: its matching cost and a penalty for leaving the initial depth.
+    """Return the cost of a plane at a pixel: the matching cost, and a penalty for leaving the initial depth.
 
-    The matching cost is that of the best view; of three or more views it is the mean of the best two.
+    The matching cost is the lowest of the matching costs in the other views. With three or more other views it is the
+    mean of the two lowest. A plane behind the camera costs infinity.
     """
     x, y = rays[row, column, 0], rays[row, column, 1]
     disparity = plane[0] * x + plane[1] * y + plane[2]
@@ -231,9 +273,21 @@ def _spread(
     change_size,
     spacing,
 ):
-    """Update every second pixel, as on a chessboard, to the cheapest of its neighbours' planes and two random changes.
+    """Update the planes of every second pixel, in a chessboard pattern, to planes of lower cost.
 
-    The neighbours are of the other colour, so that they do not change meanwhile.
+    The candidates are the pixel's own plane, the planes of eight neighbours and two random changes of the own plane. If
+    `spacing` is odd, the neighbours have the other colour of the chessboard, so their planes do not change during the
+    update.
+
+    Args:
+        tickets: Counter from which each thread takes the next row.
+        planes: [H, W, 3], updated in place.
+        cost: [H, W], the costs of `planes`, updated in place.
+        noise: [H, W, 3] standard normal, of the random changes.
+        parity: 0 or 1, the colour of the chessboard: pixels whose row + column has this parity are updated.
+        first: True in the first iteration, in which the costs of the initial planes are computed.
+        change_size: Factor on the random changes in this iteration.
+        spacing: See `_bilateral_weights`; also the factor on the distances of the neighbours.
     """
     height, width = grey.shape
     weights, plane = np.empty(_SAMPLES), np.empty(3)
@@ -263,7 +317,11 @@ def _spread(
 
 @kernel
 def _perturb(plane, ray, noise, change_size, candidate, result):
-    """Write a randomly changed plane: shifted in disparity at a ray, and tilted about that point."""
+    """Write a randomly changed copy of a plane to `result`.
+
+    The plane's disparity at the pixel's ray is changed, and the plane is tilted about its point on this ray. The last
+    candidate (`candidate` = `_CANDIDATES` - 1) gets a smaller change.
+    """
     disparity = plane[0] * ray[0] + plane[1] * ray[1] + plane[2]
     scale = disparity * change_size * (1.0 if candidate == _CANDIDATES - 2 else SMALL_CHANGE)
     across, down = SLOPE_CHANGE * scale * noise[0], SLOPE_CHANGE * scale * noise[1]

@@ -1,4 +1,4 @@
-"""Planes in disparity (1/z), where a plane is an affine function of the pixel: fits one, or joins several."""
+"""Planes in disparity (1/z), where a plane is an affine function of the pixel: the fit of one plane, or of several."""
 
 from __future__ import annotations
 
@@ -17,7 +17,12 @@ MAX_PLANES = 6  # candidates
 
 
 def fit_plane(disparity: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """[H, W]: the affine function of the pixel that fits `disparity` [H, W] best in least squares under `weights`."""
+    """Return [H, W], the affine function of the pixel that fits a disparity map best in weighted least squares.
+
+    Args:
+        disparity: [H, W], read where the weight is positive.
+        weights: [H, W] >= 0.
+    """
     rows, columns = np.nonzero(weights > 0)
     width = disparity.shape[1]
     x, y, w = columns / width, rows / width, np.sqrt(weights[rows, columns])
@@ -28,8 +33,14 @@ def fit_plane(disparity: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def plane_values(coefficients: tuple[float, float, float], shape: tuple[int, int]) -> np.ndarray:
-    """[H, W] values of a x + b y + c with x, y = (column, row) / width, where columns and rows are integers: at upper
-    left corners of pixels."""
+    """Return [H, W], the values a x + b y + c of a plane at the upper left corners of the pixels.
+
+    Here x = column / width and y = row / width, with integer columns and rows.
+
+    Args:
+        coefficients: (a, b, c).
+        shape: (H, W).
+    """
     rows, columns = np.mgrid[: shape[0], : shape[1]] / shape[1]
     a, b, c = coefficients
     return a * columns + b * rows + c
@@ -37,12 +48,15 @@ def plane_values(coefficients: tuple[float, float, float], shape: tuple[int, int
 
 @dataclass(frozen=True)
 class PlanarModel:
-    """Disparity as maxima and minima of planes: rooms are concave (the nearer plane is visible), boxes convex.
+    """A disparity map that consists of planes, joined by maxima and minima.
+
+    At each pixel of a room the nearer plane is visible, i.e. the maximum of the disparities. At each pixel of a box the
+    farther plane is visible, i.e. the minimum.
 
     Attributes:
         disparity: [H, W] float64, at every pixel.
-        explained: share of the surroundings within the tolerance, in [0, 1].
-        planes: number of planes used.
+        explained: Share of the samples around the hole, in [0, 1], whose disparity agrees with the model.
+        planes: Number of planes used.
     """
 
     disparity: np.ndarray
@@ -58,24 +72,25 @@ def planar_model(
     *,
     tolerance: float = 0.01,
 ) -> PlanarModel:
-    """Fit planes to the surroundings of a hole, and continue them until they intersect.
+    """Fit planes to the surroundings of a hole, and continue them through the hole until they intersect.
 
-    Planes are found by sequential RANSAC: the best supported plane through three samples is refitted to its inliers,
-    and these are removed. The model starts with the plane that explains most samples. Other planes join it as maximum
-    or minimum if that explains more samples. So the plane of an object in front of a wall does not cut through the
-    hole: as a maximum it would occlude the wall beside it.
+    Planes are found by sequential RANSAC: the plane through three samples with the most inliers is refitted to its
+    inliers, and these are removed before the next plane is searched. The model starts with the plane that explains most
+    samples. Another plane joins it as maximum or minimum if the result explains more samples. This excludes, for
+    example, the plane of an object in front of a wall: as a maximum it would occlude samples of the wall beside the
+    object.
 
     PAPER leaves open: the completion. This is the hypothesis for rooms; the smooth one is `completion.complete`.
 
     Args:
-        pixels: [S, 2] image points of the samples around the hole, (x, y) in pixels.
-        disparity: [S], positive.
+        pixels: [S, 2] image points (x, y) of the samples around the hole, in pixels.
+        disparity: [S] of the samples, positive.
         shape: (H, W) of the result.
-        generator: on the CPU.
-        tolerance: relative disparity within which a sample is explained.
+        generator: Draws the triples of samples; on the CPU.
+        tolerance: Relative difference in disparity below which a plane explains a sample.
 
     Raises:
-        Degenerate: fewer than 12 samples, or all of them on one line.
+        Degenerate: There are fewer than 12 samples, or all of them lie on one line.
     """
     scaled = np.column_stack([pixels / shape[1], np.ones(len(pixels))])
     if len(pixels) < MIN_SAMPLES or np.linalg.matrix_rank(scaled, tol=1e-6) < 3:
@@ -98,13 +113,20 @@ def planar_model(
 
 
 def _at_pixel_centers(plane: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """[H, W]: values of a plane at pixel centres."""
+    """Return [H, W], the values of a plane, given by its coefficients [3], at pixel centres."""
     a, b, c = plane
     return plane_values((a, b, c + 0.5 * (a + b) / shape[1]), shape)
 
 
 def _find_planes(points, values, tolerances, generator) -> list[np.ndarray]:
-    """Coefficients [3] of planes, at least one: values [S] ~ points [S, 3] @ plane within `tolerances` [S]."""
+    """Return the coefficients [3] of each plane found, at least of one.
+
+    Args:
+        points: [S, 3], for each sample its image point divided by the image's width, and 1.
+        values: [S] disparities. A plane explains a sample if points @ plane is within `tolerances` of the disparity.
+        tolerances: [S].
+        generator: Draws triples of samples.
+    """
     unexplained, planes = np.ones(len(values), bool), []
     while unexplained.sum() >= max(MIN_SAMPLES, MIN_SHARE * len(values)) and len(planes) < MAX_PLANES:
         candidate = _best_supported_plane(points, values, tolerances, np.flatnonzero(unexplained), generator)
@@ -116,7 +138,10 @@ def _find_planes(points, values, tolerances, generator) -> list[np.ndarray]:
 
 
 def _best_supported_plane(points, values, tolerances, index, generator) -> np.ndarray | None:
-    """The plane through three of the samples `index` with the most inliers; None if no three form a triangle."""
+    """Return the plane [3] through three of the samples `index` with the most inliers among them.
+
+    Return None if none of the random triples forms a triangle.
+    """
     triples = index[torch.randint(len(index), (TRIALS, 3), generator=generator).numpy()]
     is_triangle = np.abs(np.linalg.det(points[triples])) > 1e-4  # sides of about 1% of the width
     if not is_triangle.any():
@@ -128,7 +153,10 @@ def _best_supported_plane(points, values, tolerances, index, generator) -> np.nd
 
 
 def _refit_plane(plane, points, values, tolerances, unexplained) -> np.ndarray:
-    """The plane refitted to its inliers among the unexplained samples, alternately with choosing these."""
+    """Return the plane [3], refitted by least squares to its inliers among the unexplained samples.
+
+    Fitting and the choice of inliers alternate up to ten times.
+    """
     inliers = unexplained & (np.abs(points @ plane - values) < tolerances)
     for _ in range(10):
         if inliers.sum() < 3:

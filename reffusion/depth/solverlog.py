@@ -1,4 +1,4 @@
-"""Traces of the solvers that complete depth (docs/development.md#traces)."""
+"""Trace of the solvers that complete depth: their error at sparse points (docs/development.md#traces)."""
 
 from __future__ import annotations
 
@@ -10,21 +10,32 @@ from reffusion import geometry, trace
 
 
 class SolverLog:
-    """Logs how far the solvers' disparity in one view is from that of the sparse points.
+    """Logger of the errors of the depth solvers in one view.
 
-    Only the planes are fitted to these points; for the other solvers they are held out.
+    The error is the root mean square of the relative difference between a solver's disparity and the disparities of the
+    sparse points around the hole. Only the planes are fitted to these points. The other solvers do not read the points,
+    so for the other solvers these points are held-out data.
 
     Args:
-        log: receives a series for each solver; None: nothing is written.
-        view: the view's name.
-        pixels, values: image points [S, 2] of sparse points around the hole, and their disparities [S].
+        log: The trace to write to, with one series for each solver. If None, nothing is written.
+        view: The name of the view. It is a part of the name of each series.
+        pixels: [S, 2] image points (x, y) of the sparse points around the hole, in pixels.
+        values: [S] disparities of these points.
     """
 
     def __init__(self, log: trace.Trace | None, view: str, pixels: np.ndarray, values: np.ndarray):
         self.log, self.view, self.pixels, self.values, self.iterations = log, view, pixels, values, 0
 
     def log_iteration(self, iteration: int, get_result: Callable[[], tuple[np.ndarray, float]]) -> None:
-        """Log an iteration of the bilateral solver; a `bilateral.Watch`."""
+        """Log the error and the residual of the bilateral solver after an iteration.
+
+        This method is a `bilateral.Watch`. Only iterations that are evenly spaced in the logarithm are logged.
+
+        Args:
+            iteration: The number of iterations so far.
+            get_result: Returns the current disparity [H, W] and the current relative residual. It is called only if
+                this iteration is logged.
+        """
         self.iterations = iteration
         if self.log is not None and trace.log_spaced(iteration, -1, per_octave=4):
             with self.log.paused():
@@ -32,7 +43,13 @@ class SolverLog:
                 self.log.log(iteration, series=f"bilateral {self.view}", residual=residual, **self._error(result))
 
     def log_result(self, solver: str, result: np.ndarray, iterations: int = 1) -> None:
-        """Log a solver's result, disparity [H, W]."""
+        """Log the error of the final result of a solver.
+
+        Args:
+            solver: The name of the solver, which becomes a part of the name of the series.
+            result: [H, W] disparity.
+            iterations: The number of iterations that the solver took.
+        """
         if self.log is not None:
             with self.log.paused():
                 end = {"reason": "converged"}

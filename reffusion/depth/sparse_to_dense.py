@@ -1,7 +1,7 @@
-"""Dense depth of a photograph from the scene's sparse points, interpolated with the help of its colours.
+"""Dense depth of a photograph, interpolated between sparse points with the help of the photograph's colours.
 
-For scenes with few photographs: a fit to so few explains them by Gaussians just in front of each camera, while
-structure from motion knows where surfaces are.
+It serves scenes with few photographs. A fit of Gaussians explains few photographs by Gaussians just in front of each
+camera, while structure from motion knows where surfaces are.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from reffusion import geometry
 from reffusion.types import Camera
 
 MIN_POINTS = 30  # visible points that a view needs
-NEIGHBORS = 16  # nearest points that each pixel is interpolated from
+NEIGHBORS = 16  # number of nearest points from which each pixel is interpolated
 REFERENCE_WIDTH = 320  # px: distances are measured as if pictures were this wide
-COLOR_WEIGHT = 0.25  # of these pixels, for a unit of CIELAB
-MIN_DISTANCE = 2.0  # of these pixels: nearer points do not get a higher weight
+COLOR_WEIGHT = 0.25  # such pixels per unit of CIELAB: the distance that a difference in colour adds
+MIN_DISTANCE = 2.0  # such pixels: nearer points get hardly more weight
 OCCLUSION_NEIGHBORS, OCCLUSION_RATIO = (
     8,
     1.06,
@@ -33,12 +33,12 @@ MEDIAN_SIZE = 5  # px, window of the median filter over the result
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """A scene's sparse points with the normals of the surfaces they lie on.
+    """A scene's sparse points, with the normals of the surfaces on which they lie.
 
     Attributes:
         positions: [P, 3].
         colors: [P, 3] uint8.
-        normals: [P, 3], of unit length and either sign.
+        normals: [P, 3] unit vectors of either sign.
     """
 
     positions: np.ndarray
@@ -47,7 +47,12 @@ class SparsePoints:
 
     @classmethod
     def of(cls, positions: np.ndarray, colors: np.ndarray) -> SparsePoints:
-        """Estimate normals by robust fits of planes to each point's neighbours. Needs P > `NORMAL_NEIGHBORS`."""
+        """Build `SparsePoints`, with normals estimated by robust fits of planes to the neighbours of each point.
+
+        Args:
+            positions: [P, 3] with P >= `NORMAL_NEIGHBORS`.
+            colors: [P, 3] uint8.
+        """
         _, index = cKDTree(positions).query(positions, k=NORMAL_NEIGHBORS)
         neighbors = positions[index]
         weights, normals = np.ones(index.shape), np.zeros(positions.shape)
@@ -65,12 +70,13 @@ class SparsePoints:
 
 @dataclass(frozen=True)
 class DepthSamples:
-    """Samples of a view's depth.
+    """Samples of the depth in one view.
 
     Attributes:
-        pixels: [S, 2] coordinates (x, y).
-        planes: [S, 3] of the surface there: plane . (x, y, 1) = 1/z along the ray through (x, y, 1).
-        disparity: [S] of the plane at the pixel.
+        pixels: [S, 2] image points (x, y) in pixels.
+        planes: [S, 3], the plane of the surface at each sample, in camera axes: plane . (x, y, 1) = 1/z, where 1/z is
+            the disparity at which the ray (x, y, 1) meets the plane.
+        disparity: [S], the disparity of each sample.
     """
 
     pixels: np.ndarray
@@ -78,11 +84,11 @@ class DepthSamples:
     disparity: np.ndarray
 
     def select(self, selection: np.ndarray) -> DepthSamples:
-        """The samples chosen by a boolean mask or indices."""
+        """Return the samples chosen by a boolean mask [S] or by indices."""
         return DepthSamples(self.pixels[selection], self.planes[selection], self.disparity[selection])
 
     def concatenate(self, other: DepthSamples) -> DepthSamples:
-        """The samples of both."""
+        """Return these samples followed by those of `other`."""
         pairs = zip(
             (self.pixels, self.planes, self.disparity), (other.pixels, other.planes, other.disparity), strict=True
         )
@@ -90,9 +96,15 @@ class DepthSamples:
 
 
 def visible_samples(points: SparsePoints, camera: Camera, image: np.ndarray) -> DepthSamples:
-    """The points that are visible in a photograph, uint8 [H, W, 3].
+    """Return the sparse points that are visible in a photograph, as samples of its depth.
 
-    They are in its frame, not behind most of the points around them, and of the colour the photograph has there.
+    A visible point lies in the photograph's frame, is not behind most of the points around it, and has about the colour
+    of the photograph at its pixel.
+
+    Args:
+        points: The scene's sparse points.
+        camera: The camera of the photograph.
+        image: uint8 [H, W, 3], the photograph.
     """
     pixels, disparity, index = _visible_points(points, camera, image)
     normals = points.normals[index]
@@ -102,14 +114,19 @@ def visible_samples(points: SparsePoints, camera: Camera, image: np.ndarray) -> 
 
 
 def interpolate_depth(samples: DepthSamples, camera: Camera, image: np.ndarray) -> np.ndarray | None:
-    """[H, W] float64 camera z of a photograph, at every pixel; None if there are fewer than `MIN_POINTS` samples.
+    """Return the depth of a photograph at every pixel, interpolated between samples: [H, W] float64 camera z.
 
-    Each pixel is interpolated from the samples nearest to it in position and colour, so that samples across an edge do
-    not count. Each sample proposes the disparity of its plane at the pixel. The weighted median is taken, so that depth
-    steps from one surface to the next instead of sloping.
+    Each pixel uses the samples that are nearest to it in position and colour, so that samples across an edge do not
+    count. Each of these samples proposes the disparity of its plane at the pixel, and the weighted median of the
+    proposals is taken. With the median, depth steps from one surface to the next instead of sloping.
 
     Args:
+        samples: The samples of the depth.
+        camera: The camera of the photograph.
         image: uint8 [H, W, 3], the photograph.
+
+    Returns:
+        None if there are fewer than `MIN_POINTS` samples.
     """
     if len(samples.pixels) < MIN_POINTS:
         return None
@@ -132,7 +149,7 @@ def interpolate_depth(samples: DepthSamples, camera: Camera, image: np.ndarray) 
 def _visible_points(
     points: SparsePoints, camera: Camera, image: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels [S, 2], disparities [S] and indices [S] of the points that are visible in a photograph."""
+    """Return image points [S, 2], disparities [S] and indices [S] of the points that are visible in a photograph."""
     uv, z = geometry.project(points.positions, camera)
     with np.errstate(invalid="ignore"):
         in_frame = (z > 0) & (uv >= 0).all(1) & (uv < (camera.width, camera.height)).all(1)
@@ -153,7 +170,7 @@ def _visible_points(
 
 
 def _weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """[N]: medians of values [N, K] under weights [N, K] > 0."""
+    """Return [N], the weighted median of each row of `values` [N, K], with `weights` [N, K] > 0."""
     order = np.argsort(values, axis=1)
     cumulative = np.take_along_axis(weights, order, axis=1).cumsum(1)
     middle = (cumulative < 0.5 * cumulative[:, -1:]).sum(1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The critic of the adversarial term with its optimizer (RefFusion section 4.3): training, judging, checkpoints."""
+"""The critic of the adversarial term and its optimizer (RefFusion section 4.3)."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from reffusion import seeding
 from reffusion.distill.discriminator import Critic, critic_loss, generator_loss, gradient_penalty
 from reffusion.params.distill import AdversarialTerm
 
-LEARNING_RATE = 1e-3  # PAPER leaves open: the critic's step size; GANeRF's, of RMSprop
+LEARNING_RATE = 1e-3  # PAPER leaves open: the critic's step size. This is GANeRF's, for RMSprop
 
 
 class Adversary:
     """A critic and its optimizer. Patches are [P, 3, size, size] in [-1, 1].
 
     Args:
-        seed: of the critic's first weights.
-        rate: RMSprop's step size.
+        choices: Parameters of the adversarial term, among them the size of patches.
+        seed: Seed of the critic's initial weights.
+        device: The device of the critic.
+        rate: Step size of RMSprop.
     """
 
     def __init__(
@@ -30,12 +32,18 @@ class Adversary:
         self._optimizer = torch.optim.RMSprop(self.critic.parameters(), lr=rate)
 
     def train_step(self, real: Tensor, fake: Tensor) -> dict[str, float]:
-        """Takes one step of the critic. No gradient reaches what the patches were made from.
+        """Train the critic for one step. No gradient flows through the patches.
+
+        Args:
+            real: Patches of a reference.
+            fake: Patches of a rendered view, as many as `real`.
 
         Returns:
-            critic_loss, and critic_slope: the R1 penalty before its weight, the mean of ||dD / d patch||^2.
+            Values for the trace: "critic_loss", and, if the penalty is on, "critic_slope", which is the R1 penalty
+                before its weight, i.e. the mean of ||dD / d patch||^2.
+
         Raises:
-            FloatingPointError: the loss or its gradient is not finite; the critic is unchanged.
+            FloatingPointError: The loss or its gradient is not finite. The critic's weights are unchanged.
         """
         patches = {"real": real.detach(), "fake": fake.detach()}
         side = self.choices.penalized
@@ -57,14 +65,17 @@ class Adversary:
         return log
 
     def generator_loss(self, fake: Tensor) -> Tensor:
-        """The loss of what the fake patches were made from, differentiable in them; no gradient for the critic."""
+        """Return the loss that rewards fake patches which the critic takes for real.
+
+        The loss is differentiable in the patches. The critic's weights get no gradient.
+        """
         self.critic.requires_grad_(False)
         scores = self.critic(fake)
         self.critic.requires_grad_(True)
         return generator_loss(scores, self.choices.form)
 
     def state_dict(self) -> dict[str, Any]:
-        """The state from which `load_state_dict` continues, bit for bit."""
+        """Return the state from which `load_state_dict` continues, bit for bit."""
         return {"critic": self.critic.state_dict(), "optimizer": self._optimizer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

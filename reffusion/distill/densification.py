@@ -1,4 +1,4 @@
-"""Densification under distillation: the masked Gaussians with the largest gradients are cloned or split."""
+"""Densification in the stage `distill`: masked Gaussians with the largest gradients are cloned or split."""
 
 from __future__ import annotations
 
@@ -7,20 +7,22 @@ import torch
 from reffusion.gaussians.densify import densify, prune
 from reffusion.gaussians.optimize import GaussianOptimizer
 
-GROW_SCALE3D = 0.01  # standard deviation from which a Gaussian is split rather than cloned, units of the scene
-DENSIFIED_SHARE = 0.05  # of the masked Gaussians, each time
+GROW_SCALE3D = 0.01  # standard deviation above which a Gaussian is split, not cloned; in units of the scene
+DENSIFIED_SHARE = 0.05  # share of the masked Gaussians that is cloned or split each time
 CAP_MAX = 2_000_000  # the largest number of Gaussians
-PRUNE_OPA = 0.005  # opacity below which Gaussians are pruned when others are added
+PRUNE_OPA = 0.005  # opacity below which Gaussians are pruned after each densification
 
 
 def densify_masked(optimizer: GaussianOptimizer, generator: torch.Generator) -> None:
-    """Clones or splits the `DENSIFIED_SHARE` of masked Gaussians with the largest screen-space gradients, then prunes
-    every Gaussian, masked or not, of an opacity below `PRUNE_OPA`.
+    """Clone or split the masked Gaussians with the largest screen-space gradients, then prune faint Gaussians.
 
-    Only masked Gaussians grow, because the optimiser accumulates screen-space gradients of these alone.
+    The share `DENSIFIED_SHARE` of the masked Gaussians is cloned or split. All Gaussians, masked or not, whose opacity
+    is below `PRUNE_OPA` are pruned. Unmasked Gaussians are never cloned or split, because the optimizer accumulates
+    screen-space gradients of masked Gaussians only.
 
     Args:
-        generator: draws the positions of split Gaussians.
+        optimizer: Holds the Gaussians, which are changed in place, and their accumulated gradients.
+        generator: Draws the positions of split Gaussians.
     """
     if not optimizer.masked.any():
         return

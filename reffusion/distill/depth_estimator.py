@@ -1,4 +1,4 @@
-"""How the depth term finds the depth of a view: with a depth network, or by continuing the scene's own depth."""
+"""Estimators of a view's depth for the depth term: a depth network, or the continuation of the scene's own depth."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from reffusion.params.distill import Params
 
 
 class DepthEstimator(NamedTuple):
-    """Estimates the depth of a view.
+    """An estimator of the depth of a view.
 
     Attributes:
-        how: which rendered depth counts as known.
-        disparity: (what the view shows of the scene's depth, a function that returns the view with its hole repainted)
-            -> disparity [H, W] in the scene's units. The image, [H, W, 3] in [0, 1], is painted only if the function
-            is called. Raises Degenerate where the disparity is undetermined.
+        how: Settings of the estimate, which also determine at which pixels the rendered depth counts as known.
+        disparity: Function of a `ViewDepth` and of a function without arguments. It returns the disparity [H, W] in the
+            unit of the scene. The second argument returns the view with its hole repainted, [H, W, 3] in [0, 1]. This
+            function runs the diffusion prior, so it is called only if the picture is needed. The estimator raises
+            Degenerate if the view does not determine the disparity.
     """
 
     how: CompletionSettings
@@ -30,12 +31,16 @@ class DepthEstimator(NamedTuple):
 
 
 def build_estimator(params: Params, points: np.ndarray) -> DepthEstimator:
-    """The depth term's estimator: with a network if one is named, else the scene's own depth continued.
+    """Return the estimator of the depth term: with a depth network if the parameters name one, else without.
 
     Args:
+        params: Parameters of the stage `distill`.
         points: [P, 3] sparse points of the scene.
+
+    Raises:
+        ValueError: The network cannot be loaded (see `monocular.load_network`).
     """
-    # PAPER leaves open: whether an estimate is aligned by least squares or robustly on known pixels; least squares.
+    # PAPER leaves open: whether an estimate is aligned by least squares or robustly. Here it is least squares.
     how = CompletionSettings(robust=False, seed=params.seed)
     if not params.depth.model:
         return continuation_estimator(points, how)
@@ -44,19 +49,23 @@ def build_estimator(params: Params, points: np.ndarray) -> DepthEstimator:
 
 
 def continuation_estimator(points: np.ndarray, how: CompletionSettings) -> DepthEstimator:
-    """An estimator without a depth network: it continues the scene's own depth around the hole through it.
+    """Return an estimator without a depth network, which continues the scene's own depth into the hole.
 
     Args:
         points: [P, 3] sparse points of the scene.
+        how: Settings of the continuation.
     """
     return DepthEstimator(how, lambda view, picture: background_depth.continue_depth(view, picture, points, how)[0])
 
 
 def network_estimator(network: Callable[[Tensor], Tensor], how: CompletionSettings) -> DepthEstimator:
-    """The paper's estimator: a network's depth of the repainted view, aligned and passed through the bilateral solver.
+    """Return the paper's estimator, which takes a network's depth of the repainted view.
+
+    The depth is aligned with the scene and corrected by the bilateral solver (`estimates.align_estimate`).
 
     Args:
-        network: [3, H, W] in [0, 1] -> [H, W] disparity up to scale and offset.
+        network: Function of a picture [3, H, W] in [0, 1] that returns disparity [H, W] up to scale and offset.
+        how: Settings of the alignment.
     """
 
     def disparity(view: ViewDepth, picture: Callable[[], np.ndarray]) -> np.ndarray:

@@ -1,8 +1,8 @@
 """The patch critic of the adversarial term (RefFusion section 4.3): StyleGAN2's residual discriminator and its losses.
 
-The losses are written with f(x) = -log(1 + exp(-x)), the logarithm of the logistic function, and the critic's score D,
-which is large for patches that it takes for real. The critic maximises f(D(real)) + f(-D(fake)); the generator, here
-the Gaussians, minimises it.
+The losses are written with f(x) = -log(1 + exp(-x)), the logarithm of the logistic function, and with the critic's
+score D of a patch, which is high if the critic takes the patch for real. The critic maximises f(D(real)) + f(-D(fake)).
+The generator, here the Gaussians, minimises it.
 
 PAPER leaves open: details of the discriminator beyond StyleGAN2's name. We take its residual form, equalised learning
 rates, the anti-aliasing filter [1, 3, 3, 1] before each downsampling, and the minibatch standard deviation over groups
@@ -28,9 +28,10 @@ GROUP = 4  # patches in a group of the minibatch standard deviation
 
 
 class Convolution(nn.Module):
-    """A square convolution with equalised learning rate: unit normal weights, divided by sqrt(fan-in) when used.
+    """A square convolution with equalised learning rate.
 
-    All layers' weights then have the same scale, and an optimizer step changes all layers by the same proportion.
+    Its weights are standard normal at first, and are divided by sqrt(fan-in) when they are used. So the weights of all
+    layers have the same scale, and an optimizer step changes all layers by the same proportion.
     """
 
     def __init__(self, inputs: int, outputs: int, side: int, generator: torch.Generator, stride=1, padding=0):
@@ -44,7 +45,7 @@ class Convolution(nn.Module):
 
 
 class Linear(nn.Module):
-    """A linear layer with equalised learning rate, as `Convolution`."""
+    """A linear layer with equalised learning rate, like `Convolution`."""
 
     def __init__(self, inputs: int, outputs: int, generator: torch.Generator):
         super().__init__()
@@ -57,7 +58,7 @@ class Linear(nn.Module):
 
 
 class DownBlock(nn.Module):
-    """A residual block that downsamples by 2: [B, C, size, size] -> [B, C', size / 2, size / 2], size even."""
+    """A residual block that halves the size: [B, C, size, size] -> [B, C', size / 2, size / 2], for an even size."""
 
     def __init__(self, size: int, inputs: int, outputs: int, generator: torch.Generator):
         super().__init__()
@@ -73,14 +74,15 @@ class DownBlock(nn.Module):
 
 
 class Critic(nn.Module):
-    """Patches [B, 3, size, size] in [-1, 1] -> scores [B].
+    """The discriminator, which maps patches [B, 3, size, size] in [-1, 1] to scores [B].
 
     Args:
-        size: side of a patch in pixels, 8, 16, 32, ...
-        width: channels at that size; doubled with each downsampling, 512 at most.
-        generator: on the CPU; draws the initial weights.
+        size: Side of a patch in pixels: 8, 16, 32, ...
+        width: Number of channels at full size. It doubles with each downsampling, up to 512.
+        generator: Draws the initial weights, on the CPU.
+
     Raises:
-        ValueError: another size; a batch that is not a multiple of 4 patches (see `append_minibatch_std`).
+        ValueError: The size is another one, or a batch is not a multiple of 4 patches (see `append_minibatch_std`).
     """
 
     def __init__(self, size: int, width: int, generator: torch.Generator):
@@ -106,15 +108,19 @@ class Critic(nn.Module):
 
 
 def scaled_leaky_relu(x: Tensor) -> Tensor:
-    """Leaky ReLU times `GAIN`."""
+    """Return the leaky ReLU of `x`, multiplied by `GAIN`."""
     return F.leaky_relu(x, SLOPE) * GAIN
 
 
 def binomial_filter(size: int, padding: int) -> Tensor:
-    """[size + 2 padding - 3, size]: the convolution of a zero-padded row with [1, 3, 3, 1] / 8, as a matrix.
+    """Return the matrix [size + 2 padding - 3, size] that convolves a zero-padded row with [1, 3, 3, 1] / 8.
 
-    Multiplying an image by it from both sides filters rows and columns, which on the CPU is many times faster than a
+    An image is filtered by multiplying it with this matrix from both sides. On the CPU this is many times faster than a
     convolution per channel.
+
+    Args:
+        size: Length of the row.
+        padding: Number of zeros at each end of the row, at least 1.
     """
     matrix = torch.zeros(size + 2 * padding - 3, size + 2 * padding)
     for tap, weight in enumerate((1, 3, 3, 1)):
@@ -123,11 +129,15 @@ def binomial_filter(size: int, padding: int) -> Tensor:
 
 
 def append_minibatch_std(features: Tensor, group: int = GROUP) -> Tensor:
-    """Appends the minibatch standard deviation as a channel: [B, C, h, w] -> [B, C + 1, h, w].
+    """Append the minibatch standard deviation as a channel: [B, C, h, w] -> [B, C + 1, h, w].
 
     The channel is constant within a group of patches. Its value is the standard deviation over the group, averaged over
-    channels and pixels, by which the critic recognises fake patches that are too similar. A group consists of every
-    (B / group)-th patch, so that consecutive patches are in different groups.
+    channels and pixels. By this value the critic recognises fake patches that are too similar to each other. A group
+    consists of every (B / group)-th patch, so consecutive patches are in different groups (if B > group).
+
+    Args:
+        features: [B, C, h, w].
+        group: Number of patches in a group.
 
     Raises:
         ValueError: B is no multiple of `group`.
@@ -142,16 +152,29 @@ def append_minibatch_std(features: Tensor, group: int = GROUP) -> Tensor:
 
 
 def critic_loss(real: Tensor, fake: Tensor) -> Tensor:
-    """-mean f(D(real)) - mean f(-D(fake)), from scores of any shape; finite at every finite score."""
+    """Return the loss of the critic, -mean f(D(real)) - mean f(-D(fake)).
+
+    It is finite for all finite scores.
+
+    Args:
+        real, fake: Scores of real and of fake patches, of any shape.
+    """
     return -F.logsigmoid(real).mean() - F.logsigmoid(-fake).mean()
 
 
 def generator_loss(fake: Tensor, form: Form = "non-saturating") -> Tensor:
-    """The loss that the generator minimises, from the scores of fake patches (any shape).
+    """Return the loss that the generator minimises.
 
-    PAPER leaves open: which form. "saturating", mean f(-D(fake)), is the critic's own objective; its gradient vanishes
-    where the critic is certain. "non-saturating", -mean f(D(fake)), has the same fixed point, and its gradient is
-    largest there.
+    PAPER leaves open: which form. "saturating", mean f(-D(fake)), is the critic's own objective, whose gradient
+    vanishes where the critic is certain that a patch is fake. "non-saturating", -mean f(D(fake)), has the same fixed
+    point, and its gradient is largest there.
+
+    Args:
+        fake: Scores of fake patches, of any shape.
+        form: One of the two forms.
+
+    Raises:
+        ValueError: `form` is unknown.
     """
     if form == "saturating":
         return F.logsigmoid(-fake).mean()
@@ -161,27 +184,32 @@ def generator_loss(fake: Tensor, form: Form = "non-saturating") -> Tensor:
 
 
 def gradient_penalty(scores: Tensor, patches: Tensor) -> Tensor:
-    """R1: the mean over patches of ||dD / d patch||^2, differentiable in the critic's weights.
+    """Return the R1 penalty, the mean over patches of ||dD / d patch||^2, differentiable in the critic's weights.
 
     Args:
-        scores: [B], the critic's scores of `patches`. patches: [B, 3, n, n], requiring a gradient.
+        scores: [B], the critic's scores of `patches`.
+        patches: [B, 3, n, n], requiring a gradient.
     """
     (slope,) = torch.autograd.grad(scores.sum(), patches, create_graph=True)
     return slope.square().flatten(1).sum(1).mean()
 
 
 def gather_patches(image: Tensor, windows: Tensor, size: int) -> Tensor:
-    """Crops patches from an image in one indexing call: [C, H, W] -> [P, C, size, size], differentiable.
+    """Crop patches from an image in one indexing call: [C, H, W] -> [P, C, size, size], differentiable.
 
     Args:
-        windows: [P, 2] long, (top, left) of each patch, which lies inside the image.
+        image: [C, H, W].
+        windows: long [P, 2], (top, left) of each patch. The patches lie inside the image.
+        size: Side of a patch in pixels.
     """
     return _Gather.apply(image, windows, size)
 
 
 class _Gather(torch.autograd.Function):
-    """Indexing whose gradient is summed patch by patch, so that it is deterministic. The gradient of torch's own
-    indexing is summed in the order in which threads finish."""
+    """Indexing with a deterministic gradient, which is summed patch by patch.
+
+    The gradient of torch's own indexing is summed in the order in which threads finish.
+    """
 
     @staticmethod
     def forward(ctx, image: Tensor, windows: Tensor, size: int) -> Tensor:

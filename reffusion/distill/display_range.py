@@ -1,4 +1,4 @@
-"""Rendered colours as an 8-bit image can show them."""
+"""The limitation of rendered colours to the range of an 8-bit image."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from torch.autograd.function import once_differentiable
 
 
 def clamp_to_display(color: Tensor) -> Tensor:
-    """Clamps colours to [0, 1]; the gradient passes unless it would drive a colour further out of this range.
+    """Clamp colours to [0, 1]. The gradient passes, unless it would move a colour further out of this range.
 
-    PAPER leaves open: colours above 1. Spherical harmonics can add up to them, and neither the prior nor the critic
-    was trained on any. A plain clamp has no gradient there, so such colours would never return; passing every gradient
-    would let white grow without limit.
+    PAPER leaves open: colours above 1. Spherical harmonics can produce them, and neither the prior nor the critic was
+    trained on such colours. A plain clamp has no gradient there, so such colours would never return. If every gradient
+    passed, white could grow without limit.
     """
     return _ClampToDisplay.apply(color)
 

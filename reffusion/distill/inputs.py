@@ -1,4 +1,4 @@
-"""What distillation starts from: whether SDS runs, the initialization, the adapted prior, and the training views."""
+"""Inputs of the stage `distill`: the initialization, the adapted prior, the training views, and whether SDS runs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,17 @@ from reffusion.workspace import Workspace
 
 
 def resolve_sds(params: Params, initialize: Path) -> tuple[Params, str]:
-    """Decides whether SDS runs: the parameters, with `sds.weight` 0 if it does not, and the decision in words."""
+    """Decide whether SDS runs, and return the resulting parameters and the decision in words.
+
+    With `distill.sds.run: auto`, the decision is that of the stage `initialize`, read from its facts.json.
+
+    Args:
+        params: Parameters of the stage `distill`.
+        initialize: The folder of the stage `initialize`.
+
+    Returns:
+        The parameters, in which `sds.weight` is 0 if SDS does not run, and the decision.
+    """
     if params.sds.weight == 0 or params.sds.run == "always":
         return params, "runs" if params.sds.weight else "weight 0"
     never = {"sds_reason": "distill.sds.run is never"}
@@ -38,7 +48,18 @@ def resolve_sds(params: Params, initialize: Path) -> tuple[Params, str]:
 def load_initialization(
     params: Params, scene: Scene, reference: Path, initialize: Path
 ) -> tuple[Gaussians, Tensor, list[ReferenceHole]]:
-    """The initialization's Gaussians and labels, and the references with their holes, on the device."""
+    """Load the Gaussians of the initialization, their labels, and the references, onto the device of the parameters.
+
+    Args:
+        params: Parameters of the stage `distill`.
+        scene: The scene with its cameras.
+        reference: The folder of the stage `reference`.
+        initialize: The folder of the stage `initialize`.
+
+    Returns:
+        The Gaussians; the labels, bool [N], True for masked Gaussians (the new ones); and the references with their
+            holes.
+    """
     initial = load_ply(initialize / "gaussians.ply", device=params.device)
     masked = load_labels(initialize / "labels.npy").to(params.device)
     to_device = lambda array: torch.from_numpy(array).to(params.device)
@@ -47,7 +68,17 @@ def load_initialization(
 
 
 def load_adapted_prior(params: Params, personalize: Path | None) -> tuple[Prior | None, Tensor | None]:
-    """The personalized prior without its text encoder, and the prompts' embeddings; (None, None) if no term uses it."""
+    """Load the personalized prior without its text encoder, and the embeddings of the prompts.
+
+    Args:
+        params: Parameters of the stage `distill`.
+        personalize: The folder of the stage `personalize`, whose LoRA is merged into the prior. None if the prior is
+            not adapted.
+
+    Returns:
+        The prior, and [3, L, D], the embeddings of the global, the local and the empty prompt. (None, None) if no term
+            uses the prior.
+    """
     if not params.needs_prior:
         return None, None
     prior = load_prior(params.prior, params.device, params.dtype)
@@ -61,10 +92,16 @@ def load_adapted_prior(params: Params, personalize: Path | None) -> tuple[Prior 
 def load_train_views(
     params: Params, space: Workspace, initialize: Path | None = None, lift: Path | None = None
 ) -> list[TrainView]:
-    """The training views with the pixels that may supervise, those to repaint, and their images inpainted in 2D.
+    """Load the training views: photographs, the pixels that may supervise, the pixels to repaint, and lifted images.
 
-    Where `initialize` found pixels that the object shadows, these do not supervise; where it reduced a view's invent
-    mask, the reduced one counts.
+    Pixels that `initialize` found to be in the object's shadow do not supervise. If `initialize` reduced the invent
+    mask of a view, the reduced mask is used.
+
+    Args:
+        params: Parameters of the stage `distill`.
+        space: The results of the earlier stages.
+        initialize: The folder of the stage `initialize`. None: there are no shadows and no reduced masks.
+        lift: The folder of the stage `lift`, which inpaints training views in 2D. None: no view has a lifted image.
     """
     scene, sets, photos = space.scene, dict(space.mask_sets), space.load_photos(space.scene.train)
     to_device = lambda array: torch.from_numpy(array).to(params.device)
@@ -77,7 +114,7 @@ def load_train_views(
         clean, pixels = name in scene.clean, sets[name]
         hidden = pixels.consistent | pixels.invent  # a region to fill is part of the paper's mask m
         repaint = (pixels.invent if params.repaint == "invent" else hidden) & (not clean)
-        # C shows the object. Where I reaches beyond C, it is the place of an object to be inserted.
+        # C shows the object. Pixels of I outside C are the place of an object to be inserted.
         supervises = (~hidden | clean) & (name not in scene.blank)
         if name in shadows:
             supervises &= ~load_mask(shadows[name])

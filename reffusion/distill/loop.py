@@ -9,6 +9,10 @@ depth            the hole                                        masked, all but
 adversarial      patches around the hole                         masked (or all), spherical harmonics only
 reference        the reference's hole (not in the paper)         masked (or all)
 lift             the hole, or patches around it (for baselines)  masked
+
+C is the consistent mask (the object), I is the invent mask (the pixels to invent), and the hole of a view consists of
+the pixels that are repainted. A view is clean if the object is absent from it. Masked Gaussians are those that the
+initialization added; all others are unmasked.
 """
 
 from __future__ import annotations
@@ -45,13 +49,15 @@ REGION_EVERY = 50  # steps between prunings of Gaussians that changed region
 
 @dataclass(frozen=True)
 class Objective:
-    """The weighted sum of terms that a distillation minimises.
+    """The weighted sum of terms that the distillation minimises.
 
     Attributes:
-        terms: those that are on, in the order in which their gradients are added.
-        latest: what every line of the trace repeats: last values of terms that are not computed in every step, and how
-            often views were skipped. It changes from step to step, and is part of checkpoints.
-        worker: computes background terms.
+        terms: The terms that are on, in the order in which their gradients are added.
+        references: The references, on whose holes the PSNR in the trace is measured.
+        settings: Parameters of the stage `distill`.
+        latest: Values that are repeated in every line of the trace: the last values of terms that are not computed in
+            every step, and the numbers of skipped views. They change from step to step, and checkpoints contain them.
+        worker: Computes the terms that run apart (see `Term`).
     """
 
     terms: Sequence[Term]
@@ -62,13 +68,17 @@ class Objective:
 
 
 def build_objective(inputs: TermInputs, settings: Params) -> Objective:
-    """The objective of a distillation.
+    """Build the objective of a distillation from its inputs.
+
+    Args:
+        inputs: What the scene provides for the terms.
+        settings: Parameters of the stage `distill`.
 
     Raises:
-        ValueError: a term lacks what it needs.
+        ValueError: A term lacks an input that it needs.
     """
     terms = [term for module in TERMS if (term := module.build(inputs, settings)) is not None]
-    # A GPU does one thing after another.
+    # On a GPU nothing is gained, because it runs one kernel after another.
     overlaps = not inputs.masked_means.is_cuda and all(term.runs_apart or term.allows_overlap for term in terms)
     overlaps = overlaps and any(term.runs_apart for term in terms)
     return Objective(terms, inputs.references, settings, {}, OverlapWorker(torch.get_num_threads() if overlaps else 1))
@@ -77,22 +87,28 @@ def build_objective(inputs: TermInputs, settings: Params) -> Objective:
 def distill(
     initial: Gaussians, masked: Tensor, inputs: TermInputs, settings: Params, folder: Path, rates: Rates | None = None
 ) -> tuple[Gaussians, Tensor]:
-    """Optimises an initialization. Resumes from the checkpoint in `folder`, bit for bit on the CPU.
+    """Optimise an initialization, from the start or from the checkpoint in `folder` (bit for bit on the CPU).
+
+    A line of the trace contains: reconstruction and lift (the values of these terms), reference_psnr (in the holes of
+    the references), sds_gradient_mean and sds_gradient_max (norm of the weighted SDS gradient per masked Gaussian;
+    absent if the view is too far from every reference), depth (the last value of the depth term),
+    depth_skipped_<reason> (number of views skipped so far), adversarial (the generator's loss), critic_loss,
+    critic_slope (R1 without its weight), gaussians and masked_gaussians (numbers of Gaussians).
 
     Args:
-        initial, masked: the Gaussians and their labels [N] bool; everything else is on their device.
-        inputs: what the terms are built from.
-        folder: gets trace.jsonl, checkpoints, and snapshots/ of the masked Gaussians. A line of the trace:
-            reconstruction and lift (those terms' values), reference_psnr (in the references' holes),
-            sds_gradient_mean and _max (norm of the weighted SDS gradient per masked Gaussian; none if the view is too
-            far from every reference), depth (the last depth term's value), depth_skipped_<reason> (how often so far),
-            adversarial (the generator's loss), critic_loss, critic_slope (R1 unweighted), gaussians, masked_gaussians.
-        rates: Adam's step sizes; None: 3DGS's, by `settings.lr.means_unit`.
+        initial: The Gaussians of the initialization. All tensors of the inputs are on their device.
+        masked: bool [N], True for masked Gaussians (those that the initialization added).
+        inputs: What the scene provides for the terms.
+        settings: Parameters of the stage `distill`.
+        folder: Receives trace.jsonl, checkpoints, and snapshots of the masked Gaussians in snapshots/.
+        rates: Step sizes of Adam. None: those of 3DGS, in the unit that `settings.lr.means_unit` names.
+
     Returns:
-        The Gaussians, detached, and their labels.
+        The optimised Gaussians, detached, and their labels, bool [M].
+
     Raises:
-        FloatingPointError: a value or gradient is not finite; names step, term and view.
-        ValueError: a term lacks what it needs: a prior, an estimator, a hole in a reference.
+        FloatingPointError: A value or a gradient is not finite. The message names step, term and view.
+        ValueError: A term lacks an input: a prior, a depth estimator, or a hole in a reference.
     """
     objective = build_objective(inputs, settings)
     rates = rates or rates_of(settings.lr, [view.camera for view in inputs.views])
@@ -122,7 +138,13 @@ def distill(
 
 
 def take_step(optimizer: GaussianOptimizer, step: int, objective: Objective) -> dict[str, float]:
-    """One step of Adam along the gradient of the weighted sum. Returns what the terms log."""
+    """Take one step of Adam along the gradient of the weighted sum, and return the values that the terms log.
+
+    Args:
+        optimizer: Holds the Gaussians, which are changed.
+        step: Number of the step, from 0.
+        objective: The weighted sum.
+    """
     background, foreground = [], []
     for term in objective.terms:
         (background if term.runs_apart else foreground).append(term)
@@ -151,13 +173,14 @@ def take_step(optimizer: GaussianOptimizer, step: int, objective: Objective) -> 
 
 
 class _Contribution(NamedTuple):
-    """What a term contributes to a step beside its gradient.
+    """The contribution of a term to a step, apart from its gradient.
 
     Attributes:
-        moved: [N] bool, the Gaussians that it may move: those it reaches that are in its rendering.
-        log, latest: see `TermValue`.
-        skipped: key of the trace by which skipped views are counted; empty if the view was not skipped.
-        screen_gradient: arguments of `GaussianOptimizer.observe`.
+        moved: bool [N], the Gaussians that the step may move for this term: those that it reaches and that are in its
+            rendering.
+        log, latest: See `TermValue`.
+        skipped: Key of the trace under which skipped views are counted. It is empty if the view was not skipped.
+        screen_gradient: Arguments of `GaussianOptimizer.observe`; None if the term does not drive densification.
     """
 
     moved: Tensor
@@ -168,7 +191,20 @@ class _Contribution(NamedTuple):
 
 
 def _add_gradient(term: Term, step: int, gaussians: Gaussians, masked: Tensor) -> _Contribution | None:
-    """Adds the gradient of a weighted term to the Gaussians' `.grad`. None if this step is without it."""
+    """Add the gradient of a weighted term to the `.grad` of the Gaussians.
+
+    If the view does not determine the loss (Degenerate), no gradient is added, and the contribution only counts the
+    view as skipped.
+
+    Args:
+        term: The term.
+        step: Number of the step, from 0.
+        gaussians: Leaf tensors that accumulate the gradient.
+        masked: bool [N], True for masked Gaussians.
+
+    Returns:
+        None if the term is not computed in this step.
+    """
     if step % term.every or (term.fills_hole and not masked.any()):
         return None
     view = term.select_view(step // term.every)
@@ -204,7 +240,7 @@ def _backward(loss: Tensor, gaussians: Gaussians) -> None:
 
 @contextmanager
 def _name_failure(step: int, term: Term, camera: Camera) -> Iterator[None]:
-    """Adds step, term and view to the message of a FloatingPointError."""
+    """Add step, term and view to the message of a FloatingPointError that is raised inside this context."""
     try:
         yield
     except FloatingPointError as error:
@@ -212,7 +248,7 @@ def _name_failure(step: int, term: Term, camera: Camera) -> Iterator[None]:
 
 
 def _gradient_norms(gaussians: Gaussians, masked: Tensor) -> Tensor:
-    """[M]: the norm of each masked Gaussian's accumulated gradient, over all of its parameters."""
+    """Return [M], the norm of each masked Gaussian's accumulated gradient, over all of its parameters."""
     total = torch.zeros(int(masked.sum()), device=masked.device)
     for name in PARAMETERS:
         gradient = getattr(gaussians, name).grad
@@ -227,10 +263,14 @@ def _densifies_after(settings: Params, done: int) -> bool:
 
 
 def average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
-    """Lets a run without densification end with the mean of the Gaussians after its last steps.
+    """Average the Gaussians over the last steps of a run, and replace them by this mean after the last step.
+
+    A run with densification is not averaged.
 
     Args:
-        done: the number of steps so far.
+        optimizer: Holds the Gaussians and their running mean.
+        settings: Parameters of the stage `distill`.
+        done: Number of steps so far.
     """
     if not settings.densify.every and done > AVERAGED_FROM * settings.iterations:
         optimizer.remember()
@@ -239,12 +279,15 @@ def average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
 
 
 def rates_of(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:
-    """3DGS's step sizes, in the unit that `lr.means_unit` names."""
+    """Return the step sizes of 3DGS, in the unit that `lr.means_unit` names.
+
+    With the unit "cameras", the step sizes of positions are multiplied by the extent of the cameras.
+    """
     return Rates().in_units_of(cameras_extent(cameras)) if lr.means_unit == "cameras" else Rates()
 
 
 def masked_factors(lr: LearningRates) -> dict[str, float]:
-    """Parameter -> factor on the step sizes of masked Gaussians."""
+    """Return the factor on the step size of masked Gaussians, by the name of the parameter."""
     shape = lr.masked * lr.shape
     factors = {"means": shape, "quaternions": shape, "log_scales": shape, "sh": lr.masked}
     return factors | {"opacity_logits": lr.masked * lr.opacities}
@@ -252,10 +295,13 @@ def masked_factors(lr: LearningRates) -> dict[str, float]:
 
 @dataclass
 class _Run:
-    """The state of a distillation, as checkpoints keep it.
+    """The state of a distillation, as checkpoints contain it.
 
     Attributes:
-        step, seconds: steps done so far; seconds spent at the last checkpoint.
+        optimizer: Holds the Gaussians.
+        objective: The weighted sum.
+        step: Number of steps so far.
+        seconds: Time spent up to the last checkpoint.
     """
 
     optimizer: GaussianOptimizer
@@ -265,7 +311,11 @@ class _Run:
 
     @classmethod
     def start_or_resume(cls, optimizer: GaussianOptimizer, objective: Objective, state: dict[str, Any] | None) -> _Run:
-        """A run at its start, or at a checkpoint's `state`."""
+        """Return a run at its start, or at a checkpoint.
+
+        Args:
+            state: The state in the checkpoint (see `state_dict`). None starts a new run.
+        """
         run = cls(optimizer, objective)
         if state is not None:
             optimizer.load_state_dict(state["optimizer"])
@@ -287,10 +337,12 @@ class _Run:
 
 
 def _write_line(log: trace.Trace, run: _Run, line: dict[str, float]) -> None:
-    """Writes a line of the trace with its clock stopped.
+    """Write one line of the trace. The time that this takes is not counted.
 
     Args:
-        line: what the terms log.
+        log: The trace.
+        run: The state of the distillation.
+        line: The values that the terms logged in the last step.
     """
     optimizer, objective = run.optimizer, run.objective
     end = {"reason": "finished"} if run.step == objective.settings.iterations else {}
@@ -304,7 +356,7 @@ def _write_line(log: trace.Trace, run: _Run, line: dict[str, float]) -> None:
 
 @torch.no_grad()
 def _reference_psnr(gaussians: Gaussians, references: Sequence[ReferenceHole]) -> float:
-    """PSNR in dB over the pixels of all the references' holes."""
+    """Return the PSNR in dB over the pixels in the holes of all references together."""
     squared = [
         (render(gaussians, camera).color.clamp(0, 1) - image)[hole].square().flatten()
         for camera, image, hole in references
@@ -313,7 +365,10 @@ def _reference_psnr(gaussians: Gaussians, references: Sequence[ReferenceHole]) -
 
 
 def _save_snapshot(optimizer: GaussianOptimizer, folder: Path, done: int, steps: int) -> None:
-    """Saves the masked Gaussians after each part of the run but the last, as folder/snapshots/<steps done>.ply."""
+    """Save the masked Gaussians as folder/snapshots/<steps done>.ply, if a part of the run ends with this step.
+
+    The run has `SNAPSHOTS` parts. No snapshot is saved at the end of the last part, where the result is saved.
+    """
     part, masked = SNAPSHOTS * done // steps, optimizer.masked
     if SNAPSHOTS * (done - 1) // steps < part < SNAPSHOTS and masked.any():
         path = folder / "snapshots" / f"{done}.ply"

@@ -1,5 +1,7 @@
-"""Runs two parts of a step at the same time: the prior, whose small tensors gain nothing from more threads, and
-rendering."""
+"""Simultaneous execution of two parts of a step: the diffusion prior and the rendering.
+
+The prior's tensors are so small that more threads do not make it faster, so it runs on one thread beside the rendering.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +16,12 @@ T = TypeVar("T")
 
 
 class OverlapWorker:
-    """One thread for work in the background, the others for the foreground.
+    """An executor that runs background work on one thread while the foreground uses the remaining threads.
 
     Results do not depend on the number of threads.
 
     Args:
-        threads: in all; with 1 nothing overlaps.
+        threads: Total number of threads. With 1 nothing runs at the same time.
     """
 
     def __init__(self, threads: int):
@@ -29,10 +31,10 @@ class OverlapWorker:
 
     @contextmanager
     def overlap(self, work: Callable[[], T]) -> Iterator[Callable[[], T]]:
-        """Does `work` while the body of the `with` statement runs; before it if there is one thread only.
+        """Run `work` while the body of the `with` statement runs; with one thread, run it before the body.
 
-        Gives a function that returns the result of `work` or raises its exception. The context waits for `work` at its
-        end, even if the body raises.
+        The context manager gives a function that returns the result of `work` or raises its exception. At its end it
+        waits for `work`, even if the body raises.
         """
         if self._executor is None:
             result = work()

@@ -17,10 +17,13 @@ MIN_SIDE = 11  # px, the side of SSIM's window
 
 
 def load(device: str = "cpu") -> tuple[str, Distance]:
-    """The name of the distance, and the distance: LPIPS (vgg) if its weights are installed, else multi-scale D-SSIM.
+    """Return the name of a perceptual distance, and the distance as a function of two patches (see `Distance`).
+
+    The distance is LPIPS (VGG) if its weights are installed. Else the distance is the multi-scale D-SSIM, and the name
+    says why LPIPS is missing.
 
     Raises:
-        ValueError: LPIPS weights exist but are broken.
+        ValueError: The weights of LPIPS are installed but damaged.
     """
     model, missing = lpips.load("vgg")
     if model is None:
@@ -35,14 +38,16 @@ def load(device: str = "cpu") -> tuple[str, Distance]:
 
 
 def multi_scale_dssim(render: Tensor, target: Tensor) -> Tensor:
-    """Mean of 1 - SSIM over an image at full, half and quarter size, as far as a window fits into these.
+    """Return the mean of 1 - SSIM at full, half and quarter size, differentiable in `render`.
 
-    A substitute for LPIPS: both tolerate a slight blur of coarse structure, but this one knows nothing of textures.
+    It replaces LPIPS. Both tolerate a slight blur of coarse structure, but unlike LPIPS this distance does not
+    recognise textures. Sizes at which a side is shorter than SSIM's window of 11 px are left out.
 
     Args:
-        render, target: [H, W, 3] in [0, 1]; the gradient reaches `render`.
+        render, target: [H, W, 3] in [0, 1].
+
     Raises:
-        ValueError: a side is shorter than 11 px.
+        ValueError: A side is shorter than 11 px at full size.
     """
     if min(target.shape[:2]) < MIN_SIDE:
         raise ValueError(f"D-SSIM needs {MIN_SIDE} px a side; the patch has {target.shape[1]}x{target.shape[0]} px")
@@ -56,5 +61,5 @@ def multi_scale_dssim(render: Tensor, target: Tensor) -> Tensor:
 
 
 def _downsample(image: Tensor) -> Tensor:
-    """An image of half the size, [H, W, C] -> [H // 2, W // 2, C]."""
+    """Return an image [H, W, C] at half its size, [H // 2, W // 2, C]."""
     return F.avg_pool2d(image.permute(2, 0, 1)[None], 2)[0].permute(1, 2, 0)

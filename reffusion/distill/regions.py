@@ -1,4 +1,7 @@
-"""The region of space that the masked Gaussians belong to, and the Gaussians that cross its border."""
+"""The region of space to which the masked Gaussians belong, and the detection of Gaussians that cross its border.
+
+Masked Gaussians are those that the initialization added; all others are unmasked.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,15 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class VoxelRegion:
-    """The part of space the masked Gaussians belong to, as voxels of a grid around them.
+    """The part of space to which the masked Gaussians belong, as voxels of a grid around them.
 
     Attributes:
-        origin: [3], the grid's lowest corner. voxel: its pitch.
-        home: [X, Y, Z] bool, voxels within reach of a masked Gaussian of the initialization.
-        foreign: [X, Y, Z] bool, voxels that hold masked Gaussians of the initialization and have no unmasked one in
-            them or beside them.
+        origin: [3], the lowest corner of the grid.
+        voxel: Side of a voxel.
+        home: bool [X, Y, Z], True at voxels in which a masked Gaussian may be: those near a masked Gaussian of the
+            initialization.
+        foreign: bool [X, Y, Z], True at voxels in which no unmasked Gaussian may be: those that held a masked Gaussian
+            of the initialization, while neither they nor their 26 neighbours held an unmasked one.
     """
 
     origin: Tensor
@@ -27,14 +32,16 @@ class VoxelRegion:
 
 
 def build_region(means: Tensor, masked: Tensor, resolution: int = 32, reach: int = 2) -> VoxelRegion:
-    """The region of an initialization.
+    """Return the region of the masked Gaussians of an initialization.
 
     PAPER leaves open: the region whose border Gaussians must not cross. The masked Gaussians of the initialization lie
-    on the surfaces to be invented, so they mark it: the grid has `resolution` voxels along the diagonal of their
-    bounding box, and Gaussians may move within `reach` voxels of each.
+    on the surfaces to be invented, so they define the region.
 
     Args:
-        means: [N, 3]; masked: [N] bool with at least one True.
+        means: [N, 3], the centres of all Gaussians of the initialization.
+        masked: bool [N], True for masked Gaussians, of which there is at least one.
+        resolution: Number of voxels along the diagonal of the bounding box of the masked Gaussians.
+        reach: Number of voxels by which a Gaussian may be away from the masked Gaussians of the initialization.
     """
     masked_means = means[masked]
     low, high = masked_means.amin(0), masked_means.amax(0)
@@ -56,7 +63,13 @@ def build_region(means: Tensor, masked: Tensor, resolution: int = 32, reach: int
 
 
 def has_changed_region(region: VoxelRegion, means: Tensor, masked: Tensor) -> Tensor:
-    """[N] bool: masked Gaussians that have left the region and unmasked ones that have entered it. Both are pruned."""
+    """Return bool [N], the Gaussians to prune: masked ones that left the region, and unmasked ones that entered it.
+
+    Args:
+        region: The region of the initialization.
+        means: [N, 3], the present centres.
+        masked: bool [N], True for masked Gaussians.
+    """
     cells, is_inside = _grid_cells(means, region.origin, region.voxel, region.home.shape)
     home, foreign = torch.zeros_like(masked), torch.zeros_like(masked)
     home[is_inside] = region.home[tuple(cells[is_inside].T)]
@@ -65,6 +78,6 @@ def has_changed_region(region: VoxelRegion, means: Tensor, masked: Tensor) -> Te
 
 
 def _grid_cells(points: Tensor, origin: Tensor, voxel: float, shape) -> tuple[Tensor, Tensor]:
-    """([N, 3] long grid cells, [N] bool: is inside the grid)."""
+    """Return the cell of each point, long [N, 3], and whether the cell is inside the grid, bool [N]."""
     cells = ((points - origin) / voxel).floor().long()
     return cells, ((cells >= 0) & (cells < torch.tensor(list(shape), device=cells.device))).all(1)

@@ -1,8 +1,8 @@
 """The gradient of score distillation (RefFusion section 4.2), in latents.
 
 Every function takes tensors, plain numbers and one callable, the denoiser, so that tests can compare it with a
-distribution whose score is known. Notation: z is a clean latent and z_t = a z + s eps the noisy one, with
-a = sqrt(alpha_bar_t) and s = sqrt(1 - alpha_bar_t).
+distribution whose score is known. Notation: z is a clean latent and z_t = a z + s eps is the noisy one, with a =
+sqrt(alpha_bar_t) and s = sqrt(1 - alpha_bar_t).
 """
 
 from __future__ import annotations
@@ -18,7 +18,17 @@ Denoiser = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # (z_t [B, C, h, w
 
 
 def draw_timesteps(count: int, steps: int, low: float, high: float, generator: torch.Generator) -> Tensor:
-    """[count] long, uniform in [low, high] x `steps` (the number of the prior's training timesteps)."""
+    """Draw timesteps uniformly from a part of the noise schedule, long [count].
+
+    Args:
+        count: Number of timesteps to draw.
+        steps: Number of timesteps of the prior's schedule.
+        low, high: First and last timestep, as fractions of the schedule: 0 <= low < high <= 1.
+        generator: The source of randomness, on the CPU.
+
+    Raises:
+        ValueError: `low` and `high` violate this condition.
+    """
     if not 0 <= low < high <= 1:
         raise ValueError(f"timestep range must satisfy 0 <= low < high <= 1, got {low}..{high}")
     first, last = round(low * (steps - 1)), round(high * (steps - 1))
@@ -26,16 +36,18 @@ def draw_timesteps(count: int, steps: int, low: float, high: float, generator: t
 
 
 def match_contrast(x0: Tensor, latents: Tensor, mask: Tensor) -> Tensor:
-    """`x0` with its contrast inside the mask raised to that of the latents, as far as both show the same pattern.
+    """Return `x0` with its contrast inside the mask raised to that of the latents, as far as their patterns agree.
 
     A denoiser predicts the mean of all plausible images, which has less contrast than any of them. Repeated steps
-    towards it remove contrast from a rendering that was correct. So for each sample and channel, deviations x0' from
-    the mean inside the mask are multiplied by b = <z', x0'> / <x0', x0'>, the factor that minimises their squared
-    difference from the latents' deviations z'. A factor below 1 is replaced by 1, so that x0 may add contrast. A larger
-    one gives |b x0'| <= |z'|, so that contrast is never amplified beyond the latents' own.
+    towards this mean remove contrast from a rendering that was correct. So for each sample and channel, the deviations
+    x0' from the mean inside the mask are multiplied by b = <z', x0'> / <x0', x0'>. This factor minimises the squared
+    difference from the deviations z' of the latents. A factor below 1 is replaced by 1, so that x0 may add contrast.
+    With a factor above 1, |b x0'| <= |z'|, so the contrast never exceeds that of the latents.
 
     Args:
-        x0, latents: [B, C, h, w]. mask: [B, 1, h, w], 1 inside.
+        x0: [B, C, h, w], the clean latents predicted by the denoiser.
+        latents: [B, C, h, w], the latents of the rendering.
+        mask: [B, 1, h, w], 1 inside and 0 outside.
     """
     count = mask.sum((2, 3), keepdim=True).clamp(min=1)
     mean = (x0 * mask).sum((2, 3), keepdim=True) / count
@@ -57,7 +69,7 @@ def sds_gradient(
     keep_contrast: bool = False,
     mask: Tensor | None = None,
 ) -> Tensor:
-    """The SDS gradient w(t) (eps_theta(z_t, t) - eps), without the UNet's Jacobian (DreamFusion eq. 3).
+    """Return the SDS gradient w(t) (eps_theta(z_t, t) - eps), without the UNet's Jacobian (DreamFusion eq. 3).
 
     PAPER leaves open: w(t), the factor a of dz_t/dz (part of w here), and any normalisation (none here). Since
     eps_theta - eps = (a / s) (z - x0_theta), the weightings differ only by a function of t:
@@ -67,15 +79,21 @@ def sds_gradient(
 
     Args:
         latents: [B, C, h, w] clean latents z; no gradient flows here.
-        denoise: (z_t, t) -> (eps, x0), with guidance and conditioning applied.
+        denoise: Function of z_t and t that returns (eps, x0), with guidance and conditioning applied.
         timesteps: [B] long.
         noise: [B, C, h, w], standard normal, one for each latent.
         alphas_cumprod: [T], alpha_bar of every timestep.
-        keep_contrast: replaces x0_theta by `match_contrast` of it. Not in the paper.
-        mask: [B, 1, h, w], 1 where the gradient is kept; None keeps it everywhere. PAPER leaves open: whether it is
-            masked. The paper distils the whole view, and only masked Gaussians receive the gradient in any case.
+        weighting: The choice of w(t), see above.
+        keep_contrast: Whether the prediction x0_theta is replaced by `match_contrast` of x0_theta. Not in the paper.
+        mask: [B, 1, h, w], 1 where the gradient is kept and 0 where the gradient is set to zero. None keeps all of it.
+            PAPER leaves open: whether the gradient is masked. The paper distils the whole view, and only masked
+            Gaussians receive the gradient in any case.
+
     Returns:
         [B, C, h, w] without gradient.
+
+    Raises:
+        ValueError: `weighting` is unknown.
     """
     with torch.no_grad():
         alpha_bar = alphas_cumprod[timesteps].reshape(-1, 1, 1, 1)
@@ -99,15 +117,20 @@ def sds_gradient(
 
 
 def sds_loss(latents: Tensor, gradient: Tensor, reduction: Literal["sum", "mean"] = "sum") -> Tensor:
-    """A scalar whose gradient with respect to `latents` is the SDS gradient. Its value has no meaning.
+    """Return a scalar whose gradient with respect to `latents` is the SDS gradient. Its value has no meaning.
 
-    Sample 0 is the whole view and has weight 1; the others are patches, which are averaged: L_global + mean(L_local).
+    Sample 0 is the whole view and has weight 1. The other samples are patches, which are averaged: L_global +
+    mean(L_local).
 
     PAPER leaves open: "sum" (threestudio) or "mean" over a latent's elements.
 
     Args:
         latents: [1 + P, C, h, w], differentiable back to the rendering.
         gradient: [1 + P, C, h, w] from `sds_gradient`.
+        reduction: Whether the elements of a latent are summed or averaged.
+
+    Raises:
+        ValueError: `reduction` is unknown.
     """
     patches = latents.shape[0] - 1
     share = latents.new_full((latents.shape[0],), 1 / max(patches, 1))

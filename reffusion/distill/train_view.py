@@ -1,4 +1,4 @@
-"""The images that distillation is computed on: training views, and the holes of the references."""
+"""The images on which the loss is computed: training views, and references with their holes."""
 
 from __future__ import annotations
 
@@ -13,17 +13,19 @@ from reffusion.types import Camera
 
 @dataclass(frozen=True)
 class TrainView:
-    """A training view as distillation uses it.
+    """A training view, with the pixels that the terms of the loss use.
 
     Attributes:
-        camera: the view.
+        camera: The camera of the view.
         photo: [H, W, 3], uint8 (a quarter of the memory of float32, with hundreds of views) or float32 in [0, 1].
-        supervises: [H, W] bool, the pixels whose photo may supervise: outside C, I and the object's shadow; all of a
-            clean view.
-        repaint: [H, W] bool, the hole: pixels that are made up, and that the UNet repaints. Empty if the view is not
-            distilled.
-        clean: the object is absent from this view.
-        lifted: [H, W, 3] float32 in [0, 1], the view inpainted in 2D; None if it was not inpainted.
+        supervises: bool [H, W], True at pixels whose photograph may supervise: outside the consistent mask C (the
+            object), outside the invent mask I (the pixels to invent) and outside the object's shadow. In a clean view
+            all pixels outside the shadow may supervise. In a view without a photograph no pixel may.
+        repaint: bool [H, W], True in the hole: the pixels that are invented and that the UNet repaints. It is all False
+            if the view is not distilled.
+        clean: True if the object is absent from this view.
+        lifted: [H, W, 3] float32 in [0, 1], the view inpainted in 2D by the stage `lift`; None if there is no such
+            image.
     """
 
     camera: Camera
@@ -35,16 +37,17 @@ class TrainView:
 
     @property
     def picture(self) -> Tensor:
-        """The photo, [H, W, 3] float32 in [0, 1]."""
+        """Return the photograph, [H, W, 3] float32 in [0, 1]."""
         return self.photo / 255 if self.photo.dtype == torch.uint8 else self.photo
 
 
 class ReferenceHole(NamedTuple):
-    """A reference image and the pixels it was made for.
+    """A reference (a view completed in 2D) and the pixels that it completes.
 
     Attributes:
-        image: [H, W, 3] in [0, 1].
-        hole: [H, W] bool, the pixels that the reference invents.
+        camera: The camera of the view.
+        image: [H, W, 3] in [0, 1], the completed view.
+        hole: bool [H, W], True at the pixels that the reference invents.
     """
 
     camera: Camera

@@ -1,8 +1,12 @@
 """Exposure compensation: an affine colour map for each view, optimised with the scene (as in the code of 3DGS).
 
-A phone changes its exposure while it moves around a scene. Without compensation Gaussians learn the mean, or colours
-that change with the direction. With it they have one exposure, and later stages use photographs normalised to it.
-Views without a photograph take the exposure of the nearest photographs.
+A phone changes its exposure while it moves around a scene. Without compensation Gaussians learn the mean of the
+exposures, or colours that change with the viewing direction. With compensation all Gaussians have one exposure, and
+later stages use photographs normalised to this exposure. A view without a photograph takes an average of the exposures
+of nearby photographs.
+
+The *exposure* of a view is an affine map [3, 4] from the colours of the Gaussians to the colours of the photograph:
+photo = exposure[:, :3] @ colour + exposure[:, 3], with colours in [0, 1].
 """
 
 from __future__ import annotations
@@ -27,12 +31,13 @@ FILE = "exposures.json"
 LEARNING_RATE, FINAL_LEARNING_RATE = 1e-2, 1e-3  # Adam's step size at the start and at the end
 MIN_DETERMINANT = 1e-5  # determinant of an exposure below which the picture is practically black
 BRIGHTNESS_DEVIATION = 0.05  # standard deviation of the photographs' log brightness, from which exposures are fitted
-# Of the kernel that interpolates exposures, in mean distances to the nearest photograph.
+# Candidate bandwidths of the kernel that interpolates exposures, in units of the mean distance from a photograph to the
+# nearest other one.
 BANDWIDTHS = (0.5, 1.0, 2.0, 4.0, 16.0)
-BLUR = 0.01  # of the width: blur under which a view is compared with its photograph
+BLUR = 0.01  # share of the image's width: standard deviation of the blur before a view and its photograph are compared
 MIN_COVERAGE, MIN_PIXELS = 0.5, 100  # share of usable pixels around a compared pixel, and number of such pixels
 ERROR_SCALE, REWEIGHTINGS = 0.03, 8  # difference above which a pixel gets a lower weight, and number of reweightings
-# Of a gain; and deviation of colours above which gain and offset can be separated.
+# Bounds of a fitted gain; standard deviation of the colours above which gain and offset can be separated.
 GAIN_BOUNDS, MIN_SPREAD = (0.4, 2.5), 0.02
 PROTOCOL = (
     "the photographs differ in brightness: each channel of a test view is as bright as its photograph is outside the "
@@ -42,14 +47,21 @@ _IDENTITY = torch.eye(3, 4)
 
 
 class Exposures:
-    """A [3, 4] matrix for each view: photo = matrix[:, :3] @ colour + matrix[:, 3].
+    """The exposures of V views, and the Adam optimiser that fits them together with the Gaussians.
 
-    Multiplying all matrices by one matrix, and all colours by its inverse, leaves the pictures unchanged. So the mean
-    of the matrices is kept at the identity. PAPER leaves open: any exposure.
+    Each view has a matrix [3, 4]: photo = matrix[:, :3] @ colour + matrix[:, 3]. Multiplying all matrices by one
+    matrix, and all colours by the inverse of this matrix, leaves the pictures unchanged. So the mean of the matrices is
+    kept at the identity. PAPER leaves open: exposure compensation, which it does not mention.
     """
 
     def __init__(self, names: Iterable[str], device: torch.device | str = "cpu", gains: np.ndarray | None = None):
-        """Args: gains: [V, 3], initial brightness of each view's red, green and blue; None: all equal."""
+        """Start from the given brightness of the views.
+
+        Args:
+            names: names of the V views.
+            gains: [V, 3], relative brightness of each view's red, green and blue, for the initial matrices. None: all
+                views are equally bright.
+        """
         names = list(names)
         first = np.ones((len(names), 3)) if gains is None else gains / gains.mean(0)
         initial = lambda gain: torch.diag(torch.from_numpy(gain).float()) @ _IDENTITY
@@ -60,13 +72,21 @@ class Exposures:
         self._adam = torch.optim.Adam(list(self._matrices.values()), lr=LEARNING_RATE, eps=1e-15)
 
     def apply(self, color: Tensor, name: str) -> Tensor:
-        """[H, W, 3] with the exposure of the view; differentiable in the colours and in the exposure."""
+        """Return the colours [H, W, 3] with the exposure of view `name` applied.
+
+        Differentiable in the colours and in the exposure. The result is not clamped.
+        """
         matrix = self._matrices[name]
         return color @ matrix[:, :3].T + matrix[:, 3]
 
     @torch.no_grad()
     def step(self, progress: float) -> None:
-        """Update the exposures that have a gradient; `progress` of the run in [0, 1] sets the learning rate."""
+        """Do one Adam step for the exposures that have a gradient, then shift all so that their mean is the identity.
+
+        Args:
+            progress: share of the run in [0, 1] that is done; the learning rate decays exponentially with it, from
+                `LEARNING_RATE` to `FINAL_LEARNING_RATE`.
+        """
         for group in self._adam.param_groups:
             group["lr"] = LEARNING_RATE ** (1 - progress) * FINAL_LEARNING_RATE**progress
         self._adam.step()
@@ -77,26 +97,34 @@ class Exposures:
             matrix -= shift
 
     def state_dict(self) -> dict:
-        """State from which `load_state_dict` continues bit for bit."""
+        """Return the state from which `load_state_dict` continues bit for bit."""
         return {"matrices": {n: m.detach().clone() for n, m in self._matrices.items()}, "adam": self._adam.state_dict()}
 
     def load_state_dict(self, state: dict) -> None:
+        """Restore a state returned by `state_dict`; the views must be the same."""
         with torch.no_grad():
             for name, matrix in self._matrices.items():
                 matrix.copy_(state["matrices"][name])
         self._adam.load_state_dict(state["adam"])
 
     def save(self, folder: Path) -> None:
+        """Write `folder`/exposures.json: view name -> matrix [3, 4]."""
         save_json(folder / FILE, {name: matrix.detach().cpu().tolist() for name, matrix in self._matrices.items()})
 
 
 def view_exposures(fit: Path, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
-    """View name -> exposure [3, 4]: as fitted, or interpolated from nearby photographs for other views.
+    """Return the exposure of every view: as fitted, or for a view without a fit interpolated from nearby photographs.
 
-    Empty where no exposures were fitted.
+    The interpolation averages the fitted exposures with Gaussian kernel weights of the distances between poses. The
+    bandwidth is the one of `BANDWIDTHS` that predicts each fitted exposure best from all other fitted exposures (the
+    smallest one if fewer than three exposures were fitted).
 
     Args:
-        cameras: of all views, including the fitted ones.
+        fit: folder of the stage `fit`, which holds exposures.json if exposures were fitted.
+        cameras: the cameras of all views, including the views with a fitted exposure.
+
+    Returns:
+        View name -> exposure [3, 4] float64. Empty if no exposures were fitted.
     """
     path = Path(fit) / FILE
     fitted = {name: np.array(matrix) for name, matrix in load_json(path).items()} if path.exists() else {}
@@ -110,7 +138,7 @@ def view_exposures(fit: Path, cameras: Sequence[Camera]) -> dict[str, np.ndarray
     interpolate = lambda distances, bandwidth: np.einsum(
         "vk,kij->vij", _kernel_weights(distances / (bandwidth * mean_spacing)), matrices
     )
-    # Choose the bandwidth that predicts each photograph's exposure best from the others.
+    # The diagonal of `distances` is infinite, so no photograph takes part in its own prediction.
     leave_one_out_error = lambda bandwidth: float(np.square(interpolate(distances, bandwidth) - matrices).sum())
     bandwidth = min(BANDWIDTHS, key=leave_one_out_error) if len(fitted_cameras) > 2 else BANDWIDTHS[0]
     other_cameras = [camera for camera in cameras if camera.name not in fitted]
@@ -119,19 +147,29 @@ def view_exposures(fit: Path, cameras: Sequence[Camera]) -> dict[str, np.ndarray
 
 
 def _pose_distances(views: Sequence[Camera], fitted_cameras: Sequence[Camera]) -> np.ndarray:
-    """[V, K]: distances between poses, where a difference of viewing directions counts like one of the centres."""
+    """Return the distances [V, K] between the poses of V views and of K fitted cameras.
+
+    A distance is the length of a vector of six numbers: the difference of the two camera centres (normalised frame) and
+    the difference of the two unit viewing directions, with equal weight.
+    """
     features = lambda cameras: np.array([[*camera.center, *camera.world_to_camera[2, :3]] for camera in cameras])
     return np.linalg.norm(features(views)[:, None] - features(fitted_cameras)[None], axis=-1)
 
 
 def _kernel_weights(distances: np.ndarray) -> np.ndarray:
-    """[V, K]: Gaussian kernel weights for distances [V, K]; they sum to 1 over K."""
+    """Return Gaussian kernel weights [V, K] for distances [V, K] in units of the bandwidth; they sum to 1 over K."""
+    # Subtracting the smallest square changes no normalised weight, and keeps the weights from all becoming 0.
     weights = np.exp(-(distances**2 - np.square(distances.min(1, keepdims=True))) / 2)
     return weights / weights.sum(1, keepdims=True)
 
 
 def apply_exposure(color: Tensor, matrix: np.ndarray | None) -> Tensor:
-    """[H, W, 3]: colours of the Gaussians with an exposure [3, 4] applied."""
+    """Return the colours [H, W, 3] of rendered Gaussians with an exposure [3, 4] applied, not clamped.
+
+    Args:
+        color: [H, W, 3] in [0, 1].
+        matrix: [3, 4]; None returns the colours unchanged.
+    """
     if matrix is None:
         return color
     exposure = torch.from_numpy(matrix).to(color)
@@ -139,15 +177,20 @@ def apply_exposure(color: Tensor, matrix: np.ndarray | None) -> Tensor:
 
 
 def match_exposure(matrix: np.ndarray, color: np.ndarray, photo: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """[3, 4]: an exposure adjusted to a photograph by a gain and an offset per channel.
+    """Return an exposure adjusted to a photograph by a gain and an offset per channel.
 
-    It is returned unchanged where too few pixels can be compared. Both pictures are blurred first: where one is less
-    sharp, the other's contrast would seem higher.
+    Both pictures are blurred before the comparison, because in a less sharp rendering contrast would seem lower, and
+    the gain would compensate for sharpness instead of exposure. Pixels that are too dark or clipped in the photograph
+    are left out.
 
     Args:
+        matrix: [3, 4], the exposure to adjust.
         color: [H, W, 3] in [0, 1], the rendering with this exposure.
-        photo: uint8 [H, W, 3].
-        pixels: bool [H, W], the pixels to compare.
+        photo: uint8 [H, W, 3], the photograph of the same view.
+        pixels: bool [H, W], True for the pixels to compare.
+
+    Returns:
+        [3, 4] float64; a copy of `matrix` if fewer than `MIN_PIXELS` pixels can be compared.
     """
     result = np.array(matrix, np.float64)
     usable = pixels & (photo > DARK).all(-1) & (photo < BRIGHT).all(-1)
@@ -165,7 +208,15 @@ def match_exposure(matrix: np.ndarray, color: np.ndarray, photo: np.ndarray, pix
 
 
 def _fit_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Gain and offset of the robust line y = gain * x + offset, with the gain bounded."""
+    """Fit the line y = gain * x + offset robustly, by reweighted least squares.
+
+    Args:
+        x, y: [K] values in [0, 1].
+
+    Returns:
+        The gain, bounded by `GAIN_BOUNDS`, and the offset. If x varies too little to separate gain and offset, the gain
+        is mean(y) / mean(x), without bounds, and the offset is 0.
+    """
     weight, gain, offset = np.ones_like(x), 1.0, 0.0
     for _ in range(REWEIGHTINGS):
         mean_x, mean_y = np.average(x, weights=weight), np.average(y, weights=weight)
@@ -178,9 +229,16 @@ def _fit_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 
 def load_normalized_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """View name -> uint8 [H, W, 3]: the photographs, `normalize_exposure`.
+    """Load the photographs of the named views, all with one exposure (see `normalize_exposure`).
 
-    Views without a photograph are rendered from the Gaussians in the folder `fit`, object included.
+    A view without a photograph is replaced by a rendering of the fitted Gaussians, object included.
+
+    Args:
+        poses, fit: folders of the stages of these names.
+        names: names of the views.
+
+    Returns:
+        View name -> uint8 [H, W, 3], in the order of `names`.
     """
     names = list(names)
     photographed = [name for name in names if has_photograph(poses, name)]
@@ -191,7 +249,14 @@ def load_normalized_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[
 
 @torch.no_grad()
 def render_views(poses: Path, fit: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """View name -> uint8 [H, W, 3], rendered from the Gaussians in the folder `fit`."""
+    """Render the named views from the Gaussians that the stage `fit` wrote, object included.
+
+    Args:
+        poses, fit: folders of the stages of these names.
+
+    Returns:
+        View name -> uint8 [H, W, 3].
+    """
     if not names:
         return {}
     gaussians, cameras = load_ply(fit / "gaussians.ply"), load_scene(poses).cameras
@@ -199,12 +264,18 @@ def render_views(poses: Path, fit: Path, names: Sequence[str]) -> dict[str, np.n
 
 
 def normalize_exposure(image: np.ndarray, fit: Path, name: str) -> np.ndarray:
-    """uint8 [H, W, 3] in the exposure of the Gaussians in the folder `fit`: the view's fitted exposure is undone.
+    """Return a photograph with the exposure of the fitted Gaussians: the view's own fitted exposure is undone.
 
-    Values are clipped to [0, 255]. The image is returned unchanged where no exposure was fitted, as for test views.
+    Args:
+        image: uint8 [H, W, 3], the photograph.
+        fit: folder of the stage `fit`.
+        name: the view's name.
+
+    Returns:
+        uint8 [H, W, 3], clipped to [0, 255]. `image` itself if the view has no fitted exposure, as test views.
 
     Raises:
-        ValueError: the exposure cannot be inverted.
+        ValueError: the exposure cannot be inverted, because the photograph is almost black.
     """
     path = Path(fit) / FILE
     matrices = load_json(path) if path.exists() else {}
@@ -217,5 +288,10 @@ def normalize_exposure(image: np.ndarray, fit: Path, name: str) -> np.ndarray:
 
 
 def undo_exposure(color: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
-    """[H, W, 3], the inverse of `apply_exposure`."""
+    """Return the colours of the Gaussians for the colours [H, W, 3] of a photograph; the inverse of `apply_exposure`.
+
+    Args:
+        color: [H, W, 3] in [0, 1].
+        matrix: [3, 4]; None returns the colours unchanged.
+    """
     return color if matrix is None else (color - matrix[:, 3]) @ np.linalg.inv(matrix[:, :3]).T

@@ -1,7 +1,7 @@
 """Initial Gaussians for a fit to few photographs: on surfaces found by multi-view stereo from the sparse points.
 
-PAPER leaves open: how few views are reconstructed. A fit from points alone explains one or two photographs by floaters
-in front of the cameras, which then fill other views.
+PAPER leaves open: how a scene with few views is reconstructed. A fit that starts from sparse points alone explains one
+or two photographs by floaters in front of the cameras. These floaters then fill other views.
 """
 
 from __future__ import annotations
@@ -20,9 +20,13 @@ from reffusion.params.fit import Params
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
-MAX_VIEWS = 8  # training views up to which surfaces beat points; with 25 photographs of a table they were torn
+# Number of training views up to which a start on surfaces gives a better fit than a start from points. With 25
+# photographs of a table the surfaces were not connected.
+MAX_VIEWS = 8
 STEPS_SHARE = 0.2  # of the steps of a normal fit: the surfaces exist already, and more steps only bend them
-MIN_ALPHA, OCCLUSION_RATIO = 0.7, 1.05  # a pixel with this alpha, up to this relative depth, is covered already
+# A pixel counts as covered if the Gaussians so far have at least this alpha there, and a depth less than this multiple
+# of the pixel's own.
+MIN_ALPHA, OCCLUSION_RATIO = 0.7, 1.05
 NEIGHBORHOOD_PX = 3  # px, side of the square in which nearer surfaces are searched
 
 
@@ -35,18 +39,23 @@ def gaussians_on_surfaces(
     hidden: Mapping[str, np.ndarray],
     params: Params,
 ) -> Gaussians | None:
-    """Gaussians on the surfaces seen by the training views; None if there are too few sparse points.
+    """Place Gaussians on the surfaces that the training views show, as found by multi-view stereo.
 
-    The first pass adds the pixels that other views confirm, each view only where the ones before it leave gaps. The
-    second pass adds the pixels that are neither confirmed nor refuted, in the same way.
+    The first pass over the views adds Gaussians for the pixels whose depth another view confirms, in each view only
+    where the Gaussians of earlier views leave gaps. The second pass adds, in the same way, the pixels whose depth is
+    neither confirmed nor refuted (refuted: a confirmed pixel of another view sees past the surface). Pixels beside a
+    nearer surface are left out, because the colour of the nearer surface bleeds into them.
 
     Args:
         cameras: the training views.
-        images: view name -> uint8 [H, W, 3].
+        images: view name -> uint8 [H, W, 3], with equal exposure.
         points: [P, 3] sparse points.
-        colors: [P, 3] uint8.
-        hidden: view name -> bool [H, W], pixels to be ignored.
-        params: sets the degree of spherical harmonics, the device and antialiasing.
+        colors: [P, 3] uint8, their colours.
+        hidden: view name -> bool [H, W], True for pixels to be ignored; a view without an entry has none.
+        params: sets the seed, the degree of spherical harmonics, the device and antialiasing.
+
+    Returns:
+        Two sheets of Gaussians (see `gaussians.sheets`), or None if there are too few sparse points.
     """
     if len(points) <= NORMAL_NEIGHBORS:
         return None
@@ -71,11 +80,15 @@ def gaussians_on_surfaces(
 
 
 def is_beside_nearer(depth: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels of a depth map next to a nearer surface, whose colour bleeds into them."""
+    """Return bool [H, W], the pixels of a depth map that lie next to a nearer surface.
+
+    The colour of the nearer surface bleeds into these pixels. A pixel next to it is one whose depth exceeds
+    `OCCLUSION_RATIO` times the smallest depth in the 3 x 3 pixels around it.
+    """
     return depth > OCCLUSION_RATIO * ndimage.minimum_filter(depth, NEIGHBORHOOD_PX)
 
 
 def shorten_schedule(params: Params) -> Params:
-    """The parameters of a fit from surfaces: fewer steps, and no densification."""
+    """Return the parameters of a fit that starts on surfaces: `STEPS_SHARE` of the steps, and no densification."""
     steps = max(1, round(STEPS_SHARE * params.iterations))
     return params.changed({"iterations": steps, "densify.stop": 0.0, "densify.start": 0.0, "densify.reset_every": 0.0})

@@ -1,4 +1,4 @@
-"""Relative brightness of the photographs, estimated from the points they share."""
+"""Relative brightness of the photographs (their *gains*), estimated from the points that several of them show."""
 
 from __future__ import annotations
 
@@ -10,22 +10,27 @@ import numpy as np
 from reffusion.capture.image_detail import sample_visible
 from reffusion.types import Camera
 
-MAX_POINTS = 5000  # at which photographs are compared
-BLUR = 0.004  # of the width: sigma of the blur before colours are sampled
+MAX_POINTS = 5000  # maximum number of points at which photographs are compared
+BLUR = 0.004  # share of the image's width: standard deviation of the blur before colours are sampled
 DARK, BRIGHT = 8, 247  # levels of 255: colours outside are too dark, or clipped
-REWEIGHTINGS = 10  # of reweighting
-ERROR_SCALE = 0.1  # log difference above which a point gets a lower weight: it is occluded, or specular
-PRIOR_WEIGHT = 1e-3  # weight, in points, that pulls a view towards the mean where it shares no points
+REWEIGHTINGS = 10  # iterations of reweighted least squares
+ERROR_SCALE = 0.1  # residual of a log colour above which it gets a lower weight: the point is occluded, or specular
+PRIOR_WEIGHT = 1e-3  # pull of a view towards the mean, in points; it decides only for a view that shares no points
 
 
 def estimate_gains(points: np.ndarray, cameras: Sequence[Camera], photos: Mapping[str, np.ndarray]) -> np.ndarray:
-    """[V, 3]: brightness of each view's red, green and blue relative to the geometric mean of all views.
+    """Estimate the brightness of each view's red, green and blue relative to the geometric mean of all views.
 
-    Robust least squares on log colours, with one unknown per view and one per point. 1 where a view shares no points.
+    The estimate is a robust least-squares fit to the logarithms of colours, with one unknown per view (its brightness)
+    and one per point (its colour). Colours that are too dark or clipped are left out.
 
     Args:
-        points: [P, 3] on the scene's surfaces.
+        points: [P, 3] points on the scene's surfaces.
+        cameras: the V views.
         photos: view name -> uint8 [H, W, 3].
+
+    Returns:
+        [V, 3] positive gains, in the order of `cameras`; 1 for a view that shares no points with another one.
     """
     points = points[:: max(1, -(-len(points) // MAX_POINTS))]
     result = np.ones((len(cameras), 3))
@@ -39,7 +44,7 @@ def estimate_gains(points: np.ndarray, cameras: Sequence[Camera], photos: Mappin
 
 
 def brightness_deviation(gains: np.ndarray) -> float:
-    """Standard deviation of the views' log brightness, from their gains [V, 3]."""
+    """Return the standard deviation of the views' log brightness, from their gains [V, 3]; 0 without views."""
     return float(np.log(gains).mean(1).std()) if len(gains) else 0.0
 
 
@@ -48,15 +53,19 @@ def _blur(photo: np.ndarray) -> np.ndarray:
 
 
 def _view_offsets(values: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """[V], zero on average: the views' part of log colours [V, P], read where `usable`, bool [V, P].
+    """Split log colours into an offset per view and a colour per point, and return the offsets [V], of mean 0.
 
     The model is value = offset of the view + colour of the point.
+
+    Args:
+        values: [V, P] log colours, one for each view and point.
+        usable: bool [V, P], True where a value is known; all other values are ignored.
     """
     offsets, weight = np.zeros(len(values)), usable.astype(np.float64)
     for _ in range(REWEIGHTINGS):
         total = np.maximum(weight.sum(0), 1e-12)
         centered = values - (weight * values).sum(0) / total
-        # The unknowns of the points are eliminated, which leaves a system of the size of the views.
+        # The unknown colours of the points are eliminated, which leaves a linear system in the V offsets.
         system = np.diag(weight.sum(1) + PRIOR_WEIGHT) - (weight / total) @ weight.T
         offsets = np.linalg.solve(system, (weight * centered).sum(1))
         residual = values - offsets[:, None]

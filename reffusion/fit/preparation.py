@@ -1,4 +1,4 @@
-"""What a fit starts from: parameters limited to what the scene's views determine, equal exposure, initial Gaussians."""
+"""Preparation of a fit: parameters that suit the scene's views, photographs of equal exposure, initial Gaussians."""
 
 from __future__ import annotations
 
@@ -21,7 +21,11 @@ from reffusion.types import Camera, Gaussians, Scene
 
 
 def limit_sh_degree(params: Params, scene: Scene) -> Params:
-    """The parameters with the degree of spherical harmonics limited to what the training views determine."""
+    """Return the parameters with the degree of spherical harmonics limited to what the training views determine.
+
+    A degree d has (d + 1)^2 coefficients, and at least this many training views must contain a typical sparse point.
+    With `few_views` = "as_many" the parameters are returned unchanged. A lower degree is printed.
+    """
     max_degree = params.sh.degree
     if params.few_views == "as_many":
         return params
@@ -37,7 +41,18 @@ def limit_sh_degree(params: Params, scene: Scene) -> Params:
 def estimate_exposures(
     params: Params, scene: Scene, cameras: list[Camera], images: Mapping[str, np.ndarray]
 ) -> np.ndarray | None:
-    """[V, 3], relative brightness of the views; None if exposures are not fitted."""
+    """Decide whether exposures are fitted, and estimate the brightness of the views as their initial values.
+
+    With `exposure` = "auto" exposures are fitted if the brightness of shared points varies by at least
+    `BRIGHTNESS_DEVIATION` between views. The decision to fit is printed.
+
+    Args:
+        cameras: the V views.
+        images: view name -> uint8 [H, W, 3].
+
+    Returns:
+        [V, 3], relative brightness of each view's red, green and blue; None if exposures are not fitted.
+    """
     if params.exposure == "never":
         return None
     gains = estimate_gains(scene.points, cameras, images)
@@ -53,13 +68,32 @@ def estimate_exposures(
 def equalize_exposure(
     images: Mapping[str, np.ndarray], cameras: list[Camera], gains: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """View name -> uint8 [H, W, 3], the pictures with equal brightness."""
+    """Divide each picture by the gains of its view, so that all pictures have equal brightness.
+
+    Args:
+        images: view name -> uint8 [H, W, 3]; a picture whose view is not among `cameras` stays unchanged.
+        cameras: the V views.
+        gains: [V, 3], from `estimate_exposures`.
+
+    Returns:
+        View name -> uint8 [H, W, 3].
+    """
     gain_of = {camera.name: gain for camera, gain in zip(cameras, gains, strict=True)}
     return {name: to_uint8(image / 255.0 / gain_of.get(name, 1.0)) for name, image in images.items()}
 
 
 def start_on_surfaces(params: Params, scene: Scene, cameras: list[Camera], images, hidden) -> Gaussians | None:
-    """Initial Gaussians on surfaces, for scenes with few views; None with more views or too few visible points."""
+    """Return initial Gaussians on the surfaces between the sparse points, for a scene with few views.
+
+    Args:
+        cameras: the training views.
+        images: view name -> uint8 [H, W, 3], with equal exposure.
+        hidden: view name -> bool [H, W], True for pixels to be ignored.
+
+    Returns:
+        The Gaussians; None if `params.few_views` is not "surfaces", if there are more than `few_views.MAX_VIEWS` views,
+        or if too few sparse points are visible.
+    """
     if params.few_views != "surfaces" or len(cameras) > few_views.MAX_VIEWS:
         return None
     gaussians = few_views.gaussians_on_surfaces(cameras, images, scene.points, scene.point_colors, hidden, params)
@@ -75,9 +109,18 @@ def collect_points(
     images: dict[str, np.ndarray],
     hidden: Mapping[str, np.ndarray] = MappingProxyType({}),
 ):
-    """Positions [P, 3] and colours [P, 3] uint8 of the sparse points and of the optical flow between these views.
+    """Collect the points from which a fit starts: the sparse points, and points triangulated from optical flow.
 
-    Points that most views show inside `hidden` are left out: no pixel would ever move them.
+    Points from flow are added if `params.init.flow_cell` is not 0. Points that lie inside `hidden` in more than half
+    of the views with such a mask are left out, because no supervising pixel would ever move Gaussians there.
+
+    Args:
+        cameras: the views between which flow is computed.
+        images: view name -> uint8 [H, W, 3].
+        hidden: view name -> bool [H, W], True for pixels that do not supervise.
+
+    Returns:
+        Positions [P, 3] float64 and colours [P, 3] uint8.
     """
 
     points, colors = scene.points, scene.point_colors
@@ -90,7 +133,12 @@ def collect_points(
 
 
 def make_gaussians(params: Params, points: np.ndarray, colors: np.ndarray) -> Gaussians:
-    """Initial Gaussians at the points, on the device of the computation."""
+    """Return an initial Gaussian at each point (see `initial_gaussians`), on the device `params.device`.
+
+    Args:
+        points: [P, 3] positions.
+        colors: [P, 3] uint8.
+    """
     generator, settings = seeding.generator(params.seed, "start"), params.init
     sh_degree, max_gaussians = params.sh.degree, params.densify.cap_max
     gaussians = initial_gaussians(points, colors, sh_degree, max_gaussians, generator, settings.opacity, settings.scale)
@@ -98,7 +146,11 @@ def make_gaussians(params: Params, points: np.ndarray, colors: np.ndarray) -> Ga
 
 
 def limit_gaussians(params: Params, cameras: list[Camera]) -> Params:
-    """The parameters with `cap_max` limited by the image size: larger pictures have room for more Gaussians."""
+    """Return the parameters with `densify.cap_max`, the maximum number of Gaussians, limited by the image size.
+
+    Larger pictures show more detail, which needs more Gaussians. The limit is `densify.per_pixel` times the mean number
+    of pixels of a view, at least 4. With `densify.per_pixel` = 0 the parameters are returned unchanged.
+    """
     densify = params.densify
     if not densify.per_pixel:
         return params

@@ -1,4 +1,4 @@
-"""3DGS optimisation of a whole scene from its training views, with masked pixels if asked for."""
+"""3DGS optimisation of a whole scene from its training views; pixels can be excluded by weights of 0."""
 
 from __future__ import annotations
 
@@ -29,8 +29,9 @@ from reffusion.params.fit import Params
 from reffusion.splat.rasterizer import Implementation, render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
-PLACED_RATE_FACTOR = 0.1  # on the learning rate of positions, for Gaussians whose positions are known
-FIRST_TRACED_STEP = 16  # first traced step after the start: measuring held-out views takes as long as several steps
+PLACED_RATE_FACTOR = 0.1  # factor on the learning rate of positions, for Gaussians whose positions are known
+# After step 1, the first step with a line in the trace: rendering the held-out views takes as long as several steps.
+FIRST_TRACED_STEP = 16
 
 
 def fit(
@@ -48,26 +49,36 @@ def fit(
     spent: float = 0.0,
     impl: Implementation = "auto",
 ) -> Gaussians:
-    """Optimise `initial` so that its renderings match the views; resumes bit for bit from the checkpoint in `folder`.
+    """Optimise the initial Gaussians so that their renderings match the views, and return the result.
+
+    If `folder` holds a checkpoint, the fit resumes from it, and ends with the same bits as without the interruption.
 
     Args:
+        cameras: the V views that supervise.
         images: view name -> uint8 [H, W, 3], for `cameras` and `held_out`.
-        initial: the initial Gaussians; computation runs on their device. With a checkpoint, only their degree, device
-            and antialiasing matter.
-        folder: receives trace.jsonl (loss, psnr since the last line, gaussians, psnr_held_out), checkpoints and
-            exposures.json.
-        weights: view name -> [H, W], weight of each pixel; pixels of weight 0, and only these, influence nothing. A
+        initial: the initial Gaussians; the computation runs on their device. When a fit resumes, the checkpoint's
+            Gaussians take their place, and only their device and `antialiased` matter.
+        settings: the parameters of the stage `fit`.
+        folder: receives trace.jsonl, checkpoints and, if exposures are fitted, exposures.json. A line of the trace
+            holds "loss" and "psnr" (over the steps since the last line), "gaussians" (their number) and
+            "psnr_held_out".
+        weights: view name -> [H, W], weight of each pixel. Pixels of weight 0, and only these, influence nothing. A
             view without an entry has weight 1 everywhere.
-        held_out: views that are only evaluated.
-        rates: Adam's learning rates, if they are not those of `settings.lr`.
-        gains: [V, 3] of `cameras`: exposures are fitted, starting from these; None: they are not.
-        placed: [N] bool, of `initial`: Gaussians whose positions are known; their positions move at
-            `PLACED_RATE_FACTOR` of the learning rate.
-        spent: seconds that making `initial` took; the trace starts from there.
+        held_out: views that are evaluated for the trace, and do not supervise.
+        rates: Adam's learning rates; None takes those of `settings.lr`.
+        gains: [V, 3], initial brightness of `cameras` from which exposures are fitted; None fits no exposures.
+        placed: [N] bool, True for the Gaussians of `initial` whose positions are known. Their positions move with
+            `PLACED_RATE_FACTOR` times the learning rate. None: none is.
+        spent: seconds already spent on making `initial`; "seconds" in the trace starts from this value.
+        impl: implementation of the renderer.
+
+    Returns:
+        The Gaussians, detached. Their number differs from that of `initial` if the schedule densifies or prunes.
 
     Raises:
-        ValueError: before any computation: there is no view, or an image or mask differs in size from its camera.
-        FloatingPointError: a loss, gradient or parameter is infinite or NaN; names the step and the view.
+        ValueError: there is no view, or an image or the weights differ in size from their camera (both are checked
+            before any computation); or pruning removed all Gaussians.
+        FloatingPointError: a loss, gradient or parameter is infinite or NaN. The message names the step and the view.
     """
     weights = weights or {}
     _check_views(cameras, held_out, images, weights)
@@ -107,6 +118,7 @@ def _check_views(
     images: Mapping[str, np.ndarray],
     weights: Mapping[str, np.ndarray],
 ) -> None:
+    """Raise ValueError if there is no view to fit, or if an image or weights differ in size from their camera."""
     if not cameras:
         raise ValueError("a fit needs at least one view")
     check_sizes(cameras, images, weights)
@@ -115,12 +127,16 @@ def _check_views(
 
 @dataclass
 class _Run:
-    """State of a fit, from which it can resume.
+    """State of a fit; a checkpoint stores it, so that a later process can resume.
 
     Attributes:
-        started_with: number of Gaussians at the start.
-        iteration, seconds: steps done and time spent so far.
-        loss, error, steps: sums over the steps since the last line of the trace, and their number.
+        optimizer: the Gaussians and their Adam moments.
+        exposures: the exposures of the views; None if they are not fitted.
+        started_with: number of Gaussians at the start of the fit.
+        seconds: time spent before the fit began or, when it was resumed, up to the checkpoint.
+        iteration: number of steps done.
+        loss, error: sums of the losses and of the mean squared errors of the steps since the last line of the trace.
+        steps: number of these steps.
     """
 
     optimizer: GaussianOptimizer
@@ -146,7 +162,12 @@ class _Run:
         state: dict[str, Any] | None,
         spent: float,
     ) -> _Run:
-        """A new run, or one restored from the state of a checkpoint."""
+        """Make the state of a new fit, or restore it from a checkpoint.
+
+        Args:
+            initial, placed, cameras, gains, settings, rates, spent: as for `fit`.
+            state: what `state_dict` returned, with the current "seconds"; None starts a new fit.
+        """
         names, device = [camera.name for camera in cameras], initial.means.device
         exposures = None if gains is None else Exposures(names, device, gains)
         optimizer = GaussianOptimizer(initial, placed, rates, {"means": PLACED_RATE_FACTOR}, settings.lr.betas)
@@ -160,17 +181,18 @@ class _Run:
         return run
 
     def count(self, loss: float, error: float) -> None:
-        """Count a step with this loss and mean squared error."""
+        """Count one step, with its loss and its mean squared error."""
         self.iteration, self.steps = self.iteration + 1, self.steps + 1
         self.loss, self.error = self.loss + loss, self.error + error
 
     def finish(self, folder: Path) -> Gaussians:
-        """Save the exposures and return the Gaussians."""
+        """Write the exposures, if any, to `folder`/exposures.json, and return the detached Gaussians."""
         if self.exposures is not None:
             self.exposures.save(folder)
         return self.optimizer.gaussians.map(Tensor.detach)
 
     def state_dict(self) -> dict[str, Any]:
+        """Return the state from which `create` restores this one."""
         state = {"optimizer": self.optimizer.state_dict(), "exposures": self.exposures and self.exposures.state_dict()}
         return state | {name: getattr(self, name) for name in self._NUMBERS}
 
@@ -183,7 +205,10 @@ def _write_line(
     settings: Params,
     impl: Implementation,
 ) -> None:
-    """Write a line of the trace, with the clock stopped."""
+    """Write a line of the trace and reset the sums of `run`. The time of this call does not count in "seconds".
+
+    The line after the last step also has the entry "reason": "finished".
+    """
     with log.paused():
         end = {"reason": "finished"} if run.iteration == settings.iterations else {}
         log.log(run.iteration, **_trace_values(run, held_out, images, settings, impl), **end)
@@ -193,7 +218,12 @@ def _write_line(
 def _trace_values(
     run: _Run, held_out: Sequence[Camera], images: Mapping[str, np.ndarray], settings: Params, impl: Implementation
 ) -> dict[str, Any]:
-    """Values of a line of the trace; loss and training PSNR only if there were steps since the last line."""
+    """Return the values of a line of the trace.
+
+    Returns:
+        "gaussians", their number; "loss" and "psnr" in dB of the steps since the last line, if there were any; and
+        "psnr_held_out" in dB, the mean over the held-out views, if there are such views.
+    """
     line: dict[str, Any] = {"gaussians": len(run.optimizer.gaussians)}
     if run.steps:
         line = {"loss": run.loss / run.steps, "psnr": trace.decibels(run.error / run.steps)} | line
@@ -209,7 +239,12 @@ def _trace_values(
 
 
 def _check_gaussians(gaussians: Gaussians, step: int, camera: Camera, check_values: bool) -> None:
-    """Raise if no Gaussian is left, or, with `check_values`, if a parameter is not finite."""
+    """Raise ValueError if no Gaussian is left, or FloatingPointError if a parameter is NaN or infinite.
+
+    Args:
+        step, camera: the step that was just done and its view, which the messages name.
+        check_values: True to check the parameters, too.
+    """
     if not len(gaussians):
         remedy = "raise densify.prune_scale3d"
         raise ValueError(f"fit, step {step}: pruning left no Gaussian: {remedy}")

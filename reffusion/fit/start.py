@@ -1,4 +1,4 @@
-"""The initial Gaussians of a fit: one at each point."""
+"""The initial Gaussians of a fit: one at each sparse point."""
 
 from __future__ import annotations
 
@@ -21,18 +21,23 @@ def initial_gaussians(
     opacity: float = 0.1,
     size: float = 1.0,
 ) -> Gaussians:
-    """Initialization of 3DGS: an isotropic Gaussian at each point, scaled by the distance to its 3 nearest neighbours.
+    """Return the initial Gaussians of 3DGS: an isotropic one at each point, as large as the points are far apart.
 
     Args:
         points: [P, 3] in the normalised frame, P >= 4.
-        colors: [P, 3] uint8.
-        budget: maximum number of Gaussians; above it a random subset of the points is used.
-        generator: of that subset.
-        opacity: of each Gaussian, in (0, 1).
-        size: standard deviation divided by the root mean square of the distances to the neighbours.
+        colors: [P, 3] uint8, the colours of the Gaussians.
+        sh_degree: degree of the spherical harmonics; all but the constant one are 0.
+        budget: maximum number of Gaussians; if there are more points, a random subset of them is used.
+        generator: random generator for this subset.
+        opacity: opacity of each Gaussian, in (0, 1).
+        size: standard deviation of a Gaussian, divided by the root mean square of the distances from its point to the
+            3 nearest other points.
+
+    Returns:
+        min(P, budget) Gaussians, float32 on the CPU.
 
     Raises:
-        ValueError: fewer than 4 points.
+        ValueError: there are fewer than 4 points.
     """
     if len(points) < 4:
         raise ValueError(f"a fit starts from sparse points, at least 4; the scene has {len(points)}")

@@ -1,4 +1,7 @@
-"""One step of a fit: render, compute the loss, update; and the schedules of densification, resolution and averaging."""
+"""One step of a fit (render, compute the loss, update), and the schedules of densification, resolution and averaging.
+
+A *dense start* below is a start with many points: `fit.init.flow_cell` adds a point from optical flow every few pixels.
+"""
 
 from __future__ import annotations
 
@@ -19,19 +22,23 @@ from reffusion.splat.rasterizer import Implementation, render
 from reffusion.types import Camera
 
 PRUNE_OPA = 0.005  # opacity below which Gaussians are pruned, as in 3DGS
-# For refining an existing scene: between the rates at the start and at the end of a fit, so that Gaussians which
-# contradict the views can still move.
+# Learning rates for refining an existing scene. The rates of positions lie between those at the start and at the end of
+# a fit with the profile `laptop`, so that Gaussians which contradict the views can still move.
 REFIT_RATES = Rates(
     means=4e-4, means_last=2e-5, quaternions=2e-3, log_scales=5e-3, opacity_logits=0.05, sh_dc=5e-3, sh_rest=5e-4
 )
-COARSE_SHARE = 0.3  # of the steps, at the start, that use views of half the size
-SPARSE_UNTIL = 0.9  # of the steps, up to which every second pixel is used
-AVERAGED_FROM = 0.9  # of the steps, from which on Gaussians are averaged into the result
+COARSE_SHARE = 0.3  # share of the steps, at the start, that use views of half the size
+SPARSE_UNTIL = 0.9  # share of the steps up to which every second pixel is used
+AVERAGED_FROM = 0.9  # share of the steps after which Gaussians are averaged into the result
 GROW_SCALE3D = 0.01  # standard deviation / distance to the camera above which a Gaussian is split, not cloned
 
 
 def learning_rates(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:
-    """Adam's learning rates for a fit to these views; that of positions decays to a hundredth."""
+    """Return Adam's learning rates for a fit to these views.
+
+    The learning rate of positions decays to a hundredth. With `lr.means_unit` = "cameras" it is in units of
+    `cameras_extent(cameras)`, the unit of 3DGS, else in units of the normalised frame.
+    """
     rates = Rates(
         means=lr.means,
         means_last=lr.means / 100,
@@ -54,7 +61,24 @@ def step(
     i: int,
     impl: Implementation,
 ) -> tuple[float, float]:
-    """Render a view, compute the loss and update; returns the loss and the mean squared error of weighted pixels."""
+    """Do one optimisation step on one view: render it, compute the loss, and update Gaussians and exposures.
+
+    As long as the schedule densifies, the screen-space gradients of the step are accumulated in `optimizer`.
+
+    Args:
+        exposures: exposures of the views, which are updated, too; None leaves colours as they are rendered.
+        camera: the view.
+        target: [H, W, 3] in [0, 1], its photograph.
+        counts: [H, W], weights of its pixels; None: all 1.
+        i: number of the step, from 0.
+        impl: implementation of the renderer.
+
+    Returns:
+        The reconstruction loss, and the mean squared error of the pixels of positive weight, both before the update.
+
+    Raises:
+        FloatingPointError: the loss or a gradient is infinite or NaN. The message names the step and the view.
+    """
     location = f"step {i}, view '{camera.name}'"
     probe = None
     if i < settings.densify.stop * settings.iterations:
@@ -83,7 +107,12 @@ def step(
 
 
 def squared_error(image: Tensor, target: Tensor, counts: Tensor | None) -> float:
-    """Mean squared error over the channels of the pixels with positive weight `counts` [H, W]."""
+    """Return the mean squared error between two pictures, over the channels of the pixels of positive weight.
+
+    Args:
+        image, target: [H, W, 3].
+        counts: [H, W], weights of the pixels; None includes all pixels. If no weight is positive, the error is 0.
+    """
     if counts is None:
         error = (image - target).flatten()
         return float(error @ error) / error.numel()
@@ -93,18 +122,19 @@ def squared_error(image: Tensor, target: Tensor, counts: Tensor | None) -> float
 
 
 def coarse_steps(settings: Params) -> int:
-    """Number of initial steps that use views of half the size.
+    """Return the number of steps, at the start, that use views of half the size.
 
-    With a dense start (a point every few pixels) positions are known. Sizes and colours are learnt first, and small
-    views are enough for these. 0 without such a start, as in 3DGS.
+    With a dense start positions are known. Sizes and colours are learnt first, and small views are enough for these.
+    Without a dense start the number is 0, as in 3DGS.
     """
     return round(COARSE_SHARE * settings.iterations) if settings.init.flow_cell else 0
 
 
 def sparse_steps(settings: Params) -> range:
-    """The steps that use every second pixel each way: from the end of densification up to `SPARSE_UNTIL`.
+    """Return the steps that use every second pixel in each direction, that is, a quarter of the pixels.
 
-    None without a dense start, as in 3DGS.
+    These are the steps from the end of densification up to the share `SPARSE_UNTIL` of the fit. Without a dense start
+    the range is empty, as in 3DGS.
     """
     if not settings.init.flow_cell:
         return range(0)
@@ -112,7 +142,11 @@ def sparse_steps(settings: Params) -> range:
 
 
 def average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
-    """Accumulate the Gaussians after `done` steps into the mean, and replace them by it after the last step."""
+    """Add the current Gaussians to the running mean if `is_averaged`; after the last step replace them by the mean.
+
+    Args:
+        done: number of steps done.
+    """
     if is_averaged(settings, done):
         optimizer.remember()
     if done == settings.iterations:
@@ -120,10 +154,10 @@ def average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
 
 
 def is_averaged(settings: Params, done: int) -> bool:
-    """Do the Gaussians after `done` steps count in the final mean?
+    """Return whether the Gaussians after `done` steps are part of the mean that becomes the result of the fit.
 
-    Every second of the last steps, after densification, does. In runs like those of 3DGS, which start with few
-    Gaussians, none does.
+    The mean contains the Gaussians after every second one of the last steps (from the share `AVERAGED_FROM` of the fit
+    on, and after densification). A fit that starts with few Gaussians and densifies, as 3DGS, has no such mean.
     """
     has_dense_start = settings.init.flow_cell or settings.densify.stop == 0
     first = max(AVERAGED_FROM, settings.densify.stop) * settings.iterations
@@ -131,7 +165,10 @@ def is_averaged(settings: Params, done: int) -> bool:
 
 
 def degree_at(settings: Params, i: int) -> int:
-    """Degree of the spherical harmonics in step `i`."""
+    """Return the degree of spherical harmonics rendered in step `i`: from 0, one more every `sh.every` of the fit.
+
+    With `sh.every` = 0 it is the highest degree, `sh.degree`, from the first step on.
+    """
     if settings.sh.every == 0:
         return settings.sh.degree
     return min(settings.sh.degree, int(i / (settings.sh.every * settings.iterations)))
@@ -140,7 +177,13 @@ def degree_at(settings: Params, i: int) -> int:
 def control_density(
     optimizer: GaussianOptimizer, centers: Tensor, started_with: int, settings: Params, done: int
 ) -> None:
-    """Densify, prune and reset opacities where the schedule asks for it after `done` steps."""
+    """Densify, prune and reset opacities, if the schedule `settings.densify` asks for it after `done` steps.
+
+    Args:
+        centers: [V, 3], the camera centres; a Gaussian's size is measured relative to the distance to the nearest one.
+        started_with: number of Gaussians at the start of the fit.
+        done: number of steps done.
+    """
     schedule, progress = settings.densify, done / settings.iterations
     if not schedule.start <= progress < schedule.stop:
         return
@@ -157,7 +200,11 @@ def control_density(
 
 
 def _max_gaussians(started_with: int, settings: Params, done: int) -> int:
-    """Maximum number of Gaussians after `done` steps; it grows linearly during densification."""
+    """Return the maximum number of Gaussians after the densification at `done` steps.
+
+    The maximum grows linearly from `started_with` to `densify.cap_max` while the schedule densifies, so that late
+    densifications can still add Gaussians.
+    """
     first, last = settings.densify.start * settings.iterations, settings.densify.stop * settings.iterations
     progress = (done + settings.densify.every - first) / (last - first)
     return round(started_with + (settings.densify.cap_max - started_with) * min(1.0, progress))

@@ -1,4 +1,4 @@
-"""Feeds views to a fit in random order, each prepared in a thread while the previous step runs."""
+"""Iteration over the views of a fit in random order; a thread prepares each view while the previous step runs."""
 
 from __future__ import annotations
 
@@ -26,10 +26,23 @@ def iterate_views(
     sparse: range = range(0),
     device: torch.device | str = "cpu",
 ) -> Iterator[tuple[Camera, Tensor, Tensor | None]]:
-    """Yields for each step (camera, image, weights), on `device`, prepared by a thread while the previous step runs.
+    """Yield the view of each step, as camera, image and weights; a thread prepares it while the previous step runs.
 
-    Steps before `coarse` get views of half the size. The steps `sparse` get every second pixel each way of views that
-    are large enough, so that four visits cover all pixels.
+    In each epoch every view appears once, in a new random order.
+
+    Args:
+        cameras: the views.
+        images: view name -> uint8 [H, W, 3].
+        weights: view name -> [H, W], weights of the pixels; a view without an entry has none.
+        steps: the numbers of the steps; a resumed fit does not begin at 0.
+        seed: seed of the order of the views and of the subsampled pixels.
+        coarse: number of the first step that gets full views; all steps before it get views of half the size.
+        sparse: steps that get every second pixel in each direction, from views of at least `MIN_SPARSE_PIXELS` pixels.
+            Four visits of a view cover all its pixels.
+        device: the device of the tensors.
+
+    Yields:
+        The camera that fits the image, the image [H, W, 3] float32 in [0, 1], and the weights [H, W] float32 or None.
     """
 
     def prepare(i: int) -> tuple[Camera, Tensor, Tensor | None]:
@@ -53,7 +66,15 @@ def iterate_views(
 def to_tensors(
     camera: Camera, image: np.ndarray, weights: np.ndarray | None, device: torch.device | str
 ) -> tuple[Camera, Tensor, Tensor | None]:
-    """Camera, image [H, W, 3] in [0, 1] and weights on the device. Images are copied to a GPU as bytes."""
+    """Convert a view to tensors on the device. An image is copied to a GPU as bytes, and converted there.
+
+    Args:
+        image: uint8 [H, W, 3].
+        weights: [H, W] or None.
+
+    Returns:
+        The camera, the image [H, W, 3] float32 in [0, 1], and the weights [H, W] float32 or None.
+    """
     counts = None if weights is None else torch.from_numpy(np.asarray(weights, np.float32)).to(device)
     return camera, torch.from_numpy(image).to(device).float() / 255, counts
 
@@ -61,7 +82,11 @@ def to_tensors(
 def downsample(
     camera: Camera, image: np.ndarray, weights: np.ndarray | None
 ) -> tuple[Camera, np.ndarray, np.ndarray | None]:
-    """The view at half its size, rounded up; a pixel's weight is the lowest of those it covers."""
+    """Return the view (camera, image and weights) at half its size, rounded up.
+
+    A pixel of the small view gets the lowest weight among 3 x 3 pixels around the upper left corner of its area. So a
+    colour to which a pixel of weight 0 contributes has weight 0 (in views of even size).
+    """
     size = (camera.width + 1) // 2, (camera.height + 1) // 2
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     if weights is not None:
@@ -73,13 +98,24 @@ def downsample(
 def subsample(
     camera: Camera, image: np.ndarray, weights: np.ndarray | None, left: int, top: int
 ) -> tuple[Camera, np.ndarray, np.ndarray | None]:
-    """Every second pixel of the view each way, from (left, top) on: a quarter of the work at full sharpness."""
+    """Return every second pixel of the view in each direction, as camera, image and weights.
+
+    A step on these pixels is a quarter of the work, at the sharpness of the full view.
+
+    Args:
+        left, top: column and row of the first pixel, each 0 or 1.
+    """
     weights = None if weights is None else weights[top::2, left::2]
     return camera.sampled(2, left, top), np.ascontiguousarray(image[top::2, left::2]), weights
 
 
 def check_sizes(cameras: Sequence[Camera], images: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray]) -> None:
-    """Raise ValueError naming a view without an image, or whose image or mask differs in size from its camera."""
+    """Check that every view has an image, and that images and weights have the size of their camera.
+
+    Raises:
+        ValueError: an image is missing, or an image or the weights (called mask in the message) have another size. The
+            message names the view.
+    """
     for camera in cameras:
         for kind, array in (("image", images.get(camera.name)), ("mask", weights.get(camera.name))):
             if array is None and kind == "image":

@@ -1,4 +1,7 @@
-"""One step of Adam over rows of parameters, each with its own step count: in plain torch and in two faster ways."""
+"""One step of Adam on the parameters of Gaussians, each of which counts its own steps.
+
+`adam` is written in plain torch; `adam_cpu` (numba) and `cuda_kernels.adam` (Triton) compute the same, faster.
+"""
 
 from __future__ import annotations
 
@@ -14,25 +17,32 @@ from reffusion.gaussians.ssim import triton_works
 from reffusion.kernels.compiled import FREE_ROUNDING, kernel, parallel_for
 from reffusion.kernels.vectors import take_ticket
 
-_CHUNK = 512  # rows per ticket of a thread
+_CHUNK = 512  # Gaussians that a thread takes at a time
 _jit = partial(kernel, fastmath=FREE_ROUNDING)
 
 
 @lru_cache(maxsize=4)
 def unbiasing(betas: tuple[float, float], kilo: int, device: torch.device) -> list[Tensor]:
-    """Bias corrections 1 / (1 - beta^t) of each beta, for t = 0 (never used) to 1024 * `kilo` - 1."""
+    """Return Adam's bias corrections 1 / (1 - beta^t) as one tensor per beta, indexed by the step count t.
+
+    Args:
+        betas: decay rates of the first and of the second moment.
+        kilo: length of the tensors in units of 1024; t goes from 0 (never used) to 1024 * `kilo` - 1.
+        device: device of the tensors.
+    """
     t = torch.arange(1024 * kilo, dtype=torch.float64).clamp(min=1)
     return [(1 / (1 - beta**t)).float().to(device) for beta in betas]
 
 
 class Update(NamedTuple):
-    """Inputs of an Adam step for one parameter.
+    """Inputs of an Adam step for one parameter of N Gaussians, such as their means.
 
     Attributes:
-        parameter, first, second: the parameter and its two moments [N, D], updated in place.
+        parameter: [N, D], one row per Gaussian, updated in place.
+        first, second: [N, D], Adam's first and second moments, updated in place.
         gradient: [N, D].
-        rates: learning rates [d] of the first d columns; the other columns stay.
-        masked_factor: factor on the rates in masked rows.
+        rates: [d] learning rates of the first d <= D columns; all other columns stay unchanged.
+        masked_factor: factor on the learning rates of masked Gaussians.
     """
 
     parameter: Tensor
@@ -44,7 +54,7 @@ class Update(NamedTuple):
 
 
 def fastest(device: torch.device) -> Callable[..., None]:
-    """The fastest implementation for the device; all compute the same formula."""
+    """Return the fastest implementation of `adam` for float32 on this device; all have the same arguments."""
     if device.type == "cpu":
         return adam_cpu
     if device.type == "cuda" and triton_works():
@@ -56,9 +66,16 @@ def fastest(device: torch.device) -> Callable[..., None]:
 
 @torch.no_grad()
 def adam(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
-    """One Adam step on the visible rows.
+    """Do one Adam step on the visible Gaussians: update their parameters and moments in place.
 
-    `unbias1` and `unbias2` [T] are the bias corrections 1 / (1 - beta^t); `steps` [N] is t of each row.
+    Args:
+        updates: the parameters with their moments, gradients and learning rates.
+        steps: [N] int32, step count t of each Gaussian, this step included.
+        visible: [N] bool, True for the Gaussians to update.
+        masked: [N] bool, True where the learning rates are multiplied by `Update.masked_factor`.
+        unbias1, unbias2: [T] bias corrections 1 / (1 - beta^t) of the two moments (see `unbiasing`).
+        beta1, beta2: decay rates of the two moments.
+        epsilon: added to the root of the second moment.
     """
     rows = visible.nonzero()[:, 0]
     first_unbias, second_unbias = unbias1[steps[rows], None], unbias2[steps[rows], None]
@@ -73,7 +90,7 @@ def adam(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1,
 
 
 def adam_cpu(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
-    """`adam` in one pass over memory, for float32 on the CPU."""
+    """Do the step of `adam` in one pass over memory, for float32 on the CPU; arguments as for `adam`."""
     if not updates:
         return
     columns = [tuple(t.numpy() for t in kind) for kind in list(zip(*updates, strict=True))[:5]]
@@ -84,6 +101,14 @@ def adam_cpu(updates: list[Update], steps, visible, masked, unbias1, unbias2, be
 
 @_jit
 def _adam_kernel(tickets, parameters, firsts, seconds, gradients, rates, factors, rows, numbers):
+    """Update all parameters; a ticket is a chunk of `_CHUNK` Gaussians of one parameter.
+
+    Args:
+        parameters, firsts, seconds, gradients, rates: tuples with one array per parameter, as in `Update`.
+        factors: [len(parameters)] masked factors.
+        rows: steps, visible, masked, unbias1 and unbias2 of `adam`.
+        numbers: beta1, beta2 and epsilon.
+    """
     count = len(rows[0])
     chunks = (count + _CHUNK - 1) // _CHUNK
     while True:
@@ -97,6 +122,7 @@ def _adam_kernel(tickets, parameters, firsts, seconds, gradients, rates, factors
 
 @_jit
 def _adam_rows(begin, end, tables, rates, masked_factor, rows, numbers):
+    """Update the Gaussians `begin` to `end` - 1 of one parameter; `tables` holds it, its moments and its gradient."""
     parameter, first, second, gradient = tables
     steps, visible, masked, unbias1, unbias2 = rows
     beta1, beta2, epsilon = numbers

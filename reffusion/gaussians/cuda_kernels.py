@@ -1,7 +1,11 @@
 """D-SSIM and Adam on CUDA as Triton kernels, each in a few passes over memory (Triton comes with torch's CUDA builds).
 
-In plain torch the windows of SSIM and the gathering of visible rows for Adam take three quarters of a step of `fit` on
-a GPU (docs/gpu.md). The formulas are those of `gaussians.ssim` and `gaussians.adam`.
+In plain torch the windows of SSIM and the gathering of visible rows (one row per Gaussian) for Adam take three quarters
+of a step of `fit` on a GPU (docs/gpu.md). The formulas are those of `gaussians.ssim` and `gaussians.adam`.
+
+The kernels of D-SSIM hold a picture [H, W, C] as H * W * C consecutive numbers: a pixel to the right is C numbers away,
+a row below is W * C numbers away. Arguments with the same meaning everywhere: `count` is H * W * C, `row` is W * C,
+`BLOCK` the numbers per program, `RADIUS` half the window, `WEIGHTED` False if there are no weights.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ _BLOCK = 1024  # elements per program of a kernel
 
 
 def works() -> bool:
-    """Can the kernels be compiled for the GPU of this machine? Prints the reason if not."""
+    """Return whether the kernels can be compiled and run on the GPU of this machine. If not, the reason is printed."""
     try:
         probe = torch.zeros(4, 4, 1, device="cuda")
         dssim_and_gradient(probe, probe, None, np.ones(1), (1.0, 1.0))
@@ -30,7 +34,7 @@ def works() -> bool:
 
 
 class Dssim(torch.autograd.Function):
-    """`gaussians.ssim.dssim` for float32 on CUDA; arguments as `dssim_and_gradient`."""
+    """Autograd function of `gaussians.ssim.dssim` for float32 on CUDA; arguments as for `dssim_and_gradient`."""
 
     @staticmethod
     def forward(ctx, image: Tensor, target: Tensor, weights: Tensor | None, taps: np.ndarray, constants) -> Tensor:
@@ -46,12 +50,16 @@ class Dssim(torch.autograd.Function):
 def dssim_and_gradient(
     image: Tensor, target: Tensor, weights: Tensor | None, window: np.ndarray, constants: tuple[float, float]
 ) -> tuple[Tensor, Tensor]:
-    """Mean of weights * (1 - SSIM), and its gradient by the image [H, W, C]; float32.
+    """Compute the mean of weights * (1 - SSIM) over pixels and channels, and its gradient with respect to the image.
 
     Args:
-        weights: [H, W], or None.
-        window: [2 R + 1], the taps along one axis.
+        image, target: [H, W, C] float32 in [0, 1].
+        weights: [H, W] float32, or None for weights of 1.
+        window: [2 R + 1], the taps of the window along one axis.
         constants: C1 and C2 of SSIM.
+
+    Returns:
+        The mean, a scalar, and the gradient [H, W, C].
     """
     channels, count, row = image.shape[2], image.numel(), image.shape[1] * image.shape[2]
     x, y = image.contiguous(), target.contiguous()
@@ -74,7 +82,7 @@ def dssim_and_gradient(
 def _products_along_rows(
     x, y, weights, taps, fields, count, row, channels, BLOCK: tl.constexpr, RADIUS: tl.constexpr, WEIGHTED: tl.constexpr
 ):
-    """fields [5, H, W * C] = weights * (x, y, x^2 + y^2, x y, 1), filtered along each row of `row` numbers."""
+    """Write fields [5, H, W * C]: weights * (x, y, x^2 + y^2, x y, 1), filtered by the window along each row."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     column = at % row
     mean_x = tl.zeros((BLOCK,), tl.float32)
@@ -104,7 +112,10 @@ def _products_along_rows(
 
 @triton.jit
 def _filtered(field, taps, at, step, low, high, BLOCK: tl.constexpr, RADIUS: tl.constexpr):
-    """Window sum around `at` with pixels `step` elements apart; outside `low` to `high` they count as 0."""
+    """Return the window sums around the elements `at` of a field.
+
+    Neighbouring pixels of the window are `step` elements apart. Elements before `low` or from `high` on count as 0.
+    """
     total = tl.zeros((BLOCK,), tl.float32)
     for k in tl.static_range(2 * RADIUS + 1):
         to = at + (k - RADIUS) * step
@@ -117,7 +128,12 @@ def _compared_down_columns(
     weights, taps, fields, slopes, sums, count, row, channels, c1, c2,
     BLOCK: tl.constexpr, RADIUS: tl.constexpr, WEIGHTED: tl.constexpr,
 ):  # fmt: skip
-    """Sum of weights * (1 - SSIM) of each program; slopes [3, H, W * C] by the means of x, x^2 + y^2 and x y."""
+    """Filter the fields down the columns, and compute SSIM and its derivatives at each pixel.
+
+    Args:
+        sums: [programs], output, the sum of weights * (1 - SSIM) over the pixels of each program.
+        slopes: [3, H, W * C], output, derivatives of this sum with respect to the windowed x, x^2 + y^2 and x y.
+    """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mean_x = _filtered(fields, taps, at, row, 0, count, BLOCK, RADIUS)
     mean_y = _filtered(fields + count, taps, at, row, 0, count, BLOCK, RADIUS)
@@ -147,7 +163,7 @@ def _compared_down_columns(
 
 @triton.jit
 def _slopes_along_rows(taps, slopes, filtered, count, row, channels, BLOCK: tl.constexpr, RADIUS: tl.constexpr):
-    """filtered [3, H, W * C] = slopes, filtered along each row."""
+    """Write filtered [3, H, W * C]: the slopes, filtered by the window along each row."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     low = at - at % row
     high = tl.minimum(low + row, count)
@@ -161,7 +177,11 @@ def _gathered_down_columns(
     x, y, weights, taps, filtered, gradient, count, row, channels,
     BLOCK: tl.constexpr, RADIUS: tl.constexpr, WEIGHTED: tl.constexpr,
 ):  # fmt: skip
-    """gradient [H, W * C] = d(sum of weights * (1 - SSIM)) / dx."""
+    """Write gradient [H, W * C], the derivative of the sum of weights * (1 - SSIM) with respect to x.
+
+    The filtered slopes are filtered down the columns, too: the window is symmetric, so this is the backward pass of the
+    windowing.
+    """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     by_mean = _filtered(filtered, taps, at, row, 0, count, BLOCK, RADIUS)
     by_squares = _filtered(filtered + count, taps, at, row, 0, count, BLOCK, RADIUS)
@@ -176,7 +196,7 @@ def _gathered_down_columns(
 
 @torch.no_grad()
 def adam(updates, steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
-    """`gaussians.adam.adam` in one pass over memory."""
+    """Do the step of `gaussians.adam.adam` in one pass over memory; arguments as there."""
     for parameter, first, second, gradient, rates, masked_factor in updates:
         count, wide = parameter.numel(), parameter.shape[1]
         tables = parameter, first, second, gradient.contiguous(), rates.to(parameter)
@@ -190,6 +210,7 @@ def _adam_kernel(
     parameters, firsts, seconds, gradients, rates, steps, visible, masked, unbias1, unbias2,
     masked_factor, beta1, beta2, epsilon, count, wide, moving, BLOCK: tl.constexpr,
 ):  # fmt: skip
+    """Update one parameter: `count` numbers in rows of `wide`, of which the first `moving` columns are updated."""
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     row, column = at // wide, at % wide
     moves = (at < count) & (column < moving)

@@ -13,7 +13,7 @@ from torch import Tensor
 from reffusion.gaussians.optimize import GaussianOptimizer
 from reffusion.types import Gaussians
 
-SHRINK = 1.6  # factor by which the two children of a split are smaller; 0.8 * 2 in 3DGS
+SHRINK = 1.6  # factor by which the standard deviations of the two children of a split are smaller; 0.8 * 2 in 3DGS
 
 
 def densify(
@@ -23,17 +23,19 @@ def densify(
     cap_max: int,
     generator: torch.Generator,
 ) -> int:
-    """Clone the small and split the large Gaussians whose mean observed gradient is at least `grow_grad2d`.
+    """Clone small and split large Gaussians whose mean screen-space gradient is at least `grow_grad2d`.
 
-    A clone is a copy at the same position, which moves away because it gathers other moments. A split samples two
-    children from the Gaussian. Children inherit the label. The observed gradients are reset.
+    The gradients are those that `GaussianOptimizer.observe` accumulated; they are reset. A clone is a copy at the same
+    position. It moves away from the original, because its Adam moments start at zero. A split replaces a Gaussian by
+    two smaller children at positions sampled from it. Clones and children inherit the label.
 
     Args:
         grow_grad2d: in units of normalised device coordinates (see `GaussianOptimizer.observe`); 3DGS: 2e-4.
-        grow_scale3d: the largest standard deviation above which a Gaussian is split, not cloned; one for all or [N].
-            3DGS: 0.01.
-        cap_max: maximum number of Gaussians; of more candidates those with the largest gradients are taken.
-        generator: of the random positions of children.
+        grow_scale3d: Gaussians whose largest standard deviation is above this value are split, all other ones cloned.
+            One value for all Gaussians, or [N]. 3DGS: 0.01.
+        cap_max: maximum number of Gaussians. If there are more candidates than room, the ones with the largest
+            gradients are chosen.
+        generator: random generator for the positions of children.
 
     Returns:
         The increase in the number of Gaussians.
@@ -56,14 +58,20 @@ def densify(
 
 
 def viewing_distance(means: Tensor, centers: Tensor) -> Tensor:
-    """[N]: distance of each mean [N, 3] to the nearest camera centre [V, 3], the unit for sizes."""
+    """Return the distance [N] of each mean [N, 3] to the nearest camera centre [V, 3].
+
+    Sizes of Gaussians are measured in units of this distance.
+    """
     return torch.cdist(means.detach(), centers.to(means)).amin(dim=1)
 
 
 def split(gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
-    """Two smaller Gaussians for each one, at positions sampled from it: [M] -> [2 M], all first children first.
+    """Return two children for each of M Gaussians, at positions sampled from it and smaller by the factor `SHRINK`.
 
-    Opacity and colour are those of the parent.
+    Rotation, opacity and colour are those of the parent.
+
+    Returns:
+        2 M Gaussians: the first child of every parent, then the second child of every parent.
     """
     repeated = gaussians.map(lambda p: torch.cat([p, p]))
     noise = torch.randn(repeated.means.shape, generator=generator, device=generator.device).to(repeated.means)
@@ -73,7 +81,7 @@ def split(gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
 
 
 def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
-    """[M, 3]: vectors rotated by wxyz quaternions [M, 4] of any length (zero is the identity)."""
+    """Return the vectors [M, 3] rotated by wxyz quaternions [M, 4] of any length (zero is the identity)."""
     quaternions = unit(quaternions)
     w, axis = quaternions[:, :1], quaternions[:, 1:]
     across = 2 * torch.linalg.cross(axis, vectors)
@@ -81,17 +89,21 @@ def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
 
 
 def unit(quaternions: Tensor) -> Tensor:
-    """[M, 4]: quaternions normalised to length 1; zero stays zero."""
+    """Return the quaternions [M, 4] normalised to length 1; zero stays zero."""
     # Divide by the largest entry first: the squares of very short quaternions would underflow.
     quaternions = quaternions / quaternions.abs().amax(1, keepdim=True).clamp_min(torch.finfo(quaternions.dtype).tiny)
     return torch.nn.functional.normalize(quaternions, dim=1)
 
 
 def prune(optimizer: GaussianOptimizer, prune_opa: float, prune_scale3d: float | Tensor) -> int:
-    """Remove the Gaussians fainter than `prune_opa`, or with a standard deviation above `prune_scale3d` (one or [N]).
+    """Remove the Gaussians that are too faint or too large.
 
-    PAPER leaves open: 3DGS also removes Gaussians that cover more than 20 pixels of a view. That limit depends on the
-    image size, would remove whole walls in small images, and is left out here.
+    PAPER leaves open: 3DGS also removes Gaussians that cover more than 20 pixels of a view. This limit depends on the
+    image size, and would remove whole walls in small images, so it is left out here.
+
+    Args:
+        prune_opa: opacity in [0, 1] below which a Gaussian is removed.
+        prune_scale3d: largest standard deviation above which a Gaussian is removed; one for all, or [N].
 
     Returns:
         The number of removed Gaussians.

@@ -1,4 +1,8 @@
-"""Finds the Gaussians that were deleted from a scene in an editor, by matching positions in any order."""
+"""Search for the Gaussians that were deleted from a scene in an editor.
+
+The positions in the editor's file (the *cleaned* scene) are matched to those of the *whole* scene; their order does not
+matter.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-CANDIDATES = 8  # nearest Gaussians of the whole scene that a kept one is compared with
-MAX_DISTANCE = 0.5  # of the distance to its nearest neighbour, within which a position counts as quantised
-MIN_SPACING = 0.1  # of the median distance, used for Gaussians at the same position
-SAMPLE_SIZE = 5000  # kept Gaussians by which axis flips and different scenes are detected
+CANDIDATES = 8  # nearest Gaussians of the whole scene with which a Gaussian of the cleaned scene is compared
+# Matching radius of a Gaussian of the whole scene, as a share of the distance to its nearest neighbour: within it a
+# position of the cleaned scene counts as the Gaussian's own position, moved by quantisation.
+MAX_DISTANCE = 0.5
+# Least radius, as a share of the median of these distances; it matters for several Gaussians at one position.
+MIN_SPACING = 0.1
+SAMPLE_SIZE = 5000  # Gaussians of the cleaned scene by which axis flips and different scenes are detected
 QUERY_SIZE = 100_000  # points per query of neighbours
-MIN_MATCHED_SHARE = 0.95  # share of the kept Gaussians that must be matched for both files to be one scene
-# Signs of the axes: unchanged, or rotated by 180 degrees about x, y or z, as editors do with scenes that have y down.
+MIN_MATCHED_SHARE = 0.95  # share of the cleaned scene's Gaussians that must be matched for both files to be one scene
+# Signs of x, y and z: unchanged, or rotated by 180 degrees about x, y or z, as editors do with scenes that have y down.
 AXIS_FLIPS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
 
@@ -22,10 +29,12 @@ class Match:
     """Correspondence between a whole scene and a cleaned one.
 
     Attributes:
-        deleted: bool [N], Gaussians of the whole scene that are not in the cleaned one; all False where `found` is
-            less than `MIN_MATCHED_SHARE`.
-        found: share of the cleaned scene's Gaussians that are matched.
-        turn: signs of the axes by which the cleaned scene was rotated.
+        deleted: bool [N], True for the Gaussians of the whole scene that are not in the cleaned one. All False if the
+            scenes are different ones: less than `MIN_MATCHED_SHARE` of a sample of the cleaned scene is near Gaussians
+            of the whole scene.
+        found: share in [0, 1] of the cleaned scene's Gaussians that are matched; if the scenes are different ones, of
+            the sample.
+        turn: one of `AXIS_FLIPS`, the signs of x, y and z by which the cleaned scene was rotated.
     """
 
     deleted: np.ndarray
@@ -34,11 +43,12 @@ class Match:
 
 
 def match_gaussians(whole: np.ndarray, cleaned: np.ndarray) -> Match:
-    """Match the Gaussians of a cleaned scene to those of the whole scene: one to one, nearest pairs first.
+    """Match the Gaussians of a cleaned scene to those of the whole scene, one to one and the nearest pairs first.
 
-    Most editors keep positions to the last bit; these are matched by sorting. Quantisation moves a Gaussian by far less
-    than the distance to its neighbours, even in a compressed .ply, whose steps are 1/2000 of the extent of 256
-    neighbours. Gaussians that were moved, rotated otherwise or scaled are not matched.
+    Most editors keep positions to the last bit; equal positions are matched by sorting. Some editors quantise
+    positions. This moves a Gaussian by far less than the distance to its neighbours, even in a compressed .ply, whose
+    steps are 1/2000 of the extent of 256 neighbours. Gaussians that were moved, scaled, or rotated other than by
+    `AXIS_FLIPS` are not matched.
 
     Args:
         whole: [N, 3] positions, N >= 2.
@@ -64,7 +74,7 @@ def match_gaussians(whole: np.ndarray, cleaned: np.ndarray) -> Match:
 
 
 class _ExactIndex:
-    """Looks up Gaussians of a scene by their exact positions."""
+    """Index of a scene's Gaussians by their exact positions."""
 
     def __init__(self, whole: np.ndarray):
         self._whole, keys = whole, _hash_positions(whole)
@@ -72,7 +82,10 @@ class _ExactIndex:
         self._keys = keys[self._order]
 
     def find(self, points: np.ndarray) -> np.ndarray:
-        """int [M]: for each point [M, 3] the Gaussian at exactly this position, one to one; -1 where there is none."""
+        """Return int [M], for each point [M, 3] the index of the Gaussian at exactly this position, or -1 without one.
+
+        If several Gaussians have the same position, each of them is given to one point only.
+        """
         index, keys = np.full(len(points), -1), _hash_positions(points)
         order = np.argsort(keys, kind="stable")
         keys = keys[order]
@@ -86,7 +99,7 @@ class _ExactIndex:
 
 
 def _hash_positions(points: np.ndarray) -> np.ndarray:
-    """uint64 [N]: hashes that are equal for equal positions; zeros of both signs are equal."""
+    """Return uint64 [N], hashes that are equal for equal positions [N, 3]; 0.0 and -0.0 are equal."""
     bits = np.ascontiguousarray(points + 0.0, np.float64).view(np.uint64)
     key = np.zeros(len(points), np.uint64)
     for axis in range(3):
@@ -96,7 +109,7 @@ def _hash_positions(points: np.ndarray) -> np.ndarray:
 
 
 class _NearIndex:
-    """Looks up Gaussians of a scene within a radius that depends on their spacing."""
+    """Index of a scene's Gaussians by position, with a matching radius for each that depends on its neighbours."""
 
     def __init__(self, whole: np.ndarray):
         self.tree = cKDTree(whole)
@@ -108,20 +121,31 @@ class _NearIndex:
         self._min_radius = MIN_SPACING * float(np.median(self.radius(sample))) / MAX_DISTANCE
 
     def radius(self, splats: np.ndarray) -> np.ndarray:
-        """float32, shape of `splats`: matching radius of Gaussians, given by their indices in the tree."""
+        """Return the matching radii of Gaussians of the scene, as float32 of the shape of `splats`.
+
+        The radius of a Gaussian is `MAX_DISTANCE` times the distance to its nearest neighbour, but not below the least
+        radius (see `MIN_SPACING`).
+
+        Args:
+            splats: int array of any shape, indices of the Gaussians.
+        """
         unknown = np.unique(splats[np.isnan(self._spacing[splats])])
         unknown = unknown[np.argsort(self._position[unknown])]  # in the order of the tree, for the cache
         self._spacing[unknown] = self.tree.query(self.tree.data[unknown], 2, workers=-1)[0][:, 1]
         return np.maximum(MAX_DISTANCE * self._spacing[splats], self._min_radius)
 
     def share(self, points: np.ndarray) -> float:
-        """Share of the points that lie within the radius of a Gaussian."""
+        """Return the share of the points [M, 3] that lie within the matching radius of their nearest Gaussian."""
         distances, nearest = self.tree.query(points)
         return float((distances <= self.radius(nearest)).mean())
 
 
 def _find_candidates(index: _NearIndex, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest Gaussians of each point: distances float32 [M, C], inf beyond the radius; indices int32 [M, C]."""
+    """Find the C nearest Gaussians of each point [M, 3], nearest first; C is `CANDIDATES`, or all if there are fewer.
+
+    Returns:
+        The distances float32 [M, C], infinite beyond the Gaussian's matching radius, and the indices int32 [M, C].
+    """
     count = min(CANDIDATES, index.tree.n)
     distances, candidates = np.empty((len(points), count), np.float32), np.empty((len(points), count), np.int32)
     order = cKDTree(points).indices
@@ -136,7 +160,15 @@ def _find_candidates(index: _NearIndex, points: np.ndarray) -> tuple[np.ndarray,
 
 
 def _match_one_to_one(index: _NearIndex, points: np.ndarray, excluded: np.ndarray) -> np.ndarray:
-    """bool [N]: the Gaussians that are matched to one of the points [M, 3], one to one; never one of `excluded` [N]."""
+    """Match points to Gaussians one to one, the nearest pairs first.
+
+    Args:
+        points: [M, 3].
+        excluded: bool [N], True for Gaussians that cannot be matched.
+
+    Returns:
+        bool [N], True for the Gaussians that are matched to a point.
+    """
     distances, candidates = _find_candidates(index, points)
     distances[excluded[candidates]] = np.inf
     count = distances.shape[1]
@@ -144,14 +176,15 @@ def _match_one_to_one(index: _NearIndex, points: np.ndarray, excluded: np.ndarra
     owner_distance = np.full(index.tree.n, np.inf)  # distance to the owner
     rank = np.zeros(len(points), int)  # next candidate that each point proposes to
     proposers = np.arange(len(points))
-    while len(proposers):  # stable matching: the result equals that of greedily taking the nearest pairs
+    # Stable matching: each point proposes to its nearest Gaussian, then to the next ones; a Gaussian keeps the nearest
+    # point. The result equals that of greedily matching the nearest pairs.
+    while len(proposers):
         proposers = proposers[rank[proposers] < count]
         proposed, proposed_distance = (table[proposers, rank[proposers]] for table in (candidates, distances))
         rank[proposers] += 1
         order = np.lexsort((proposers, proposed_distance))[::-1]
-        order = order[
-            proposed_distance[order] < owner_distance[proposed[order]]
-        ]  # the nearest comes last, and overwrites the others
+        # Farthest first: if several points propose to one Gaussian, the nearest is written last and stays.
+        order = order[proposed_distance[order] < owner_distance[proposed[order]]]
         displaced = owner[proposed[order]]
         owner[proposed[order]], owner_distance[proposed[order]] = proposers[order], proposed_distance[order]
         proposers = np.setdiff1d(np.concatenate([proposers, displaced[displaced >= 0]]), owner)

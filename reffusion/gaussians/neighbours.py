@@ -12,18 +12,19 @@ from reffusion.gaussians.densify import rotate
 from reffusion.splat.conventions import SH0
 from reffusion.types import Gaussians
 
-NEIGHBOURS = 8  # nearest neighbours of each Gaussian
-UNLIKE = 1.0  # how much longer an edge is where colours differ as neighbours do on average
+NEIGHBOURS = 8  # number of nearest neighbours to which each Gaussian has an edge
+UNLIKE = 1.0  # relative increase of an edge's length if its two colours differ as those of neighbours do on average
 
 
 @dataclass(frozen=True)
 class NeighbourGraph:
-    """The graph of neighbouring Gaussians, with the similarity of their colours.
+    """The graph whose E edges join neighbouring Gaussians, with the similarity of their colours.
 
     Attributes:
-        pairs: [E, 2] int, each pair once.
-        likeness: [E] in (0, 1], similarity of colours.
-        way: [E] > 0, length of the edge: the distance, longer where colours differ.
+        pairs: [E, 2] int, indices of the two Gaussians of each edge; each pair occurs once.
+        likeness: [E] in [0, 1], similarity of the two colours: exp(-d / 2), where d is the squared difference of the
+            colours over its mean of all edges.
+        way: [E], positive, length of the edge: the distance of the two means times 1 + `UNLIKE` sqrt(d).
     """
 
     pairs: np.ndarray
@@ -32,7 +33,10 @@ class NeighbourGraph:
 
 
 def find_neighbours(gaussians: Gaussians) -> NeighbourGraph:
-    """The graph of neighbouring Gaussians; likeness of colours is relative to the mean difference of neighbours."""
+    """Build the graph that joins each Gaussian to its `NEIGHBOURS` nearest ones, by the distance of means.
+
+    Colours are compared without their view-dependent part.
+    """
     means, color = (each.detach().cpu().double().numpy() for each in (gaussians.means, gaussians.sh[:, 0] * SH0))
     near = cKDTree(means).query(means, min(NEIGHBOURS + 1, len(means)))[1].reshape(len(means), -1)[:, 1:]
     own = np.repeat(np.arange(len(means)), near.shape[1])
@@ -45,11 +49,15 @@ def find_neighbours(gaussians: Gaussians) -> NeighbourGraph:
 
 
 def measure_overlap(gaussians: Gaussians, pairs: np.ndarray) -> np.ndarray:
-    """[E] in [0, 1], how much the Gaussians of each pair overlap: exp(-g^2 / 2), where g is their distance over the sum
-    of their standard deviations towards each other.
+    """Compute how much the two Gaussians of each pair overlap: exp(-g^2 / 2).
+
+    Here g is the distance of their means, over the sum of their standard deviations along the line between the means.
 
     Args:
-        pairs: [E, 2] int.
+        pairs: [E, 2] int, indices of the two Gaussians.
+
+    Returns:
+        [E] float64 in [0, 1].
     """
     means, scales = (each.detach().cpu().double() for each in (gaussians.means, gaussians.log_scales.exp()))
     inverse = gaussians.quaternions.detach().cpu().double() * torch.tensor([1.0, -1.0, -1.0, -1.0])

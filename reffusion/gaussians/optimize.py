@@ -1,6 +1,7 @@
 """The reconstruction loss, the paper's confinement of gradients, and Adam over a varying number of Gaussians.
 
-Shared by `fit` and `distill`. All functions take tensors and plain numbers.
+The stages `fit` and `distill` share this module. *Masked* Gaussians are those with the label True: in `distill` the new
+ones that fill the hole, in `fit` the ones whose positions are known.
 """
 
 from __future__ import annotations
@@ -17,23 +18,28 @@ from reffusion.gaussians import adam
 from reffusion.gaussians.ssim import dssim
 from reffusion.types import PARAMETERS, Gaussians
 
-DSSIM_SHARE = 0.2  # of the reconstruction loss, as in 3DGS
+DSSIM_SHARE = 0.2  # share of D-SSIM in the reconstruction loss, as in 3DGS
 
 
 def reconstruction_loss(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
-    """The photometric loss of 3DGS: 0.8 L1 + 0.2 D-SSIM, where D-SSIM = 1 - SSIM.
+    """Compute the photometric loss of 3DGS: 0.8 L1 + 0.2 D-SSIM, where D-SSIM = 1 - SSIM.
+
+    PAPER leaves open: by what a masked loss is divided. Here it is divided by the number of all pixels, so that a pixel
+    has the same influence in every view. The loss of a completely masked view is 0.
 
     Args:
         image, target: [H, W, C] in [0, 1]; the gradient reaches `image` only.
         weights: [H, W], bool or in [0, 1]; None: all 1. A pixel of weight 0 influences neither the value nor the
             gradient of any other pixel, and its own gradient is 0 (see `gaussians.ssim`).
-            PAPER leaves open: what a masked loss is divided by. It is divided by the number of all pixels, so that a
-            pixel has the same influence in every view; the loss of a completely masked view is 0.
+
+    Returns:
+        The loss, a scalar.
     """
     return (1 - DSSIM_SHARE) * _l1(image, target.detach(), weights) + DSSIM_SHARE * dssim(image, target, weights)
 
 
 def _l1(image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
+    """Return the mean of weights * |image - target| over pixels and channels; a pixel of weight 0 may hold NaN."""
     difference = (image - target).abs()
     if weights is None:
         return difference.mean()
@@ -42,7 +48,12 @@ def _l1(image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
 
 
 def confine(gaussians: Gaussians, select: Tensor) -> Gaussians:
-    """The same Gaussians, with gradients only in the rows selected by `select`, bool [N]; exactly 0 elsewhere."""
+    """Return the same Gaussians, through which gradients reach only the selected ones.
+
+    Args:
+        select: bool [N], True for the Gaussians whose parameters receive gradients. The gradients of all other
+            Gaussians are exactly 0.
+    """
 
     def confined(parameter: Tensor) -> Tensor:
         return torch.where(select.view(-1, *[1] * (parameter.ndim - 1)), parameter, parameter.detach())
@@ -52,14 +63,16 @@ def confine(gaussians: Gaussians, select: Tensor) -> Gaussians:
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rates: those of 3DGS, for the normalised frame, in which cameras are about 1 from the scene.
+    """Adam's learning rates for the parameters of Gaussians.
+
+    The defaults are those of 3DGS, for the normalised frame, in which cameras are about 1 from the scene.
 
     Attributes:
-        means: for positions at the start, in units of the frame; decays exponentially to `means_last`.
-        means_last: for positions at the end.
-        quaternions, log_scales, opacity_logits: for the parameters of these names.
-        sh_dc: for the constant spherical harmonic.
-        sh_rest: for the others.
+        means: learning rate of positions at the start, in units of the frame; it decays exponentially to `means_last`.
+        means_last: learning rate of positions at the end.
+        quaternions, log_scales, opacity_logits: learning rates of the parameters of these names.
+        sh_dc: learning rate of the constant spherical harmonic.
+        sh_rest: learning rate of all other spherical harmonics.
     """
 
     means: float = 1.6e-4
@@ -71,11 +84,19 @@ class Rates:
     sh_rest: float = 2.5e-3 / 20
 
     def in_units_of(self, unit: float) -> Rates:
-        """The same rates with those of positions multiplied by `unit`."""
+        """Return these rates, with the rates of positions multiplied by `unit`, a length in the normalised frame."""
         return replace(self, means=unit * self.means, means_last=unit * self.means_last)
 
     def at(self, progress: float, gaussians: Gaussians) -> dict[str, Tensor]:
-        """Learning rate per parameter and column, at `progress` in [0, 1] of the run."""
+        """Return the learning rates of each parameter at one moment of the run.
+
+        Args:
+            progress: share of the run in [0, 1] that is done.
+            gaussians: the Gaussians; only the number of their spherical harmonics matters.
+
+        Returns:
+            Parameter name -> [D], a learning rate for each of the D numbers that a Gaussian has of this parameter.
+        """
         constant = lambda value, count: torch.full((count,), value)
         sh = constant(self.sh_rest, gaussians.sh.shape[1] * 3)
         sh[:3] = self.sh_dc
@@ -96,10 +117,12 @@ class GaussianOptimizer:
     gradient to average.
 
     Attributes:
-        gaussians: the parameters, leaves that require gradients. A new object after each change of their number.
-        masked: [N] bool, labels of the Gaussians; `select` and `append` keep them aligned.
-        masked_factors: parameter -> factor on the learning rates of masked Gaussians; 1 if it has no entry.
-        grad2d_sum, grad2d_count: [N], accumulated by `observe` since `forget_grad2d`; kept aligned likewise.
+        gaussians: the N Gaussians; their parameters are leaf tensors that require gradients. After each change of their
+            number this is a new object.
+        masked: [N] bool, labels of the Gaussians; `select` and `append` update them.
+        masked_factors: parameter name -> factor on the learning rates of masked Gaussians; 1 without an entry.
+        grad2d_sum: [N], sum of the screen-space gradients that `observe` was given since `forget_grad2d`.
+        grad2d_count: [N], number of views in this sum. `select` and `append` update both.
     """
 
     _COUNTERS = ("masked", "_steps", "grad2d_sum", "grad2d_count")
@@ -113,6 +136,16 @@ class GaussianOptimizer:
         betas: tuple[float, float] = (0.9, 0.999),
         epsilon: float = 1e-15,
     ):
+        """Start Adam with zero moments.
+
+        Args:
+            gaussians: the initial Gaussians, which are copied.
+            masked: [N] bool, their labels; None: all False.
+            rates: learning rates; None takes the defaults of `Rates`.
+            masked_factors: see the class; None: no factors.
+            betas: Adam's decay rates of the first and of the second moment.
+            epsilon: added to the root of the second moment.
+        """
         self.rates, self.betas, self.epsilon = rates or Rates(), betas, epsilon
         self.masked_factors = dict(masked_factors or {})
         self.masked = torch.zeros(len(gaussians), dtype=torch.bool) if masked is None else masked.clone()
@@ -125,16 +158,16 @@ class GaussianOptimizer:
         self.forget_grad2d()
 
     def observe(self, probe_gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
-        """Accumulate one view's screen-space gradients, which `densify` uses.
+        """Accumulate the screen-space gradients of one view, which `densify` uses.
 
         3DGS measures in normalised device coordinates, where the image spans [-1, 1]: one unit is half the image. So
-        gradients by pixels are multiplied by `width / 2` and `height / 2`. Since the loss is a mean over pixels, the
-        result depends neither on the size of the image nor on that of the scene.
+        gradients with respect to pixels are multiplied by `width / 2` and `height / 2`. Since the loss is a mean over
+        pixels, the result depends neither on the size of the image nor on the size of the scene.
 
         Args:
             probe_gradient: [N, 2], d loss / d (2D mean in pixels), the gradient of the probe of `splat.render`.
-            radii: [N], 0 where the Gaussian was not rendered.
-            width, height: of the rendered image, in pixels.
+            radii: [N], radii of the footprints; Gaussians of radius 0 were not rendered and do not count.
+            width, height: size of the rendered image in pixels.
         """
         visible = radii > 0
         grad2d = torch.hypot(probe_gradient[:, 0] * (width / 2), probe_gradient[:, 1] * (height / 2))
@@ -147,15 +180,16 @@ class GaussianOptimizer:
         self.grad2d_count = torch.zeros_like(self._steps)
 
     def step(self, progress: float, visible: Tensor | None = None, sh_degree: int | None = None) -> None:
-        """One Adam step along the accumulated gradients, which are then cleared.
+        """Do one Adam step with the accumulated gradients, and clear them.
 
         Args:
-            progress: in [0, 1] of the run; sets the learning rate of the means.
-            visible: [N] bool, the Gaussians to update, e.g. `rendering.radii > 0`; None updates all.
-            sh_degree: the highest degree rendered so far; higher coefficients are not updated. None: all are.
+            progress: share of the run in [0, 1] that is done; sets the learning rate of the means.
+            visible: [N] bool, True for the Gaussians to update, e.g. `rendering.radii > 0`; None updates all.
+            sh_degree: the highest degree of spherical harmonics rendered so far; coefficients of higher degrees are not
+                updated. None updates all coefficients.
 
         Raises:
-            FloatingPointError: a gradient is not finite; names the parameter. Nothing has been changed then.
+            FloatingPointError: a gradient is NaN or infinite. The message names the parameter. Nothing has changed.
         """
         gradients = {name: getattr(self.gaussians, name).grad for name in PARAMETERS}
         refuse_not_finite(gradients)
@@ -177,6 +211,7 @@ class GaussianOptimizer:
         self.forget_gradients()
 
     def _states(self) -> tuple[Gaussians, Gaussians, Gaussians]:
+        """Return the Gaussians, and their first and second moments in the same form."""
         return self.gaussians, self._first, self._second
 
     def forget_gradients(self) -> None:
@@ -186,7 +221,7 @@ class GaussianOptimizer:
 
     @torch.no_grad()
     def remember(self) -> None:
-        """Add the current Gaussians to the running mean that `take_mean` applies."""
+        """Include the current Gaussians in the running mean; `apply_mean` later replaces the Gaussians by this mean."""
         self._meant += 1
         if self._mean is None:
             self._mean = self.gaussians.map(lambda p: p.detach().clone())
@@ -196,24 +231,32 @@ class GaussianOptimizer:
 
     @torch.no_grad()
     def apply_mean(self) -> None:
-        """Replace the Gaussians by their running mean, if `remember` was called.
+        """Replace the Gaussians by their running mean. Without a call of `remember` nothing changes.
 
-        With one view per step Gaussians fluctuate around their optimum, and the mean of the iterates is closer to it
-        than the last one (Polyak, Ruppert).
+        With one view per step Gaussians fluctuate around their optimum, and the mean of the iterates is closer to the
+        optimum than the last iterate (Polyak, Ruppert).
         """
         if self._mean is not None:
             for name in PARAMETERS:
                 getattr(self.gaussians, name).copy_(getattr(self._mean, name))
 
     def select(self, keep: Tensor) -> None:
-        """Keep the rows chosen by `keep` ([N] bool, or indices [M]), with their labels, moments and mean."""
+        """Keep the chosen Gaussians, with their labels, moments and running mean, and remove all other ones.
+
+        Args:
+            keep: [N] bool, True for the Gaussians to keep, or their indices [M].
+        """
         self._replace(lambda p: p[keep])
         self._mean = self._mean and self._mean.map(lambda p: p[keep])
         for name in self._COUNTERS:
             setattr(self, name, getattr(self, name)[keep])
 
     def append(self, gaussians: Gaussians, masked: Tensor) -> None:
-        """Append Gaussians with labels `masked` [M] bool and zero moments; the running mean is discarded."""
+        """Append M Gaussians with zero moments; the running mean is discarded.
+
+        Args:
+            masked: [M] bool, their labels.
+        """
         self._mean, self._meant = None, 0
         self.gaussians = self.gaussians.zip_map(gaussians, lambda a, b: _leaf(torch.cat([a, b])))
         empty = gaussians.map(_zeros)
@@ -224,9 +267,10 @@ class GaussianOptimizer:
             setattr(self, name, torch.cat([old, masked if name == "masked" else old.new_zeros(len(gaussians))]))
 
     def cap_opacity(self, limit: float) -> None:
-        """Opacity reset of 3DGS: clamp opacities to `limit` in (0, 1); needed Gaussians recover.
+        """Clamp all opacities to at most `limit` in (0, 1), the opacity reset of 3DGS.
 
-        Adam's moments of the opacity are set to zero, because they belong to the former values.
+        The opacities of Gaussians that the views need grow again in later steps. Adam's moments of the opacity are set
+        to zero, because they belong to the former values.
         """
         with torch.no_grad():
             self.gaussians.opacity_logits.clamp_(max=float(np.log(limit / (1 - limit))))
@@ -234,7 +278,7 @@ class GaussianOptimizer:
             self._second.opacity_logits.zero_()
 
     def state_dict(self) -> dict[str, Any]:
-        """State from which `load_state_dict` continues bit for bit."""
+        """Return the state from which `load_state_dict` continues bit for bit."""
         parts = {"parameters": self.gaussians, "first": self._first, "second": self._second}
         parts |= {"mean": self._mean} if self._mean is not None else {}
         state: dict[str, Any] = {
@@ -243,7 +287,7 @@ class GaussianOptimizer:
         return state | {name: getattr(self, name).clone() for name in self._COUNTERS} | {"meant": self._meant}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a `state_dict`, with any number of Gaussians."""
+        """Restore a state returned by `state_dict`; its number of Gaussians may differ from the present one."""
         self.gaussians = Gaussians(**state["parameters"], antialiased=self.gaussians.antialiased).map(_leaf)
         self._first = Gaussians(**state["first"]).map(torch.clone)
         self._second = Gaussians(**state["second"]).map(torch.clone)
@@ -253,12 +297,17 @@ class GaussianOptimizer:
             setattr(self, name, state[name].clone())
 
     def _replace(self, function) -> None:
+        """Apply `function` to each parameter of the Gaussians and to its moments."""
         self.gaussians = self.gaussians.map(lambda p: _leaf(function(p)))
         self._first, self._second = self._first.map(function), self._second.map(function)
 
 
 def refuse_not_finite(gradients: Mapping[str, Tensor | None]) -> None:
-    """Raise FloatingPointError naming the parameter if a gradient is NaN or infinite."""
+    """Raise FloatingPointError if a gradient is NaN or infinite; the message names the parameter.
+
+    Args:
+        gradients: parameter name -> gradient, or None without one.
+    """
     # A sum is finite only if every term is, and needs no array of flags; all sums are checked at once.
     sums = {name: gradient.sum() for name, gradient in gradients.items() if gradient is not None}
     for name, finite in zip(sums, torch.isfinite(torch.stack([*sums.values()])).tolist() if sums else (), strict=True):
@@ -267,6 +316,7 @@ def refuse_not_finite(gradients: Mapping[str, Tensor | None]) -> None:
 
 
 def _leaf(parameter: Tensor) -> Tensor:
+    """Return a contiguous copy that requires gradients."""
     return parameter.detach().clone().contiguous().requires_grad_()
 
 
@@ -275,4 +325,5 @@ def _zeros(parameter: Tensor) -> Tensor:
 
 
 def _rows(parameter: Tensor) -> Tensor:
+    """Return a parameter [N, ...] as a table [N, D], one row per Gaussian, that shares its memory if contiguous."""
     return parameter.detach().contiguous().view(parameter.shape[0], -1)

@@ -14,26 +14,28 @@ from reffusion.types import Camera, Gaussians
 
 @dataclass(frozen=True)
 class Sheets:
-    """Settings of the Gaussians on a surface: a sheet of faint ones, and a second, more opaque sheet behind it.
+    """Settings of the Gaussians on a surface: a first sheet of faint ones, and a more opaque second sheet behind it.
 
-    Opaque neighbouring Gaussians cannot show a sharp picture from all sides: each occludes part of the next one, so
-    that only its far side is visible. The texture appears shifted away from the camera by a third of their spacing, and
-    by twice that between opposite views. Fainter Gaussians reduce the shift; the second sheet keeps the surface closed.
-    Figures are in docs/method.md#initialization.
+    Opaque neighbouring Gaussians cannot show a sharp picture from all sides. On a slanted surface each Gaussian
+    occludes the near side of the next one behind it. So the texture appears shifted away from the camera by a third of
+    the Gaussians' spacing, and between opposite views by twice this distance. Fainter Gaussians reduce the shift; the
+    second sheet keeps the surface closed. Figures are in docs/method.md#initialization.
 
     PAPER leaves open: scale and opacity of the initial Gaussians.
 
     Attributes:
-        spread: standard deviation of the first sheet's Gaussians, in pixels of the reference.
-        thickness: standard deviation along the normal, relative to that within the surface.
-        grazing: cosine of the viewing angle below which Gaussians are not stretched further.
-        opacity: of the first sheet.
-        offset_px: distance of the second sheet behind the first, in pixels (0: no second sheet).
-        under_spread, under_opacity: of the second sheet. Its Gaussians are wider so that they leave no gaps, which a
-            nearer view would show as a grid; the colours of the first sheet compensate for the blur.
-        color_steps: corrections of the colours, see `reffusion.initialize.unprojection.match_colors`.
-        view_dependent: make colours depend on the direction as those around them do, see
-            `reffusion.initialize.view_dependent_color`.
+        spread: standard deviation of the first sheet's Gaussians, in pixels of the view whose pixels they show.
+        thickness: standard deviation along the normal, relative to the smaller one within the surface.
+        grazing: cosine of the angle between normal and viewing direction below which Gaussians are not stretched
+            further.
+        opacity: opacity of the first sheet's Gaussians, in (0, 1).
+        offset_px: distance of the second sheet behind the first one, in pixels; 0: there is no second sheet.
+        under_spread, under_opacity: `spread` and `opacity` of the second sheet. Its Gaussians are wider so that they
+            leave no gaps, which a nearer view would show as a grid. The colours of the first sheet compensate for the
+            blur.
+        color_steps: number of corrections of the colours, see `reffusion.initialize.unprojection.match_colors`.
+        view_dependent: True makes the colours change with the viewing direction, as the colours of the surface around
+            the hole do, see `reffusion.initialize.view_dependent_color`.
     """
 
     spread: float = 0.3
@@ -50,7 +52,13 @@ class Sheets:
 def sheet_gaussians(
     image: np.ndarray, depth: np.ndarray, pixels: np.ndarray, camera: Camera, sh_count: int, settings: Sheets
 ) -> Gaussians:
-    """Gaussians of both sheets for the chosen `pixels`; arguments as `surface_gaussians`."""
+    """Return the Gaussians of both sheets for the chosen pixels: first the front sheet, then the sheet behind it.
+
+    `color_steps` and `view_dependent` of the settings are not used here.
+
+    Args:
+        image, depth, pixels, camera, sh_count: as for `surface_gaussians`.
+    """
     shape = partial(surface_gaussians, sh_count=sh_count, thickness=settings.thickness, grazing=settings.grazing)
     sheet = partial(shape, image, depth, pixels, camera)
     front = sheet(spread=settings.spread, opacity=settings.opacity)

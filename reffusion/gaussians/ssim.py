@@ -1,9 +1,9 @@
 """Structural similarity over windows that leave out masked pixels, differentiable in the first image.
 
 Windows are those of 3DGS: Gaussian, 11 x 11, sigma 1.5. Local statistics are *normalised convolutions*: weighted sums
-divided by the sum of the weights in the window. So a pixel of weight 0 is in no window, and neither are pixels outside
-the image (3DGS counts those as black). The alternative, making both images equal where masked, would put a common edge
-into the windows around a mask and raise their similarity.
+divided by the sum of the weights in the window. So a pixel of weight 0 is in no window, and neither is a pixel outside
+the image (3DGS counts pixels outside as black). The alternative is to make both images equal where they are masked. It
+would put an edge that both images share into the windows around a mask, and so raise the similarity there.
 
 `dssim` runs a numba kernel on float32 CPU tensors, a Triton kernel on CUDA, and plain torch elsewhere; all compute the
 same formula.
@@ -29,20 +29,21 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 def window() -> np.ndarray:
-    """[11]: taps of the window along one axis, with sum 1."""
+    """Return the 11 taps of the window along one axis, float64 with sum 1."""
     taps = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
     return taps / taps.sum()
 
 
 def dssim(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Mean of weights * (1 - SSIM) over pixels and channels; its gradient reaches `image` only.
+    """Compute the mean of weights * (1 - SSIM) over pixels and channels; its gradient reaches `image` only.
 
     Args:
         image, target: [H, W, C] in [0, 1].
-        weights: [H, W], bool or in [0, 1]; a pixel of weight 0 influences nothing, whatever its value. None: all 1.
+        weights: [H, W], bool or in [0, 1]; None: all 1. A pixel of weight 0 influences nothing, even if it holds NaN.
 
     Returns:
-        A scalar in [0, 2]: the sum divided by H * W * C, so that a pixel counts the same however large the mask is.
+        A scalar in [0, 2]. The sum is divided by H * W * C, not by the sum of weights, so that a pixel has the same
+        influence however large the mask is.
     """
     if weights is not None:
         weights = weights.to(image.dtype)
@@ -59,7 +60,10 @@ def dssim(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tenso
 
 @cache
 def triton_works() -> bool:
-    """Are a CUDA device and Triton available for `gaussians.cuda_kernels`? Triton comes with torch's CUDA builds."""
+    """Return whether `gaussians.cuda_kernels` can be used: there is a CUDA device, and Triton can compile for it.
+
+    Triton comes with torch's CUDA builds.
+    """
     if not torch.cuda.is_available() or find_spec("triton") is None:
         return False
     from reffusion.gaussians import cuda_kernels
@@ -68,7 +72,10 @@ def triton_works() -> bool:
 
 
 def dssim_torch(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
-    """`dssim` in plain torch, for any device and dtype and finite inputs; the reference for the kernels."""
+    """Compute `dssim` in plain torch, on any device and in any dtype; the kernels are tested against this function.
+
+    Unlike in `dssim`, pixels of weight 0 must be finite.
+    """
     if weights is None:
         weights = torch.ones_like(image[..., 0])
     weights = weights[..., None]
@@ -83,10 +90,10 @@ def dssim_torch(image: Tensor, target: Tensor, weights: Tensor | None = None) ->
 
 
 class _Windowed(torch.autograd.Function):
-    """[H, W, F] -> [H, W, F]: window sums of each field, with zeros around the image.
+    """Window sums of F fields [H, W, F], with zeros around the image.
 
-    The window is symmetric, so the operation is its own adjoint. An autograd function of its own makes the backward
-    pass as exact as the forward pass.
+    The window is symmetric, so the operation is its own adjoint: the backward pass is the same operation. Without this
+    class autograd would compute the backward pass outside of `no_tf32`, with fewer digits.
     """
 
     @staticmethod
@@ -105,10 +112,10 @@ class _Windowed(torch.autograd.Function):
 
 @contextmanager
 def no_tf32() -> Iterator[None]:
-    """Disable TF32 in CUDA convolutions inside the context.
+    """Disable TF32 in CUDA convolutions inside this context.
 
-    SSIM subtracts E[x]^2 from E[x^2]: of the 10 bits of TF32 hardly any would remain, and gradients would be wrong by a
-    tenth to a third.
+    SSIM subtracts E[x]^2 from E[x^2]. Hardly any of the 10 bits of TF32 would be left after the subtraction, and
+    gradients would be wrong by a tenth to a third.
     """
     before = torch.backends.cudnn.allow_tf32
     torch.backends.cudnn.allow_tf32 = False
@@ -119,6 +126,8 @@ def no_tf32() -> Iterator[None]:
 
 
 class _FastDssim(torch.autograd.Function):
+    """Autograd function of `dssim` for float32 on the CPU, by numba kernels; its forward pass computes the gradient."""
+
     @staticmethod
     def forward(ctx, image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
         height, width, channels = image.shape
@@ -143,16 +152,20 @@ class _FastDssim(torch.autograd.Function):
 
 
 def _allocate_fields(count: int, image: np.ndarray) -> np.ndarray:
-    """`count` uninitialised fields of the size of `image`, with 5 rows of zeros above and below."""
+    """Return `count` uninitialised fields [count, H + 10, W * C], with 5 rows of zeros above and below each.
+
+    Args:
+        image: [H, W * C], gives the size.
+    """
     fields = empty_aligned(count, image.shape[0] + 2 * RADIUS, image.shape[1])
     fields[:, :RADIUS], fields[:, -RADIUS:] = 0, 0
     return fields
 
 
 def _weight_rows(weights: np.ndarray, channels: int) -> tuple[np.ndarray, np.ndarray]:
-    """The weights [H, W] and their window sums, each repeated for every channel: [H, W * C].
+    """Return the weights [H, W] and their window sums, each repeated for every channel: two arrays [H, W * C].
 
-    The sum of a pixel of weight 0 is set to 1, so that nothing is divided by 0.
+    Window sums at pixels of weight 0 are set to 1, so that nothing is divided by 0.
     """
     norm = np.where(weights > 0, _filtered(weights, 1), np.float32(1))
     return np.repeat(weights, channels, 1), np.repeat(norm, channels, 1)
@@ -160,19 +173,25 @@ def _weight_rows(weights: np.ndarray, channels: int) -> tuple[np.ndarray, np.nda
 
 @lru_cache(maxsize=8)
 def _unmasked_weight_rows(height: int, width: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return `_weight_rows` for weights of 1, from a cache."""
     return _weight_rows(np.ones((height, width), np.float32), channels)
 
 
 # The kernels hold an image as H rows of W * C numbers, so that inner loops run along memory. Fields are filtered along
-# rows, then along columns; both filters are symmetric, hence their own adjoints (pixels outside count as 0). Threads
-# take rows in turn.
+# rows, then along columns. Pixels outside the image count as 0. Both filters are symmetric, so the backward pass uses
+# them, too. A ticket of a thread is one row.
 _K0, _K1, _K2, _K3, _K4, _K5 = (np.float32(k) for k in window()[RADIUS:])
 _jit = partial(kernel, fastmath=FREE_ROUNDING)
 
 
 @_jit
 def _along_row(padded, out, n, step):
-    """out[j] = window sum around padded[5 * step + j]."""
+    """Write out[j], the window sum around padded[5 * step + j] along a row, for j < n.
+
+    Args:
+        padded: a row of n numbers with 5 * step zeros before and after it.
+        step: distance of two neighbouring pixels in the row, the number of channels.
+    """
     a0, a1, a2, a3 = padded[:n], padded[step:], padded[2 * step :], padded[3 * step :]
     a4, a5, a6, a7 = padded[4 * step :], padded[5 * step :], padded[6 * step :], padded[7 * step :]
     a8, a9, a10 = padded[8 * step :], padded[9 * step :], padded[10 * step :]
@@ -189,7 +208,10 @@ def _along_row(padded, out, n, step):
 
 @_jit
 def _down_column(rows, i, out, n):
-    """out[j] = window sum around rows[i + 5, j]; `rows` has 5 rows of zeros above and below."""
+    """Write out[j], the window sum around rows[i + 5, j] down the column, for j < n.
+
+    `rows` [H + 10, n] has 5 rows of zeros above and below; i is the row of the image.
+    """
     r0, r1, r2, r3 = rows[i], rows[i + 1], rows[i + 2], rows[i + 3]
     r4, r5, r6, r7 = rows[i + 4], rows[i + 5], rows[i + 6], rows[i + 7]
     r8, r9, r10 = rows[i + 8], rows[i + 9], rows[i + 10]
@@ -206,6 +228,7 @@ def _down_column(rows, i, out, n):
 
 @_jit
 def _filtered(field, channels):
+    """Return the window sums [H, W * C] of a field [H, W * C]."""
     height, n = field.shape
     rows = np.zeros((height + 2 * RADIUS, n), np.float32)
     padded = np.zeros(n + 2 * RADIUS * channels, np.float32)
@@ -220,7 +243,10 @@ def _filtered(field, channels):
 
 @_jit
 def _filter_products(tickets, x, y, weights, channels, fields):
-    """fields [4, H + 10, W * C] = weights * (x, y, x^2 + y^2, x y), filtered along each row."""
+    """Write fields [4, H + 10, W * C]: weights * (x, y, x^2 + y^2, x y), filtered by the window along each row.
+
+    `x`, `y` and `weights` are [H, W * C].
+    """
     height, n = x.shape
     lead = RADIUS * channels
     padded = np.zeros((4, n + 2 * lead), np.float32)
@@ -242,9 +268,14 @@ def _filter_products(tickets, x, y, weights, channels, fields):
 
 @_jit
 def _compare(tickets, fields, weights, norm, channels, sums, partials):
-    """Sum of weights * (1 - SSIM) of each row, and its derivatives by the windowed fields, filtered along the row.
+    """Filter the fields down the columns, and compute SSIM and its derivatives at each pixel.
 
-    Writes sums [H] float64 and partials [3, H + 10, W * C]: derivatives by the means of x, of x^2 + y^2 and of x y.
+    Args:
+        fields: [4, H + 10, W * C], from `_filter_products`.
+        weights, norm: [H, W * C], from `_weight_rows`.
+        sums: [H] float64, output, the sum of weights * (1 - SSIM) of each row.
+        partials: [3, H + 10, W * C], output, derivatives of this sum with respect to the windowed x, x^2 + y^2 and x y,
+            filtered along each row, which is the first half of the backward pass.
     """
     height, n = weights.shape
     lead = RADIUS * channels
@@ -283,7 +314,10 @@ def _compare(tickets, fields, weights, norm, channels, sums, partials):
 
 @_jit
 def _gather_gradient(tickets, partials, x, y, weights, gradient):
-    """gradient [H, W * C] = d(sum of weights * (1 - SSIM)) / dx."""
+    """Write gradient [H, W * C], the derivative of the sum of weights * (1 - SSIM) with respect to x.
+
+    `partials` is from `_compare`, and is filtered down the columns here.
+    """
     height, n = x.shape
     column, two = np.empty((3, n), np.float32), np.float32(2)
     c0, c1, c2 = column[0], column[1], column[2]

@@ -1,4 +1,4 @@
-"""Normals of a depth map, and Gaussians that render its surface. Inputs are float64 arrays."""
+"""Normals of a depth map, and Gaussians that render its surface. Depth maps are float64 arrays of camera z."""
 
 from __future__ import annotations
 
@@ -24,30 +24,31 @@ def surface_gaussians(
     opacity: float = 0.95,
     offset_px: float = 0.0,
 ) -> Gaussians:
-    """One Gaussian for each chosen pixel: a disk on the surface that the depth map describes.
+    """Return one Gaussian for each chosen pixel: a disk on the surface that the depth map describes.
 
-    In `camera` each disk is round with a standard deviation of `spread` pixels, whatever the slant of the surface;
-    along the normal it is thin. So the surface stays closed in nearer views and from the side.
+    In `camera` each disk appears round, with a standard deviation of `spread` pixels, because it is stretched along the
+    slope of a slanted surface; along the normal it is thin. So the surface stays closed in nearer views and from the
+    side.
 
     PAPER leaves open: scale and opacity of the initial Gaussians. These values reproduce the reference.
 
     Args:
-        image: [H, W, 3] uint8 or [0, 1], the colours.
+        image: [H, W, 3], the colours, uint8 or floating point in [0, 1].
         depth: [H, W] camera z, positive on the chosen pixels.
-        pixels: bool [H, W].
+        pixels: bool [H, W], True for the chosen pixels.
         camera: the view.
-        sh_count: number K of spherical harmonics; all but the constant one are 0.
-        spread: standard deviation in pixels.
+        sh_count: number of spherical harmonics per Gaussian; all but the constant one are 0.
+        spread: standard deviation of a disk in pixels of the view.
         thickness: standard deviation along the normal, relative to the smaller one within the surface.
-        grazing: cosine between normal and view below which disks are not stretched further.
-        opacity: in (0, 1).
-        offset_px: distance behind the surface, along its normal, in pixels.
+        grazing: cosine of the angle between normal and viewing direction below which disks are not stretched further.
+        opacity: opacity of each disk, in (0, 1).
+        offset_px: distance of the disks behind the surface, along its normal, in pixels.
 
     Returns:
-        Gaussians, one for each chosen pixel in row-major order, float32 on the CPU.
+        The Gaussians in row-major order of the pixels, float32 on the CPU.
 
     Raises:
-        ValueError: depth not positive and finite on a chosen pixel, or not of the view's size.
+        ValueError: the depth of a chosen pixel is not positive and finite, or the depth map has not the view's size.
     """
     if not (np.isfinite(depth[pixels]).all() and (depth[pixels] > 0).all()):
         raise ValueError(f"view {camera.name}: the depth of a pixel to be filled is not positive and finite")
@@ -70,20 +71,34 @@ def surface_gaussians(
 
 
 def _axes(normals: np.ndarray, view_directions: np.ndarray, camera: Camera) -> np.ndarray:
-    """[N, 3, 3]: axes in columns: across the slope (scale w), up the slope (w / cosine), along the normal."""
+    """Return the axes of N disks as the columns of rotation matrices [N, 3, 3] in world coordinates.
+
+    The first axis lies within the surface and across the slope, where the disk has its smaller standard deviation. The
+    second lies within the surface and along the slope, where the disk is stretched. The third is the normal.
+
+    Args:
+        normals: [N, 3] unit normals.
+        view_directions: [N, 3] unit vectors from the camera to the disks.
+    """
     first_axis = np.cross(normals, view_directions)
     length = np.linalg.norm(first_axis, axis=-1, keepdims=True)
-    fallback = np.cross(normals, camera.world_to_camera[1, :3])  # facing the camera, any direction will do
+    # A disk that faces the camera has no slope, so any axis within the surface serves.
+    fallback = np.cross(normals, camera.world_to_camera[1, :3])
     first_axis = np.where(length > 1e-4, first_axis, fallback)
     first_axis /= np.linalg.norm(first_axis, axis=-1, keepdims=True)
     return np.stack([first_axis, np.cross(normals, first_axis), normals], -1)
 
 
 def surface_normals(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """[H, W, 3]: unit normals of a depth map, towards the camera.
+    """Return the unit normals [H, W, 3] of a depth map, in world coordinates and towards the camera.
 
-    Slopes are computed in disparity, where they are exact for planes, by forward or backward differences: the side
-    whose slope changes less, so that pixels beside a crease or a step take the normal of their own surface.
+    Slopes are computed in disparity, where they are exact for planes. They are forward or backward differences,
+    whichever belongs to the side where the slope changes less. So pixels beside a crease or a step get the normal of
+    their own surface.
+
+    Args:
+        depth: [H, W] camera z; 0 where unknown.
+        camera: the view.
     """
     disparity = np.divide(1.0, depth, out=np.zeros(depth.shape), where=np.asarray(depth) > 0)
     along_x, along_y = _one_sided_slope(disparity.T).T, _one_sided_slope(disparity)
@@ -97,7 +112,11 @@ def surface_normals(depth: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def _one_sided_slope(values: np.ndarray) -> np.ndarray:
-    """d/drow of [H, W]: the forward or backward difference, whichever has the smaller second difference."""
+    """Return the derivative of values [H, W] down the rows, per row.
+
+    At each element it is the forward or the backward difference, whichever has the smaller second difference next to
+    it.
+    """
     if len(values) < 3:
         return np.gradient(values, axis=0) if len(values) > 1 else np.zeros_like(values)
     step = np.diff(values, axis=0)  # step[i] = v[i+1] - v[i]

@@ -1,5 +1,8 @@
-"""What is still to be drawn: pixels of C that nothing covers, the next view to complete, and a reference's pixels that
-lie over what remains."""
+"""Coverage of the hole during `initialize`: which pixels of C still have to be filled, and from which view.
+
+C is the consistent mask of a view: the pixels of the removed object. The draft is the scene that is being filled; it
+consists of the remaining Gaussians (the scene without the object) and of the new ones that references added.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +22,24 @@ from reffusion.masks import voting
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference, Rendering
 
-EDGE = 0.03  # relative depth of a step between two things; closer surfaces are the same
-NARROW = 0.02  # of the image's width: a gap up to this wide shows no texture
-MAX_ANGLE = 45.0  # degrees between the axis of a camera without a photograph and the nearest one with a photograph
-MIN_SHARE = 0.001  # of a view's C: fewer uncovered pixels are left to its neighbours
+EDGE = 0.03  # relative difference of depth from which two surfaces are different ones
+NARROW = 0.02  # largest width of a gap that is too narrow to show texture, as a fraction of the image's width
+MAX_ANGLE = 45.0  # degrees: largest angle from the axis of a camera without a photograph to the nearest one with one
+MIN_SHARE = 0.001  # a view is completed only if a larger share of its C is uncovered; neighbours complete the rest
 ISLAND, GAP = 0.01, 0.02  # of the image's width: smaller islands of uncovered pixels are dropped, smaller holes filled
 
 
 def expected_mirror_depth(background: Background) -> dict[str, np.ndarray]:
-    """View name -> [H, W], depth of the plausible mirror images in C, inf elsewhere; empty where there is no mirror."""
+    """Return for each view the depth at which its hole should show mirror images of symmetric things.
+
+    A thing beside the object may be mirror-symmetric (`reffusion.background.mirrors`). Then the mirror image of its
+    visible part shows the part that the object hides.
+
+    Returns:
+        View name -> float64 [H, W], the camera z of the plausible mirror images inside C, and inf elsewhere. A mirror
+        image is plausible where photographs show the part that is mirrored, and no view sees past the image. The
+        dictionary is empty if the background has no mirrors.
+    """
     if not background.mirrors:
         return {}
     render = lambda camera: (
@@ -44,10 +56,21 @@ def find_uncovered(
     cameras: Sequence[Camera],
     mirror_depth: Mapping[str, np.ndarray],
 ) -> dict[str, np.ndarray]:
-    """View name -> bool [H, W], pixels of C that nothing covers, or that show something else than the plausible mirror
-    image there.
+    """Return for each view the pixels of C that still have to be completed.
 
-    Only these are completed: without a true picture an invented surface is worse than what is there, unobserved or not.
+    A pixel is uncovered if its alpha is at most `OPAQUE`, or if its surface contradicts a plausible mirror image
+    (`_contradicts`). Covered pixels are left as they are, even if no photograph shows their surface: without a true
+    picture, an invented surface is worse than the present one.
+
+    Args:
+        gaussians: the N Gaussians of the draft.
+        is_new: bool [N], True for the Gaussians that references added.
+        background: the photographs and surfaces around the object.
+        cameras: the views to examine.
+        mirror_depth: the result of `expected_mirror_depth`.
+
+    Returns:
+        View name -> bool [H, W], True for uncovered pixels, without small islands and with small holes filled.
     """
     found = {}
     for camera in cameras:
@@ -64,8 +87,16 @@ def find_uncovered(
 
 
 def _contradicts(image_depth: np.ndarray, rendering: Rendering, unobserved: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels at which something unobserved, that no reference drew, occludes the mirror image, or nothing
-    is as near as the image."""
+    """Return bool [H, W], the pixels at which a rendering contradicts a plausible mirror image.
+
+    It does so where the rendered surface lies behind the image. It also does so where the rendered surface lies in
+    front of the image, no reference added this surface, and the pixel is unobserved.
+
+    Args:
+        image_depth: [H, W], camera z of the mirror image; inf where there is none.
+        rendering: of the draft, with one feature, which is 1 for the new Gaussians and 0 for all others.
+        unobserved: bool [H, W], pixels of C whose background no photograph shows.
+    """
     depth, is_new = (each.cpu().numpy() for each in (rendering.depth, rendering.features[..., 0] > 0.5))
     in_front = (depth < (1 - EDGE) * image_depth) & ~is_new & unobserved
     return np.isfinite(image_depth) & (in_front | (image_depth < (1 - EDGE) * depth))
@@ -74,7 +105,16 @@ def _contradicts(image_depth: np.ndarray, rendering: Rendering, unobserved: np.n
 def find_floaters(
     gaussians: Gaussians, is_new: Tensor, background: Background, uncovered: Mapping[str, np.ndarray], tau: float
 ) -> Tensor:
-    """bool [N]: old Gaussians that are visible mostly where nothing else covers C."""
+    """Return bool [N], the floaters: remaining Gaussians that are visible mostly in uncovered pixels.
+
+    Args:
+        gaussians: the N Gaussians of the draft.
+        is_new: bool [N], True for the Gaussians that references added; these are never floaters.
+        background: the photographs and surfaces around the object.
+        uncovered: view name -> bool [H, W], the result of `find_uncovered`.
+        tau: a Gaussian is a floater if its blending weights in uncovered pixels, summed over all views, exceed `tau`
+            times those in all other pixels.
+    """
     return voting.find_floaters(gaussians, background.cameras, uncovered, tau) & ~is_new
 
 
@@ -82,7 +122,13 @@ def find_floaters(
 def completed_views(
     references: Sequence[Reference], gaussians: Gaussians, background: Background
 ) -> list[tuple[DepthView, np.ndarray]]:
-    """The references as depth views of the completed scene, unmasked where they are completed, and their pictures."""
+    """Convert references to sources of texture for further views.
+
+    Returns:
+        For each reference its depth view and its picture, uint8 [H, W, 3]. The depth is that of `gaussians`, rendered
+        in the reference's view, and 0 where alpha is at most `OPAQUE`. The object's mask of the depth view does not
+        contain the pixels that the reference completed.
+    """
     views, found = {view.camera.name: view for view in background.views}, []
     for each in references:
         rendering = rasterizer.render(gaussians, each.camera, sh_degree=0)
@@ -93,9 +139,11 @@ def completed_views(
 
 
 def cameras_near_photographs(background: Background) -> list[Camera]:
-    """The cameras whose views may be completed: those with a photograph, and those that look about the same way.
+    """Return the cameras whose views may be completed.
 
-    An invention seen from elsewhere knows nothing of what is there, and may hide what photographs show.
+    These are all cameras with a photograph, and each camera without one whose optical axis is within `MAX_ANGLE` of the
+    axis of a camera with a photograph. A view from elsewhere would be invented without knowledge of its surroundings,
+    and the invented surface might hide surfaces that photographs show.
     """
     axis = lambda camera: camera.world_to_camera[2, :3]
     photographed = [camera for camera in background.cameras if camera.name not in background.without_photo]
@@ -107,7 +155,16 @@ def cameras_near_photographs(background: Background) -> list[Camera]:
 def least_covered_view(
     cameras: Sequence[Camera], background: Background, uncovered: Mapping[str, np.ndarray]
 ) -> Camera | None:
-    """The camera of the view with most uncovered pixels; None where every view has too few to count."""
+    """Return the camera of the view with the most uncovered pixels.
+
+    Args:
+        cameras: the candidates.
+        background: holds C of each view.
+        uncovered: view name -> bool [H, W], the result of `find_uncovered`.
+
+    Returns:
+        None if in no view more than `MIN_SHARE` of C is uncovered.
+    """
     candidates = [
         camera
         for camera in cameras
@@ -117,25 +174,32 @@ def least_covered_view(
 
 
 def is_narrow(mask: np.ndarray) -> bool:
-    """Whether the mask, bool [H, W], is nowhere wider than a gap without texture."""
+    """Return whether a mask, bool [H, W], is nowhere wider than `NARROW`, so that its content shows no texture."""
     distance = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return 2 * float(distance.max()) <= NARROW * mask.shape[1]
 
 
 @torch.no_grad()
 def uncovered_share(gaussians: Gaussians, camera: Camera, mask: np.ndarray, min_alpha: float = 0.9) -> float:
-    """Share in [0, 1] of C, bool [H, W], whose alpha is below `min_alpha`."""
+    """Return the share in [0, 1] of the pixels of `mask`, bool [H, W], whose rendered alpha is below `min_alpha`.
+
+    The share is 0 for an empty mask.
+    """
     alpha = rasterizer.render(gaussians, camera, sh_degree=0).alpha.cpu().numpy()
     return float((alpha[mask] < min_alpha).mean()) if mask.any() else 0.0
 
 
 @torch.no_grad()
 def pixels_in_front(gaussians: Gaussians, depth: np.ndarray, reference: Reference, mask: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels outside C whose surface is nearer than every Gaussian. Most are the inner side of a surface
-    that an earlier reference added.
+    """Return bool [H, W], the reference's pixels outside C whose surface lies in front of all Gaussians.
+
+    Most of these pixels show the inner side of a surface that an earlier reference added.
 
     Args:
-        depth: [H, W] of the reference's surface. mask: bool [H, W], C.
+        gaussians: of the draft.
+        depth: [H, W], camera z of the surface that the reference shows.
+        reference: the completed view; only pixels of its mask are returned.
+        mask: bool [H, W], C of the view.
     """
     rendering = rasterizer.render(gaussians, reference.camera, sh_degree=0)
     visible = torch.where(rendering.alpha > 0.5, rendering.depth, torch.inf).double().cpu().numpy()
@@ -143,12 +207,13 @@ def pixels_in_front(gaussians: Gaussians, depth: np.ndarray, reference: Referenc
 
 
 def beside_depth_edges(depth: np.ndarray, remaining_depth: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels at the farther side of a depth edge whose surface belongs to the remaining scene.
+    """Return bool [H, W], the pixels on the farther side of a depth edge whose surface belongs to the remaining scene.
 
-    The colour of the nearer surface bleeds into these pixels of a completed view; photographs show them clean.
+    In a completed view the colour of the nearer surface bleeds into these pixels. Photographs show them without it.
 
     Args:
-        depth, remaining_depth: [H, W] of the completed view, and of the scene that remains.
+        depth: [H, W], camera z of the surfaces in the completed view.
+        remaining_depth: [H, W], camera z of the remaining Gaussians (the scene without the object) in the same view.
     """
     nearest = cv2.erode(depth, np.ones((3, 3)))
     return (depth > (1 + EDGE) * nearest) & (np.abs(depth - remaining_depth) < EDGE * remaining_depth)

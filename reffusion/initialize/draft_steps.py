@@ -1,4 +1,7 @@
-"""Steps of the initialization that work on a whole draft: restricted invent masks, random Gaussians, and the refit."""
+"""Steps of the initialization that work on a whole draft (the scene while it is filled).
+
+These are the restriction of invent masks, the random Gaussians of an ablation, and the refit.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +18,23 @@ from reffusion.masks import regions, voting
 from reffusion.types import MaskSet, Reference, Scene
 from reffusion.workspace import Workspace
 
-SEED = 0  # of the refit, and of random Gaussians
+SEED = 0  # seed of the refit and of the random Gaussians
 
 
 def restrict_invent_masks(draft: Draft, sets: Mapping[str, MaskSet], background: Background) -> dict[str, MaskSet]:
-    """View name -> its masks with I where the references drew something; only of views whose I reaches beyond C."""
+    """Restrict the invent masks I outside C to the pixels that show new Gaussians of the references.
+
+    C is the consistent mask (the removed object's pixels). I reaches beyond C where the scene asks to fill a region.
+    There the photographs are right wherever the references added nothing. Inside C, I stays as it is.
+
+    Args:
+        draft: the scene with the references' Gaussians.
+        sets: view name -> pixel classes.
+        background: its cameras are the views to examine.
+
+    Returns:
+        View name -> pixel classes with the restricted I, for the views whose I reaches beyond C.
+    """
     restricted = {}
     for camera in background.cameras:
         each = sets[camera.name]
@@ -31,8 +46,14 @@ def restrict_invent_masks(draft: Draft, sets: Mapping[str, MaskSet], background:
 
 
 def add_random(draft: Draft, space: Workspace) -> Draft:
-    """The draft with random Gaussians in the region of the hole: around the removed ones, or in the box that the scene
-    names."""
+    """Return the draft with random Gaussians added in the region of the hole.
+
+    The region is the box that scene.yaml names (`region`), or else the bounding box of the object's Gaussians. As many
+    Gaussians are added as the object has, but at least `MIN_GAUSSIANS` of `random_init`.
+
+    Raises:
+        ValueError: there is neither a region nor an object, or the region does not meet the invent masks.
+    """
     scene, region = space.scene, space.facts.get("region")
     removed = space.gaussians.map(lambda p: p[space.object_labels])
     if region:
@@ -61,14 +82,21 @@ def refit_draft(
     has_exact_depth: bool,
     folder: Path,
 ) -> Draft:
-    """The draft after `steps` steps of reconstruction.
+    """Return the draft after a refit: `steps` steps of reconstruction, in which all Gaussians move (`refit.refit`).
+
+    Photographs supervise outside the object and outside the invent masks. Completed views supervise inside their masks.
 
     Args:
-        trusted: completed views, with the pixels that supervise.
-        has_exact_depth: new Gaussians lie where depth that the scene brings puts them, and hardly move.
-        folder: for the trace and checkpoints of these steps.
+        draft: the filled scene.
+        steps: number of optimisation steps, one view each.
+        scene: tells which views are clean (the object is absent) and which have no photograph.
+        background: holds the photographs and where they show the object.
+        trusted: completed views; the mask of each marks the pixels that supervise.
+        sets: view name -> pixel classes.
+        has_exact_depth: True if each reference has a depth map of its own. Then the new Gaussians hardly move.
+        folder: receives the trace and the checkpoints.
     """
-    invented = lambda name: sets[name].invent & (name not in scene.clean)  # drawn where no photograph shows it
+    invented = lambda name: sets[name].invent & (name not in scene.clean)  # no photograph shows these pixels
     views = [view for view in background.views if view.camera.name not in scene.blank]
     hidden = {view.camera.name: view.masked | invented(view.camera.name) for view in views}
     completed = [each for each in trusted if each.mask.any()]

@@ -1,4 +1,9 @@
-"""Complete extra views beside the references: next-best-view selection over the pixels that nothing covers."""
+"""Extra views: views that are completed besides the references, because the filled scene still has gaps in them.
+
+Each time, the view is selected that has the most uncovered pixels (next-best-view selection). These are the pixels of C
+(the object's mask) that no opaque surface covers (`coverage.find_uncovered`). The draft is the scene that is being
+filled.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +23,9 @@ from reffusion.params.initialize import Params
 from reffusion.prior import inpaint
 from reffusion.types import Reference
 
-FLOATER_RATIO = 1.0  # weight in uncovered over other pixels from which Gaussians are floaters
-STUCK = 0.9  # share of its uncovered pixels that may remain after a view is completed, before it is given up
-SEED = 0  # of the patch search
+FLOATER_RATIO = 1.0  # ratio of blending weights in uncovered to other pixels above which a Gaussian is a floater
+STUCK = 0.9  # a completed view is not tried again if more than this share of its uncovered pixels remains uncovered
+SEED = 0  # seed of the patch search
 
 
 def complete_extra_views(
@@ -28,12 +33,18 @@ def complete_extra_views(
 ) -> tuple[Draft, list[Reference], dict[str, np.ndarray]]:
     """Complete the view with most uncovered pixels, add it to the draft, and repeat, up to `params.extra_views` times.
 
+    Before the first view, floaters are removed (`coverage.find_floaters`).
+
     Args:
-        references: completed views, of which textures may be taken too.
-        painter: a feed-forward inpainter; None for patches of the photographs and the references.
+        params: parameters of the stage `initialize`.
+        draft: the scene after the references were added.
+        background: the photographs and surfaces around the object.
+        references: completed views; the patch search takes textures from them too.
+        painter: the feed-forward inpainter that completes the views. None to complete them from patches of the
+            photographs and the references.
 
     Returns:
-        The draft, the extra views, and view name -> the depth [H, W] at which each was added.
+        The draft with the extra views, the extra views, and view name -> [H, W], the depth at which each was added.
     """
     extra: list[Reference] = []
     depths: dict[str, np.ndarray] = {}
@@ -56,27 +67,35 @@ def complete_extra_views(
         print(f"extra view {camera.name}: {hole.sum() / mask.sum():.1%} of the mask is covered by nothing")
         try:
             filled = fill_reference(params, draft, reference, background, farthest=True)
-        except ValueError as error:  # a sliver at the border of a view: others may show it better
+        except ValueError as error:  # a sliver at the border of the image; other views may show it better
             print(f"left as it is: {error}")
             uncovered[camera.name] = np.zeros_like(hole)
             continue
         draft, depths[camera.name] = filled.draft, filled.depth
         extra.append(reference)
         uncovered |= find(draft, [each for each in cameras if uncovered[each.name].any()])
-        if uncovered[camera.name].sum() > STUCK * hole.sum():  # another try would cover as little
+        if uncovered[camera.name].sum() > STUCK * hole.sum():  # a second try would cover as little as the first
             uncovered[camera.name] = np.zeros_like(hole)
     return draft, extra, depths
 
 
 def _complete_view(draft: Draft, camera, hole: np.ndarray, sources: Background, painter: Painter | None) -> np.ndarray:
-    """uint8 [H, W, 3]: the view with its uncovered pixels, bool [H, W], completed."""
+    """Return a view with its uncovered pixels completed in 2D, uint8 [H, W, 3].
+
+    Args:
+        draft: the scene that is rendered inside C.
+        camera: the view.
+        hole: bool [H, W], the uncovered pixels of C.
+        sources: the photographs and completed views from which patches are taken.
+        painter: a feed-forward inpainter, or None for patches.
+    """
     mask = sources.masks[camera.name]
-    # Just outside C a photograph may still show the object's rim, which would be repeated.
+    # Just outside C a photograph may still show the object's rim; the inpainter would continue this rim into the hole.
     photo = sources.photos[camera.name]
     base = inpaint.composite_background(draft.gaussians, camera, photo, morphology.dilate(mask, exemplar.RIM_WIDTH))
     region = exemplar.add_rim(hole, mask)
     if painter is not None:
         return painter.paint(base, region)
-    if coverage.is_narrow(hole):  # a gap has no room for texture, only for what is beside it
+    if coverage.is_narrow(hole):  # a narrow gap shows no texture; continuing the adjacent colours is enough
         return classical.telea(base, region)
     return exemplar.complete_view(base, region, camera, mask, sources, [SEED])[0].image

@@ -1,4 +1,4 @@
-"""Fill the hole from references: each is unprojected onto its depth, the best one first."""
+"""Filling of the hole from references: each reference is unprojected onto estimated depth, the best one first."""
 
 from __future__ import annotations
 
@@ -25,14 +25,19 @@ from reffusion.trace import Trace
 from reffusion.types import Reference
 
 OVERLAP = 0.006  # of the image's width: how far new Gaussians extend beyond the hole
-COVERED = 0.9  # alpha below which a reference also fills pixels of C
-GAP_ALPHA = 0.5  # alpha in C of another view below which the new surface has a gap
+COVERED = 0.9  # a reference also fills the pixels of C (the object's mask) whose alpha is below this
+GAP_ALPHA = 0.5  # the new surface has a gap where another view renders a lower alpha in its C
 COMPLETION = CompletionSettings()
 
 
 @dataclass(frozen=True)
 class Filled:
-    """A draft after a reference was added, and the depth at which it was added, [H, W] float64."""
+    """The result of adding one reference to a draft.
+
+    Attributes:
+        draft: the draft (the scene that is being filled) with the reference's Gaussians.
+        depth: [H, W] float64, camera z of the surface onto which the reference was unprojected.
+    """
 
     draft: Draft
     depth: np.ndarray
@@ -47,12 +52,19 @@ def fill_references(
     network: DepthNetwork | None,
     log: Trace,
 ) -> tuple[Draft, dict[str, np.ndarray]]:
-    """The draft with all references that have a mask; and view name -> the depth [H, W] at which each was added.
+    """Add all references to the draft, one after the other; each fills only what the earlier ones left empty.
 
     Args:
-        first: the view that is drawn first; the others follow by size.
-        network: the depth model; None where the surroundings are continued instead.
+        params: parameters of the stage `initialize`.
+        draft: the scene without the object.
+        references: completed views; those with an empty mask are left out.
+        first: name of the view that is added first. The other views follow by decreasing size of their masks.
+        background: the photographs and surfaces around the object.
+        network: the depth model; None to continue the depth of the surroundings into the hole instead.
         log: receives the traces of the depth solvers.
+
+    Returns:
+        The filled draft, and view name -> [H, W], the depth at which the reference was added.
     """
     ordered = [each for each in references if each.mask.any()]
     ordered.sort(key=lambda each: (each.camera.name != first, -int(each.mask.sum())))
@@ -77,22 +89,33 @@ def fill_reference(
     farthest: bool = False,
     share: Share | None = None,
 ) -> Filled:
-    """The draft with one reference, on the pixels of its mask, or of its share, that are still empty.
+    """Add one reference to the draft, on the pixels of its mask that are still empty.
+
+    Inside C (the object's mask) the reference shows the background, whose depth is estimated. Outside C it may draw an
+    inserted object over the remaining scene.
 
     Args:
-        disparity: [H, W], a depth model's answer to the reference, up to scale and offset; None without a model.
-        farthest: the reference is an extra view, that fills a gap through which one sees the farthest surface.
-        share: what the reference draws over what remains, where several have depth maps.
+        params: parameters of the stage `initialize`.
+        draft: the scene that is being filled.
+        reference: the completed view.
+        background: the photographs and surfaces around the object.
+        disparity: [H, W], the depth model's output for the reference, up to scale and offset; None without a model.
+        log: receives the traces of the depth solvers.
+        farthest: True for an extra view (`extra_views`). Through the gap that it fills one sees the farthest of the
+            surfaces around the gap, so only this surface is continued into the gap.
+        share: the pixels outside C that this reference adds, and those that it leaves to other references. None if it
+            is the only one with a depth map.
     """
     camera, mask = reference.camera, background.masks[reference.camera.name]
-    over = reference.mask & ~mask  # an inserted part, drawn over what remains
-    # An inserted part has a shine of its own, and so narrow an extra view tells nothing of it.
+    over = reference.mask & ~mask  # an inserted object, drawn over the remaining scene
+    # New Gaussians change colour with direction as their surroundings do. An inserted object does not: it has a shine
+    # of its own. An extra view is too narrow to show how colours change.
     sheets = Sheets(view_dependent=params.view_dependent_color and not farthest and not over.any())
     hole = unprojection.find_hole(draft, reference, mask, COVERED)
     if farthest and background.mirrors:
-        hole |= reference.mask  # also where something is visible, but behind a mirror image
+        hole |= reference.mask  # also where the visible surface lies behind a mirror image
     remaining = draft.remaining
-    # A gap that is still open after the references is too narrow for the sweep to tell of its rim.
+    # The plane sweep cannot measure depth at the rim of a gap as narrow as this.
     sweep = params.depth.sweep and not (farthest and coverage.is_narrow(hole))
     near, swept = refine_background(background, camera, hole) if sweep else (background, None)
     uncovered = find_unobserved(remaining, camera, mask, near.views, near.planes, near.mirrors)
@@ -125,7 +148,7 @@ def fill_reference(
     print(f"depth of reference {camera.name}: {words}")
     pixels = dilate_by_distance(hole & ~inserted & ~ceded, OVERLAP) & ~ceded | drawn_over
     draft = unprojection.add_surface(draft, reference, depth, pixels, background, sheets)
-    if farthest or not params.tidy:  # what is still open is completed view by view, or left
+    if farthest or not params.tidy:  # gaps that are still open are left to the extra views, if there are any
         return Filled(draft, depth)
     views = [(each, background.masks[each.name]) for each in background.cameras]
     gaps = unprojection.find_gaps(draft.gaussians, camera, estimate, mask & ~pixels, views, GAP_ALPHA)
@@ -135,7 +158,10 @@ def fill_reference(
 
 
 def _predict_disparity(network: DepthNetwork | None, reference: Reference) -> np.ndarray | None:
-    """The depth model's answer to the reference, [H, W] disparity up to scale and offset; None without a model."""
+    """Return the depth model's output for the reference: disparity [H, W], up to scale and offset.
+
+    None without a model.
+    """
     if network is None:
         return None
     image = torch.from_numpy(reference.image).permute(2, 0, 1) / 255

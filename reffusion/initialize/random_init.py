@@ -1,4 +1,4 @@
-"""Random Gaussians in the region of a hole: the initialization without a reference (an ablation, and a baseline's)."""
+"""Random Gaussians in the region of a hole: the initialization without a reference, for an ablation and a baseline."""
 
 from __future__ import annotations
 
@@ -14,35 +14,49 @@ from reffusion.types import Camera, Gaussians
 
 MIN_GAUSSIANS = 1000
 TRIM = 0.02  # share of the removed Gaussians that are ignored at each end of an axis: strays must not stretch the box
-MARGIN = 0.1  # of the box's extent, on each side: the surface to be found lies behind the object
-MAX_ROUNDS = 200  # of sampling, after which the few points found must do
+MARGIN = 0.1  # share of the box's extent that is added on each side: the surface to be found lies behind the object
+MAX_ROUNDS = 200  # rounds of sampling; after the last one, fewer points than asked for are accepted
 
 Box = tuple[np.ndarray, np.ndarray]  # lowest and highest corner, [3] each
 
 
 def bounding_box(means: np.ndarray) -> Box:
-    """The box of these positions [N, 3] without the outermost 2 % at each end of an axis, 10 % larger on each side."""
+    """Return the axis-aligned box around most of the positions [N, 3], enlarged by 10 % of its extent on each side.
+
+    On each axis the outermost 2 % of the positions at either end are ignored.
+    """
     low, high = np.quantile(means, (TRIM, 1 - TRIM), axis=0)
     margin = MARGIN * np.maximum(high - low, 1e-6)
     return low - margin, high + margin
 
 
 def box_at(center: Sequence[float], size: Sequence[float]) -> Box:
-    """The box with this centre and these side lengths."""
+    """Return the axis-aligned box with this centre and these side lengths."""
     return np.asarray(center) - np.asarray(size) / 2, np.asarray(center) + np.asarray(size) / 2
 
 
 def sample_points(
     box: Box, count: int, cameras: Sequence[Camera], holes: Mapping[str, np.ndarray], generator: torch.Generator
 ) -> np.ndarray:
-    """[count, 3] points, uniform in the part of the box that more than half of the views show inside their hole.
+    """Draw points uniformly in the part of a box that projects into the holes of the views.
+
+    A point is kept if more than half of the views that have a hole and whose image contains the point show it inside
+    the hole.
 
     PAPER leaves open: how many random Gaussians its ablation starts from, and where.
 
     Args:
-        holes: view name -> I, bool [H, W], of the views that have one.
+        box: lowest and highest corner.
+        count: the number of points to draw.
+        cameras: the training views.
+        holes: view name -> bool [H, W], the invent mask I (the pixels to be invented) of the views that have one.
+        generator: draws the points.
+
+    Returns:
+        [count, 3] float64; fewer points, at least 4, if `MAX_ROUNDS` rounds do not find `count`.
+
     Raises:
-        ValueError: hardly any part of the box is visible inside the holes.
+        ValueError: fewer than 4 points are found.
     """
     low, high = box
     found = np.zeros((0, 3))
@@ -57,10 +71,13 @@ def sample_points(
 
 
 def random_gaussians(points: np.ndarray, sh_count: int, antialiased: bool, generator: torch.Generator) -> Gaussians:
-    """Round Gaussians at the points, of random colours, sized and faint as 3DGS's initial ones.
+    """Return isotropic Gaussians of random colours at the points, with the sizes and opacity that 3DGS starts with.
 
     Args:
-        sh_count: spherical harmonic coefficients of each.
+        points: [N, 3], N at least 4.
+        sh_count: number of spherical harmonic coefficients of a Gaussian, (degree + 1)^2.
+        antialiased: whether the Gaussians are meant for Mip-Splatting's 2D filter, see `types.Gaussians`.
+        generator: draws the colours.
     """
     colors = torch.randint(256, (len(points), 3), generator=generator, dtype=torch.uint8).numpy()
     degree = round(sh_count**0.5) - 1

@@ -1,4 +1,7 @@
-"""Refit all Gaussians briefly, after the hole is filled, to what is known of the scene without the object."""
+"""The refit: a short reconstruction after the hole is filled, in which all Gaussians move.
+
+It is supervised by the photographs outside the object and by completed views inside the hole.
+"""
 
 from __future__ import annotations
 
@@ -15,20 +18,21 @@ from reffusion.metrics.image_metrics import mask_box
 from reffusion.params.fit import Densify, LearningRates, Params, SphericalHarmonics
 from reffusion.types import Camera, Gaussians, Reference
 
-REFERENCE_SHARE = 1 / 3  # of the steps that show a completed view
-CROP_MARGIN = 0.1  # of its size: how far around its completed part a view is rendered
-BETAS = (0.8, 0.99)  # Adam's; a short run is better with a short memory
+REFERENCE_SHARE = 1 / 3  # share of the steps that show a completed view
+CROP_MARGIN = 0.1  # a completed view is rendered this share of the size of its completed part beyond that part
+BETAS = (0.8, 0.99)  # Adam's decay rates; a short run is better with a short memory
 
 
 @dataclass(frozen=True)
 class Supervision:
-    """The pictures to fit to.
+    """The pictures to which the Gaussians are fitted.
 
     Attributes:
         cameras: the training views.
-        photos: view name -> uint8 [H, W, 3].
-        hidden: view name -> bool [H, W], where the photograph shows the object, with a margin.
-        references: completed views, each valid inside its mask.
+        photos: view name -> uint8 [H, W, 3], the photographs.
+        hidden: view name -> bool [H, W], the pixels at which the photograph does not supervise: it shows the object
+            there (with a margin), or the background there is invented.
+        references: completed views, each of which supervises inside its mask.
     """
 
     cameras: Sequence[Camera]
@@ -40,17 +44,23 @@ class Supervision:
 def refit(
     gaussians: Gaussians, has_exact_depth: Tensor, supervision: Supervision, steps: int, seed: int, folder: Path
 ) -> Gaussians:
-    """The Gaussians after `steps` of reconstruction, as many as before and in the same order; resumes from `folder`.
+    """Return the Gaussians after `steps` steps of reconstruction, as many as before and in the same order.
 
-    Photographs supervise outside the masks, completed views inside theirs. This removes what is left of the object's
-    blurred rim and of its shadow, and joins old and new surfaces at the seam.
+    This removes what is left of the object's blurred rim and of its shadow, and joins remaining and new surfaces at the
+    seam. The run resumes from the checkpoint in `folder`, if there is one.
 
     Args:
-        has_exact_depth: [N] bool, Gaussians whose depth came with a reference. They hardly move: disks that drift apart
-            leave gaps for nearer views. Estimated depth improves by moving.
+        gaussians: the N Gaussians to start from.
+        has_exact_depth: bool [N], True for Gaussians that lie on a depth map which came with a reference. Their
+            positions hardly move, because disks that drift apart leave gaps that nearer views show. The positions of
+            other Gaussians are estimated, and improve by moving.
+        supervision: the photographs and completed views.
+        steps: number of steps, one view each.
+        seed: seed of the order of views and of the random backgrounds.
+        folder: receives the trace and the checkpoints.
 
     Raises:
-        FloatingPointError: see `fit`.
+        FloatingPointError: a loss, gradient or parameter is not finite.
     """
     views, images = list(supervision.cameras), dict(supervision.photos)
     weights = {name: ~mask for name, mask in supervision.hidden.items()}
@@ -74,9 +84,15 @@ def refit(
 
 
 def crop_to_mask(reference: Reference) -> tuple[Camera, np.ndarray, np.ndarray]:
-    """Camera, picture and weights of the crop around a completed view's mask.
+    """Crop a completed view to the surroundings of its mask.
 
-    A pixel has the weight it would have in the whole view. Gaussians outside the crop are not moved by their momentum.
+    The loss is a mean over the pixels of the crop. The weights are therefore scaled by the crop's share of the view, so
+    that a pixel counts as much as in the whole view. Gaussians outside the crop are not rendered, and so Adam's
+    momentum does not move them.
+
+    Returns:
+        The camera of the crop, its picture, uint8 [h, w, 3], and the weights of its pixels, float32 [h, w], which are 0
+        outside the mask.
     """
     box, camera = mask_box(reference.mask, CROP_MARGIN), reference.camera
     assert box is not None, f"{camera.name}: nothing of it was completed"
@@ -87,8 +103,12 @@ def crop_to_mask(reference: Reference) -> tuple[Camera, np.ndarray, np.ndarray]:
 
 
 def repetitions(supervision: Supervision) -> list[int]:
-    """How often each completed view occurs for one occurrence of each photograph, in proportion to its completed
-    pixels: an extra view of a few pixels must not take steps from the reference."""
+    """Return how many times each completed view occurs per pass over the photographs, in which each occurs once.
+
+    Together the completed views take about `REFERENCE_SHARE` of the steps. Each takes a part in proportion to the
+    number of its completed pixels, but occurs at least once: an extra view of a few pixels must not take steps from the
+    reference.
+    """
     sizes = [int(reference.mask.sum()) for reference in supervision.references]
     total = REFERENCE_SHARE / (1 - REFERENCE_SHARE) * len(supervision.cameras)
     return [max(1, round(total * size / max(sum(sizes), 1))) for size in sizes]

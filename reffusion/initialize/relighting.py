@@ -1,4 +1,4 @@
-"""Relight photographs that show the object's shadow, which references no longer show."""
+"""Relighting of photographs that show the object's shadow, which the completed references no longer show."""
 
 from __future__ import annotations
 
@@ -18,12 +18,20 @@ from reffusion.types import Gaussians, Reference
 def remove_shadows(
     references: Sequence[Reference], gaussians: Gaussians, background: Background
 ) -> tuple[list[Reference], Background, dict[str, np.ndarray]]:
-    """Detect the object's shadow by each reference, and relight the photographs.
+    """Detect the object's cast shadow by comparing references with their photographs, and relight all photographs.
+
+    Args:
+        references: completed views, without the object and its shadow.
+        gaussians: of the filled scene.
+        background: the photographs and where they show the object.
 
     Returns:
-        The references, whose masks contain the shadow; the background with photographs in the references' light, and
-        views that do not count where the light is unknown; and view name -> bool [H, W], the shadow, empty where no
-        reference shows one.
+        A tuple of three results:
+
+        - the references, with the shadow added to their masks;
+        - the background. Its photographs have the references' light where they showed the shadow. Pixels whose light
+          is unknown are added to the masks of its views, and so do not supervise;
+        - view name -> bool [H, W], the shadow in each view; an empty dictionary if no reference shows a shadow.
     """
     found = {camera.name: np.zeros((camera.height, camera.width), bool) for camera in background.cameras}
     unknown, photos = dict(found), dict(background.photos)
@@ -33,7 +41,7 @@ def remove_shadows(
         mask = background.masks[name]
         view = inpaint.composite_background(gaussians, each.camera, photos[name], mask)
         shadow = shadows.detect_shadows(each.image, view, mask)
-        if (each.mask & ~mask).any():  # it draws over what remains, which is no shadow, and neither is its rim
+        if (each.mask & ~mask).any():  # an inserted object and its rim differ too, but are no shadow
             shadow &= mask
         extended.append(replace(each, mask=each.mask | shadow))
         if not shadow.any():

@@ -1,9 +1,10 @@
-"""Predict whether score distillation can improve an initialization, from how well it shows the photographs.
+"""Prediction of whether score distillation (SDS) can improve an initialization.
 
-The embedded prior, adapted to the reference, improves pictures of up to `PRIOR_PSNR`, at its own size of `SIDE_PX` for
-a whole view, and degrades better ones (docs/method.md#the-embedded-prior). The truth inside the hole is unknown. Beside
-the hole there are photographs, and renders inside the hole are about `HOLE_LOSS` worse. This says nothing of pixels
-that no reference shows and that patches of photographs filled.
+The embedded prior, adapted to the reference, improves renders whose PSNR is below `PRIOR_PSNR`, and degrades better
+ones (docs/method.md#the-embedded-prior). The PSNR is that of a whole view, reduced to the prior's size of `SIDE_PX`
+pixels. Inside the hole the truth is unknown. So the PSNR is measured against the photographs beside the hole, and
+assumed to be lower by `HOLE_LOSS` inside. This assumption tells nothing of pixels that no reference shows, and that
+were filled by patches of photographs.
 """
 
 from __future__ import annotations
@@ -21,17 +22,24 @@ from reffusion.splat import rasterizer
 from reffusion.trace import decibels
 from reffusion.types import Camera, Gaussians, MaskSet
 
-SIDE_PX = 64  # the embedded prior's size
-PRIOR_PSNR = 26.0  # dB
-HOLE_LOSS = 8.5  # dB
-RING_PX = 4  # of the reduced view: how far around the mask errors are measured
-MAX_VIEWS = 12  # spread evenly
-GUESSED_SHARE = 0.05  # of a view's mask: it was 0.19 where SDS gained (`demo-corner`), below 0.03 elsewhere
+SIDE_PX = 64  # side of the images that the embedded prior takes
+PRIOR_PSNR = 26.0  # dB, PSNR of the best renders that the prior improves
+HOLE_LOSS = 8.5  # dB, by which the PSNR of renders is lower inside the hole than beside it
+RING_PX = 4  # pixels of the reduced view: width of the ring around the mask in which errors are measured
+MAX_VIEWS = 12  # views that are compared at most, evenly spread
+# Share of a view's mask filled by patches above which SDS may gain. It was 0.19 in the scene where SDS gained
+# (`demo-corner`), and below 0.03 in the others.
+GUESSED_SHARE = 0.05
 
 
 class GainPrediction(NamedTuple):
-    """Whether SDS may gain, the reason in words, and the PSNR in dB beside the hole (None where nothing was
-    compared)."""
+    """The prediction of `predict_gain`.
+
+    Attributes:
+        may_gain: whether SDS may improve the initialization.
+        reason: the reason, in words.
+        psnr_beside: PSNR in dB of the renders beside the hole; None if there was no photograph to compare with.
+    """
 
     may_gain: bool
     reason: str
@@ -46,17 +54,24 @@ def predict_gain(
     photos: Mapping[str, np.ndarray],
     guessed_share: float = 0.0,
 ) -> GainPrediction:
-    """Predict the gain for an initialization from references, by the training views in which something is invented.
+    """Predict whether SDS may improve an initialization, from its renders of views in which something is invented.
+
+    SDS may gain if the PSNR estimated inside the hole is below `PRIOR_PSNR`, if patches fill more than `GUESSED_SHARE`
+    of some view's mask, or if there is no photograph to compare with.
 
     Args:
-        photos: view name -> uint8 [H, W, 3]; other views are not used.
-        guessed_share: the largest share of a view's mask that no reference covers, and that patches fill.
+        gaussians: the initialization.
+        cameras: the training views.
+        sets: view name -> pixel classes.
+        photos: view name -> uint8 [H, W, 3]; views without an entry are not compared.
+        guessed_share: share in [0, 1] of a view's mask that no reference covers and that patches of photographs fill,
+            in the view where it is largest.
     """
     usable = [camera for camera in cameras if camera.name in photos and sets[camera.name].invent.any()]
     indices = np.unique(np.linspace(0, len(usable) - 1, MAX_VIEWS).round().astype(int)) if usable else []
     errors = []
     for camera in (usable[k] for k in indices):
-        each = sets[camera.name]  # an inserted object has nothing removed behind it: I counts beside C
+        each = sets[camera.name]  # where an object is inserted and none removed, the hole is I, not C
         errors.append(_errors_beside(gaussians, camera, each.consistent | each.invent, photos[camera.name]))
     squared = torch.cat(errors) if errors else torch.zeros(0)
     if not len(squared):
@@ -71,7 +86,14 @@ def predict_gain(
 
 
 def _errors_beside(gaussians: Gaussians, camera: Camera, mask: np.ndarray, photo: np.ndarray) -> Tensor:
-    """[N, 3]: squared errors of the pixels of the reduced view that lie beside the mask, bool [H, W]."""
+    """Return [N, 3], squared errors of a render of the N pixels beside the mask, in a view reduced to `SIDE_PX` pixels.
+
+    Args:
+        gaussians: the scene to render.
+        camera: the view.
+        mask: bool [H, W], the hole.
+        photo: uint8 [H, W, 3], the photograph, with which the render is compared in [0, 1].
+    """
     reduce = lambda image: two_scales(image.permute(2, 0, 1).float().cpu(), [], SIDE_PX)[0]
     rendering = rasterizer.render(gaussians, camera).color.clamp(0, 1)
     small = two_scale_masks(torch.from_numpy(mask), [], SIDE_PX)

@@ -1,4 +1,8 @@
-"""Several references with depth maps: decide which one draws a surface that more than one of them shows."""
+"""Division of inserted surfaces among several references with depth maps.
+
+Where more than one reference shows the same surface, one of them is chosen, and its pixels become Gaussians. This
+concerns the pixels outside C (the object's mask) where a reference draws an inserted object over the remaining scene.
+"""
 
 from __future__ import annotations
 
@@ -19,21 +23,22 @@ from reffusion.gaussians.surfels import surface_normals
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference
 
-SAME_DEPTH = 0.015  # relative depth within which two references show the same surface
-SAME_NORMAL = 0.85  # least cosine between their normals there
-PAST = 0.03  # relative depth by which a reference sees past what another draws
-MIN_COSINE = 0.05  # between surface normal and view: a more oblique surface counts as this oblique
-UNCHANGED = 12  # of 255: largest difference between pictures that show the same
-EDGE = np.ones((3, 3), np.uint8)  # px: the position of an edge is accurate to a pixel
+SAME_DEPTH = 0.015  # relative difference of depth within which two references show the same surface
+SAME_NORMAL = 0.85  # smallest cosine between the normals of the same surface in two references
+PAST = 0.03  # relative difference of depth from which a reference sees past a surface that another one shows
+MIN_COSINE = 0.05  # smallest cosine between normal and view that is counted: the footprint stays finite
+UNCHANGED = 12  # levels of 255: largest difference between two pictures that show the same
+EDGE = np.ones((3, 3), np.uint8)  # window of 3 x 3 px, because an edge is located to within a pixel
 
 
 @dataclass(frozen=True)
 class Share:
-    """Which pixels of its depth map one of several references adds to the scene.
+    """The part of the inserted surfaces that one of several references adds to the scene.
 
     Attributes:
-        drawn: bool [H, W], pixels that become Gaussians.
-        ceded: bool [H, W], pixels that do not: another reference adds them, or the scene shows them already.
+        drawn: bool [H, W], the pixels outside C that become Gaussians.
+        ceded: bool [H, W], all other pixels of the reference's mask outside C whose depth is known. Another reference
+            adds their surface, or sees past it, or they look like the photograph.
     """
 
     drawn: np.ndarray
@@ -45,7 +50,9 @@ class ReferenceSurface:
     """The surface that a reference shows.
 
     Attributes:
-        camera: its view. depth: [H, W], 0 where unknown. pixels: bool [H, W], what the reference would draw.
+        camera: the view of the reference.
+        depth: [H, W], camera z in world units; 0 where unknown.
+        pixels: bool [H, W], the pixels that the reference would add if it were the only one.
     """
 
     camera: Camera
@@ -54,13 +61,15 @@ class ReferenceSurface:
 
     @cached_property
     def normals(self) -> np.ndarray:
-        """[H, W, 3], towards the camera."""
+        """[H, W, 3], unit normals of the surface, towards the camera."""
         return surface_normals(self.depth, self.camera)
 
     @cached_property
     def footprints(self) -> np.ndarray:
-        """[H, W], the width of a pixel on the surface, in its widest direction, in world units; infinite where depth is
-        unknown."""
+        """[H, W], the length of a pixel's footprint on the surface along its longest direction, in world units.
+
+        It grows with depth and with the slant of the surface; it is infinite where depth is unknown.
+        """
         rays = geometry.unproject(np.ones_like(self.depth), self.camera) - self.camera.center
         direction = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         cosine = np.abs((direction * self.normals).sum(-1)).clip(MIN_COSINE)
@@ -71,14 +80,19 @@ class ReferenceSurface:
 def share_surfaces(
     remaining: Gaussians, references: Sequence[Reference], background: Background, completion: CompletionSettings
 ) -> dict[str, Share]:
-    """View name -> its share, of the references with a depth map; empty where there are fewer than two.
+    """Decide for each reference with a depth map which pixels outside C (the object's mask) it adds to the scene.
 
-    Each alone would draw all that it shows. What it shows obliquely is coarse, one pixel is a long smear there, and it
-    would keep out what another reference shows sharply.
+    Without this division the first reference would add every surface that it shows. A surface that it sees obliquely
+    would be coarse, with one pixel as a long smear, and would prevent another reference from adding it sharply.
 
     Args:
-        remaining: the Gaussians that remain.
-        references: in the order in which they are drawn.
+        remaining: the Gaussians of the scene without the object.
+        references: completed views, in the order in which they are added.
+        background: the photographs and masks.
+        completion: settings for the depth around the hole, to which the depth maps are aligned.
+
+    Returns:
+        View name -> its share, for the references with a depth map; empty if fewer than two have one.
     """
     with_depth = [each for each in references if each.depth is not None]
     if len(with_depth) < 2:
@@ -100,7 +114,13 @@ def share_surfaces(
 def align_reference_depth(
     remaining: Gaussians, reference: Reference, background: Background, completion: CompletionSettings
 ) -> np.ndarray:
-    """[H, W] the depth map of a reference in world units; 0 where unknown."""
+    """Return [H, W], the depth map of a reference, aligned to the depth of the scene; 0 where unknown.
+
+    The result is camera z in world units. The reference must have a depth map, of any scale and offset.
+
+    Raises:
+        ValueError: the depth map does not fit the scene, or too little depth is known, see `alignment.align_either`.
+    """
     assert reference.depth is not None
     camera, rendering = reference.camera, rasterizer.render(remaining, reference.camera, sh_degree=0)
     hints = Hints(photographed_depth=background.photographed_depth(camera))
@@ -111,10 +131,11 @@ def align_reference_depth(
 
 
 def select_finest(surfaces: Sequence[ReferenceSurface]) -> list[np.ndarray]:
-    """bool [H, W] of each: the pixels that it draws.
+    """Return for each reference bool [H, W], the pixels that it adds to the scene.
 
-    A surface is drawn by the reference that shows it with the smallest footprint, by the earlier of two alike; and
-    nothing is drawn where another reference sees past it.
+    Each surface is added by the reference that shows it with the smallest footprint (the length of a pixel on the
+    surface); between equal footprints the earlier reference wins. A surface that another reference sees past is not
+    added at all.
     """
     found = []
     for i, each in enumerate(surfaces):
@@ -133,11 +154,20 @@ def select_finest(surfaces: Sequence[ReferenceSurface]) -> list[np.ndarray]:
 def cross_visibility(
     points: np.ndarray, normals: np.ndarray, other: ReferenceSurface
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of points [P, 3] with normals [P, 3]: whether another reference would draw the same surface there, bool [P];
-    whether it sees past them, bool [P]; and its footprint there, [P].
+    """Test whether another reference shows the surface at given points, or sees past it.
 
-    Beyond an edge the next side of a thing is as near, but faces elsewhere: it is another surface. Where this is
-    uncertain both draw, which does less harm than a gap.
+    Two references show the same surface where depths and normals agree. The normals tell two faces of an object apart:
+    beside the edge between them both have the same depth. Where it is uncertain whether surfaces are the same, both
+    references add them, which does less harm than a gap.
+
+    Args:
+        points: [P, 3], points of a reference's surface.
+        normals: [P, 3], unit normals at the points.
+        other: the surface of the other reference.
+
+    Returns:
+        Three arrays [P]: bool, True where the other reference would add the same surface; bool, True where the other
+        reference sees past the point; and the other reference's footprint at the pixel that shows the point.
     """
     near, far = cv2.erode(np.where(other.depth > 0, other.depth, np.inf), EDGE), cv2.dilate(other.depth, EDGE)
     uv, z = geometry.project(points, other.camera)
@@ -151,10 +181,15 @@ def cross_visibility(
 
 
 def unchanged_rim(image: np.ndarray, photo: np.ndarray, drawn: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels at the border of what was drawn over a photograph, bool [H, W], that look like the
-    photograph; both pictures uint8 [H, W, 3].
+    """Return bool [H, W], the pixels along the border of an inserted region that look like the photograph.
 
-    Detected changes extend a little too far, and depth there belongs to something else.
+    Detected changes extend a little beyond the inserted object. The depth of these extra pixels belongs to another
+    surface, so they must not be added.
+
+    Args:
+        image: uint8 [H, W, 3], the completed view.
+        photo: uint8 [H, W, 3], the photograph of the same view.
+        drawn: bool [H, W], the pixels that were drawn over the photograph.
     """
     alike = drawn & (np.abs(image.astype(np.int16) - photo).max(-1) <= UNCHANGED)
     alike = ndimage.binary_opening(alike, np.ones((2, 2)))

@@ -1,7 +1,7 @@
-"""Plane sweep: find the depth of one photograph around a hole by comparing it with its neighbours.
+"""Plane sweep stereo: the depth of one photograph around a hole, found by comparing it with neighbouring photographs.
 
-The expected depth of splats is rough, and biased towards the camera wherever haze hangs before a surface. A surface
-that continues into a hole must be accurate to a thousandth of its depth, or it breaks at the hole's border.
+The rendered depth of Gaussians is rough, and too small wherever faint Gaussians float in front of a surface. But a
+surface that continues into a hole must be accurate to a thousandth of its depth, or a step shows at the hole's border.
 """
 
 from __future__ import annotations
@@ -20,19 +20,27 @@ from reffusion.background.visibility import DepthView
 from reffusion.io.images import to_gray
 from reffusion.types import Camera
 
-NEIGHBORS = 6
+NEIGHBORS = 6  # neighbouring photographs that are compared at most
 MIN_ANGLE, MAX_ANGLE = 4.0, 35.0  # degrees between a neighbour and the view, as seen from the surface
-RANGE, STEPS = 0.03, 21  # relative disparity that is searched to either side, and the number of steps
+RANGE, STEPS = 0.03, 21  # relative disparity that is searched to either side, and the number of disparities tried
 WINDOW = 0.024  # of the image's width: side of the compared window
-SMOOTHING = 0.02  # of the image's width: side of the median of the initial depth, whose roughness would tear the window
-MIN_CONTRAST = 2.5  # of 255: standard deviation in a window below which it tells nothing
-MIN_CORRELATION = 0.55  # mean, with the better half of the neighbours
-RING = 0.1  # of the image's width: how far around a hole depth is swept
+SMOOTHING = 0.02  # of the image's width: side of the median filter of the initial depth; rough depth distorts windows
+MIN_CONTRAST = 2.5  # levels of 255: standard deviation in a window below which the window is too plain to be compared
+MIN_CORRELATION = 0.55  # smallest mean correlation with the better half of the neighbours at which depth is accepted
+RING = 0.1  # of the image's width: width of the ring around a hole in which depth is searched
 
 
 def refine_background(background: Background, camera: Camera, hole: np.ndarray) -> tuple[Background, np.ndarray]:
-    """The background with the depth of one view, and with planes, moved to where the photographs agree best around a
-    hole; and bool [H, W], pixels whose depth was found."""
+    """Correct the depth of one view, and all planes, around a hole by plane sweep stereo.
+
+    Args:
+        background: the photographs, depth views and planes around the object.
+        camera: the view.
+        hole: bool [H, W], the pixels to be filled. Depth is searched in a ring around them and the object's pixels.
+
+    Returns:
+        The background with corrected depth and planes, and bool [H, W], the pixels at which the sweep found depth.
+    """
     depth = background.photographed_depth(camera)
     ring = morphology.dilate(hole | background.masks[camera.name], RING) & ~hole & (depth > 0)
     photos = background.photos
@@ -52,12 +60,19 @@ def sweep_depth(
     views: Sequence[DepthView],
     photos: Mapping[str, np.ndarray],
 ) -> np.ndarray:
-    """[H, W] float64: camera z of `pixels` at which the other photographs agree best; 0 where none tells.
+    """Return [H, W] float64, the camera z at which the other photographs agree best with the view's.
 
     Args:
-        photo: [H, W, 3] uint8, the view's picture.
-        depth: [H, W], its depth to within some percent, 0 where unknown. pixels: bool [H, W].
-        views: the scene's, which do not count where they show the object. photos: their pictures.
+        photo: [H, W, 3] uint8, the photograph of the view.
+        depth: [H, W], approximate depth of the view, correct to within `RANGE`; 0 where unknown.
+        pixels: bool [H, W], the pixels whose depth is searched.
+        camera: the view.
+        views: depth views of the scene, from which neighbours are chosen. Their masked pixels (the object's) do not
+            count.
+        photos: view name -> uint8 [H, W, 3], the photographs of `views`.
+
+    Returns:
+        0 outside `pixels` and where no depth agrees well enough; everywhere if there are fewer than two neighbours.
     """
     found = np.zeros(pixels.shape)
     pixels = pixels & (depth > 0)
@@ -87,13 +102,20 @@ def sweep_depth(
 
 
 def _smooth_depth(depth: np.ndarray, known: np.ndarray, side: int) -> np.ndarray:
-    """The median depth around each pixel; an unknown pixel takes the depth of the nearest known one first."""
+    """Return [H, W], the depth map after a median filter with a window of `side` px.
+
+    Before, each pixel that is not `known`, bool [H, W], takes the depth of the nearest known pixel.
+    """
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     return ndimage.median_filter(depth[tuple(nearest)].astype(np.float64), side)
 
 
 def _select_neighbors(camera: Camera, point: np.ndarray, views: Sequence[DepthView]) -> list[DepthView]:
-    """The views that look at a point from another direction, but not too different a one; the nearest first."""
+    """Return up to `NEIGHBORS` views that see a point from a different, but not too different, direction.
+
+    The angle at the point between the camera and such a view lies between `MIN_ANGLE` and `MAX_ANGLE`. The views are
+    spread over this range, by increasing angle.
+    """
     direction = lambda center: (center - point) / max(np.linalg.norm(center - point), 1e-12)
     angles = [
         np.degrees(np.arccos(np.clip(direction(v.camera.center) @ direction(camera.center), -1, 1))) for v in views
@@ -115,7 +137,19 @@ def _correlation(
     photos: Mapping[str, np.ndarray],
     side: int,
 ) -> np.ndarray:
-    """[H, W] mean correlation with the better half of the neighbours, were the surface at these points [H, W, 3]."""
+    """Return [H, W], how well the neighbours' photographs agree with the view's if the surface is at given points.
+
+    The value is the normalised correlation of windows, averaged over the better half of the neighbours. A neighbour
+    whose window cannot be compared counts as -1.
+
+    Args:
+        gray: [H, W], the view's photograph in grey levels.
+        points: [H, W, 3], the surface point assumed for each pixel.
+        known: bool [H, W], the pixels that take part in the windows.
+        neighbors: the other views.
+        photos: view name -> uint8 [H, W, 3].
+        side: px, side of the window.
+    """
     mean = lambda values: cv2.boxFilter(values, -1, (side, side), borderType=cv2.BORDER_CONSTANT)
     scores = []
     for view in neighbors:

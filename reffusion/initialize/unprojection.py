@@ -1,4 +1,8 @@
-"""Unproject a completed view: estimate the depth behind the object, and add a disk for each pixel."""
+"""Unprojection of a completed view into 3D: the depth behind the object is estimated, and pixels become Gaussians.
+
+The Gaussians are thin disks on the surface, in two sheets (`reffusion.gaussians.sheets`). The draft is the scene that
+is being filled: the remaining Gaussians (the scene without the object) and the new ones.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +26,8 @@ from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians, Reference
 
-COLOR_WINDOW_PX = 2  # radius in which the picture bounds a Gaussian's colour
-COLOR_MARGIN = 0.1  # of [0, 1]: how far beyond these bounds it may lie
+COLOR_WINDOW_PX = 2  # px: radius of the window whose darkest and brightest colours bound a Gaussian's colour
+COLOR_MARGIN = 0.1  # colours in [0, 1]: how far beyond these bounds a Gaussian's colour may lie
 
 
 @torch.no_grad()
@@ -39,28 +43,34 @@ def estimate_depth(
     hints: Hints = NO_HINTS,
     farthest: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, str]:
-    """The depth of the scene without the object in one view.
+    """Estimate the depth of the scene without the object in one view.
 
-    The reference's own depth map is used where it has one; with a depth model's answer the paper's way
-    (`depth.estimates`); otherwise the surroundings are continued into the hole.
+    If the reference has its own depth map, this map is aligned to the scene. Else, if there is a depth model, the
+    model's output is aligned as in the paper (`depth.estimates`). Else the depth of the surroundings is continued into
+    the hole.
 
     Args:
-        remaining: the Gaussians that remain.
-        reference: its camera and picture.
+        remaining: the Gaussians of the scene without the object.
+        reference: the completed view.
         hole: bool [H, W], the pixels to fill.
-        mask: bool [H, W], C of the view.
-        points: [P, 3] sparse points of the scene.
-        completion: settings.
-        disparity: [H, W], a depth model's answer to the reference, up to scale and offset; None without a model.
-        log: receives a series for each solver (docs/development.md#traces).
-        hints: what else is known of the depth. farthest: see `background_depth.continue_depth`.
+        mask: bool [H, W], C of the view (the object's pixels).
+        points: [P, 3], sparse points of the scene.
+        completion: settings of the depth completion.
+        disparity: [H, W], the depth model's output for the reference, up to scale and offset; None without a model.
+        log: receives a series of values for each solver (docs/development.md#traces).
+        hints: further knowledge of the view's depth.
+        farthest: continue only the farthest of several surfaces around the hole.
 
     Returns:
-        Depth [H, W] float64, as rendered where that is known, else estimated; the estimate at all pixels; and the way
-        it was found, in words.
+        A tuple of three results:
+
+        - depth, [H, W] float64 camera z: the rendered depth where it is known, and the estimate elsewhere;
+        - the estimate at all pixels, [H, W] float64;
+        - a description of the method, in words.
 
     Raises:
-        ValueError: naming the view, where too little is known around the hole, or the estimate does not fit.
+        ValueError: too little depth is known around the hole, or the depth map or the model's output does not fit the
+            scene. The message names the view.
     """
     rendering = rasterizer.render(remaining, reference.camera, sh_degree=0)
     view = background_depth.extract_depth(rendering, reference.camera, hole, mask, completion, hints)
@@ -76,7 +86,7 @@ def estimate_depth(
             )
         else:
             solved, words = estimates.align_estimate(view, reference.image, disparity, completion, solvers)
-        # Nothing is beyond infinity: the farthest depth that can be told stands in for it.
+        # A continued disparity may fall to 0 and below, where depth is infinite; so it is limited from below.
         estimate = 1.0 / np.maximum(solved, view.least_disparity)
     except ValueError as error:
         raise ValueError(f"reference {reference.camera.name}: {error}") from error
@@ -85,10 +95,16 @@ def estimate_depth(
 
 @torch.no_grad()
 def find_hole(draft: Draft, reference: Reference, mask: np.ndarray, min_alpha: float) -> np.ndarray:
-    """bool [H, W]: the pixels that a reference has to fill.
+    """Return bool [H, W], the pixels that a reference has to fill.
 
-    These are the pixels of its mask that no earlier reference filled, and pixels of C, `mask`, that the Gaussians
-    cover by less than `min_alpha`, e.g. where floaters were dropped.
+    These are the pixels of the reference's mask that no earlier reference filled, and all pixels of C whose rendered
+    alpha is below `min_alpha`, for example because floaters were removed.
+
+    Args:
+        draft: the scene that is being filled.
+        reference: the completed view.
+        mask: bool [H, W], C of the view (the object's pixels).
+        min_alpha: in [0, 1].
     """
     features = draft.is_new[:, None].to(draft.gaussians.means.dtype)
     rendering = rasterizer.render(draft.gaussians, reference.camera, features=features, sh_degree=0)
@@ -105,15 +121,19 @@ def find_gaps(
     views: Sequence[tuple[Camera, np.ndarray]],
     min_alpha: float,
 ) -> np.ndarray:
-    """bool [H, W]: those of `pixels`, bool [H, W], whose surface another view sees through into nothing.
+    """Return bool [H, W], the pixels of a view whose surface is missing in another view, so that a gap shows there.
 
-    Beside the hole, behind the object, lie Gaussians that few views looked at from about one side. From there they
-    cover the ground; from the other side they leave a black gap between the ground and the new surface.
+    Only few views, all from about the same side, see the ground beside the hole and behind the object. The Gaussians
+    that were fitted there cover the ground from this side. From the other side a black gap shows between these
+    Gaussians and the new surface.
 
     Args:
-        camera: the view. depth: [H, W] of its surface.
-        views: other cameras, and C in them, bool; gaps are looked for in C only.
-        min_alpha: alpha below which there is nothing.
+        gaussians: of the filled scene.
+        camera: the view.
+        depth: [H, W], camera z of the view's surface.
+        pixels: bool [H, W], the pixels of the view to test.
+        views: other cameras, each with its C (the object's pixels), bool [H, W]. Gaps are sought in C only.
+        min_alpha: a pixel of another view shows a gap if its rendered alpha is below this.
     """
     rows, columns = np.nonzero(pixels)
     points, is_gap = geometry.unproject(depth, camera)[rows, columns], np.zeros(len(rows), bool)
@@ -130,7 +150,16 @@ def find_gaps(
 def add_surface(
     draft: Draft, reference: Reference, depth: np.ndarray, pixels: np.ndarray, background: Background, sheets: Sheets
 ) -> Draft:
-    """The draft with a surface at `depth`, [H, W], that shows these pixels of the reference, bool [H, W]."""
+    """Add pixels of a reference to the draft, as a surface of new Gaussians.
+
+    Args:
+        draft: the scene that is being filled.
+        reference: the completed view, from which the colours are taken.
+        depth: [H, W], camera z of the surface; positive at `pixels`.
+        pixels: bool [H, W], the pixels to add.
+        background: the photographs, from which view-dependent colour is estimated.
+        sheets: settings of the Gaussians on a surface.
+    """
     camera = reference.camera
     added = sheet_gaussians(reference.image, depth, pixels, camera, draft.gaussians.sh.shape[1], sheets)
     old_count, draft = len(draft.gaussians), draft.add(added.map(lambda p: p.to(draft.gaussians.means)))
@@ -149,14 +178,20 @@ def add_surface(
 def match_colors(
     gaussians: Gaussians, labels: torch.Tensor, image: np.ndarray, pixels: np.ndarray, camera: Camera, steps: int
 ) -> Gaussians:
-    """The labelled Gaussians' constant colours, corrected until the view shows `image` on `pixels`.
+    """Correct the colours of the labelled Gaussians so that a rendered view shows a given picture.
 
-    Each step adds to a Gaussian the mean residual of the pixels it is blended into, by weight, which undoes the blur of
-    the footprints. An occluded Gaussian cannot show the picture whatever its colour; its colour is bounded by the
-    picture around it, or it would stand out as a speck in other views.
+    Only the constant spherical harmonic changes. Each step adds to the colour of a Gaussian the mean residual of the
+    pixels that it is blended into, weighted by its blending weights. This undoes the blur of the footprints. A Gaussian
+    that others occlude cannot show the picture, whatever its colour is. Therefore colours are bounded by those of the
+    picture around the Gaussian. Otherwise an occluded Gaussian would stand out as a speck in other views.
 
     Args:
-        image: [H, W, 3] uint8; pixels: bool [H, W]; labels: bool [N]; steps: corrections.
+        gaussians: all N Gaussians of the scene.
+        labels: bool [N], True for the Gaussians whose colours are corrected.
+        image: uint8 [H, W, 3], the picture that the view should show.
+        pixels: bool [H, W], the pixels at which the picture is compared.
+        camera: the view.
+        steps: number of corrections.
     """
     target = torch.from_numpy(image).to(gaussians.means) / 255
     chosen = torch.from_numpy(pixels)[..., None].to(gaussians.means)
@@ -173,7 +208,11 @@ def match_colors(
 
 
 def _color_bounds(gaussians: Gaussians, image: np.ndarray, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    """[N, 3] twice: bounds of the constant coefficients, from the picture's colours around each Gaussian."""
+    """Return the lowest and the highest constant harmonic that each Gaussian may have, [N, 3] each.
+
+    The bounds are the colours of the picture, uint8 [H, W, 3], within `COLOR_WINDOW_PX` of the Gaussian's centre, with
+    a margin of `COLOR_MARGIN`.
+    """
     uv, _ = geometry.project(gaussians.means.double().cpu().numpy(), camera)
     bounds = []
     for extreme, margin in ((cv2.erode, -COLOR_MARGIN), (cv2.dilate, COLOR_MARGIN)):

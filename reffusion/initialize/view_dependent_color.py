@@ -1,8 +1,8 @@
-"""View-dependent colour of new Gaussians: it follows the surface around them, from photograph to photograph.
+"""View-dependent colour of new Gaussians, estimated from the surface around the hole.
 
-One picture shows a surface from one side. A wet table, or a leaf in the sun, is brighter from another side, and new
-Gaussians of constant colour would stand out as a patch. The photographs show the surface around the hole from all
-sides.
+A reference shows the new surface from one side only. A wet table, or a leaf in the sun, is brighter from another side,
+where new Gaussians of constant colour would stand out as a patch. But the photographs show the surface around the hole
+from all sides. So its change of colour from view to view is measured, and given to new Gaussians of similar colour.
 """
 
 from __future__ import annotations
@@ -22,30 +22,34 @@ from reffusion.splat.conventions import SH0
 from reffusion.splat.pure_torch import harmonics
 from reffusion.types import Camera, Gaussians
 
-RING = 0.1  # of the image's width: how far around the hole the surface is sampled
-MARGIN = 0.006  # of the image's width: distance from the object's blurred rim
-BLUR = 0.015  # of the image's width: standard deviation at which brightness is compared
-COLOR_BLUR = 0.03  # of the image's width: at which materials are compared; at `BLUR` dark spots would seem to brighten
-MAX_SAMPLES = 3000  # points that are kept
-NEIGHBORS = 200  # samples that each new Gaussian takes its colour change from
-BATCH = 20_000  # new Gaussians at a time: their neighbours in all views take a GB at 200 views
-COLOR_SIGMA = 0.08  # of [0, 1]: difference at which a sample's weight is 0.6; wood and steel shine differently
-NOISE = 0.012  # of [0, 1]: mean change up to which a surface is matte
-MIN_SHARE = 0.05  # of the samples, by weight, that a view must show to tell of the change
-GUESS_WEIGHT = 0.3  # of a view that does not tell, against 1 for one that does
-RIDGE = 0.002  # weight of no change against one view: where few views tell, little is made up
+RING = 0.1  # of the image's width: width of the ring around the hole in which the surface is sampled
+MARGIN = 0.006  # of the image's width: distance that samples keep from the object's blurred rim
+BLUR = 0.015  # of the image's width: standard deviation of the blur before colours are compared between views
+# Of the image's width: standard deviation of the blur before materials are compared. After the weaker blur `BLUR`, dark
+# spots would seem to brighten.
+COLOR_BLUR = 0.03
+MAX_SAMPLES = 3000  # sampled points at most
+NEIGHBORS = 200  # nearest samples, from which each new Gaussian takes its change of colour
+BATCH = 20_000  # new Gaussians that are handled at a time: for 200 views their neighbours take a GB
+COLOR_SIGMA = 0.08  # colours in [0, 1]: difference at which a sample's weight is 0.6; wood and steel shine differently
+NOISE = 0.012  # colours in [0, 1]: a mean change up to this is noise, and the surface matte
+MIN_SHARE = 0.05  # a view's change of colour is known where it shows this share of the neighbouring samples, by weight
+GUESS_WEIGHT = 0.3  # weight of a view whose change of colour is unknown and guessed; known ones have weight 1
+RIDGE = 0.002  # weight of the ridge penalty, per view: it keeps harmonics small where few views determine them
 
 
 @dataclass(frozen=True)
 class ColorChange:
-    """How the surface around a hole changes from a completed view to V other views.
+    """The change of colour of the surface around a hole, from a completed view to each of V views.
 
     Attributes:
-        material: [H, W, 3] float32, the completed view, strongly blurred, in [0, 1].
-        points: [R, 3], R samples of the surface. colors: [R, 3], `material` at them.
-        change: [R, V, 3], colour in each view minus colour in the completed view, both blurred by `BLUR`; 0 where the
-            view does not show the sample.
-        visible: bool [R, V], whether a view shows a sample.
+        material: [H, W, 3] float32 in [0, 1], the completed view after a strong blur (`COLOR_BLUR`). It tells materials
+            apart.
+        points: [R, 3], R samples of the surface, in the world.
+        colors: [R, 3], `material` at the samples.
+        change: [R, V, 3], a sample's colour in each view minus its colour in the completed view, both in [0, 1] and
+            blurred by `BLUR`; 0 where the view does not show the sample.
+        visible: bool [R, V], True where a view shows a sample.
     """
 
     material: np.ndarray
@@ -63,15 +67,19 @@ def measure_change(
     views: Sequence[DepthView],
     photos: Mapping[str, np.ndarray],
 ) -> ColorChange:
-    """The change of colour around a hole, from its completed view to all views.
+    """Measure how the colour of the surface around a hole changes from the completed view to all other views.
 
     Args:
-        picture: [H, W, 3] uint8, the completed view; depth: [H, W] of the surfaces it shows, 0 where unknown.
-        hole: bool [H, W]. camera: the completed view, one of those with a photograph.
-        views: V of them. photos: their pictures, uint8, in one exposure.
+        picture: [H, W, 3] uint8, the completed view.
+        depth: [H, W], camera z of the surfaces in the completed view; 0 where unknown.
+        hole: bool [H, W], the pixels that were completed, and C (the object's pixels). The surface is sampled around
+            them.
+        camera: the camera of the completed view, which must have a photograph too.
+        views: the V depth views of the scene.
+        photos: view name -> uint8 [H, W, 3], the photographs of these views, in one common exposure.
     """
-    # Outside the hole photographs are compared: a reference may show in the light what they show in the object's
-    # shadow.
+    # Outside the hole photographs are compared with photographs. A reference may have removed the object's shadow,
+    # which the photographs show.
     picture = np.where(hole[..., None], picture, photos[camera.name])
     ring = morphology.dilate(hole, RING) & ~morphology.dilate(hole, MARGIN) & (depth > 0)
     rows, columns = np.nonzero(ring)
@@ -89,7 +97,13 @@ def measure_change(
 
 
 def _blur(image: np.ndarray, known: np.ndarray, blur: float) -> np.ndarray:
-    """[H, W, 3] float32 in [0, 1], blurred over known pixels only."""
+    """Return [H, W, 3] float32 in [0, 1], the image blurred over the `known` pixels only.
+
+    Args:
+        image: uint8 [H, W, 3].
+        known: bool [H, W].
+        blur: standard deviation, as a fraction of the image's width.
+    """
     sigma, weight = morphology.to_pixels(blur, known.shape[1]), known.astype(np.float32)
     total = cv2.GaussianBlur(weight, (0, 0), sigma)
     blurred = cv2.GaussianBlur(image.astype(np.float32) / 255 * weight[..., None], (0, 0), sigma)
@@ -100,11 +114,21 @@ def _blur(image: np.ndarray, known: np.ndarray, blur: float) -> np.ndarray:
 def transfer_sh(
     gaussians: Gaussians, is_new: torch.Tensor, camera: Camera, change: ColorChange, views: Sequence[DepthView]
 ) -> Gaussians:
-    """The new Gaussians, bool [N], with spherical harmonics that change as the surface around them does.
+    """Give new Gaussians spherical harmonics whose colour changes as that of the surface around them does.
 
-    Each takes the mean change of its neighbours in every view, weighted by distance and similarity of colour; the
-    harmonics are a least squares fit to these. Towards `camera`, in which the Gaussians were made, they keep their
-    colour.
+    For every view, each new Gaussian takes the mean change of colour of the neighbouring samples, weighted by distance
+    and similarity of colour. Its harmonics are a least squares fit to these changes. Seen from `camera`, the Gaussian
+    keeps its colour.
+
+    Args:
+        gaussians: all N Gaussians of the scene.
+        is_new: bool [N], True for the Gaussians to change.
+        camera: the completed view, from which the new Gaussians were made.
+        change: the changes of colour around the hole.
+        views: the V views of `change`.
+
+    Returns:
+        All N Gaussians. They are unchanged if their harmonics are of degree 0, or if there are too few samples.
     """
     indices = torch.nonzero(is_new)[:, 0]
     if gaussians.sh_degree == 0 or not len(indices) or len(change.points) < NEIGHBORS:
@@ -117,7 +141,10 @@ def transfer_sh(
 
 
 def _fit_harmonics(batch: Gaussians, camera: Camera, change: ColorChange, views: Sequence[DepthView]) -> torch.Tensor:
-    """[N, K, 3], the harmonics of `transfer_sh`."""
+    """Return [N, K, 3], the spherical harmonics of N new Gaussians; arguments as of `transfer_sh`.
+
+    The non-constant harmonics c_k minimise the sum of squares in docs/method.md#initialization (view-dependent colour).
+    """
     degree, means, constant = batch.sh_degree, batch.means.double(), batch.sh[:, 0].double()
     own, _ = geometry.sample_nearest(change.material, geometry.project(means.numpy(), camera)[0])
     mean, known = _neighbor_change(means.numpy(), own, change)
@@ -137,8 +164,17 @@ def _fit_harmonics(batch: Gaussians, camera: Camera, change: ColorChange, views:
 
 
 def _neighbor_change(means: np.ndarray, own: np.ndarray, change: ColorChange) -> tuple[np.ndarray, np.ndarray]:
-    """The mean change [N, V, 3] of the neighbours of means [N, 3], whose colours are `own`, [N, 3]; and bool [N, V],
-    whether enough of them are visible."""
+    """Average the changes of colour of the samples around each new Gaussian.
+
+    Args:
+        means: [N, 3], centres of the new Gaussians.
+        own: [N, 3], their colours in `change.material`.
+        change: the samples.
+
+    Returns:
+        The mean change in each view, [N, V, 3], which is shrunk towards 0 where neighbours disagree; and bool [N, V],
+        True where a view shows enough of the neighbours (`MIN_SHARE`).
+    """
     distance, index = cKDTree(change.points).query(means, k=NEIGHBORS)
     near = np.exp(-0.5 * (distance / np.maximum(distance[:, -1:] / 2, 1e-12)) ** 2)
     alike = np.exp(-0.5 * ((own[:, None] - change.colors[index]) ** 2).sum(-1) / COLOR_SIGMA**2)
@@ -150,7 +186,7 @@ def _neighbor_change(means: np.ndarray, own: np.ndarray, change: ColorChange) ->
     flat = change.change.reshape(len(change.points), -1)
     average = lambda values: (weights @ values).reshape(len(means), -1, 3) / np.maximum(share, 1e-12)[..., None]
     mean, square = average(flat), average(flat**2)
-    # A mirror shows something else at every point: where neighbours disagree, their mean is shrunk.
+    # On a mirror the change differs from point to point, and a mean of it is wrong: disagreement shrinks the mean.
     size = (mean**2).sum(-1)
     agreement = size / np.maximum(square.sum(-1), 1e-12) * np.maximum(1 - 3 * NOISE**2 / np.maximum(size, 1e-12), 0)
     return mean * agreement[..., None], share > MIN_SHARE
@@ -159,9 +195,19 @@ def _neighbor_change(means: np.ndarray, own: np.ndarray, change: ColorChange) ->
 def _fill_unknown_views(
     change: np.ndarray, known: np.ndarray, middle: np.ndarray, views: Sequence[DepthView]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The change [N, V, 3], where a view is unknown that of the nearest known one; and the views' weights [N, V].
+    """Guess the change of colour in views where it is unknown from the view with the nearest direction.
 
-    Harmonics that are constrained in a few directions only run away in the others.
+    Without the guesses, harmonics that are constrained in a few directions would take extreme values in all others.
+
+    Args:
+        change: [N, V, 3], the change of each Gaussian in each view.
+        known: bool [N, V], True where the change is known.
+        middle: [3], the point from which the directions to the cameras are compared.
+        views: the V views.
+
+    Returns:
+        The completed change, [N, V, 3]; and the weights of the views, [N, V]: 1 where known, `GUESS_WEIGHT` where
+        guessed, and 0 for a Gaussian whose change is known in no view.
     """
     directions = np.stack([view.camera.center for view in views]) - middle
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -1,6 +1,6 @@
-"""Deterministic 2D inpainting: LaMa from a TorchScript file on this machine, or OpenCV's methods.
+"""Deterministic 2D inpainting by LaMa, from a TorchScript file on this machine, or by OpenCV's methods.
 
-Nothing is downloaded. Each painter has a name, so that a table of results can say which one filled the holes.
+Nothing is downloaded. Holes are bool [H, W], True for the pixels to fill.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ import torch
 import torch.nn.functional as F
 
 SIZE_MULTIPLE = 8  # px: LaMa halves an image three times
-FSR_SIDE = 160  # px, the longer side FSR works at: its time grows with the hole's area, and larger is no sharper
-TELEA_RADIUS = 5  # px around each pixel from which Telea's method takes colours
+FSR_SIDE = 160  # px, longer side to which images are reduced for FSR: larger ones take longer and get no sharper
+TELEA_RADIUS = 5  # px, radius around each pixel from which Telea's method takes colours
 
 
 @dataclass(frozen=True)
 class Painter:
-    """An inpainter.
+    """A 2D inpainter.
 
     Attributes:
-        name: of the method and its weights, for tables.
-        paint: (image uint8 [H, W, 3], hole bool [H, W]) -> uint8 [H, W, 3]. Outside the hole the result equals the
-            image; it does not depend on the image inside the hole.
+        name: the method and its weights, so that a table of results can say what filled the holes.
+        paint: function (image uint8 [H, W, 3], hole bool [H, W]) -> uint8 [H, W, 3]. The result equals the image
+            outside the hole, and does not depend on the image inside the hole.
     """
 
     name: str
@@ -34,12 +34,16 @@ class Painter:
 
 
 def load_classical() -> Painter:
-    """Returns OpenCV's FSR, or Telea's method where this OpenCV has no FSR, or one that does not work."""
+    """Return OpenCV's FSR as a painter, or Telea's method if FSR is missing in this OpenCV or does not work."""
     return Painter(f"OpenCV FSR fast, {FSR_SIDE} px", fsr) if _fsr_works() else _TELEA
 
 
 def load_lama(file: Path, device: str = "cpu") -> Painter:
-    """Loads LaMa from a TorchScript file. ValueError if the file is no TorchScript module."""
+    """Load LaMa from a TorchScript file.
+
+    Raises:
+        ValueError: the file is no TorchScript module.
+    """
     try:
         module = torch.jit.load(file, map_location=device).eval()
     except (RuntimeError, ValueError) as error:
@@ -50,13 +54,17 @@ def load_lama(file: Path, device: str = "cpu") -> Painter:
 
 @torch.no_grad()
 def lama(module: torch.nn.Module, image: np.ndarray, hole: np.ndarray, device: str = "cpu") -> np.ndarray:
-    """uint8 [H, W, 3], the image with its hole filled by one forward pass of LaMa.
+    """Return the image, uint8 [H, W, 3], with its hole filled by one forward pass of LaMa.
 
-    The module takes an image [1, 3, H, W] in [0, 1] and a mask [1, 1, H, W], 1 in the hole, both with sides that are
-    multiples of 8, and returns an image of that size in [0, 1].
+    Args:
+        module: takes an image [1, 3, H, W] in [0, 1] and a mask [1, 1, H, W], which is 1 in the hole. The sides of both
+            are multiples of 8. It returns an image of the same size in [0, 1].
+        image: uint8 [H, W, 3], of any size; it is padded.
+        hole: bool [H, W], the pixels to fill.
+        device: the device of the module.
 
     Raises:
-        ValueError: its answer has another shape or is not finite.
+        ValueError: the module's output has another shape than its input, or is not finite.
     """
     height, width = hole.shape
     padding = (0, -width % SIZE_MULTIPLE, 0, -height % SIZE_MULTIPLE)
@@ -71,7 +79,10 @@ def lama(module: torch.nn.Module, image: np.ndarray, hole: np.ndarray, device: s
 
 
 def fsr(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3], the hole filled by OpenCV's frequency selective reconstruction at `FSR_SIDE` px, enlarged."""
+    """Return the image, uint8 [H, W, 3], with its hole filled by OpenCV's frequency selective reconstruction (FSR).
+
+    The hole is filled in an image whose longer side is at most `FSR_SIDE` px; this content is then enlarged.
+    """
     if not hole.any():
         return image.copy()
     factor = min(1.0, FSR_SIDE / max(hole.shape))
@@ -88,7 +99,7 @@ def fsr(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
 
 
 def telea(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3], the hole filled by OpenCV's fast marching method (Telea, 2004)."""
+    """Return the image, uint8 [H, W, 3], with its hole filled by OpenCV's fast marching method (Telea, 2004)."""
     painted = cv2.inpaint(blank_hole(image, hole), hole.astype(np.uint8), TELEA_RADIUS, cv2.INPAINT_TELEA)
     return paste_hole(image, painted, hole)
 
@@ -97,6 +108,7 @@ _TELEA = Painter(f"OpenCV Telea, radius {TELEA_RADIUS} px", telea)
 
 
 def _fsr_works() -> bool:
+    """Return whether FSR fills a small hole in a uniform image."""
     hole = np.zeros((16, 16), bool)
     hole[6:10, 6:10] = True
     try:
@@ -106,10 +118,10 @@ def _fsr_works() -> bool:
 
 
 def blank_hole(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3], the image with zeros in the hole, bool [H, W]."""
+    """Return the image, uint8 [H, W, 3], with zeros in the hole, bool [H, W]."""
     return np.where(hole[..., None], np.uint8(0), image)
 
 
 def paste_hole(image: np.ndarray, painted: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """[H, W, 3], `painted` in the hole, bool [H, W], the image elsewhere."""
+    """Return [H, W, 3], the colours of `painted` inside the hole, bool [H, W], and of `image` outside."""
     return np.where(hole[..., None], painted, image)

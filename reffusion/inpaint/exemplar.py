@@ -1,7 +1,8 @@
-"""Fills a hole in a view with texture of the photographs, along the surfaces that continue into the hole.
+"""Exemplar-based inpainting: fills a hole in a view with texture of the photographs.
 
-Mirror images of things beside the object come first, then planes that repeat themselves, then large pieces of the
-view's own photograph, and patches for the rest.
+Textures follow the surfaces that continue into the hole. The hole is filled in four steps, each of which fills what the
+steps before it left: mirror images of symmetric things beside the object, planes whose texture repeats itself, large
+pieces of the view's own photograph, and small patches of all sources. C is the consistent mask, the object's pixels.
 """
 
 from __future__ import annotations
@@ -32,25 +33,31 @@ from reffusion.inpaint.source_image import SourceImage
 from reffusion.morphology import convex_hull, dilate, disk, to_pixels
 from reffusion.types import Camera
 
-OTHER_PHOTOS = 3  # photographs beside the view's own that patches are taken from
-RING = 0.12  # of the image's width: how far around the object foreground layers are separated
-SOURCE_REACH = 4.0  # radii of the object around its middle within which patches are taken
-RIM_WIDTH = 0.006  # of the image's width: the rim of the mask that is painted, too
-MIN_KEPT_RADIUS = 0.02  # of the image's width: observed parts of C that no disk of this radius fits in are painted, too
-MASK_MARGIN = 0.008  # of the image's width: so near to its mask a photograph mixes object and background
-PLANE_SAMPLE_DISTANCE = 0.06  # relative depth up to which a pixel counts in the roughness of a plane
-PLANE_SAMPLE_REACH = 2.5  # radii of the object around its middle within which it counts
-MIN_PLANE_PIXELS = 200  # of a view that count, for the view to count
-SMOOTH = 0.01  # roughness up to which a plane is smooth: not grass, nor rock
-SMOOTH_IF_REPEATING = 0.02  # the same, of a plane that repeats itself as planks and tiles do, and grass does not
-MIN_LAYER_SHARE = 0.02  # of the hole that a foreground layer must continue into, or it is ignored: it ends beside it
+OTHER_PHOTOS = 3  # photographs, besides the view's own, from which patches are taken
+RING = 0.12  # of the image's width: width of the ring around the object in which foreground layers are separated
+SOURCE_REACH = 4.0  # patches are taken within this many radii of the object around its middle
+RIM_WIDTH = 0.006  # of the image's width: width of the mask's rim, which is painted too
+MIN_KEPT_RADIUS = 0.02  # of the image's width: observed parts of C too narrow for a disk of this radius are painted too
+MASK_MARGIN = 0.008  # of the image's width: nearer to its mask than this, a photograph mixes object and background
+# The roughness of a plane is measured on pixels whose depth differs from the plane's by at most PLANE_SAMPLE_DISTANCE
+# (relative), and whose points lie within PLANE_SAMPLE_REACH radii of the object around its middle.
+PLANE_SAMPLE_DISTANCE = 0.06
+PLANE_SAMPLE_REACH = 2.5
+MIN_PLANE_PIXELS = 200  # pixels of this kind that a view must have to take part in the roughness of a plane
+SMOOTH = 0.01  # roughness up to which a plane is smooth; grass and rock are rougher
+SMOOTH_IF_REPEATING = 0.02  # the same for a plane whose texture repeats itself, as planks and tiles do, not grass
+MIN_LAYER_SHARE = 0.02  # share of the hole into which a foreground layer must continue; others end beside the hole
 
 
 def mask_to_paint(hidden: np.ndarray, unknown: np.ndarray) -> np.ndarray:
-    """bool [H, W], the pixels of a view to paint: `unknown`, narrow observed strips between its parts, and the rim.
+    """Return bool [H, W], the pixels of a view to paint.
+
+    These are the unknown pixels, observed parts of C that are too narrow to be kept (`MIN_KEPT_RADIUS`), and the rim of
+    C beside them.
 
     Args:
-        hidden: bool [H, W], C. unknown: bool [H, W], the pixels of C that must be painted.
+        hidden: bool [H, W], C.
+        unknown: bool [H, W], the pixels of C that must be painted.
     """
     observed = hidden & ~unknown
     reach = to_pixels(MIN_KEPT_RADIUS, hidden.shape[1])
@@ -60,22 +67,28 @@ def mask_to_paint(hidden: np.ndarray, unknown: np.ndarray) -> np.ndarray:
 
 
 def add_rim(hole: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """bool [H, W], the hole and the rim of C (`hidden`) beside it, inside and out. The object's blurred edge that is
-    left there would be continued into the hole."""
+    """Return bool [H, W], the hole and the rim of C (`hidden`) beside it, on either side of C's border.
+
+    The rim may still show the object's blurred edge, which would be continued into the hole.
+    """
     return hole | dilate(hidden, RIM_WIDTH) & dilate(hole, RIM_WIDTH)
 
 
 def complete_view(
     image: np.ndarray, hole: np.ndarray, camera: Camera, hidden: np.ndarray, around: Background, seeds: Sequence[int]
 ) -> list[Completion]:
-    """A training view's image, uint8 [H, W, 3], with its hole filled from its own photograph, from others, and from
-    views completed before; once for each seed.
+    """Fill the hole of a training view from its own photograph, other photographs, and views completed before.
 
     Args:
-        hole: bool [H, W].
-        camera: of a training view.
-        hidden: bool [H, W], C: where the photograph shows the object.
-        around: what the photographs show.
+        image: uint8 [H, W, 3], the view; read outside the hole only.
+        hole: bool [H, W], the pixels to fill.
+        camera: the camera of the view.
+        hidden: bool [H, W], C: the pixels at which the photograph shows the object.
+        around: the photographs and the surfaces around the object.
+        seeds: seeds of the random searches.
+
+    Returns:
+        One completion of the view for each seed.
     """
     mirrored = render_mirrors(around.mirrors, camera, hidden, around.views)
     target, sources, smooth, symmetries = _find_surfaces(image, hole, camera, hidden, around, mirrored)
@@ -95,8 +108,15 @@ def complete_view(
 def _complete_rest(
     target: SourceImage, hole: np.ndarray, sources: Sequence[SourceImage], smooth: Sequence[int], seed: int
 ) -> Completion:
-    """The target with its hole filled from large pieces of the own photograph, and from patches where these do not
-    suit."""
+    """Fill the hole from large pieces of the view's own photograph, and from patches where no such piece suits.
+
+    Args:
+        target: the view.
+        hole: bool [H, W], the pixels that are still to be filled.
+        sources: images from which texture is taken; the view's own photograph is the first.
+        smooth: indices of the planes whose perspective patches follow.
+        seed: seed of the random searches.
+    """
     assembly = fill_from_photo(target, hole, sources[0], smooth, seed)
     rest = hole & ~assembly.filled
     completion = complete(_with_filled(target, assembly.image, assembly.filled), rest, sources, smooth, seed)
@@ -105,25 +125,28 @@ def _complete_rest(
 
 
 def _same_depth(depth: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """bool [H, W], where two depth maps agree; the other is inf where it is empty."""
+    """Return bool [H, W], True where two depth maps agree within `MAX_DISTANCE`; `other` may be inf (unknown)."""
     return np.abs(depth - np.where(np.isfinite(other), other, 0.0)) < MAX_DISTANCE * depth
 
 
 def _with_filled(target: SourceImage, image: np.ndarray, filled: np.ndarray) -> SourceImage:
-    """The target with another image, in which more of the hole is filled, bool [H, W]."""
+    """Return the target with a new image, in which the pixels `filled`, bool [H, W], are no longer a hole."""
     return replace(target, image=image, masked=target.masked & ~filled, usable=target.usable | filled)
 
 
 def _find_surfaces(
     image: np.ndarray, hole: np.ndarray, camera: Camera, hidden: np.ndarray, around: Background, mirrored: MirrorImage
 ) -> tuple[SourceImage, list[SourceImage], list[int], dict[int, PlaneSymmetry]]:
-    """What a hole is filled from; arguments as of `complete_view`.
+    """Collect the surfaces behind the hole, and the images from which the hole is filled.
+
+    Arguments are those of `complete_view`, and `mirrored`, the mirror images of symmetric things in this view.
 
     Returns:
         target: the view, with the surfaces that continue into its hole.
-        sources: the view's own photograph, others, and views completed before.
-        smooth: indices of the planes whose perspective patches follow.
-        symmetries: plane index -> how the plane repeats itself, of those in the hole that do.
+        sources: the view's own photograph, other photographs, and views completed before.
+        smooth: indices of the smooth planes, whose perspective patches follow.
+        symmetries: plane index -> how the texture of the plane repeats itself, for the planes in the hole whose texture
+            does.
     """
     own = next(view for view in around.views if view.camera.name == camera.name)
     plane, depth, layer = _surfaces_behind(own, hidden, hole | hidden, around.planes, mirrored)
@@ -147,7 +170,15 @@ def _find_surfaces(
 
 
 def _symmetry_of(plane: int, sources: Sequence[SourceImage]) -> PlaneSymmetry | None:
-    """How the plane repeats itself, from the source that shows most of it; None where it does not."""
+    """Find how the texture of a plane repeats itself, in the source that shows most of the plane.
+
+    Args:
+        plane: index of the plane in the sources.
+        sources: images with the planes that they show.
+
+    Returns:
+        None if the texture does not repeat itself, or too little of the plane is visible.
+    """
     masks = [source.usable & ~source.masked & (source.plane == plane) for source in sources]
     best = int(np.argmax([mask.sum() for mask in masks]))
     rows, columns = np.nonzero(masks[best])
@@ -160,11 +191,22 @@ def _symmetry_of(plane: int, sources: Sequence[SourceImage]) -> PlaneSymmetry | 
 def _surfaces_behind(
     own: DepthView, hidden: np.ndarray, pixels: np.ndarray, planes: Sequence[Plane], mirrored: MirrorImage
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What a view would show without the object: plane indices, int [H, W]; depth, [H, W] float64; and foreground
-    layers, int [H, W], see `_interpolate_depth`.
+    """Determine the surfaces that a view would show without the object.
 
-    In `pixels`, bool [H, W], C and its rim, it is the nearest plane that other views see there or that
-    continues there; where there is none, depth and layer are those of `_interpolate_depth`.
+    A pixel of C and its rim (`pixels`) shows the nearest plane that other views see there or that continues there, or
+    a mirror image. If there is neither, its depth and layer are interpolated from the surroundings
+    (`_interpolate_depth`).
+
+    Args:
+        own: the depth view, with the object.
+        hidden: bool [H, W], C.
+        pixels: bool [H, W], C and the hole, which includes C's rim.
+        planes: the planes around the object.
+        mirrored: the mirror images of symmetric things in this view.
+
+    Returns:
+        The index of each pixel's plane, int [H, W], 0 for none; the depth, float64 [H, W]; and the foreground layer,
+        int [H, W], as in `_interpolate_depth`.
     """
     surface = remove_reflected_depth(own.depth, own.camera, planes)
     known = (surface > 0) & ~hidden
@@ -179,7 +221,8 @@ def _surfaces_behind(
     for k in range(1, len(planes) + 1):
         beside = (plane == k) & ~hidden & (layer >= 0)
         layer[hidden & (plane == k)] = np.bincount(layer[beside]).argmax() if beside.any() else 0
-    image = mirrored.plausible_depth < (1 + MAX_DISTANCE) * nearest  # a plane may cut through a round thing
+    # A plane may cut through a round thing; there the mirror image of the thing wins.
+    image = mirrored.plausible_depth < (1 + MAX_DISTANCE) * nearest
     if image.any():
         thing = known & (layer >= 0) & _same_depth(surface, mirrored.depth)
         layer[image] = np.bincount(layer[thing]).argmax() if thing.any() else 0
@@ -188,12 +231,21 @@ def _surfaces_behind(
 
 
 def _interpolate_depth(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth [H, W], interpolated across the `hidden` pixels from the known ones around; and the foreground layer, int
-    [H, W]: 1, 2, ... for things in front of all that they meet beside the hidden pixels, 0 for the rest, -1 beyond the
-    ring in which layers are separated.
+    """Interpolate depth across the hidden pixels, and separate foreground layers.
 
-    The surroundings are split where depth jumps. A nearer piece continues as far as its convex hull in the image, so
-    that it ends at the straight prolongation of its visible borders; the farther ones continue beyond.
+    The surroundings of the hidden pixels are split into pieces where depth jumps. Each piece is continued by itself. A
+    nearer piece continues as far as its convex hull in the image reaches, so that it ends at the straight continuation
+    of its visible borders. Beyond, the farther pieces continue.
+
+    Args:
+        depth: [H, W], camera z.
+        known: bool [H, W], the pixels whose depth is known.
+        hidden: bool [H, W], the pixels to interpolate.
+
+    Returns:
+        The depth, [H, W]; and the foreground layer, int [H, W]: 1, 2, ... for surfaces that are nearer than all
+        surfaces they touch beside the hidden pixels, 0 for all other pixels, and -1 beyond the ring in which layers are
+        separated.
     """
     if not known.any():
         return np.ones(depth.shape), np.zeros(depth.shape, np.int64)
@@ -212,15 +264,23 @@ def _interpolate_depth(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray)
 
 
 class _LayerLookup:
-    """Foreground layers as one view shows them, looked up by points in the world."""
+    """The foreground layers of one view, which can be looked up for the surface points of other views."""
 
     def __init__(self, points: np.ndarray, layer: np.ndarray):
-        """Args: points: [H, W, 3]. layer: int [H, W], -1 where it is not known."""
+        """Store the layers of a view.
+
+        Args:
+            points: [H, W, 3], the surface points of the view, in the world.
+            layer: int [H, W], the layer of each pixel; -1 where unknown.
+        """
         known = (layer >= 0) & (np.indices(layer.shape).sum(0) % 2 == 0)
         self._tree, self._layer = cKDTree(points[known]), layer[known]
 
     def in_view(self, view: DepthView) -> np.ndarray:
-        """int [H, W], layer of the nearest point to each pixel of a view; 0 where the view shows nothing."""
+        """Return int [H, W], for each pixel of another view the layer of the nearest stored point.
+
+        It is 0 where that view has no depth.
+        """
         layer = np.zeros(view.depth.shape, np.int64)
         opaque = view.depth > 0
         layer[opaque] = self._layer[self._tree.query(geometry.unproject(view.depth, view.camera)[opaque])[1]]
@@ -234,8 +294,16 @@ def _source_image(
     layers: _LayerLookup | None = None,
     with_reflections: bool = False,
 ) -> SourceImage:
-    """A view's image as a source: usable is what it shows near the object, beside its mask. `with_reflections`: also
-    the mirrors in planes, which show something else to other views."""
+    """Convert a view to a source of texture. Its usable pixels are those that show surfaces near the object.
+
+    Args:
+        view: the depth view.
+        image: uint8 [H, W, 3], the picture of the view.
+        around: the planes around the object, and the object's extent.
+        layers: the foreground layers; None for no layers.
+        with_reflections: whether pixels that show a reflection in a plane are usable too. Other views see other
+            reflections there, so only those of the view's own photograph suit.
+    """
     depth = remove_reflected_depth(view.depth, view.camera, around.planes)
     points = geometry.unproject(depth, view.camera)
     near = np.linalg.norm(points - around.center, axis=-1) < SOURCE_REACH * around.radius
@@ -250,7 +318,10 @@ def _source_image(
 
 
 def _choose_others(own: DepthView, views: Sequence[DepthView]) -> list[DepthView]:
-    """Up to `OTHER_PHOTOS` other views, from near to far, so that what one sees obliquely another does not."""
+    """Choose up to `OTHER_PHOTOS` other views, evenly spread from near to far.
+
+    So a surface that one of them sees obliquely is seen less obliquely by another one.
+    """
     distance = lambda view: float(np.linalg.norm(view.camera.center - own.camera.center))
     others = sorted((view for view in views if view is not own), key=distance)
     count = len(others)
@@ -259,8 +330,11 @@ def _choose_others(own: DepthView, views: Sequence[DepthView]) -> list[DepthView
 
 
 def _roughness(plane: Plane, around: Background) -> float:
-    """Median distance of a plane's pixels near the object from the plane, relative to depth; inf where no view shows
-    enough of it."""
+    """Return the roughness of a plane near the object.
+
+    It is the median distance of the pixels near the plane from the plane, relative to their depth, over several views.
+    It is inf if no view shows enough of the plane.
+    """
     medians = []
     for view in around.views[:: max(1, len(around.views) // 6)]:
         off = np.abs(view.depth / plane.depth(view.camera) - 1)

@@ -1,7 +1,8 @@
-"""Loads 2D inpainters, and runs the feed-forward ones from a file on this machine: LaMa and MI-GAN.
+"""Loading of 2D inpainters, and use of the feed-forward networks LaMa and MI-GAN from files on this machine.
 
-A network of fixed input size gets a crop around the hole, resized; any other the whole image. (MI-GAN's published
-pipeline takes any size, and crops and resizes itself.)
+A network of fixed input size gets a resized crop around the hole; any other network gets the whole image. (MI-GAN's
+published pipeline takes images of any size, and crops and resizes them itself.) Holes are bool [H, W], True for the
+pixels to fill.
 """
 
 from __future__ import annotations
@@ -16,18 +17,23 @@ from reffusion.params.inpainter import Inpainter
 from reffusion.weights import painters
 from reffusion.weights.published import PAINTERS
 
-DTYPES = {"lama": "float32", "migan": "uint8"}  # of the ONNX models' images
+DTYPES = {"lama": "float32", "migan": "uint8"}  # type of the images that the ONNX models take
 
 
 def load_inpainter(inpainter: Inpainter, device: str = "cpu") -> Painter | None:
-    """Loads the inpainter of kind "lama", "migan" or "fsr" (OpenCV), or the one that "auto" stands for.
+    """Load an inpainter that needs only an image and a hole: "lama", "migan" or "fsr" (OpenCV).
 
-    TorchScript (.pt, LaMa only) runs on `device`, ONNX (.onnx) on the CPU.
+    The kind "auto" is replaced by the best feed-forward inpainter on this machine, or else by "exemplar".
+
+    Args:
+        inpainter: the setting.
+        device: runs TorchScript files (.pt, LaMa only). ONNX files (.onnx) run on the CPU.
 
     Returns:
-        None for the kinds that need more than an image and a hole: "exemplar" the scene, "diffusion" the prior.
+        None for the kinds that need more than an image and a hole: "exemplar" needs the scene, "diffusion" the prior.
+
     Raises:
-        ValueError: no such file or several, no onnxruntime, or a file of another kind.
+        ValueError: the file is missing, is not the only one, or is of another kind; or onnxruntime is missing.
     """
     inpainter = painters.resolve_inpainter(inpainter)
     if inpainter.kind == "fsr":
@@ -42,13 +48,16 @@ def load_inpainter(inpainter: Inpainter, device: str = "cpu") -> Painter | None:
 
 
 def run_network(network: Network, image: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """The image, uint8 [H, W, 3], with its hole, bool [H, W], filled by the network; nothing else changes."""
+    """Return the image, uint8 [H, W, 3], with its hole, bool [H, W], filled by the network.
+
+    Pixels outside the hole are unchanged.
+    """
     if not hole.any():
         return image.copy()
     crop = crop_around(hole, network.side) if network.side else (slice(None), slice(None))
     inner = hole[crop]
-    # The hole is prefilled smoothly, so that no black reaches the rim: by resizing, or where a pipeline blends its
-    # answer with its input (MI-GAN's does over 3 px).
+    # The hole is prefilled smoothly, because from a black hole black would reach the rim: by resizing, or where a
+    # pipeline blends its output with its input (MI-GAN's does so over 3 px).
     prefilled = classical.telea(image[crop], inner)
     height, width = inner.shape
     padded = (max(height, width),) * 2 if network.side else (_round_up(height), _round_up(width))
@@ -62,10 +71,11 @@ def run_network(network: Network, image: np.ndarray, hole: np.ndarray) -> np.nda
 
 
 def crop_around(hole: np.ndarray, side: int) -> tuple[slice, slice]:
-    """Rows and columns of a square around the hole, bool [H, W].
+    """Return the rows and columns of a square crop around the hole, bool [H, W].
 
-    Its side is twice the longer side of the hole's bounding box and at least `side` px, but at most the image's shorter
-    side. If the hole is longer than that, the crop is a rectangle that takes all of the shorter side.
+    The side of the square is twice the longer side of the hole's bounding box and at least `side` px, but at most the
+    shorter side of the image. If the hole is longer than the shorter side of the image, the crop is a rectangle that
+    takes all of this shorter side.
     """
     spans = [np.flatnonzero(hole.any(axis)) for axis in (1, 0)]
     longest = max(int(span[-1] - span[0]) + 1 for span in spans)
@@ -79,17 +89,17 @@ def crop_around(hole: np.ndarray, side: int) -> tuple[slice, slice]:
 
 
 def _round_up(length: int) -> int:
-    """The next multiple of `SIZE_MULTIPLE`, in px."""
+    """Return the smallest multiple of `SIZE_MULTIPLE` that is not less than `length`, in px."""
     return length + -length % classical.SIZE_MULTIPLE
 
 
 def resize(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """The picture, uint8 [H, W, 3], resized to (height, width)."""
+    """Return the picture, uint8 [H, W, 3], resized to `size` (height, width)."""
     method = cv2.INTER_AREA if size[0] < picture.shape[0] else cv2.INTER_CUBIC
     return picture if size == picture.shape[:2] else cv2.resize(picture, size[::-1], interpolation=method)
 
 
 def resize_hole(hole: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """The hole, bool [H, W], resized to (height, width): a pixel is set if it holds any part of the hole."""
+    """Return the hole, bool [H, W], resized to `size` (height, width). A pixel that holds any part of it is True."""
     method = cv2.INTER_AREA if size[0] < hole.shape[0] else cv2.INTER_LINEAR
     return cv2.resize(hole.astype(np.float32), size[::-1], interpolation=method) > 0

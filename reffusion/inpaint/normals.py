@@ -1,4 +1,4 @@
-"""Surface normals from depth maps, averaged: they tell a tree's bark from ground of the same colour."""
+"""Averaged surface normals from depth maps. They distinguish a tree's bark from ground of the same colour."""
 
 from __future__ import annotations
 
@@ -12,14 +12,20 @@ from reffusion.types import Camera
 
 ARM = 0.01  # of the image's width: half the distance of the points between which slope is measured, at least a pixel
 AVERAGE = 0.02  # of the image's width: radius of the window over which normals are averaged
-MIN_KNOWN = 0.3  # share of the window around each of these points that must be known
+MIN_KNOWN = 0.3  # share of the window around each of the points of a slope whose depth must be known
 
 
 def mean_normals(depth: np.ndarray, known: np.ndarray, camera: Camera) -> np.ndarray:
-    """[H, W, 3] float32, the mean normal around each pixel, in world coordinates, towards the camera.
+    """Return [H, W, 3] float32, the mean of the unit normals around each pixel, in world coordinates.
 
-    It is short where normals differ, as in leaves. Where too little is `known`, bool [H, W], the nearest pixel's normal
-    is taken; all are zero where no normal is known at all.
+    Normals point towards the camera. Their mean is shorter than 1 where they differ, as in leaves. A pixel around which
+    too little depth is known takes the normal of the nearest pixel that has one. If no pixel has one, the result is
+    zero everywhere.
+
+    Args:
+        depth: [H, W], camera z.
+        known: bool [H, W], the pixels whose depth is used.
+        camera: the view.
     """
     step = to_pixels(ARM, depth.shape[1]) + 1
     window = (2 * step - 1,) * 2

@@ -1,4 +1,4 @@
-"""Runs inpainters from ONNX files on the CPU."""
+"""Inpainting networks in ONNX files, run on the CPU."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ class Network:
     """An inpainting network.
 
     Attributes:
-        side: of the square images that it takes, px; None if it takes any size.
-        paint: (picture uint8 [H, W, 3], hole bool [H, W]) -> uint8 [H, W, 3], the network's whole output.
-            ValueError if the output has another size, is not finite or not in 0..255.
+        side: px, side of the square images that the network takes; None if it takes any size.
+        paint: function (picture uint8 [H, W, 3], hole bool [H, W]) -> uint8 [H, W, 3]. The result is the network's
+            output for the whole picture, also outside the hole. Raises ValueError if the output has another size, is
+            not finite, or has values in [0, 1] instead of 0..255.
     """
 
     side: int | None
@@ -29,13 +30,17 @@ class Network:
 
 
 def load(file: Path, dtype: str) -> Network:
-    """Loads a network with inputs `image` [1, 3, H, W] and `mask` [1, 1, H, W] and one output [1, 3, H, W].
+    """Load a network with inputs `image` [1, 3, H, W] and `mask` [1, 1, H, W] and one output [1, 3, H, W].
 
     Args:
-        dtype: "float32" (LaMa): image in [0, 1], mask 1 in the hole, output in 0..255; "uint8" (MI-GAN): image and
-            output in 0..255, mask 0 in the hole and 255 elsewhere.
+        file: the ONNX file.
+        dtype: type of the arrays. For "float32" (LaMa), the image is in [0, 1], the mask is 1 in the hole, and the
+            output is in 0..255. For "uint8" (MI-GAN), image and output are in 0..255, and the mask is 0 in the hole and
+            255 elsewhere.
+
     Raises:
-        ValueError: no onnxruntime, no ONNX model, or other inputs and outputs; one line that names the file.
+        ValueError: onnxruntime is missing, the file is no ONNX model, or its inputs and outputs differ. The message is
+            one line that names the file.
     """
     session = open_session(file, str(file))
     side = _read_side(session, file, dtype)
@@ -43,13 +48,17 @@ def load(file: Path, dtype: str) -> Network:
 
 
 def _read_side(session: Any, file: Path, dtype: str) -> int | None:
-    """The side of the square images that the model takes, px; None for any size. ValueError if its inputs and outputs
-    are not as `load` says."""
+    """Return the side, in px, of the square images that the model takes; None if it takes any size.
+
+    Raises:
+        ValueError: the model's inputs and outputs are not those that `load` describes.
+    """
     inputs = {each.name: (each.type, list(each.shape)) for each in session.get_inputs()}
     outputs = [(each.type, list(each.shape)) for each in session.get_outputs()]
     sides = [side for _, shape in inputs.values() for side in shape[2:]]
     fixed = {side for side in sides if isinstance(side, int)}
-    # A size that is not fixed is a name or None. Sizes of outputs are checked when it runs: exporters misname them.
+    # A size that is not fixed is a name or None. The size of the output is checked when the model runs, because
+    # exporters write wrong names for it.
     one_size = len(fixed) == 1 and all(isinstance(side, int) for side in sides)
     fits = (
         {name: _type_and_channels(*each) for name, each in inputs.items()} == {"image": (dtype, 3), "mask": (dtype, 1)}
@@ -67,19 +76,19 @@ def _read_side(session: Any, file: Path, dtype: str) -> int | None:
 
 
 def _type_and_channels(kind: str, shape: list[Any]) -> tuple[str, int] | None:
-    """Type and number of channels of an input that may be a batch of one image; None if it may not."""
+    """Return the type and the number of channels of an input; None if it cannot hold a batch of one image."""
     types = {onnx_type: dtype for dtype, onnx_type in ONNX_TYPES.items()}
     batch = len(shape) == 4 and (shape[0] == 1 or not isinstance(shape[0], int))
     return (types[kind], shape[1]) if batch and kind in types else None
 
 
 def _describe(kind: str, shape: list[Any]) -> str:
-    """An input or output, for messages: its type and shape."""
+    """Return the type and shape of an input or output as text for messages, such as "float [1, 3, H, W]"."""
     return f"{kind.removeprefix('tensor(').removesuffix(')')} [{', '.join(map(str, shape))}]"
 
 
 def _run(session: Any, file: Path, dtype: str, picture: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """See `Network.paint`."""
+    """Run the model on one picture; arguments, result and errors as of `Network.paint`."""
     if dtype == "uint8":
         image, mask = picture, np.where(hole, np.uint8(0), np.uint8(255))
     else:
@@ -100,6 +109,6 @@ def _run(session: Any, file: Path, dtype: str, picture: np.ndarray, hole: np.nda
 
 
 def _one_line(error: BaseException) -> str:
-    """The error's text on one line of at most 160 characters."""
+    """Return the error's text on one line of at most 160 characters."""
     text = " ".join(str(error).split())
     return text if len(text) <= 160 else text[:157] + "..."

@@ -1,4 +1,4 @@
-"""The planes that an image shows: which one a pixel lies on, its coordinates there, and their derivative."""
+"""The planes that an image shows: for each pixel its plane, its coordinates on this plane, and their derivative."""
 
 from __future__ import annotations
 
@@ -10,14 +10,20 @@ from reffusion import geometry
 from reffusion.background.plane import Plane
 from reffusion.types import Camera
 
-MAX_DISTANCE = 0.03  # relative difference of depth up to which a pixel lies on a plane
+MAX_DISTANCE = 0.03  # relative difference of depth within which a pixel lies on a plane
 
 
 def label_planes(depth: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
-    """int [H, W], index of the plane that each pixel lies on, 1, 2, ...; 0: none. Of several the nearest in depth.
+    """Return int [H, W], the index of the plane on which each pixel lies.
 
     Args:
-        depth: [H, W], 0 where nothing is known.
+        depth: [H, W], camera z of the visible surface; 0 where unknown.
+        camera: the view.
+        planes: the planes, counted from 1 in the result.
+
+    Returns:
+        1, 2, ... for the first, second, ... plane; 0 for pixels on none of them. A pixel near several planes gets the
+        one closest in depth.
     """
     label, nearest = np.zeros(depth.shape, np.int64), np.full(depth.shape, MAX_DISTANCE)
     for k, plane in enumerate(planes, start=1):
@@ -28,10 +34,14 @@ def label_planes(depth: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> 
 
 
 def plane_jacobians(label: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
-    """[H, W, 2, 2], derivative of a pixel's coordinates on its plane by the pixel (x, y); the identity off planes.
+    """Return [H, W, 2, 2], the derivative of a pixel's coordinates on its plane with respect to the pixel (x, y).
+
+    It is the identity for pixels on no plane.
 
     Args:
-        label: int [H, W], see `label_planes`.
+        label: int [H, W], the plane of each pixel, see `label_planes`.
+        camera: the view.
+        planes: the planes.
     """
     jacobians = np.broadcast_to(np.eye(2), (*label.shape, 2, 2)).copy()
     rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
@@ -47,10 +57,14 @@ def plane_jacobians(label: np.ndarray, camera: Camera, planes: Sequence[Plane]) 
 
 
 def plane_coordinates(label: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
-    """[H, W, 2], each pixel's coordinates on its plane, in the plane's own axes; 0 off planes.
+    """Return [H, W, 2], the coordinates of each pixel on its plane, in the plane's own axes and in world units.
+
+    They are 0 for pixels on no plane.
 
     Args:
-        label: int [H, W], see `label_planes`.
+        label: int [H, W], the plane of each pixel, see `label_planes`.
+        camera: the view.
+        planes: the planes.
     """
     coordinates = np.zeros((*label.shape, 2))
     rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
@@ -62,7 +76,7 @@ def plane_coordinates(label: np.ndarray, camera: Camera, planes: Sequence[Plane]
 
 
 def invert_2x2(matrices: np.ndarray) -> np.ndarray:
-    """[..., 2, 2], inverses of matrices; zeros for a singular one, as where a plane is seen edge on."""
+    """Return the inverses of matrices [..., 2, 2]; zeros for a singular matrix, as for a plane seen edge on."""
     (a, b), (c, d) = (np.moveaxis(matrices[..., row, :], -1, 0) for row in (0, 1))
     with np.errstate(invalid="ignore"):
         determinant = a * d - b * c

@@ -1,4 +1,7 @@
-"""Blends pieces without seams: finds the picture whose gradients are nearest to theirs (screened Poisson equation)."""
+"""Blending of pieces without seams, by the screened Poisson equation.
+
+The result is the picture whose gradients are nearest to those of the pieces, and whose colours are near to theirs.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-COLOR_WEIGHT = 0.02  # of the pieces' own colours against their gradients: far from the border the colours win
-TINY_WEIGHT = 1e-9  # of them, so that a hole without known neighbours is zero, not singular
+COLOR_WEIGHT = 0.02  # weight of the pieces' colours; gradients have weight 1. Far from the border the colours win.
+TINY_WEIGHT = 1e-9  # weight of colours with which a hole without known neighbours becomes zero, instead of singular
 
 
 def blend(
@@ -19,13 +22,18 @@ def blend(
     beside: np.ndarray | None = None,
     color_weight: float = COLOR_WEIGHT,
 ) -> np.ndarray:
-    """[N, 3] float64, the blended colours of the hole's pixels in reading order (Perez et al. 2003).
+    """Compute the blended colours of a hole (Perez et al. 2003).
 
     Args:
-        known: [H, W, 3], read beside the hole. hole: bool [H, W].
-        right, below: [H, W, 3], the gradients wanted, to the next pixel. own: [H, W, 3], the colours wanted.
-        beside: bool [H, W], the pixels outside the hole that it must join without a seam; None: all.
-        color_weight: of the colours against the gradients.
+        known: [H, W, 3], the picture outside the hole, which the hole must join without a seam.
+        hole: bool [H, W], the N pixels to compute.
+        right, below: [H, W, 3], the desired difference from each pixel to the next one on the right, and below.
+        own: [H, W, 3], the desired colours.
+        beside: bool [H, W], the pixels outside the hole that the hole must join; None for all.
+        color_weight: weight of the desired colours, if the weight of the desired differences is 1.
+
+    Returns:
+        [N, 3] float64, the colours of the hole's pixels in row-major order.
     """
     rows, columns = np.nonzero(hole)
     index = np.full(hole.shape, -1)
@@ -51,8 +59,18 @@ def blend(
 
 
 def paste(image: np.ndarray, picture: np.ndarray, mask: np.ndarray, both: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3], the image with a picture pasted into a mask, bool [H, W], in the image's tone: the median
-    difference of the two is added, where `both` are known, bool [H, W]."""
+    """Paste a picture into an image, after its tone is matched to the image's.
+
+    To match the tone, the median difference between image and picture is added to the picture.
+
+    Args:
+        image, picture: uint8 [H, W, 3].
+        mask: bool [H, W], the pixels to paste.
+        both: bool [H, W], the pixels at which image and picture show the same; the difference is taken there.
+
+    Returns:
+        uint8 [H, W, 3].
+    """
     difference = image[both].astype(np.float64) - picture[both]
     tone = np.median(difference, 0) if len(difference) else np.zeros(3)
     result = image.copy()
@@ -61,14 +79,15 @@ def paste(image: np.ndarray, picture: np.ndarray, mask: np.ndarray, both: np.nda
 
 
 def interpolate(values: np.ndarray, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """Fill a hole by the Laplace equation.
+    """Interpolate values smoothly across a hole, by the Laplace equation.
 
     Args:
         values: [H, W, 3].
-        hole: bool [H, W], the pixels to fill. beside: bool [H, W], the pixels whose values are continued.
+        hole: bool [H, W], the N pixels to fill.
+        beside: bool [H, W], the pixels outside the hole whose values are continued into it.
 
     Returns:
-        [N, 3] float64, the hole's pixels in reading order.
+        [N, 3] float64, the values of the hole's pixels in row-major order.
     """
     even = np.zeros(values.shape, np.float32)
     return blend(values, hole, even, even, even, beside, TINY_WEIGHT)

@@ -1,4 +1,4 @@
-"""An image and the geometry of the surfaces that it shows: what every exemplar-based method works on."""
+"""An image together with the geometry of the surfaces that it shows: the input of all exemplar-based methods."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import numpy as np
 
 @dataclass(frozen=True)
 class SourceImage:
-    """An image and the surfaces that it shows.
+    """An image and the surfaces that it shows. It is the view whose hole is filled, or a source of texture.
 
     Attributes:
         image: [H, W, 3] uint8.
-        masked: bool [H, W], pixels that must not be read.
-        usable: bool [H, W], where a patch may have its middle.
-        plane: int [H, W], index of the plane shown, 1, 2, ...; 0: none.
-        to_plane: [H, W, 2, 2], derivative of the coordinates on the plane by the pixel (x, y); off planes any regular
-            matrix.
-        pixel_size: [H, W], length of a pixel on the surface, in the world's unit.
-        plane_xy: [H, W, 2], coordinates on the pixel's plane; anything off planes.
-        layer: int [H, W], index of the foreground layer shown, 1, 2, ..., a thing in front of all that it meets beside
-            the hole; 0: none.
-        normal: [H, W, 3], the surface's mean normal, see `normals.mean_normals`; zeros where nothing is known.
+        masked: bool [H, W], True for pixels whose colours must not be used.
+        usable: bool [H, W], True for pixels at which a patch may have its centre.
+        plane: int [H, W], index of the plane that the pixel shows, 1, 2, ...; 0 for none.
+        to_plane: [H, W, 2, 2], derivative of the coordinates on the plane with respect to the pixel (x, y); any regular
+            matrix for pixels on no plane.
+        pixel_size: [H, W], length of a pixel on the surface, in world units.
+        plane_xy: [H, W, 2], the pixel's coordinates on its plane; meaningless for pixels on no plane.
+        layer: int [H, W], index of the foreground layer that the pixel shows, 1, 2, ...; 0 for none. A foreground layer
+            is a surface that is nearer than all surfaces it touches beside the hole.
+        normal: [H, W, 3], the mean normal of the surface, see `normals.mean_normals`; zeros where unknown.
     """
 
     image: np.ndarray
@@ -37,7 +37,12 @@ class SourceImage:
 
 
 def without_geometry(image: np.ndarray, hole: np.ndarray) -> SourceImage:
-    """An image with a hole, bool [H, W], that is masked, and nothing known of its surfaces."""
+    """Return an image whose surfaces are unknown: no planes, layers or normals, and pixels of one size.
+
+    Args:
+        image: uint8 [H, W, 3].
+        hole: bool [H, W]; these pixels are masked, and all others usable.
+    """
     identity, none = np.broadcast_to(np.eye(2), (*hole.shape, 2, 2)), np.zeros(hole.shape, np.int64)
     plane_xy, normal = np.zeros((*hole.shape, 2)), np.zeros((*hole.shape, 3), np.float32)
     return SourceImage(image, hole, ~hole, none, identity, np.ones(hole.shape), plane_xy, none, normal)

@@ -1,4 +1,4 @@
-"""Exports cameras in the scene's own frame for other tools: as a COLMAP model and as nerfstudio's transforms.json."""
+"""Export of cameras for other tools, in the scene's own frame: a COLMAP model and nerfstudio's transforms.json."""
 
 from __future__ import annotations
 
@@ -15,14 +15,17 @@ if TYPE_CHECKING:
     from reffusion.types import Camera, Scene, Similarity
 
 POINTS = "sparse_pc.ply"
-GL = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's cameras look along -z, y up
+GL = np.diag([1.0, -1.0, -1.0, 1.0])  # to nerfstudio's camera axes: it looks along -z, and y points up
 
 
 def save_cameras(folder: Path, scene: Scene, images: str) -> None:
-    """Write undistorted pinholes and sparse points as sparse/0/*.bin, transforms.json and sparse_pc.ply.
+    """Write the undistorted pinhole cameras and the sparse points of a scene, in the scene's own frame.
+
+    The files are sparse/0/*.bin (COLMAP), transforms.json and sparse_pc.ply (nerfstudio). No picture is written.
 
     Args:
-        images: folder of the views' pictures <view>.png, relative to `folder`.
+        folder: where the files are written.
+        images: folder of the undistorted pictures <view>.png, relative to `folder`; transforms.json refers to them.
     """
     folder = Path(folder)
     points = scene.similarity.invert(scene.points)
@@ -43,7 +46,14 @@ def save_cameras(folder: Path, scene: Scene, images: str) -> None:
 
 
 def scene_frame_pose(camera: Camera, similarity: Similarity) -> np.ndarray:
-    """[4, 4] float64, world to camera in the scene's own frame and unit."""
+    """Convert a camera's pose from the normalised frame to the scene's own frame and unit.
+
+    Args:
+        similarity: from the scene's own frame to the normalised frame.
+
+    Returns:
+        The world-to-camera transform, [4, 4] float64.
+    """
     pose = camera.world_to_camera.copy()
     pose[:3, 3] = pose[:3, 3] / similarity.scale - pose[:3, :3] @ similarity.offset
     return pose

@@ -1,4 +1,4 @@
-"""Reads and writes COLMAP models: a folder of cameras, images and points3D, binary or text."""
+"""Reading and writing of COLMAP models: folders with the files cameras, images and points3D, binary or text."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from reffusion.io.files import BadInput, Cursor, is_file, reading, shorten
 from reffusion.io.rotations import quaternion_to_pose, rotation_to_quaternion
 
-# Model name -> number of parameters, in the order of COLMAP's model ids.
+# Name of a camera model -> number of its parameters. The order is that of COLMAP's model ids, from 0 on.
 MODELS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
     "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
@@ -25,7 +25,13 @@ NAMES = tuple(MODELS)
 
 @dataclass(frozen=True)
 class ModelCamera:
-    """Intrinsics: COLMAP's model name, size in pixels, and parameters in COLMAP's order."""
+    """The intrinsics of a camera in a COLMAP model.
+
+    Attributes:
+        model: COLMAP's name of the camera model, a key of `MODELS`.
+        width, height: image size in pixels.
+        params: parameters of the camera model, in COLMAP's order.
+    """
 
     model: str
     width: int
@@ -35,7 +41,13 @@ class ModelCamera:
 
 @dataclass(frozen=True)
 class ModelImage:
-    """A registered image: file name, camera id, [4, 4] float64 world-to-camera."""
+    """A registered image of a COLMAP model.
+
+    Attributes:
+        name: file name of the image, as the model has it.
+        camera_id: id of its camera in the model.
+        world_to_camera: [4, 4] float64 rigid transform, in COLMAP's axes (+z forward, x right, y down).
+    """
 
     name: str
     camera_id: int
@@ -44,12 +56,13 @@ class ModelImage:
 
 @dataclass(frozen=True)
 class ModelPoints:
-    """P sparse points.
+    """The P sparse points of a COLMAP model, and their T observations in images.
 
     Attributes:
-        positions: [P, 3] float64.
+        positions: [P, 3] float64, in the world frame of the model.
         colors: [P, 3] uint8.
-        track_points, track_images: [T] int64 each: point index (row) and image id of every observation.
+        track_points: [T] int64, for each observation the row of its point in `positions`.
+        track_images: [T] int64, for each observation the id of the image that observes the point.
     """
 
     positions: np.ndarray
@@ -59,12 +72,12 @@ class ModelPoints:
 
 
 def model_file(folder: Path, stem: str) -> Path | None:
-    """`<folder>/<stem>.bin` or else `.txt`; None where neither exists."""
+    """Return `<folder>/<stem>.bin` if this file exists, else `<folder>/<stem>.txt`; None if neither exists."""
     return next((p for p in (Path(folder) / f"{stem}{end}" for end in (".bin", ".txt")) if is_file(p)), None)
 
 
 def is_model(folder: Path) -> bool:
-    """Does the folder hold both cameras and images? Points may be missing."""
+    """Return whether the folder has the files cameras and images of a COLMAP model. points3D may be missing."""
     return model_file(folder, "cameras") is not None and model_file(folder, "images") is not None
 
 
@@ -72,17 +85,20 @@ def is_model(folder: Path) -> bool:
 
 
 def _lines(path: Path) -> list[str]:
-    """The lines of a text file without comments. Blank lines stay: one may be an image without points."""
+    """Return the stripped lines of a text file, without comment lines.
+
+    Blank lines are kept, because images.txt has an empty line where an image observes no points.
+    """
     lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
     return [line.strip() for line in lines if not line.lstrip().startswith("#")]
 
 
 def load_cameras(path: Path) -> dict[int, ModelCamera]:
-    """Camera id -> intrinsics, from cameras.bin or cameras.txt.
+    """Read cameras.bin or cameras.txt as a dict camera id -> intrinsics.
 
     Raises:
-        BadInput: naming the file; also for a camera without pixels, with parameters that are not finite, or with focal
-            lengths that are not positive.
+        BadInput: the file cannot be read, or a camera has an image size of zero, a parameter that is not finite, or a
+            focal length that is not positive. The message names the file.
     """
     with reading(path, "COLMAP's cameras"):
         found = _cameras_binary(path) if path.suffix == ".bin" else _cameras_text(path)
@@ -135,7 +151,13 @@ def _add(found: dict, identity: int, value: ModelCamera | ModelImage, path: Path
 
 @contextmanager
 def _line_errors(path: Path, what: str, line: str) -> Iterator[None]:
-    """Turn errors inside into BadInput that shows the line."""
+    """Turn parsing errors raised inside the context into BadInput.
+
+    Args:
+        path: the file, for the message.
+        what: what the line describes, for the message, e.g. "camera".
+        line: the line that is parsed; the message shows it.
+    """
     try:
         yield
     except BadInput:
@@ -145,7 +167,11 @@ def _line_errors(path: Path, what: str, line: str) -> Iterator[None]:
 
 
 def load_images(path: Path) -> dict[int, ModelImage]:
-    """Image id -> pose and name, from images.bin or images.txt. BadInput where a pose is not finite."""
+    """Read images.bin or images.txt as a dict image id -> image with its name, camera id and pose.
+
+    Raises:
+        BadInput: the file cannot be read, or a pose is not finite. The message names the file.
+    """
     with reading(path, "COLMAP's images"):
         found = _images_binary(path) if path.suffix == ".bin" else _images_text(path)
     for image in found.values():
@@ -200,7 +226,11 @@ POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", 
 
 
 def load_model_points(path: Path) -> ModelPoints:
-    """The points of points3D.bin or points3D.txt, with the images that observe each."""
+    """Read points3D.bin or points3D.txt: the points, and which images observe them.
+
+    Raises:
+        BadInput: the file cannot be read, or a position is not finite.
+    """
     with reading(path, "COLMAP's points"):
         points = _points_binary(path) if path.suffix == ".bin" else _points_text(path)
     if not np.isfinite(points.positions).all():
@@ -211,7 +241,8 @@ def load_model_points(path: Path) -> ModelPoints:
 def _points_binary(path: Path) -> ModelPoints:
     file = Cursor(path)
     count = file.count(POINT.itemsize)
-    # Records vary in length with their tracks: first find where each starts, then read all at once.
+    # The length of a record depends on the length of its track. So this loop only finds where each record starts, and
+    # numpy reads all records at once afterwards.
     starts, at, track_at = np.empty(count, np.int64), file.at, POINT.itemsize - 8
     for k in range(count):
         starts[k] = at
@@ -257,7 +288,15 @@ def save_model(
     positions: np.ndarray,
     colors: np.ndarray,
 ) -> None:
-    """Write cameras.bin, images.bin and points3D.bin (without tracks)."""
+    """Write a COLMAP model: cameras.bin, images.bin and points3D.bin. No tracks (observations of points) are written.
+
+    Args:
+        folder: created if it does not exist.
+        cameras: camera id -> intrinsics.
+        images: image id -> registered image.
+        positions: [P, 3] float64 sparse points.
+        colors: [P, 3] uint8.
+    """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "cameras.bin", "wb") as file:

@@ -1,7 +1,6 @@
-"""Reads and writes the formats that gsply supports: PlayCanvas's compressed .ply, quantised in chunks of 256 Gaussians,
-and Niantic's .spz.
+"""Reading and writing of quantised files by the library gsply: PlayCanvas's compressed .ply and Niantic's .spz.
 
-The only module that imports gsply.
+A compressed .ply is quantised in chunks of 256 Gaussians. This is the only module that imports gsply.
 """
 
 from __future__ import annotations
@@ -20,16 +19,22 @@ from reffusion.io.splat_rows import Rows
 if TYPE_CHECKING:
     from reffusion.types import Gaussians, Similarity
 
-PACKED = "packed_position"  # a property that only compressed files have
+PACKED = "packed_position"  # a vertex property by which a compressed .ply is recognised
 SPZ_HEADER, SPZ_MAGIC = struct.Struct("<IIIBBBB"), 0x5053474E
-# Signs of the spherical harmonics under y, z -> -y, -z, in the order of 3DGS: degree 1 is y, z, x.
+# Sign of each spherical harmonic when y and z change sign, in the order of 3DGS (degree 1 is y, z, x).
 TURNED_SH = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 
 def save_compressed(path: Path, gaussians: Gaussians, similarity: Similarity) -> None:
-    """Write Gaussians in the scene's own frame, sorted so that chunks are small and quantisation is fine.
+    """Write Gaussians as a compressed .ply in the scene's own frame.
 
-    Positions keep 11, 10 and 11 bits of their chunk's extent, colours and opacity 8 bits, spherical harmonics 8.
+    The Gaussians are sorted along a Morton curve, so that chunks have a small extent and quantisation is fine. The x, y
+    and z of a position keep 11, 10 and 11 bits of the chunk's extent. Colours, opacity and spherical harmonics keep 8
+    bits.
+
+    Args:
+        gaussians: in the normalised frame, on the CPU.
+        similarity: from the scene's own frame to the normalised frame.
 
     Raises:
         BadInput: gsply is not installed.
@@ -54,14 +59,23 @@ def save_compressed(path: Path, gaussians: Gaussians, similarity: Similarity) ->
 
 
 def load_compressed(path: Path) -> Rows:
-    """The splats of a compressed .ply. BadInput where it is damaged, or gsply is not installed."""
+    """Read the splats of a compressed .ply. Raises BadInput if the file is damaged or gsply is not installed."""
     gsply = _import_gsply(path)
     with reading(path, "a compressed .ply"):
         return _to_rows(gsply.plyread(str(path)))
 
 
 def load_spz_header(path: Path) -> tuple[int, int, bool]:
-    """The number of splats in a .spz, its version, and whether they are meant to be rendered antialiased."""
+    """Read the header of a .spz file.
+
+    Returns:
+        count: the number of splats.
+        version: the version of the format.
+        antialiased: True if the splats are to be rendered with Mip-Splatting's 2D filter.
+
+    Raises:
+        BadInput: the file is no .spz file, or its spherical harmonics have a degree above 3.
+    """
     with reading(path, "a .spz file"), open(path, "rb") as file:
         start = file.read(4096)
         if start[:2] == b"\x1f\x8b":  # versions 1 to 3 are one gzip stream
@@ -75,14 +89,29 @@ def load_spz_header(path: Path) -> tuple[int, int, bool]:
 
 
 def load_spz(path: Path) -> Rows:
-    """The splats of a .spz, in the frame of a .ply: the file holds them turned by 180 degrees about x (y up)."""
+    """Read the splats of a .spz, and rotate them by 180 degrees about x into the frame that a .ply would have.
+
+    In a .spz file y points up, in a .ply down.
+
+    Raises:
+        BadInput: the file is damaged or gsply is not installed.
+    """
     gsply = _import_gsply(path)
     with reading(path, "a .spz file"):
         return _turn_about_x(_to_rows(gsply.read_spz(str(path))))
 
 
 def save_spz(path: Path, rows: Rows) -> None:
-    """Write rows that are in the frame of a .ply. Positions keep 24 bits, as fine as their extent allows."""
+    """Write rows as a .spz file.
+
+    Positions are fixed-point numbers of 24 bits. As many bits as the largest coordinate allows are fractional.
+
+    Args:
+        rows: in the frame of a .ply (y down); they are rotated by 180 degrees about x for the file.
+
+    Raises:
+        BadInput: gsply is not installed.
+    """
     gsply = _import_gsply(path)
     turned = _turn_about_x(rows)
     extent = float(np.abs(turned.means).max(initial=1e-6))
@@ -101,24 +130,28 @@ def save_spz(path: Path, rows: Rows) -> None:
 
 
 def _to_rows(data) -> Rows:
-    """Rows from gsply's arrays."""
+    """Convert gsply's arrays to rows."""
     sh = data.sh0[:, None] if data.shN is None else np.concatenate([data.sh0[:, None], data.shN], axis=1)
     return Rows(data.means.astype(np.float64), data.quats, data.scales, data.opacities.reshape(-1), sh)
 
 
 def _turn_about_x(rows: Rows) -> Rows:
-    """Rows turned by 180 degrees about x: y and z change sign, and with them each odd spherical harmonic."""
+    """Rotate rows by 180 degrees about x: y and z of positions and rotations change sign.
+
+    The spherical harmonics that are odd under this change of sign are negated (`TURNED_SH`).
+    """
     means, quaternions = rows.means * (1, -1, -1), rows.quaternions * np.array([1, 1, -1, -1], np.float32)
     return Rows(means, quaternions, rows.log_scales, rows.opacity_logits, rows.sh * TURNED_SH[: rows.sh.shape[1], None])
 
 
 def check_gsply(path: Path) -> None:
-    """BadInput where gsply is not installed; does not import it."""
+    """Raise BadInput if gsply is not installed, without importing gsply. `path` is for the message."""
     if importlib.util.find_spec("gsply") is None:
         raise BadInput(f"{path}: a quantised file takes gsply: `pip install gsply`, or save it as plain .ply")
 
 
 def _import_gsply(path: Path):
+    """Return the module gsply. Raises BadInput if it is not installed."""
     check_gsply(path)
     import gsply
 
@@ -126,7 +159,10 @@ def _import_gsply(path: Path):
 
 
 def _morton_codes(points: np.ndarray) -> np.ndarray:
-    """uint64 [N], Morton codes of the positions [N, 3]: the bits of x, y and z in turn, so that neighbours are near."""
+    """Compute Morton codes, uint64 [N], of positions [N, 3].
+
+    A code interleaves the bits of x, y and z (20 each), so that positions with similar codes lie near each other.
+    """
     low, extent = points.min(0, initial=np.inf), np.ptp(points, axis=0).max(initial=1e-30)
     cells = ((points - low) / extent * (2**20 - 1)).astype(np.uint64)
     code = np.zeros(len(points), np.uint64)

@@ -1,4 +1,4 @@
-"""Reads depth maps from other tools: 16-bit pictures, .npy, .exr."""
+"""Reading of depth maps that other tools wrote: 16-bit or float pictures, .npy and .exr files."""
 
 from __future__ import annotations
 
@@ -12,10 +12,14 @@ from reffusion.io.images import load_exr, open_image
 
 
 def load_depth(path: Path) -> np.ndarray:
-    """float32 [h, w], a map of depth or disparity in any unit; NaN where unknown (not finite, or 0 in a picture).
+    """Read a map of depth or disparity as float32 [h, w], in the unit of the file.
+
+    A pixel is unknown, and becomes NaN, if its value is not finite. A value of 0 means unknown too if the file holds
+    integers.
 
     Raises:
-        BadInput: naming the file, where it is unreadable, not of one channel, 8-bit, empty or constant.
+        BadInput: the file is unreadable, has several channels or is a picture of 8 bits, or its known values are all
+            equal or cover less than 1 % of the pixels. The message names the file.
     """
     path = Path(path)
     values = _values(path)

@@ -1,4 +1,4 @@
-"""Opens files that a user hands over, and turns everything that is wrong with them into a message of one line."""
+"""Checks and error messages for files that a user supplies: every error becomes `BadInput` with one line of text."""
 
 from __future__ import annotations
 
@@ -9,26 +9,30 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-MOST_PIXELS = 200_000_000  # of a picture or depth map; larger ones are refused before memory is allocated
-LONGEST_WORD = 400  # characters of a message without a blank
+MOST_PIXELS = 200_000_000  # largest size of a picture or depth map; larger ones are refused before they are read
+LONGEST_WORD = 400  # characters; longer words of a message are cut
 
 
 class BadInput(ValueError):
-    """Something that a user handed over is wrong: one line that names the file or key and, where possible, the
-    remedy."""
+    """An error in what a user supplied: a file, or a key of scene.yaml.
+
+    The message is one line that names the file or key and, where possible, says how to correct the error.
+    """
 
     def __init__(self, message: str):
-        # Long words, such as a number of two thousand digits, are cut; a path is hardly ever so long.
+        # Words longer than LONGEST_WORD, such as a number of two thousand digits, are cut. Paths are shorter.
         super().__init__(" ".join(shorten(word, LONGEST_WORD) for word in " ".join(message.splitlines()).split(" ")))
 
 
 @contextmanager
 def as_bad_input(path: Path, what: str) -> Iterator[None]:
-    """Turn every error raised inside into BadInput. Libraries raise dozens of kinds of errors for input that they do
-    not understand, so all are caught.
+    """Turn every exception that is raised inside the context into BadInput.
+
+    All kinds of exceptions are caught, because libraries raise dozens of kinds for input that they do not understand.
 
     Args:
-        path: the file that is read, for the message; what: what it should be, as in "a readable picture".
+        path: the file that is read, for the message.
+        what: what the file should be, for the message, e.g. "a readable picture".
     """
     try:
         yield
@@ -41,15 +45,21 @@ def as_bad_input(path: Path, what: str) -> Iterator[None]:
 
 @contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """`as_bad_input` for a file that is opened inside: BadInput too where it is missing, a folder, a pipe or
-    a device."""
+    """Check that `path` is a regular file, and turn every exception raised inside the context into BadInput.
+
+    Args:
+        path, what: as in `as_bad_input`.
+
+    Raises:
+        BadInput: the file is missing, or a folder, pipe or device; or an exception was raised inside.
+    """
     with as_bad_input(path, what):
         _check_regular(path)
         yield
 
 
 def _check_regular(path: Path) -> None:
-    """BadInput where the path is no regular file: opening a pipe would wait for its other end for ever."""
+    """Raise BadInput if the path is no regular file. Opening a pipe, for example, could block for ever."""
     try:
         mode = Path(path).stat().st_mode
     except FileNotFoundError:
@@ -59,7 +69,7 @@ def _check_regular(path: Path) -> None:
 
 
 def check_pixels(path: Path, width: int, height: int) -> None:
-    """BadInput where a picture has no pixel, or more than `MOST_PIXELS`."""
+    """Raise BadInput if a picture of this size in pixels has no pixel, or more than `MOST_PIXELS`."""
     if width < 1 or height < 1:
         raise BadInput(f"{path}: {width}x{height} px; it has no pixel")
     if width * height > MOST_PIXELS:
@@ -67,8 +77,11 @@ def check_pixels(path: Path, width: int, height: int) -> None:
 
 
 def is_file(path: Path) -> bool:
-    """Does a file of this name exist? BadInput where it is something else, which would otherwise be
-    ignored."""
+    """Return whether the path is an existing regular file; False if nothing exists there.
+
+    Raises:
+        BadInput: the path exists and is no regular file (e.g. a folder), which would otherwise be ignored silently.
+    """
     if path.is_file():
         return True
     if path.exists() or path.is_symlink():
@@ -77,18 +90,27 @@ def is_file(path: Path) -> bool:
 
 
 def shorten(value: object, most: int = 60) -> str:
-    """A value as text for a message, cut after `most` characters."""
+    """Return a value as text for a message, with at most `most` characters."""
     text = value if isinstance(value, str) else reprlib.repr(value)
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
 class Cursor:
-    """A position in a little-endian binary file; BadInput where the file ends before what it declares."""
+    """A reader of a little-endian binary file, which it holds in memory.
+
+    Every method raises BadInput if the file ends too early.
+
+    Attributes:
+        path: the file.
+        data: its content.
+        at: offset in bytes from which the next value is read.
+    """
 
     def __init__(self, path: Path):
         self.path, self.data, self.at = path, Path(path).read_bytes(), 0
 
     def read(self, layout: str) -> tuple:
+        """Read values in a layout of the module `struct`, without byte order, and advance."""
         layout = "<" + layout
         self.need(1, struct.calcsize(layout))
         values = struct.unpack_from(layout, self.data, self.at)
@@ -96,17 +118,18 @@ class Cursor:
         return values
 
     def need(self, count: int, size: int) -> None:
-        """BadInput where fewer than `count` records of `size` bytes follow, before memory is allocated for them."""
+        """Raise BadInput if fewer than `count` records of `size` bytes follow. Nothing is read."""
         if self.at + count * size > len(self.data):
             raise BadInput(f"{self.path}: cut off at byte {len(self.data)}")
 
     def count(self, size: int) -> int:
-        """Read the number of records that follow, each of at least `size` bytes."""
+        """Read a number of records (uint64), and check that so many records of at least `size` bytes can follow."""
         (count,) = self.read("Q")
         self.need(count, size)
         return count
 
     def text(self) -> str:
+        """Read text that ends with a zero byte, and advance beyond this byte."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise BadInput(f"{self.path}: cut off at byte {len(self.data)}")
@@ -114,5 +137,6 @@ class Cursor:
         return name
 
     def end(self) -> None:
+        """Raise BadInput if bytes are left."""
         if self.at != len(self.data):
             raise BadInput(f"{self.path}: {len(self.data) - self.at} bytes too many at its end; write the model again")

@@ -1,4 +1,4 @@
-"""What a render is compared with: the view's own picture, and the mask of the object in it."""
+"""Ground truth with which the render of a view is compared: the view's own picture, and the object's mask in it."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ if TYPE_CHECKING:
 
 
 def load_ground_truth(camera: Camera, poses: Path) -> np.ndarray | None:
-    """uint8 [H, W, 3], the view's own picture; None where the scene has none.
+    """Read a view's own picture as uint8 [H, W, 3]; None if the view has no picture.
+
+    Args:
+        poses: folder of the stage `poses`.
 
     Raises:
-        ValueError: the picture and its camera differ in size.
+        ValueError: the picture and the camera differ in size.
     """
     path = poses / "images" / f"{camera.name}.png"
     if not path.exists():
@@ -32,10 +35,14 @@ def load_ground_truth(camera: Camera, poses: Path) -> np.ndarray | None:
 
 
 def load_object_mask(camera: Camera, raw_masks: Path, masks: Path | None) -> np.ndarray:
-    """bool [H, W]: the object in a view.
+    """Read the object's mask in a view as bool [H, W], True = the object.
 
-    The first of these that exists: the view's test mask, its consistent mask, its raw mask (a variant may leave out
-    the stage `masks`), an empty mask. So wherever there are test masks, all variants are scored in the same box.
+    The mask is the first of the following that exists: the view's test mask; its consistent mask C (the rendered labels
+    of the object's Gaussians); its raw mask, as a variant may skip the stage `masks`; an empty mask. The test mask
+    comes first, so that all variants of a scene with test masks are scored in the same box.
+
+    Args:
+        raw_masks, masks: folders of the stages of these names; `masks` is None if that stage was skipped.
     """
     size, file = (camera.height, camera.width), f"{camera.name}.png"
     paths = [raw_masks / "test_masks" / file, *([masks / "consistent" / file] if masks else [])]
@@ -46,6 +53,9 @@ def load_object_mask(camera: Camera, raw_masks: Path, masks: Path | None) -> np.
 
 
 def load_training_object_masks(scene: Scene, raw_masks: Path, masks: Path | None) -> dict[str, np.ndarray]:
-    """View name -> bool [H, W], the object in each training view that may show it (not `clean`)."""
+    """Read the object's mask in each training view, as a dict view name -> bool [H, W], True = the object.
+
+    Views that the scene declares clean (without the object) are left out. For the arguments see `load_object_mask`.
+    """
     names = [name for name in scene.train if name not in scene.clean]
     return {name: load_object_mask(scene.cameras[name], raw_masks, masks) for name in names}

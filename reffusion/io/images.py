@@ -1,4 +1,4 @@
-"""Reads and writes pictures, masks and depth maps."""
+"""Reading and writing of pictures, masks and EXR depth maps."""
 
 from __future__ import annotations
 
@@ -15,26 +15,33 @@ from PIL import Image, ImageOps
 
 from reffusion.io.files import BadInput, check_pixels, reading, shorten
 
-HEIC = (".heic", ".heif")  # endings of phones' pictures
-ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", *HEIC)  # of pictures, in lower case
+HEIC = (".heic", ".heif")  # endings of the pictures that phones write
+ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", *HEIC)  # endings of pictures, in lower case
 
-DARK = 8  # levels up to which the background of a mask may be grey
+DARK = 8  # grey level up to which an area of a mask counts as background
 FLAT = 0.002  # share of a mask that a value must fill to count as an area, not as part of a soft edge
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "HEIF")
 _HEIC_BRANDS = tuple(
     b"ftyp" + brand for brand in (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"hevc", b"hevx")
 )
-logging.getLogger("PIL").addHandler(logging.NullHandler())  # what it says on standard error is in our line too
-Image.MAX_IMAGE_PIXELS = None  # `open_image` looks at the size itself: with one limit, and without a warning below it
+logging.getLogger("PIL").addHandler(logging.NullHandler())  # errors here say the same in one line
+Image.MAX_IMAGE_PIXELS = None  # `open_image` checks the size: Pillow would warn from half of its own limit on
 
 
 @contextmanager
 def open_image(path: Path, what: str = "a readable image") -> Iterator[Image.Image]:
-    """A picture of which the header has been read. BadInput naming the file for everything that is wrong with it, here
-    or inside the block, and for more than `MOST_PIXELS`."""
+    """Open a picture as a context; only its header is read at first.
+
+    Args:
+        what: what the file should be, for error messages.
+
+    Raises:
+        BadInput: the file is no readable picture, or has more than `MOST_PIXELS` pixels. Errors that are raised inside
+            the context, e.g. while pixels are decoded, become BadInput too. The message names the file.
+    """
     with reading(path, what):
         with open(path, "rb") as file:
-            if file.read(12)[4:12] in _HEIC_BRANDS:  # whatever it is called
+            if file.read(12)[4:12] in _HEIC_BRANDS:  # the ending of the file's name may be another one
                 _register_heic(path)
         known = [each for each in _FORMATS if each != "HEIF" or each in Image.OPEN]
     with reading(path, what), Image.open(path, formats=known) as image:
@@ -43,7 +50,14 @@ def open_image(path: Path, what: str = "a readable image") -> Iterator[Image.Ima
 
 
 def _register_heic(path: Path) -> None:
-    """Let Pillow read HEIC, always upright. pi-heif only decodes; pillow-heif's wheels bring an encoder under GPL."""
+    """Enable Pillow to read HEIC pictures, always with their orientation applied.
+
+    pi-heif is used, and not pillow-heif: pi-heif only decodes, and the wheels of pillow-heif contain an encoder under
+    the GPL.
+
+    Raises:
+        BadInput: pi-heif is not installed.
+    """
     try:
         import pi_heif
     except ImportError:
@@ -52,7 +66,11 @@ def _register_heic(path: Path) -> None:
 
 
 def image_size(path: Path, upright: bool = False) -> tuple[int, int]:
-    """(width, height) in pixels, from the file's header alone. `upright` as in `load_image`."""
+    """Return the (width, height) of a picture in pixels; only the file's header is read.
+
+    Args:
+        upright: True applies the orientation tag, as in `load_image`.
+    """
     with open_image(path) as image:
         width, height = image.size
         turned = upright and image.getexif().get(0x0112, 1) in (5, 6, 7, 8)
@@ -62,11 +80,15 @@ def image_size(path: Path, upright: bool = False) -> tuple[int, int]:
 def load_image(path: Path, upright: bool = False) -> np.ndarray:
     """Read a picture as uint8 [H, W, 3], sRGB.
 
-    Grey becomes RGB, 16-bit grey levels are divided by 257, and an alpha channel is dropped. The camera's orientation
-    tag is ignored, because poses that come with photographs refer to the stored pixels; `upright=True` obeys it.
+    Grey becomes RGB, 16-bit grey levels are divided by 257, and an alpha channel is dropped.
+
+    Args:
+        upright: True applies the EXIF orientation tag. False ignores the tag, because poses that come with photographs
+            refer to the stored pixels.
 
     Raises:
-        BadInput: naming the file, where it is missing, truncated, or has pixels of more than 16 bits or of floats.
+        BadInput: the file is missing or truncated, or its pixels have more than 16 bits or are floats. The message
+            names the file.
     """
     with open_image(path) as image:
         turned = ImageOps.exif_transpose(image) if upright else image
@@ -79,8 +101,10 @@ def load_image(path: Path, upright: bool = False) -> np.ndarray:
 
 
 def load_thumbnail(path: Path, side: int) -> np.ndarray:
-    """The picture as uint8 [h, w, 3], its longer side at most `side` px; from the stored pixels. Does not import
-    OpenCV."""
+    """Read a picture, reduced so that its longer side is at most `side` px, as uint8 [h, w, 3].
+
+    The orientation tag is ignored. OpenCV is not imported.
+    """
     with open_image(path) as image:
         if image.mode[0] not in "IF":
             image.draft("RGB", (2 * side, 2 * side))  # JPEGs are decoded at a fraction of their size
@@ -93,10 +117,14 @@ def load_thumbnail(path: Path, side: int) -> np.ndarray:
 
 
 def save_image(path: Path, array: np.ndarray) -> None:
-    """Write [H, W, 3] (or [H, W]) as 8-bit, creating the folder. Floats are in [0, 1] and are clipped and rounded.
+    """Write an array as an 8-bit picture, and create its folder.
+
+    Args:
+        path: the file; its ending determines the format.
+        array: [H, W, 3] or [H, W], uint8 or floats. Floats are clipped to [0, 1], scaled by 255 and rounded.
 
     Raises:
-        ValueError: where values are not finite, or the shape or type is none of these.
+        ValueError: a value is not finite, or the shape or type is another one.
     """
     array = np.asarray(array)
     if np.issubdtype(array.dtype, np.floating):
@@ -106,25 +134,28 @@ def save_image(path: Path, array: np.ndarray) -> None:
     if array.dtype != np.uint8 or not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)):
         raise ValueError(f"{path}: a picture is uint8 or float [H, W, 3], got {array.dtype} {list(array.shape)}")
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    # The fastest settings of the lossless coder: a third larger, five times quicker to write.
+    # These are the fastest settings of the lossless coder: files are a third larger, and written five times faster.
     quick: dict[str, Any] = {"compress_level": 1, "compress_type": zlib.Z_RLE} if _is_png(path) else {}
     Image.fromarray(np.ascontiguousarray(array)).save(path, **quick)
 
 
 def replace_image(path: Path, array: np.ndarray) -> None:
-    """`save_image` atomically: after a kill, `path` is complete, or as it was."""
+    """Write an array as an 8-bit picture (see `save_image`), atomically.
+
+    If the process is killed, `path` holds either the complete new picture or its old content.
+    """
     writing = Path(path).with_name(f".{Path(path).name}")
     save_image(writing, array)
     writing.replace(path)
 
 
 def to_uint8(array: np.ndarray) -> np.ndarray:
-    """Floats, clipped to [0, 1], rounded to levels of 255."""
+    """Convert floats to uint8 of the same shape: clip to [0, 1], scale by 255 and round."""
     return np.round(np.clip(array, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def to_gray(image: np.ndarray) -> np.ndarray:
-    """Luma of an RGB picture, uint8 [H, W, 3], as float32 [H, W] in levels of 255."""
+    """Return the luma of an RGB picture, uint8 [H, W, 3], as float32 [H, W] in [0, 255]."""
     import cv2
 
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
@@ -136,11 +167,12 @@ def _is_png(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class MaskValues:
-    """Which pixel values of a mask file are the object.
+    """The pixel values of a mask file that mark the object.
 
     Attributes:
-        ids: these numbers (for palettes: these entries); empty: white, as `load_mask` understands it.
-        inverted: all other pixels instead.
+        ids: grey levels, or entries of a palette, that mark the object. If empty, white pixels mark it, as `load_mask`
+            describes.
+        inverted: True if the object is all other pixels instead.
     """
 
     ids: tuple[int, ...] = ()
@@ -151,18 +183,21 @@ WHITE = MaskValues()  # the object is white
 
 
 def load_mask(path: Path, size: tuple[int, int] | None = None, values: MaskValues = WHITE) -> np.ndarray:
-    """Read a mask as bool [H, W], True = masked.
+    """Read a mask file as bool [H, W], True = masked.
 
-    Accepted are files of {0, 1}, of {0, 255} (threshold 128, so lossy and soft edges do no harm), one-bit files, and
-    palettes and colours of which black is the background. Of colours the brightest channel counts. Alpha is ignored,
-    but refused where only it can hold the mask: tools disagree on which of its ends is the object.
+    The file may have values {0, 1} or {0, 255}, one bit per pixel, a palette, or colours on a black background. Values
+    up to 255 are thresholded at 128, so that lossy compression and soft edges do not matter; 16-bit values at 32768. Of
+    a colour, the brightest channel counts; in a palette of colours, every entry but black. An alpha channel is ignored.
+    A file whose colours are constant while its alpha varies is refused, because tools disagree whether transparent or
+    opaque pixels are the object.
 
     Args:
-        size: (height, width) to resize to, nearest neighbour; None keeps the file's.
-        values: which pixels are the object.
+        size: (height, width) to which the mask is resized by nearest neighbour; None keeps the file's size.
+        values: which pixel values mark the object.
 
     Raises:
-        BadInput: naming the file, where it is unreadable, in its alpha, or a map of object numbers without `ids`.
+        BadInput: the file is unreadable, has its mask in the alpha channel, or has areas of several values or colours
+            (such as numbers of objects) while `values` has no `ids`. The message names the file.
     """
     with open_image(path, "a readable mask") as image:
         if values.ids:
@@ -174,7 +209,11 @@ def load_mask(path: Path, size: tuple[int, int] | None = None, values: MaskValue
 
 
 def _object_numbers(path: Path, image: Image.Image) -> np.ndarray:
-    """[H, W], the object numbers of a map: grey levels, or the entries of a palette."""
+    """Return the object numbers [H, W] of a mask file: its grey levels, or the indices of its palette entries.
+
+    Raises:
+        BadInput: the pixels have colours.
+    """
     array = np.array(image)
     if array.ndim == 3 and (array[..., :1] == array[..., : min(3, array.shape[2])]).all():
         array = array[..., 0]
@@ -210,7 +249,15 @@ def _white_pixels(path: Path, image: Image.Image) -> np.ndarray:
 
 
 def _check_colors(path: Path, mode: str, colors: np.ndarray) -> None:
-    """BadInput where a picture [H, W, 3] has areas of several colours beside black: any of them may be the object."""
+    """Raise BadInput if a mask file has areas of more than one colour besides black.
+
+    Each of these colours could be the object.
+
+    Args:
+        path: the file, for the message.
+        mode: Pillow's mode of the picture.
+        colors: its pixels, [H, W, 3].
+    """
     found = [color for color in _flat_levels(colors.astype(np.int32) @ (65536, 256, 1)) if color]
     if len(found) > 1:
         numbers = ", or name the object's entries in scene.yaml: `masks: {id: ...}`" if mode in ("P", "PA") else ""
@@ -220,7 +267,11 @@ def _check_colors(path: Path, mode: str, colors: np.ndarray) -> None:
 
 
 def _flat_levels(array: np.ndarray) -> list[int]:
-    """The values that fill areas, ascending; soft edges pass through other values."""
+    """Return the values of an array [H, W] that fill areas, ascending.
+
+    A pixel lies in an area if its upper, left and upper left neighbours have the same value. Values that only occur
+    along soft edges are thereby left out. The areas of a value must cover more than the share `FLAT` of the pixels.
+    """
     same = np.ones(array.shape, bool)
     same[1:] &= array[1:] == array[:-1]
     same[:, 1:] &= array[:, 1:] == array[:, :-1]
@@ -230,7 +281,13 @@ def _flat_levels(array: np.ndarray) -> list[int]:
 
 
 def resize_image(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """The picture, uint8 [h, w, 3], at `size` (width, height): by area averaging where it shrinks, else bicubic."""
+    """Resize a picture, uint8 [h, w, 3], to `size`.
+
+    The interpolation is area averaging if neither side grows, and bicubic else.
+
+    Args:
+        size: (width, height) in pixels.
+    """
     import cv2
 
     if size == (image.shape[1], image.shape[0]):
@@ -240,7 +297,13 @@ def resize_image(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def resize_nearest(array: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """[H, W, ...] -> [*size, ...]: each new pixel takes the value of the old one that contains its centre."""
+    """Resize an array [H, W, ...] to [*size, ...] by nearest neighbour.
+
+    Each new pixel takes the value of the old pixel that contains the new pixel's centre.
+
+    Args:
+        size: (height, width).
+    """
     rows, columns = (
         np.minimum(((np.arange(new) + 0.5) * old / new).astype(int), old - 1)
         for new, old in zip(size, array.shape[:2], strict=True)
@@ -249,7 +312,7 @@ def resize_nearest(array: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def save_mask(path: Path, mask: np.ndarray) -> None:
-    """Write bool [H, W] as 0/255."""
+    """Write a mask, bool [H, W], as a picture: 255 where it is True, else 0. Raises ValueError for any other array."""
     mask = np.asarray(mask)
     if mask.dtype != np.bool_ or mask.ndim != 2:
         raise ValueError(f"{path}: a mask is bool [H, W], got {mask.dtype} {list(mask.shape)}")
@@ -257,7 +320,11 @@ def save_mask(path: Path, mask: np.ndarray) -> None:
 
 
 def save_exr(path: Path, depth: np.ndarray) -> None:
-    """Write float32 [H, W] (depths: camera z) losslessly to one channel `Z` of an OpenEXR file."""
+    """Write a depth map [H, W] (camera z) losslessly as float32 to the channel `Z` of an OpenEXR file.
+
+    Raises:
+        ValueError: the array is not two-dimensional, or the file cannot be written.
+    """
     import OpenImageIO as oiio
 
     depth = np.ascontiguousarray(depth, np.float32)
@@ -267,7 +334,7 @@ def save_exr(path: Path, depth: np.ndarray) -> None:
     spec = oiio.ImageSpec(depth.shape[1], depth.shape[0], 1, oiio.FLOAT)
     spec.channelnames = ("Z",)
     spec.attribute("compression", "zip")
-    spec.attribute("DateTime", "1970:01:01 00:00:00")  # the default, now, would make files of equal depths differ
+    spec.attribute("DateTime", "1970:01:01 00:00:00")  # the current time would make files of equal depths differ
     file = oiio.ImageOutput.create(str(path))
     if file is None or not file.open(str(path), spec) or not file.write_image(depth[..., None]) or not file.close():
         raise ValueError(f"{path}: cannot be written ({file.geterror() if file else oiio.geterror()})")
@@ -277,12 +344,12 @@ _EXR = b"\x76\x2f\x31\x01"
 
 
 def load_exr(path: Path) -> np.ndarray:
-    """float32 [H, W], the first channel of an OpenEXR file."""
+    """Read the first channel of an OpenEXR file as float32 [H, W]. Raises BadInput if the file is unreadable."""
     import OpenImageIO as oiio
 
     with reading(path, "a readable EXR file"):
         with open(path, "rb") as start:
-            if start.read(4) != _EXR:  # else other formats are tried, which complain on standard error
+            if start.read(4) != _EXR:  # without this check the library tries other formats and prints their errors
                 raise BadInput(f"{path}: not an EXR file; give it the ending of what it is")
         file = oiio.ImageInput.open(str(path))
         if file is None:

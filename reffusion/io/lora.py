@@ -1,4 +1,4 @@
-"""Exports LoRA weights for other tools."""
+"""Export of LoRA weights for other tools."""
 
 from __future__ import annotations
 
@@ -7,14 +7,22 @@ from pathlib import Path
 
 from reffusion.io.files import reading
 
-FACTS = "lora_adapter_metadata"  # of diffusers: its configuration by part, as JSON
+FACTS = "lora_adapter_metadata"  # metadata key of diffusers: JSON with "<part>.r", "<part>.lora_alpha" and others
 
 
 def save_portable(source: Path, path: Path) -> None:
-    """Write the LoRA of `source`, as diffusers saved it, for tools that do not read its configuration.
+    """Write a copy of a LoRA that has the same effect in tools that ignore the configuration in its metadata.
 
-    alpha / rank is multiplied into B, and alpha becomes the rank, so that the weights change by as much. Dropout is 0,
-    since the LoRA is for inference.
+    A LoRA adds (alpha / rank) B A to a weight matrix. Here the factor alpha / rank is multiplied into B, and alpha is
+    set to the rank, so that the product stays the same with a factor of 1. Dropout is set to 0, because the copy is for
+    inference.
+
+    Args:
+        source: the .safetensors file that diffusers saved.
+        path: the file to write; its folder is created.
+
+    Raises:
+        BadInput: `source` is unreadable.
     """
     from safetensors import safe_open
     from safetensors.torch import save_file

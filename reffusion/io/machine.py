@@ -1,4 +1,7 @@
-"""Detects what this machine has for CUDA, and what it lacks, from small files, without importing torch."""
+"""Detection of the hardware and software for CUDA on this machine, and of what is missing.
+
+Only small files are read and nvidia-smi is run. torch is not imported, so that `plan` is fast.
+"""
 
 from __future__ import annotations
 
@@ -13,22 +16,25 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-DRIVER = Path("/proc/driver/nvidia/version")
-TOOLKIT = Path("/usr/local/cuda")
-# The oldest Linux driver that runs programs of a CUDA version (NVIDIA, CUDA compatibility).
+DRIVER = Path("/proc/driver/nvidia/version")  # text with the version of the loaded driver
+TOOLKIT = Path("/usr/local/cuda")  # the usual folder of the CUDA toolkit
+# Major version of CUDA -> major version of the oldest Linux driver that runs it (NVIDIA, CUDA compatibility).
 OLDEST_DRIVER = {11: 450, 12: 525, 13: 580}
 INSTALL = "`make gpu` installs it"
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What CUDA needs; None where it is missing or unknown.
+    """The parts of this machine that CUDA needs. None means that a part is missing or unknown.
 
     Attributes:
-        gpu: name of the GPU. gigabytes: its memory, 1e9 bytes. driver: major version.
-        torch_cuda: the CUDA version torch was built for, e.g. "13.0"; "" for a build without.
-        gsplat: is the package installed? extension: are its kernels compiled with it?
-        nvcc: the CUDA version of the compiler, "" where it exists but its version is unknown.
+        gpu: name of the first visible GPU.
+        gigabytes: memory of this GPU, in 1e9 bytes.
+        driver: major version of the NVIDIA driver.
+        torch_cuda: the CUDA version for which torch was built, e.g. "13.0"; "" if torch was built without CUDA.
+        gsplat: True if the package gsplat is installed.
+        extension: True if the installed package contains its compiled CUDA kernels.
+        nvcc: the CUDA version of the compiler nvcc; "" if nvcc exists and its version is unknown.
     """
 
     gpu: str | None = None
@@ -42,7 +48,7 @@ class Machine:
 
 @functools.cache
 def detect() -> Machine:
-    """This machine: a few files are read, and nvidia-smi is run where it exists."""
+    """Detect what this machine has for CUDA. A few files are read, and nvidia-smi is run if it exists."""
     gpu, gigabytes, driver = _query_gpu()
     package = _package("gsplat")
     extension = package is not None and any(package.glob("csrc*.so"))
@@ -50,12 +56,15 @@ def detect() -> Machine:
 
 
 def find_missing(here: Machine, memory_gb: float = 0.0, splats: bool = True, memory_param: str = "") -> list[str]:
-    """What keeps this machine from running a stage on CUDA, a line each with the remedy; a driver is present.
+    """Return what prevents this machine from running a stage on CUDA, one line each with the remedy.
+
+    The NVIDIA driver must be present; its absence is reported elsewhere (`plan`).
 
     Args:
-        memory_gb: limit of the stage's memory by its parameters, 0: no limit.
-        memory_param: the name of that parameter.
-        splats: does the stage render Gaussians?
+        here: this machine, from `detect`.
+        memory_gb: GPU memory in GB that the stage's parameters allow it to use; 0: no limit.
+        splats: True if the stage renders Gaussians, and thus needs gsplat.
+        memory_param: name of the parameter that holds `memory_gb`, for the message.
     """
     found = []
     if here.torch_cuda == "":
@@ -80,7 +89,13 @@ def find_missing(here: Machine, memory_gb: float = 0.0, splats: bool = True, mem
 
 
 def _cannot_build(here: Machine, cuda_major: int | None) -> list[str]:
-    """Why gsplat cannot be compiled: its wheel holds sources only, which nvcc compiles when they are first loaded."""
+    """Return why the CUDA kernels of gsplat cannot be compiled here, as a list of at most one line.
+
+    The wheel of gsplat contains only sources, which nvcc compiles when gsplat is first loaded.
+
+    Args:
+        cuda_major: major version of the CUDA for which torch was built; None if unknown.
+    """
     if here.nvcc is None:
         toolkit = f"CUDA toolkit {cuda_major}" if cuda_major else "the CUDA toolkit"
         return [
@@ -100,7 +115,10 @@ def _major(version: str | None) -> int | None:
 
 
 def _query_gpu() -> tuple[str | None, float | None, int | None]:
-    """(name, GB, driver's major version) of the first visible GPU, by nvidia-smi."""
+    """Ask nvidia-smi for the name, the memory in GB and the driver's major version of the first visible GPU.
+
+    All three are None if nvidia-smi does not exist or gives no answer.
+    """
     command = shutil.which("nvidia-smi") or shutil.which("nvidia-smi", path="/usr/lib/wsl/lib")
     if not command:
         return None, None, None
@@ -116,8 +134,11 @@ def _query_gpu() -> tuple[str | None, float | None, int | None]:
 
 
 def _driver(path: Path) -> int | None:
-    """Major version from a line like `NVRM version: NVIDIA UNIX x86_64 Kernel Module  580.65.06  Sun ...`, also of open
-    modules."""
+    """Read the driver's major version from the file that the NVIDIA kernel module provides; None if unknown.
+
+    The line is like `NVRM version: NVIDIA UNIX x86_64 Kernel Module  580.65.06  Sun ...`, or that of the open kernel
+    modules.
+    """
     with suppress(OSError):
         if found := re.search(r"Kernel Module\D*?(?:for \S+)?\s+(\d+)\.\d", path.read_text()):
             return int(found[1])
@@ -125,12 +146,17 @@ def _driver(path: Path) -> int | None:
 
 
 def _package(name: str) -> Path | None:
+    """Return the folder of an installed package, without importing the package; None if it is not installed."""
     spec = importlib.util.find_spec(name)
     return Path(spec.origin).parent if spec and spec.origin else None
 
 
 def _torch_cuda() -> str | None:
-    """The CUDA version in torch/version.py, read without importing torch."""
+    """Read from torch/version.py for which CUDA version torch was built, without importing torch.
+
+    Returns:
+        The version; "" if torch was built without CUDA; None if torch is not installed or the version is not found.
+    """
     folder = _package("torch")
     with suppress(OSError):
         text = (folder / "version.py").read_text() if folder else ""
@@ -140,7 +166,13 @@ def _torch_cuda() -> str | None:
 
 
 def _nvcc() -> str | None:
-    """The version of the toolkit where torch looks for it: CUDA_HOME, CUDA_PATH, nvcc on the path, /usr/local/cuda."""
+    """Return the version of the CUDA toolkit that torch would use to compile kernels.
+
+    Like torch, this function looks at CUDA_HOME, CUDA_PATH, nvcc on the path, and /usr/local/cuda, in this order.
+
+    Returns:
+        The version; "" if nvcc exists and its version is unknown; None if there is no nvcc.
+    """
     on_path = shutil.which("nvcc")
     named = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
     home = Path(named) if named else Path(on_path).resolve().parent.parent if on_path else TOOLKIT
@@ -152,7 +184,10 @@ def _nvcc() -> str | None:
 
 
 def idle_seconds() -> float:
-    """Idle time since boot, summed over all cores; infinite where it is unknown."""
+    """Return the idle time since boot in seconds, summed over all cores; infinity if unknown.
+
+    Waiting for disks counts as idle.
+    """
     try:
         ticks = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
     except (OSError, ValueError):

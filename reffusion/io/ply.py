@@ -1,4 +1,4 @@
-"""Reads and writes Gaussians as files, in the layout of 3DGS and related ones, and coloured points as PLY."""
+"""Reading and writing of Gaussians (PLY of 3DGS and other formats), and of coloured points as PLY."""
 
 from __future__ import annotations
 
@@ -37,16 +37,18 @@ NORMAL = ("nx", "ny", "nz")
 def save_ply(
     path: Path, gaussians: Gaussians, similarity: Similarity | None = None, properties: Sequence[str] = ()
 ) -> None:
-    """Write Gaussians in the standard 3DGS layout (binary, little endian).
+    """Write Gaussians as a binary, little-endian PLY file in the standard layout of 3DGS.
 
-    Properties: x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3. `f_rest` holds the coefficients of red,
-    then green, then blue; opacity is a logit, scales are logarithms, rotations wxyz.
+    The properties are x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3. `f_rest` holds the coefficients of
+    red, then green, then blue. The opacity is a logit, scales are logarithms, and rotations are wxyz. Normals are zero.
 
     Args:
-        similarity: with it, positions and sizes are converted (in float64) to the scene's own frame. Positions are then
-            written as doubles only where floats would move them by more than 1e-5 of the normalised extent
-            (geo-referenced scenes); viewers that insist on floats read all others.
-        properties: another order of these, without normals where it has none (`load_property_names` a file to match).
+        similarity: from the scene's own frame to the normalised frame of `gaussians`. If given, positions and sizes are
+            converted (in float64) to the scene's own frame. Positions are then written as doubles if rounding to floats
+            would move one by more than 1e-5 of the normalised extent, as in geo-referenced scenes. In all other cases
+            they are floats, because some viewers read floats only.
+        properties: names of properties in the order in which they are written, such as `load_property_names` of a file
+            to match. Missing ones are appended, except normals; unknown ones are ignored. Empty: the order above.
     """
     array = lambda name: getattr(gaussians, name).detach().cpu().numpy()
     means, log_scales, sh, position_type = array("means").astype(np.float64), array("log_scales"), array("sh"), "f4"
@@ -70,7 +72,7 @@ def save_ply(
     columns = [name for name in properties or found if name in found]
     columns += [name for name in found if name not in columns and name not in NORMAL]
     table = np.empty(count, [(name, position_type if name in POSITION else "f4") for name in columns])
-    for start in range(0, count, BLOCK):  # so that a row is in the processor's cache until its last property is written
+    for start in range(0, count, BLOCK):  # in blocks: rows stay in the processor's cache until they are complete
         rows = slice(start, start + BLOCK)
         for name in columns:
             table[name][rows] = found[name] if name in NORMAL else found[name][rows]
@@ -78,7 +80,11 @@ def save_ply(
 
 
 def check_can_save(path: Path) -> None:
-    """BadInput where `save_splats` cannot write this file: unknown ending, missing library, or missing folder."""
+    """Raise BadInput if `save_splats` cannot write this file.
+
+    The ending may be unknown, the library for this format or the folder of the file may be missing, or the path may be
+    a folder.
+    """
     name = Path(path).name.lower()
     if not name.endswith(FORMATS):
         raise BadInput(f"{path}: {Path(path).suffix or 'no ending'} is not written; one of {', '.join(FORMATS)} is")
@@ -89,10 +95,12 @@ def check_can_save(path: Path) -> None:
 
 
 def save_splats(path: Path, gaussians: Gaussians, similarity: Similarity, properties: Sequence[str] = ()) -> None:
-    """Write Gaussians in the scene's own frame, in the format of the file's ending, see `splats.FORMATS`.
+    """Write Gaussians in the scene's own frame, in the format that the file's ending names (see `splats.FORMATS`).
 
     Args:
-        properties: for a plain .ply, their order, as in `save_ply`.
+        gaussians: in the normalised frame.
+        similarity: from the scene's own frame to the normalised frame.
+        properties: order of the properties of a plain .ply, as in `save_ply`; other formats ignore it.
     """
     name = Path(path).name.lower()
     if name.endswith((".spz", ".splat")):
@@ -108,14 +116,15 @@ def save_splats(path: Path, gaussians: Gaussians, similarity: Similarity, proper
 
 
 def load_ply(path: Path, similarity: Similarity | None = None, device: str = "cpu") -> Gaussians:
-    """Read the Gaussians of a .ply, compressed .ply, .spz or .splat (see `splats.load_splats`), float32 on `device`.
+    """Read the Gaussians of a .ply, compressed .ply, .spz or .splat as float32 on `device`, see `splats.load_splats`.
 
     Args:
-        similarity: with it, the file is in the scene's own frame and the result is in the normalised one.
+        similarity: from the scene's own frame, in which the file then is, to the normalised frame, in which the result
+            then is. None keeps the file's frame.
 
     Raises:
-        BadInput: naming the file, where properties are missing (e.g. a plain point cloud), the number of `f_rest`
-            properties belongs to no degree, or most rows are not finite.
+        BadInput: properties are missing (e.g. in a plain point cloud), the number of `f_rest` properties belongs to no
+            degree, most rows are not finite, or a value exceeds float32. The message names the file.
     """
     gaussians = load_splats(path).gaussians(similarity)
     if not (gaussians.means.isfinite().all() and gaussians.log_scales.isfinite().all()):
@@ -124,7 +133,7 @@ def load_ply(path: Path, similarity: Similarity | None = None, device: str = "cp
 
 
 def save_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
-    """Write [P, 3] float64 positions and [P, 3] uint8 colours."""
+    """Write a point cloud as PLY: positions [P, 3] as doubles, and colours [P, 3] uint8."""
     types = [(name, "f8") for name in POSITION] + [(name, "u1") for name in RED_GREEN_BLUE]
     table = np.empty(len(points), dtype=types)
     for names, values in ((POSITION, points), (RED_GREEN_BLUE, colors)):
@@ -134,7 +143,15 @@ def save_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
 
 
 def load_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """[P, 3] float64 positions and [P, 3] uint8 colours (mid grey where the file has none) of a point cloud."""
+    """Read a point cloud from a PLY file, or the positions of a compressed .ply of Gaussians.
+
+    Returns:
+        positions: [P, 3] float64.
+        colours: [P, 3] uint8; mid grey if the file has no colours red, green and blue.
+
+    Raises:
+        BadInput: the file is unreadable, or its vertices have no x, y, z.
+    """
     path = Path(path)
     header = load_header(path)
     if PACKED in header.vertices()[1]:
@@ -158,5 +175,5 @@ def _points(path: Path, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def load_property_names(path: Path) -> tuple[str, ...]:
-    """The names of the vertices' properties, in order; empty for a quantised file."""
+    """Return the names of the vertex properties of a .ply of Gaussians, in order; empty for a quantised file."""
     return summarize_splats(path).properties

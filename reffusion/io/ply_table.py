@@ -1,4 +1,4 @@
-"""PLY files as tables: reads the header and the vertices as a structured array, and writes one."""
+"""Reading and writing of PLY files whose vertices are a table: a structured numpy array with a field per property."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TYPES: dict[str, np.dtype] = {
     **dict.fromkeys(("float", "float32"), np.dtype("f4")),
     **dict.fromkeys(("double", "float64"), np.dtype("f8")),
 }
-LONGEST_LINE = 10_000  # bytes, of a header
+LONGEST_LINE = 10_000  # bytes that are read at once of a line of the header
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,11 @@ class Header:
     """The header of a PLY file.
 
     Attributes:
-        text: numbers are written as text.
-        elements: name, number of rows, and type and name of each property; of a list ("list", name).
-        comments: the comment lines.
-        at: offset of the data in bytes.
+        text: True if the data is ASCII text, False if it is binary.
+        elements: (name, number of rows, properties) of each element, in the order of the file. Properties are pairs
+            (type, name); the type of a list is "list".
+        comments: the comment lines, without the word `comment`.
+        at: offset in bytes at which the data begins.
     """
 
     text: bool
@@ -40,23 +41,29 @@ class Header:
     at: int
 
     def least_bytes(self) -> int:
-        """Smallest possible size of the data in bytes: a digit and a blank per number in text, one byte for the length
-        of a list.
+        """Return the smallest size in bytes that the data can have according to this header.
 
-        A row without properties counts as one byte, so that an element cannot claim any number of them.
+        In text each number takes at least two bytes, a digit and a blank. In binary data a list takes at least one
+        byte, for its length. A row without properties counts as one byte, so that a header cannot declare any number of
+        rows for a short file.
         """
         size = lambda kind: 2 if self.text else TYPES[kind].itemsize if kind in TYPES else 1
         rows = ((count, max(sum(size(kind) for kind, _ in each), 1)) for _, count, each in self.elements)
         return sum(count * row for count, row in rows) - int(self.text)  # the last line may end without a break
 
     def vertices(self) -> tuple[int, list[str]]:
-        """The number of vertices, and the names of their numeric properties."""
+        """Return the number of vertices, and the names of their properties that are single numbers (not lists)."""
         count, properties = next((c, p) for name, c, p in self.elements if name == "vertex")
         return count, [name for kind, name in properties if kind in TYPES]
 
 
 def load_header(path: Path) -> Header:
-    """Read the header. BadInput where it is none, or where the file is too short for what it declares."""
+    """Read the header of a PLY file.
+
+    Raises:
+        BadInput: the file cannot be read, has no valid PLY header or no vertices, or is shorter than its header
+            declares.
+    """
     with reading(path, "a readable PLY file with vertices"), open(path, "rb") as file:
         if file.readline(8).strip() != b"ply":
             raise BadInput(f"{path}: not a PLY file; its first line is not `ply`")
@@ -87,8 +94,16 @@ def load_header(path: Path) -> Header:
 
 
 def load_vertices(path: Path, header: Header) -> np.ndarray:
-    """[N] structured array with a field per property. Vertices of fixed size are mapped from the file, not held in
-    memory."""
+    """Read the N vertices of a PLY file as a structured array [N] with a field per property.
+
+    The array of a binary file whose vertices have no list properties is a memory map of the file, and takes no memory.
+
+    Args:
+        header: the header of this file, from `load_header`.
+
+    Raises:
+        BadInput: the file cannot be read, or ends before its last vertex.
+    """
     from plyfile import PlyData
 
     with reading(path, "a readable PLY file with vertices"):
@@ -106,7 +121,7 @@ def load_vertices(path: Path, header: Header) -> np.ndarray:
 
 
 def save_vertices(path: Path, table: np.ndarray, comments: Sequence[str] = ()) -> None:
-    """Write a structured array [N] as the vertices of a PLY file, binary, little endian."""
+    """Write a structured array [N] as the vertices of a binary, little-endian PLY file; create its folder."""
     from plyfile import PlyData, PlyElement
 
     Path(path).parent.mkdir(parents=True, exist_ok=True)

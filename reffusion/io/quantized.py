@@ -1,7 +1,8 @@
-"""Reads and writes files of antimatter15's viewer (.splat): 32 bytes a splat, no header, no spherical harmonics.
+"""Reading and writing of .splat files, the format of antimatter15's viewer: 32 bytes per splat, without a header.
 
-A record holds three float32 of position, three of size (standard deviations, not logarithms), colour and opacity in
-four bytes, and the quaternion wxyz in four bytes. No maintained library reads it without a compiler or network.
+A record holds the position as three float32, the size as three float32 (standard deviations, not logarithms), colour
+and opacity in four bytes, and the quaternion wxyz in four bytes. There are no spherical harmonics beyond the colour. No
+maintained library reads this format without a compiler or the network.
 """
 
 from __future__ import annotations
@@ -19,7 +20,11 @@ RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 
 
 
 def count_splat(path: Path) -> int:
-    """The number of splats, from the size of the file. BadInput where that is no multiple of a record."""
+    """Return the number of splats, from the size of the file.
+
+    Raises:
+        BadInput: the file is missing, or its size is no multiple of a record's.
+    """
     with reading(path, "a .splat file"):
         size = Path(path).stat().st_size
     if size % RECORD.itemsize:
@@ -28,7 +33,11 @@ def count_splat(path: Path) -> int:
 
 
 def open_splat(path: Path) -> Callable[[slice], Rows]:
-    """A function that reads a range of rows; a record of zero bytes gives a row of zeros."""
+    """Return a function that reads the rows of a slice of the file.
+
+    A record of 32 zero bytes (padding) gives a row of zeros. An opacity of 0 or 255 gives an infinite logit, and a size
+    of 0 a log-scale of minus infinity.
+    """
     table = np.memmap(path, RECORD, mode="r") if Path(path).stat().st_size else np.empty(0, RECORD)
 
     def read(chosen: slice) -> Rows:
@@ -53,7 +62,7 @@ def open_splat(path: Path) -> Callable[[slice], Rows]:
 
 
 def save_splat(path: Path, rows: Rows) -> None:
-    """Write the rows; spherical harmonics above the constant one are dropped."""
+    """Write rows as a .splat file, and create its folder. Spherical harmonics of degree 1 and above are dropped."""
     table = np.empty(len(rows), RECORD)
     in_bytes = lambda values, most: np.clip(np.round(values), 0, most).astype(np.uint8)
     opacities = 1 / (1 + np.exp(-rows.opacity_logits.astype(np.float64)))

@@ -1,4 +1,4 @@
-"""Converts between rotations and quaternions, as in COLMAP's files."""
+"""Conversion between rotation matrices and quaternions, in the convention of COLMAP's files (w, x, y, z)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,12 @@ import numpy as np
 def quaternion_to_pose(
     quaternion: np.ndarray | Sequence[float], translation: np.ndarray | Sequence[float]
 ) -> np.ndarray:
-    """[4, 4] float64 from wxyz (any length; not finite where it is zero) and a translation."""
+    """Return the rigid transform [4, 4] float64 of a rotation and a translation.
+
+    Args:
+        quaternion: [4], wxyz, of any length; it is normalised. The rotation of a zero quaternion is not finite.
+        translation: [3].
+    """
     with np.errstate(all="ignore"):
         w, x, y, z = np.asarray(quaternion, np.float64) / np.linalg.norm(quaternion)
     matrix = np.eye(4)
@@ -24,7 +29,10 @@ def quaternion_to_pose(
 
 
 def rotation_to_quaternion(rotation: np.ndarray) -> np.ndarray:
-    """[4] wxyz of a [3, 3] rotation, w >= 0; accurate near an angle of pi too."""
+    """Return the unit quaternion [4], wxyz with w >= 0, of a rotation matrix [3, 3].
+
+    The result is accurate for all angles, also near pi, where w is close to 0.
+    """
     r = np.asarray(rotation, np.float64)
     # The largest of the four components is computed first, to avoid a division by a small number.
     squares = np.array(

@@ -1,7 +1,8 @@
-"""Reads and writes the artifacts of the stages: scenes, views, masks and references.
+"""Reading and writing of the files that stages hand on: scenes, views, masks and references.
 
-`poses` writes images/<view>.png, sparse/0/*.bin, transform.json, views.json and lenses.json; `raw_masks` writes
-masks/<view>.png (with several objects masks/<object>/<view>.png), test_masks/<view>.png and fill/<view>.png.
+The stage `poses` writes images/<view>.png, sparse/0/*.bin, transform.json, views.json and lenses.json. The stage
+`raw_masks` writes masks/<view>.png (or masks/<object>/<view>.png if the scene has masks of several objects),
+test_masks/<view>.png and fill/<view>.png. Terms of masks are explained in `reffusion.types.MaskSet`.
 """
 
 from __future__ import annotations
@@ -21,12 +22,16 @@ if TYPE_CHECKING:
 
     from reffusion.types import MaskSet, Reference, Scene
 
-WARNINGS = "warnings.json"  # in either folder: sentences about oddities
+WARNINGS = "warnings.json"  # in the folder of a stage: sentences about what looks wrong in its input
 PIXEL_CLASSES = ("raw", "consistent", "unobserved", "invent")
 
 
 def save_scene(poses_dir: Path, scene: Scene) -> None:
-    """Write sparse/0/*.bin (PINHOLE, normalised frame), transform.json and views.json; no pictures."""
+    """Write a scene as sparse/0/*.bin, transform.json and views.json; pictures are not written.
+
+    The cameras in sparse/0/ are of COLMAP's model PINHOLE, in the normalised frame. transform.json holds the
+    similarity, and views.json the names of training, test and clean views (clean: without the object).
+    """
     poses_dir = Path(poses_dir)
     cameras, images = {}, {}
     for identity, camera in enumerate(scene.cameras.values(), start=1):
@@ -43,7 +48,11 @@ def save_scene(poses_dir: Path, scene: Scene) -> None:
 
 
 def load_scene(poses_dir: Path) -> Scene:
-    """The scene that `poses` wrote, in the normalised frame. ValueError naming a file that is wrong."""
+    """Read the scene that the stage `poses` wrote, in the normalised frame.
+
+    Raises:
+        ValueError: a file is missing or wrong; the message names it.
+    """
     from reffusion.types import Camera, Scene, Similarity
 
     poses_dir = Path(poses_dir)
@@ -75,29 +84,40 @@ def load_scene(poses_dir: Path) -> Scene:
 
 
 def load_views(poses_dir: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """View name -> uint8 [H, W, 3]."""
+    """Read the undistorted pictures of the named views, as a dict view name -> uint8 [H, W, 3]."""
     return {name: load_image(Path(poses_dir) / "images" / f"{name}.png") for name in names}
 
 
 def has_photograph(poses_dir: Path, name: str) -> bool:
-    """Does the view have a photograph? In a scene without photographs renders of its Gaussians stand for them."""
+    """Return whether the view has a photograph.
+
+    In a scene without photographs, later stages use renders of its Gaussians instead.
+    """
     return (Path(poses_dir) / "images" / f"{name}.png").exists()
 
 
 def load_warnings(folder: Path) -> list[str]:
-    """The oddities that `poses` or `raw_masks` found, a sentence each."""
+    """Read the warnings that a stage left in its folder, a sentence each; empty if there are none."""
     path = Path(folder) / WARNINGS
     return load_json(path) if path.is_file() else []
 
 
 def list_objects(raw_masks_dir: Path) -> list[str]:
-    """The objects that masks tell apart, sorted."""
+    """Return the sorted names of the objects that have masks of their own, masks/<object>/; empty for one object."""
     return sorted(path.name for path in (Path(raw_masks_dir) / "masks").glob("[!.]*") if path.is_dir())
 
 
 def raw_mask_files(raw_masks_dir: Path, name: str, objects: Sequence[str] | None = None) -> list[Path]:
-    """The view's masks: a single one, or where objects are told apart one for each of `objects` (None: all) that has
-    one."""
+    """Return the paths of a view's raw masks that exist.
+
+    Args:
+        raw_masks_dir: folder of the stage `raw_masks`.
+        name: the view.
+        objects: names of the objects whose masks are returned, if objects have masks of their own; None: all objects.
+
+    Returns:
+        One file per object, or masks/<view>.png if objects have no masks of their own; empty if the view has no mask.
+    """
     folder = Path(raw_masks_dir) / "masks"
     found_objects = list_objects(raw_masks_dir) if objects is None else objects
     return [path for path in (folder / thing / f"{name}.png" for thing in found_objects or [""]) if path.is_file()]
@@ -106,9 +126,17 @@ def raw_mask_files(raw_masks_dir: Path, name: str, objects: Sequence[str] | None
 def load_raw_masks(
     raw_masks_dir: Path, names: Iterable[str], objects: Sequence[str] | None = None
 ) -> dict[str, np.ndarray]:
-    """View name -> bool [H, W], True = the object; only the views that have a mask.
+    """Read the raw masks of views as a dict view name -> bool [H, W], True = the object.
 
-    Where objects are told apart, the union of those in `objects` (None: all), for views with a mask of each.
+    If objects have masks of their own, a view's mask is the union of those of `objects`.
+
+    Args:
+        raw_masks_dir: folder of the stage `raw_masks`.
+        names: the views.
+        objects: names of the objects; None: all.
+
+    Returns:
+        Only views that have a mask, or a mask of each object, are keys.
     """
     objects = list_objects(raw_masks_dir) if objects is None else objects
     files = {name: raw_mask_files(raw_masks_dir, name, objects) for name in names}
@@ -117,19 +145,23 @@ def load_raw_masks(
 
 
 def load_fill_masks(raw_masks_dir: Path) -> dict[str, np.ndarray]:
-    """Training view name -> bool [H, W], what is to be filled; empty where the scene brings no such masks."""
+    """Read the fill masks: the pixels that the scene asks to fill, whatever the photographs show there.
+
+    Returns:
+        Training view name -> bool [H, W], True = to be filled; empty if the scene has no such masks.
+    """
     return {path.stem: load_mask(path) for path in sorted((Path(raw_masks_dir) / "fill").glob("*.png"))}
 
 
 def save_mask_sets(masks_dir: Path, sets: Mapping[str, MaskSet]) -> None:
-    """Write raw/, consistent/, unobserved/ and invent/<view>.png."""
+    """Write the pixel classes of each view as raw/, consistent/, unobserved/ and invent/<view>.png."""
     for name, mask_set in sets.items():
         for kind in PIXEL_CLASSES:
             save_mask(Path(masks_dir) / kind / f"{name}.png", getattr(mask_set, kind))
 
 
 def load_mask_sets(masks_dir: Path, names: Iterable[str]) -> dict[str, MaskSet]:
-    """View name -> the pixel classes that `masks` wrote."""
+    """Read the pixel classes that the stage `masks` wrote, as a dict view name -> MaskSet."""
     from reffusion.types import MaskSet
 
     load = lambda kind, name: load_mask(Path(masks_dir) / kind / f"{name}.png")
@@ -137,7 +169,13 @@ def load_mask_sets(masks_dir: Path, names: Iterable[str]) -> dict[str, MaskSet]:
 
 
 def has_object_mask(raw_masks_dir: Path, masks_dir: Path | None, name: str) -> bool:
-    """Has the view a raw mask, given or made from clicks?"""
+    """Return whether the view has a raw mask that the user gave, or a non-empty one that was made from clicks.
+
+    Args:
+        raw_masks_dir: folder of the stage `raw_masks`, which holds the given masks.
+        masks_dir: folder of the stage `masks`, which makes masks from clicks; None if the stage was skipped.
+        name: the view.
+    """
     if raw_mask_files(raw_masks_dir, name) or masks_dir is None:
         return bool(raw_mask_files(raw_masks_dir, name))
     made = Path(masks_dir) / "raw" / f"{name}.png"
@@ -145,13 +183,17 @@ def has_object_mask(raw_masks_dir: Path, masks_dir: Path | None, name: str) -> b
 
 
 def load_object_labels(masks_dir: Path) -> Tensor:
-    """[N] bool: of the Gaussians that `masks` removes, those that are the object, and not debris."""
+    """Read which Gaussians are the object, as bool [N] on the CPU.
+
+    The stage `masks` also labels debris for removal: Gaussians that the object had hidden and that the photographs
+    contradict. Debris is False here.
+    """
     labels, debris = load_labels(masks_dir / "labels.npy"), masks_dir / "debris.npy"
     return labels & ~load_labels(debris) if debris.exists() else labels
 
 
 def save_references(reference_dir: Path, references: Sequence[Reference]) -> None:
-    """Write references/<view>.png and masks/<view>.png; depth/<view>.exr where a reference has depth."""
+    """Write references as references/<view>.png and masks/<view>.png, and depth/<view>.exr if a reference has depth."""
     for reference in references:
         name = f"{reference.camera.name}.png"
         save_image(Path(reference_dir) / "references" / name, reference.image)
@@ -165,11 +207,11 @@ def _depth_file(reference_dir: Path, view: str) -> Path:
 
 
 def load_references(reference_dir: Path, scene: Scene) -> list[Reference]:
-    """The references and their masks, sorted by view name.
+    """Read the references that `save_references` wrote, sorted by view name.
 
     Raises:
-        ValueError: naming the file, where a reference belongs to no view, has another size than its view, or
-            has no mask.
+        ValueError: a reference belongs to no view of the scene, has no mask, or is not of its view's size. The message
+            names the file.
     """
     from reffusion.types import Reference
 

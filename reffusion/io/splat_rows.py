@@ -1,7 +1,7 @@
-"""Cleans rows of splat files for 3DGS: clamps or drops invalid ones, and folds Mip-Splatting's filter in.
+"""Cleaning of the rows of splat files: invalid rows are dropped or clamped, and Mip-Splatting's 3D filter is folded in.
 
-Tools write infinite logits for opaque splats, scales of minus infinity for flat ones, single rows with NaN, and rows of
-zeros as padding.
+A row holds the parameters of one Gaussian (splat). Other tools write infinite opacity logits for opaque splats,
+log-scales of minus infinity for flat splats, single rows with NaN, and rows of zeros as padding.
 """
 
 from __future__ import annotations
@@ -12,20 +12,24 @@ import numpy as np
 
 # In float32 the sigmoid of 20 is 1, and that of -20 is far below 1/255, the least opacity that is rendered.
 MOST_LOGIT = 20.0
-# Log-scale of an axis without extent: 2e-9 units, far below a pixel, while products of three such sizes stay above 0.
+# Log-scale that stands for an axis without extent: a size of 2e-9 units. This is far below a pixel, and the product of
+# three such sizes is still above 0 in float32.
 FLAT = -20.0
 MOST_SCALE = 80.0  # log-scale: in float32 the exponential of 88.7 is infinite
-BAD_SHARE = 0.5  # largest share of invalid rows: with more it is no file of splats
+BAD_SHARE = 0.5  # largest share of invalid rows; a file with more is refused
 DEGREE = 3  # highest degree of spherical harmonics that is rendered
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Splats of a file, or a block of them.
+    """The N splats of a file, or of a block of its rows, parametrised as `reffusion.types.Gaussians`.
 
     Attributes:
-        means: [N, 3] float64; quaternions: [N, 4] float32; log_scales: [N, 3] float32; opacity_logits: [N] float32;
-        sh: [N, K, 3] float32.
+        means: [N, 3] float64.
+        quaternions: [N, 4] float32, wxyz, of any length.
+        log_scales: [N, 3] float32, logarithms of the standard deviations.
+        opacity_logits: [N] float32.
+        sh: [N, K, 3] float32, spherical harmonics.
     """
 
     means: np.ndarray
@@ -39,21 +43,24 @@ class Rows:
 
     @property
     def unit_quaternions(self) -> np.ndarray:
-        """[N, 4]: the quaternions normalised; that of no rotation for those that are zero."""
+        """The normalised quaternions, [N, 4]. Zero quaternions become the identity (1, 0, 0, 0)."""
         lengths = np.linalg.norm(self.quaternions, axis=1, keepdims=True)
         return np.where(lengths > 0, self.quaternions / np.maximum(lengths, 1e-30), [1.0, 0.0, 0.0, 0.0])
 
     def take(self, chosen: np.ndarray | slice) -> Rows:
+        """Return the chosen rows. `chosen` is any index of numpy for the first axis."""
         return Rows(*(array[chosen] for array in vars(self).values()))
 
 
 @dataclass(frozen=True)
 class Repairs:
-    """How many rows were dropped or changed.
+    """The numbers of rows and values that `drop_invalid` dropped or changed.
 
     Attributes:
-        invalid: dropped, with NaN or infinite values; padding: dropped, all zeros.
-        opacities: clamped infinite logits; scales: clamped scales of minus infinity.
+        invalid: rows that were dropped because of NaN, infinite or too large values.
+        padding: rows that were dropped because all their values are zero.
+        opacities: infinite opacity logits that were clamped.
+        scales: log-scales of minus infinity that were clamped.
     """
 
     invalid: int = 0
@@ -65,7 +72,7 @@ class Repairs:
         return Repairs(*(a + b for a, b in zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def sentence(self, count: int) -> str:
-        """What was done to a file of `count` rows; empty if nothing."""
+        """Describe in words how a file of `count` rows was changed; "" if it was not changed."""
         dropped = [f"{self.invalid} with NaN or infinite values"] if self.invalid else []
         dropped += [f"{self.padding} of zeros only (padding)"] if self.padding else []
         clamped = [f"{self.opacities} infinite opacities"] if self.opacities else []
@@ -77,10 +84,14 @@ class Repairs:
 
 
 def drop_invalid(rows: Rows) -> tuple[Rows, Repairs]:
-    """The valid rows, clamped, and what was done.
+    """Drop invalid rows, and clamp extreme opacities and scales to finite values that look the same.
 
-    Dropped are rows with NaN, an infinite position, rotation, colour or size, and rows of zeros. A zero quaternion
-    alone stays: 3DGS renders it as the identity.
+    A row is dropped if it has a NaN, an infinite position, rotation or colour, or a log-scale of `MOST_SCALE` or more,
+    or if all its values are zero. A row whose only zero parameter is the quaternion is kept, because 3DGS renders a
+    zero quaternion as the identity.
+
+    Returns:
+        The remaining rows, and the numbers of dropped rows and clamped values.
     """
     logits, scales = rows.opacity_logits, rows.log_scales
     with np.errstate(invalid="ignore", over="ignore"):
@@ -102,20 +113,30 @@ def drop_invalid(rows: Rows) -> tuple[Rows, Repairs]:
 
 
 def fold_filter(log_scales: np.ndarray, logits: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fold Mip-Splatting's 3D filter of standard deviations `sizes` [N] into log-scales [N, 3] and opacity logits [N],
-    float64:
+    """Fold the 3D filter of Mip-Splatting into scales and opacities.
+
+    With f the standard deviation of a Gaussian's filter:
 
         scale' = sqrt(scale^2 + f^2),  opacity' = opacity * prod(scale) / prod(scale')
 
-    In logarithms: log(scale'/scale) is half the softplus of 2 (log f - log scale), which neither overflows nor cancels;
-    the logit of a probability p is log p - log(1 - p), with 1 - p by expm1.
+    The computation is in logarithms. log(scale' / scale) is half the softplus of 2 (log f - log scale), which neither
+    overflows nor cancels. The logit of a probability p is log p - log(1 - p), where 1 - p is computed by expm1.
+
+    Args:
+        log_scales: [N, 3].
+        logits: [N], opacity logits.
+        sizes: [N], standard deviations f of the filters.
+
+    Returns:
+        log_scales: [N, 3] float64, widened by the filter.
+        logits: [N] float64, of the lower opacities.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         filters = np.log(np.abs(np.asarray(sizes, np.float64)))[:, None]
         scales = np.asarray(log_scales, np.float64)
         widened = np.logaddexp(2 * scales, 2 * filters) / 2
         growth = np.logaddexp(0.0, 2 * (filters - scales)) / 2
-        # of a filter of no size and an axis of none: inf - inf, and nothing grows
+        # a filter of size zero changes nothing; without this line a flat axis would give inf - inf
         growth = np.where(np.isneginf(filters), 0.0, growth)
         log_opacity = -np.logaddexp(0.0, -np.asarray(logits, np.float64)) - growth.sum(1)
         return widened, log_opacity - np.log(-np.expm1(log_opacity))

@@ -1,6 +1,7 @@
-"""Reads files of Gaussians: .ply of 3DGS and related tools, compressed .ply, .spz and .splat.
+"""Reading of files of Gaussians: .ply of 3DGS and related tools, compressed .ply, .spz and .splat.
 
-Rows are read in blocks, so that only one block is held in memory beside the result.
+A row is one Gaussian of a file. Rows are read and checked in blocks, so that memory holds only one block besides the
+result.
 """
 
 from __future__ import annotations
@@ -26,22 +27,23 @@ DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALES = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 RED_GREEN_BLUE = ("red", "green", "blue")
-FILTER = "filter_3D"  # Mip-Splatting's standard deviation of each splat's smoothing filter
-ANTIALIASED = "antialiased"  # a comment that says how the Gaussians are meant to be rendered
-FORMATS = (".ply", ".compressed.ply", ".spz", ".splat")
+FILTER = "filter_3D"  # property of Mip-Splatting: the standard deviation of the 3D filter of each Gaussian
+ANTIALIASED = "antialiased"  # a comment in a .ply: the Gaussians are to be rendered with Mip-Splatting's 2D filter
+FORMATS = (".ply", ".compressed.ply", ".spz", ".splat")  # endings of the files that are read and written
 UNREAD = (".ksplat", ".sog", ".lcc", ".lcc2", ".glb", ".gltf", ".usdz", ".zip", ".json")
-BLOCK = 8192  # rows
+BLOCK = 8192  # rows that are read at a time
 DEGREES = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(11)}  # number of `f_rest` properties -> degree
 
 
 @dataclass(frozen=True)
 class Splats:
-    """The splats of a file, in its own frame, and what was changed when they were read.
+    """The Gaussians of a file in the file's own frame, and notes on what was changed when they were read.
 
     Attributes:
-        rows: the valid ones, in the order of the file.
-        antialiased: they are meant to be rendered with Mip-Splatting's compensation.
-        notes: sentences without the file's name.
+        rows: the valid Gaussians, in the order of the file.
+        antialiased: True if they are to be rendered with Mip-Splatting's 2D filter, which lowers the opacity of
+            Gaussians that the low-pass widens.
+        notes: what was changed, a sentence each, without the file's name.
     """
 
     rows: Rows
@@ -49,7 +51,12 @@ class Splats:
     notes: tuple[str, ...]
 
     def gaussians(self, similarity: Similarity | None = None) -> Gaussians:
-        """Float32 on the CPU; with `similarity` in the normalised frame."""
+        """Return the Gaussians as float32 tensors on the CPU.
+
+        Args:
+            similarity: from the file's frame to the normalised frame, into which the result is converted; None keeps
+                the file's frame.
+        """
         import torch
 
         from reffusion.types import Gaussians
@@ -64,12 +71,13 @@ class Splats:
 
 @dataclass(frozen=True)
 class Summary:
-    """What the header of a file of Gaussians says.
+    """The contents of a file of Gaussians, as far as its header tells.
 
     Attributes:
-        count: the number of rows.
-        notes: what reading will change, sentences without the file's name.
-        properties: names of a .ply's vertex properties, in order; empty for a quantised file.
+        count: the number of rows, valid or not.
+        notes: what reading the file will change, a sentence each, without the file's name.
+        properties: names of the vertex properties of a plain .ply, in order; empty for a quantised file (compressed
+            .ply, .spz or .splat).
         antialiased: as in `Splats`.
     """
 
@@ -80,7 +88,12 @@ class Summary:
 
 
 def summarize_splats(path: Path) -> Summary:
-    """Read the header. BadInput where the file is truncated, or no file of Gaussians."""
+    """Read the header of a file of Gaussians.
+
+    Raises:
+        BadInput: the file is truncated, is no file of Gaussians, or has a format that is not read; or gsply is needed
+            and not installed.
+    """
     path = Path(path)
     ending = path.suffix.lower()
     if ending in UNREAD:
@@ -105,10 +118,11 @@ def summarize_splats(path: Path) -> Summary:
 
 
 def load_splats(path: Path) -> Splats:
-    """Read the splats of a file; invalid rows are dropped, see `splat_rows.drop_invalid`.
+    """Read the Gaussians of a file. Invalid rows are dropped, see `splat_rows.drop_invalid`.
 
     Raises:
-        BadInput: naming the file, where it holds no Gaussians, or more than half of its rows are invalid.
+        BadInput: the file cannot be read or is no file of Gaussians, more than half of its rows are invalid, or none is
+            left. The message names the file.
     """
     path = Path(path)
     is_file(path)
@@ -128,7 +142,15 @@ def load_splats(path: Path) -> Splats:
 
 
 def _gather(path: Path, count: int, read: Callable[[slice], Rows]) -> tuple[Rows, Repairs]:
-    """All valid rows of a file of `count` rows, which `read` returns in blocks."""
+    """Read a file of `count` rows in blocks, and keep the valid rows.
+
+    Args:
+        path: the file, for messages.
+        read: returns the rows of a slice.
+
+    Returns:
+        The valid rows in the order of the file, and how many rows were dropped or changed.
+    """
     first, repairs, at = read(slice(0, 0)), Repairs(), 0
     whole = Rows(*(np.empty((count, *array.shape[1:]), array.dtype) for array in vars(first).values()))
     for start in range(0, count, BLOCK):
@@ -148,7 +170,11 @@ def _gather(path: Path, count: int, read: Callable[[slice], Rows]) -> tuple[Rows
 
 
 def _open_ply(table: np.ndarray) -> Callable[[slice], Rows]:
-    """A function that reads a range of rows."""
+    """Return a function that converts a slice of a plain .ply's vertex table to rows.
+
+    Mip-Splatting's 3D filter is folded into scales and opacities. The missing third scale of 2DGS becomes that of a
+    flat axis. Spherical harmonics above `DEGREE` are dropped.
+    """
     names = table.dtype.names
     higher = sum(name.startswith("f_rest_") for name in names) // 3
     used = min(higher, (DEGREE + 1) ** 2 - 1)
@@ -162,7 +188,7 @@ def _open_ply(table: np.ndarray) -> Callable[[slice], Rows]:
         return found
 
     def read(chosen: slice) -> Rows:
-        block = np.array(table[chosen])  # mapped: from the disk once, not once for each property
+        block = np.array(table[chosen])  # the table is a memory map: copy it once, or each property reads the disk
         logits = read_columns(block, ["opacity"], "f8")[:, 0]
         scales = read_columns(block, [name for name in SCALES if name in names], "f8")
         if scales.shape[1] == 2:
@@ -181,14 +207,25 @@ def _open_ply(table: np.ndarray) -> Callable[[slice], Rows]:
 
 
 def _color_coefficients(block: np.ndarray) -> np.ndarray:
-    """[N, 3] float32, the constant coefficient of each colour, from bytes, or floats from 0 to 1."""
+    """Return the constant spherical harmonic [N, 3] float32 of the colours red, green and blue of N rows.
+
+    The colours are bytes, or floats in [0, 1].
+    """
     colors = np.stack([block[name] for name in RED_GREEN_BLUE], axis=1)
     unit = colors if np.issubdtype(colors.dtype, np.floating) else colors / 255
     return ((unit - 0.5) / SH0).astype(np.float32)
 
 
 def _check_properties(path: Path, names: Sequence[str]) -> tuple[str, ...]:
-    """What reading will change, by the names of the properties; BadInput where they are not those of Gaussians."""
+    """Return what reading a plain .ply will change, a sentence each.
+
+    Args:
+        path: the file, for messages.
+        names: the names of its vertex properties.
+
+    Raises:
+        BadInput: the properties are not those of Gaussians.
+    """
     others = (*POSITION, "opacity", *SCALES[:2], *ROTATION)
     colored = {*others, *RED_GREEN_BLUE} <= {*names} and DC[0] not in names  # as nerfstudio writes on request
     missing = [n for n in (*others, *(() if colored else DC)) if n not in names]

@@ -1,4 +1,8 @@
-"""The schema of `trace.jsonl`, error against run time, and reading it (docs/development.md#traces)."""
+"""The schema of `trace.jsonl`, in which a stage records its error against run time, and reading of such files.
+
+A trace has one JSON object per line, see docs/development.md#traces. Its keys are quantities, such as "psnr". A trace
+may hold several series, e.g. one per solver and view.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-REASONS = ("finished", "converged")
+REASONS = ("finished", "converged")  # values of "reason", which the last line of a series may have
 
 
 @dataclass(frozen=True)
@@ -16,9 +20,10 @@ class Quantity:
     """The meaning of a key in a trace.
 
     Attributes:
-        unit: "dB", "count", "1" for a ratio; "" where values can only be compared within a scene.
-        better: "more" or "less"; "" where neither is.
-        label: for an axis.
+        unit: "dB", "count", or "1" for a number without unit. "" means that values of different scenes cannot be
+            compared.
+        better: "more" if larger values are better, "less" if smaller ones are, "" if neither is better.
+        label: text for the axis of a chart.
     """
 
     unit: str
@@ -45,7 +50,7 @@ QUANTITIES = {
     "masked_gaussians": Quantity("count", "", "masked Gaussians"),
 }
 
-MAIN = {  # stage -> the quantities that stand for its error, the first that a trace has
+MAIN = {  # stage -> candidates for the quantity that is shown as its error: the first one that its trace has is taken
     "fit": ("psnr_held_out", "psnr"),
     "personalize": ("photo_psnr", "hole_psnr"),
     "distill": ("reference_psnr",),
@@ -54,7 +59,10 @@ MAIN = {  # stage -> the quantities that stand for its error, the first that a t
 
 
 def read_trace(path: Path) -> list[dict[str, Any]]:
-    """The lines of a `trace.jsonl` as they are; a line cut off by a kill is ignored."""
+    """Read the lines of a `trace.jsonl` as dicts, without checking them against the schema.
+
+    A line that is not valid JSON is skipped, because a killed process may leave an incomplete line.
+    """
     records = []
     for line in path.read_text().splitlines():
         try:
@@ -65,10 +73,17 @@ def read_trace(path: Path) -> list[dict[str, Any]]:
 
 
 def load_trace(path: Path, stage: str) -> dict[str, list[dict[str, Any]]]:
-    """The lines of a stage's trace by series (docs/development.md#traces), "" for those without a name.
+    """Read a stage's trace and check each line against the schema (docs/development.md#traces).
+
+    Args:
+        stage: name of the stage; `distill` may have quantities that are not in `QUANTITIES` (its loss terms).
+
+    Returns:
+        Name of the series -> its lines in order. Lines without the key "series" are under "".
 
     Raises:
-        ValueError: naming file, line and what violates the schema; or the file does not exist.
+        ValueError: the file does not exist, or a line violates the schema. The message names the file, the line and the
+            violation.
     """
     if not path.exists():
         raise ValueError(f"{path}: no such file")
@@ -84,7 +99,13 @@ def load_trace(path: Path, stage: str) -> dict[str, list[dict[str, Any]]]:
 
 
 def _find_violation(line: dict[str, Any], before: dict[str, Any] | None, seconds: float, stage: str) -> str | None:
-    """What violates the schema in a line, given the one before it in its series and the last time."""
+    """Return how a line of a trace violates the schema, in words; None if it does not.
+
+    Args:
+        before: the previous line of the same series; None for the first line.
+        seconds: "seconds" of the previous line of any series.
+        stage: name of the stage that wrote the trace.
+    """
     if missing := [key for key in ("seconds", "iteration") if key not in line]:
         return f"no {missing[0]!r}"
     texts = {"series", "reason"} & line.keys()

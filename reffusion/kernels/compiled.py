@@ -1,4 +1,8 @@
-"""Compiles kernels, caches machine code, and runs kernels on several threads."""
+"""Compilation of numba kernels, a cache of their machine code, and their execution on several threads.
+
+A kernel here is a function compiled by numba. The threads that run a kernel divide its work by *tickets*: a ticket is
+the number of a piece of the work, and each thread takes the next one until none is left.
+"""
 
 from __future__ import annotations
 
@@ -22,20 +26,25 @@ import torch
 
 T = TypeVar("T")
 R = TypeVar("R")
-_MIN_KEPT, _MAX_BLOCKS = 2**16, 24  # numbers of an array that is reused; arrays kept, about those of two steps
+# Least size, in numbers, of an array whose memory is reused; and how many blocks of memory are kept, about as many as
+# two optimisation steps need.
+_MIN_KEPT, _MAX_BLOCKS = 2**16, 24
 MIN_PARALLEL = 8000  # Gaussians below which another thread costs more time than it saves
-# Rounding may vary, but NaN and infinity are preserved, because `fit` checks for them.
+# Fast-math flags of LLVM. The order and rounding of operations may change, but NaN and infinity are preserved, because
+# `fit` checks for them.
 FREE_ROUNDING = "contract", "reassoc", "nsz", "arcp"
 _PACKAGES = "kernels", "splat", "gaussians", "depth", "background", "inpaint/patchmatch"  # packages with kernels
-_torch_threads = threading.local()  # thread-local, like the number itself: torch's number outside `torch_on_one_thread`
-_CACHE = "splat-"  # prefix of folders of machine code in __pycache__, one per state of the sources
+# Inside `torch_on_one_thread`, torch's number of threads outside of it. It is thread-local, as torch's number itself.
+_torch_threads = threading.local()
+_CACHE = "splat-"  # prefix of the folder of machine code in __pycache__; its name ends in a hash of the sources
 
 
 @functools.cache
 def _cache_folder() -> Path:
-    """The folder of machine code for the present content of `_PACKAGES`.
+    """Return the folder of machine code for the present sources of `_PACKAGES`.
 
-    numba itself checks only the file of a function, and would keep using a constant or a callee that changed elsewhere.
+    numba itself checks only whether the file of a function has changed. It would go on using machine code with an old
+    constant or an old callee from another file.
     """
     library = Path(__file__).parents[1]
     sources = [path for package in _PACKAGES for path in sorted((library / package).glob("*.py"))]
@@ -44,7 +53,14 @@ def _cache_folder() -> Path:
 
 
 def kernel(function: Callable, fastmath: tuple[str, ...] = ()) -> Callable:
-    """Compile `function` at its first call, to run without the GIL; later processes load it from disk."""
+    """Return `function` as a numba kernel that runs without the GIL.
+
+    It is compiled at the first call; later processes load the machine code from disk.
+
+    Args:
+        function: the function to compile.
+        fastmath: LLVM's fast-math flags, such as `FREE_ROUNDING`.
+    """
     folder, before = _cache_folder(), numba.config.CACHE_DIR
     try:
         if not folder.exists():
@@ -61,15 +77,15 @@ def kernel(function: Callable, fastmath: tuple[str, ...] = ()) -> Callable:
 
 
 def inlined(function: Callable) -> Callable:
-    """Inline `function` into every kernel that calls it."""
+    """Return `function` compiled so that it is inlined into every kernel that calls it."""
     return numba.njit(forceinline=True, error_model="numpy")(function)
 
 
 def empty_aligned(*shape: int) -> np.ndarray:
-    """Uninitialised float32 array, aligned to cache lines; large ones reuse memory of arrays that no longer exist.
+    """Return an uninitialised float32 array of this shape, aligned to cache lines.
 
-    Otherwise the system provides new pages for large arrays each time, and clearing these takes much of an
-    optimisation step.
+    A large array takes the memory of an earlier array that no longer exists. Otherwise the system would provide new
+    pages of memory each time, and clearing these takes much of an optimisation step.
     """
     size = math.prod(shape)
     if size < _MIN_KEPT:
@@ -80,13 +96,15 @@ def empty_aligned(*shape: int) -> np.ndarray:
         block = next(fits, None) or _Block(_cache_aligned(size))
         others = [other for other in blocks if other is not block]
         blocks[:] = [*others[1 - _MAX_BLOCKS :], block]
-        # through a memoryview, so that views refer to this array and not to the block
+        # Made through a memoryview, so that the base of each view of this array is this array, and not the block's
+        # memory. So the array exists, and the block is in use, as long as any view of it exists.
         array = np.frombuffer(block.memory.data, np.float32, size)
         block.tenant = weakref.ref(array)
         return array.reshape(shape)
 
 
 def _cache_aligned(size: int) -> np.ndarray:
+    """Return an uninitialised float32 array [size] in new memory, aligned to cache lines of 64 bytes."""
     memory = np.empty(size + 16, np.float32)
     first = -memory.ctypes.data // 4 % 16
     return memory[first : first + size]
@@ -94,7 +112,12 @@ def _cache_aligned(size: int) -> np.ndarray:
 
 @dataclass
 class _Block:
-    """Memory, and a reference to the array that uses it."""
+    """A block of memory that `empty_aligned` reuses.
+
+    Attributes:
+        memory: [K] float32.
+        tenant: weak reference to the array that uses the memory; it returns None if this array no longer exists.
+    """
 
     memory: np.ndarray
     tenant: Callable[[], np.ndarray | None] = lambda: None
@@ -102,24 +125,25 @@ class _Block:
 
 @functools.cache
 def _blocks() -> tuple[list[_Block], threading.Lock]:
-    """Blocks given out by `empty_aligned`, the latest last, and their lock."""
+    """Return the blocks of memory that `empty_aligned` keeps, the last used one last, and the lock of this list."""
     return [], threading.Lock()
 
 
 def threads() -> int:
-    """Number of threads for kernels: that of torch, so that one setting (or OMP_NUM_THREADS) controls both.
+    """Return the number of threads for kernels: torch's number, so that one setting (or OMP_NUM_THREADS) controls both.
 
-    Inside `torch_on_one_thread` it is torch's number outside of it.
+    Inside `torch_on_one_thread`, where torch's number is 1, it is the number that torch had before.
     """
     return getattr(_torch_threads, "threads", None) or torch.get_num_threads()
 
 
 @contextmanager
 def torch_on_one_thread() -> Iterator[None]:
-    """Let torch use one thread, for work that mostly renders; context manager and decorator.
+    """Let torch use one thread, for work that mostly renders; a context manager, also usable as a decorator.
 
-    The operations of torch between kernels are small: synchronising threads in each takes longer than it saves, and far
-    longer if another process occupies a core. Besides, results do not depend on the number of threads.
+    Torch's operations between kernels are small. In each of them, synchronising threads takes longer than the threads
+    save, and far longer if another process occupies a core. Besides, results then do not depend on the number of
+    threads. Kernels still use `threads()` threads.
     """
     outer, torch_threads = getattr(_torch_threads, "threads", None), torch.get_num_threads()
     _torch_threads.threads = outer or torch_threads
@@ -132,28 +156,35 @@ def torch_on_one_thread() -> Iterator[None]:
 
 
 def parallel_for(function: Callable, *arguments, gaussians: int = MIN_PARALLEL) -> None:
-    """Call `function(tickets, *arguments)` on every thread at once; they take tickets until all work is done.
+    """Call `function(tickets, *arguments)` on all threads at once, and return when all have returned.
 
-    `tickets` [2] int64: a counter for `vectors.take_ticket`, and the number of threads. What a piece of work writes
-    must depend only on its number, so that results are the same for any number of threads.
+    Each call takes tickets (numbers of pieces of work) by `vectors.take_ticket(tickets)` until none is left. Results
+    are the same for any number of threads if what a piece of work writes depends only on its number.
 
     Args:
-        gaussians: number of Gaussians, where it determines the work; below MIN_PARALLEL only this thread is used.
+        function: a kernel. Its first argument `tickets` [2] int64 holds the counter of tickets and the number of
+            threads.
+        arguments: its other arguments.
+        gaussians: number of Gaussians, if it determines the amount of work. Below `MIN_PARALLEL` only the calling
+            thread is used.
     """
     helpers = threads() - 1 if gaussians >= MIN_PARALLEL else 0
     tickets = np.array([0, helpers + 1])
     pending = [_pool(os.getpid(), helpers).submit(function, tickets, *arguments) for _ in range(helpers)]
     function(tickets, *arguments)
     for future in pending:
-        if not future.cancel():  # a thread that did not start has nothing left to do
+        if not future.cancel():  # a call that has not begun by now finds no ticket left, and need not run
             future.result()
 
 
 def side_by_side(function: Callable[[T], R], items: Iterable[T], most: int = 8) -> Iterator[R]:
-    """`function` of each item, in order, with up to `most` items at once, one per thread.
+    """Yield `function(item)` for each item, in order; several items are computed at once, each in one thread.
 
-    For work whose array operations release the GIL; torch's threads are divided among the items. If the iteration is
-    left early, items that have not begun are cancelled.
+    This is useful for functions whose array operations release the GIL. Torch's threads are divided among the items. If
+    the iteration ends early, items whose computation has not begun are cancelled.
+
+    Args:
+        most: largest number of items at once; it is also limited by `threads()`.
     """
     workers = max(1, min(threads(), most))
     threads_each = max(1, threads() // workers)
@@ -166,5 +197,10 @@ def side_by_side(function: Callable[[T], R], items: Iterable[T], most: int = 8) 
 
 @functools.lru_cache(maxsize=1)
 def _pool(process: int, helpers: int) -> ThreadPoolExecutor:
-    """A pool of waiting threads; a forked process makes its own."""
+    """Return a pool of `helpers` threads that is kept between calls.
+
+    Args:
+        process: id of this process. Threads do not survive a fork, so a forked process makes its own pool.
+        helpers: number of threads.
+    """
     return ThreadPoolExecutor(helpers, thread_name_prefix="splat")

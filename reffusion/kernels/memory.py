@@ -1,6 +1,11 @@
-"""Loads and stores vectors: consecutive elements, columns of consecutive rows, sums over lanes.
+"""Loads and stores of vectors in numba kernels: consecutive elements, columns of consecutive rows, sums over lanes.
 
-Arrays are contiguous and one-dimensional; bounds are not checked.
+A vector holds LANES numbers (see `vectors`). Arrays are contiguous and one-dimensional. An array with the remark
+"flat" holds the rows of a two-dimensional array [R, width], one after the other. `place` is the index of the (first)
+element in the one-dimensional array. Bounds are not checked.
+
+Each `@intrinsic` describes a function of kernels, whose arguments follow `typing`; it returns the signature of this
+function, and the code generator `emit` that writes its LLVM instructions.
 """
 
 from __future__ import annotations
@@ -15,7 +20,12 @@ _LONG = ir.IntType(64)
 
 
 def _pointer(context, builder, array, place, kind=None):
-    """Address of an element of a contiguous one-dimensional array; arguments are (type, value) pairs."""
+    """Return the address of an element of a contiguous one-dimensional array.
+
+    Args:
+        array, place: (numba type, LLVM value) pairs of the array and of the index.
+        kind: LLVM type to which the address points; None: the type of the elements.
+    """
     data = context.make_array(array[0])(context, builder, array[1]).data
     pointer = builder.gep(data, [context.cast(builder, place[1], place[0], types.intp)])
     return pointer if kind is None else builder.bitcast(pointer, kind.as_pointer())
@@ -23,7 +33,7 @@ def _pointer(context, builder, array, place, kind=None):
 
 @intrinsic
 def splat_at(typing, array, place):
-    """One element of a float32 array in every lane."""
+    """Load one element of a float32 array, and return a vector with a copy of it in every lane."""
 
     def emit(context, builder, sig, args):
         return copies(builder, FLOATS, builder.load(_pointer(context, builder, *zip(sig.args, args, strict=True))))
@@ -33,7 +43,7 @@ def splat_at(typing, array, place):
 
 @intrinsic
 def load(typing, array, place):
-    """LANES consecutive elements of a float32 array."""
+    """Load LANES consecutive elements of a float32 array, from `place` on."""
 
     def emit(context, builder, sig, args):
         return builder.load(_pointer(context, builder, *zip(sig.args, args, strict=True), FLOATS), align=4)
@@ -43,7 +53,7 @@ def load(typing, array, place):
 
 @intrinsic
 def store(typing, array, place, value):
-    """Write LANES consecutive elements."""
+    """Write a vector to LANES consecutive elements of a float32 array, from `place` on."""
 
     def emit(context, builder, sig, args):
         at = _pointer(context, builder, (sig.args[0], args[0]), (sig.args[1], args[1]), FLOATS)
@@ -54,7 +64,13 @@ def store(typing, array, place, value):
 
 
 def _element(context, builder, kinds, values, lane: int):
-    """Address of [row + lane, column] of a flat array [R, width], given as array, width, column, row (and last row)."""
+    """Return the address of the element [row + lane, column] of a flat array [R, width].
+
+    Args:
+        kinds, values: numba types and LLVM values of the array, width, column, row and, optionally, the last row. Rows
+            after the last row are replaced by the last row.
+        lane: constant added to the row.
+    """
     data = context.make_array(kinds[0])(context, builder, values[0]).data
     pairs = zip(values[1:], kinds[1:], strict=True)
     width, column, row, *last = (context.cast(builder, value, kind, types.intp) for value, kind in pairs)
@@ -66,7 +82,12 @@ def _element(context, builder, kinds, values, lane: int):
 
 @intrinsic
 def load_column(typing, array, width, column, row, last):
-    """One column of LANES consecutive rows of a float32 array [R, width] (flat); rows after `last` repeat it."""
+    """Load one column of LANES consecutive rows of a float32 array [R, width] (flat).
+
+    Args:
+        row: the first of these rows.
+        last: the last row of the array. Rows after it are replaced by it, so that nothing outside the array is read.
+    """
 
     def emit(context, builder, sig, args):
         value = ir.Constant(FLOATS, ir.Undefined)
@@ -80,7 +101,7 @@ def load_column(typing, array, width, column, row, last):
 
 @intrinsic
 def store_column(typing, array, width, column, row, value):
-    """Write one column of LANES consecutive rows of a float32 array [R, width] (flat)."""
+    """Write a vector to one column of LANES consecutive rows, from `row` on, of a float32 array [R, width] (flat)."""
 
     def emit(context, builder, sig, args):
         for lane in range(LANES):
@@ -93,7 +114,7 @@ def store_column(typing, array, width, column, row, value):
 
 @intrinsic
 def load_mask(typing, array, place):
-    """A mask of the nonzero ones among LANES consecutive elements of an int32 array."""
+    """Load LANES consecutive elements of an int32 array, and return a mask that is set where they are not 0."""
 
     def emit(context, builder, sig, args):
         value = builder.load(_pointer(context, builder, *zip(sig.args, args, strict=True), INTS), align=4)
@@ -104,7 +125,7 @@ def load_mask(typing, array, place):
 
 @intrinsic
 def store_whole(typing, array, place, value):
-    """Write LANES consecutive elements of an int32 array; values are truncated."""
+    """Write a float32 vector to LANES consecutive elements of an int32 array; fractions are cut off."""
 
     def emit(context, builder, sig, args):
         at = _pointer(context, builder, (sig.args[0], args[0]), (sig.args[1], args[1]), INTS)
@@ -116,7 +137,10 @@ def store_whole(typing, array, place, value):
 
 @intrinsic
 def prefetch(typing, array, place):
-    """Prefetch the cache line of an element that is needed soon; only a hint, so any index is allowed."""
+    """Load the cache line of an element that is needed soon into the cache.
+
+    This is only a hint to the processor, so `place` may also lie outside the array.
+    """
 
     def emit(context, builder, sig, args):
         pointer = _pointer(context, builder, *zip(sig.args, args, strict=True), ir.IntType(8))
@@ -129,11 +153,16 @@ def prefetch(typing, array, place):
 
 
 def _indices(places) -> ir.Constant:
+    """Return the lanes that a shuffle picks, as an LLVM constant; lanes from LANES on belong to its second vector."""
     return ir.Constant(INTS, list(places))
 
 
 def _fold(builder, x, y, unit: int, span: int):
-    """For each span of lanes: the sums of neighbouring units of x, then those of y."""
+    """Add neighbouring groups of lanes of two vectors, so that one vector holds the sums of both.
+
+    Within each `span` of lanes, every two neighbouring groups of `unit` lanes are added element by element. In the
+    result the sums of x come first in each span, and the sums of y follow.
+    """
     even = [
         source + start + at
         for start in range(0, LANES, span)
@@ -146,7 +175,7 @@ def _fold(builder, x, y, unit: int, span: int):
 
 
 def _totals(builder, vectors: list):
-    """One vector: lane k is the sum over the lanes of vector k."""
+    """Return one vector, whose lane k is the sum over the lanes of vector k; 0 in lanes without a vector."""
     rows = vectors + [ir.Constant(FLOATS, [0.0] * LANES)] * (LANES - len(vectors))
     steps = [(1, 4), (1, 4)] + [(4, LANES)] * (LANES.bit_length() - 3)
     for unit, span in steps:
@@ -156,7 +185,10 @@ def _totals(builder, vectors: list):
 
 @intrinsic
 def store_totals(typing, array, place, vectors):
-    """Write the sums over lanes of each vector of a tuple; zeros up to the next multiple of LANES."""
+    """Write the sum over the lanes of each vector of a tuple to consecutive elements of a float32 array.
+
+    Zeros follow up to the next multiple of LANES elements.
+    """
 
     def emit(context, builder, sig, args):
         rows = [builder.extract_value(args[2], i) for i in range(len(sig.args[2]))]
@@ -170,11 +202,12 @@ def store_totals(typing, array, place, vectors):
 
 
 def _transposed(builder, rows: list) -> list:
-    """Transpose LANES vectors: lane k of vector i becomes lane i of vector k."""
+    """Return LANES vectors transposed: lane k of vector i becomes lane i of vector k."""
     fours = range(0, LANES, 4)
     take = lambda x, y, places: builder.shuffle_vector(x, y, _indices(places))
     pick = lambda x, y, a, b, c, d: take(x, y, [g + i for g in fours for i in (a, b, c, d)])
-    blocks = []  # for each four rows, vectors with columns 0, 4, ... of them; then 1, 5, ...; and so on
+    # Four vectors for each four rows: the first holds the rows' columns 0, 4, ..., the second the columns 1, 5, ...
+    blocks = []
     for k in fours:
         low = [pick(rows[i], rows[i + 1], 0, LANES, 1, LANES + 1) for i in (k, k + 2)]
         high = [pick(rows[i], rows[i + 1], 2, LANES + 2, 3, LANES + 3) for i in (k, k + 2)]
@@ -193,9 +226,12 @@ def _transposed(builder, rows: list) -> list:
 
 @intrinsic
 def load_columns(typing, array, width, column, row, last, columns, place):
-    """Copy LANES columns of LANES rows of a float32 array [R, width] (flat), one after the other, into `columns`.
+    """Copy a block of LANES rows and LANES columns of a float32 array [R, width] (flat) into `columns`, transposed.
 
-    Rows after `last` repeat it.
+    Args:
+        column, row: first column and first row of the block.
+        last: the last row of the array. Rows after it are replaced by it, so that nothing outside the array is read.
+        columns: float32 array, output: from `place` on it holds the columns one after the other, LANES numbers each.
     """
 
     def emit(context, builder, sig, args):
@@ -214,7 +250,7 @@ def load_columns(typing, array, width, column, row, last, columns, place):
 
 @intrinsic
 def store_columns(typing, array, width, column, row, columns, place):
-    """The inverse of `load_columns`: write LANES columns of LANES rows from `columns`."""
+    """Write a block of LANES rows and LANES columns from `columns`, the inverse of `load_columns`."""
 
     def emit(context, builder, sig, args):
         source = _pointer(context, builder, (sig.args[4], args[4]), (sig.args[5], args[5]))
@@ -232,7 +268,7 @@ def store_columns(typing, array, width, column, row, columns, place):
 
 @intrinsic
 def total(typing, x):
-    """Sum over the lanes."""
+    """Return the sum over the lanes of a float32 vector, as a number."""
 
     def emit(context, builder, sig, args):
         return builder.extract_element(_totals(builder, [args[0]]), INT(0))

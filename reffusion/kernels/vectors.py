@@ -1,10 +1,14 @@
-"""A few float32 or float64 lanes as one numba value, a thin layer over LLVM vectors.
+"""Vectors of LANES numbers as values of numba kernels, a thin layer over LLVM vectors.
 
-numba's loops are vectorised only when LLVM finds it safe and worthwhile, which it does not for blending. These few
-operations say it outright; the compiler turns them into AVX-512, AVX2 or SSE instructions. There are LANES to a value:
-sixteen where the processor has AVX-512, else eight.
+A *lane* is one number of a vector. LANES is sixteen if the processor has AVX-512, else eight. The types are `lanes`
+(float32), `wide` (float64) and `lane_mask` (a bit per lane). LLVM vectorises a loop only if it finds this safe and
+worthwhile, which it does not for blending. With these operations a kernel is vectorised explicitly; the compiler turns
+them into AVX-512, AVX2 or SSE instructions.
 
-Operators work lane by lane, a number on one side standing for as many copies; comparisons give masks.
+Operators work lane by lane. If one side is a number, each lane uses this number. Comparisons return masks.
+
+Each `@intrinsic` describes a function of kernels, whose arguments follow `typing`; it returns the signature of this
+function, and the code generator `emit` that writes its LLVM instructions.
 """
 
 from __future__ import annotations
@@ -22,7 +26,7 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 
 
 def _has_avx512() -> bool:
-    """Does numba compile for AVX-512? NUMBA_CPU_FEATURES overrides the processor."""
+    """Return whether numba compiles for AVX-512; NUMBA_CPU_FEATURES overrides what the processor has."""
     if config.CPU_FEATURES is not None:
         return "+avx512f" in config.CPU_FEATURES.split(",")
     return llvmlite.binding.get_host_cpu_features().get("avx512f", False)
@@ -37,14 +41,16 @@ LONGS = ir.VectorType(ir.IntType(64), LANES)
 _BITS = ir.VectorType(ir.IntType(1), LANES)
 INT = ir.IntType(32)
 
-ROUND = 1.5 * 2.0**23  # added to a small float32, leaves the nearest integer in the low bits
-# Minimax polynomial of degree 5 for 2^f on [-0.5, 0.5]: relative error 7.5e-8, 2.1e-7 with float32 rounding.
+ROUND = 1.5 * 2.0**23  # the sum of this and a small float32 has the nearest integer in its low bits
+# Coefficients of the minimax polynomial of degree 5 for 2^f on [-0.5, 0.5], lowest power first. Its relative error is
+# 7.5e-8, and 2.1e-7 with float32 rounding.
 EXP2 = (1.0000000717, 0.6931469671, 0.2402211972, 0.0555071327, 0.0096755413, 0.0013276472)
-_EXP2_DOUBLE = tuple(math.log(2) ** k / math.factorial(k) for k in range(13))  # series: 2e-16 on [-0.5, 0.5]
+# Taylor coefficients of 2^f, lowest power first; the relative error on [-0.5, 0.5] is 2e-16.
+_EXP2_DOUBLE = tuple(math.log(2) ** k / math.factorial(k) for k in range(13))
 
 
 class _Vector(types.Type):
-    """`lanes`, `wide` or `lane_mask`."""
+    """The numba type of a vector; its instances are `lanes`, `wide` and `lane_mask`."""
 
 
 lanes, wide, lane_mask = _Vector(f"float32x{LANES}"), _Vector(f"float64x{LANES}"), _Vector(f"boolx{LANES}")
@@ -58,13 +64,14 @@ class _VectorModel(models.PrimitiveModel):
 
 
 def _constant(kind: ir.VectorType, value: float) -> ir.Constant:
+    """Return an LLVM vector of type `kind` with `value` in every lane."""
     if kind.element == ir.FloatType():
         value = float(np.float32(value))
     return ir.Constant(kind, [value] * LANES)
 
 
 def _call(builder, name: str, *arguments):
-    """An LLVM intrinsic on whole vectors, all of one type."""
+    """Call the LLVM intrinsic `name` on whole vectors; the arguments and the result have one type."""
     kind = arguments[0].type
     name = f"llvm.{name}.v{LANES}f{32 if kind == FLOATS else 64}"
     function_type = ir.FunctionType(kind, [kind] * len(arguments))
@@ -72,17 +79,23 @@ def _call(builder, name: str, *arguments):
 
 
 def _fma(builder, x, y, z):
-    """Multiply-add, fused if the processor supports it."""
+    """Return x y + z, as a fused multiply-add if the processor supports it."""
     return _call(builder, "fmuladd", x, y, z)
 
 
 def copies(builder, kind: ir.VectorType, number):
+    """Return an LLVM vector of type `kind` with `number` in every lane."""
     one = builder.insert_element(ir.Constant(kind, ir.Undefined), number, INT(0))
     return builder.shuffle_vector(one, ir.Constant(kind, ir.Undefined), ir.Constant(INTS, [0] * LANES))
 
 
 def _as_vector(context, builder, value, have, want):
-    """A vector unchanged, or a number copied to all lanes."""
+    """Return a vector of type `want`: `value` itself if it has this type, else the number `value` in every lane.
+
+    Args:
+        have: numba type of `value`.
+        want: `lanes` or `wide`, or the type of `value`.
+    """
     if have == want:
         return value
     number = types.float32 if want == lanes else types.float64
@@ -90,7 +103,14 @@ def _as_vector(context, builder, value, have, want):
 
 
 def _register_operator(symbol, emit, kind, result):
-    """Register the operator `left symbol right` in numba for vectors of a kind; either side may be a number."""
+    """Register a binary operator in numba for vectors; on one of its sides a number may stand instead (not for masks).
+
+    Args:
+        symbol: function of the module `operator`, such as `operator.add`.
+        emit: emit(builder, x, y) writes the LLVM instruction and returns its result.
+        kind: type of the vectors.
+        result: type of the result.
+    """
     pairs = [(kind, kind)]
     if kind != lane_mask:
         pairs += [pair for number in (types.float32, types.float64) for pair in ((kind, number), (number, kind))]
@@ -121,7 +141,7 @@ _register_operator(operator.and_, lambda b, x, y: b.and_(x, y), lane_mask, lane_
 
 @intrinsic
 def splat(typing, value):
-    """The same float32 in every lane."""
+    """Return a float32 vector with the number `value` in every lane."""
 
     def emit(context, builder, sig, args):
         return _as_vector(context, builder, args[0], sig.args[0], lanes)
@@ -131,7 +151,7 @@ def splat(typing, value):
 
 @intrinsic
 def ramp(typing):
-    """0, 1, ... LANES - 1."""
+    """Return the float32 vector 0, 1, ... LANES - 1."""
 
     def emit(context, builder, sig, args):
         return ir.Constant(FLOATS, [float(i) for i in range(LANES)])
@@ -141,7 +161,7 @@ def ramp(typing):
 
 @intrinsic
 def fma(typing, x, y, z):
-    """x y + z, rounded once if the processor supports it."""
+    """Return x y + z, rounded once if the processor supports it, else twice."""
 
     def emit(context, builder, sig, args):
         return _fma(builder, *args)
@@ -151,7 +171,7 @@ def fma(typing, x, y, z):
 
 @intrinsic
 def fnma(typing, x, y, z):
-    """z - x y, rounded once if the processor supports it."""
+    """Return z - x y, rounded once if the processor supports it, else twice."""
 
     def emit(context, builder, sig, args):
         return _fma(builder, builder.fneg(args[0]), args[1], args[2])
@@ -161,7 +181,7 @@ def fnma(typing, x, y, z):
 
 @intrinsic
 def minimum(typing, x, y):
-    """The smaller value; y where x is NaN."""
+    """Return the smaller of x and y in each lane; y where either is NaN. y may be a number."""
 
     def emit(context, builder, sig, args):
         both = [_as_vector(context, builder, value, have, x) for value, have in zip(args, sig.args, strict=True)]
@@ -172,7 +192,7 @@ def minimum(typing, x, y):
 
 @intrinsic
 def maximum(typing, x, y):
-    """The larger value; y where x is NaN."""
+    """Return the larger of x and y in each lane; y where either is NaN. y may be a number."""
 
     def emit(context, builder, sig, args):
         both = [_as_vector(context, builder, value, have, x) for value, have in zip(args, sig.args, strict=True)]
@@ -183,7 +203,7 @@ def maximum(typing, x, y):
 
 @intrinsic
 def root(typing, x):
-    """Square root."""
+    """Return the square root of each lane."""
 
     def emit(context, builder, sig, args):
         return _call(builder, "sqrt", args[0])
@@ -193,7 +213,7 @@ def root(typing, x):
 
 @intrinsic
 def ceiling(typing, x):
-    """The value rounded up."""
+    """Return each lane rounded up to an integer."""
 
     def emit(context, builder, sig, args):
         return _call(builder, "ceil", args[0])
@@ -203,7 +223,7 @@ def ceiling(typing, x):
 
 @intrinsic
 def select(typing, mask, x, y):
-    """x where the mask is set, else y; one of both may be a number."""
+    """Return x in the lanes where the mask is set, and y in all other lanes; one of x and y may be a number."""
     kind = x if isinstance(x, _Vector) else y
 
     def emit(context, builder, sig, args):
@@ -217,7 +237,7 @@ def select(typing, mask, x, y):
 
 @intrinsic
 def any_lane(typing, mask):
-    """Is any lane of the mask set?"""
+    """Return whether any lane of the mask is set."""
 
     def emit(context, builder, sig, args):
         bits = builder.bitcast(args[0], ir.IntType(LANES))
@@ -228,7 +248,7 @@ def any_lane(typing, mask):
 
 @intrinsic
 def widen(typing, x):
-    """float32 lanes converted to float64."""
+    """Return a float32 vector converted to float64."""
 
     def emit(context, builder, sig, args):
         return builder.fpext(args[0], DOUBLES)
@@ -238,7 +258,7 @@ def widen(typing, x):
 
 @intrinsic
 def narrow(typing, x):
-    """float64 lanes rounded to float32."""
+    """Return a float64 vector rounded to float32."""
 
     def emit(context, builder, sig, args):
         return builder.fptrunc(args[0], FLOATS)
@@ -248,7 +268,12 @@ def narrow(typing, x):
 
 @intrinsic
 def times_power(typing, x, rounded):
-    """x 2^n of float32 lanes, where `rounded` is n + ROUND."""
+    """Return x 2^n in each lane of a float32 vector, by adding n to the exponent of x.
+
+    Args:
+        x: float32 vector.
+        rounded: float32 vector n + ROUND, with integers n in its low bits.
+    """
 
     def emit(context, builder, sig, args):
         exponent = builder.shl(builder.bitcast(args[1], INTS), ir.Constant(INTS, [23] * LANES))
@@ -259,7 +284,7 @@ def times_power(typing, x, rounded):
 
 @intrinsic
 def exp2(typing, x):
-    """2^x of float64 lanes in [-1022, 1023]; undefined (without a trap) outside."""
+    """Return 2^x of a float64 vector in [-1022, 1023]; outside the result is undefined, without a trap."""
 
     def emit(context, builder, sig, args):
         magic, value = _constant(DOUBLES, 1.5 * 2.0**52), _constant(DOUBLES, _EXP2_DOUBLE[-1])
@@ -275,12 +300,12 @@ def exp2(typing, x):
 
 @intrinsic
 def log2(typing, x):
-    """log2 of positive normal float64 lanes; undefined (without a trap) elsewhere."""
+    """Return log2(x) of a float64 vector of positive normal numbers; elsewhere it is undefined, without a trap."""
 
     def emit(context, builder, sig, args):
         number = lambda value: ir.Constant(LONGS, [int(np.float64(value).view(np.int64))] * LANES)
         bits = builder.bitcast(args[0], LONGS)
-        # x = 2^e m with m between sqrt(1/2) and sqrt(2); ln m = 2 artanh s, s = (m - 1) / (m + 1)
+        # x = 2^e m with m between sqrt(1/2) and sqrt(2); ln m = 2 artanh s with s = (m - 1) / (m + 1), by its series.
         e = builder.ashr(builder.sub(bits, number(math.sqrt(0.5))), ir.Constant(LONGS, [52] * LANES))
         m = builder.bitcast(builder.sub(bits, builder.shl(e, ir.Constant(LONGS, [52] * LANES))), DOUBLES)
         one, magic = _constant(DOUBLES, 1.0), 1.5 * 2.0**52
@@ -296,7 +321,7 @@ def log2(typing, x):
 
 @intrinsic
 def take_ticket(typing, counter):
-    """Add 1 to counter[0] (int64) atomically and return its former value."""
+    """Return counter[0] (int64) and atomically add 1 to it, so that no two threads get the same number."""
 
     def emit(context, builder, sig, args):
         data = context.make_array(sig.args[0])(context, builder, args[0]).data

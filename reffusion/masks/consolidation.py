@@ -1,4 +1,9 @@
-"""Consistent masks: label the object's Gaussians, render them, and split each view's mask into pixel classes."""
+"""Consistent masks and pixel classes: label the object's Gaussians, render the labels, and classify each view's pixels.
+
+The pixel classes of a view (`MaskSet`) are: C, the consistent mask, where the view shows the object; U, the pixels of C
+whose background no other photograph shows; I, the pixels to be invented. A *clean* view was photographed without the
+object.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +26,9 @@ from reffusion.masks.voting import Votes
 from reffusion.params.masks import Params
 from reffusion.types import Camera, Gaussians, MaskSet, Scene
 
-UNSEEN_WEIGHT = 0.1  # blending weight over all views up to which a Gaussian is labelled by its position
-ISLAND, GAP = 0.01, 0.02  # of the image's width: smaller islands of a mask are dropped, smaller holes filled
-MAX_PARALLEL = 4  # views, each with its pixels as points in memory
+UNSEEN_WEIGHT = 0.1  # px, total blending weight in all views up to which a Gaussian is labelled by its position
+ISLAND, GAP = 0.01, 0.02  # of the image's width: smaller islands of a mask are removed, smaller holes filled
+MAX_PARALLEL = 4  # number of views processed at once; each holds its pixels as points in memory
 
 
 def label_object(
@@ -33,39 +38,62 @@ def label_object(
     ballots: Mapping[str, np.ndarray],
     region: Region | None,
 ) -> Tensor:
-    """bool [N], the Gaussians of the object: by votes of the masks; without masks by the region that holds it.
+    """Label the Gaussians of the object: by votes of the raw masks, or without masks by a region in space.
 
     Args:
-        cameras: the training views. ballots: view name -> bool [H, W], raw masks of the views that vote.
+        params: parameters of the stage `masks`.
+        gaussians: the N Gaussians of the whole scene.
+        cameras: the training views.
+        ballots: view name -> bool [H, W], raw masks of the views that vote, True at pixels of the object. Empty if the
+            scene has no masks.
+        region: region of space that the scene names; None if it names none.
+
+    Returns:
+        bool [N], True for the Gaussians of the object. All are False if there are neither masks nor a region that holds
+        the object.
     """
     if not ballots:
         if region is None or not region.holds:
             return torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
         return regions.inside_region(gaussians, region)
-    # Whether a Gaussian is seen at all is measured by weight, whatever the votes count.
+    # Blending weights tell whether a Gaussian is seen at all, also if the votes are counts.
     weights = voting.cast_votes(gaussians, cameras, ballots, mode="weight")
     votes = weights if params.vote == "weight" else voting.cast_votes(gaussians, cameras, ballots, mode=params.vote)
     labels = voting.label_gaussians(votes, params.tau)
-    # What hardly any view sees, inside the object or in the wall behind it, is labelled by its position. PAPER leaves
-    # open: the ratio of 0 to 0, of Gaussians that no view sees.
+    # Gaussians that hardly any view sees, e.g. inside the object or in the wall behind the object, are labelled by
+    # their position. PAPER leaves open: the ratio of votes 0 / 0 of Gaussians that no view sees.
     unseen = _total(weights) <= (UNSEEN_WEIGHT if params.tidy else 0)
     return labels | (unseen & voting.hidden_inside(gaussians, cameras, ballots))
 
 
 def _total(votes: Votes) -> Tensor:
+    """Return [N], the sum of the votes of masked and unmasked pixels."""
     return votes.masked + votes.unmasked
 
 
 def render_consistent_masks(
     params: Params, gaussians: Gaussians, labels: Tensor, cameras: Mapping[str, Camera]
 ) -> dict[str, np.ndarray]:
-    """View name -> bool [H, W], the consistent mask C: where the rendered labels exceed tau'."""
+    """Render the consistent mask C of each view: the pixels where the rendered labels exceed tau'.
+
+    Args:
+        params: sets the threshold tau' (`tau_rendered`).
+        gaussians: the N Gaussians of the whole scene.
+        labels: bool [N], True for the Gaussians of the object.
+        cameras: view name -> camera.
+
+    Returns:
+        View name -> bool [H, W].
+    """
     shares = {name: voting.render_labels(gaussians, labels, camera) for name, camera in cameras.items()}
     return {name: clean_mask(params, share > params.tau_rendered) for name, share in shares.items()}
 
 
 def clean_mask(params: Params, mask: np.ndarray) -> np.ndarray:
-    """The mask, bool [H, W], without small islands and holes, if `params.tidy`."""
+    """Remove small islands from a mask, bool [H, W], and fill small holes.
+
+    If `params.tidy` is False, the mask is returned unchanged.
+    """
     width = mask.shape[1]
     return morphology.remove_small_parts(mask, ISLAND * width, GAP * width) if params.tidy else mask
 
@@ -79,7 +107,22 @@ def classify_pixels(
     background: Background,
     fill: FillRequest,
 ) -> dict[str, MaskSet]:
-    """View name -> its pixel classes: what other views show behind the object is observed, and not invented."""
+    """Split the consistent mask of each view into observed and unobserved pixels, and select the pixels to invent.
+
+    Unobserved pixels are invented (with `params.invent` "consistent": all of C), as well as the pixels that the scene
+    asks to fill. In a clean view no pixel is unobserved.
+
+    Args:
+        params: parameters of the stage `masks`.
+        remaining: the Gaussians of the scene without the removed ones.
+        raw: view name -> bool [H, W], the given masks; views without a mask have no entry.
+        consistent: view name -> bool [H, W], the consistent mask C of every view.
+        background: the surroundings of the object.
+        fill: the pixels that the scene asks to fill.
+
+    Returns:
+        View name -> pixel classes, for every view of the scene.
+    """
     names = list(scene.cameras)
 
     def classify(name: str) -> MaskSet:
@@ -97,8 +140,19 @@ def classify_pixels(
 def add_uncaptured_pixels(
     params: Params, scene: Scene, gaussians: Gaussians, hidden: Mapping[str, np.ndarray], sets: Mapping[str, MaskSet]
 ) -> dict[str, MaskSet]:
-    """View name -> the pixel classes of the views without a photograph: what they show and no photograph does is
-    unobserved, and invented."""
+    """Extend the pixel classes of the views without a photograph by the pixels that no photograph shows.
+
+    These pixels are added to C, U and I, so they are invented.
+
+    Args:
+        params: parameters of the stage `masks`.
+        gaussians: the Gaussians of the whole scene with the object.
+        hidden: view name -> bool [H, W], True at pixels that show the object.
+        sets: view name -> pixel classes, as `classify_pixels` returns them.
+
+    Returns:
+        View name -> extended pixel classes, of the views without a photograph only.
+    """
     if not scene.blank:
         return {}
     seen_by = training_coverage.render_coverage_views(gaussians, [scene.cameras[name] for name in scene.train], hidden)
@@ -113,17 +167,32 @@ def add_uncaptured_pixels(
 def drop_negligible(
     params: Params, sets: Mapping[str, MaskSet], names: Sequence[str], fill: FillRequest
 ) -> dict[str, MaskSet]:
-    """The pixel classes with nothing to invent where the unobserved share of C over the views `names` is negligible."""
+    """Clear the invent masks of all views if the unobserved share of C is negligible.
+
+    The share is that of `unobserved_share`, and `params.negligible` is its limit. Nothing is cleared if all of C is to
+    be invented (`params.invent` "consistent"), or if the scene asks to fill pixels.
+
+    Args:
+        names: the views over which the share is computed.
+        fill: the pixels that the scene asks to fill.
+    """
     if params.invent == "consistent" or fill or unobserved_share(sets, names) > params.negligible:
         return dict(sets)
     return {name: replace(each, invent=np.zeros_like(each.invent)) for name, each in sets.items()}
 
 
 def count_pixels(kind: str, sets: Mapping[str, MaskSet], names: Sequence[str]) -> int:
-    """Pixels of a class, e.g. "invent", over the views `names`."""
+    """Return the number of pixels of a class in the views `names`, all together.
+
+    Args:
+        kind: an attribute of `MaskSet`, e.g. "invent".
+    """
     return int(sum(np.count_nonzero(getattr(sets[name], kind)) for name in names))
 
 
 def unobserved_share(sets: Mapping[str, MaskSet], names: Sequence[str]) -> float:
-    """Share of the consistent masks' pixels behind which no photograph shows the background, over the views `names`."""
+    """Return the share of the consistent masks' pixels that are unobserved, in [0, 1], over the views `names`.
+
+    Behind an unobserved pixel no photograph shows the background.
+    """
     return count_pixels("unobserved", sets, names) / max(count_pixels("consistent", sets, names), 1)

@@ -1,4 +1,4 @@
-"""Debris: Gaussians that come to light when the object is removed, and that no photograph supports."""
+"""Debris: Gaussians that the object hides, that become visible when it is removed, and that no photograph supports."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from reffusion.splat import rasterizer
 from reffusion.splat.pure_torch import colors
 from reffusion.types import Gaussians
 
-COLOR_MARGIN = 10.0  # of 255: a Gaussian beyond the colours around its pixel by more than this has another colour
-ROUGH = 1.05  # farthest over nearest depth around a point from which a surface is rough
-MISMATCH_SHARE = 0.5  # of the views that see a Gaussian, those in which its colour must differ for it to be debris
+COLOR_MARGIN = 10.0  # levels of 255: a colour differs if it is further outside the range of colours around the pixel
+ROUGH = 1.05  # ratio of farthest to nearest depth around a point above which the surface is rough
+MISMATCH_SHARE = 0.5  # a Gaussian is debris if its colour differs in a larger share of the views that see it
 
 
 @torch.no_grad()
@@ -27,15 +27,24 @@ def find_debris(
     masks: Mapping[str, np.ndarray],
     photos: Mapping[str, np.ndarray],
 ) -> torch.Tensor:
-    """bool [N]: Gaussians that removing the object uncovers and that no photograph supports.
+    """Find the Gaussians that removing the object uncovers and that no photograph supports.
 
-    They lie inside the object or in its shadow, where the fit was not supervised. Without the object they contribute
-    more to masked pixels than they ever did to unmasked ones, and where other views can check, there is free space or a
-    surface of another colour.
+    Such Gaussians lie inside or behind the object, where no photograph supervised the fit. A Gaussian is debris if it
+    meets two conditions. First, its blending weight in masked pixels, rendered without the object, exceeds 0.5 px in
+    all views together, and also exceeds its blending weight in unmasked pixels, rendered with the object. Second, the
+    number of views that show a surface at the Gaussian does not exceed the number of views that see past the Gaussian,
+    or most of the views that show a surface there show a rough surface of another colour. A Gaussian that no view can
+    check meets the second condition, too.
 
     Args:
-        gaussians: N of them, with the object. labels: [N] bool, the object's.
-        masks: view name -> bool [H, W], C. photos: view name -> uint8 [H, W, 3], in the exposure of the Gaussians.
+        gaussians: the N Gaussians of the whole scene, with the object.
+        labels: bool [N], True for the Gaussians of the object.
+        views: depth of the training views, rendered with the object.
+        masks: view name -> bool [H, W], the consistent masks C, True at pixels that show the object.
+        photos: view name -> uint8 [H, W, 3], the photographs in the exposure of the Gaussians.
+
+    Returns:
+        bool [N], True for debris; the Gaussians of the object are False.
     """
     remaining = gaussians.map(lambda p: p[~labels])
     uncovered, supervised = torch.zeros(len(remaining)), torch.zeros(len(remaining))
@@ -57,9 +66,15 @@ def find_debris(
 def count_color_mismatches(
     gaussians: Gaussians, views: Sequence[DepthView], photos: Mapping[str, np.ndarray]
 ) -> np.ndarray:
-    """[N]: the number of views that show a surface at a Gaussian, but in another colour than its own.
+    """Return int64 [N], for each Gaussian the number of views that show a rough surface of another colour there.
 
-    Only rough surfaces count. On a smooth one the position is evidence enough, and its colour may be view-dependent.
+    Smooth surfaces do not count: a Gaussian on a smooth surface is confirmed by its position, and its colour may be
+    view-dependent.
+
+    Args:
+        gaussians: N Gaussians.
+        views: depth of the training views, rendered with the object.
+        photos: view name -> uint8 [H, W, 3], the photographs in the exposure of the Gaussians.
     """
     points, found = gaussians.means.double().cpu().numpy(), np.zeros(len(gaussians), np.int64)
     for view in views:

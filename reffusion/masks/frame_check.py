@@ -1,4 +1,4 @@
-"""Check that Gaussians from elsewhere lie in the frame of the scene's cameras."""
+"""The check that Gaussians which the scene provides lie in the same coordinate frame as its cameras."""
 
 from __future__ import annotations
 
@@ -11,20 +11,24 @@ import torch
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
-WIDTH_PX = 160  # at which renders and photographs are compared
-LOW_PASS = 0.06  # of the width: coarser structure, such as sky above ground, agrees in any two pictures
-MIN_CORRELATION = 0.3  # of the rest; above 0.8 where the frame is right
-MIN_COVERAGE = 0.2  # share of a view's pixels that must show something
+WIDTH_PX = 160  # width of the images at which renderings and photographs are compared
+LOW_PASS = 0.06  # of the width: coarser structure is removed, because e.g. sky above ground agrees in any two pictures
+MIN_CORRELATION = 0.3  # least correlation of the finer structure; in the right frame it is above 0.8
+MIN_COVERAGE = 0.2  # least share of a view's pixels that must show Gaussians
 
 
 @torch.no_grad()
 def explain_misplacement(
     gaussians: Gaussians, cameras: Sequence[Camera], photos: Mapping[str, np.ndarray]
 ) -> str | None:
-    """A sentence about what is wrong; None where most cameras see what their photographs show.
+    """Compare renderings of the Gaussians with photographs, and explain why the Gaussians seem to be misplaced.
 
     Args:
+        cameras: some of the training views.
         photos: view name -> uint8 [H, W, 3].
+
+    Returns:
+        A sentence that states the problem; None if the median camera sees about what its photograph shows.
     """
     coverage, correlation = [], []
     for camera in cameras:
@@ -45,11 +49,12 @@ def explain_misplacement(
 
 
 def _detail(image: np.ndarray) -> np.ndarray:
-    """[h, w], brightness without coarse structure."""
+    """Return float32 [H, W], the brightness of an image [H, W, 3] without coarse structure."""
     gray = image.astype(np.float32).mean(-1)
     return gray - cv2.GaussianBlur(gray, (0, 0), LOW_PASS * gray.shape[1])
 
 
 def _correlate(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the normalised correlation of two images in [-1, 1]; 1 if one of them is zero everywhere."""
     scale = float(np.sqrt((a**2).sum() * (b**2).sum()))
     return float((a * b).sum()) / scale if scale > 0 else 1.0

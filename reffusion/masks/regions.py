@@ -1,4 +1,4 @@
-"""Regions in space to fill or to remove, and the masks that they have in the views."""
+"""Regions of space to fill or to remove, which the scene names, and their masks in the views."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torch import Tensor
 from reffusion import geometry, morphology
 from reffusion.types import Camera, Gaussians
 
-SHOWN = 0.1  # rendered label from which a pixel shows new Gaussians
-CLOSED = 0.008  # of the image's width: notches up to twice as wide are closed
+SHOWN = 0.1  # rendered label of new Gaussians above which a pixel shows them
+CLOSED = 0.008  # of the image's width: gaps up to twice as wide are closed
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,11 @@ class Region:
     """An axis-aligned box in the normalised frame, or the ellipsoid inscribed in it.
 
     Attributes:
-        center, size: [3] each, middle and side lengths.
-        round: it is the ellipsoid.
-        holds: it holds the object, and the Gaussians in it are removed; else it is only filled.
+        center: [3], the middle.
+        size: [3], the side lengths of the box.
+        round: True if the region is the ellipsoid.
+        holds: True if the region holds the object, so that the Gaussians inside are removed; False if the region is
+            only filled.
     """
 
     center: Sequence[float] | np.ndarray
@@ -33,10 +35,13 @@ class Region:
 
 @dataclass(frozen=True)
 class FillRequest:
-    """What is invented although photographs show something there.
+    """The pixels that the scene asks to fill: they are invented although photographs show something there.
+
+    A request for no pixels is False as a bool.
 
     Attributes:
-        region: of space, or None. masks: view name -> bool [H, W].
+        region: region of space to fill; None if there is none.
+        masks: view name -> bool [H, W], True at the pixels to fill in this view; other views have no entry.
     """
 
     region: Region | None
@@ -46,7 +51,12 @@ class FillRequest:
         return self.region is not None or bool(self.masks)
 
     def render(self, camera: Camera, depth: np.ndarray) -> np.ndarray:
-        """bool [H, W]: the pixels to fill in a view whose remaining surfaces, at `depth` [H, W], may occlude some."""
+        """Return bool [H, W], the pixels to fill in a view: those of its mask, and those that show the region.
+
+        Args:
+            camera: the view.
+            depth: [H, W], camera z of the remaining surfaces, which may occlude the region; 0 where there are none.
+        """
         mask = self.masks.get(camera.name, np.zeros(depth.shape, bool))
         if self.region is None:
             return mask
@@ -54,44 +64,66 @@ class FillRequest:
 
 
 def silhouette(region: Region, camera: Camera, disparity: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels whose ray meets the region in front of the surface of this disparity, [H, W]."""
+    """Return bool [H, W], the pixels whose rays meet the region before they meet the visible surface.
+
+    Args:
+        disparity: [H, W], 1 / camera z of the visible surface; 0 where there is no surface.
+    """
     near, far = _ray_interval(region, camera)
     return (far > np.maximum(near, 0.0)) & (np.maximum(near, 0.0) * disparity < 1.0)
 
 
 def outside_sphere(center: np.ndarray, radius: float, camera: Camera) -> np.ndarray:
-    """bool [H, W]: pixels whose ray misses a sphere in front of the camera (the paper's inverse masks, section 5.4)."""
+    """Return bool [H, W], the pixels whose rays miss a sphere (the paper's inverse masks, section 5.4).
+
+    A ray starts at the camera's centre, so all rays miss a sphere behind the camera.
+
+    Args:
+        center: [3], in world coordinates.
+        radius: in world units.
+    """
     return ~silhouette(Region(center, [2 * radius] * 3, True), camera, np.zeros((camera.height, camera.width)))
 
 
 def point_on_axis(camera: Camera, distance: float) -> np.ndarray:
-    """[3], the point at this distance along the optical axis."""
+    """Return [3], the world point on the camera's optical axis at this distance in front of the camera's centre."""
     return camera.center + distance * camera.world_to_camera[2, :3]
 
 
 def inside_region(gaussians: Gaussians, region: Region) -> Tensor:
-    """bool [N]: Gaussians whose centre lies in the region."""
+    """Return bool [N], True for the Gaussians whose means lie in the region."""
     middle, sides = (gaussians.means.new_tensor(np.asarray(each)) for each in (region.center, region.size))
     delta = (gaussians.means - middle) / (sides / 2)
     return (delta**2).sum(-1) <= 1 if region.round else (delta.abs() <= 1).all(-1)
 
 
 def restrict_to_new(invent: np.ndarray, consistent: np.ndarray, new_share: np.ndarray) -> np.ndarray:
-    """bool [H, W]: I of a view once the references' pixels are in the scene.
+    """Restrict the invent mask I of a view to C and to the pixels that show new Gaussians.
 
-    PAPER leaves open: where a region is filled over what remains, only what a reference drew is repainted;
-    photographs know the rest of it.
+    This happens once the references are in the scene as new Gaussians. C are the pixels of the removed object. Outside
+    C, a region that the scene asks to fill also covers pixels at which the references inserted nothing.
+
+    PAPER leaves open: where a region is filled in front of remaining surfaces, only the pixels that a reference drew
+    are repainted. Photographs show the other pixels of the region.
 
     Args:
-        invent, consistent: bool [H, W], I and C.
+        invent: bool [H, W], I.
+        consistent: bool [H, W], C.
         new_share: [H, W] in [0, 1), the rendered labels of the new Gaussians.
+
+    Returns:
+        bool [H, W], the restricted I.
     """
     closed = ~morphology.dilate(~morphology.dilate(new_share > SHOWN, CLOSED), CLOSED)
     return invent & (consistent | closed)
 
 
 def _ray_interval(region: Region, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Camera z at which rays enter and leave the region, [H, W] each; not enter < leave, or NaN, where they miss it."""
+    """Return the camera z at which the rays of a view enter and leave the region, [H, W] each.
+
+    Where a ray misses the region, the two values are NaN, or the first is not less than the second. They may be
+    negative, i.e. behind the camera.
+    """
     rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
     half = np.asarray(region.size) / 2
     offset = np.asarray(region.center) - camera.center

@@ -1,7 +1,9 @@
-"""Remnants: parts of the object that the masks leave out, and that would stay when the object is removed.
+"""Remnants: parts of the object that the masks leave out, and that would stay in the scene when the object is removed.
 
-A part of the object touches the object more than what stays, and its colours are the object's rather than those of the
-surroundings. A minimum cut through the neighbouring Gaussians proposes parts; the sum of both log-ratios selects them.
+Such a part touches the object more than it touches the surroundings, and its colours resemble those of the object more
+than those of the surroundings. A minimum cut through the graph of neighbouring Gaussians proposes parts. A part is
+selected by its score, the sum of the logarithms of two ratios: contact with the object to contact with the rest, and
+density of its colours in the object to their density in the surroundings.
 """
 
 from __future__ import annotations
@@ -22,21 +24,22 @@ from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
-REACH = 1.0  # of the object's radius: Gaussians farther from the object surely stay
-# What lies between `REACH` and here stands for what stays; farther, if it has fewer than `SAMPLES` Gaussians.
-SURROUNDINGS = 3.0  # of the object's radius
-ATTACHMENT = 2.0  # contact with the object is divided by this in the cut
-LEAST_SIMILARITY = 0.3  # of the colours of two Gaussians without labels: a pattern does not divide a surface
-COLOR_WEIGHT = 0.3  # of the log-ratio of colour densities in the cut; in the score it is 1
-LARGEST_LOG_RATIO = 3.0  # bound of that logarithm
-SAMPLES, NEAREST = 2000, 10  # colours that stand for each side; their distance to the nearest ones gives a density
-COLOR_BLUR = 0.02  # of a colour's range: differences below this do not count
-LEAST_SCORE = 2.5  # logarithms of the ratios of contact and of colours, together, from which a part is a remnant
-LEAST_COUNT = 10  # Gaussians of a remnant
-LEAST_SHARE = 0.003  # of the object's visible pixels
-FLOATING_RATIO = 10.0  # of contact with the object to contact with what stays, from which a part would float
-SOLID = 0.1  # opacity from which a Gaussian belongs to a surface
-TOUCHING = 0.1  # overlap from which two Gaussians touch
+REACH = 1.0  # in radii of the object: Gaussians farther from the object than this belong to the surroundings
+# In radii of the object: distance up to which the surroundings are considered. The distance is increased until the
+# surroundings have `SAMPLES` Gaussians.
+SURROUNDINGS = 3.0
+ATTACHMENT = 2.0  # in the cut, contact with the object is divided by this
+LEAST_SIMILARITY = 0.3  # least similarity of two unlabelled Gaussians in the cut, so that a pattern divides no surface
+COLOR_WEIGHT = 0.3  # weight of the log-ratio of colour densities in the cut; in the score its weight is 1
+LARGEST_LOG_RATIO = 3.0  # limit of the absolute value of this log-ratio
+SAMPLES, NEAREST = 2000, 10  # density of a colour: from the distance to the NEAREST-th of up to SAMPLES random colours
+COLOR_BLUR = 0.02  # added to the distances of colours in [0, 1], so that smaller differences hardly count
+LEAST_SCORE = 2.5  # score from which a part is a remnant
+LEAST_COUNT = 10  # least number of Gaussians of a remnant
+LEAST_SHARE = 0.003  # least number of a remnant's visible pixels, relative to those of the object
+FLOATING_RATIO = 10.0  # ratio of contact with the object to contact with the rest above which a part would float
+SOLID = 0.1  # opacity above which a Gaussian belongs to a surface
+TOUCHING = 0.1  # overlap above which two Gaussians touch
 
 
 @dataclass(frozen=True)
@@ -44,10 +47,11 @@ class Remnant:
     """A part of the object that the masks leave out.
 
     Attributes:
-        members: bool [N].
-        would_float: without the object it would touch hardly anything.
-        share: its visible pixels over the object's, all training views together.
-        view: the view that shows most of it; mask: bool [H, W], its pixels there.
+        members: bool [N], True for the Gaussians of the part.
+        would_float: True if the part would touch hardly anything without the object.
+        share: number of visible pixels of the part, divided by that of the object, in all views together.
+        view: name of the view that shows most pixels of the part.
+        mask: bool [H, W], the pixels of the part in this view.
     """
 
     members: np.ndarray
@@ -58,17 +62,23 @@ class Remnant:
 
     @property
     def center(self) -> tuple[int, int]:
-        """(x, y) of the middle of its pixels, px."""
+        """The median (column, row) of the pixels of `mask`."""
         rows, columns = np.nonzero(self.mask)
         return round(float(np.median(columns))), round(float(np.median(rows)))
 
     def describe(self) -> str:
-        """Where it is and how large, for messages."""
+        """Return a text for messages that states the size of the part and where it is seen."""
         return f"{self.share:.1%} of the object's visible size, best seen in {self.view} around {self.center}"
 
 
 def find_remnants(gaussians: Gaussians, labels: Tensor, cameras: Sequence[Camera]) -> list[Remnant]:
-    """Remnants of the labelled object, bool [N], the largest first."""
+    """Find the remnants of the object that are visible enough, the largest first.
+
+    Args:
+        gaussians: the N Gaussians of the whole scene.
+        labels: bool [N], True for the Gaussians of the object.
+        cameras: the views in which visible pixels are counted.
+    """
     parts = find_parts(gaussians, labels.cpu().numpy())
     if not parts:
         return []
@@ -87,7 +97,15 @@ def find_remnants(gaussians: Gaussians, labels: Tensor, cameras: Sequence[Camera
 
 
 def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarray, bool]]:
-    """(bool [N], would it float) for each connected part that continues the labelled object, bool [N]."""
+    """Find the connected parts of the scene that seem to belong to the object, without regard to their visible size.
+
+    Args:
+        gaussians: the N Gaussians of the whole scene.
+        labels: bool [N], True for the Gaussians of the object.
+
+    Returns:
+        For each part its Gaussians, bool [N], and whether the part would float once the object is removed.
+    """
     means = gaussians.means.detach().cpu().double().numpy()
     if not labels.any():
         return []
@@ -96,7 +114,7 @@ def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarra
     opacities = gaussians.opacity_logits.detach().sigmoid().cpu().double().numpy()
     beyond = np.sort(distance[(distance > REACH * radius) & (opacities > SOLID)])
     if min((labels & (opacities > SOLID)).sum(), len(beyond)) < NEAREST:
-        return []  # nothing is known to stay, as where everything around a place is removed
+        return []  # too few Gaussians to compare, e.g. no surroundings because everything around a place is removed
     near = np.flatnonzero(distance <= max(SURROUNDINGS * radius, beyond[min(SAMPLES, len(beyond)) - 1]))
     local, opacities = gaussians.map(lambda p: p[torch.as_tensor(near, device=p.device)]), opacities[near]
     inside, stays, solid = labels[near], distance[near] > REACH * radius, opacities > SOLID
@@ -119,7 +137,7 @@ def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarra
         to_object = (part[first] & inside[second]) | (part[second] & inside[first])
         to_rest = (part[first] ^ part[second]) & ~inside[first] & ~inside[second]
         ratio = (contact * similarity)[to_object].sum() / max((contact * similarity)[to_rest].sum(), 1e-12)
-        weight = (opacities * size**2)[part]  # area that a Gaussian shows
+        weight = (opacities * size**2)[part]  # the visible area of each Gaussian
         score = np.log(max(ratio, 1e-12)) + float((log_ratio[part] * weight).sum() / weight.sum())
         if score >= LEAST_SCORE:
             members = np.zeros(len(gaussians), bool)
@@ -129,10 +147,14 @@ def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarra
 
 
 def compare_densities(colors: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
-    """[N] natural logarithm of the density of the colours inside over that of the colours outside, at each colour.
+    """Return [N], for each colour the natural logarithm of its density inside divided by its density outside.
+
+    Densities are those of colours in colour space, estimated from the distance to the `NEAREST`-th nearest sample.
 
     Args:
-        colors: [N, 3]. inside, outside: bool [N], at least `NEAREST` each.
+        colors: [N, 3].
+        inside: bool [N], True for the colours of one side; at least `NEAREST` are True.
+        outside: bool [N], True for the colours of the other side; at least `NEAREST` are True.
     """
     generator, densities = np.random.default_rng(0), []
     for side in (inside, outside):
@@ -143,13 +165,21 @@ def compare_densities(colors: np.ndarray, inside: np.ndarray, outside: np.ndarra
 
 
 def surface_sizes(gaussians: Gaussians) -> np.ndarray:
-    """[N], the geometric mean of the two larger standard deviations."""
+    """Return [N], for each Gaussian the geometric mean of its two larger standard deviations, its size on a surface."""
     scales = gaussians.log_scales.detach().cpu().double().numpy()
     return np.exp(np.sort(scales, 1)[:, 1:].mean(1))
 
 
 def connected_parts(found: np.ndarray, pairs: np.ndarray) -> list[np.ndarray]:
-    """bool [N] each: the parts of `found` that pairs connect, of at least `LEAST_COUNT`."""
+    """Return the connected parts of a set of nodes that have at least `LEAST_COUNT` nodes.
+
+    Args:
+        found: bool [N], True for the nodes of the set.
+        pairs: [E, 2] int, indices of nodes that are connected.
+
+    Returns:
+        bool [N] for each part.
+    """
     pairs = pairs[found[pairs].all(1)]
     links = coo_array((np.ones(len(pairs)), tuple(pairs.T)), (len(found), len(found)))
     part = connected_components(links, directed=False)[1]
@@ -159,7 +189,11 @@ def connected_parts(found: np.ndarray, pairs: np.ndarray) -> list[np.ndarray]:
 
 @torch.no_grad()
 def render_parts(gaussians: Gaussians, parts: Sequence[np.ndarray], camera: Camera) -> list[np.ndarray]:
-    """bool [H, W] for each part, bool [N]: where it makes up most of what a view shows."""
+    """Return for each part the pixels, bool [H, W], at which its Gaussians have more than half of the blending weight.
+
+    Args:
+        parts: bool [N] for each part, True for its Gaussians.
+    """
     features = torch.as_tensor(np.stack(parts, -1)).to(gaussians.means)
     shares = rasterizer.render(gaussians, camera, sh_degree=0, features=features).features.cpu().numpy()
     return [shares[..., k] > 0.5 for k in range(len(parts))]

@@ -1,4 +1,8 @@
-"""Detect cast shadows, which masks do not cover: there a reference and its photograph differ beside the object."""
+"""Detection of the object's cast shadows, which the masks do not cover.
+
+A reference is a view completed without the object. Where the object casts a shadow, reference and photograph differ
+beside the object. The shadow is projected into the other views, whose photographs are relit.
+"""
 
 from __future__ import annotations
 
@@ -12,63 +16,80 @@ from reffusion import geometry, morphology
 from reffusion.background.visibility import FREE, DepthView
 from reffusion.types import Camera
 
-BLUR = 0.008  # of the image's width: standard deviation at which brightness is compared, so that noise does not count
-DARK_OFFSET = 8  # of 255, added to both pictures: ratios of dark pixels say little
-MIN_DENSITY = 0.05  # projected points a pixel below which the light of a pixel is unknown
-LOG_RATIO = 0.08  # logarithm of the brightness ratio above which a pixel is shadowed
-NEAR_MASK = 0.02  # of the image's width: a shadow comes this close to the mask
-MIN_AREA = 0.02  # of the mask's area that must differ beside the mask
-PENUMBRA = 0.012  # of the image's width: dilation of a detected shadow, for its soft rim
+BLUR = 0.008  # of the image's width: standard deviation of the blur with which brightness is compared, against noise
+DARK_OFFSET = 8  # of 255, added to both pictures, because the ratios of dark pixels are unreliable
+MIN_DENSITY = 0.05  # number of projected points per pixel below which the light of a pixel is unknown
+LOG_RATIO = 0.08  # absolute logarithm of the brightness ratio above which a pixel is in a shadow
+NEAR_MASK = 0.02  # of the image's width: distance from the mask that a shadow must reach
+MIN_AREA = 0.02  # of the mask's area: area beside the mask that must differ
+PENUMBRA = 0.012  # of the image's width: dilation of a detected shadow, to include its soft rim
 
-FINE_BLUR, CHANGED = 0.003, 8  # of the image's width; of 255: a difference above it means that a pixel was repainted
-NOISE_FACTOR = 4.0  # times the usual log ratio above which a pixel of a redrawn picture is shadowed
-REDRAWN_QUANTILE = 0.99  # of the difference of a redrawn picture from its photograph: below, it means nothing
-ISLAND, NOTCH = 0.015, 0.01  # of the image's width: smaller islands are dropped; notches twice as wide are closed
+# Repainted pixels are found after a blur with a standard deviation of FINE_BLUR of the image's width. A difference of
+# more than CHANGED levels of 255 means that a pixel was repainted.
+FINE_BLUR, CHANGED = 0.003, 8
+NOISE_FACTOR = 4.0  # a pixel of a redrawn picture is in a shadow if its log-ratio is this many times the usual one
+REDRAWN_QUANTILE = 0.99  # quantile of the differences between picture and photograph in `redrawn_difference`
+ISLAND, NOTCH = 0.015, 0.01  # of the image's width: smaller islands are removed; notches up to twice as wide are closed
 
 
 def redrawn_difference(reference: np.ndarray, photo: np.ndarray, known: np.ndarray) -> float:
-    """The difference, in levels of 255, between a picture and its photograph where both show the same: the texture of
-    an autoencoder.
+    """Return how much a picture differs from its photograph where both show the same, in levels of 255.
+
+    If an autoencoder redrew the picture, its texture differs from that of the photograph everywhere. The result is a
+    high quantile (`REDRAWN_QUANTILE`) of these differences, so smaller differences do not mean that a pixel was
+    repainted.
 
     Args:
-        known: bool [H, W], pixels without the object.
+        reference, photo: [H, W, 3] uint8.
+        known: bool [H, W], True at pixels without the object. If none is True, the result is 0.
     """
     return float(np.quantile(_fine_difference(reference, photo)[known], REDRAWN_QUANTILE)) if known.any() else 0.0
 
 
 def changed_pixels(reference: np.ndarray, photo: np.ndarray, within: np.ndarray, noise: float = 0.0) -> np.ndarray:
-    """bool [H, W]: pixels of `within` where a completed view shows something else than its photograph, holes filled.
+    """Return bool [H, W], the pixels where a completed view shows something else than its photograph.
+
+    Small islands are removed, and holes and notches are filled.
 
     Args:
-        noise: levels of 255, see `redrawn_difference`.
+        reference: [H, W, 3] uint8, the completed view.
+        photo: [H, W, 3] uint8, its photograph.
+        within: bool [H, W], the pixels to compare; all others are False in the result.
+        noise: the result of `redrawn_difference`. Differences up to this many levels of 255 do not count.
     """
     differs = within & (_fine_difference(reference, photo) > max(CHANGED, noise))
-    # Here and there what was drawn may look like what it hides.
+    # Some of the repainted pixels may look like the photograph, so holes and notches are closed.
     kept = morphology.remove_small_parts(differs, ISLAND * within.shape[1], 0)
     closed = ~morphology.dilate(~morphology.dilate(kept, NOTCH), NOTCH)
     return ndimage.binary_fill_holes(closed & within)
 
 
 def _fine_difference(reference: np.ndarray, photo: np.ndarray) -> np.ndarray:
-    """[H, W] levels of 255, of the channel that differs most."""
+    """Return [H, W] in levels of 255, the difference of two blurred pictures in the channel that differs most."""
     sigma = morphology.to_pixels(FINE_BLUR, photo.shape[1])
     blur = lambda image: cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma)
     return np.abs(blur(reference) - blur(photo)).max(-1)
 
 
 def detect_shadows(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels connected to the mask at which the scene is darker or brighter than the completed view.
+    """Find the object's shadow in a view: pixels that are darker or brighter than in the completed view.
+
+    A shadow is connected to the mask, up to a small gap. If too few pixels beside the mask differ, there is no shadow.
 
     Args:
         reference: [H, W, 3] uint8, the completed view.
-        view: [H, W, 3] uint8, in its exposure: the photograph, and inside the mask the remaining Gaussians' render.
-        mask: bool [H, W], C.
+        view: [H, W, 3] uint8 in the same exposure, the photograph. Inside the mask it may show a rendering of the scene
+            without the object instead.
+        mask: bool [H, W], C, True at pixels that show the object.
+
+    Returns:
+        bool [H, W], the shadow with its soft rim; it may extend into the mask.
     """
     sigma = morphology.to_pixels(BLUR, mask.shape[1])
     blur = lambda image: cv2.GaussianBlur(image.astype(np.float32).mean(2), (0, 0), sigma)
     ratio = np.abs(np.log((blur(reference) + DARK_OFFSET) / (blur(view) + DARK_OFFSET)))
     near = morphology.dilate(mask, NEAR_MASK)
-    noise = 1.4826 * float(np.median(ratio[~near])) if (~near).any() else 0.0  # 0 unless the whole view was redrawn
+    noise = 1.4826 * float(np.median(ratio[~near])) if (~near).any() else 0.0  # about 0 unless the view is redrawn
     differs = ratio > max(LOG_RATIO, NOISE_FACTOR * noise)
     if (differs & ~near).sum() <= MIN_AREA * mask.sum():  # no shadow: differences inside C have other causes
         return np.zeros_like(mask)
@@ -79,8 +100,10 @@ def detect_shadows(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) ->
 
 
 def log_light(reference: np.ndarray, view: np.ndarray) -> np.ndarray:
-    """[H, W, 3] float32, the logarithm of the brightness of the completed view over that of the scene, of blurred
-    pictures; arguments as for `detect_shadows`."""
+    """Return float32 [H, W, 3], the logarithm of the ratio of the completed view's brightness to the photograph's.
+
+    The pictures are blurred first. The arguments are those of `detect_shadows`.
+    """
     sigma = morphology.to_pixels(BLUR, view.shape[1])
     blur = lambda image: cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma) + DARK_OFFSET
     return np.log(blur(reference) / blur(view))
@@ -89,11 +112,18 @@ def log_light(reference: np.ndarray, view: np.ndarray) -> np.ndarray:
 def project_shadow(
     shadow: np.ndarray, light: np.ndarray, depth: np.ndarray, camera: Camera, views: Sequence[DepthView]
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """View name -> the shadow as the view shows it, bool [H, W], and its log light [H, W, 3]; NaN elsewhere and where
-    it is unknown.
+    """Project the shadow that was detected in one view, and its log light (see `log_light`), into other views.
 
     Args:
-        shadow: bool [H, W]; light: [H, W, 3], `log_light`; depth: [H, W], above 0 where known; camera: their view.
+        shadow: bool [H, W], the shadow in the view `camera`.
+        light: [H, W, 3], the result of `log_light` for the view `camera`.
+        depth: [H, W], camera z of the surfaces in the view `camera`; 0 where unknown.
+        camera: the view in which the shadow was detected.
+        views: the views into which the shadow is projected.
+
+    Returns:
+        View name -> (bool [H, W], the shadow in this view; [H, W, 3], its log light). The log light is NaN outside the
+        shadow, and where too few points are projected.
     """
     rows, columns = np.nonzero(shadow & (depth > 0))
     points = geometry.unproject(np.where(depth > 0, depth, 1.0), camera)[rows, columns]
@@ -117,7 +147,11 @@ def project_shadow(
 
 
 def relight(photo: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """The photograph, uint8 [H, W, 3], in the light of the completed view; unchanged where `light` is NaN."""
+    """Return the photograph, uint8 [H, W, 3], with the shadow's brightness changed to that of the completed view.
+
+    Args:
+        light: [H, W, 3], log light as from `project_shadow`. Where it is NaN, the photograph stays the same.
+    """
     known = np.isfinite(light)
     lit = (photo.astype(np.float32) + DARK_OFFSET) * np.exp(np.where(known, light, 0)) - DARK_OFFSET
     return np.where(known, np.round(lit).clip(0, 255), photo).astype(np.uint8)

@@ -1,4 +1,7 @@
-"""Mask consolidation (paper): 2D masks vote for Gaussians, and labelled Gaussians are rendered to consistent masks."""
+"""Mask consolidation (paper): 2D masks vote on which Gaussians are the object, and the labels are rendered to masks.
+
+The rendered masks, the *consistent masks* C, agree with each other in 3D.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +22,12 @@ VoteMode = Literal["count", "weight"]
 
 @dataclass(frozen=True)
 class Votes:
-    """What each Gaussian contributed to the masked and to the unmasked pixels of all voting views.
+    """The contributions of N Gaussians to the masked and to the unmasked pixels of all voting views.
 
     Attributes:
-        masked, unmasked: [N], numbers of contributions (mode `count`) or sums of blending weights (`weight`), >= 0.
+        masked: [N] >= 0, contributions to masked pixels. These are numbers of pixels in the mode `count`, and sums of
+            blending weights in the mode `weight`.
+        unmasked: [N] >= 0, contributions to all other pixels, in the same unit.
     """
 
     masked: Tensor
@@ -34,17 +39,19 @@ def cast_votes(
 ) -> Votes:
     """Sum the votes of all views that have a mask.
 
-    PAPER leaves open: whether a contribution counts as one or by its blending weight. `weight` is the default: a
-    Gaussian behind the object is blended faintly into many masked pixels, and by `count` these outvote the pixels that
-    show it plainly, so that visible background is removed.
+    PAPER leaves open: whether a contribution counts as one or by its blending weight. `weight` is the default, because
+    a Gaussian behind the object is blended faintly into many masked pixels. By `count` these pixels would outvote the
+    unmasked pixels that show the Gaussian clearly, and visible background would be removed.
 
     Args:
-        gaussians: N of them.
+        gaussians: N Gaussians.
         cameras: the training views.
-        masks: view name -> bool [H, W], True = the object; an empty mask is a vote, a missing one is not.
+        masks: view name -> bool [H, W], True at pixels of the object. A view with an empty mask votes, too: all its
+            pixels are unmasked. A view without an entry does not vote.
+        mode: value of one contribution: "count" for 1, "weight" for its blending weight.
 
     Raises:
-        ValueError: no view has a mask, or a mask is not of its view's size.
+        ValueError: no view has a mask, or a mask does not have the size of its view.
     """
     voters = [camera for camera in cameras if camera.name in masks]
     if not voters:
@@ -63,9 +70,9 @@ def cast_votes(
 
 
 def label_gaussians(votes: Votes, tau: float = 1.0) -> Tensor:
-    """bool [N], True = masked: the ratio of masked to unmasked contributions exceeds tau.
+    """Return bool [N], True (masked) where the ratio of masked to unmasked contributions exceeds tau.
 
-    A Gaussian without any contribution (0 / 0) stays unmasked; see `hidden_inside`.
+    A Gaussian without any contribution (0 / 0) is False; `hidden_inside` labels such Gaussians.
     """
     return votes.masked > tau * votes.unmasked
 
@@ -73,15 +80,21 @@ def label_gaussians(votes: Votes, tau: float = 1.0) -> Tensor:
 def find_floaters(
     remaining: Gaussians, cameras: Sequence[Camera], unobserved: Mapping[str, np.ndarray], tau: float = 1.0
 ) -> Tensor:
-    """bool [M]: floaters, the Gaussians that contribute mostly to unobserved pixels once the object is removed.
+    """Find floaters: Gaussians that contribute mostly to unobserved pixels once the object is removed.
 
-    The fit was not supervised there: their footprints reached far into or behind the object while it hid them. The
-    ratio is the one that labels the object, counted without the object.
+    An unobserved pixel shows a place behind the object that no other photograph shows. No photograph supervised the fit
+    there, so Gaussians may extend far into or behind the object. Floaters are found by the same vote as the object,
+    with the unobserved pixels as masks, and without the object's Gaussians.
 
     Args:
-        remaining: M Gaussians, without those to remove.
-        unobserved: view name -> bool [H, W].
-        tau: ratio of contributions to unobserved pixels over those to all others, above which it is a floater.
+        remaining: the M Gaussians of the scene without the removed ones.
+        cameras: the training views.
+        unobserved: view name -> bool [H, W], True at unobserved pixels.
+        tau: a Gaussian is a floater if the ratio of its contributions to unobserved pixels and to all other pixels
+            exceeds this.
+
+    Returns:
+        bool [M], True for floaters.
     """
     return label_gaussians(cast_votes(remaining, cameras, unobserved, mode="weight"), tau)
 
@@ -89,9 +102,10 @@ def find_floaters(
 def hidden_inside(
     gaussians: Gaussians, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray], share: float = 0.5
 ) -> Tensor:
-    """bool [N]: the centre lies inside the mask in more than `share` of the voting views whose frame contains it.
+    """Return bool [N], the Gaussians whose means project into the masks in more than `share` of the views.
 
-    This is the vote for Gaussians that no view sees: those inside the object would come to light when it is removed.
+    This vote labels Gaussians that no view sees: those inside the object would become visible when it is removed. The
+    arguments are those of `points_inside`.
     """
     means = gaussians.means.detach().cpu().double().numpy()
     return torch.as_tensor(points_inside(means, cameras, masks, share), device=gaussians.means.device)
@@ -100,7 +114,16 @@ def hidden_inside(
 def points_inside(
     points: np.ndarray, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray], share: float = 0.5
 ) -> np.ndarray:
-    """bool [P]: points [P, 3] that lie inside the mask in more than `share` of the masked views that frame them."""
+    """Return bool [P], the points that project into the mask in more than `share` of the views.
+
+    Only views that have a mask, and into whose image the point projects, count. A point without such a view is False.
+    Occlusion plays no role.
+
+    Args:
+        points: [P, 3], world coordinates.
+        masks: view name -> bool [H, W], True at pixels of the object.
+        share: in [0, 1].
+    """
     inside, framed = np.zeros(len(points)), np.zeros(len(points))
     for camera in cameras:
         if camera.name in masks:
@@ -112,21 +135,35 @@ def points_inside(
 
 @torch.no_grad()
 def render_labels(gaussians: Gaussians, labels: Tensor, camera: Camera) -> np.ndarray:
-    """The labels rendered into one view, [H, W] in [0, 1).
+    """Render labels into one view: [H, W] in [0, 1), the total blending weight of the labelled Gaussians at each pixel.
 
-    C is where they exceed tau'. PAPER leaves open: whether they are divided by alpha first. Here they are not: where
-    alpha is small nothing hides the background, whatever the labels of faint Gaussians.
+    The consistent mask C consists of the pixels where the result exceeds tau'. PAPER leaves open: whether the result is
+    divided by alpha first. Here it is not: where alpha is small, nothing hides the background, so faint labelled
+    Gaussians should not mask the pixel.
+
+    Args:
+        labels: bool [N], True for labelled Gaussians.
     """
     rendering = rasterizer.render(gaussians, camera, features=labels[:, None].to(gaussians.means.dtype), sh_degree=0)
     return rendering.features[..., 0].cpu().numpy()
 
 
 def best_view(invent: Mapping[str, np.ndarray], names: Sequence[str]) -> str | None:
-    """The view to complete: the one with the largest invent mask, of those whose mask does not touch the border if
-    there are any; None where no view has anything to invent.
+    """Return the name of the view to complete in 2D, which becomes the reference.
 
-    PAPER leaves open: which view is the reference. The largest mask, because parts of the hole that it does not show
-    would stay empty; away from the border, because a border that cuts the mask hides a part of the hole.
+    This is the view with the largest invent mask among the views whose invent mask does not touch the image's border.
+    If all masks touch the border, it is the view with the largest mask.
+
+    PAPER leaves open: which view is the reference. The mask should be large, because the parts of the hole that the
+    reference does not show would stay empty. It should not touch the border, because the border then cuts off a part of
+    the hole.
+
+    Args:
+        invent: view name -> bool [H, W], the pixels to invent.
+        names: the views to choose from.
+
+    Returns:
+        The name; None if no view has pixels to invent.
     """
     sizes = {name: int(invent[name].sum()) for name in names if invent[name].any()}
     whole = {name: size for name, size in sizes.items() if not _touches_border(invent[name])}
@@ -135,4 +172,5 @@ def best_view(invent: Mapping[str, np.ndarray], names: Sequence[str]) -> str | N
 
 
 def _touches_border(mask: np.ndarray) -> bool:
+    """Return whether a mask, bool [H, W], has a True pixel at the image's border."""
     return bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())

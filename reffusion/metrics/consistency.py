@@ -1,4 +1,4 @@
-"""Multi-view consistency: whether a rendered view shows the same colours of a surface as the next view."""
+"""Multi-view consistency: a score for how similar the colours are that a surface has in two rendered views."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from reffusion.depth.completion import complete
 from reffusion.fit.exposure import undo_exposure
 from reffusion.types import Camera
 
-TOLERANCE = 0.02  # relative depth by which a point may lie behind the other view's surface and still be visible
+TOLERANCE = 0.02  # relative depth by which a point may lie behind the other view's surface and still count as visible
 SOLID = 0.5  # alpha above which a rendered depth is used
 
 PROTOCOL = (
@@ -25,14 +25,15 @@ PROTOCOL = (
 
 
 class RenderedView(NamedTuple):
-    """A rendered view.
+    """A rendered view and the pixels to compare.
 
     Attributes:
-        camera: the view.
-        picture: uint8 [H, W, 3].
-        depth: [H, W] camera z; 0 where alpha is too low for a depth.
-        mask: bool [H, W], the pixels to compare.
-        exposure: [3, 4], the exposure of the picture, see `fit.exposure`; None: that of the Gaussians.
+        camera: camera of the view.
+        picture: uint8 [H, W, 3], the rendering.
+        depth: [H, W], camera z; 0 where alpha is too low for a depth.
+        mask: bool [H, W], True = the pixel is compared.
+        exposure: [3, 4], the affine colour map that was applied to the Gaussians' colours in the picture (see
+            `fit.exposure`); None if none was applied.
     """
 
     camera: Camera
@@ -43,16 +44,23 @@ class RenderedView(NamedTuple):
 
     @property
     def unexposed_color(self) -> np.ndarray:
-        """[H, W, 3] in [0, 1] with the exposure removed, so that views of different exposures can be compared."""
+        """The picture [H, W, 3], scaled to [0, 1], with the exposure undone, so that views with different exposures can
+        be compared. Undoing the exposure may give values outside [0, 1]."""
         return undo_exposure(self.picture / 255.0, self.exposure)
 
 
 def reprojected_color_difference(first: RenderedView, second: RenderedView) -> tuple[float | None, float | None]:
-    """Mean absolute colour difference in [0, 1] between the masked pixels of `first` and the same points in `second`,
-    and the share of the mask's pixels that could be compared.
+    """Compare the colours of the masked pixels of `first` with the colours of the same surface points in `second`.
 
-    Both are None for an empty mask; the difference is None too where no pixel can be compared. A point farther behind
-    the surface of `second` than the relative depth `TOLERANCE` counts as occluded there.
+    The pixels are unprojected by the depth of `first` and projected into `second`. Pixels without a depth, and points
+    outside the frame of `second`, are not compared. A point that lies farther behind the surface of `second` than the
+    relative depth `TOLERANCE` is occluded in `second` and not compared. A point at which `second` has no depth is
+    compared.
+
+    Returns:
+        The mean absolute difference over pixels and channels (colours in [0, 1], exposures undone), and the share in
+        [0, 1] of the mask's pixels that were compared. Both are None if the mask is empty. The difference is None and
+        the share 0 if no pixel can be compared.
     """
     mask_pixels = int(first.mask.sum())
     if not mask_pixels:
@@ -73,9 +81,17 @@ def reprojected_color_difference(first: RenderedView, second: RenderedView) -> t
 
 
 def continue_surrounding_depth(depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Depth [H, W] whose masked pixels continue the surrounding disparity smoothly; 0 where too little is known.
+    """Replace the depth in the mask by a smooth continuation of the surrounding disparity.
 
-    For pictures that were inpainted in 2D, which have no depth of their own.
+    This gives a depth to pictures that were inpainted in 2D, since 2D inpainting makes no depth.
+
+    Args:
+        depth: [H, W], camera z; 0 where unknown.
+        mask: bool [H, W], True = the pixel was inpainted.
+
+    Returns:
+        Depth [H, W]. It is 0 in the mask if the surroundings do not determine a continuation, and at pixels that would
+        be farther than ten times the farthest known depth. It is 0 everywhere if no depth is known outside the mask.
     """
     known = (depth > 0) & ~mask
     if not known.any():
@@ -85,5 +101,5 @@ def continue_surrounding_depth(depth: np.ndarray, mask: np.ndarray) -> np.ndarra
         disparity = complete(disparity, ~mask)
     except ValueError:
         return np.where(mask, 0.0, depth)
-    usable = disparity > 0.1 * disparity[known].min()  # none beyond ten times the farthest known depth
+    usable = disparity > 0.1 * disparity[known].min()  # at most ten times the farthest known depth
     return np.where(mask, np.divide(1.0, disparity, out=np.zeros(depth.shape), where=usable), depth)

@@ -1,7 +1,7 @@
-"""LDR-FLIP (Andersson et al., 2020): the difference that a viewer perceives when flipping between two images.
+"""LDR-FLIP (Andersson et al., 2020): the difference that a viewer perceives when alternating between two images.
 
-The package flip-evaluator takes 0.4 s for 512 x 512 px. This implementation runs its Gaussians as separable filters in
-OpenCV and takes a tenth of that. The tests compare both.
+The package flip-evaluator takes 0.4 s for 512 x 512 px. This implementation runs the Gaussian filters of FLIP as
+separable filters in OpenCV and takes a tenth of this time. The tests compare both implementations.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 PIXELS_PER_DEGREE = 67.0  # FLIP's own default: 0.7 m away from a 0.7 m wide 4K display
-# Contrast sensitivity of the eye: (weight, width in degrees^2) of the Gaussians for Y, Cx and Cz.
+# Contrast sensitivity of the eye: (weight, width in degrees^2) of each Gaussian, for the channels Y, Cx and Cz.
 SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
 EDGE_WIDTH = 0.082  # degrees, width of the edges and points that are detected
 COLOR_POWER, FEATURE_POWER = 0.7, 0.5  # exponents q_c and q_f of the paper
@@ -31,7 +31,11 @@ WHITE = TO_XYZ.sum(1)
 
 
 def flip_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """[H, W] float32 in [0, 1]: FLIP at each pixel of two sRGB images [H, W, 3] in [0, 1]."""
+    """Return the FLIP error at each pixel, float32 [H, W] in [0, 1]; 0 = no visible difference.
+
+    Args:
+        image, truth: sRGB images of one size, [H, W, 3] in [0, 1].
+    """
     pictures = [_srgb_to_ycxcz(np.asarray(picture, np.float32)) for picture in (truth, image)]
     labs = [_apply_hunt_effect(_linear_to_lab(_filter_contrast(picture))) for picture in pictures]
     color = _redistribute(_hyab_distance(*labs) ** COLOR_POWER)
@@ -41,19 +45,19 @@ def flip_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def _srgb_to_ycxcz(picture: np.ndarray) -> np.ndarray:
-    """YCxCz, float32 [H, W, 3], of sRGB in [0, 1]."""
+    """Convert sRGB [H, W, 3] in [0, 1] to the opponent colours YCxCz, float32 [H, W, 3]."""
     linear = np.where(picture <= 0.04045, picture / 12.92, ((picture + 0.055) / 1.055) ** 2.4).astype(np.float32)
     x, y, z = np.moveaxis(_apply_matrix(linear, TO_XYZ / WHITE[:, None]), 2, 0)
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], 2)
 
 
 def _apply_matrix(picture: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """The colours [H, W, 3] times a [3, 3] matrix, in float32."""
+    """Multiply each colour of a picture [H, W, 3] by a [3, 3] matrix, in float32."""
     return picture @ matrix.T.astype(np.float32)
 
 
 def _filter_contrast(picture: np.ndarray) -> np.ndarray:
-    """Linear sRGB in [0, 1] of a YCxCz image, blurred as the eye's contrast sensitivity demands."""
+    """Blur a YCxCz image [H, W, 3] by the eye's contrast sensitivity, and convert it to linear sRGB in [0, 1]."""
     y, cx, cz = (_blur_channel(np.ascontiguousarray(picture[..., k]), SENSITIVITY[k]) for k in range(3))
     y = (y + 16) / 116
     relative = np.stack([y + cx / 500, y, y - cz / 200], 2)
@@ -61,7 +65,11 @@ def _filter_contrast(picture: np.ndarray) -> np.ndarray:
 
 
 def _blur_channel(channel: np.ndarray, gaussians: tuple[tuple[float, float], ...]) -> np.ndarray:
-    """A channel [H, W] filtered by a sum of Gaussians (weight, width), each separable into rows and columns."""
+    """Filter a channel [H, W] by a normalised sum of Gaussians; each Gaussian is separable into rows and columns.
+
+    Args:
+        gaussians: (weight, width in degrees^2) of each Gaussian.
+    """
     parts = [(weight * sqrt(pi / width), _gaussian_kernel(width)) for weight, width in gaussians]
     total = sum(weight * kernel.sum() ** 2 for weight, kernel in parts)
     run = lambda kernel: cv2.sepFilter2D(channel, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
@@ -69,14 +77,17 @@ def _blur_channel(channel: np.ndarray, gaussians: tuple[tuple[float, float], ...
 
 
 def _gaussian_kernel(width: float) -> np.ndarray:
-    """exp(-pi^2 x^2 / width), x in degrees, sampled at pixels out to three deviations of the widest Gaussian."""
+    """Sample the 1D kernel exp(-pi^2 x^2 / width) at pixels, with x in degrees and `width` in degrees^2.
+
+    The kernel reaches three standard deviations of the widest Gaussian in `SENSITIVITY`, and is not normalised.
+    """
     widest = max(each for channel in SENSITIVITY for _, each in channel)
     radius = ceil(3 * sqrt(widest / (2 * pi**2)) * PIXELS_PER_DEGREE)
     return np.exp(-((pi * np.arange(-radius, radius + 1) / PIXELS_PER_DEGREE) ** 2) / width)
 
 
 def _linear_to_lab(linear: np.ndarray) -> np.ndarray:
-    """CIELAB of linear sRGB."""
+    """Convert linear sRGB [H, W, 3] to CIELAB [H, W, 3]."""
     relative, edge = _apply_matrix(linear, TO_XYZ / WHITE[:, None]), 6 / 29
     bent = np.where(relative > edge**3, np.cbrt(relative), relative / (3 * edge**2) + 4 / 29).astype(np.float32)
     x, y, z = np.moveaxis(bent, 2, 0)
@@ -84,19 +95,20 @@ def _linear_to_lab(linear: np.ndarray) -> np.ndarray:
 
 
 def _apply_hunt_effect(lab: np.ndarray) -> np.ndarray:
-    """CIELAB with its chroma scaled by the lightness: the eye sees less colour in the dark."""
+    """Scale the chroma of CIELAB colours [H, W, 3] by the lightness, because the eye sees less colour in the dark."""
     return lab * np.concatenate([np.ones_like(lab[..., :1]), 0.01 * lab[..., :1], 0.01 * lab[..., :1]], 2)
 
 
 def _hyab_distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """HyAB distance of CIELAB colours: difference in lightness plus distance in chroma."""
+    """Return [H, W], the HyAB distance of CIELAB colours: the absolute difference in lightness plus the Euclidean
+    distance in chroma."""
     apart = first - second
     return np.abs(apart[..., 0]) + np.hypot(apart[..., 1], apart[..., 2])
 
 
 @functools.cache
 def _max_color_difference() -> float:
-    """The largest colour difference, that of green and blue."""
+    """Return the largest colour difference, that between pure green and pure blue, raised to `COLOR_POWER`."""
     green, blue = (
         _apply_hunt_effect(_linear_to_lab(np.array([[color]], np.float32))) for color in ((0, 1, 0), (0, 0, 1))
     )
@@ -104,7 +116,7 @@ def _max_color_difference() -> float:
 
 
 def _redistribute(error: np.ndarray) -> np.ndarray:
-    """Colour differences mapped to [0, 1], linearly below and above `KNEE`."""
+    """Map colour differences [H, W] to [0, 1] by a piecewise linear function with a knee at `KNEE`."""
     largest, (knee, share) = _max_color_difference(), KNEE
     below = error * (share / (knee * largest))
     above = share + (error - knee * largest) / ((1 - knee) * largest) * (1 - share)
@@ -112,7 +124,7 @@ def _redistribute(error: np.ndarray) -> np.ndarray:
 
 
 def _edge_and_point_features(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Strength of edges and of points, both [H, W], in luminance Y in [0, 1]."""
+    """Return the strength of edges and the strength of points, [H, W] each, in a luminance Y [H, W] in [0, 1]."""
     sigma = 0.5 * EDGE_WIDTH * PIXELS_PER_DEGREE
     x = np.arange(-ceil(3 * sigma), ceil(3 * sigma) + 1)
     along = np.exp(-(x**2) / (2 * sigma**2))

@@ -1,7 +1,8 @@
-"""PSNR, SSIM, FLIP and LPIPS on the mask's box, outside the mask and on the full image.
+"""PSNR, SSIM, FLIP and LPIPS on the mask's bounding box, outside the mask and on the full image.
 
-Images are [H, W, 3] sRGB, uint8 or float in [0, 1]. A box is cut out first and scored as an image of its own: no pixel
-outside it enters, and nothing is resized. Every function raises ValueError on unequal or empty images.
+Images are sRGB [H, W, 3], uint8 or float in [0, 1]. The box is cut out first and scored as a separate image, so no
+pixel outside the box affects a score of the box. Nothing is resized. Every function that compares two images raises
+ValueError if their sizes differ or if they are empty.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from reffusion.metrics.lpips import NAMES, SMALLEST, Lpips
 SSIM_WINDOW = 11  # px
 SSIM_SIGMA = 1.5  # px
 SSIM_CONSTANTS = 0.01**2, 0.03**2  # C1 and C2 of the paper for a data range of 1
-BOX_DILATION = 0.1  # share of the box's extent by which each side of the mask's box moves outwards
-PSNR_CAP = 100.0  # dB, value of an identical image in a mean
+BOX_DILATION = 0.1  # share of the box's width or height by which each side of the mask's box moves outwards
+PSNR_CAP = 100.0  # dB, value that an identical image (infinite PSNR) contributes to a mean
 
 BOX_COLUMNS = (*(f"{name}_box" for name in NAMES.values()), "psnr_box", "ssim_box", "flip_box")
 COLUMNS = (
@@ -55,7 +56,7 @@ Pixels = TypeVar("Pixels", np.ndarray, torch.Tensor)
 
 
 class Box(NamedTuple):
-    """Pixel columns left..right-1 and rows top..bottom-1."""
+    """A box of pixels: the columns left to right - 1 and the rows top to bottom - 1."""
 
     left: int
     top: int
@@ -63,14 +64,17 @@ class Box(NamedTuple):
     bottom: int
 
     def crop(self, array: Pixels) -> Pixels:
-        """The part of an array [H, W, ...] inside the box."""
+        """Return the part of an array [H, W, ...] inside the box."""
         return array[self.top : self.bottom, self.left : self.right]
 
 
 def mask_box(mask: np.ndarray, dilation: float = BOX_DILATION) -> Box | None:
-    """The bounding box of a bool mask [H, W], each side moved outwards by the share `dilation` of the box's extent.
+    """Return the enlarged bounding box of a mask, rounded outwards and clipped to the image; None if the mask is empty.
 
-    The box is rounded outwards and clipped to the image. None for an empty mask.
+    Args:
+        mask: bool [H, W].
+        dilation: share of the box's width (or height) by which the left and right sides (or top and bottom) move
+            outwards.
     """
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if len(rows) == 0:
@@ -82,25 +86,37 @@ def mask_box(mask: np.ndarray, dilation: float = BOX_DILATION) -> Box | None:
 
 
 def _dilate_interval(low: int, high: int, dilation: float, size: int) -> tuple[int, int]:
-    """The interval low..high-1 widened by the share `dilation` of its length, within 0..size-1."""
-    margin = round(dilation * (high - low), 9)  # 0.1 * 30 is a hair above 3: rounding outwards must not make it 4
+    """Widen the interval of pixels low to high - 1 by the share `dilation` of its length at each end.
+
+    Returns:
+        The new low and high, clipped to 0 and `size`; high is exclusive.
+    """
+    margin = round(dilation * (high - low), 9)  # 0.1 * 30 is slightly above 3 in floats: rounding up must not give 4
     return max(0, floor(low - margin)), min(size, ceil(high + margin))
 
 
 def psnr(image: np.ndarray, truth: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB, inf for identical images."""
+    """Return the peak signal-to-noise ratio in dB for a peak of 1; inf for identical images."""
     image, truth = _as_unit_pair(image, truth)
     error = float(np.mean((image - truth) ** 2))
     return -10.0 * log10(error) if error > 0 else inf
 
 
 def ssim(image: np.ndarray, truth: np.ndarray) -> float:
-    """Structural similarity (Wang et al., 2004) as `PROTOCOL["ssim"]` says. Raises ValueError under 11 px a side."""
+    """Return the mean structural similarity (Wang et al., 2004), computed as `PROTOCOL["ssim"]` states.
+
+    Raises:
+        ValueError: a side of the images has fewer than 11 px.
+    """
     return float(ssim_map(image, truth).mean())
 
 
 def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """[H - 10, W - 10, 3]: SSIM of the windows that lie inside the image. Raises ValueError under 11 px a side."""
+    """Return the SSIM of each window of 11 x 11 px that lies inside the image, float64 [H - 10, W - 10, 3].
+
+    Raises:
+        ValueError: a side of the images has fewer than 11 px.
+    """
     image, truth = _as_unit_pair(image, truth)
     if min(image.shape[:2]) < SSIM_WINDOW:
         raise ValueError(f"SSIM needs {SSIM_WINDOW} px a side; the image is {image.shape[1]}x{image.shape[0]} px")
@@ -115,44 +131,75 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def flip(image: np.ndarray, truth: np.ndarray) -> float:
-    """Mean LDR-FLIP (Andersson et al., 2020) in [0, 1], 0 for identical images."""
+    """Return the mean LDR-FLIP error (Andersson et al., 2020) in [0, 1]; 0 for identical images."""
     return float(flip_map(image, truth).mean(dtype=np.float64))
 
 
 def flip_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """[H, W] float32 in [0, 1]: LDR-FLIP at each pixel."""
+    """Return the LDR-FLIP error at each pixel, float32 [H, W] in [0, 1]."""
     return ldr_flip.flip_map(*_as_unit_pair(image, truth))
 
 
 @dataclass(frozen=True)
 class LpipsTarget:
-    """A ground truth's activations in an LPIPS network, computed once for all images that are compared with it."""
+    """A ground truth in the form of its activations in an LPIPS network.
+
+    The activations are computed once for all images that are compared with this ground truth.
+
+    Attributes:
+        model: the LPIPS network.
+        activations: the result of `Lpips.activations` for the ground truth.
+    """
 
     model: Lpips
     activations: list[torch.Tensor]
 
     @torch.no_grad()
     def distance(self, image: np.ndarray) -> float:
-        """LPIPS of an image of the truth's size. Raises ValueError for an array that is no image."""
+        """Return the LPIPS distance between an image and the ground truth.
+
+        Args:
+            image: [H, W, 3] of the ground truth's size, uint8 or float in [0, 1].
+
+        Raises:
+            ValueError: the array has another dtype or range, or is too small for the network.
+        """
         return float(self.model.distance(_as_lpips_input(image), self.activations))
 
 
 @torch.no_grad()
 def lpips_targets(truth: np.ndarray, models: dict[str, Lpips]) -> dict[str, LpipsTarget | None]:
-    """Network -> target; None where the truth is too small for it."""
+    """Compute the LPIPS activations of a ground truth in each network.
+
+    Args:
+        truth: [H, W, 3].
+        models: name of the network ("alex" or "vgg") -> network.
+
+    Returns:
+        Name of the network -> target; None if the ground truth is too small for the network.
+    """
     fits = {net: min(truth.shape[:2]) >= SMALLEST[net] for net in models}
     return {n: LpipsTarget(m, m.activations(_as_lpips_input(truth))) if fits[n] else None for n, m in models.items()}
 
 
 def _as_lpips_input(image: np.ndarray) -> torch.Tensor:
-    """The image as [1, 3, H, W] float32 in [-1, 1]."""
+    """Convert an image [H, W, 3] to float32 [1, 3, H, W] in [-1, 1]."""
     return torch.from_numpy(2.0 * _as_unit(image) - 1.0).permute(2, 0, 1)[None].float()
 
 
 def score(
     image: np.ndarray, truth: np.ndarray, targets: dict[str, LpipsTarget | None] | None = None
 ) -> dict[str, float | None]:
-    """{"psnr", "ssim", "flip", and `NAMES` of each LPIPS target}; None where the image is too small for a metric."""
+    """Compute all metrics of an image against its ground truth.
+
+    Args:
+        image, truth: [H, W, 3] of one size.
+        targets: the result of `lpips_targets` for the ground truth; None to leave LPIPS out.
+
+    Returns:
+        "psnr", "ssim", "flip", and for each target "lpips_alex" or "lpips_vgg" -> value; None if the image is too small
+        for this metric.
+    """
     side = min(image.shape[:2])
     values = {
         "psnr": psnr(image, truth),
@@ -173,15 +220,19 @@ def score_view(
     shows_object: bool = False,
     unseen: np.ndarray | None = None,
 ) -> dict[str, float | None]:
-    """A value for each of `COLUMNS`: `score` on the box (None without one), `score_outside` of the mask, and `score` on
-    the full image without LPIPS.
+    """Compute all scores of a view: in the mask's box, outside the mask, and on the full image (without LPIPS).
 
     Args:
-        targets: `lpips_targets` of the truth in the box.
-        mask: bool [H, W], the object; None: no pixel is masked.
-        shows_object: the truth shows the object, so that only pixels outside the mask are scored.
-        unseen: bool [H, W], pixels that no training view saw; None where that is not known: the columns about them
-            are then None.
+        image, truth: [H, W, 3] of one size.
+        box: the mask's box; None if the mask is empty, which makes the scores of the box None.
+        targets: the result of `lpips_targets` for the part of the ground truth in the box; None to leave LPIPS out.
+        mask: bool [H, W], True = the object; None if no pixel is masked.
+        shows_object: True if the ground truth shows the object, so that only pixels outside the mask can be scored.
+        unseen: bool [H, W], True = no training view shows the surface of this pixel; None if unknown, which makes
+            "psnr_outside_seen" and "unseen_share" None.
+
+    Returns:
+        A value for each name in `COLUMNS`; None if it cannot be computed.
     """
     mask = np.zeros(truth.shape[:2], bool) if mask is None else mask
     values = score_outside(image, truth, mask)
@@ -195,10 +246,14 @@ def score_view(
 
 
 def score_outside(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict[str, float | None]:
-    """{"psnr", "ssim", "flip"}_outside: over the pixels where the bool mask [H, W] is False; None where there are none.
+    """Compute "psnr_outside", "ssim_outside" and "flip_outside" over the pixels where the mask, bool [H, W], is False.
 
-    The windows of SSIM and the filters of FLIP reach into the mask. There the truth replaces both images, so that
-    nothing painted inside the mask changes a score outside it.
+    The windows of SSIM and the filters of FLIP at these pixels reach into the mask. For both metrics the ground truth
+    replaces the image inside the mask, so that the image's pixels inside the mask do not change a score outside.
+
+    Returns:
+        Name -> value. All are None if the mask covers the image. "ssim_outside" is None if no window of 11 x 11 px
+        inside the image has its centre outside the mask.
     """
     kept = ~mask
     if not kept.any():
@@ -216,9 +271,16 @@ def score_outside(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dic
 def score_outside_seen(
     image: np.ndarray, truth: np.ndarray, mask: np.ndarray, unseen: np.ndarray
 ) -> dict[str, float | None]:
-    """{"psnr_outside_seen", "unseen_share"}: PSNR over the pixels outside the bool mask [H, W] that some training view
-    saw, and the share of the pixels outside the mask that none saw; each is None if
-    it has no pixels."""
+    """Compute the PSNR over the pixels outside the mask that training views show, and the share that they do not show.
+
+    Args:
+        mask: bool [H, W], True = not scored.
+        unseen: bool [H, W], True = no training view shows the surface of this pixel.
+
+    Returns:
+        "psnr_outside_seen": PSNR over the pixels outside mask and `unseen`; None if there are none. "unseen_share": the
+        share in [0, 1] of the pixels outside the mask that are in `unseen`; None if the mask covers the image.
+    """
     kept = ~mask
     return {
         "psnr_outside_seen": _masked_psnr(image, truth, kept & ~unseen),
@@ -227,7 +289,7 @@ def score_outside_seen(
 
 
 def _masked_psnr(image: np.ndarray, truth: np.ndarray, pixels: np.ndarray) -> float | None:
-    """PSNR over the chosen pixels, bool [H, W]; None where there are none."""
+    """Return the PSNR over chosen pixels, bool [H, W]; None if no pixel is chosen."""
     if not pixels.any():
         return None
     image, truth = _as_unit_pair(image, truth)
@@ -236,17 +298,25 @@ def _masked_psnr(image: np.ndarray, truth: np.ndarray, pixels: np.ndarray) -> fl
 
 
 def mean(values: list[float | None]) -> float | None:
-    """Mean of the values that are not None, each capped at `PSNR_CAP`; None if there are none.
+    """Return the mean of the values that are not None, each at most `PSNR_CAP`; None if all values are None.
 
-    Only PSNR reaches the cap. It keeps one identical view from making the mean infinite, and unlike leaving that view
-    out it never makes a better result score worse.
+    Only PSNR can exceed the cap. Without the cap one identical view would make the mean infinite. If identical views
+    were left out instead, a better result could get a worse mean.
     """
     present = [min(value, PSNR_CAP) for value in values if value is not None]
     return float(np.mean(present)) if present else None
 
 
 def join_side_by_side(panels: list[np.ndarray], box: Box | None) -> np.ndarray:
-    """uint8 [H, W', 3]: the panels from left to right with 4 px of white between them, the box drawn in yellow."""
+    """Join pictures from left to right, with 4 px of white between them and the box drawn in yellow on each.
+
+    Args:
+        panels: uint8 [H, W, 3] each, of one height.
+        box: the box to draw; None to draw none.
+
+    Returns:
+        uint8 [H, W', 3].
+    """
     gap = np.full((panels[0].shape[0], 4, 3), 255, np.uint8)
     strip = []
     for panel in panels:
@@ -260,7 +330,11 @@ def join_side_by_side(panels: list[np.ndarray], box: Box | None) -> np.ndarray:
 
 
 def _as_unit_pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both images as float64 in [0, 1]. Raises ValueError where they are no images of one size, or empty."""
+    """Convert two images to float64 in [0, 1].
+
+    Raises:
+        ValueError: an array is no image, the sizes differ, or the images are empty.
+    """
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"a metric compares two [H, W, 3] of one size; got {image.shape} and {truth.shape}")
     if image.size == 0:
@@ -269,7 +343,11 @@ def _as_unit_pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _as_unit(image: np.ndarray) -> np.ndarray:
-    """float64 in [0, 1] of a uint8 or float image. Raises ValueError for other types and ranges."""
+    """Convert a uint8 image, or a float image in [0, 1], to float64 in [0, 1].
+
+    Raises:
+        ValueError: the dtype is another one, or a float image has values outside [0, 1] or NaN.
+    """
     if image.dtype == np.uint8:
         return image / 255.0
     if not np.issubdtype(image.dtype, np.floating):

@@ -1,7 +1,8 @@
-"""LPIPS (Zhang et al., 2018), version 0.1, from weights on this machine; nothing is downloaded.
+"""LPIPS (Zhang et al., 2018), version 0.1, from weights on this machine. This module downloads nothing.
 
-The weights of a network are one file `<net>.safetensors` (`reffusion.weights.lpips_package`), or two: the backbone as
-torchvision saves it, and the published linear weights. Without them the metric is unavailable and says why.
+The weights of a network are one file `<net>.safetensors` (written by `reffusion.weights.lpips_package`), or two files:
+the backbone as torchvision saves it, and the published linear weights. If the files are missing, `load` returns the
+reason instead of a metric.
 """
 
 from __future__ import annotations
@@ -39,13 +40,13 @@ EPSILON = 1e-10  # added to the norm of a cell's features, as in the published c
 
 
 class Lpips(nn.Module):
-    """The LPIPS distance by one network. Build it with `from_states` or `load`.
+    """The LPIPS distance by one network. Use `from_states` or `load` to build it with weights.
 
     Attributes:
-        net: "alex" or "vgg" (16 layers).
-        features: the backbone under torchvision's indices.
-        linear: five non-negative weights, [C_l] each.
-        files: name -> digest of each file that was read; empty if built from state dicts.
+        net: "alex" (AlexNet) or "vgg" (VGG with 16 layers).
+        features: the convolutional backbone; its layers have the same indices as in torchvision.
+        linear: the published non-negative weights of the channels of the five compared layers, [C_l] each.
+        files: file name -> digest of each file that was read; empty if built from state dicts.
     """
 
     def __init__(self, net: Net):
@@ -67,22 +68,40 @@ class Lpips(nn.Module):
         self.requires_grad_(False).eval()
 
     def forward(self, first: Tensor, second: Tensor) -> Tensor:
-        """Distance [B] of two batches [B, 3, H, W] in [-1, 1]: the sum over layers of the mean over cells of
-        w_l · (f_l(first) - f_l(second))², with features normalised over channels.
+        """Return the LPIPS distance [B] of two batches of images, [B, 3, H, W] in [-1, 1].
 
-        Raises ValueError if the shapes differ or an image is smaller than `SMALLEST[net]` a side.
+        This is the sum over layers l of the mean over the cells (pixels of the layer) of
+        w_l · (f_l(first) - f_l(second))², with features f_l normalised over channels.
+
+        Raises:
+            ValueError: the shapes differ, or a side of the images is smaller than `SMALLEST[net]`.
         """
         if first.shape != second.shape:
             raise ValueError(f"LPIPS compares two [B, 3, H, W]; got {tuple(first.shape)} and {tuple(second.shape)}")
         return self.distance(first, self.activations(second))
 
     def distance(self, images: Tensor, target: list[Tensor]) -> Tensor:
-        """Distance [B] of images [B, 3, H, W] from targets whose `activations` are known."""
+        """Return the LPIPS distance [B] of images from target images whose activations were computed before.
+
+        Args:
+            images: [B, 3, H, W] in [-1, 1].
+            target: the result of `activations` for the target images.
+        """
         pairs = zip(self.activations(images), target, self.linear, strict=True)
         return sum(((a - b).square() * w.float().view(1, -1, 1, 1)).sum(1).mean((1, 2)) for a, b, w in pairs)
 
     def activations(self, images: Tensor) -> list[Tensor]:
-        """The activations of the five tapped layers, float32, normalised over channels in each cell."""
+        """Return the activations of the five compared layers, normalised over channels in each cell.
+
+        Args:
+            images: [B, 3, H, W] in [-1, 1].
+
+        Returns:
+            float32 [B, C_l, H_l, W_l] for each layer l.
+
+        Raises:
+            ValueError: `images` has another shape, or a side is smaller than `SMALLEST[net]`.
+        """
         if images.dim() != 4 or images.shape[1] != 3:
             raise ValueError(f"LPIPS compares two [B, 3, H, W]; got {tuple(images.shape)}")
         height, width = images.shape[2:]
@@ -94,16 +113,23 @@ class Lpips(nn.Module):
         for index, layer in enumerate(self.features):
             x = layer(x)
             if index in TAPS[self.net]:
-                # In half precision squares overflow and EPSILON is 0. The norm's gradient is 0 where all are 0.
+                # float32, because in half precision squares overflow and EPSILON is 0. Where all features are 0,
+                # vector_norm has the gradient 0.
                 wide = x.float()
                 tapped.append(wide / (torch.linalg.vector_norm(wide, dim=1, keepdim=True) + EPSILON))
         return tapped
 
 
 def from_states(net: Net, backbone: dict[str, Tensor], linear: dict[str, Tensor]) -> Lpips:
-    """The metric from two state dicts: torchvision's (its classifier is ignored) and that of the linear weights.
+    """Build the metric from two state dicts.
 
-    Raises ValueError naming the first key that is missing or has another shape.
+    Args:
+        backbone: state dict of torchvision's network, with keys `features.<index>.weight` and `.bias`. Other keys, such
+            as the classifier's, are ignored.
+        linear: state dict of the published linear weights, with keys `lin<l>.model.1.weight`, [1, C_l, 1, 1] each.
+
+    Raises:
+        ValueError: a key is missing or has another shape; the message names the first one.
     """
     model = Lpips(net)
     feature_targets = {f"features.{key}": value for key, value in model.features.state_dict(keep_vars=True).items()}
@@ -124,10 +150,17 @@ def from_states(net: Net, backbone: dict[str, Tensor], linear: dict[str, Tensor]
 
 
 def load(net: Net, folder: str | Path | None = None) -> tuple[Lpips | None, str | None]:
-    """(metric, None), or (None, the reason why it is unavailable).
+    """Load the metric from weights on this machine.
 
-    Raises ValueError for a broken file: wrong keys or shapes, or other content than published. A damaged file is an
-    error to fix, not an unavailable metric.
+    Args:
+        folder: folder to search first; None to search only the default folders.
+
+    Returns:
+        (metric, None), or (None, the reason) if there are no weights.
+
+    Raises:
+        ValueError: a file has wrong keys or shapes, or other content than published. The user should replace a damaged
+            file, so it is not reported as a missing one.
     """
     files = lpips_files(net, folder)
     if not files:
@@ -146,7 +179,11 @@ def load(net: Net, folder: str | Path | None = None) -> tuple[Lpips | None, str 
 
 
 def _load_whole(net: Net, path: Path) -> Lpips:
-    """The metric from one file with all weights. Raises ValueError if it is damaged."""
+    """Build the metric from one file with all weights.
+
+    Raises:
+        ValueError: the weights are not the published ones.
+    """
     from safetensors.torch import load_file
 
     state = load_file(path)
@@ -159,7 +196,11 @@ def _load_whole(net: Net, path: Path) -> Lpips:
 
 
 def _check_name(path: Path) -> None:
-    """Raise ValueError if the name ends in a hash, as torchvision's names do, and the file has another hash."""
+    """Check a file whose name ends in eight hexadecimal digits of its sha256, as the names of torchvision do.
+
+    Raises:
+        ValueError: the file has another hash than its name states.
+    """
     stated = path.stem.rpartition("-")[2]
     if re.fullmatch("[0-9a-f]{8}", stated) and not _sha256(path).startswith(stated):
         raise ValueError(f"{path.name} is not the file its name says: download it again")

@@ -1,4 +1,4 @@
-"""The scores of a test run: a row for each view, their means, and the protocol that all numbers depend on."""
+"""Scores of the rendered views: one row for each view, the means over views, and the protocol of the measurement."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from reffusion.metrics.lpips import Lpips
 from reffusion.morphology import dilate
 
 LIBRARIES = ("torch", "numpy", "opencv-contrib-python-headless")
-# Margin around the mask that the scores outside it leave out, as a share of the image's width.
+# Share of the image's width: the mask grows by this margin before pixels outside it are scored.
 OUTSIDE_MARGIN = 0.01
 CONSISTENCY_COLUMNS = ("consistency", "consistency_share")
 
 
 class GroundTruth(NamedTuple):
-    """What a view is compared with.
+    """The picture with which a rendered view is compared.
 
     Attributes:
-        picture: uint8 [H, W, 3], the view's own picture; None where the scene has none.
-        shows_object: the picture shows the object.
-        unseen: bool [H, W], pixels that no training view saw; None where that is not known.
+        picture: uint8 [H, W, 3], the photograph of the view; None if the scene has none.
+        shows_object: True if the picture shows the object.
+        unseen: bool [H, W], True = no training view shows the surface of this pixel; None if unknown.
     """
 
     picture: np.ndarray | None
@@ -39,12 +39,16 @@ class GroundTruth(NamedTuple):
 def score_row(
     view: RenderedView, initial: np.ndarray | None, truth: GroundTruth, models: dict[str, Lpips], longest: int = 0
 ) -> dict[str, Any]:
-    """A view's row of per_view.csv: its size, its box and, where there is a truth, its scores.
+    """Return the row of a view in per_view.csv: its size, its mask's box and, if there is a ground truth, its scores.
 
     Args:
-        initial: uint8 [H, W, 3], the render of the initialization, which is scored too; None: there is none.
-        longest: px; where the pictures are larger, the box is scored once more with all pictures reduced to this
-            larger side. 0: never.
+        view: the rendered view; its mask is the object.
+        initial: uint8 [H, W, 3], the rendering of the initialization (the scene before `distill`), which is scored in
+            the columns `initialize_*`; None if there is none.
+        truth: the ground truth.
+        models: name of the network ("alex" or "vgg") -> LPIPS network.
+        longest: px. If the picture's larger side exceeds this, the box is also scored after all pictures are reduced to
+            this larger side, in the columns `reduced_*`, unless the ground truth shows the object. 0 for never.
     """
     camera, box = view.camera, image_metrics.mask_box(view.mask)
     row = {"view": camera.name, "width": camera.width, "height": camera.height} | dict.fromkeys(CONSISTENCY_COLUMNS)
@@ -67,13 +71,18 @@ def score_row(
 def _score_reduced(
     pictures: dict[str, np.ndarray], truth: np.ndarray, mask: np.ndarray, models: dict[str, Lpips], longest: int
 ) -> dict[str, Any]:
-    """{prefix + "reduced_<score>_box"} for each prefix and picture, and the reduced size of all.
+    """Score the mask's box of pictures after pictures, ground truth and mask are reduced in size.
 
     Args:
         pictures: prefix of the columns -> uint8 [H, W, 3].
-        truth: uint8 [H, W, 3].
-        mask: bool [H, W].
-        longest: px, the larger side to which all are reduced.
+        truth: uint8 [H, W, 3], the ground truth.
+        mask: bool [H, W], the object.
+        models: name of the network ("alex" or "vgg") -> LPIPS network.
+        longest: px, the larger side after the reduction.
+
+    Returns:
+        "reduced_width" and "reduced_height", and for each prefix <prefix>reduced_<score>_box. The scores are missing if
+        the reduced mask is empty.
     """
     height, width = mask.shape
     factor = longest / max(width, height)
@@ -92,8 +101,17 @@ def _score_reduced(
 def summarize(
     rows: list[dict[str, Any]], columns: tuple[str, ...] = image_metrics.COLUMNS, infix: str = ""
 ) -> dict[str, Any]:
-    """{"mean", "initialize", "views"}, each with `columns`: the means of the columns, the means of the columns prefixed
-    with `initialize_`, and how many views have a value. `infix`: what stands before a column's name in the rows."""
+    """Summarise columns over all views.
+
+    Args:
+        rows: the rows of `score_row`.
+        columns: names of the columns.
+        infix: text that precedes a column's name in the rows, after `initialize_`; for example "reduced_".
+
+    Returns:
+        "mean": column -> mean over the views that have a value. "initialize": column -> mean of the column
+        `initialize_<column>`. "views": column -> number of views that have a value.
+    """
     values = lambda prefix, name: [row.get(f"{prefix}{infix}{name}") for row in rows]
     return {
         "mean": {name: image_metrics.mean(values("", name)) for name in columns},
@@ -103,8 +121,13 @@ def summarize(
 
 
 def summarize_reduced(rows: list[dict[str, Any]], longest: int) -> dict[str, Any] | None:
-    """{"mean", "initialize", "views"} of `image_metrics.BOX_COLUMNS` at the reduced size, and {"protocol"}; None where
-    no view was reduced."""
+    """Summarise the scores of the box at reduced size: `summarize` of `image_metrics.BOX_COLUMNS`, and "protocol".
+
+    None if no view was reduced.
+
+    Args:
+        longest: px, the larger side after the reduction, for the text of the protocol.
+    """
     sizes = sorted({f"{row['reduced_width']}x{row['reduced_height']}" for row in rows if "reduced_width" in row})
     if not sizes:
         return None
@@ -115,7 +138,10 @@ def summarize_reduced(rows: list[dict[str, Any]], longest: int) -> dict[str, Any
 
 
 def to_csv(rows: list[dict[str, Any]]) -> str:
-    """CSV with a line for each view. A missing value is an empty cell; the PSNR of an identical image is inf."""
+    """Format rows as CSV with a header and a line for each view.
+
+    A missing value gives an empty cell. The PSNR of an identical image is written as inf.
+    """
     text = StringIO()
     columns = dict.fromkeys(column for row in rows for column in row)
     writer = csv.DictWriter(text, list(columns), lineterminator="\n")
@@ -125,13 +151,17 @@ def to_csv(rows: list[dict[str, Any]]) -> str:
 
 
 def add_consistency(row: dict[str, Any], view: RenderedView, following: RenderedView) -> None:
-    """Fill `CONSISTENCY_COLUMNS` of a view's row by comparing the view with the next one."""
+    """Compare a view with the next view, and write the result into `CONSISTENCY_COLUMNS` of the view's row."""
     row |= dict(zip(CONSISTENCY_COLUMNS, consistency.reprojected_color_difference(view, following), strict=True))
 
 
 def summarize_consistency(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """{"consistency", "consistency_share"}: means over the pairs of consecutive views; {"pairs"}: how many could be
-    compared; {"protocol"}."""
+    """Summarise the multi-view consistency over the pairs of consecutive views.
+
+    Returns:
+        "consistency" and "consistency_share": means over the pairs that have a value. "pairs": number of pairs that
+        could be compared. "protocol": description of the measurement.
+    """
     difference, share = ([row[name] for row in rows] for name in CONSISTENCY_COLUMNS)
     return {
         "consistency": image_metrics.mean(difference),
@@ -142,14 +172,19 @@ def summarize_consistency(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def library_versions() -> dict[str, str]:
-    """Library -> version, of those that the numbers depend on."""
+    """Return the versions of reffusion and of the libraries that the scores depend on: name -> version."""
     import reffusion
 
     return {"reffusion": reffusion.__version__} | {name: version(name) for name in LIBRARIES}
 
 
 def protocol(rows: list[dict[str, Any]], models: dict[str, Lpips]) -> dict[str, Any]:
-    """All that the numbers depend on, in words and versions."""
+    """Describe how the scores were measured: definitions, image sizes, digests of LPIPS weights, versions of libraries.
+
+    Args:
+        rows: the rows of `score_row`.
+        models: name of the network ("alex" or "vgg") -> LPIPS network.
+    """
     return {
         **image_metrics.PROTOCOL,
         "seen": training_coverage.PROTOCOL,

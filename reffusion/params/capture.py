@@ -1,4 +1,4 @@
-"""The keys of scene.yaml about files and views, read by the stages `poses` and `raw_masks`."""
+"""The keys of scene.yaml about files and views, which the stages `poses` and `raw_masks` read."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Side = Annotated[float, Field(gt=0)]
 
 
 class RegionSpec(Settings):
-    """A region in the scene's own frame and units: an axis-aligned box, or a sphere."""
+    """The key `region`: an axis-aligned box or a sphere, in the frame and units of the scene's own files."""
 
     center: tuple[float, float, float] | None = Field(None, description="its middle")
     view: str | None = Field(None, description="instead of center: a view on whose optical axis the middle lies")
@@ -35,7 +35,7 @@ class RegionSpec(Settings):
 
 
 class MaskSpec(Settings):
-    """The folder of the masks, and which numbers in them are the object."""
+    """The key `masks` in its long form: the folder of the masks, and the values of a pixel that mean the object."""
 
     folder: str | None = Field(None, description="relative to the scene; None: the usual folders")
     id: int | list[int] | None = Field(
@@ -44,14 +44,15 @@ class MaskSpec(Settings):
 
     @property
     def numbers(self) -> tuple[int, ...]:
+        """The values that mean the object, as a tuple; empty if `id` is None."""
         return () if self.id is None else (self.id,) if isinstance(self.id, int) else tuple(self.id)
 
 
 class SceneKeys(Settings):
-    """The keys of scene.yaml that `poses` and `raw_masks` read.
+    """The keys of scene.yaml that the stages `poses` and `raw_masks` read.
 
-    Entries about masks do not enter a stage's hash; the views and files that they select do (`scene_facts` in
-    `stages.plan`).
+    Keys about masks do not themselves enter the hash by which a stage's result is cached. The views and files that
+    these keys select do enter the hash (`scene_facts` in `stages.plan`).
     """
 
     layout: Literal["llff", "colmap", "transforms", "photos"] | None = Field(None, description="None: detected")
@@ -96,9 +97,10 @@ class SceneKeys(Settings):
 
     @property
     def has_masks(self) -> bool:
-        """False where the scene says `masks: none`."""
+        """Whether the scene may have masks: False if scene.yaml says `masks: none`."""
         return (self.mask_folder or "").lower() != "none"
 
     @property
     def mask_folder(self) -> str | None:
+        """The folder of the masks, or "none", as scene.yaml says; None if it names none: the usual folders."""
         return self.masks.folder if isinstance(self.masks, MaskSpec) else self.masks

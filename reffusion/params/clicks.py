@@ -1,4 +1,4 @@
-"""The key `clicks` of scene.yaml."""
+"""The key `clicks` of scene.yaml: clicks on the object, from which the stage `masks` makes masks."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-CLICKS = "clicks.json"  # in a scene's folder: what the mask page keeps for itself, and no stage reads
+CLICKS = "clicks.json"  # file in a scene's folder with the clicks made on the mask page; no stage reads it
 
 
 def _click(value: Any) -> Any:
-    """Complete a click: YAML reads an unquoted + or - as text, and a click without either is on the object."""
+    """Return the click as (x, y, sign); a click without a sign gets "+" and so is on the object.
+
+    Raises:
+        ValueError: the value is not a list of two or three entries.
+    """
     if not isinstance(value, list | tuple) or len(value) not in (2, 3):
         raise ValueError("a click is [x, y, +] on the object, [x, y, -] on what is not")
     return (*value, "+") if len(value) == 2 else value
@@ -19,4 +23,4 @@ def _click(value: Any) -> Any:
 Click = Annotated[
     tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)], Literal["+", "-"]], BeforeValidator(_click)
 ]
-Clicked = dict[str, list[Click]]  # view -> clicks, in pixels of its photograph from the upper left corner
+Clicked = dict[str, list[Click]]  # view name -> clicks (x, y, sign), in px from the photograph's upper left corner

@@ -21,7 +21,7 @@ from reffusion.params.base import (
 
 
 class SdsTerm(Settings):
-    """Multi-scale score distillation (section 4.2)."""
+    """Settings of multi-scale score distillation, SDS (paper, section 4.2)."""
 
     weight: float = Field(1e-3, ge=0, description="lambda of the SDS term; 0 leaves it out")
     # The paper always distils. `initialize` estimates what SDS could gain: reffusion.initialize.sds_gain.
@@ -38,7 +38,8 @@ class SdsTerm(Settings):
     max_angle: float = Field(
         180, gt=0, le=180, description="degrees; views farther than this from every reference are not distilled"
     )
-    # PAPER leaves open: timesteps, w(t), normalisation, guidance, reduction (see `distill.sds`). threestudio's values.
+    # PAPER leaves open: timesteps, w(t), normalisation, guidance, reduction (see `distill.sds`). The values are those
+    # of threestudio.
     t_high: float = Field(0.98, ge=0, le=1, description="highest timestep")
     weighting: Literal["x0", "sigma2", "one"] = Field("sigma2", description="w(t) of the SDS gradient")
     hole_only: bool = Field(False, description="drop the gradient at latents that are not repainted")
@@ -49,12 +50,12 @@ class SdsTerm(Settings):
 
     @property
     def is_on(self) -> bool:
-        """Whether SDS runs; with `run: auto` it may."""
+        """Whether SDS may run. With `run: auto` it does so only if `initialize` finds that it could gain."""
         return self.weight > 0 and self.run != "never"
 
 
 class DepthTerm(Settings):
-    """Depth regularization."""
+    """Settings of the depth term (paper, section 4.3): rendered depth follows the depth of a repainted view."""
 
     weight: float = Field(0.0625, ge=0, description="lambda of the depth term; 0 leaves it out")
     every: int = Field(8, ge=1, description="steps between two evaluations of the depth term")
@@ -64,10 +65,14 @@ class DepthTerm(Settings):
 
 
 class AdversarialTerm(Settings):
-    """The critic, and the term that makes rendered patches pass for real ones (section 4.3, GANeRF)."""
+    """Settings of the adversarial term and its critic (paper, section 4.3, after GANeRF).
+
+    The critic tells patches of the reference ("real") from rendered patches ("fake"). The term changes the Gaussians so
+    that the critic takes rendered patches for real ones.
+    """
 
     weight: float = Field(0.03, ge=0, description="lambda of the adversarial term; 0 leaves it out")
-    # PAPER leaves open: when the critic starts. At once: the paper trains with the sum of all terms.
+    # PAPER leaves open: when the critic starts. It starts at once, since the paper trains with the sum of all terms.
     start: float = Field(
         0.0, ge=0, le=1, description="fraction of the run after which the term starts (PAPER leaves open)"
     )
@@ -77,31 +82,33 @@ class AdversarialTerm(Settings):
     )
     patches: int = Field(64, ge=4, multiple_of=4, description="real patches in a step, and as many fake ones")
     size: Literal[8, 16, 32, 64, 128, 256] = Field(64, description="side of a patch, px")
-    # PAPER leaves open: the critic's width and its step size; GANeRF's.
+    # PAPER leaves open: the critic's width and its step size. Both are GANeRF's.
     width: int = Field(
         256, ge=1, description="the critic's channels at that side; doubled with each halving, up to 512"
     )
-    # The paper prints the saturating form. GANeRF's code has this one, whose gradient does not vanish where the critic
-    # is certain.
+    # The paper prints the saturating form. GANeRF's code has the non-saturating form, whose gradient does not vanish
+    # where the critic is certain.
     form: Literal["non-saturating", "saturating"] = Field("non-saturating", description="form of the generator's loss")
-    # PAPER leaves open: the weight; GANeRF's. The paper prints the penalty at fake patches, GANeRF takes real ones.
+    # PAPER leaves open: the weight, which is GANeRF's. The paper prints the penalty at fake patches; GANeRF takes it at
+    # real patches.
     penalty: float = Field(0.2, ge=0, description="weight of half the squared gradient norm of the critic (R1)")
     penalized: Literal["real", "fake"] = Field("fake", description="the patches at which that gradient is taken")
 
 
 class ReconstructionTerm(Settings):
-    """Photometric loss against the photographs, outside the mask."""
+    """Settings of the photometric loss against the photographs, outside the mask."""
 
     every: int = Field(1, ge=0, description="steps between two evaluations of the reconstruction term; 0: never")
     # PAPER leaves open: the rim, where masked and unmasked Gaussians are blended into the same pixels. Its text
-    # confines reconstruction to unmasked ones, but photographs are also true where masked ones reach beyond the mask.
+    # confines reconstruction to unmasked Gaussians, but photographs are also true where masked ones reach beyond the
+    # mask. ("Masked" Gaussians are those that `initialize` added.)
     reaches: Literal["unmasked", "shown"] = Field(
         "unmasked", description="Gaussians that photographs move: unmasked ones, or all that show outside the mask"
     )
 
 
 class ReferenceTerm(Settings):
-    """The reference's own pixels in its hole. Not in the paper."""
+    """Settings of the loss against the reference's own pixels in its hole. Not in the paper."""
 
     weight: float = Field(0.0, ge=0, description="weight of the reference's pixels in its hole (paper: 0)")
     reaches: Literal["masked", "all"] = Field(
@@ -110,7 +117,7 @@ class ReferenceTerm(Settings):
 
 
 class LiftTerm(Settings):
-    """Supervision by images inpainted in 2D, for baselines. Not in the paper's method."""
+    """Settings of the loss against views inpainted in 2D by the stage `lift`. For baselines; not in the paper."""
 
     weight: float = Field(0.0, ge=0, description="weight of the images of the stage lift; 0 leaves the term out")
     loss: Literal["mse", "perceptual"] = Field(
@@ -120,21 +127,31 @@ class LiftTerm(Settings):
 
 
 class LearningRates(Settings):
-    """PAPER leaves open: Adam's step sizes in distillation; 3DGS's. Unmasked Gaussians keep theirs: the reconstruction
-    term corrects those that the object's blurred rim had tinted."""
+    """Factors on the step sizes of Adam in distillation.
+
+    They apply to masked Gaussians (those that `initialize` added). Unmasked Gaussians keep the step sizes of 3DGS,
+    because the reconstruction term has to correct those that the object's blurred rim had tinted.
+
+    PAPER leaves open: Adam's step sizes in distillation. They are those of 3DGS, times these factors.
+    """
 
     masked: float = Field(1.0, gt=0, description="factor on 3DGS's step sizes of masked Gaussians")
     means_unit: MeansUnit = means_unit_field()
     opacities: float = Field(1.0, ge=0, description="further factor on the step sizes of opacities")
     shape: float = Field(1.0, ge=0, description="further factor on the step sizes of means, scales and rotations")
-    # PAPER leaves open: Adam's epsilon; 3DGS's 1e-15. The gradient of a mean over an image's pixels is about 1e-6. At
-    # 1e-15 a Gaussian that almost only SDS reaches takes full steps, however small lambda is.
+    # PAPER leaves open: Adam's epsilon. It is 3DGS's, 1e-15. The gradient of a mean over an image's pixels is about
+    # 1e-6. With an epsilon of 1e-15 a Gaussian that gets its gradient almost only from SDS takes full steps, however
+    # small lambda is.
     epsilon: float = Field(1e-15, gt=0, description="Adam's epsilon: much smaller gradients do not move a Gaussian")
 
 
 class Densify(Settings):
-    """PAPER leaves open: how densification changes. A fixed share of the masked Gaussians, those with the largest
-    screen-space gradients, is cloned or split: the SDS gradient has no scale that a threshold could refer to."""
+    """Settings of the densification of masked Gaussians (those that `initialize` added).
+
+    PAPER leaves open: how densification changes. Here a fixed share of the masked Gaussians is cloned or split, those
+    with the largest screen-space gradients. A threshold, as in 3DGS, is not possible, because the SDS gradient has no
+    fixed scale.
+    """
 
     every: int = Field(0, ge=0, description="steps between densifications of masked Gaussians; 0: never")
     stop: float = Field(0.5, ge=0, le=1, description="fraction of the run after which no Gaussian is added")
@@ -152,11 +169,11 @@ class Params(Settings):
     lift: LiftTerm = LiftTerm()
     lr: LearningRates = LearningRates()
     densify: Densify = Densify()
-    # PAPER leaves open: which mask m is. Its text repaints the consistent mask. The invent mask keeps background that
-    # other views see.
+    # PAPER leaves open: which mask m is. Its text repaints the consistent mask. Repainting only the invent mask keeps
+    # the background that other views see.
     repaint: Literal["invent", "consistent"] = Field("invent", description="the pixels the UNet repaints")
-    # PAPER leaves open: the prompt of a prior that was not adapted. It was not taught "sks", which may still have a
-    # meaning.
+    # PAPER leaves open: the prompt of a prior that was not adapted. Such a prior was not taught "sks", but the word may
+    # mean something to it all the same.
     prompts: Literal["sks", "empty"] = Field(
         "sks",
         description="the prior's prompts: those it is adapted with, or empty ones; guidance, which amplifies what a "
@@ -177,5 +194,5 @@ class Params(Settings):
 
     @property
     def needs_prior(self) -> bool:
-        """Whether a term uses the diffusion prior."""
+        """Whether a loss term that may run uses the diffusion prior: SDS or the depth term."""
         return self.sds.is_on or self.depth.weight > 0

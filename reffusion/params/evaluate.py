@@ -13,7 +13,8 @@ Kind = Literal["fsr", "lama", "migan"]
 
 
 class Params(Settings):
-    # PAPER leaves open: at which size it scores. SPIn-NeRF's masks are of 1008 px, and LPIPS depends on the size.
+    # PAPER leaves open: at which size pictures are scored. SPIn-NeRF's masks are of 1008 px, and LPIPS depends on the
+    # size.
     longest: int | None = Field(
         None,
         ge=0,

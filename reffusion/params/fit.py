@@ -1,7 +1,10 @@
-"""Parameters of the stage `fit`. Times are fractions of the run in [0, 1]; values are those of 3DGS unless noted.
+"""Parameters of the stage `fit`.
 
-PAPER leaves open: 3DGS measures Gaussians by the extent of the cameras, and so prunes large distant Gaussians, for
-example in a street. Here sizes are standard deviations divided by the distance to the nearest camera.
+Times are fractions of the run in [0, 1]. Default values are those of 3DGS unless a description says otherwise.
+
+PAPER leaves open: 3DGS measures the size of Gaussians by the extent of the cameras, and so prunes large distant
+Gaussians, for example in a street. Here the size of a Gaussian is its standard deviation divided by its distance from
+the nearest camera.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ class SphericalHarmonics(Settings):
 
 
 class Init(Settings):
-    """Initial Gaussians: one at each point."""
+    """Settings of the initial Gaussians, one at each sparse point and at each point added from optical flow."""
 
     flow_cell: int = Field(0, ge=0, description="cell size in px; adds a point from optical flow per cell; 0: none")
     opacity: float = Field(0.1, gt=0, lt=1, description="opacity of the initial Gaussians")
@@ -47,7 +50,7 @@ class Densify(Settings):
 
 
 class LearningRates(Settings):
-    """Adam's learning rates, for the normalised frame, in which cameras are about 1 from the scene."""
+    """Adam's learning rates. They suit the normalised frame, in which cameras are about 1 from the scene."""
 
     means: float = Field(1.6e-4, gt=0, description="initial learning rate of positions; the final one is 1/100 of it")
     means_unit: MeansUnit = means_unit_field()
@@ -66,8 +69,8 @@ class Params(Settings):
     init: Init = Init()
     densify: Densify = Densify()
     lr: LearningRates = LearningRates()
-    # PAPER leaves open: the default of 3DGS is black. Dark texture can then be represented by holes, which later stages
-    # would take for places without Gaussians.
+    # PAPER leaves open: the background colour; the default of 3DGS is black. On black, a fit can represent dark texture
+    # by holes, which later stages would take for places without a surface.
     random_background: bool = Field(True, description="a random background colour in each step instead of black")
     antialiased: bool = Field(False, description="2D filter of Mip-Splatting: same total opacity at any distance")
     exposure: Literal["never", "auto", "always"] = Field(

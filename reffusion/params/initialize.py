@@ -11,7 +11,7 @@ from reffusion.params.inpainter import Inpainter, ReferenceKind
 
 
 class Depth(Settings):
-    """Depth in the hole of a reference."""
+    """Settings of the depth that is estimated in the hole of a reference."""
 
     # PAPER leaves open: the depth model, and whether its alignment is plain or robust.
     model: str | None = depth_model_field()

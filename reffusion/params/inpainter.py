@@ -9,15 +9,17 @@ from pydantic import Field, model_validator
 from reffusion.params.base import WEIGHTS, Settings
 
 KindT = TypeVar("KindT", bound=str)
-ReferenceKind = Literal["exemplar", "diffusion", "lama", "migan", "auto"]  # of `reference` and `initialize`
-FEED_FORWARD = ("lama", "migan")  # the kinds that read a file
+ReferenceKind = Literal["exemplar", "diffusion", "lama", "migan", "auto"]  # in `reference`, `initialize`
+FEED_FORWARD = ("lama", "migan")  # the kinds whose network is read from a file
 
 
 class Inpainter(Settings, Generic[KindT]):
-    """What inpaints in 2D. A stage allows some kinds: `Inpainter[Literal["fsr", "lama"]]`; a plain string is the kind.
+    """The method that inpaints a view in 2D.
 
-    `weights` is for lama and migan only. The parameter `prior` of `reference` and `lift` names the diffusion model. A
-    profile sets the model, which has to suit the machine; a scene or a variant sets the kind.
+    The type parameter lists the kinds that a stage allows, as in `Inpainter[Literal["fsr", "lama"]]`. A plain string in
+    a parameter file stands for the kind. The diffusion model is not named here but by the parameter `prior` of
+    `reference` and `lift`: a profile sets the model, which has to suit the machine, while a scene or a variant sets the
+    kind.
     """
 
     kind: KindT = Field(

@@ -47,7 +47,8 @@ class Params(Settings):
         description="find parts of the object that the masks leave out: remove those that would float in the air, and "
         "warn of the others",
     )
-    # PAPER leaves open: it always invents. So few pixels are rims of masks and crevices, not worth a diffusion model.
+    # PAPER leaves open: the paper always invents. If so few pixels are unobserved, they are rims of masks and crevices,
+    # which are not worth a diffusion model.
     negligible: float = Field(
         0.005, ge=0, lt=1, description="share of C up to which unobserved pixels are not inpainted"
     )

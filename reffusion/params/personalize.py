@@ -30,8 +30,11 @@ class Lora(Settings):
 
 
 class Optimizer(Settings):
-    """AdamW. PAPER leaves open: batch, accumulation, weight decay, clipping, schedule. Batch 16 is RealFill's; weight
-    decay and clipping are in `reffusion.prior.personalize`."""
+    """Settings of AdamW.
+
+    PAPER leaves open: batch, accumulation, weight decay, clipping, schedule. The batch of 16 is RealFill's. Weight
+    decay and clipping are constants in `reffusion.prior.personalize`.
+    """
 
     lr_unet: float = Field(2e-4, gt=0, description="learning rate of the UNet's LoRA")
     lr_text: float = Field(4e-5, gt=0, description="learning rate of the text encoder's LoRA")
@@ -42,18 +45,22 @@ class Optimizer(Settings):
 
 
 class TrainingSamples(Settings):
-    """Sampling of training images from the reference.
+    """Settings of the training samples that are drawn from the reference (`reffusion.prior.crops`).
 
-    PAPER leaves open: everything except that there are local and global samples; see `reffusion.prior.crops`.
+    Global samples show the whole view, local ones crops around the hole.
+
+    PAPER leaves open: everything except that there are local and global samples.
     """
 
     size: int = Field(0, ge=0, description="side of a sample in pixels; 0: the prior's native size (paper)")
     local_share: float = Field(0.5, ge=0, le=1, description="share of the samples that are local crops")
-    # PAPER leaves open: number and sides of the rectangles; RealFill's in both cases. The paper uses only rectangles.
+    # PAPER leaves open: number and sides of the rectangles. Both choices take those of RealFill; the paper uses only
+    # rectangles.
     masks: Literal["rectangles", "realfill"] = Field(
         "rectangles", description="random rectangles; code of RealFill: a tenth of the masks covers everything"
     )
-    # The hole is the mask to be inpainted later; rectangles leave most of it visible, which a short training exploits.
+    # The hole is the mask that is inpainted later. Rectangles leave most of the hole visible, and a short training
+    # learns to rely on these visible parts.
     hole_share: float = Field(
         0.0, ge=0, le=1, description="share of the samples whose mask is the reference's hole (paper: 0)"
     )

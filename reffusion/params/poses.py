@@ -9,7 +9,8 @@ from reffusion.params.capture import SceneKeys
 
 class Params(SceneKeys):
     longest: int = Field(1600, ge=16, description="larger image side in px; smaller pictures are not enlarged")
-    # PAPER leaves open: pictures that are blurred or were enlarged. It takes 1600 px; half of that may show as much.
+    # PAPER leaves open: pictures that are blurred or were enlarged. The paper takes 1600 px; of such pictures half that
+    # size may show as much.
     min_detail: float = Field(
         0.0, ge=0, description="pictures with less detail (reffusion.capture.image_detail) are halved; 0: never"
     )

@@ -11,7 +11,7 @@ from reffusion.params.inpainter import Inpainter, ReferenceKind
 
 
 class ReferenceSpec(Settings):
-    """A completed view that the scene brings."""
+    """An entry of the key `reference` of scene.yaml: a completed view that comes with the scene."""
 
     view: str = Field(description="name of the view it completes")
     image: str = Field(description="picture, relative to the scene; of another size or cropped a little is fine")
@@ -21,7 +21,7 @@ class ReferenceSpec(Settings):
 
 
 def reference_list(given: ReferenceSpec | Sequence[ReferenceSpec] | None) -> list[ReferenceSpec]:
-    """The values of the key `reference` as a list."""
+    """Return the value of the key `reference`, which may be one entry, several or None, as a list."""
     return [] if given is None else [given] if isinstance(given, ReferenceSpec) else list(given)
 
 

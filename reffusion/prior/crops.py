@@ -1,6 +1,7 @@
 """Training samples for personalization (RefFusion section 4.1): the reference, as a whole and in crops.
 
-A sample consists of an image, a mask of pixels to repaint and a prompt.
+A sample consists of an image, a mask of pixels to repaint and a prompt. A global sample shows the whole reference, a
+local sample shows a crop around its hole.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ INVERTED_SHARE = 0.5  # of masks cover everything except their rectangles
 
 @dataclass(frozen=True)
 class Picture:
-    """A training picture.
+    """A picture from which training samples are taken.
 
     Attributes:
         image: [3, H, W] float32 in [-1, 1], no side shorter than the prior's native size.
-        region: [H, W] bool, the inpainted pixels of the reference.
+        region: bool [H, W], True in the hole: the pixels of the reference that were inpainted.
     """
 
     image: Tensor
@@ -41,7 +42,7 @@ class Picture:
 
 
 class Batch(NamedTuple):
-    """Training samples.
+    """A batch of training samples.
 
     Attributes:
         images: [B, 3, n, n] in [-1, 1].
@@ -55,7 +56,13 @@ class Batch(NamedTuple):
 
 
 def make_picture(image: Tensor, region: Tensor, size: int) -> Picture:
-    """A `Picture` from a uint8 [H, W, 3] image and a bool [H, W] region, enlarged to at least `size` pixels a side."""
+    """Build a `Picture`, enlarged to at least `size` pixels a side.
+
+    Args:
+        image: uint8 [H, W, 3].
+        region: bool [H, W], True in the hole.
+        size: Least side in pixels.
+    """
     floats = enlarge_to_fit(image.permute(2, 0, 1).to(torch.float32) / 127.5 - 1, size)
     return Picture(floats, enlarge_to_fit(region.to(torch.float32)[None], size)[0] > 1e-4)
 
@@ -65,7 +72,7 @@ def _uniform(low: float, high: float, generator: torch.Generator) -> float:
 
 
 def rectangle_mask(size: int, generator: torch.Generator) -> Tensor:
-    """[1, size, size] float, 1 = repaint: a union of random rectangles, or its complement."""
+    """Draw a mask that is a union of random rectangles or the complement of one: [1, size, size] float, 1 = repaint."""
     fewest, most = RECTANGLE_COUNT
     mask = torch.zeros(1, size, size)
     for _ in range(int(torch.randint(fewest, most + 1, (), generator=generator))):
@@ -76,14 +83,17 @@ def rectangle_mask(size: int, generator: torch.Generator) -> Tensor:
 
 
 def random_mask(samples: TrainingSamples, size: int, generator: torch.Generator) -> Tensor:
-    """[1, size, size] float, 1 = repaint: a random mask of the kind `samples.masks`."""
+    """Draw a random mask of the kind `samples.masks`, [1, size, size] float, 1 = repaint."""
     if samples.masks == "realfill" and _uniform(0, 1, generator) < WHOLE_SHARE:
         return torch.ones(1, size, size)
     return rectangle_mask(size, generator)
 
 
 def crop_border(source: Picture, max_border: float, generator: torch.Generator) -> Picture:
-    """The picture without a strip of random width at each side: at most `max_border` of its height or width."""
+    """Return the picture without a strip of random width at each side.
+
+    A strip takes at most the share `max_border` of the picture's height or width.
+    """
     height, width = source.region.shape
     top, bottom = (int(_uniform(0, max_border, generator) * height) for _ in range(2))
     left, right = (int(_uniform(0, max_border, generator) * width) for _ in range(2))
@@ -99,12 +109,16 @@ def draw_samples(
     samples: TrainingSamples,
     generator: torch.Generator,
 ) -> Batch:
-    """`count` random training samples of side `size`, determined by `generator`.
+    """Draw `count` random training samples of side `size`.
 
     Args:
-        references: the pictures to learn; all of their pixels may be used.
-        native: side to which distillation resizes a whole view. Global samples are resized to it, too. If `size` is
-            smaller, a window of them that shows part of the hole is used, so that the scale is that of distillation.
+        references: The pictures to learn; all of their pixels may be used.
+        native: Side in pixels to which distillation resizes a whole view. Global samples are resized to it, too.
+        size: Side of a sample in pixels. If it is smaller than `native`, a global sample is a window of the resized
+            view that shows part of the hole, so that its scale is that of distillation.
+        count: Number of samples.
+        samples: Parameters of the samples.
+        generator: The source of randomness, on the CPU.
     """
     images, masks, prompts = [], [], []
     for _ in range(count):
@@ -120,7 +134,11 @@ def draw_samples(
 def _sample_of_reference(
     source: Picture, native: int, size: int, local_share: float, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, int]:
-    """A local or global sample of a reference: image [3, size, size], its hole [1, size, size], index of the prompt."""
+    """Draw a local or a global sample of a reference.
+
+    Returns:
+        The image [3, size, size], its hole [1, size, size] (1 = hole), and the index of its prompt.
+    """
     if _uniform(0, 1, generator) < local_share:
         image, hole, prompt = source.image, source.region[None].to(torch.float32), LOCAL
     else:

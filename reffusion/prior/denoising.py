@@ -16,13 +16,16 @@ from reffusion.seeding import generator as seeded
 
 
 def spread_timesteps(count: int, steps: int, generator: torch.Generator) -> Tensor:
-    """[count] long: stratified timesteps, one in each of `count` equal parts of [0, steps); batches vary less."""
+    """Draw stratified timesteps in random order, long [count]: one in each of `count` equal parts of [0, steps).
+
+    Stratified timesteps vary less between batches than independent ones.
+    """
     positions = torch.randperm(count, generator=generator) + torch.rand(1, generator=generator)
     return (positions * (steps / count)).long().clamp(max=steps - 1)
 
 
 def latent_shape(prior: Prior, size: int) -> tuple[int, int, int]:
-    """(C, h, w) of the latents of a size x size image."""
+    """Return the shape (C, h, w) of the latents of a size x size image."""
     side = size // prior.factor
     config: Any = prior.vae.config
     return config.latent_channels, side, side
@@ -31,16 +34,21 @@ def latent_shape(prior: Prior, size: int) -> tuple[int, int, int]:
 def denoising_error(
     prior: Prior, samples: Batch, text: Tensor, timesteps: Tensor, noise: Tensor, outside_weight: float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    """([B], [B]): mean squared errors over the whole image, of the prior's own target and of the clean latent.
+    """Return two mean squared errors of the denoiser for each sample: of its target, and of the clean latent, [B] each.
 
-    The target is what the network was trained to predict: eps, or v = a eps - s z. PAPER leaves open: the target
-    (its prior predicts eps) and whether the loss covers the whole image or the mask; as in RealFill, it covers all.
+    The target is the quantity that the network was trained to predict: eps, or v = a eps - s z. Both errors are means
+    over the whole image.
+
+    PAPER leaves open: the target (the paper's prior predicts eps) and whether the loss covers the whole image or the
+    mask. As in RealFill, it covers the whole image.
 
     Args:
-        text: [3, L, D], embeddings of PROMPTS.
+        prior: The diffusion prior.
+        samples: The training samples.
+        text: [3, L, D], the embeddings of PROMPTS.
         timesteps: [B] long.
         noise: [B, C, h, w] standard normal, in the shape of the latents.
-        outside_weight: weight of latents outside the mask; those to repaint have weight 1. The mean is weighted.
+        outside_weight: Weight of latents outside the mask in the means. Latents to repaint have weight 1.
     """
     images, masks = samples.images.to(prior.device), samples.masks.to(prior.device)
     timesteps, noise = timesteps.to(prior.device), noise.to(prior.device)
@@ -59,7 +67,15 @@ def denoising_error(
 
 
 def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Batch:
-    """The reference with its own hole (all of it if it has none): the whole view and a crop. Fixed by the seed."""
+    """Return two fixed samples of the first reference, the whole view and a crop, with its hole as mask.
+
+    These samples measure the error of the prior. If the reference has no hole, the mask covers everything.
+
+    Args:
+        references: The references, of which the first is used.
+        size: Side of a sample in pixels.
+        seed: Determines the position of the crop.
+    """
     generator = seeded(seed, "personalize", "held out")
     reference = references[0]
     region = reference.region if reference.region.any() else torch.ones_like(reference.region)
@@ -69,7 +85,7 @@ def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Bat
 
 
 def backward_one_sample(prior: Prior, references: Sequence[Picture], seed: int) -> None:
-    """Compute loss and gradient of one sample; `memory.fit_to_memory` measures the memory of this."""
+    """Compute the loss and the gradient of one sample; `memory.fit_to_memory` measures the memory that this takes."""
     sample = Batch(*(tensor[:1] for tensor in held_out_samples(references, prior.native_size, seed)))
     noise = torch.zeros(1, *latent_shape(prior, prior.native_size))
     text = diffusion.embed_text(prior, list(PROMPTS))

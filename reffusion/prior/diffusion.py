@@ -1,7 +1,7 @@
 """Operations of the inpainting diffusion model: embed, encode, decode, add noise, predict, sample. Masks: 1 = repaint.
 
-Schedule, noise and x0 = (z_t - s eps) / a are float32 whatever the precision of the UNet: at the last timestep 1 / a is
-15, and rounding errors are multiplied by it.
+Schedule, noise and x0 = (z_t - s eps) / a are float32 whatever the precision of the UNet. At the last timestep 1 / a is
+15, and rounding errors are multiplied by this factor.
 """
 
 from __future__ import annotations
@@ -21,10 +21,13 @@ from reffusion.prior.model import Prior
 
 
 def embed_text(prior: Prior, prompts: list[str]) -> Tensor:
-    """[B, L, D] hidden states of the prompts; differentiable in the LoRA of the text encoder.
+    """Return the hidden states of prompts, [B, L, D], differentiable in the LoRA of the text encoder.
 
-    For SDXL these are the penultimate hidden layers of both encoders, concatenated. One more row, padded with zeros,
-    holds the pooled embedding that its UNet also takes. So a prompt is one tensor for both kinds of model.
+    For SDXL these are the penultimate hidden layers of both text encoders, concatenated. One more row, padded with
+    zeros, contains the pooled embedding that its UNet also takes. So a prompt is one tensor for both kinds of model.
+
+    Raises:
+        ValueError: The text encoder was dropped (`model.drop_text_encoders`).
     """
     if prior.text_encoder is None:
         raise ValueError("this prior's text encoder was dropped; embed every prompt before `without_text`")
@@ -48,7 +51,15 @@ def _token_ids(tokenizer: Any, encoder: nn.Module, prompts: list[str], device: t
 
 
 def _in_batches(prior: Prior, function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-    """`function` of the rows, in passes of at most the number of rows set in the prior."""
+    """Return `function` of the rows, computed in passes of at most the number of rows that the prior sets.
+
+    With a gradient, the passes are recomputed in the backward pass.
+
+    Args:
+        prior: Sets the number of rows (`rows`, or `rows_with_grad`).
+        function: Maps tensors [b, ...] to a tensor [b, ...].
+        rows: Its arguments for all samples, [B, ...] each.
+    """
     max_rows = (prior.rows_with_grad if torch.is_grad_enabled() else prior.rows) or len(rows[0])
     if len(rows[0]) <= max_rows:
         return function(*rows)
@@ -59,14 +70,17 @@ def _in_batches(prior: Prior, function: Callable[..., Tensor], *rows: Tensor) ->
 
 
 def encode(prior: Prior, images: Tensor) -> Tensor:
-    """Images [B, 3, H, W] in [-1, 1] -> latents [B, C, H/f, W/f], the scaled mean of the posterior; differentiable."""
+    """Encode images [B, 3, H, W] in [-1, 1] as latents [B, C, H/f, W/f]; differentiable.
+
+    The latents are the mean of the VAE's posterior times its scaling factor. f is `prior.factor`.
+    """
     dtype = next(prior.vae.parameters()).dtype
     mean = _in_batches(prior, lambda part: prior.vae.encode(part.to(dtype)).latent_dist.mean, images)
     return (mean * prior.vae.config.scaling_factor).float()
 
 
 def decode(prior: Prior, latents: Tensor) -> Tensor:
-    """Latents [B, C, h, w] -> images [B, 3, H, W], roughly in [-1, 1]; differentiable."""
+    """Decode latents [B, C, h, w] to images [B, 3, H, W], roughly in [-1, 1]; differentiable."""
     dtype = next(prior.vae.parameters()).dtype
     scaled = latents / prior.vae.config.scaling_factor
     return _in_batches(prior, lambda part: prior.vae.decode(part.to(dtype)).sample, scaled).float()
@@ -74,10 +88,14 @@ def decode(prior: Prior, latents: Tensor) -> Tensor:
 
 @torch.no_grad()
 def conditioning(prior: Prior, images: Tensor, masks: Tensor) -> Tensor:
-    """Conditioning of the UNet: [mask | latents of the image outside the mask], [B, 1 + C, h, w].
+    """Return the conditioning of the UNet, [mask | latents of the masked image], [B, 1 + C, h, w], without gradient.
 
-    Carries no gradient. `images` [B, 3, H, W] in [-1, 1], `masks` [B, 1, H, W], 1 = repaint. The hole is grey, or
-    filled from its surroundings if `prior.fills`.
+    The hole in the masked image is grey, or filled from its surroundings if `prior.fills`.
+
+    Args:
+        prior: The diffusion prior.
+        images: [B, 3, H, W] in [-1, 1].
+        masks: [B, 1, H, W], 1 = repaint.
     """
     hidden = (masks > 0.5).to(images.dtype)
     latents = encode(prior, harmonic_fill.harmonic_extension(images, hidden) if prior.fills else images * (1 - hidden))
@@ -86,18 +104,33 @@ def conditioning(prior: Prior, images: Tensor, masks: Tensor) -> Tensor:
 
 
 def alpha_bar(prior: Prior, t: Tensor) -> Tensor:
-    """alpha-bar at timesteps `t` [B], in the shape [B, 1, 1, 1]."""
+    """Return alpha_bar at timesteps `t` [B], in the shape [B, 1, 1, 1]."""
     return prior.alphas_cumprod[t].view(-1, 1, 1, 1)
 
 
 def add_noise(prior: Prior, latents: Tensor, noise: Tensor, t: Tensor) -> Tensor:
-    """z_t = sqrt(abar_t) z_0 + sqrt(1 - abar_t) eps."""
+    """Return the noisy latents z_t = sqrt(abar_t) z_0 + sqrt(1 - abar_t) eps.
+
+    Args:
+        prior: The diffusion prior.
+        latents: [B, C, h, w], the clean latents z_0.
+        noise: [B, C, h, w], the noise eps.
+        t: [B] timesteps.
+    """
     a = alpha_bar(prior, t)
     return a.sqrt() * latents + (1 - a).sqrt() * noise
 
 
 def raw_prediction(prior: Prior, noisy: Tensor, t: Tensor, condition: Tensor, text: Tensor) -> Tensor:
-    """The raw output of the UNet, eps or v, float32 [B, C, h, w]; for training."""
+    """Return the output of the UNet, which is a prediction of eps or of v, float32 [B, C, h, w]. For training.
+
+    Args:
+        prior: The diffusion prior.
+        noisy: [B, C, h, w], the noisy latents z_t.
+        t: [B] timesteps.
+        condition: [B, 1 + C, h, w], see `conditioning`.
+        text: [B, L, D], the hidden states of the prompts.
+    """
     inputs = torch.cat([noisy, condition], 1).to(prior.dtype)
     return _in_batches(prior, lambda *rows: _unet(prior, *rows), inputs, t, text.to(prior.dtype)).float()
 
@@ -114,7 +147,7 @@ def _unet(prior: Prior, inputs: Tensor, t: Tensor, text: Tensor) -> Tensor:
 
 
 def training_target(prior: Prior, latents: Tensor, noise: Tensor, t: Tensor) -> Tensor:
-    """The target of `raw_prediction`: eps, or v = sqrt(abar) eps - sqrt(1 - abar) z_0."""
+    """Return the target of `raw_prediction`: eps, or v = sqrt(abar) eps - sqrt(1 - abar) z_0."""
     if prior.prediction_type == "epsilon":
         return noise
     a = alpha_bar(prior, t)
@@ -122,7 +155,7 @@ def training_target(prior: Prior, latents: Tensor, noise: Tensor, t: Tensor) -> 
 
 
 def predict(prior: Prior, noisy: Tensor, t: Tensor, condition: Tensor, text: Tensor) -> tuple[Tensor, Tensor]:
-    """(eps, z_0) predicted from z_t; both float32 [B, C, h, w]."""
+    """Return eps and z_0 as predicted from the noisy latents z_t, float32 [B, C, h, w] each."""
     output, a = raw_prediction(prior, noisy, t, condition, text), alpha_bar(prior, t)
     if prior.prediction_type == "epsilon":
         return output, (noisy - (1 - a).sqrt() * output) / a.sqrt()
@@ -141,19 +174,24 @@ def sample(
     empty: Tensor | None = None,
     start: float = 1.0,
 ) -> Tensor:
-    """Inpaint by deterministic DDIM.
+    """Inpaint pictures by deterministic DDIM.
 
     Args:
-        images: [B, 3, H, W] in [-1, 1]; pixels under the mask matter only if `start` < 1.
+        prior: The diffusion prior.
+        images: [B, 3, H, W] in [-1, 1]. Pixels under the mask matter only if `start` < 1.
         masks: [B, 1, H, W], 1 = repaint.
-        text, empty: [B, L, D] hidden states; `empty` is needed when `guidance` > 0.
-        steps: denoising steps, >= 1.
-        random: a CPU generator for the noise.
-        guidance: a of the paper: (1 + a) eps(cond) - a eps(empty); the guidance scale of libraries is 1 + a.
-        start: initial noise level as a fraction of the schedule; 1 starts from pure noise.
+        text: [B, L, D], the hidden states of the prompts.
+        steps: Number of denoising steps, at least 1.
+        random: Draws the noise, on the CPU.
+        guidance: The paper's a in (1 + a) eps(cond) - a eps(empty). The guidance scale of libraries is 1 + a.
+        empty: [B, L, D], the hidden states of the empty prompt; needed if `guidance` > 0.
+        start: Initial noise level in (0, 1], as a fraction of the schedule. 1 starts from pure noise.
 
     Returns:
-        [B, 3, H, W] in [-1, 1], the whole picture of the model; the caller restores known pixels.
+        [B, 3, H, W] in [-1, 1], the whole pictures of the model. The caller restores known pixels.
+
+    Raises:
+        ValueError: `start` is out of range, or `empty` is missing.
     """
     if not 0 < start <= 1:
         raise ValueError(f"start must lie in (0, 1], not {start}")
@@ -173,9 +211,21 @@ def sample(
 def guided(
     prior: Prior, noisy: Tensor, t: Tensor, condition: Tensor, text: Tensor, empty: Tensor | None, guidance: float
 ) -> tuple[Tensor, Tensor]:
-    """(eps, z_0) with classifier-free guidance (1 + a) eps(cond) - a eps(empty), both in one UNet batch.
+    """Return eps and z_0 with classifier-free guidance, (1 + a) eps(cond) - a eps(empty), in one batch of the UNet.
 
-    For the empty prompt itself this is eps(empty), whatever a is, and takes one pass.
+    If the prompt itself is empty, the result is eps(empty) for every a, and the UNet runs for this prompt only.
+
+    Args:
+        prior: The diffusion prior.
+        noisy: [B, C, h, w], the noisy latents z_t.
+        t: [B] timesteps.
+        condition: [B, 1 + C, h, w], see `conditioning`.
+        text: [B, L, D], the hidden states of the prompts.
+        empty: [B, L, D], the hidden states of the empty prompt. None is allowed without guidance.
+        guidance: The paper's a; 0 means no guidance.
+
+    Raises:
+        ValueError: `guidance` is not 0 and `empty` is None.
     """
     if guidance and empty is None:
         raise ValueError("guidance needs the empty prompt's embedding")

@@ -1,4 +1,4 @@
-"""Fills holes by the harmonic extension of their surroundings: the solution of Laplace's equation, like a soap film."""
+"""Filling of holes by the harmonic extension of their surroundings, the solution of Laplace's equation."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ JACOBI_STEPS = 4
 
 @torch.no_grad()
 def harmonic_extension(images: Tensor, hidden: Tensor) -> Tensor:
-    """Images with every hole filled by the harmonic extension of the known pixels, by cascadic multigrid.
+    """Return images whose holes are filled by the harmonic extension of the known pixels.
 
-    Grids go from one pixel to the full size. Cells with known pixels keep the mean of these. The others start from the
-    coarser grid and take `JACOBI_STEPS` iterations, with Neumann conditions at the borders of the image.
+    The method is cascadic multigrid: grids go from one cell to the full size. Cells with known pixels have the mean of
+    these pixels. All other cells start from the coarser grid and take `JACOBI_STEPS` iterations, with Neumann
+    conditions at the borders of the image.
 
     Args:
-        images: [B, C, H, W]; values under `hidden` are ignored and need not be finite.
+        images: [B, C, H, W]. Values in the hole are ignored and need not be finite.
         hidden: [B, 1, H, W], 1 = hole, 0 = known.
 
     Returns:
-        [B, C, H, W] within the range of the known values; all 0 where nothing is known. Carries no gradient.
+        [B, C, H, W] within the range of the known values; all 0 if nothing is known. Without gradient.
     """
     known = 1 - hidden
     grids = [(torch.where(hidden > 0.5, 0, images), known)]
@@ -41,12 +42,16 @@ def harmonic_extension(images: Tensor, hidden: Tensor) -> Tensor:
 
 
 def _downsample(values: Tensor) -> Tensor:
-    """Means of 2 x 2 pixels; an odd side is padded with zeros, which have no weight."""
+    """Return the means of 2 x 2 pixels. An odd side is padded with zeros.
+
+    The images are 0 in holes, and the share of known pixels is downsampled likewise, so zeros do not change the mean of
+    the known pixels.
+    """
     height, width = values.shape[-2:]
     return F.avg_pool2d(F.pad(values, (0, width % 2, 0, height % 2)), 2)
 
 
 def _neighbor_mean(x: Tensor) -> Tensor:
-    """Mean of the four neighbours of each pixel; at borders the pixel itself replaces the missing one."""
+    """Return the mean of the four neighbours of each pixel. At borders the pixel itself replaces a missing one."""
     padded = F.pad(x, (1, 1, 1, 1), mode="replicate")
     return (padded[..., :-2, 1:-1] + padded[..., 2:, 1:-1] + padded[..., 1:-1, :-2] + padded[..., 1:-1, 2:]) / 4

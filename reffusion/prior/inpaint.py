@@ -1,4 +1,4 @@
-"""2D inpainting of a view by the prior at the view's full resolution: coarse to fine, several candidates."""
+"""2D inpainting of a view by the prior, at the view's full resolution, coarse to fine, with several candidates."""
 
 from __future__ import annotations
 
@@ -20,39 +20,42 @@ from reffusion.types import Camera, Gaussians
 
 @torch.no_grad()
 def composite_background(remaining: Gaussians, camera: Camera, photo: np.ndarray, consistent: np.ndarray) -> np.ndarray:
-    """A view without the object, as far as it is known, uint8 [H, W, 3].
+    """Return a view without the object, as far as its background is known, uint8 [H, W, 3].
 
-    Outside C this is the photo, inside C a rendering of the remaining Gaussians. The rendering shows what other views
-    observed, and is meaningless where none did.
+    Outside C (the consistent mask, which shows the object) this is the photograph. Inside C it is a rendering of the
+    remaining Gaussians, which shows the background that other views observed. Where no view observed it, the rendering
+    is meaningless.
 
     Args:
-        remaining: the Gaussians without those of the object.
-        photo: uint8 [H, W, 3].
-        consistent: C, bool [H, W].
+        remaining: The Gaussians without those of the object.
+        camera: The camera of the view.
+        photo: uint8 [H, W, 3], the photograph.
+        consistent: bool [H, W], the mask C.
     """
     rendering = rasterizer.render(remaining, camera).color.cpu().numpy()
     return np.where(consistent[..., None], to_uint8(rendering), photo)
 
 
 def to_input(picture: np.ndarray) -> Tensor:
-    """uint8 [H, W, 3] -> float32 [3, H, W] in [-1, 1], the input of `paint`."""
+    """Convert a picture, uint8 [H, W, 3], to the input of `paint`, float32 [3, H, W] in [-1, 1]."""
     return torch.from_numpy(picture).permute(2, 0, 1) / 127.5 - 1
 
 
 def to_picture(painted: Tensor) -> np.ndarray:
-    """[3, H, W] in [-1, 1] -> uint8 [H, W, 3]."""
+    """Convert an output of `paint`, [3, H, W] in [-1, 1], to a picture, uint8 [H, W, 3]."""
     return to_uint8((painted.permute(1, 2, 0).cpu().numpy() + 1) / 2)
 
 
 def resize(image: Tensor, height: int, width: int) -> Tensor:
-    """[B, C, H, W] -> [B, C, height, width], bilinear, antialiased when shrinking."""
+    """Resize an image [B, C, H, W] to [B, C, height, width]: bilinear, antialiased when shrinking."""
     return F.interpolate(image, size=(height, width), mode="bilinear", align_corners=False, antialias=True)
 
 
 def level_sizes(height: int, width: int, size: int) -> list[tuple[int, int]]:
-    """(height, width) of each refinement level: the shorter side doubles from 2 x `size` up to the full view.
+    """Return the (height, width) of each refinement level: the shorter side doubles from 2 x `size` to the full view.
 
-    A view whose shorter side is at most `size` is refined once, scaled so that this side is `size`.
+    The last level has the size of the view. A view whose shorter side is at most `size` has one level, in which this
+    side is `size`.
     """
     shorter = min(height, width)
     sizes, side = [], 2 * size
@@ -64,7 +67,12 @@ def level_sizes(height: int, width: int, size: int) -> list[tuple[int, int]]:
 
 
 def windows_over(hole: Tensor, size: int) -> Iterator[tuple[int, int]]:
-    """(top, left) of size x size windows, half overlapping, that cover the True pixels of a [H, W] bool hole."""
+    """Yield the corner (top, left) of size x size windows that together cover a hole and overlap by half.
+
+    Args:
+        hole: bool [H, W], True at the pixels to cover.
+        size: Side of a window in pixels, at most min(H, W).
+    """
     height, width = hole.shape
     uncovered = hole.clone()
     while uncovered.any():
@@ -95,19 +103,21 @@ def paint(
     start: float,
     guidance: float,
 ) -> Tensor:
-    """Candidates for the pixels of `hole`; other pixels are unchanged.
+    """Paint candidates for the pixels of a hole. All other pixels are unchanged.
 
-    The whole view is painted at the prior's native size from pure noise. Each finer level (`level_sizes`) starts from
-    the enlarged coarser one and is repainted window by window from the timestep `start`; a window sees the results of
-    its neighbours. The result is determined by the seeds.
+    First the whole view is painted at the prior's native size from pure noise. Each finer level (`level_sizes`) starts
+    from the enlarged result of the coarser level, and is repainted window by window from the noise level `start`. A
+    window sees the results of its neighbours. The seeds determine the result.
 
     Args:
-        image: [3, H, W] float32 in [-1, 1]; pixels inside the hole are ignored.
-        hole: [H, W] bool, with at least one True pixel.
-        seeds: one per candidate.
-        steps: sampler steps from pure noise; a later start takes a proportional part of them.
-        start: in (0, 1], initial noise level of refinements as a fraction of the schedule (1 = pure noise).
-        guidance: a of the paper.
+        prior: The diffusion prior.
+        image: [3, H, W] float32 in [-1, 1]. Pixels inside the hole are ignored.
+        hole: bool [H, W], with at least one True pixel.
+        prompt: The text prompt.
+        seeds: One seed for each candidate.
+        steps: Number of sampler steps from pure noise. A lower noise level takes a proportional part of them.
+        start: Initial noise level of refinements in (0, 1], as a fraction of the schedule (1 = pure noise).
+        guidance: The paper's a, the strength of classifier-free guidance.
 
     Returns:
         [len(seeds), 3, H, W] in [-1, 1].
@@ -143,10 +153,14 @@ def paint(
 
 
 def _paint_windows(painted: Tensor, mask: Tensor, size: int, sample: Callable[..., Tensor]) -> None:
-    """Repaint `mask` [1, 1, h, w] of `painted` [B, 3, h, w] in place, window by window.
+    """Repaint the masked pixels of pictures in place, window by window. A window sees the results of its neighbours.
 
-    A window sees the results of its neighbours. `sample(images, part, top, left)` returns the new picture of a window,
-    of which the pixels `part` are used.
+    Args:
+        painted: [B, 3, h, w], the pictures, changed in place.
+        mask: [1, 1, h, w], nonzero at the pixels to repaint.
+        size: Side of a window in pixels.
+        sample: Function of (pictures of a window, part, top, left) that returns new pictures of the window. `part` [1,
+            1, size, size] is 1 at the pixels that are used.
     """
     remaining = mask[0, 0] > 0
     for top, left in windows_over(remaining.cpu(), size):
@@ -173,23 +187,27 @@ def repaint(
     steps: int,
     guidance: float,
 ) -> Tensor:
-    """A view with its hole repainted, starting from its present content: the smaller `start`, the less changes.
+    """Return a view whose hole is repainted from its present content. The smaller `start`, the less the hole changes.
 
-    The whole view is repainted at the prior's native size, then at `levels` of the finer sizes of `paint`. The change
-    of a level is enlarged and added to the view at the next one, so that the view keeps its own detail.
+    The whole view is repainted at the prior's native size, then at the first `levels` of the finer sizes of
+    `level_sizes`. The change at one size is enlarged and added to the view at the next size, so that the view keeps its
+    own detail.
 
     Args:
+        prior: The diffusion prior.
         image: [3, H, W] in [-1, 1].
-        hole: [H, W] bool, with at least one True pixel.
-        text: [3, L, D], hidden states of the prompts for the whole view and for windows, and of the empty prompt.
-        random: a CPU generator.
-        start: in (0, 1], initial noise level of the whole view as a fraction of the schedule.
-        finest: upper limit of this level for finer sizes; from pure noise a window would ignore the whole view.
-        steps: sampler steps from pure noise; a later start takes a proportional part of them.
-        guidance: a of the paper.
+        hole: bool [H, W], with at least one True pixel.
+        text: [3, L, D], the hidden states of the prompt for the whole view, of the prompt for windows, and of the empty
+            prompt.
+        random: Draws the noise, on the CPU.
+        start: Initial noise level of the whole view in (0, 1], as a fraction of the schedule.
+        finest: Upper limit of the noise level at finer sizes. From pure noise a window would ignore the whole view.
+        levels: Number of finer sizes.
+        steps: Number of sampler steps from pure noise. A lower noise level takes a proportional part of them.
+        guidance: The paper's a, the strength of classifier-free guidance.
 
     Returns:
-        [3, H, W] in [-1, 1]; pixels outside the hole are unchanged.
+        [3, H, W] in [-1, 1]. Pixels outside the hole are unchanged.
     """
     size, (height, width), device = prior.native_size, hole.shape, prior.device
     view, whole_hole = image.to(device)[None], hole.to(device, torch.float32)[None, None]
@@ -214,13 +232,14 @@ def repaint(
 
 
 def seam_score(candidates: Tensor, hole: Tensor) -> Tensor:
-    """[B]: mean absolute colour step across the boundary of the hole; low values are seamless.
+    """Return [B], the mean absolute colour step across the boundary of the hole; a low value means no visible seam.
 
-    PAPER leaves open: how its reference is chosen (by eye). By default the candidate with the lowest value is chosen.
+    PAPER leaves open: how the reference is chosen (the paper: by eye). Here by default the candidate with the lowest
+    value is chosen.
 
     Args:
         candidates: [B, 3, H, W].
-        hole: [H, W] bool.
+        hole: bool [H, W].
     """
     hole = hole.to(candidates.device)
     total, count = candidates.new_zeros(candidates.shape[0]), 0

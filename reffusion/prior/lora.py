@@ -2,10 +2,10 @@
 
 This is the only module that imports peft.
 
-W' = W + alpha / rank * B A. Without dropout the product is added to the weights once per forward pass, instead of
-passing every input through A and B as well. Function and gradients are the same, and a step of the embedded prior is a
-fifth cheaper. In half precision this is not done: most of a small product would be lost in the sum, while A and B
-themselves are float32.
+A weight with LoRA is W' = W + alpha / rank * B A. Without dropout the product B A is added to the weights once per
+forward pass, instead of passing every input through A and B as well. Function and gradients are the same, and a step of
+the embedded prior is a fifth cheaper. In half precision this is not done: most of a small product would be lost in the
+sum, while A and B themselves are float32.
 """
 
 from __future__ import annotations
@@ -35,19 +35,20 @@ CONVOLUTIONS = (
 def attach(
     prior: Prior, rank: int, alpha: float, dropout: float, layers: str, seed: int
 ) -> dict[str, list[nn.Parameter]]:
-    """Attach fresh LoRA layers to UNet and text encoder, in place.
+    """Attach new LoRA layers to UNet and text encoder, in place.
 
     Args:
-        rank, alpha, dropout: of every layer; a weight changes by alpha / rank * B A.
+        prior: The diffusion prior.
+        rank, alpha, dropout: Of every layer. A weight changes by alpha / rank * B A.
         layers: "attention" (as in the paper), "qkv" (without output projections), or "attention+conv" (also
             convolutions and feed-forward layers of the UNet).
-        seed: of the initial values.
+        seed: Seed of the initial values.
 
     Returns:
         {"unet": parameters, "text": parameters}, float32, requiring gradients.
 
     Raises:
-        ValueError: the prior is SDXL, or `layers` is unknown.
+        ValueError: The prior is SDXL, or `layers` is unknown.
     """
     from peft import LoraConfig
 
@@ -75,7 +76,7 @@ def attach(
 
 
 def _merge_in_forward(part: nn.Module) -> None:
-    """Make layers with LoRA compute with W' in one product: fewer operations for the same result."""
+    """Make layers with LoRA compute with W' in one product, which takes fewer operations for the same result."""
     from peft.tuners.lora import LoraLayer
 
     for layer in part.modules():
@@ -86,7 +87,7 @@ def _merge_in_forward(part: nn.Module) -> None:
 
 
 def _merged_weight(layer) -> Tensor:
-    """W' of a peft layer; for a convolution A has its kernel size, and B is 1 x 1."""
+    """Return W' of a peft layer. For a convolution A has the kernel's size, and B is 1 x 1."""
     (name,) = layer.active_adapters
     a, b = layer.lora_A[name].weight, layer.lora_B[name].weight
     weight = layer.base_layer.weight
@@ -113,7 +114,7 @@ def _lora_parameters(part: nn.Module) -> list[nn.Parameter]:
 
 
 def state(prior: Prior) -> dict[str, Tensor]:
-    """LoRA weights by name, for checkpoints."""
+    """Return copies of the LoRA weights by name, for checkpoints."""
     return {
         f"{label}.{name}": parameter.detach().cpu().clone()
         for label, part in (("unet", prior.unet), ("text", prior.text_encoder))
@@ -131,13 +132,16 @@ def load_state(prior: Prior, state: dict[str, Tensor]) -> None:
 
 
 def set_dropout(prior: Prior, active: bool) -> None:
-    """Switch to training mode (with LoRA dropout) or evaluation mode."""
+    """Switch UNet and text encoder to training mode, with LoRA dropout, or to evaluation mode."""
     for part in (prior.unet, prior.text_encoder):
         part.train(active)
 
 
 def save(prior: Prior, folder: Path) -> None:
-    """Write `pytorch_lora_weights.safetensors` for `load_lora_weights` of diffusers, with rank and alpha."""
+    """Write the LoRA, with rank and alpha, to `folder` as pytorch_lora_weights.safetensors.
+
+    diffusers reads this file by `load_lora_weights`.
+    """
     from peft import get_peft_model_state_dict
 
     assert prior.text_encoder is not None
@@ -154,18 +158,19 @@ def save(prior: Prior, folder: Path) -> None:
 
 
 def _with_prefix(layers: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Keys of the text encoder with the prefix of published LoRA files.
+    """Return the text encoder's weights with the prefix "text_model." of published LoRA files in their names.
 
-    transformers 5 has no prefix, but transformers 4 and other readers of such files need it; diffusers removes it where
-    the encoder has none.
+    transformers 5 uses no prefix, but transformers 4 and other readers of such files need it. diffusers removes the
+    prefix if the encoder has none.
     """
     return {key if key.startswith("text_model.") else f"text_model.{key}": value for key, value in layers.items()}
 
 
 def _sort_metadata(path: Path) -> None:
-    """Sort the metadata in the header of the file.
+    """Sort the metadata in the header of a safetensors file.
 
-    safetensors writes it in random order, and equal weights must give equal files; else later stages would run again.
+    safetensors writes the metadata in random order. Equal weights must give equal files, else later stages would run
+    again.
     """
     content = path.read_bytes()
     end = 8 + int.from_bytes(content[:8], "little")
@@ -177,14 +182,20 @@ def _sort_metadata(path: Path) -> None:
 
 
 def _adapter_config(part: nn.Module) -> dict[str, Any]:
-    """The configuration of the adapter (rank, alpha, layers), sorted and without local paths."""
+    """Return the configuration of the adapter (rank, alpha, layers), sorted and without local paths."""
     config = next(iter(part.peft_config.values())).to_dict()
     plain = {key: sorted(value) if isinstance(value, set) else value for key, value in sorted(config.items())}
     return plain | {"base_model_name_or_path": None}
 
 
 def merge(prior: Prior, folder: Path) -> Prior:
-    """The prior with the LoRA in `folder`, merged into the UNet (the text encoder keeps separate layers)."""
+    """Return the prior with the LoRA in `folder`. The networks of the given prior are changed.
+
+    The LoRA is merged into the weights of the UNet. The text encoder keeps separate LoRA layers.
+
+    Raises:
+        ValueError: The folder contains no LoRA.
+    """
     if not (folder / LORA_FILE).exists():
         raise ValueError(f"{folder / LORA_FILE} does not exist; run the personalize stage first")
     pipe = pipeline(prior)

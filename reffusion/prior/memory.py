@@ -1,4 +1,4 @@
-"""Limits the samples per pass to a memory budget, measured on one sample, and explains out-of-memory errors."""
+"""The number of samples per pass that fits into a memory budget, and the explanation of out-of-memory errors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ USABLE_SHARE = 0.9  # of a budget; the rest is left for workspaces of kernels an
 
 
 class _TensorBytes(TorchDispatchMode):
-    """Counts the bytes of all live tensors that were created inside the context."""
+    """A counter of the bytes of all live tensors that were created inside the context, and of their peak."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,9 +49,10 @@ def _address(tensor: Tensor) -> int:
 
 
 def peak_bytes(work: Callable[[], object], device: torch.device | str) -> int:
-    """Peak memory in bytes of the tensors created by `work`, beyond what was allocated before.
+    """Return the peak memory in bytes of the tensors created by `work`, beyond the memory allocated before.
 
-    On a GPU this is the count of the allocator; elsewhere live tensors are counted, without workspaces of kernels.
+    On a GPU this is the count of the allocator. On other devices live tensors are counted, without the workspaces of
+    kernels.
     """
     if torch.device(device).type == "cuda":
         torch.cuda.synchronize(device)
@@ -66,10 +67,16 @@ def peak_bytes(work: Callable[[], object], device: torch.device | str) -> int:
 
 
 def rows_within(budget_gb: float, fixed: int, row: int, param: str) -> int:
-    """Number of samples of `row` bytes that fit into a budget in GB (1e9 bytes) beside `fixed` bytes of weights.
+    """Return the number of samples that fit into a memory budget beside the weights.
+
+    Args:
+        budget_gb: The budget in GB (1e9 bytes), of which the share `USABLE_SHARE` is used.
+        fixed: Bytes of the weights.
+        row: Bytes of one sample.
+        param: Name of the parameter that sets the budget, e.g. "distill.memory_gb".
 
     Raises:
-        ValueError: not even one fits; names `param` and other remedies.
+        ValueError: Not even one sample fits. The message names `param` and other remedies.
     """
     count = int((USABLE_SHARE * budget_gb * 1e9 - fixed) // max(row, 1))
     if count < 1:
@@ -85,13 +92,17 @@ def rows_within(budget_gb: float, fixed: int, row: int, param: str) -> int:
 def fit_to_memory(
     prior: Prior, budget_gb: float, param: str, backward: Callable[[Prior], object] | None = None
 ) -> Prior:
-    """The prior with the number of samples per pass set to what fits into the budget; unchanged for a budget of 0.
+    """Return the prior with the number of samples per pass set to the number that fits into the budget.
 
     Args:
-        backward: computes loss and gradient of one sample; gradients it leaves are removed.
+        prior: The diffusion prior.
+        budget_gb: The budget in GB. With 0 the prior is returned unchanged.
+        param: Name of the parameter that sets the budget.
+        backward: Computes the loss and the gradient of one sample, whose memory determines `rows_with_grad`. The
+            gradients in the networks are removed afterwards. None: `rows_with_grad` is not set.
 
     Raises:
-        ValueError: as `rows_within`.
+        ValueError: As `rows_within`.
     """
     if not budget_gb:
         return prior
@@ -107,7 +118,7 @@ def fit_to_memory(
 
 @torch.no_grad()
 def inpaint_one_sample(prior: Prior) -> None:
-    """Run the passes of inpainting for one sample: encode, UNet, decode."""
+    """Run the passes of inpainting for one sample: encoder, UNet, decoder."""
     size = prior.native_size
     config: Any = prior.unet.config
     latents = diffusion.encode(prior, torch.zeros(1, 3, size, size, device=prior.device))
@@ -118,7 +129,7 @@ def inpaint_one_sample(prior: Prior) -> None:
 
 
 def encode_one_sample(prior: Prior) -> None:
-    """Run the pass of score distillation that needs a gradient, for one sample: encode it, and back."""
+    """Run the pass of score distillation that needs a gradient, for one sample: the encoder, forward and backward."""
     size = prior.native_size
     image = torch.zeros(1, 3, size, size, device=prior.device, requires_grad=True)
     diffusion.encode(prior, image).sum().backward()
@@ -126,7 +137,12 @@ def encode_one_sample(prior: Prior) -> None:
 
 @contextmanager
 def explain_oom(param: str, value: float) -> Iterator[None]:
-    """Turn an out-of-memory error inside the context into a ValueError that names the parameter to lower."""
+    """Turn an out-of-memory error inside the context into a ValueError that names the parameter to lower.
+
+    Args:
+        param: Name of the parameter that sets the memory budget.
+        value: Its present value in GB; 0 means no limit.
+    """
     try:
         yield
     except (torch.OutOfMemoryError, RuntimeError) as error:

@@ -1,15 +1,15 @@
-"""The inpainting latent diffusion model: loading, assembling from parts, conversion to a diffusers pipeline.
+"""The inpainting latent diffusion model: loading, assembly from parts, and conversion to a diffusers pipeline.
 
 This is the only module that imports diffusers. It works with any inpainting folder of the Stable Diffusion type, SDXL
-included (channels: latents C | mask 1 | masked latents C). Sizes, factor and prediction type are read from the
-configuration, so that the embedded prior and SD2-inpainting take the same path. `reffusion.prior.diffusion` holds the
-operations.
+included (channels of the UNet's input: latents C | mask 1 | masked latents C). Sizes, factor and prediction type are
+read from the configuration, so that the embedded prior and SD2-inpainting take the same path.
+`reffusion.prior.diffusion` contains the operations.
 
 Half precision applies to UNet and text encoders. Always float32 are:
-- the VAE: SDXL's overflows in float16, a gradient through the encoder underflows in it, and the 8 bits of bfloat16
-  show as bands in a decoded picture;
+- the VAE: SDXL's overflows in float16, a gradient through the encoder underflows in float16, and the 8 bits of bfloat16
+show as bands in a decoded picture;
 - schedule, noise and x0 (reffusion.prior.diffusion); LoRA and its optimiser (reffusion.prior.lora); the sums of a
-  softmax, within PyTorch's attention kernels.
+softmax, within PyTorch's attention kernels.
 """
 
 from __future__ import annotations
@@ -35,17 +35,19 @@ class Prior:
     """An inpainting diffusion model on one device.
 
     Attributes:
-        unet, vae, text_encoder, tokenizer: diffusers and transformers objects, frozen, in evaluation mode;
-            text_encoder is None after `drop_text_encoders`.
+        unet, vae, text_encoder, tokenizer: Objects of diffusers and transformers, frozen and in evaluation mode. The
+            text encoder is None after `drop_text_encoders`.
         alphas_cumprod: [T] float32, abar_t of the noise schedule.
         prediction_type: "epsilon" or "v_prediction".
-        scheduler: the scheduler of the folder; only passed on when a pipeline is built.
-        text_encoder_2, tokenizer_2: the second ones of SDXL, else None.
-        zero_empty: embed the empty prompt as zeros (set in the configuration of SDXL).
-        rows, rows_graded: samples per pass of UNet and VAE, without and with a gradient; 0: all. More samples are
-            processed in parts, whose activations are recomputed in the backward pass.
-        fills: condition the model on the picture with the hole filled from its surroundings
-            (`harmonic_fill.harmonic_extension`), if conditioning.json says so; else with a grey hole, as is usual.
+        scheduler: The scheduler of the folder, which is used only to build a pipeline.
+        text_encoder_2, tokenizer_2: The second text encoder and tokenizer of SDXL; None for other models.
+        zero_empty: Whether the empty prompt is embedded as zeros (set in the configuration of SDXL).
+        rows: Number of samples in one pass of UNet and VAE without a gradient; 0 means all. More samples are processed
+            in parts.
+        rows_with_grad: The same for passes with a gradient. Activations of the parts are recomputed in the backward
+            pass.
+        fills: Whether the hole in the conditioning picture is filled from its surroundings
+            (`harmonic_fill.harmonic_extension`), as conditioning.json may ask. Else the hole is grey, as usual.
     """
 
     unet: nn.Module
@@ -68,42 +70,47 @@ class Prior:
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of UNet and text encoders; the module docstring lists what is always float32."""
+        """Return the type of UNet and text encoders. The module docstring lists what is always float32."""
         return next(self.unet.parameters()).dtype
 
     @property
     def factor(self) -> int:
-        """Pixels per latent along a side."""
+        """Return the number of pixels per latent along a side."""
         config: Any = self.vae.config
         return 2 ** (len(config.block_out_channels) - 1)
 
     @property
     def native_size(self) -> int:
-        """Side of the training images in pixels."""
+        """Return the side of the training images in pixels."""
         config: Any = self.unet.config
         size = config.sample_size
         return self.factor * (size if isinstance(size, int) else min(size))
 
     @property
     def timesteps(self) -> int:
-        """Number of timesteps of the noise schedule."""
+        """Return the number of timesteps of the noise schedule."""
         return len(self.alphas_cumprod)
 
     @property
     def bytes(self) -> int:
-        """Memory of the weights in bytes."""
+        """Return the memory of the weights in bytes."""
         parts = [p for p in (self.unet, self.vae, self.text_encoder, self.text_encoder_2) if p is not None]
         return sum(p.numel() * p.element_size() for part in parts for p in part.parameters())
 
 
 def load_prior(source: str | Path, device: str = "cpu", dtype: torch.dtype | str = torch.float32) -> Prior:
-    """Load the model from a local diffusers folder, or by a hub id whose weights are on this machine (`local.locate`).
+    """Load the model from a diffusers folder, or by a hub id whose weights are on this machine. Nothing is downloaded.
 
-    Nothing is downloaded. `dtype` is that of UNet and text encoders; a string is the name of one of torch.
+    Names, headers and configurations are checked before weights are read.
+
+    Args:
+        source: The folder or the hub id (see `local.locate`).
+        device: The device of the model.
+        dtype: Type of UNet and text encoders, or its name in torch, such as "float16".
 
     Raises:
-        ValueError: weights are missing or damaged, parts or shapes do not fit, it is no inpainting model, or it
-            predicts neither epsilon nor v. Names, headers and configurations are checked before weights are read.
+        ValueError: Weights are missing or damaged, parts or shapes do not fit, the model is no inpainting model, or it
+            predicts neither epsilon nor v.
     """
     from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
     from transformers import CLIPTextModel, CLIPTextModelWithProjection, CLIPTokenizer
@@ -134,7 +141,11 @@ def load_prior(source: str | Path, device: str = "cpu", dtype: torch.dtype | str
 
 
 def _fills_hole(folder: Path) -> bool:
-    """Does conditioning.json ask for filled holes? Without this file they are grey."""
+    """Return True if conditioning.json in the folder asks for filled holes. Without this file holes are grey.
+
+    Raises:
+        ValueError: The file cannot be read or names an unknown content.
+    """
     path = folder / CONDITIONING
     if not path.exists():
         return False
@@ -148,7 +159,17 @@ def _fills_hole(folder: Path) -> bool:
 
 
 def _load_network(kind: Any, folder: Path, part: str, **dtype: torch.dtype) -> nn.Module:
-    """Load one network of the folder with all of its weights. Raises ValueError naming what does not fit."""
+    """Load one network of the folder with all of its weights.
+
+    Args:
+        kind: The class of diffusers or transformers.
+        folder: The model folder.
+        part: Name of the subfolder, e.g. "unet".
+        dtype: The keyword argument of `kind.from_pretrained` for the type of the weights.
+
+    Raises:
+        ValueError: Weights are missing or do not fit config.json. The message names the first problem.
+    """
     from transformers.utils import logging as transformers_logging
 
     transformers_logging.disable_progress_bar()
@@ -192,10 +213,17 @@ def make_prior(
     text_2: nn.Module | None = None,
     tokenizer_2: Any = None,
 ) -> Prior:
-    """Build a Prior from parts in memory, and check that they fit together; the last two are for SDXL.
+    """Build a Prior from networks in memory, freeze them, and check that they fit together.
+
+    Args:
+        unet, vae, text, tokenizer, scheduler: The parts of the model; `text` is the text encoder.
+        device: The device to which the networks are moved.
+        name: The name of the model in error messages.
+        text_2, tokenizer_2: The second text encoder and tokenizer of SDXL; None for other models.
 
     Raises:
-        ValueError: as `load_prior`.
+        ValueError: The parts do not fit together, or the model predicts epsilon although its noise schedule ends
+            without any signal.
     """
     of_part: dict[str, Any] = {"unet": unet.config, "vae": vae.config, "scheduler": scheduler.config}
     configs = {name: dict(config) for name, config in of_part.items()}
@@ -216,19 +244,22 @@ def make_prior(
 
 
 def drop_text_encoders(prior: Prior) -> Prior:
-    """The prior without text encoders, to free their memory once all prompts are embedded."""
+    """Return the prior without text encoders, which frees their memory once all prompts are embedded."""
     return replace(prior, text_encoder=None, text_encoder_2=None)
 
 
 def enable_checkpointing(prior: Prior) -> Prior:
-    """Enable gradient checkpointing in UNet and VAE: blocks are recomputed in the backward pass; returns the prior."""
+    """Enable gradient checkpointing in UNet and VAE, and return the same prior.
+
+    With checkpointing the activations of each block are recomputed in the backward pass.
+    """
     prior.unet.enable_gradient_checkpointing()
     prior.vae.enable_gradient_checkpointing()
     return prior
 
 
 def pipeline(prior: Prior) -> Any:
-    """The inpainting pipeline of diffusers with the same parts."""
+    """Return the inpainting pipeline of diffusers with the networks of the prior."""
     parts = {name: getattr(prior, name) for name in ("vae", "text_encoder", "tokenizer", "unet", "scheduler")}
     if prior.text_encoder_2 is None:
         unused = {"safety_checker": None, "feature_extractor": None, "requires_safety_checker": False}
@@ -239,7 +270,10 @@ def pipeline(prior: Prior) -> Any:
 
 
 def pipeline_class(name: str = "StableDiffusionInpaintPipeline") -> Any:
-    """A pipeline class of diffusers, imported without its advice to install torchvision, which is not needed."""
+    """Import and return a pipeline class of diffusers.
+
+    The import is silenced, because transformers advises to install torchvision, which is not needed.
+    """
     from transformers.utils import logging as transformers_logging
 
     level = transformers_logging.get_verbosity()

@@ -26,9 +26,15 @@ FIRST_MEASURED_STEP = 4  # from this step on, errors are measured each time the 
 
 
 def learning_rate_factor(step: int, steps: int, warm_up: int, schedule: str) -> float:
-    """Factor on the learning rate: linear warm-up, then constant or a cosine decay to 0.
+    """Return the factor on the learning rate: a linear warm-up, then 1 or a cosine decay to 0.
 
     PAPER leaves open: the schedule (default constant, without warm-up).
+
+    Args:
+        step: Number of the step, from 0.
+        steps: Number of steps of the training.
+        warm_up: Number of steps of the warm-up.
+        schedule: "constant" or "cosine".
     """
     if step < warm_up:
         return (step + 1) / warm_up
@@ -45,17 +51,23 @@ def personalize(
     folder: Path,
     photographs: Sequence[tuple[torch.Tensor, torch.Tensor]] = (),
 ) -> None:
-    """Train the prior's LoRA in place; resumes from the checkpoint in `folder`, bit for bit on one CPU thread.
+    """Train the prior's LoRA in place, from the start or from the checkpoint in `folder`.
+
+    A resumed training equals an unbroken one bit for bit on one CPU thread.
 
     Args:
-        trained: the parameters returned by `lora.attach`.
-        references: see `draw_samples`.
-        folder: receives trace.jsonl (`validation.measure_errors`, with the clock stopped) and checkpoints.
-        photographs: see `validation.make_held_out`; nothing is learnt from them.
+        prior: The prior with LoRA layers attached.
+        trained: The parameters returned by `lora.attach`.
+        references: The pictures to learn, see `draw_samples`.
+        settings: Parameters of the stage `personalize`.
+        folder: Receives checkpoints and trace.jsonl with the errors of `validation.measure_errors`. The time of these
+            measurements is not counted.
+        photographs: Photographs in which errors are measured, see `validation.make_held_out`. The prior is not trained
+            on them.
 
     Raises:
-        ValueError: samples larger than the prior's native size.
-        FloatingPointError: a loss or gradient is not finite; names the step.
+        ValueError: Samples are larger than the prior's native size, or no multiple of its factor.
+        FloatingPointError: A loss or gradient is not finite; the message names the step.
     """
     options, steps = settings.optimizer, settings.steps
     _check_size(prior, _sample_size(prior, settings))
@@ -94,7 +106,7 @@ def personalize(
 
 
 def _sample_size(prior: Prior, settings: Params) -> int:
-    """Side of a training sample in pixels."""
+    """Return the side of a training sample in pixels."""
     return settings.samples.size or prior.native_size
 
 
@@ -114,13 +126,18 @@ def train_step(
     step: int,
     threads: Threads | None = None,
 ) -> float:
-    """One optimiser step; returns the mean loss. Random draws depend only on the seed and on `step`.
+    """Take one optimiser step, and return the mean loss. Random draws depend only on the seed and on `step`.
 
     Args:
-        threads: process parts of the batch in parallel; None: one thread does all.
+        prior: The prior with LoRA layers attached.
+        optimizer: Holds the LoRA's parameters of the UNet and of the text encoder, as two groups in this order.
+        references: The pictures to learn.
+        settings: Parameters of the stage `personalize`.
+        step: Number of the step, from 0.
+        threads: Processes parts of the batch in parallel. None, or LoRA with dropout: one part after the other.
 
     Raises:
-        FloatingPointError: loss or gradient is not finite; names the step. The weights are unchanged.
+        FloatingPointError: Loss or gradient is not finite; the message names the step. The weights are unchanged.
     """
     lora.set_dropout(prior, True)
     samples, size, count = settings.samples, _sample_size(prior, settings), settings.optimizer.batch
@@ -161,6 +178,6 @@ def train_step(
 
 
 def _sum_gradients(parts: Iterable[torch.Tensor | None]) -> torch.Tensor | None:
-    """Sum of one parameter's gradients over the parts of a batch; None if no part has one."""
+    """Return the sum of one parameter's gradients over the parts of a batch; None if no part has one."""
     present = [part for part in parts if part is not None]
     return torch.stack(present).sum(0) if present else None

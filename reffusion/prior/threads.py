@@ -1,7 +1,7 @@
-"""Chooses how many threads process the samples of a training step, each thread with samples of its own.
+"""The choice of how many threads process the samples of a training step, each thread with samples of its own.
 
-The feature maps of one sample are too small to be split between threads, and threads that wait for each other in every
-operation are delayed by any other process.
+The feature maps of one sample are too small to be split between threads. Threads that wait for each other in every
+operation are also delayed by any other process.
 """
 
 from __future__ import annotations
@@ -23,17 +23,24 @@ FREE_SHARE = 0.8  # share of idle time from which a core counts as free
 
 
 class Threads:
-    """Threads for the steps of a long training on the CPU.
+    """A pool of threads for the steps of a long training on the CPU, used as a context manager.
 
-    The first steps run on one thread. If other cores are idle meanwhile, all threads of torch are used from then on,
-    until the steps take longer than those on one thread did.
+    The first steps run on one thread. If the other cores were idle during these steps, all threads of torch are used
+    afterwards, each for a part of the samples. If they were busy, or if steps on all threads take longer than the first
+    steps did, one thread is used to the end.
 
-    Used as a context, in which torch itself uses one thread per part; afterwards its number of threads is restored.
-    Another number of threads rounds the sums of a step differently. Short runs, and those on a GPU, are left to torch.
+    Inside the context torch uses one thread per part; at its end torch's number of threads is restored. In short runs
+    (fewer than `MIN_STEPS` steps) and on a GPU the number of threads is not changed. The sums of a step are rounded
+    differently with another number of threads.
+
+    Args:
+        steps: Number of steps of the training.
+        device: The device of the training.
+        idle: Returns the idle time of all cores so far, in seconds; inf if it is unknown.
 
     Attributes:
-        all: number of threads of torch at the beginning.
-        now: number of parts of the next step that are processed at once.
+        all: Number of threads of torch at the beginning.
+        now: Number of parts of the next step that are processed at the same time.
     """
 
     def __init__(self, steps: int, device: torch.device, idle: Callable[[], float] = idle_seconds):
@@ -54,15 +61,18 @@ class Threads:
         torch.set_num_threads(self.all)
 
     def map(self, function: Callable[[Any], Any], parts: Iterable[Any]) -> Iterator[Any]:
-        """`function` of each part, in order, `now` at once.
+        """Return an iterator over `function` of each part, in order, computed for `now` parts at the same time.
 
-        Thread-local state of torch, such as no_grad, must be set by the function.
+        `function` must set thread-local state of torch, such as no_grad, by itself.
         """
         return self._pool.map(function, parts) if self.now > 1 else map(function, parts)
 
     @contextmanager
     def step(self) -> Iterator[None]:
-        """Context that measures a step."""
+        """Measure the time of a step, and choose the number of threads for the next steps.
+
+        The step is the body of the `with` statement.
+        """
         began = time.perf_counter()
         yield
         seconds = time.perf_counter() - began

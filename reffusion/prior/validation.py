@@ -27,10 +27,10 @@ class HeldOut:
     """Fixed samples for validation.
 
     Attributes:
-        reference: the reference with its own hole, as a whole view and as a crop.
-        pictures: [1 + B, 3, n, n], the whole reference and B photographs.
-        repaint: [1 + B, 1, n, n], the pixels to repaint.
-        holes: [1 + B, 1, n, n], those of them whose true colours are known.
+        reference: Two samples of the reference with its hole as mask, the whole view and a crop.
+        pictures: [1 + B, 3, n, n] in [-1, 1], the whole reference and B photographs.
+        repaint: [1 + B, 1, n, n], 1 at the pixels to repaint.
+        holes: [1 + B, 1, n, n], 1 at the pixels to repaint whose true colours are known, i.e. outside the object.
     """
 
     reference: Batch
@@ -40,7 +40,7 @@ class HeldOut:
 
 
 def choose_photos(names: Sequence[str], references: Sequence[str]) -> list[str]:
-    """Up to `PHOTOS` of the views, evenly spread, that are no references."""
+    """Return the names of up to `PHOTOS` views, evenly spread over `names`, that are no references."""
     others = [name for name in names if name not in references]
     return others[:: max(1, len(others) // PHOTOS)][:PHOTOS]
 
@@ -48,11 +48,14 @@ def choose_photos(names: Sequence[str], references: Sequence[str]) -> list[str]:
 def make_held_out(
     references: Sequence[Picture], photographs: Sequence[tuple[Tensor, Tensor]], size: int, seed: int
 ) -> HeldOut:
-    """Samples for `measure_errors`; the same for equal seeds.
+    """Build the samples for `measure_errors`. They are the same for equal seeds.
 
     Args:
-        photographs: other views [3, H, W] in [-1, 1] with the object's mask, bool [H, W]. The hole of the reference is
-            placed where it overlaps least with the object.
+        references: The references, of which the first is used.
+        photographs: Other views, [3, H, W] in [-1, 1], each with the object's mask, bool [H, W]. The hole of the
+            reference is placed in each photograph, shifted to where it overlaps least with the object.
+        size: Side of a sample in pixels.
+        seed: Determines the crop of the reference.
     """
     reference = held_out_samples(references, size, seed)
     hole = reference.masks[0]
@@ -72,12 +75,16 @@ def make_held_out(
 def measure_errors(
     prior: Prior, held: HeldOut, seed: int, map_parts: Callable[..., Iterable] = map
 ) -> dict[str, float]:
-    """The errors listed in docs/development.md#traces, with fixed noise, so that they are comparable during training.
+    """Return the errors listed in docs/development.md#traces, by their key.
 
-    With a small model this takes about as long as one training step.
+    The noise is fixed, so the errors are comparable during training. With a small model this takes about as long as one
+    training step.
 
     Args:
-        map_parts: like `map`; may run several calls at once.
+        prior: The prior with LoRA layers attached.
+        held: The samples.
+        seed: Seed of the noise.
+        map_parts: Function like `map`, which may run several calls at the same time.
     """
     lora.set_dropout(prior, False)
     parts = [partial(_hole_errors, prior, held, seed, level) for level in NOISE_LEVELS] + [
@@ -91,7 +98,10 @@ def measure_errors(
 
 @torch.no_grad()
 def _hole_errors(prior: Prior, held_out: HeldOut, seed: int, level: float) -> Tensor:
-    """[2, B]: both errors of `denoising_error` in the hole of the reference, at one noise level."""
+    """Return both errors of `denoising_error` in the hole of the reference at one noise level, [2, 2].
+
+    The rows are the error of the target and the error of the clean latent; the columns are the whole view and the crop.
+    """
     samples = held_out.reference
     timesteps = torch.full((len(samples.prompts),), round(level * (prior.timesteps - 1)))
     generator = seeded(seed, "personalize", "held out", level)
@@ -102,9 +112,9 @@ def _hole_errors(prior: Prior, held_out: HeldOut, seed: int, level: float) -> Te
 
 @torch.no_grad()
 def _one_step_psnr(prior: Prior, held_out: HeldOut, seed: int) -> dict[str, float]:
-    """PSNR of the hole in the reference and of those in photographs, for one denoising step from pure noise.
+    """Return the PSNR in the holes of the reference and of photographs, for one denoising step from pure noise.
 
-    One step predicts the mean of what the prior would paint.
+    One step predicts the mean of the pictures that the prior would paint.
     """
     text = diffusion.embed_text(prior, [PROMPTS[GLOBAL]]).expand(len(held_out.pictures), -1, -1)
     images, repaint, holes = (each.to(prior.device) for each in (held_out.pictures, held_out.repaint, held_out.holes))

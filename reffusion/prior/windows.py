@@ -1,4 +1,4 @@
-"""Windows around masked pixels, and views at two scales: the inputs of SDS and personalization."""
+"""Windows around masked pixels, and views at two scales: the inputs of SDS and of personalization."""
 
 from __future__ import annotations
 
@@ -8,21 +8,29 @@ from torch import Tensor
 
 
 def window_around(mask: Tensor, size: int, generator: torch.Generator) -> tuple[int, int]:
-    """(top, left) of a random size x size window inside the view that contains a masked pixel.
+    """Draw a random size x size window that contains a masked pixel, and return its upper left corner (top, left).
 
-    PAPER leaves open: how a patch is sampled from the bounding box of the mask. A box may be mostly unmasked (a ring,
-    two objects), so a masked pixel is sampled first, then its position in the window. The window is moved inside the
-    view.
+    PAPER leaves open: how a patch is sampled from the bounding box of the mask. The box may be mostly unmasked (a ring,
+    two objects), so a masked pixel is drawn first, then its position in the window. A window that extends beyond the
+    view is moved inside.
 
     Args:
-        mask: [H, W] bool with at least one True pixel.
-        size: side of the window in pixels, at most min(H, W).
+        mask: bool [H, W] with at least one True pixel.
+        size: Side of the window in pixels, at most min(H, W).
+        generator: The source of randomness, on the CPU.
+
+    Raises:
+        ValueError: The window does not fit into the view, or the mask is empty.
     """
     return tuple(windows_around(mask, size, 1, generator)[0].tolist())
 
 
 def windows_around(mask: Tensor, size: int, count: int, generator: torch.Generator) -> Tensor:
-    """[count, 2] long: (top, left) of `count` independent windows as of `window_around`."""
+    """Draw `count` independent windows like `window_around`, and return their corners (top, left), long [count, 2].
+
+    Raises:
+        ValueError: A window does not fit into the view, or the mask is empty.
+    """
     height, width = mask.shape
     if size > min(height, width):
         raise ValueError(f"a window of {size} px does not fit into a view of {width} x {height} px; enlarge it first")
@@ -36,7 +44,7 @@ def windows_around(mask: Tensor, size: int, count: int, generator: torch.Generat
 
 
 def enlarge_to_fit(image: Tensor, size: int) -> Tensor:
-    """[C, H, W] -> the same image, enlarged bilinearly if needed so that a window of `size` px fits into it."""
+    """Return an image [C, H, W], enlarged bilinearly if a window of `size` pixels does not fit into it."""
     height, width = image.shape[-2:]
     factor = size / min(height, width)
     if factor <= 1:
@@ -46,7 +54,7 @@ def enlarge_to_fit(image: Tensor, size: int) -> Tensor:
 
 
 def two_scales(image: Tensor, windows: list[tuple[int, int]], size: int) -> Tensor:
-    """The whole view resized to size x size, and patches in full resolution (section 4.2).
+    """Return an image at two scales: the whole view resized to a square, and patches at full resolution (section 4.2).
 
     PAPER leaves open: whether the bilinear reduction is antialiased. It is, so that each rendered pixel receives a part
     of the global gradient; plain bilinear sampling of a large view would skip most pixels.
@@ -54,9 +62,10 @@ def two_scales(image: Tensor, windows: list[tuple[int, int]], size: int) -> Tens
     Args:
         image: [C, H, W].
         windows: (top, left) of each patch.
+        size: Side of the square and of the patches in pixels.
 
     Returns:
-        [1 + len(windows), C, size, size], differentiable in `image`.
+        [1 + len(windows), C, size, size], the whole view first; differentiable in `image`.
     """
     whole = F.interpolate(image[None], size=(size, size), mode="bilinear", align_corners=False, antialias=True)
     patches = [image[None, :, top : top + size, left : left + size] for top, left in windows]
@@ -64,8 +73,14 @@ def two_scales(image: Tensor, windows: list[tuple[int, int]], size: int) -> Tens
 
 
 def two_scale_masks(mask: Tensor, windows: list[tuple[int, int]], size: int) -> Tensor:
-    """`two_scales` of a bool [H, W] mask -> [1 + len(windows), 1, size, size] float, 1 = repaint.
+    """Return a mask at the two scales of `two_scales`, [1 + len(windows), 1, size, size] float, 1 = repaint.
 
-    A reduced pixel is repainted if any part of it is masked, because masked content must not reach the UNet.
+    A pixel of the reduced view is repainted if any part of it is masked, because masked content must not reach the
+    UNet.
+
+    Args:
+        mask: bool [H, W], True = repaint.
+        windows: (top, left) of each patch.
+        size: Side of the results in pixels.
     """
     return (two_scales(mask.to(torch.float32)[None], windows, size) > 1e-4).to(torch.float32)

@@ -1,4 +1,7 @@
-"""Adopts references that a scene brings: aligns each with its photograph, and decides which of its pixels to use."""
+"""Adoption of references that come with a scene: each is aligned with its photograph, and its usable pixels are found.
+
+A reference is a completed view: a picture of a training view without the object.
+"""
 
 from __future__ import annotations
 
@@ -20,23 +23,31 @@ from reffusion.references.undistort import undistort_reference, undistort_refere
 from reffusion.types import Camera, MaskSet, Reference
 from reffusion.workspace import Workspace
 
-PASTE_MARGIN, PASTE_BLEND = 0.01, 0.01  # of the width: kept of a reference around the hole, then blended over beyond
+# Of the image's width: how far around the hole the reference's own pixels are taken, and the width of the strip beyond
+# in which they are blended into the photograph.
+PASTE_MARGIN, PASTE_BLEND = 0.01, 0.01
 LEAST_HOLE_SHARE = 0.9  # share of the invent mask that a reference must cover after alignment
-NEIGHBOURS = 4  # nearest views that a matching reference is compared with, in case it shows one of them better
+NEIGHBOURS = 4  # nearest views with which a matching reference is compared, in case it shows one of them better
 
 
 def adopt_references(files: Sequence[ReferenceFile], space: Workspace) -> tuple[list[Reference], dict[str, str]]:
     """Align the references with their views, and drop those in whose view nothing has to be invented.
 
-    The mask of a reference is the invent mask of its view. In a clean view, whose photograph shows what other views
-    have to invent, it is the consistent mask.
+    A reference is used inside the invent mask I of its view (the pixels to be invented). In a clean view, whose
+    photograph shows the scene without the object, it is used inside the consistent mask C instead (the pixels where the
+    object's Gaussians would be).
+
+    Args:
+        files: the references that come with the scene.
+        space: results of earlier stages.
 
     Returns:
-        the references, and view name -> how well each fits its photograph, in words.
+        The references, and view name -> a description of how well the reference fits its photograph.
 
     Raises:
-        BadInput: a reference does not show its view, and scene.yaml does not trust it.
-        ValueError: no reference is left, one covers too little of the hole, or two contradict each other.
+        BadInput: a reference does not show its view, and scene.yaml does not say that it is trusted.
+        ValueError: no reference is left, a reference covers too little of the hole, or two references contradict each
+            other.
     """
     references, fits = [], {}
     for file in files:
@@ -60,14 +71,16 @@ def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tu
     object's shadow and a blended rim are pasted into the photograph.
 
     Args:
-        masks: pixel classes of its view; the reference is used within `masks.invent`.
+        file: the reference's files.
+        masks: pixel classes of its view; the reference is used inside `masks.invent`.
+        space: results of earlier stages.
 
     Returns:
-        the reference in the scene's common exposure, and how well it fits, in words.
+        The reference in the scene's common exposure, and a description of how well it fits its photograph.
 
     Raises:
-        BadInput: it does not show its view, and scene.yaml does not trust it.
-        ValueError: it covers less than `LEAST_HOLE_SHARE` of the hole.
+        BadInput: the picture does not show its view, and scene.yaml does not say that it is trusted.
+        ValueError: the picture covers less than `LEAST_HOLE_SHARE` of the hole.
     """
     lenses, upright = load_lenses(space.poses)
     camera, lens = space.scene.cameras[file.view], lenses[file.view]
@@ -99,23 +112,25 @@ def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tu
     differs = masks.consistent | shadows.changed_pixels(image, photo, masks.invent, usual)
     image = image if file.painted else exposure.normalize_exposure(image, space.fit, file.view)
     depth = undistort_reference_depth(file, lens, upright, found.affine)
-    if depth is not None:  # a depth map in the scene's own unit is now in that of the normalised frame
+    if depth is not None:  # a depth map in the unit of the scene's own files is now in that of the normalised frame
         depth = depth * space.scene.similarity.scale
     return Reference(camera, image, masks.invent & inside & differs, depth), str(found)
 
 
 def check_match(file: ReferenceFile, found: Registration, image: np.ndarray, space: Workspace) -> Registration:
-    """The registration, where the picture shows its view and shows no other view better.
+    """Check that a picture shows its own view, and shows no other view better; return its registration.
 
-    If scene.yaml trusts a picture that does not match, a warning replaces the error, and the picture is used without
-    alignment.
+    If the check fails but scene.yaml says that the picture is trusted, a warning replaces the error. A trusted picture
+    that does not fit its own view is used without alignment.
 
     Args:
-        found: how the picture lies over the photograph of its own view.
+        file: the reference's files.
+        found: the registration of the picture with the photograph of its own view.
         image: uint8 [H, W, 3], the undistorted picture before alignment.
+        space: results of earlier stages.
 
     Raises:
-        BadInput: it does not show its view, or shows another one better, and is not trusted.
+        BadInput: the check fails, and the picture is not trusted.
     """
     scene = space.scene
     others = [name for name in scene.train if name != file.view and has_photograph(space.poses, name)]
@@ -134,8 +149,11 @@ def check_match(file: ReferenceFile, found: Registration, image: np.ndarray, spa
 
 
 def check_agreement(references: Sequence[Reference], space: Workspace) -> None:
-    """ValueError where two references show different things in the part of the hole that both see: training would
-    average them."""
+    """Raise ValueError if two references contradict each other.
+
+    They do so if their colours differ in the part of the hole that both show (`references.agreement`). Training would
+    average the two.
+    """
     if len(references) < 2:
         return
     cameras = [each.camera for each in references]
@@ -152,17 +170,20 @@ def check_agreement(references: Sequence[Reference], space: Workspace) -> None:
 
 
 def load_photo(space: Workspace, name: str) -> np.ndarray:
-    """uint8 [H, W, 3], the undistorted photograph as its camera exposed it."""
+    """Return uint8 [H, W, 3], the undistorted photograph of a view, in the exposure of its camera."""
     return load_views(space.poses, [name])[name]
 
 
 def object_pixels(masks: MaskSet) -> np.ndarray:
-    """bool [H, W], the pixels of a view that may show the object."""
+    """Return bool [H, W], the pixels of a view that may show the object."""
     return masks.raw | masks.consistent | masks.invent
 
 
 def view_distance(a: Camera, b: Camera) -> float:
-    """How differently two cameras look: the distance of their centres, in units of the normalised frame, plus the angle
-    between their optical axes in radians."""
+    """Return a measure of how differently two cameras see the scene.
+
+    It is the distance of their centres, in units of the normalised frame, plus the angle between their optical axes, in
+    radians.
+    """
     cosine = a.world_to_camera[2, :3] @ b.world_to_camera[2, :3]
     return float(np.linalg.norm(a.center - b.center) + np.arccos(np.clip(cosine, -1, 1)))

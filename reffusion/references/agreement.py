@@ -1,8 +1,9 @@
-"""Checks whether completed views agree where two of them show the same part of a hole.
+"""Check of whether completed views agree where two of them show the same part of a hole.
 
 The surface behind the object is not known yet. As in `view_ranking`, the disparity of the surroundings is continued
-across the hole, unless the completed view brings its depth. So pictures are aligned only to a few pixels, and colours
-are compared, not texture: the smoothed colours of one, beyond the range of the other's around the same point.
+across the hole, unless the completed view has a depth map. Therefore a point of one view is found in the other only to
+within a few pixels, and texture cannot be compared. Instead, smoothed colours of one view are compared with the range
+of colours that the other view shows around the same point.
 """
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ from reffusion.references.view_ranking import Hole
 from reffusion.splat import rasterizer
 from reffusion.types import Gaussians, Reference
 
-SMOOTH, REACH = 0.02, 0.04  # of the width: standard deviation of the smoothing, and radius of the window of colours
-NEAR = 0.015  # relative depth within which two views show the same surface
-ALIKE = 0.7  # cosine between normals of the same surface
-LEAST_PIXELS = 40  # pixels that both show, at `view_ranking.SIDE`, from which a pair is compared
+# Of the image's width: standard deviation of the smoothing, and radius of the window whose range of colours is taken.
+SMOOTH, REACH = 0.02, 0.04
+NEAR = 0.015  # relative difference of depth within which two views show the same surface
+ALIKE = 0.7  # smallest cosine between the normals of the same surface in two views
+LEAST_PIXELS = 40  # pixels, at the size `view_ranking.SIDE`, that both views must show for a pair to be compared
 # Mean difference, colours in [0, 1], from which two pictures contradict each other. On demo-pair true pictures have
 # 0.001, one 0.9 times as bright 0.004, one with a smoothly inpainted hole 0.007, one turned upside down 0.021; one 0.7
 # times as bright 0.038, with red and blue exchanged 0.047, mirrored 0.053, with the objects left in 0.089. A chequered
@@ -37,12 +39,16 @@ CONTRADICTION = 0.04
 def refine_hole_depth(
     holes: Mapping[str, Hole], references: Sequence[Reference], remaining: Gaussians, hidden: Mapping[str, np.ndarray]
 ) -> dict[str, Hole]:
-    """The holes with the depth that completed views bring. Holes of unknown depth are left out: what is drawn over the
-    background does not lie at the depth of the surroundings.
+    """Replace the depth of holes by the depth maps of their references, and drop holes whose depth is unknown.
+
+    Depth is unknown where a reference without a depth map draws mostly outside the object's pixels. It inserts an
+    object there, which does not lie at the depth of the surroundings. A hole is also dropped if its depth map cannot
+    be aligned, because too little depth is known.
 
     Args:
         holes: view name -> its hole (`view_ranking.find_holes`).
-        remaining: the Gaussians without the object's.
+        references: the completed views.
+        remaining: the Gaussians of the scene without the object.
         hidden: view name -> bool [H, W], the object's pixels.
     """
     found = {}
@@ -57,7 +63,12 @@ def refine_hole_depth(
 
 
 def _align_depth(hole: Hole, reference: Reference, remaining: Gaussians, hidden: np.ndarray) -> Hole:
-    """The hole with the depth map of its reference, aligned to the surroundings."""
+    """Return the hole with the depth map of its reference, aligned to the rendered depth of the surroundings.
+
+    Raises:
+        Degenerate: too little depth is known around the hole, or the depth map is constant there.
+        ValueError: the depth map does not fit the scene.
+    """
     size = hole.camera.width, hole.camera.height
     shrunk = lambda array: cv2.resize(array, size, interpolation=cv2.INTER_NEAREST)
     depth = shrunk(reference.depth.astype(np.float64))
@@ -68,10 +79,13 @@ def _align_depth(hole: Hole, reference: Reference, remaining: Gaussians, hidden:
 
 
 def find_contradictions(references: Sequence[Reference], holes: Mapping[str, Hole]) -> list[tuple[str, str, float]]:
-    """The pairs of views that contradict each other, with their `color_difference`, the largest first.
+    """Return the pairs of views whose references contradict each other, with their `color_difference`.
+
+    Two references contradict each other if the difference exceeds `CONTRADICTION`. The largest difference comes first.
 
     Args:
-        holes: view name -> its hole (`view_ranking.find_holes`).
+        references: the completed views; those without an entry in `holes` are ignored.
+        holes: view name -> its hole (`refine_hole_depth`).
     """
     candidates = [each for each in references if each.camera.name in holes]
     found = []
@@ -83,15 +97,26 @@ def find_contradictions(references: Sequence[Reference], holes: Mapping[str, Hol
 
 
 def color_difference(a: Reference, b: Reference, hole_a: Hole, hole_b: Hole) -> float | None:
-    """How far the colours of one reference lie beyond those of the other around the same point, [0, 1]: the mean over
-    what both show in their holes, in both directions. None where they share too few pixels."""
+    """Return the mean difference in [0, 1] between the colours of two references, where both show the same surface.
+
+    At a point in both holes, the difference is how far the smoothed colour of one reference lies outside the range of
+    smoothed colours that the other shows around this point. It is averaged over all such points, and over both
+    directions of comparison.
+
+    Args:
+        a, b: the two references.
+        hole_a, hole_b: the hole of each.
+
+    Returns:
+        None if the references share fewer than `LEAST_PIXELS` pixels.
+    """
     ways = [_one_way_difference(a, b, hole_a, hole_b), _one_way_difference(b, a, hole_b, hole_a)]
     differences = [way for way in ways if way is not None]
     return sum(differences) / len(differences) if differences else None
 
 
 def _one_way_difference(a: Reference, b: Reference, hole_a: Hole, hole_b: Hole) -> float | None:
-    """`color_difference` of `a` from `b` alone."""
+    """Return how far the colours of `a` lie outside the range of those of `b`; see `color_difference`."""
     own = hole_a.pixels & (hole_a.depth > 0)
     points, colors = geometry.unproject(hole_a.depth, hole_a.camera)[own], _smooth_colors(a, hole_a)[own]
     uv, z = geometry.project(points, hole_b.camera)
@@ -113,7 +138,7 @@ def _one_way_difference(a: Reference, b: Reference, hole_a: Hole, hole_b: Hole) 
 
 
 def _smooth_colors(reference: Reference, hole: Hole) -> np.ndarray:
-    """[h, w, 3] float32 in [0, 1], the smoothed picture at the size of its hole."""
+    """Return [h, w, 3] float32 in [0, 1], the reference's picture, reduced to the size of its hole and smoothed."""
     size = hole.camera.width, hole.camera.height
     small = cv2.resize(reference.image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
     return cv2.GaussianBlur(small, (0, 0), SMOOTH * hole.camera.width)

@@ -1,4 +1,4 @@
-"""Colours of a reference: matched to its photograph's, and the hole pasted into the photograph."""
+"""Colours of a reference: they are matched to those of its photograph, and its hole is pasted into the photograph."""
 
 from __future__ import annotations
 
@@ -10,14 +10,21 @@ from reffusion.io.images import to_uint8
 VISIBLE_CHANGE = 1.0  # levels of 255: smaller changes of colour are ignored
 SAMPLES = 5000  # pixels that are compared
 LEAST_PIXELS = 100  # pixels that determine a gain
-LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # beyond these bounds the pictures have nothing in common
+LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # with a gain beyond these bounds the fit is meaningless and ignored
 
 
 def match_colors(picture: np.ndarray, photo: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gain and offset [3] per channel, colours in [0, 1]: photo = gain * picture + offset, by a robust fit over known
-    pixels.
+    """Fit the gain and offset that map the colours of a picture to those of its photograph.
 
-    1 and 0 where they would hardly change a colour, or where no line fits.
+    For each channel, photo = gain * picture + offset, with colours in [0, 1], is fitted robustly over known pixels.
+
+    Args:
+        picture, photo: uint8 [H, W, 3], aligned with each other.
+        known: bool [H, W], the pixels to compare.
+
+    Returns:
+        Gain and offset, [3] each. They are 1 and 0 if they would hardly change any colour, or if a gain is not within
+        `LEAST_GAIN` and `MOST_GAIN`.
     """
     x, y = (_samples(image, known) for image in (picture, photo))
     gain, offset = np.ones(3), np.zeros(3)
@@ -30,7 +37,7 @@ def match_colors(picture: np.ndarray, photo: np.ndarray, known: np.ndarray) -> t
 
 
 def recolor(picture: np.ndarray, gain: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3], the picture in the colours of the photograph."""
+    """Return gain * picture + offset, uint8 [H, W, 3], where gain and offset, [3] each, are those of `match_colors`."""
     return to_uint8(picture / 255.0 * gain + offset)
 
 
@@ -40,9 +47,12 @@ def paste(
     """Paste the hole of the picture into the photograph, uint8 [H, W, 3].
 
     Args:
-        picture: aligned with the photograph, in its colours.
-        hole: bool [H, W]. inside: bool [H, W], pixels that the picture covers.
-        margin: px around the hole that are taken from the picture too; rim: px beyond, over which both are blended.
+        picture: uint8 [H, W, 3], aligned with the photograph and matched to its colours.
+        photo: uint8 [H, W, 3].
+        hole: bool [H, W].
+        inside: bool [H, W], the pixels that the picture covers.
+        margin: px; pixels this close to the hole are taken from the picture too.
+        rim: px, width of the strip beyond the margin in which picture and photograph are blended.
     """
     away = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5) if hole.any() else np.full(hole.shape, 1e9)
     share = np.clip(1 - (away - margin) / max(rim, 1e-6), 0, 1) * inside
@@ -51,7 +61,7 @@ def paste(
 
 
 def _samples(image: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """[N, 3] colours in [0, 1] of known pixels, low-passed, evenly chosen."""
+    """Return [N, 3], the low-passed colours in [0, 1] of about `SAMPLES` known pixels, evenly spaced."""
     rows, columns = np.nonzero(known)
     every = max(1, len(rows) // SAMPLES)
     soft = cv2.GaussianBlur(image, (0, 0), 1.5)
@@ -59,7 +69,10 @@ def _samples(image: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Gain and offset of y ~ gain * x + offset, by reweighted least squares; gain 1 where x hardly varies."""
+    """Fit y = gain * x + offset by iteratively reweighted least squares; return the gain and the offset.
+
+    The gain is 1 if x hardly varies. With fewer than `LEAST_PIXELS` values, gain and offset are 1 and 0.
+    """
     if len(x) < LEAST_PIXELS:
         return 1.0, 0.0
     gain, offset = 1.0, float(np.median(y - x))

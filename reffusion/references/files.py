@@ -1,4 +1,4 @@
-"""Finds the references that a scene brings: named in its scene.yaml, or painted into its folder `painted`."""
+"""The files of the references that come with a scene: named in its scene.yaml, or saved in its folder `painted`."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from reffusion.params.reference import ReferenceSpec, reference_list
 
 PAINTED = "painted"  # folder of the scene with <view>.png and <view>_depth.*
 DEPTH_ENDINGS = (".npy", ".exr", ".png", ".tif", ".tiff")
-PROPORTION_TOLERANCE = 0.1  # relative difference of a reference's proportions from its view's: people crop
+PROPORTION_TOLERANCE = 0.1  # relative difference of aspect ratio from the view's that is allowed, because people crop
 
 
 @dataclass(frozen=True)
 class ReferenceFile:
-    """A completed view that the scene brings.
+    """The files of a completed view that comes with the scene.
 
     Attributes:
         view: name of the view.
-        path: the picture. Another size than the photograph's, and slightly different proportions, are corrected later.
-        depth: depth or disparity map of the whole picture; or None.
-        undistorted: the picture was painted over an undistorted image, not over the photograph.
-        painted: it lies in `painted`, over what `reference` wrote to be painted, whose exposure is the scene's common
-            one.
-        trust: it is used even where it does not seem to show its view.
+        path: file of the picture. Its size may differ from the photograph's, and its proportions slightly; both are
+            corrected later.
+        depth: file of a depth or disparity map of the whole picture; None if there is none.
+        undistorted: True if the picture was painted over an undistorted image, False if over the photograph.
+        painted: True if the picture lies in the folder `painted`. It was then painted over an image that the stage
+            `reference` wrote for this purpose, and has the common exposure of the scene.
+        trust: True to use the picture even if it does not seem to show its view.
     """
 
     view: str
@@ -39,7 +40,7 @@ class ReferenceFile:
 
     @property
     def trust_hint(self) -> str:
-        """What to write in scene.yaml so that the reference is used despite a failed check, in words."""
+        """A sentence that tells users how to make scene.yaml accept the reference despite a failed check."""
         if not self.painted:
             return "write `trust: true` beside it in scene.yaml"
         line = f"{{view: {self.view}, image: {PAINTED}/{self.path.name}, trust: true}}"
@@ -47,21 +48,30 @@ class ReferenceFile:
 
 
 def list_paintings(folder: Path) -> list[Path]:
-    """The files of the scene's folder `painted`, sorted."""
+    """Return the files in the scene's folder `painted`, sorted; hidden files are left out."""
     return sorted(path for path in (Path(folder) / PAINTED).glob("[!.]*") if path.is_file())
 
 
 def load_reference_files(
     folder: Path, views: ViewTable, specs: ReferenceSpec | Sequence[ReferenceSpec] | None
 ) -> list[ReferenceFile]:
-    """The references that scene.yaml names (`specs`) and those in `painted`, sorted by view.
+    """Find the references that scene.yaml names and those in the folder `painted`, and check their files.
 
-    A painting is called <view>.png, its depth map <view>_depth.*. It replaces one that scene.yaml names for the same
-    view.
+    A painting is called <view>.png, its depth map <view>_depth.*. A painting replaces a reference that scene.yaml names
+    for the same view.
+
+    Args:
+        folder: the scene's folder.
+        views: the views of the scene.
+        specs: value of the key `reference` of scene.yaml.
+
+    Returns:
+        The references, sorted by view name.
 
     Raises:
-        BadInput: naming the file and the remedy: an unknown view, a test view, a view that is for neither, two
-            references for a view, a missing file, other proportions than the view's, a depth map of an unknown kind.
+        BadInput: a view is unknown, is a test view, or is neither a training nor a test view; a view has two
+            references; a file is missing; a picture has other proportions than its view; or a depth map is of an
+            unknown kind. The message names the file and the remedy.
     """
     folder = Path(folder)
     found: dict[str, ReferenceFile] = {}
@@ -81,12 +91,16 @@ def load_reference_files(
 
 
 def describe_references(given: Sequence[ReferenceFile]) -> str:
-    """The views of references, for people."""
+    """Return the names of the references' views as text for people, with "(painted)" after those of paintings."""
     return ", ".join(each.view + (" (painted)" if each.painted else "") for each in given)
 
 
 def _paintings(files: Sequence[Path], views: ViewTable) -> list[ReferenceFile]:
-    """The paintings with their depth maps; masks copied along with them are ignored."""
+    """Return the paintings among `files` with their depth maps; copies of the views' mask files are ignored.
+
+    Raises:
+        BadInput: a file is neither a painting nor a depth map of a known view, or two files are for the same view.
+    """
     pictures, depths = {}, {}
     for path in files:
         of = {end: path.stem.removesuffix(end) for end in ("_depth", "_mask") if path.stem.endswith(end)}
@@ -111,6 +125,7 @@ def _paintings(files: Sequence[Path], views: ViewTable) -> list[ReferenceFile]:
 
 
 def _check(file: ReferenceFile, views: ViewTable) -> None:
+    """Raise BadInput if the files of a reference cannot be used; see `load_reference_files`."""
     where = "" if file.painted else "; correct `reference` in scene.yaml"
     for path in (file.path, file.depth):
         if path is not None and not path.is_file():

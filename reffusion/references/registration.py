@@ -1,8 +1,12 @@
-"""Registers a completed view from another tool with its photograph, and tells whether it shows that view.
+"""Registration of a completed view from another tool with its photograph, and a test of whether it shows that view.
 
-Pictures are uint8 [H, W, 3] of one size; affine maps are as in `tracks`. Only pixels outside the object are compared. A
-picture of this view shows each point where the photograph does, even when an autoencoder redrew it. A picture of
-another view displaces points by parallax, which no affine map explains; another scene does not show them.
+Pictures are uint8 [H, W, 3] of one size. Affine maps [2, 3] lead from pixels of the photograph to pixels of the picture
+(`tracks`). Only pixels outside the object are compared. A picture of the same view shows each point at the place where
+the photograph shows it, even if an autoencoder redrew the picture. In a picture of another view, parallax displaces
+points in a way that no affine map explains. A picture of another scene does not show these points at all.
+
+An inlier is a tracked point that picture and photograph show at the same place. The inlier ratio is the share of
+inliers among all points compared.
 """
 
 from __future__ import annotations
@@ -20,20 +24,22 @@ from reffusion.references import tracks
 from reffusion.references.color import match_colors, recolor
 
 WORKING_SIDE = 512  # px, the longer side at which pictures are compared; autoencoders keep what is visible at this size
-QUICK_SIDE = 256  # px, the same where many views are compared
-MARGIN = 0.01  # of the width: pixels nearer to the object are ignored, since its blurred edge lies there
+QUICK_SIDE = 256  # px, the longer side at which a picture is compared with many views
+MARGIN = 0.01  # of the width: pixels nearer to the object are ignored, because the object's blurred edge lies there
 INLIER_DISPLACEMENT = 0.001  # of the longer side: a point displaced by less counts as an inlier
-LEAST_INLIER_DISPLACEMENT = 0.5  # px of the working size, where that is less: flow is no finer
-LEAST_POINTS = 20  # points; with fewer nothing can be said
+LEAST_INLIER_DISPLACEMENT = 0.5  # px of the working size: lower bound of this limit, because flow is no more accurate
+LEAST_POINTS = 20  # points that must be found in a picture to judge it
 LEAST_INLIER_RATIO = 0.7  # share of inliers from which a picture shows its view
 SURE_INLIER_RATIO = 0.95  # share of inliers from which no other map is tried
 REFINEMENTS = 3  # times that an affine map is estimated from the remaining displacements
-IDENTITY_SHIFT = 0.2  # px of the working size: a map that moves no corner further is the identity
+IDENTITY_SHIFT = 0.2  # px of the working size: a map that moves no corner further counts as the identity
 IDENTICAL = 1.5  # levels of 255: largest median difference of a picture that equals the photograph outside the hole
 LEAST_SCALE, LARGEST_SCALE = 0.8, 1.25  # scales a map may have: people resize and crop, they do not zoom
 LARGEST_SHEAR = 0.05  # radians of rotation and shear a map may have
-FAR_SHIFT = 0.02  # of the longer side: a map that moves a corner by less may be another tool's shift
-CLEAR_MARGIN = 0.1  # inlier ratio by which another view must be better
+# Of the longer side: a map that moves a corner by less may only undo a shift by the tool that made the picture. A
+# larger shift raises the suspicion that the picture shows another view.
+FAR_SHIFT = 0.02
+CLEAR_MARGIN = 0.1  # difference of inlier ratios by which another view must be better
 LARGEST_SHIFT = 0.15  # of the longer side: how far a map may move a corner
 
 IDENTITY = np.eye(2, 3)
@@ -41,18 +47,20 @@ IDENTITY = np.eye(2, 3)
 
 @dataclass(frozen=True)
 class Registration:
-    """How a picture lies over its photograph.
+    """The alignment of a picture with its photograph, in position and colour, and how well both agree then.
 
     Attributes:
-        affine: [2, 3] affine map from the photograph's pixels to the picture's; None where the picture is aligned as it
-            is.
-        max_shift: px, by how much the map moves the corner that it moves most.
-        gain, offset: [3] each, colours in [0, 1]: photograph = gain * picture + offset; 1 and 0 where none is needed.
+        affine: [2, 3], the affine map from pixels of the photograph to pixels of the picture; None if the picture is
+            aligned without one.
+        max_shift: px, the largest distance by which the map moves a corner of the picture.
+        gain, offset: [3] each, so that photograph = gain * picture + offset for colours in [0, 1]; 1 and 0 if the
+            colours need no correction.
         point_count: number of points that were compared.
-        inlier_ratio: share in [0, 1] of the points that the picture shows where the photograph does; NaN with too few
-            points.
-        median_displacement: px, of the tracked points; NaN where none was tracked.
-        is_identical: the picture equals the photograph outside the hole, up to rounding.
+        inlier_ratio: share in [0, 1] of the points that the aligned picture shows at the same place as the photograph;
+            NaN if there are too few points.
+        median_displacement: px, median of the displacements of the tracked points that remain after alignment; NaN if
+            no point was tracked.
+        is_identical: True if the picture equals the photograph outside the hole, up to rounding.
     """
 
     affine: np.ndarray | None
@@ -66,12 +74,12 @@ class Registration:
 
     @property
     def fits(self) -> bool:
-        """Is it a picture of this view? True where there are too few points to tell."""
+        """Whether the picture shows this view. True also if there are too few points to tell."""
         return not self.inlier_ratio < LEAST_INLIER_RATIO
 
     @property
     def mismatch(self) -> str:
-        """How badly it fits, for an error message."""
+        """A description of how badly the picture fits its view, for an error message."""
         moved = f"moved by up to {self.max_shift:.0f} px" if self.affine is not None else "as it lies"
         displaced = (
             "none of the others is found in it"
@@ -94,13 +102,15 @@ class Registration:
 
 
 def register(picture: np.ndarray, photo: np.ndarray, hidden: np.ndarray, working: int = WORKING_SIDE) -> Registration:
-    """Align a picture with its photograph, in position and colour. The identity is kept where it fits as well.
+    """Align a picture with its photograph, in position and colour.
+
+    The picture is not moved if the best affine map hardly moves it or improves nothing.
 
     Args:
-        picture: the completed view, resized to the photograph's size.
-        photo: the photograph of the view.
+        picture: uint8 [H, W, 3], the completed view, resized to the photograph's size.
+        photo: uint8 [H, W, 3], the photograph of the view.
         hidden: bool [H, W], the object's pixels in the photograph.
-        working: px, the longer side at which both are compared, where they are larger.
+        working: px; larger pictures are reduced to this longer side before they are compared.
     """
     known = ~_dilate(hidden, MARGIN)
     untouched = known.any() and np.median(np.abs(picture.astype(np.int16) - photo)[known]) <= IDENTICAL
@@ -119,12 +129,16 @@ def register(picture: np.ndarray, photo: np.ndarray, hidden: np.ndarray, working
 def find_better_view(
     picture: np.ndarray, found: Registration, others: Iterable[tuple[str, np.ndarray, np.ndarray]]
 ) -> tuple[str, float] | None:
-    """The name of another view that the picture shows better than its own, and the inlier ratio there; None for no such
-    view.
+    """Search for another view that the picture shows better than its own.
 
     Args:
-        found: how the picture lies over its own photograph.
-        others: of other views the name, the photograph, and bool [H, W] the object's pixels; likely ones first.
+        picture: uint8 [H, W, 3].
+        found: the registration of the picture with the photograph of its own view.
+        others: for each other view its name, its photograph, and the object's pixels in the photograph, bool [H, W].
+            Likely views should come first, because the search ends at the first view that surely fits.
+
+    Returns:
+        The name of the best such view and its inlier ratio; None if no other view is better.
     """
     best: tuple[str, float] | None = None
     own = 0.0 if np.isnan(found.inlier_ratio) else found.inlier_ratio
@@ -133,7 +147,8 @@ def find_better_view(
         size = (photo.shape[1], photo.shape[0])
         image = picture if picture.shape == photo.shape else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
         match = register(image, photo, hidden, QUICK_SIDE)
-        # Other views of a plane show the same points, all displaced alike: then the view that needs no shift is right.
+        # If a view shows a plane, other views show the same points, all displaced alike, and fit as well. Then the view
+        # to which the picture fits with the much smaller shift is the right one.
         as_well = is_far and match.inlier_ratio > own - 0.05 and match.max_shift < found.max_shift / 2
         if match.inlier_ratio >= LEAST_INLIER_RATIO and (match.inlier_ratio > own + CLEAR_MARGIN or as_well):
             best = (name, match.inlier_ratio) if best is None or match.inlier_ratio > best[1] else best
@@ -143,10 +158,18 @@ def find_better_view(
 
 
 def warp(picture: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The picture resampled to the photograph's pixels, and bool [H, W]: pixels that lie inside the picture."""
+    """Resample the picture at the pixels of the photograph.
+
+    Args:
+        picture: uint8 [H, W, 3].
+        moved: [2, 3], the affine map from pixels of the photograph to pixels of the picture.
+
+    Returns:
+        The resampled picture, uint8 [H, W, 3], and bool [H, W], the pixels that the map takes into the picture.
+    """
     height, width = picture.shape[:2]
     linear, shift = moved[:, :2], moved[:, 2] + (moved[:, :2] - np.eye(2)) @ (0.5, 0.5)
-    matrix = np.concatenate([linear, shift[:, None]], 1)  # OpenCV counts from the centre of the first pixel
+    matrix = np.concatenate([linear, shift[:, None]], 1)  # OpenCV's origin is the centre of the first pixel
     read = cv2.warpAffine(picture, matrix, (width, height), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
                           borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).astype(np.float32)
@@ -159,11 +182,14 @@ def warp(picture: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 @dataclass(frozen=True)
 class _Pair:
-    """Picture and photograph at the working size.
+    """A picture and its photograph, reduced to the working size.
+
+    Affine maps are called `moved` and lead from pixels of the photograph to pixels of the picture, at the working size.
 
     Attributes:
-        picture, photo: uint8 [h, w, 3]; known: bool [h, w], pixels of the photograph without the object.
-        stride: [2] full-size pixels per working pixel, across and down.
+        picture, photo: uint8 [h, w, 3].
+        known: bool [h, w], the pixels of the photograph that do not show the object.
+        stride: [2], full-size pixels per working pixel, across and down.
     """
 
     picture: np.ndarray
@@ -173,6 +199,7 @@ class _Pair:
 
     @classmethod
     def at(cls, picture: np.ndarray, photo: np.ndarray, known: np.ndarray, working: int) -> _Pair:
+        """Reduce full-size arrays so that the longer side has at most `working` px."""
         full_size = np.array(photo.shape[1::-1])
         size = np.maximum(1, np.rint(full_size * min(1.0, working / full_size.max()))).astype(int)
         if (size == full_size).all():
@@ -181,7 +208,7 @@ class _Pair:
         return cls(reduce(picture), reduce(photo), reduce(known.astype(np.float32)) > 0.99, full_size / size)
 
     def judge(self, moved: np.ndarray) -> Registration:
-        """The registration by a map [2, 3] in working pixels, in full-size pixels."""
+        """Return the registration by a given map, [2, 3] at the working size, converted to full-size pixels."""
         gain, offset, found = self.compare(moved)
         limit = max(INLIER_DISPLACEMENT * max(self.known.shape), LEAST_INLIER_DISPLACEMENT)
         places = len(found.points)
@@ -194,11 +221,16 @@ class _Pair:
 
     @cached_property
     def unmoved(self) -> tuple[np.ndarray, np.ndarray, tracks.Tracks]:
-        """`compare` for the identity."""
+        """The result of `compare` for the identity."""
         return self._compare(self.picture, self.known)
 
     def compare(self, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, tracks.Tracks]:
-        """(Gain, offset, tracks): colours of the moved picture, and where it shows the photograph's points."""
+        """Compare the photograph with the picture after the picture is resampled by a map.
+
+        Returns:
+            Gain and offset, [3] each, which match the colours of the picture to the photograph's; and the tracks, from
+            points of the photograph to the places where the resampled picture shows them.
+        """
         if moved is IDENTITY:
             return self.unmoved
         read, inside = warp(self.picture, moved)
@@ -215,17 +247,21 @@ class _Pair:
             gain,
             offset,
             tracks.track(in_picture, in_photo, tracks.find_points(in_picture, known)),
-        )  # of a plain photograph
+        )  # a plain photograph has too few points of its own, so those of the picture are tracked
 
     def starts(self) -> Iterator[np.ndarray]:
-        """Initial maps: the identity, then one by matching features, for larger displacements."""
+        """Yield initial maps: the identity, then a map from matched features, which can cover larger displacements."""
         yield IDENTITY
         if (found := _by_features(self.picture, self.photo, self.known)) is not None:
             yield found
 
     def refine(self, moved: np.ndarray) -> Registration | None:
-        """Refine a map by the affine part of the remaining displacements. None for a map that resizing and cropping
-        cannot make, and where the identity needs no refinement."""
+        """Refine a map by the affine part of the displacements that remain after it, and return its registration.
+
+        Returns:
+            None if resizing and cropping cannot produce the refined map, if too few points are tracked, or if the map
+            is the identity and needs no refinement.
+        """
         for _ in range(REFINEMENTS):
             correction = self.compare(moved)[2].affine()
             if correction is None or (moved is IDENTITY and _shift(correction, self.known.shape) < IDENTITY_SHIFT):
@@ -238,7 +274,7 @@ class _Pair:
         return self.judge(moved)
 
     def is_plausible(self, moved: np.ndarray) -> bool:
-        """Can resizing and cropping make this map?"""
+        """Return whether resizing and cropping can produce this map."""
         (a, b), (c, d) = moved[:, :2]
         scales = min(a, d) > LEAST_SCALE and max(a, d) < LARGEST_SCALE
         near = _shift(moved, self.known.shape) < LARGEST_SHIFT * max(self.known.shape)
@@ -246,27 +282,33 @@ class _Pair:
 
 
 def _is_better(found: Registration, best: Registration) -> bool:
-    """Does `found` have a larger inlier ratio than `best`, or the same with smaller displacements?"""
+    """Return whether `found` has a larger inlier ratio than `best`, or about the same and smaller displacements."""
     if found.inlier_ratio > best.inlier_ratio + 0.01 or np.isnan(best.inlier_ratio):
         return not np.isnan(found.inlier_ratio)
     return found.inlier_ratio > best.inlier_ratio - 0.01 and found.median_displacement < best.median_displacement
 
 
 def _compose(first: np.ndarray, then: np.ndarray) -> np.ndarray:
-    """[2, 3] of `first` after `then`: photograph -> moved picture -> picture."""
+    """Return [2, 3], the map that applies `then` and after it `first`.
+
+    `then` leads from the photograph to the resampled picture, `first` from the resampled to the original picture.
+    """
     linear = first[:, :2] @ then[:, :2]
     return np.concatenate([linear, (first[:, :2] @ then[:, 2] + first[:, 2])[:, None]], 1)
 
 
 def _shift(moved: np.ndarray, shape: tuple[int, ...]) -> float:
-    """px, by how much the map moves the corner that it moves most."""
+    """Return the largest distance, in px, by which the map moves a corner of an image of `shape` (height, width)."""
     height, width = shape
     corners = np.array([(0, 0), (width, 0), (0, height), (width, height)], np.float64)
     return float(np.linalg.norm(corners @ moved[:, :2].T + moved[:, 2] - corners, axis=1).max())
 
 
 def _by_features(picture: np.ndarray, photo: np.ndarray, known: np.ndarray) -> np.ndarray | None:
-    """An affine map by SIFT matches; None where there are too few."""
+    """Estimate the affine map from matched SIFT features; None if there are too few matches.
+
+    Features of the photograph are taken from its `known` pixels only.
+    """
     finder = cv2.SIFT_create(1000)
     grey = lambda image: cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     in_photo, of_photo = finder.detectAndCompute(grey(photo), known.astype(np.uint8))
@@ -283,5 +325,6 @@ def _by_features(picture: np.ndarray, photo: np.ndarray, known: np.ndarray) -> n
 
 
 def _dilate(mask: np.ndarray, fraction: float) -> np.ndarray:
+    """Return the mask, bool [H, W], dilated by a square whose radius is `fraction` of the width, at least 1 px."""
     reach = max(1, round(fraction * mask.shape[1]))
     return cv2.dilate(mask.astype(np.uint8), square(reach)) > 0

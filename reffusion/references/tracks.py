@@ -1,8 +1,8 @@
 """Sparse optical flow between a photograph and a picture of the same view, and the affine map that explains most of it.
 
-Both are low-passed first, so that texture redrawn by an autoencoder does not count; structure stays where it was.
-Pictures are float32 [H, W], grey, in levels of 255. An affine map [2, 3] takes a pixel of the photograph
-(docs/architecture.md#conventions) to the pixel that shows the same in the picture.
+Both are low-passed first, because an autoencoder that redrew the picture changes fine texture; coarser structure stays
+in place. Pictures are grey, float32 [H, W], in levels of 255. An affine map [2, 3] takes a pixel of the photograph to
+the pixel of the picture that shows the same point (docs/architecture.md#conventions).
 """
 
 from __future__ import annotations
@@ -12,25 +12,26 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-LOW_PASS = 0.004  # of the longer side: standard deviation of the blur, 2 px of 512, a quarter of the resolution
+LOW_PASS = 0.004  # of the longer side: standard deviation of the blur; 2 px for 512 px, a quarter of the resolution
 LEAST_LOW_PASS = 1.0  # px: smallest standard deviation of the blur
 TEXTURE = 0.5  # levels of 255 per px: smallest gradient, in every direction, of a point that can be located
-SPACING = 0.014  # of the longer side: distance between points
-WINDOW = 0.041  # of the longer side: window of the flow around a point
-PYRAMID_LEVELS = 3  # of the pyramid, beside the full size
-ROUND_TRIP = 1.0  # px: largest distance from the start of a point tracked forward and back
+SPACING = 0.014  # of the longer side: smallest distance between points
+WINDOW = 0.041  # of the longer side: side of the window around a point in which flow is computed
+PYRAMID_LEVELS = 3  # levels of the image pyramid besides the full size
+ROUND_TRIP = 1.0  # px: a point that is tracked forward and back must return to within this distance of its start
 INLIER = 1.0  # px: largest residual of an inlier of the affine map
 LEAST_PAIRS = 12  # needed to estimate an affine map
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Points of a photograph and where a picture shows them.
+    """Points of a photograph, and their displacements in a picture.
 
     Attributes:
-        points: [N, 2] px in the photograph.
-        displacements: [N, 2] px, from there to where the picture shows the same; meaningless where not `tracked`.
-        tracked: bool [N], forward and backward flow agree.
+        points: [N, 2], px (x, y) in the photograph.
+        displacements: [N, 2] px, position in the picture minus position in the photograph; meaningless where `tracked`
+            is False.
+        tracked: bool [N], True where forward and backward flow agree.
     """
 
     points: np.ndarray
@@ -39,11 +40,14 @@ class Tracks:
 
     @property
     def lengths(self) -> np.ndarray:
-        """[N] px, length of the displacements; infinite where a point was lost."""
+        """[N] px, the lengths of the displacements; infinite where a point is not tracked."""
         return np.where(self.tracked, np.linalg.norm(self.displacements, axis=1), np.inf)
 
     def affine(self) -> np.ndarray | None:
-        """[2, 3], the affine map that explains most displacements; None where too few points are tracked."""
+        """Return [2, 3], the affine map that explains most displacements.
+
+        None if fewer than `LEAST_PAIRS` points are tracked or agree on a map.
+        """
         if self.tracked.sum() < LEAST_PAIRS:
             return None
         source = self.points[self.tracked]
@@ -51,14 +55,14 @@ class Tracks:
 
 
 def estimate_affine(source: np.ndarray, target: np.ndarray, inlier: float) -> np.ndarray | None:
-    """[2, 3], an affine map by RANSAC and least squares over its inliers.
+    """Estimate the affine map from source to target points by RANSAC, then least squares over the inliers.
 
     Args:
         source, target: [N, 2] px, corresponding points.
-        inlier: px, largest residual of an inlier.
+        inlier: px, the largest residual of an inlier.
 
     Returns:
-        None where fewer than `LEAST_PAIRS` points agree on a map.
+        The map, [2, 3]; None if fewer than `LEAST_PAIRS` points agree on a map.
     """
     cv2.setRNGSeed(0)
     found, agree = cv2.estimateAffine2D(source, target, ransacReprojThreshold=inlier)
@@ -66,13 +70,23 @@ def estimate_affine(source: np.ndarray, target: np.ndarray, inlier: float) -> np
 
 
 def low_pass(grey: np.ndarray) -> np.ndarray:
-    """float32 [H, W], the picture without what is finer than a quarter of its resolution; the size stays."""
+    """Return the picture, float32 [H, W], blurred so that details finer than a quarter of its resolution vanish.
+
+    The size of the picture stays the same.
+    """
     sigma = max(LOW_PASS * max(grey.shape), LEAST_LOW_PASS)
     return cv2.GaussianBlur(grey.astype(np.float32), (0, 0), sigma)
 
 
 def find_points(grey: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """[N, 2] px: corners and blobs among the known pixels of a low-passed picture, spread over it."""
+    """Return [N, 2], px (x, y), points of a low-passed picture that can be located in both directions.
+
+    These are corners and blobs, which lie at least `SPACING` apart and so spread over the picture.
+
+    Args:
+        grey: float32 [H, W], the low-passed picture.
+        known: bool [H, W], the pixels in which points are sought.
+    """
     textured = known & (_least_gradient(grey) > TEXTURE)
     if not textured.any():
         return np.zeros((0, 2))
@@ -82,7 +96,12 @@ def find_points(grey: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def track(photo: np.ndarray, picture: np.ndarray, points: np.ndarray) -> Tracks:
-    """Track points of the photograph to the picture by pyramidal Lucas-Kanade; both are low-passed."""
+    """Track points of the photograph into the picture by pyramidal Lucas-Kanade.
+
+    Args:
+        photo, picture: float32 [H, W], both low-passed.
+        points: [N, 2], px (x, y) in the photograph.
+    """
     low, high = np.percentile(photo, (1, 99))
     stretch = lambda image: np.clip((image - low) * (255 / max(high - low, 16)), 0, 255).round().astype(np.uint8)
     side = _odd(WINDOW * max(photo.shape))
@@ -98,7 +117,10 @@ def track(photo: np.ndarray, picture: np.ndarray, points: np.ndarray) -> Tracks:
 
 
 def _least_gradient(grey: np.ndarray) -> np.ndarray:
-    """[H, W] levels of 255 per px: root mean square gradient in a window, along the direction of least gradient."""
+    """Return [H, W], the gradient around each pixel along the direction in which it is least, in levels of 255 per px.
+
+    It is the root mean square of the directional derivative in a window.
+    """
     side = _odd(WINDOW * max(grey.shape) / 2)
     across, down = (cv2.Sobel(grey, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1)))
     xx, xy, yy = (cv2.blur(each, (side, side)) for each in (across * across, across * down, down * down))
@@ -107,4 +129,5 @@ def _least_gradient(grey: np.ndarray) -> np.ndarray:
 
 
 def _odd(pixels: float) -> int:
+    """Return the length, rounded to an odd number of pixels, at least 5."""
     return max(5, round(pixels)) | 1

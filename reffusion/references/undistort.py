@@ -1,4 +1,4 @@
-"""Undistorts references and their depth maps like the photographs of their views."""
+"""Undistortion of references and their depth maps, by the lens of their views' photographs."""
 
 from __future__ import annotations
 
@@ -10,20 +10,24 @@ from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, load_image, resize_image, resize_nearest
 from reffusion.references.files import ReferenceFile
 
-DOWNSCALE_ABOVE = 1.5  # times the width of the view: larger pictures are shrunk before they are resampled
+DOWNSCALE_ABOVE = 1.5  # pictures wider than this many times their view are reduced before they are resampled
 
 
 def undistort_reference(
     given: ReferenceFile, lens: Lens, upright: bool, affine: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Load a reference and undistort it like its view: uint8 [H, W, 3], and bool [H, W]: pixels that the file covers.
+    """Load the picture of a reference, and undistort it as the photograph of its view was undistorted.
 
     Args:
-        given: the reference.
-        lens: of the view's photograph, see `reffusion.capture.lenses`.
-        upright: the orientation tag is obeyed.
-        moved: [2, 3] affine map from the view's pixels to those that show the same in the result without a map. The
-            file is then resampled once, not twice. None: the picture is aligned, and treated like its photograph.
+        given: the files of the reference.
+        lens: the lens of the view's photograph, at the size of the undistorted photograph (`reffusion.capture.lenses`).
+        upright: whether the EXIF orientation of pictures is applied.
+        affine: [2, 3], an affine map that aligns the picture in addition. It leads from pixels of the view to pixels of
+            the picture that this function returns for None. Both steps take a single resampling of the file. None if
+            the picture needs no alignment.
+
+    Returns:
+        The picture, uint8 [H, W, 3], and bool [H, W], the pixels that the file covers.
     """
     image, size = load_image(given.path, upright), (lens.width, lens.height)
     pinhole, where = undistortion_map(lens)
@@ -41,13 +45,16 @@ def undistort_reference(
 def undistort_reference_depth(
     given: ReferenceFile, lens: Lens, upright: bool, affine: np.ndarray | None = None
 ) -> np.ndarray | None:
-    """Load the depth map of a reference and undistort it like `undistort_reference`, by the nearest pixel.
+    """Load the depth map of a reference, and undistort it as `undistort_reference` does, but by the nearest pixel.
+
+    Args:
+        given, lens, upright, affine: as of `undistort_reference`.
 
     Returns:
-        float32 [H, W], NaN where unknown; None where the reference has no depth map.
+        float32 [H, W], NaN where unknown; None if the reference has no depth map.
 
     Raises:
-        BadInput: naming the file, where it is no depth map, or has other proportions than its picture.
+        BadInput: the file is no depth map, or has other proportions than the picture. The message names the file.
     """
     if given.depth is None:
         return None
@@ -70,7 +77,14 @@ def undistort_reference_depth(
 
 
 def _sampling_points(shape: tuple[int, ...], lens: Lens, pinhole: Lens, affine: np.ndarray) -> np.ndarray:
-    """[H, W, 2]: for each pixel of the view, where to read in a file of this shape that was made with this lens."""
+    """Return [H, W, 2], for each pixel of the view the position (x, y) in the file that shows the same point.
+
+    Args:
+        shape: height and width of the file.
+        lens: the lens of the file's picture: the photograph's, or `pinhole` for an undistorted picture.
+        pinhole: the lens of the view without distortion.
+        affine: [2, 3], applied to the view's pixels first.
+    """
     columns, rows = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
     points = np.stack([columns, rows], -1) @ affine[:, :2].T + affine[:, 2]
     directions = (points - (pinhole.cx, pinhole.cy)) / (pinhole.fx, pinhole.fy)

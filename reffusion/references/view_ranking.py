@@ -1,8 +1,8 @@
-"""For people who paint references: which views to complete, by how much of the hole each covers, and what is known of
-them.
+"""Ranking of views for people who paint references: which views should be completed, and the pictures to paint over.
 
-The surface behind the object is not known before a view is painted. Here the disparity of the surroundings is continued
-across the hole, which is enough to tell which views look at the same part of it.
+Views are ranked by how much of the hole they show that earlier views do not show. The surface behind the object is not
+known before a view is painted. Here the disparity of the surroundings is continued across the hole, which is accurate
+enough to tell which views show the same part of the hole.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from reffusion.depth.inpaint_depth import inpaint_depth
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
-SIDE = 160  # px, the longer side at which surfaces are compared
-SAME_SURFACE = 0.1  # relative depth within which two views show the same surface
-GREY = 128  # level of the pixels to be painted
-LEAST_GAIN = 0.02  # share of all pixels to be invented that a further view must cover
+SIDE = 160  # px, the longer side to which views are reduced before their surfaces are compared
+SAME_SURFACE = 0.1  # relative difference of depth within which two views show the same surface
+GREY = 128  # grey level of the pixels to be painted
+LEAST_GAIN = 0.02  # share of all pixels to be invented that a view must newly cover to be ranked
 
 
 @dataclass(frozen=True)
 class Hole:
-    """The pixels of a view to be invented, at a small size.
+    """The hole of a view, that is, its pixels to be invented, at a reduced size.
 
     Attributes:
-        camera: the small view.
-        pixels: bool [h, w].
-        depth: [h, w] camera z, continued across the pixels from the surroundings; 0 where unknown.
+        camera: the camera of the reduced view.
+        pixels: bool [h, w], the pixels to be invented.
+        depth: [h, w], camera z, continued from the surroundings into the hole; 0 where unknown.
     """
 
     camera: Camera
@@ -42,7 +42,13 @@ class Hole:
 
 @dataclass(frozen=True)
 class RankedView:
-    """A view to paint: its name, and the share of all pixels to be invented that it adds to the views before it."""
+    """An entry of the ranking.
+
+    Attributes:
+        view: the name of the view.
+        share: share in [0, 1] of the pixels to be invented, in all views together, that this view covers and no view
+            before it in the ranking covers.
+    """
 
     view: str
     share: float
@@ -52,10 +58,11 @@ class RankedView:
 def find_holes(
     remaining: Gaussians, cameras: Sequence[Camera], hidden: Mapping[str, np.ndarray], invent: Mapping[str, np.ndarray]
 ) -> dict[str, Hole]:
-    """View name -> its hole, for the views that have one.
+    """Return view name -> its hole at a reduced size, for the views that have pixels to be invented.
 
     Args:
-        remaining: the Gaussians without the object's.
+        remaining: the Gaussians of the scene without the object.
+        cameras: the views.
         hidden: view name -> bool [H, W], the object's pixels.
         invent: view name -> bool [H, W], the pixels to be invented.
     """
@@ -78,15 +85,16 @@ def find_holes(
 
 
 def rank_views(view_holes: Mapping[str, Hole], chosen: Sequence[str], most: int) -> list[RankedView]:
-    """Rank views greedily: those of `chosen`, then up to `most` others, each the one that covers most of what is not
-    covered yet.
+    """Rank views greedily by how many pixels to be invented they cover that the views before them do not cover.
 
-    Of the others, views whose hole does not touch the picture's border come first: a hole that is cut off hides a part.
+    The views in `chosen` come first, in the given order. Up to `most` other views follow. Of these, views whose hole
+    does not touch the border of the picture precede the rest, because the border cuts off a part of the hole. Other
+    views that newly cover less than `LEAST_GAIN` are left out.
 
     Args:
         view_holes: view name -> its hole.
-        chosen: views that have their picture already.
-        most: how many further ones.
+        chosen: the views that have been painted already.
+        most: the largest number of other views.
     """
     covers, total = _coverage(view_holes)
     if not total:
@@ -111,12 +119,19 @@ def rank_views(view_holes: Mapping[str, Hole], chosen: Sequence[str], most: int)
 
 
 def _touches_border(hole: Hole) -> bool:
-    """Does the hole touch the border of the picture?"""
+    """Return whether the hole touches the border of the picture."""
     return bool(hole.pixels[[0, -1]].any() or hole.pixels[:, [0, -1]].any())
 
 
 def _coverage(view_holes: Mapping[str, Hole]) -> tuple[dict[str, np.ndarray], int]:
-    """View -> bool [P]: which of the pixels to be invented, of all views together, its own hole covers; and P."""
+    """Find which pixels to be invented, of all views together, each single view covers.
+
+    A view covers a pixel of another view if its own hole shows the same surface point.
+
+    Returns:
+        View name -> bool [P], True for the pixels that the view covers; and P, the number of pixels to be invented in
+        all views together, at the reduced size.
+    """
     points = [
         geometry.unproject(hole.depth, hole.camera)[hole.pixels & (hole.depth > 0)] for hole in view_holes.values()
     ]
@@ -131,12 +146,22 @@ def _coverage(view_holes: Mapping[str, Hole]) -> tuple[dict[str, np.ndarray], in
 
 
 def painting_template(known: np.ndarray, invent: np.ndarray) -> np.ndarray:
-    """The picture to paint over, uint8 [H, W, 3]: the known background, grey where it has to be invented."""
+    """Return the picture to paint over, uint8 [H, W, 3].
+
+    Args:
+        known: uint8 [H, W, 3], the view without the object, as far as it is known.
+        invent: bool [H, W], the pixels to be invented; they become grey.
+    """
     return np.where(invent[..., None], np.uint8(GREY), known)
 
 
 def format_ranking(views: Sequence[RankedView], painted: Sequence[str]) -> str:
-    """The ranking as text, a line per view."""
+    """Return the ranking as text, with one line per view.
+
+    Args:
+        views: the ranking.
+        painted: names of the views that have been painted already; they are marked.
+    """
     lines = ["# what each view would cover of all that has to be invented, beyond the views above it"]
     for number, each in enumerate(views, start=1):
         lines.append(f"{number}. {each.view}  {each.share:.0%}{'  (painted)' if each.view in painted else ''}")

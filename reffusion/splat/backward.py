@@ -1,7 +1,11 @@
 """Gradients of blending, per tile, front to back with the arithmetic of `forward` (docs/method.md#splatting).
 
-Each footprint-tile pair writes one record. The records of a footprint are then added in a fixed order, so that results
-do not depend on the number of threads.
+A *footprint* is a Gaussian projected into the image. Each pair of a footprint and a tile that it touches writes one
+*record* (see `layout`): its gradients, summed over the pixels of the tile. The records of a footprint are then added in
+a fixed order (`footprints.add_records`), so that results do not depend on the number of threads.
+
+A *step* is a vector of LANES pixels of a tile. The *state* of a tile is a float32 array with several vectors for each
+step, one after the other; `stride` is the number of floats per step.
 """
 
 from __future__ import annotations
@@ -43,22 +47,26 @@ from reffusion.splat.layout import (
     TILE_WIDTH,
 )
 
-# Vectors per step before those of features: transmittance, remainder, upstream gradients of r, g, b, depth.
+# Vectors of the state per step, before the upstream gradients of the features: transmittance; remainder (see
+# `_load_tile`); upstream gradients of red, green, blue and depth.
 _UPSTREAM = 6
 
 
 def blend_backward(footprints, features, bins, used, images, transmittance, gradients):
-    """Compute one gradient record per footprint-tile pair.
+    """Compute the gradient records of all I pairs of a footprint and a tile.
 
     Args:
-        footprints: [>= N, FOOTPRINT] flat; features: [N, C]; bins: see `binning`.
-        images: color [H, W, 3], depth [H, W], alpha [H, W], features [H, W, C] from `blend`.
-        used, transmittance: from `blend`.
-        gradients: dLoss/d(color, depth, alpha, features), of the same shapes.
+        footprints: [>= N, FOOTPRINT] flat.
+        features: [N, C].
+        bins: the tile lists, see `binning.Bins`.
+        used: [tiles], number of processed entries of each list, from `forward.blend`.
+        images: color [H, W, 3], depth [H, W], alpha [H, W] and features [H, W, C] from `forward.blend`.
+        transmittance: [H, W], from `forward.blend`.
+        gradients: derivatives of the loss with respect to the four images, of the same shapes.
 
     Returns:
-        records [I, columns] float32 ordered by Gaussian, with the first GRAD_FEATURES + C columns as in `layout`; and
-        written [I] bool, which of them are valid: a pair that no pixel blends has none.
+        records [I, columns] float32, ordered by Gaussian, whose first GRAD_FEATURES + C columns are as in `layout`; and
+        written [I] bool, True for the valid records. A pair that no pixel blends writes no record.
     """
     columns = record_columns(features.shape[1])
     records, written = empty_aligned(len(bins.entries), columns), np.zeros(len(bins.entries), np.bool_)
@@ -68,7 +76,7 @@ def blend_backward(footprints, features, bins, used, images, transmittance, grad
 
 
 def record_columns(channels: int) -> int:
-    """Floats per gradient record, rounded up to whole cache lines."""
+    """Return the number of floats of a gradient record with `channels` features, rounded up to whole cache lines."""
     return -(-(GRAD_FEATURES + channels) // 16) * 16
 
 
@@ -91,6 +99,7 @@ def _blend_backward(
     records,
     written,
 ):
+    """Write the records of all tiles; arguments as for `blend_backward`, features None without channels."""
     channels = blended.shape[2]
     state = allocate_vectors(STEPS * (_UPSTREAM + channels))
     sums = allocate_vectors(channels)
@@ -112,10 +121,20 @@ def _blend_backward(
 
 @kernel
 def _load_tile(left, top, state, stride, images, gradients):
-    """Load upstream gradients of the blended sums, and the remainder: their dot product with the rendered pixel.
+    """Fill the state of a tile with the transmittance before the first footprint, upstream gradients and remainder.
 
-    With depth = D / alpha and alpha = 1 - transmittance, D receives grad_depth / alpha, and alpha minus depth times
-    that.
+    Upstream gradients are derivatives of the loss with respect to the blended sums of colour, depth and features. The
+    rendered depth is D / alpha, where D is the blended sum. So the derivative with respect to D is grad_depth / alpha,
+    and -depth * grad_depth / alpha is added to grad_alpha. The remainder is the numerator sum_{j>k} w_j a_j + B of
+    docs/method.md#splatting before the first footprint: the dot product of the upstream gradients with the rendered
+    pixel, minus the final transmittance times the derivative with respect to alpha.
+
+    Args:
+        left, top: upper left pixel of the tile.
+        state: output; pixels of the tile that lie outside the image are marked as finished.
+        stride: floats per step in `state`.
+        images: color, depth, alpha, features and transmittance.
+        gradients: derivatives of the loss with respect to color, depth, alpha and features.
     """
     color, depth, alpha, blended, transmittance = images
     grad_color, grad_depth, grad_alpha, grad_blended = gradients
@@ -142,7 +161,15 @@ def _load_tile(left, top, state, stride, images, gradients):
 
 @kernel
 def _tile_backward(left, top, start, stop, footprints, features, bins, state, sums, constants, records, written):
-    """Write the records of one tile's list."""
+    """Write the records of the entries `start` to `stop` - 1, the processed part of one tile's list.
+
+    Args:
+        state: from `_load_tile`; it is updated from footprint to footprint.
+        sums: memory for C vectors.
+        constants: from `forward.load_constants`.
+        records: [I * columns], output.
+        written: [I], output.
+    """
     columns = records.shape[0] // max(1, written.shape[0])
     stride = _UPSTREAM * LANES
     if features is not None:
@@ -168,15 +195,22 @@ def _tile_backward(left, top, start, stop, footprints, features, bins, state, su
 
 @inlined
 def _rows_backward(member, rows, left, top, footprints, features, state, stride, sums, constants):
-    """Backward pass of one footprint in the rows of a tile.
+    """Compute the gradients of one footprint in the rows of a tile that it can touch.
+
+    Args:
+        member: index of the Gaussian.
+        rows: first + 256 * (one past the last) of these rows.
+        sums: output, gradients of the features, summed per lane.
 
     Returns:
-        Whether any pixel blends it; and per lane the first ten columns of its record.
+        Whether any pixel blends the footprint, and a tuple of vectors: the first ten columns of its record, summed per
+        lane.
     """
     zero = splat(0.0)
     base, first_row, end_row = member * FOOTPRINT, rows & 255, rows >> 8
     middle = np.float32((first_row + end_row) // 2)
-    # Blending is decided with the same bits as in forward; sums are about the middle row, where they lose least.
+    # `footprint` decides which pixels blend, with the same bits as in the forward pass. Moments are computed from
+    # `centered_footprint`, relative to the middle row, where rounding loses least.
     footprint = footprint_in_tile(footprints, base, left, top, np.float32(0.0))
     centered_footprint = footprint_in_tile(footprints, base, left, top, middle)
     red, green = splat_at(footprints, base + RED), splat_at(footprints, base + GREEN)
@@ -206,7 +240,8 @@ def _rows_backward(member, rows, left, top, footprints, features, state, stride,
                 store(sums, c * LANES, fma(weight, up, load(sums, c * LANES)))
         behind = fnma(weight, shade, load(state, place + LANES))
         store(state, place + LANES, behind)
-        # g = dLoss/d(ln alpha) = alpha (transmittance shade - behind / (1 - alpha)), 0 where clamped or not blended
+        # g = dLoss/d(ln alpha) = alpha (transmittance * shade - behind / (1 - alpha)); 0 where alpha is clamped or the
+        # footprint is not blended.
         g = fnma(behind, alpha / (splat(1.0) - alpha), weight * shade)
         g = select((after > zero) & (raw < load(constants, AT_MAX_ALPHA * LANES)), g, zero)
         j = row - splat(middle)
@@ -217,7 +252,11 @@ def _rows_backward(member, rows, left, top, footprints, features, state, stride,
 
 @inlined
 def _moments(footprint, g_0, g_1, g_2):
-    """From sums of g, g j, g j^2 per lane to those of g, g u, g v, g u^2, g u v, g v^2 (`footprint_in_tile`)."""
+    """Convert the sums of g, g j and g j^2 per lane to the sums of g, g u, g v, g u^2, g u v and g v^2.
+
+    In a column of pixels u and v are affine functions of the row j, with the coefficients in `footprint` (see
+    `footprint_in_tile`).
+    """
     u_middle, lean, v_middle, whiten_y, _ = footprint
     g_u, g_uj = fnma(lean, g_1, u_middle * g_0), fnma(lean, g_2, u_middle * g_1)
     g_v, g_vj = fma(whiten_y, g_1, v_middle * g_0), fma(whiten_y, g_2, v_middle * g_1)
@@ -226,10 +265,17 @@ def _moments(footprint, g_0, g_1, g_2):
 
 
 def gather_values(footprints, bins, values, count):
-    """Sums over pixels of weight x value (`count`: of value) per footprint-tile pair, ordered by Gaussian.
+    """Sum weight x value over the pixels of each pair of a footprint and a tile.
+
+    Args:
+        footprints: [>= N, FOOTPRINT] flat.
+        bins: the tile lists, see `binning.Bins`.
+        values: [H, W, C].
+        count: True takes weight 1 at each pixel that blends the footprint, instead of the blending weight.
 
     Returns:
-        records [I, columns] and written [I], as of `blend_backward`.
+        records [I, columns] float32, ordered by Gaussian, with the sums in the first C columns; and written [I] bool,
+        True for the valid records.
     """
     columns = -(-values.shape[2] // 16) * 16
     records, written = np.zeros((len(bins.entries), columns), np.float32), np.zeros(len(bins.entries), np.bool_)
@@ -239,6 +285,7 @@ def gather_values(footprints, bins, values, count):
 
 @kernel
 def _gather_values(tickets, footprints, bins, values, count, records, written):
+    """Write the records of all tiles for `gather_values`; the state of a step is its transmittance and its values."""
     height, width, channels = values.shape
     stride = (1 + channels) * LANES
     state = allocate_vectors(STEPS * (1 + channels))
@@ -260,7 +307,7 @@ def _gather_values(tickets, footprints, bins, values, count, records, written):
 
 @kernel
 def _gather_tile(left, top, tile, footprints, bins, count, channels, state, sums, constants, records, written):
-    """Write the records of one tile's list, whose values are in `state`."""
+    """Write the records of one tile's list; `state` holds the transmittance and the values of the tile's pixels."""
     start, stop, stride = bins.starts[tile], bins.starts[tile + 1], (1 + channels) * LANES
     zero = splat(0.0)
     for at in range(start, stop):

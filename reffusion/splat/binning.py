@@ -1,4 +1,4 @@
-"""Lists of footprints per tile: one sort by depth, then lists filled in that order.
+"""Lists of the footprints (projected Gaussians) that touch each tile, filled in the order of one sort by depth.
 
 The lists do not depend on the number of threads.
 """
@@ -38,16 +38,17 @@ from reffusion.splat.layout import (
 )
 
 _F = np.float32
-_PAIRS_PER_FOOTPRINT = 16  # pairs per footprint for which memory is allocated first; unused memory costs nothing
+# Pairs of a footprint and a tile, per footprint, for which memory is allocated first; unused memory costs nothing.
+_PAIRS_PER_FOOTPRINT = 16
 
 
 class Bins(NamedTuple):
-    """Tile lists, front to back.
+    """The tile lists of an image, with I entries in all: one for each pair of a footprint and a tile that it touches.
 
     Attributes:
-        starts: [tiles + 1] int64, start of each tile's list; tiles are in row-major order.
-        entries: [I, ENTRY] int32, the concatenated lists, each front to back (`layout`).
-        first_slots: [N + 1] int64, start of each Gaussian's records, which are ordered by Gaussian.
+        starts: [tiles + 1] int64, index in `entries` at which each tile's list starts; tiles are in row-major order.
+        entries: [I, ENTRY] int32, the concatenated lists, each front to back (columns: see `layout`).
+        first_slots: [N + 1] int64, index of each Gaussian's first gradient record; records are ordered by Gaussian.
     """
 
     starts: np.ndarray
@@ -57,13 +58,14 @@ class Bins(NamedTuple):
 
 @kernel
 def depth_order(radii, footprints):
-    """Sort the Gaussians with a positive radius by depth, equal depths by index (stable radix sort).
+    """Sort the Gaussians with a positive radius by depth, and Gaussians of equal depth by index (stable radix sort).
 
     Args:
-        radii: [N] int32; footprints: [>= N, FOOTPRINT] flat.
+        radii: [N] int32, radii of the footprints, 0 where culled.
+        footprints: [>= N, FOOTPRINT] flat.
 
     Returns:
-        [M] int32: indices front to back.
+        [M] int32, the indices of these Gaussians, front to back.
     """
     count = radii.shape[0]
     visible = 0
@@ -99,7 +101,10 @@ def bin_footprints(footprints, order, count: int, width: int, height: int) -> Bi
     """Build the tile lists of an image.
 
     Args:
-        footprints: [>= N, FOOTPRINT] flat; order: [M] int32 front to back; count: N.
+        footprints: [>= N, FOOTPRINT] flat.
+        order: [M] int32, indices of the visible Gaussians, front to back (from `depth_order`).
+        count: N, the number of all Gaussians.
+        width, height: size of the image in pixels.
     """
     tiles = -(-width // TILE_WIDTH) * -(-height // TILE_HEIGHT)
     capacity = -(-len(order) // CHUNKS) * _PAIRS_PER_FOOTPRINT
@@ -121,13 +126,17 @@ def bin_footprints(footprints, order, count: int, width: int, height: int) -> Bi
 
 @inlined
 def ellipse(slant, whiten_x, whiten_y, level):
-    """The ellipse alpha >= 1/255 of footprints, slightly enlarged against rounding; all as float32 vectors.
+    """Compute the ellipses alpha >= 1/255 of LANES footprints, slightly enlarged to allow for rounding.
+
+    Args:
+        slant, whiten_x, whiten_y, level: columns of the footprints (see `layout`), as float32 vectors.
 
     Returns:
-        half width, half height, slope of the centre line y(dx), squared half-height of the column at dx = 0.
+        Four float32 vectors, with dx and dy relative to the 2D mean: half width and half height of the ellipse in
+        pixels; slope of the line dy(dx) that halves all its columns; squared half height of its column at dx = 0.
     """
     level = (level - CUT) * 1.00002 + 1e-4
-    across = 1.0 / (whiten_x * whiten_x)  # variance of x at fixed y, x log2(e) / 2
+    across = 1.0 / (whiten_x * whiten_x)  # variance of x at fixed y, in units in which log2(alpha) = level - u^2 - v^2
     yy = 1.0 / (whiten_y * whiten_y)
     xx = across + slant * slant * yy
     return root(level * xx), root(level * yy), slant * yy / xx, level * yy * (across / xx)
@@ -135,7 +144,7 @@ def ellipse(slant, whiten_x, whiten_y, level):
 
 @inlined
 def _mean(footprints, base):
-    """The 2D mean, from the anchor and the whitened coordinates there."""
+    """Compute the 2D mean of a footprint from its anchor and the whitened coordinates u and v at the anchor."""
     dy = footprints[base + ANCHOR_V] / footprints[base + WHITEN_Y]
     dx = footprints[base + ANCHOR_U] / footprints[base + WHITEN_X] + footprints[base + SLANT] * dy
     return footprints[base + ANCHOR_X] - dx, footprints[base + ANCHOR_Y] - dy
@@ -143,7 +152,14 @@ def _mean(footprints, base):
 
 @inlined
 def _column_rows(footprints, base, column, width, height, tops, bottoms):
-    """First and one past the last pixel row of the image that the ellipse can touch, for LANES tile columns."""
+    """Compute the pixel rows that a footprint's ellipse can touch, in each of LANES columns of tiles.
+
+    Args:
+        base: index of the footprint's first number.
+        column: the first of these columns of tiles.
+        width, height: size of the image in pixels.
+        tops, bottoms: [LANES] int32, output, the first and one past the last row of the image; both 0 for none.
+    """
     mean_x, mean_y = _mean(footprints, base)
     half_width = footprints[base + HALF_WIDTH]
     half_height = footprints[base + HALF_HEIGHT]
@@ -166,7 +182,12 @@ def _column_rows(footprints, base, column, width, height, tops, bottoms):
 
 @inlined
 def _columns(mean_x, half_width, tiles_x):
-    """First and one past the last tile column that the ellipse can touch."""
+    """Return the first and one past the last column of tiles that an ellipse can touch; (0, 0) if none.
+
+    Args:
+        mean_x, half_width: centre and half width of the ellipse in pixels.
+        tiles_x: number of columns of tiles.
+    """
     first = max(mean_x - half_width - _F(0.5), _F(0.0))
     last = min(mean_x + half_width, _F(tiles_x * TILE_WIDTH - 1))
     if not first <= last:
@@ -176,11 +197,17 @@ def _columns(mean_x, half_width, tiles_x):
 
 @kernel
 def _find_pairs(tickets, footprints, order, width, height, counts_by_chunk, first_slots, pairs, needed):
-    """Find tile and rows of each pair, in chunks of the order, and count them by tile and by Gaussian.
+    """Find the pairs of a footprint and a tile that it touches, and count them by tile and by Gaussian.
+
+    A ticket is one of CHUNKS parts of `order`.
 
     Args:
-        pairs: [CHUNKS, capacity, 2] int32, output up to the capacity.
-        needed: [CHUNKS], output, the number of pairs.
+        order: [M] int32, indices of the visible Gaussians, front to back.
+        counts_by_chunk: [CHUNKS, tiles] zeros, output, number of each tile's pairs.
+        first_slots: [N + 1] zeros, output, number of pairs of Gaussian n at n + 1.
+        pairs: [CHUNKS, capacity, 2] int32, output up to the capacity: for each pair the tile, and first + 256 * (one
+            past the last) row of the tile that the footprint can touch.
+        needed: [CHUNKS], output, the number of pairs, which may exceed the capacity.
     """
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
     tops, bottoms = np.empty(LANES, np.int32), np.empty(LANES, np.int32)
@@ -215,7 +242,13 @@ def _find_pairs(tickets, footprints, order, width, height, counts_by_chunk, firs
 
 @kernel
 def _cumulate_counts(first_slots, counts):
-    """Turn counts into offsets by running sums in place: by Gaussian, and by tile then chunk. Returns their total."""
+    """Turn numbers of pairs into start indices in place, by running sums, and return the number of all pairs.
+
+    Args:
+        first_slots: [N + 1], by Gaussian.
+        counts: [CHUNKS, tiles]. The order of the sum is that of the lists: tile by tile, and within a tile chunk by
+            chunk.
+    """
     for m in range(first_slots.shape[0] - 1):
         first_slots[m + 1] += first_slots[m]
     total = 0
@@ -229,7 +262,14 @@ def _cumulate_counts(first_slots, counts):
 
 @kernel
 def _fill_lists(tickets, order, all_offsets, first_slots, pairs, entries):
-    """Write the pairs into the tile lists."""
+    """Write the pairs into the tile lists.
+
+    Args:
+        order, pairs: as for `_find_pairs`.
+        all_offsets: [CHUNKS, tiles], index of the next entry of each chunk in each tile's list; advanced in place.
+        first_slots: [N + 1], index of each Gaussian's first record.
+        entries: [I, ENTRY] int32, output.
+    """
     while True:
         ticket = take_ticket(tickets)
         if ticket >= CHUNKS:

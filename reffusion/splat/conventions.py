@@ -1,11 +1,11 @@
 """The constants of the splatting model, shared by its implementations (docs/method.md#splatting)."""
 
 NEAR = 0.01  # camera z below which a Gaussian is culled, in units of the normalised frame
-LOW_PASS = 0.3  # px^2 added to the diagonal of the 2D covariance; in a subsampled view, px of the full view
-MIN_ALPHA = 1.0 / 255.0  # fainter contributions are skipped
-MAX_ALPHA = 0.999  # larger values are clamped, with zero gradient; compiled into gsplat
-MIN_TRANSMITTANCE = 1e-4  # a Gaussian that would go below is not blended, and the pixel is finished
-JACOBIAN_MARGIN = 0.3  # in the Jacobian, x/z is clamped at the image border + this share of half the image
+LOW_PASS = 0.3  # px^2 added to the diagonal of the 2D covariance; in a subsampled view, pixels of the full view
+MIN_ALPHA = 1.0 / 255.0  # a Gaussian is skipped at the pixels where its alpha is smaller
+MAX_ALPHA = 0.999  # larger alphas are clamped, with zero gradient; gsplat has the same value compiled in
+MIN_TRANSMITTANCE = 1e-4  # a Gaussian that would bring the transmittance below is not blended, and ends the pixel
+JACOBIAN_MARGIN = 0.3  # in the Jacobian, x/z and y/z are clamped at the image border + this share of half the image
 MAX_PIXELS = 1e7  # Gaussians whose 2D mean is farther than this from the image are culled
 MAX_VARIANCE = 1e30  # px^2; Gaussians with a larger 2D variance are culled
 

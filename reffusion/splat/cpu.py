@@ -1,4 +1,4 @@
-"""Splatting on the CPU, compiled by numba: float32, all cores, bit for bit the same for any number of threads."""
+"""Splatting on the CPU, compiled by numba, in float32 on all cores; results are the same for any number of threads."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from reffusion.types import Camera, Gaussians, Rendering
 
 
 class ProjectedView(NamedTuple):
-    """The Gaussians projected into one view.
+    """The Gaussians projected into one view, as footprints, and binned by tile.
 
     Attributes:
-        footprints: [padded(N), FOOTPRINT] float32 flat, see `layout`.
-        radii: [padded(N)] int32.
-        bins: lists of Gaussians per tile.
+        footprints: [padded(N), FOOTPRINT] float32 flat (columns: see `layout`; N is rounded up by `footprints.padded`).
+        radii: [padded(N)] int32, radii of the footprints in pixels, 0 where culled.
+        bins: lists of the footprints that touch each tile.
     """
 
     footprints: np.ndarray
@@ -33,7 +33,7 @@ class ProjectedView(NamedTuple):
 def render(
     gaussians: Gaussians, camera: Camera, features: Tensor | None, background: Tensor, degree: int, probe: Tensor | None
 ) -> Rendering:
-    """See `reffusion.splat.rasterizer.render`."""
+    """Render Gaussians; see `reffusion.splat.rasterizer.render`, which checks the arguments."""
     color, depth, alpha, blended, radii = _Splat.apply(
         gaussians.means,
         gaussians.quaternions,
@@ -51,7 +51,7 @@ def render(
 
 
 def accumulate(gaussians: Gaussians, camera: Camera, values: Tensor, count: bool) -> Tensor:
-    """See `reffusion.splat.rasterizer.accumulate`."""
+    """Sum pixel values by Gaussian; see `reffusion.splat.rasterizer.accumulate`, which checks the arguments."""
     parameters = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.opacity_logits, gaussians.sh)
     no_probe = np.empty((0, 2), np.float32)
     view = project_and_bin([_array(p) for p in parameters], gaussians.antialiased, no_probe, camera, 0)
@@ -62,13 +62,22 @@ def accumulate(gaussians: Gaussians, camera: Camera, values: Tensor, count: bool
 
 
 def _array(tensor: Tensor) -> np.ndarray:
+    """Return a tensor on the CPU as a contiguous array, without a copy if possible."""
     return tensor.detach().contiguous().numpy()
 
 
 def project_and_bin(
     parameters: list[np.ndarray], antialiased: bool, probe: np.ndarray, camera: Camera, degree: int
 ) -> ProjectedView:
-    """Project, sort and bin the Gaussians; `parameters` are in the order of `types.PARAMETERS`."""
+    """Project the Gaussians into a view, sort them by depth, and list them by tile.
+
+    Args:
+        parameters: float32 arrays in the order of `types.PARAMETERS`.
+        antialiased: True uses the 2D filter of Mip-Splatting.
+        probe: [N, 2] added to the 2D means, in pixels, or [0, 2] for none.
+        camera: the view.
+        degree: degree of the spherical harmonics used.
+    """
     count, rows = len(parameters[0]), footprints.padded(len(parameters[0]))
     footprint_array, radii = empty_aligned(rows * FOOTPRINT), np.zeros(rows, np.int32)
     view_arguments = view_numbers(camera, antialiased), camera.center
@@ -88,13 +97,17 @@ def project_and_bin(
 
 
 def _flat(parameters: list[np.ndarray], degree: int) -> footprints.Parameters:
+    """Return the parameters as flat arrays, in the form that kernels take."""
     means, quaternions, log_scales, logits, sh = (array.reshape(-1) for array in parameters)
     width = 3 * parameters[4].shape[1]
     return footprints.Parameters(means, quaternions, log_scales, logits, sh, width, degree)
 
 
 class _Splat(torch.autograd.Function):
-    """Gaussians -> color, depth, alpha, features, radii."""
+    """Rendering as a differentiable function of the Gaussians, the features, the background and the probe.
+
+    It returns color, depth, alpha, features and radii. The radii have no gradient.
+    """
 
     @staticmethod
     def forward(
@@ -136,7 +149,22 @@ class _Splat(torch.autograd.Function):
 def _to_parameters(
     view, records, written, parameters, channels, numbers, center, degree, want_probe
 ) -> list[np.ndarray]:
-    """Gradients of the parameters (in the order of `types.PARAMETERS`), of the features and of the probe."""
+    """Compute the gradients of parameters, features and probe from the gradient records.
+
+    Args:
+        view: the `ProjectedView` of the forward pass.
+        records, written: from `backward.blend_backward`.
+        parameters: float32 arrays in the order of `types.PARAMETERS`.
+        channels: number of features.
+        numbers: from `projection.view_numbers`.
+        center: [3] float64, the camera centre.
+        degree: degree of the spherical harmonics used.
+        want_probe: False leaves the gradient of the probe empty.
+
+    Returns:
+        Gradients of the parameters, in the order of `types.PARAMETERS`, of the features [N, channels] and of the probe
+        [N, 2].
+    """
     count, rows = len(parameters[0]), footprints.padded(len(parameters[0]))
     shapes = [(rows, *array.shape[1:]) for array in parameters] + [(rows, channels), (rows if want_probe else 0, 2)]
     out = [empty_aligned(*shape) for shape in shapes]

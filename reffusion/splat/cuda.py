@@ -1,8 +1,9 @@
 """Splatting on a CUDA GPU by gsplat 1.5, with the conventions of the other implementations.
 
-Calls the steps of gsplat's `rasterization` separately, because the probe is added to the 2D means between two of them.
-Two differences from `pure_torch` cannot be configured: the transmittance limit is <= 1e-4 instead of <, and the conic
-is inverted from a float32 determinant (long needles lose digits).
+The steps of gsplat's `rasterization` are called one by one, because the probe (see `rasterizer.render`) is added to the
+2D means between two of them. Two differences from `pure_torch` cannot be configured. A pixel ends where its
+transmittance would be <= 1e-4, instead of < 1e-4. And the 2D covariance is inverted by a float32 determinant, so that
+long needles lose digits.
 """
 
 from __future__ import annotations
@@ -15,22 +16,22 @@ from torch import Tensor
 from reffusion.splat.conventions import LOW_PASS, NEAR
 from reffusion.types import Camera, Gaussians, Rendering
 
-_TILE = 16
+_TILE = 16  # side of a tile in pixels
 
 
 class _Footprints(NamedTuple):
-    """Footprints of one view as gsplat represents them, with a leading dimension for the view."""
+    """The Gaussians projected into one view, as gsplat represents them, with a leading dimension for the view."""
 
-    means: Tensor  # [1, N, 2]
-    radii: Tensor  # [1, N, 2] int32
-    depths: Tensor  # [1, N]
-    conics: Tensor  # [1, N, 3]
-    opacities: Tensor  # [1, N]
-    tiles: tuple[Tensor, Tensor]  # start of each tile's list, and the lists
+    means: Tensor  # [1, N, 2] pixels
+    radii: Tensor  # [1, N, 2] int32 pixels, along x and y; 0 where culled
+    depths: Tensor  # [1, N] camera z
+    conics: Tensor  # [1, N, 3], xx, xy and yy of the inverse 2D covariance
+    opacities: Tensor  # [1, N], compensated for the low-pass if the Gaussians are antialiased
+    tiles: tuple[Tensor, Tensor]  # start of each tile's list [1, tiles down, tiles across], and the concatenated lists
 
 
 def require_gpu(means: Tensor) -> None:
-    """Raise ValueError unless a GPU and gsplat are available and the tensors are on that GPU."""
+    """Raise ValueError unless a CUDA GPU and gsplat are available, and `means` is a float32 tensor on the GPU."""
     if not torch.cuda.is_available():
         raise ValueError("impl='cuda' needs a CUDA GPU and there is none here; take impl='cpu' or 'auto'")
     if not means.is_cuda or means.dtype != torch.float32:
@@ -46,7 +47,7 @@ def require_gpu(means: Tensor) -> None:
 def render(
     gaussians: Gaussians, camera: Camera, features: Tensor | None, background: Tensor, degree: int, probe: Tensor | None
 ) -> Rendering:
-    """See `reffusion.splat.rasterizer.render`."""
+    """Render Gaussians; see `reffusion.splat.rasterizer.render`, which checks the arguments."""
     if len(gaussians) == 0:
         return _empty(camera, features, background)
     import gsplat
@@ -82,7 +83,11 @@ def render(
 
 
 def accumulate(gaussians: Gaussians, camera: Camera, values: Tensor, count: bool) -> Tensor:
-    """See `reffusion.splat.rasterizer.accumulate`. Weighted sums are the gradient of blended features."""
+    """Sum pixel values by Gaussian; see `reffusion.splat.rasterizer.accumulate`, which checks the arguments.
+
+    Sums with blending weights are computed as the gradient of blended features: a feature's gradient is the sum of
+    weight x upstream gradient over the pixels.
+    """
     size = len(gaussians), values.shape[-1]
     if 0 in size:
         return values.new_zeros(size)
@@ -111,6 +116,7 @@ def accumulate(gaussians: Gaussians, camera: Camera, values: Tensor, count: bool
 
 
 def _project(gaussians: Gaussians, camera: Camera) -> _Footprints:
+    """Project the Gaussians into the view, and list them by tile; differentiable except for the lists."""
     import gsplat
 
     like = gaussians.means
@@ -143,6 +149,7 @@ def _project(gaussians: Gaussians, camera: Camera) -> _Footprints:
 
 
 def _empty(camera: Camera, features: Tensor | None, background: Tensor) -> Rendering:
+    """Return the rendering of no Gaussians: the background."""
     zeros = background.new_zeros(camera.height, camera.width)
     return Rendering(
         color=zeros[..., None] + background,

@@ -1,4 +1,8 @@
-"""Work per Gaussian: footprints and colours, and gradients of the parameters from sums over pixels."""
+"""Kernels that work on Gaussians: footprints and colours, and the gradients of parameters from sums over pixels.
+
+A *footprint* is a Gaussian projected into the image (columns: see `layout`). Kernels process groups of LANES
+consecutive Gaussians; `row` is the first Gaussian of a group.
+"""
 
 from __future__ import annotations
 
@@ -50,9 +54,9 @@ class Parameters(NamedTuple):
     """Parameters of N Gaussians as flat arrays, and the format of their colours.
 
     Attributes:
-        means, ..., sh: float32, in the order of `types.PARAMETERS`.
-        width: numbers in a row of sh.
-        degree: of the spherical harmonics used.
+        means, ..., sh: flat float32 arrays, in the order of `types.PARAMETERS`.
+        width: numbers per Gaussian in `sh`, 3 for each spherical harmonic.
+        degree: degree of the spherical harmonics used, which may be lower than the stored one.
     """
 
     means: np.ndarray
@@ -65,11 +69,12 @@ class Parameters(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """Gradients of the parameters, [padded(N), columns] flat.
+    """Gradients of the parameters, each [padded(N), columns] flat.
 
     Attributes:
+        means, ..., sh: gradients, in the order of `types.PARAMETERS`.
         features: [padded(N), C], not flat.
-        probe: of the offset of the 2D means, or empty.
+        probe: [padded(N), 2] flat, gradient of the 2D means, or empty if it is not needed.
     """
 
     means: np.ndarray
@@ -82,10 +87,14 @@ class Gradients(NamedTuple):
 
 
 class ScratchArrays(NamedTuple):
-    """Temporary arrays, LANES numbers per column.
+    """Temporary arrays for a group of LANES Gaussians, flat float32 arrays.
 
-    The basis of the harmonics and its gradient, a row of sh, and the sums over a footprint's pixels by Gaussian and by
-    column.
+    Attributes:
+        basis: [16, LANES], the spherical harmonics Y_k.
+        along: [16, LANES], their gradients.
+        coefficients: [width, LANES], the coefficients sh_k, and then their gradients.
+        sums: [LANES, columns], the sums of each Gaussian's records.
+        moments: [columns, LANES], the same, transposed.
     """
 
     basis: np.ndarray
@@ -96,13 +105,13 @@ class ScratchArrays(NamedTuple):
 
 
 def padded(count: int) -> int:
-    """Number of rows of an array that kernels write LANES rows at a time."""
+    """Return `count` rounded up to a multiple of LANES, because kernels write LANES rows of an array at a time."""
     return -(-count // LANES) * LANES
 
 
 @kernel
 def next_chunk(tickets, count):
-    """Bounds of the next of CHUNKS parts of range(count), or (-1, -1) when all are taken."""
+    """Return the start and the end of the next of CHUNKS parts of range(count), or (-1, -1) if all are taken."""
     ticket = take_ticket(tickets)
     if ticket >= CHUNKS:
         return -1, -1
@@ -113,13 +122,15 @@ def next_chunk(tickets, count):
 def project_gaussians(tickets, parameters, probe, view, center, footprints, radii):
     """Compute the footprints of all Gaussians.
 
+    Groups of LANES Gaussians none of which reaches the image are skipped; nothing is written for them.
+
     Args:
         parameters: `Parameters`.
-        probe: added to the 2D means, flat, or empty.
+        probe: [N, 2] flat, added to the 2D means, or empty.
         view: see `projection.view_numbers`.
-        center: of the camera.
-        footprints: [padded(N), FOOTPRINT] float32 flat, output for groups with a Gaussian that reaches the image.
-        radii: [padded(N)] int32 zeros, output for the same groups.
+        center: [3], the camera centre.
+        footprints: [padded(N), FOOTPRINT] float32 flat, output.
+        radii: [padded(N)] int32 zeros, output, the radii in pixels of the Gaussians that reach the image.
     """
     basis, columns = np.zeros(16 * LANES, np.float32), np.zeros(FOOTPRINT * LANES, np.float32)
     coefficients = np.zeros(parameters.width * LANES, np.float32)
@@ -152,7 +163,14 @@ def project_gaussians(tickets, parameters, probe, view, center, footprints, radi
 
 @inlined
 def _fill_footprint(columns, anchor, ellipse_numbers, z, colors):
-    """Write the columns of LANES footprints, see `layout`."""
+    """Write the columns of LANES footprints (see `layout`) into `columns` [FOOTPRINT, LANES] flat.
+
+    Args:
+        anchor: x and y of the anchors, and u and v there (`projection.anchor`).
+        ellipse_numbers: slant, whitening factors along x and y, and level.
+        z: camera z.
+        colors: red, green, blue.
+    """
     slant, whiten_x, whiten_y, level = ellipse_numbers
     shape = narrow(slant), narrow(whiten_x), narrow(whiten_y), narrow(level)
     half_width, half_height, tilt, column_height = ellipse(shape[0], shape[1], shape[2], shape[3])
@@ -176,7 +194,10 @@ def _fill_footprint(columns, anchor, ellipse_numbers, z, colors):
 
 @kernel
 def _read_rows(array, width, row, last, columns):
-    """Copy LANES rows of an array [R, width] (flat) into `columns`, LANES values per column; `last` is the last row."""
+    """Copy LANES rows of an array [R, width] (flat), from `row` on, into `columns` [width, LANES] (flat), transposed.
+
+    `last` is the last row of the array; rows after it are replaced by it.
+    """
     if width < LANES:
         for column in range(width):
             store(columns, column * LANES, load_column(array, width, column, row, last))
@@ -188,7 +209,7 @@ def _read_rows(array, width, row, last, columns):
 
 @kernel
 def _write_rows(array, width, row, columns):
-    """The inverse of `_read_rows`; the array has all of these rows."""
+    """Write LANES rows of an array from `columns`, the inverse of `_read_rows`; the array must have all these rows."""
     if width < LANES:
         for column in range(width):
             store_column(array, width, column, row, load(columns, column * LANES))
@@ -200,12 +221,20 @@ def _write_rows(array, width, row, columns):
 
 @kernel
 def add_records(records, written, first_slots, columns, row, sums):
-    """Sum the records of LANES Gaussians into sums [LANES, columns], in their order."""
+    """Sum the records of each of LANES Gaussians, in the order of the records, into sums [LANES, columns] (flat).
+
+    Args:
+        records: [I * columns].
+        written: [I] bool, True for the valid records; all other records are left out.
+        first_slots: [N + 1], index of each Gaussian's first record.
+        row: the first of the Gaussians; Gaussians from N on have no records.
+    """
     for lane in range(LANES):
         begin, end = 0, 0
         if row + lane < first_slots.shape[0] - 1:
             begin, end = first_slots[row + lane], first_slots[row + lane + 1]
-        for part in range(0, columns, 16):  # a cache line, in two vectors or (twice the same) one
+        # A cache line holds 16 floats: two vectors of 8 lanes, or one of 16 lanes, which is then computed twice.
+        for part in range(0, columns, 16):
             other = part + 16 - LANES
             value = other_value = splat(0.0)
             for slot in range(begin, end):
@@ -218,7 +247,12 @@ def add_records(records, written, first_slots, columns, row, sums):
 
 @kernel
 def add_all_records(tickets, records, written, first_slots, gathered):
-    """Write the sums of the first columns of all Gaussians' records into gathered [padded(N), C]."""
+    """Sum the first C columns of each Gaussian's records, and write the sums into gathered [padded(N), C].
+
+    Args:
+        records: [I, columns].
+        written, first_slots: as for `add_records`.
+    """
     columns, channels = records.shape[1], gathered.shape[1]
     sums, flat = np.empty(LANES * columns, np.float32), records.reshape(-1)
     while True:
@@ -236,13 +270,14 @@ def add_all_records(tickets, records, written, first_slots, gathered):
 def project_gaussians_backward(
     tickets, records, written, first_slots, columns, radii, footprints, parameters, view, center, gradients
 ):
-    """Compute the gradients of all parameters from the records of each footprint.
+    """Compute the gradients of all parameters from the gradient records of each footprint.
 
     Args:
-        records, written, first_slots: see `backward.blend_backward`.
-        columns: of a record.
+        records: [I * columns], from `backward.blend_backward`.
+        written, first_slots: as for `add_records`.
+        columns: number of columns of a record.
         radii, footprints: from `project_gaussians`.
-        parameters: `Parameters`.
+        parameters, view, center: as for `project_gaussians`.
         gradients: `Gradients`, output.
     """
     workspace = ScratchArrays(
@@ -271,7 +306,7 @@ def project_gaussians_backward(
 
 @inlined
 def _rows_backward(row, is_visible, footprints, parameters, view, center, workspace, gradients):
-    """Write LANES rows of all gradients except those of features, from `workspace.moments`."""
+    """Write the gradients of LANES Gaussians, except those of features, from the sums in `workspace.moments`."""
     last = parameters.opacity_logits.shape[0] - 1
     mean = projection.three_columns(parameters.means, row, last)
     _read_rows(parameters.sh, parameters.width, row, last, workspace.coefficients)
@@ -304,7 +339,7 @@ def _rows_backward(row, is_visible, footprints, parameters, view, center, worksp
 
 @inlined
 def _clear_rows(row, width, gradients):
-    """Clear LANES rows without a visible Gaussian."""
+    """Set the gradients of LANES Gaussians, none of which is visible, to 0, except those of features."""
     _store_zeros(gradients.probe, 2 if gradients.probe.shape[0] > 0 else 0, row)
     _store_zeros(gradients.means, 3, row)
     _store_zeros(gradients.quaternions, 4, row)
@@ -315,7 +350,11 @@ def _clear_rows(row, width, gradients):
 
 @inlined
 def _colors_backward(degree, mean, center, is_visible, footprints, row, workspace):
-    """Replace the coefficients by their gradients, and return the gradient of the mean, from those of the colours."""
+    """Compute the gradients of the harmonics' coefficients and of the means from the gradients of the colours.
+
+    The gradients of the coefficients replace them in `workspace.coefficients`. The gradient of the means, through the
+    viewing directions, is returned as three vectors.
+    """
     x, y, z, inverse = harmonics.direction(mean, center)
     zero, used = splat(0.0), 3 * (degree + 1) * (degree + 1)
     x, y, z = select(is_visible, x, zero), select(is_visible, y, zero), select(is_visible, z, zero)
@@ -330,13 +369,13 @@ def _colors_backward(degree, mean, center, is_visible, footprints, row, workspac
 
 @inlined
 def _store_one(array, width, column, row, is_visible, value):
-    """Write a column of LANES rows; 0 for Gaussians that are not visible."""
+    """Write a vector to one column of LANES rows, with 0 for Gaussians that are not visible."""
     store_column(array, width, column, row, select(is_visible, value, splat(0.0)))
 
 
 @inlined
 def _store_three(array, width, row, is_visible, first, second, third):
-    """Write the first three columns in the same way."""
+    """Write three vectors to the first three columns of LANES rows, with 0 for Gaussians that are not visible."""
     _store_one(array, width, 0, row, is_visible, first)
     _store_one(array, width, 1, row, is_visible, second)
     _store_one(array, width, 2, row, is_visible, third)
@@ -344,13 +383,17 @@ def _store_three(array, width, row, is_visible, first, second, third):
 
 @inlined
 def _store_zeros(array, width, row):
-    """Clear LANES rows."""
+    """Set LANES rows, from `row` on, of an array [R, width] (flat) to 0."""
     for at in range(row * width, (row + LANES) * width, LANES):
         store(array, at, splat(0.0))
 
 
 @inlined
 def _color_gradient(moments, column, footprints, color, is_visible, row):
-    """Gradient of a colour; 0 where it is clamped at 0."""
+    """Return the gradient of a colour channel; 0 where the colour is clamped at 0 and for invisible Gaussians.
+
+    Args:
+        column, color: columns of the gradient and of the colour, in a record and in a footprint.
+    """
     free = is_visible & (load_column(footprints, FOOTPRINT, color, row, row + LANES - 1) > 0.0)
     return select(free, load(moments, column * LANES), splat(0.0))

@@ -1,4 +1,9 @@
-"""Blends tiles front to back, one vector of pixels at a time: one row of eight, or two."""
+"""Blending of tiles front to back, one vector of LANES pixels at a time: one row of eight pixels, or two rows.
+
+A *step* is such a vector of pixels of a tile. The *state* of a tile is a float32 array with several vectors for each
+step, one after the other: `stride` is the number of floats per step, and the first vector is the transmittance. A
+negative transmittance marks a finished pixel, whose transmittance is its absolute value.
+"""
 
 from __future__ import annotations
 
@@ -45,11 +50,12 @@ from reffusion.splat.layout import (
 STEP_ROWS = LANES // TILE_WIDTH  # pixel rows per vector
 STEPS = TILE_HEIGHT // STEP_ROWS  # vectors per tile
 LANE_X = np.arange(LANES, dtype=np.float32) % TILE_WIDTH + np.float32(0.5)  # pixel centre of each lane, from the left
-_SUMS = 6  # vectors per step before its features: transmittance, red, green, blue, depth, alpha
+_SUMS = 6  # vectors of the state per step, before features: transmittance, red, green, blue, depth, alpha
 
-# Constants for every vector of pixels, each in all lanes, then the row of each pixel of a tile. Loops read them from
-# memory, which costs nothing as an operand of arithmetic. There are not enough registers for all, and constants in the
-# code would take two instructions each, more than the arithmetic itself.
+# Constants, each as a vector with the same value in all lanes; then, for each step, the row of each of its pixels in
+# the tile. The names are indices of vectors. Loops read these constants from memory, which costs nothing extra for an
+# operand of arithmetic. There are not enough registers for all, and constants in the code would take two instructions
+# each, more than the arithmetic itself.
 AT_CUT, AT_ROUND, _AT_SERIES, AT_MAX_ALPHA, _AT_MIN_TRANSMITTANCE, AT_ROW = 0, 1, 2, 8, 9, 10
 _CONSTANTS = np.concatenate(
     [
@@ -60,14 +66,19 @@ _CONSTANTS = np.concatenate(
 
 
 def blend(footprints, features, background, bins, width, height):
-    """Blend every tile's list.
+    """Blend the footprints of every tile's list, front to back, into images.
 
     Args:
-        footprints: [>= N, FOOTPRINT] flat; features: [N, C]; background: [3]; bins: see `binning`.
+        footprints: [>= N, FOOTPRINT] flat.
+        features: [N, C].
+        background: [3], the colour behind everything.
+        bins: the tile lists, see `binning.Bins`.
+        width, height: size of the image in pixels.
 
     Returns:
-        color [H, W, 3], depth [H, W], alpha [H, W], features [H, W, C], transmittance [H, W], all float32, and used
-        [tiles] int64: number of entries of a tile's list that were processed before all its pixels were finished.
+        color [H, W, 3], depth [H, W], alpha [H, W], features [H, W, C] and transmittance [H, W], all float32; and used
+        [tiles] int64, the number of entries of each tile's list that were processed before all its pixels were
+        finished.
     """
     color, blended = empty_aligned(height, width, 3), empty_aligned(height, width, features.shape[1])
     depth = empty_aligned(height, width)
@@ -80,13 +91,13 @@ def blend(footprints, features, background, bins, width, height):
 
 
 def or_none(features):
-    """`features`, or None without channels, for which kernels are compiled separately."""
+    """Return the features [N, C], or None if C is 0; kernels are compiled separately for None."""
     return features if features.shape[1] else None
 
 
 @kernel
 def allocate_vectors(vectors):
-    """Memory for a number of vectors, aligned to cache lines."""
+    """Return an uninitialised float32 array for this number of vectors, aligned to cache lines."""
     memory = np.empty(vectors * LANES + 16, np.float32)
     first = (-memory.ctypes.data // 4) % 16
     return memory[first : first + vectors * LANES]
@@ -94,7 +105,7 @@ def allocate_vectors(vectors):
 
 @kernel
 def load_constants():
-    """A copy of _CONSTANTS whose values the compiler does not know."""
+    """Return a copy of `_CONSTANTS`, whose values the compiler does not know, so that it reads them from memory."""
     constants = allocate_vectors(len(_CONSTANTS) // LANES)
     constants[:] = _CONSTANTS
     return constants
@@ -102,9 +113,15 @@ def load_constants():
 
 @kernel
 def next_tile(tickets, tiles):
-    """The next tile, or -1 when all are taken; tiles are taken in turn from as many parts of the image as threads.
+    """Return the next tile to process, or -1 if all are taken.
 
-    Threads at neighbouring tiles would write to the same cache lines (images, records of a footprint).
+    The tiles are divided into as many parts as there are threads, and tickets take one tile of each part in turn.
+    Otherwise threads would work on neighbouring tiles at once, and write to the same cache lines (of images, and of the
+    records of a footprint).
+
+    Args:
+        tickets: [2], the counter of tickets and the number of threads.
+        tiles: number of tiles.
     """
     parts = tickets[1]
     length = (tiles + parts - 1) // parts
@@ -119,14 +136,19 @@ def next_tile(tickets, tiles):
 
 @inlined
 def tile_corner(tile, width):
-    """Left column and top row of a tile in the image."""
+    """Return the left column and the top row of a tile in an image of this width, in pixels."""
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
     return (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
 
 
 @inlined
 def init_transmittance(state, stride, rows, columns):
-    """Set the transmittance, the first vector of each step's `stride` floats: 1, or -1 (finished) outside the image."""
+    """Set the transmittance of each pixel of a tile: 1, or -1 (finished) for pixels outside the image.
+
+    Args:
+        state: output, in the first vector of each step.
+        rows, columns: numbers of rows and columns of the image from the tile's upper left pixel on.
+    """
     for step in range(STEPS):
         for lane in range(LANES):
             inside = step * STEP_ROWS + lane // TILE_WIDTH < rows and lane % TILE_WIDTH < columns
@@ -135,7 +157,7 @@ def init_transmittance(state, stride, rows, columns):
 
 @inlined
 def is_finished(state, stride):
-    """Are all pixels of the tile finished?"""
+    """Return whether all pixels of the tile are finished."""
     for step in range(STEPS):
         if any_lane(load(state, step * stride) > splat(0.0)):
             return False
@@ -144,10 +166,19 @@ def is_finished(state, stride):
 
 @inlined
 def footprint_in_tile(footprints, base, left, top, middle):
-    """A footprint in the coordinates of a tile: u = u_middle - lean j, v = v_middle + whiten_y j, j = row - middle.
+    """Return a footprint in the coordinates of a tile.
+
+    In a pixel of the tile's row `middle` + j the whitened coordinates (see `layout`) are u = u_middle - lean j and
+    v = v_middle + whiten_y j.
+
+    Args:
+        base: index of the footprint's first number.
+        left, top: upper left pixel of the tile.
+        middle: row of the tile from which j counts, float32.
 
     Returns:
-        u_middle, lean, v_middle, whiten_y, level: equal in all lanes except u_middle.
+        u_middle, lean, v_middle, whiten_y and level, as vectors. Lanes belong to columns of pixels; only u_middle
+        differs between them.
     """
     whiten_x, whiten_y = footprints[base + WHITEN_X], splat_at(footprints, base + WHITEN_Y)
     lean = splat(whiten_x * footprints[base + SLANT])
@@ -160,7 +191,12 @@ def footprint_in_tile(footprints, base, left, top, middle):
 
 @inlined
 def log_alpha(footprint, j):
-    """log2(alpha) before clamping at the pixels of a step."""
+    """Return log2(alpha), before alpha is clamped, at the pixels of a step.
+
+    Args:
+        footprint: from `footprint_in_tile`.
+        j: rows of the pixels, counted from its `middle`.
+    """
     u_middle, lean, v_middle, whiten_y, level = footprint
     u, v = fnma(lean, j, u_middle), fma(whiten_y, j, v_middle)
     return fnma(u, u, fnma(v, v, level))
@@ -168,9 +204,9 @@ def log_alpha(footprint, j):
 
 @inlined
 def exp2(x, constants):
-    """2^x for x in [-126, 127], relative error below 2e-7; undefined (without a trap) outside.
+    """Return 2^x for x in [-126, 127], with a relative error of about 2e-7; outside it is undefined, without a trap.
 
-    A polynomial in the remainder of x after rounding.
+    x is divided into the nearest integer, which becomes the exponent, and a remainder, of which 2^x is a polynomial.
     """
     rounded = x + load(constants, AT_ROUND * LANES)
     part = x - (rounded - load(constants, AT_ROUND * LANES))
@@ -185,10 +221,17 @@ def exp2(x, constants):
 
 @inlined
 def blend_pixels(power, is_above_cut, before, constants):
-    """Blend a footprint of log2(alpha) = `power` into pixels of transmittance `before` (negative: finished).
+    """Blend a footprint into the pixels of a step.
+
+    Args:
+        power: log2(alpha), before clamping.
+        is_above_cut: mask of the pixels where alpha is at least 1/255.
+        before: transmittance in front of the footprint, negative in finished pixels.
 
     Returns:
-        raw alpha (undefined below the cut), alpha, weight, transmittance afterwards.
+        Alpha before clamping (undefined where `is_above_cut` is not set); alpha; blending weight; and transmittance
+        behind the footprint. Where the footprint would bring the transmittance below `MIN_TRANSMITTANCE`, the weight is
+        0, and the pixel is finished.
     """
     raw = exp2(power, constants)
     alpha = select(is_above_cut, minimum(raw, load(constants, AT_MAX_ALPHA * LANES)), np.float32(0.0))
@@ -200,6 +243,7 @@ def blend_pixels(power, is_above_cut, before, constants):
 
 @kernel
 def _blend(tickets, footprints, features, background, bins, color, depth, alpha, blended, transmittance, used):
+    """Blend all tiles; arguments and outputs as for `blend`, features None without channels."""
     stride = (_SUMS + blended.shape[2]) * LANES
     state, constants = allocate_vectors(STEPS * (_SUMS + blended.shape[2])), load_constants()
     while True:
@@ -212,7 +256,12 @@ def _blend(tickets, footprints, features, background, bins, color, depth, alpha,
 
 @kernel
 def _blend_tile(tile, footprints, features, bins, size, state, constants):
-    """Blend one tile into `state`; returns the number of processed entries of its list."""
+    """Blend the list of one tile into `state`, and return the number of processed entries of the list.
+
+    Args:
+        size: height and width of the image in pixels.
+        state: output, see the module and `_SUMS`.
+    """
     stride = _SUMS * LANES
     if features is not None:
         stride += features.shape[1] * LANES
@@ -252,7 +301,7 @@ def _blend_tile(tile, footprints, features, bins, size, state, constants):
 
 @kernel
 def _write_tile(tile, state, stride, background, color, depth, alpha, blended, transmittance):
-    """Write a blended tile into the images."""
+    """Write a blended tile from `state` into the images, with the background."""
     height, width = depth.shape
     left, top = tile_corner(tile, width)
     for row in range(min(TILE_HEIGHT, height - top)):

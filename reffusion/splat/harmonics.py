@@ -1,6 +1,7 @@
-"""View-dependent colours of LANES Gaussians by spherical harmonics, and their gradients.
+"""View-dependent colours of LANES Gaussians at a time by spherical harmonics, and their gradients.
 
-Directions are from the camera to the Gaussian.
+Directions point from the camera to the Gaussian. Arrays of harmonics, coefficients and their gradients are flat float32
+arrays with LANES values (one per Gaussian) for each number.
 """
 
 from __future__ import annotations
@@ -13,7 +14,15 @@ from reffusion.splat.conventions import SH0, SH1, SH2, SH3
 
 @inlined
 def direction(mean, center):
-    """Unit vectors from the camera centre to the means, and 1 / distance."""
+    """Return the unit vectors from the camera centre to the means, and 1 / distance.
+
+    Args:
+        mean: x, y and z of the means, three float64 vectors.
+        center: [3], the camera centre.
+
+    Returns:
+        x, y and z of the unit vectors, and 1 / distance, as float32 vectors.
+    """
     x, y, z = mean[0] - center[0], mean[1] - center[1], mean[2] - center[2]
     inverse = 1.0 / root(x * x + y * y + z * z)
     return narrow(x * inverse), narrow(y * inverse), narrow(z * inverse), narrow(inverse)
@@ -21,7 +30,7 @@ def direction(mean, center):
 
 @inlined
 def fill_basis(degree, x, y, z, basis):
-    """Write the (degree + 1)^2 spherical harmonics of 3DGS in unit directions, LANES values each."""
+    """Write the (degree + 1)^2 spherical harmonics Y_k of 3DGS in the unit directions (x, y, z) into `basis`."""
     store(basis, 0, splat(SH0))
     if degree >= 1:
         store(basis, LANES, -SH1 * y)
@@ -46,10 +55,11 @@ def fill_basis(degree, x, y, z, basis):
 
 @inlined
 def colors(degree, basis, coefficients):
-    """max(0, 0.5 + sum_k Y_k sh_k).
+    """Return red, green and blue, as three vectors: max(0, 0.5 + sum_k Y_k sh_k).
 
     Args:
-        basis: from `fill_basis`; coefficients: sh_k of red, green, blue, then the next k, LANES values each.
+        basis: Y_k, from `fill_basis`.
+        coefficients: sh_k of red, green and blue, then those of the next k.
     """
     red = green = blue = splat(0.5)
     for k in range((degree + 1) * (degree + 1)):
@@ -62,11 +72,13 @@ def colors(degree, basis, coefficients):
 
 @inlined
 def colors_backward(degree, basis, coefficients, red, green, blue, basis_gradient):
-    """Overwrite the coefficients by dLoss/dcoefficient.
+    """Compute the gradients of the coefficients, which overwrite them, and of the harmonics.
 
     Args:
+        basis: Y_k, from `fill_basis`.
+        coefficients: sh_k as for `colors`; output, dLoss/dsh_k.
         red, green, blue: dLoss/dcolour; the caller sets them to 0 where the colour is clamped.
-        basis_gradient: output, dLoss/dY_k, LANES values each.
+        basis_gradient: output, dLoss/dY_k.
     """
     for k in range((degree + 1) * (degree + 1)):
         y, place = load(basis, k * LANES), 3 * k * LANES
@@ -81,7 +93,12 @@ def colors_backward(degree, basis, coefficients, red, green, blue, basis_gradien
 
 @inlined
 def direction_backward(degree, x, y, z, inverse, along):
-    """Gradient of the mean through the viewing direction, given dLoss/dY_k."""
+    """Return the gradient of the means through the viewing directions, as three vectors.
+
+    Args:
+        x, y, z, inverse: from `direction`.
+        along: dLoss/dY_k, from `colors_backward`.
+    """
     gx = gy = gz = splat(0.0)
     if degree >= 1:
         gx, gy, gz = -SH1 * _at(along, 3), -SH1 * _at(along, 1), SH1 * _at(along, 2)

@@ -1,7 +1,12 @@
-"""Geometry of LANES Gaussians: from parameters to footprints, and the backward pass.
+"""Geometry of LANES Gaussians at a time: from parameters to footprints (2D Gaussians), and the backward pass.
 
-Computed in float64, so that scales of any size stay finite and needles keep their gradients. Results for pixels are
-rounded to float32. Derivation of the backward pass: docs/method.md#splatting.
+All is computed in float64, so that scales of any size stay finite and needles keep their gradients. Results for pixels
+are rounded to float32 by the callers. docs/method.md#splatting derives the backward pass.
+
+With the Jacobian J of the projection, the camera's rotation W, and the Gaussian's rotation R and standard deviations s,
+the *projector* is J W [2, 3], and the *root* is A = J W R diag(s) [2, 3], with rows a and b. The 2D covariance is
+A A^T + low-pass. A tuple of three vectors stands for a row of such a matrix, for LANES Gaussians. `view` is from
+`view_numbers`.
 """
 
 from __future__ import annotations
@@ -19,13 +24,22 @@ from reffusion.types import Camera
 
 _LOG2_E = 1.4426950408889634
 _HALF_LOG2_E = math.sqrt(0.5 * _LOG2_E)
-_UNSCALE = 1.0 / _HALF_LOG2_E  # u and v of a footprint are scaled by sqrt(log2(e) / 2)
+_UNSCALE = 1.0 / _HALF_LOG2_E  # undoes the scale sqrt(log2(e) / 2) of a footprint's u and v
 _LEAST_LEVEL = math.log2(MIN_ALPHA)
 
 
 def view_numbers(camera: Camera, antialiased: bool) -> np.ndarray:
-    """[24] float64: rotation rows, translation, fx, fy, cx, cy, clamping range of x/z and y/z, size, antialiased,
-    low-pass."""
+    """Return the numbers of a view that kernels need, as one array.
+
+    Args:
+        camera: the view.
+        antialiased: True uses the 2D filter of Mip-Splatting.
+
+    Returns:
+        [24] float64: 0 to 8 the camera's rotation, row by row; 9 to 11 its translation; 12 to 15 fx, fy, cx, cy; 16 to
+        19 the least and greatest x/z, then y/z, to which the Jacobian is clamped; 20, 21 width and height; 22
+        antialiased, 0 or 1; 23 the low-pass in square pixels of this view.
+    """
     half_x, half_y = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
     return np.array(
         [
@@ -44,7 +58,10 @@ def view_numbers(camera: Camera, antialiased: bool) -> np.ndarray:
 
 @inlined
 def three_columns(array, row, last):
-    """Columns of a [R, 3] array (flat) in float64."""
+    """Return the three columns of LANES rows, from `row` on, of an array [R, 3] (flat), as float64 vectors.
+
+    `last` is the last row of the array; rows after it are replaced by it.
+    """
     return (
         widen(load_column(array, 3, 0, row, last)),
         widen(load_column(array, 3, 1, row, last)),
@@ -54,13 +71,13 @@ def three_columns(array, row, last):
 
 @inlined
 def exponential(x):
-    """e^x, finite everywhere."""
+    """Return e^x, with x limited so that the result is finite and not 0."""
     return exp2(maximum(minimum(x * _LOG2_E, 1020.0), -1020.0))
 
 
 @inlined
 def camera_point(view, mean):
-    """Camera coordinates of a mean."""
+    """Return the camera coordinates x, y and z of the means."""
     a, b, c = mean
     return (
         view[0] * a + view[1] * b + view[2] * c + view[9],
@@ -71,7 +88,10 @@ def camera_point(view, mean):
 
 @inlined
 def _unit_quaternion(quaternions, row, last):
-    """Quaternions wxyz divided by their length (zero: identity), and 1 / length (zero: 0)."""
+    """Load LANES quaternions, and return w, x, y and z of the unit quaternions, and 1 / length.
+
+    A zero quaternion becomes the identity, with 0 for 1 / length, so that its gradient is 0.
+    """
     w = widen(load_column(quaternions, 4, 0, row, last))
     x = widen(load_column(quaternions, 4, 1, row, last))
     y = widen(load_column(quaternions, 4, 2, row, last))
@@ -85,7 +105,7 @@ def _unit_quaternion(quaternions, row, last):
 
 @inlined
 def _rotation(w, x, y, z):
-    """Rotation matrix of a unit quaternion, row by row."""
+    """Return the rotation matrices of unit quaternions, as three rows."""
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
     wx, wy, wz = w * x, w * y, w * z
     return (
@@ -97,7 +117,12 @@ def _rotation(w, x, y, z):
 
 @inlined
 def _projector(view, x, y, z_inverse):
-    """The two rows of Jacobian x rotation [2, 3]."""
+    """Return the two rows of the projector, Jacobian x camera rotation, with x/z and y/z clamped.
+
+    Args:
+        x, y: camera coordinates of the means.
+        z_inverse: 1 / camera z.
+    """
     slope_x = maximum(minimum(x * z_inverse, view[17]), view[16])
     slope_y = maximum(minimum(y * z_inverse, view[19]), view[18])
     fx, fy = view[12] * z_inverse, view[13] * z_inverse
@@ -109,7 +134,7 @@ def _projector(view, x, y, z_inverse):
 
 @inlined
 def _times_rotation(p, r):
-    """A row times the rotation matrix."""
+    """Return a row p of three numbers times the rotation matrix r."""
     return (
         p[0] * r[0][0] + p[1] * r[1][0] + p[2] * r[2][0],
         p[0] * r[0][1] + p[1] * r[1][1] + p[2] * r[2][1],
@@ -134,9 +159,13 @@ def _cross(a, b):
 
 @inlined
 def _covariance(a, b, low):
-    """xx, xy, yy and determinant of root rootᵀ, for rows a and b of root [2, 3], and the determinant with low-pass.
+    """Return xx, xy, yy and the determinant of A A^T, and the determinant of A A^T + low-pass.
 
-    By Cauchy-Binet the determinant is the sum of squared 2x2 minors, without the cancellation of xx yy - xy^2.
+    By Cauchy-Binet the determinant is the sum of the squared 2x2 minors of A, without the cancellation of xx yy - xy^2.
+
+    Args:
+        a, b: rows of the root A.
+        low: the low-pass, which is added to xx and yy in the second determinant.
     """
     xx, xy, yy = _dot(a, a), _dot(a, b), _dot(b, b)
     m0, m1, m2 = _cross(a, b)
@@ -146,7 +175,15 @@ def _covariance(a, b, low):
 
 @inlined
 def _frame(view, x, y, z_inverse, quaternions, log_scales, row, last):
-    """Shared by forward and backward pass: unit quaternion, rotation, projector, scales, rows of root [2, 3]."""
+    """Compute the quantities that the forward and the backward pass share.
+
+    Args:
+        x, y, z_inverse: camera coordinates x and y of the means, and 1 / camera z.
+        quaternions, log_scales, row, last: as for `project`.
+
+    Returns:
+        Unit quaternion with 1 / length, rotation R, projector, standard deviations, and the two rows of the root A.
+    """
     quaternion = _unit_quaternion(quaternions, row, last)
     rotation = _rotation(quaternion[0], quaternion[1], quaternion[2], quaternion[3])
     projector = _projector(view, x, y, z_inverse)
@@ -159,17 +196,19 @@ def _frame(view, x, y, z_inverse, quaternions, log_scales, row, last):
 
 @inlined
 def project(view, mean, quaternions, log_scales, opacity_logits, row, last):
-    """Footprints of LANES Gaussians.
+    """Compute the footprints of LANES Gaussians.
 
     Args:
         view: see `view_numbers`.
-        mean: their means, three float64 vectors.
-        quaternions, log_scales, opacity_logits: of all Gaussians, flat.
-        row, last: the first Gaussian of the group, and the last of all.
+        mean: the means of these Gaussians, three float64 vectors.
+        quaternions, log_scales, opacity_logits: parameters of all Gaussians, flat.
+        row: index of the first of these Gaussians.
+        last: index of the last of all Gaussians.
 
     Returns:
-        A mask of those in front of the camera, opaque and small enough; and as float64 vectors: 2D mean x, y; slant,
-        the two whitening factors and the level of a footprint; camera z; half width and height of the box around
+        A mask of the Gaussians to keep: camera z is at least `NEAR`, the opacity at least 1/255, and the variances are
+        below `MAX_VARIANCE`. Then float64 vectors: x and y of the 2D mean; slant, the two whitening factors and level
+        of the footprint (see `layout`); camera z; half width and half height, in whole pixels, of the box around
         alpha >= 1/255.
     """
     x, y, z = camera_point(view, mean)
@@ -191,7 +230,14 @@ def project(view, mean, quaternions, log_scales, opacity_logits, row, last):
 
 @inlined
 def in_image(view, mean_x, mean_y, reach_x, reach_y):
-    """A mask of the boxes that touch the image."""
+    """Return a mask of the Gaussians whose box around alpha >= 1/255 touches the image.
+
+    Boxes with a centre beyond `MAX_PIXELS` are not in the mask.
+
+    Args:
+        mean_x, mean_y: centres of the boxes in pixels.
+        reach_x, reach_y: half widths and half heights of the boxes in pixels.
+    """
     near_enough = (mean_x > -MAX_PIXELS) & (mean_x < MAX_PIXELS) & (mean_y > -MAX_PIXELS) & (mean_y < MAX_PIXELS)
     inside_x = (mean_x + reach_x > 0.0) & (mean_x - reach_x < view[20])
     inside_y = (mean_y + reach_y > 0.0) & (mean_y - reach_y < view[21])
@@ -200,7 +246,7 @@ def in_image(view, mean_x, mean_y, reach_x, reach_y):
 
 @inlined
 def anchor(view, mean_x, mean_y, slant, whiten_x, whiten_y):
-    """The point of the image nearest to the 2D mean, and the whitened coordinates u and v there."""
+    """Return x and y of the anchor, the point of the image nearest to the 2D mean, and its whitened u and v."""
     x, y = minimum(maximum(mean_x, 0.0), view[20]), minimum(maximum(mean_y, 0.0), view[21])
     dx, dy = x - mean_x, y - mean_y
     return x, y, whiten_x * (dx - slant * dy), whiten_y * dy
@@ -208,11 +254,11 @@ def anchor(view, mean_x, mean_y, slant, whiten_x, whiten_y):
 
 @inlined
 def project_backward(view, mean, quaternions, log_scales, opacity_logits, row, last, moments):
-    """Gradients of the geometry of LANES Gaussians.
+    """Compute the gradients of the geometry of LANES Gaussians.
 
     Args:
-        view, ..., last: as in `project`.
-        moments: the columns of their gradient records (`layout`), LANES values each.
+        view, mean, quaternions, log_scales, opacity_logits, row, last: as for `project`.
+        moments: the columns of the Gaussians' summed gradient records (`layout`), LANES values each.
 
     Returns:
         Gradients of the mean (3), quaternion (4), log-scales (3), opacity logit and 2D mean (2), as float64 vectors.
@@ -255,12 +301,20 @@ def project_backward(view, mean, quaternions, log_scales, opacity_logits, row, l
 
 @inlined
 def _column(moments, column):
+    """Return a column of the moments as a float64 vector."""
     return widen(load(moments, column * LANES))
 
 
 @inlined
 def _root_backward(a, b, slant, lx, ly, moments):
-    """dLoss/d(root) = L M Lᵀ root, with L the whitening factor and M the second moments of (u, v)."""
+    """Return the gradient of the root A through the 2D covariance, as two rows: dLoss/dA = L M L^T A.
+
+    L is the factor L L^T of the inverse 2D covariance, and M the matrix of second moments of (u, v) in `moments`.
+
+    Args:
+        a, b: rows of A.
+        slant, lx, ly: the entries of L: u = lx (dx - slant dy) and v = ly dy, without the scale of `layout`.
+    """
     uu = _UNSCALE * _UNSCALE * _column(moments, SUM_UU)
     uv = _UNSCALE * _UNSCALE * _column(moments, SUM_UV)
     vv = _UNSCALE * _UNSCALE * _column(moments, SUM_VV)
@@ -275,10 +329,21 @@ def _root_backward(a, b, slant, lx, ly, moments):
 
 @inlined
 def _compensation_backward(a, b, sharp, determinant, low, grad, grad_a, grad_b):
-    """Add the gradient of ln sqrt(sharp / determinant) by root: `grad` times half the gradients of the two logarithms.
+    """Add the gradient of the root through the antialiased opacity, which contains sqrt(sharp / determinant).
 
-    The gradient of the minors is a cross product, again without cancellation. Where sharp is 0, nothing is rendered and
-    grad is 0.
+    It is `grad` times the gradient of ln sqrt(sharp / determinant), that is, half the difference of the gradients of
+    the two logarithms. The gradient of the minors is a cross product, again without cancellation. If sharp is 0,
+    nothing is rendered, and grad is 0.
+
+    Args:
+        a, b: rows of the root.
+        sharp, determinant: determinants of the 2D covariance without and with low-pass.
+        low: the low-pass.
+        grad: dLoss/d(ln opacity); 0 if the Gaussians are not antialiased.
+        grad_a, grad_b: gradients of the rows so far.
+
+    Returns:
+        The gradients of the two rows.
     """
     m = _cross(a, b)
     sharpness = grad * (1.0 / maximum(sharp, 1e-300) - 1.0 / determinant)
@@ -289,6 +354,7 @@ def _compensation_backward(a, b, sharp, determinant, low, grad, grad_a, grad_b):
 
 @inlined
 def _moved_row(grad, by, sharpness, row, width):
+    """Return grad + sharpness * by - width * row, for rows of three numbers."""
     return (
         grad[0] + sharpness * by[0] - width * row[0],
         grad[1] + sharpness * by[1] - width * row[1],
@@ -298,9 +364,13 @@ def _moved_row(grad, by, sharpness, row, width):
 
 @inlined
 def _quaternion_backward(quaternion, p, ga, gb):
-    """Gradient through the rotation matrix: tangential to the unit sphere, divided by the length; zero stays zero.
+    """Return the gradient of the quaternion (w, x, y, z) through the rotation matrix.
+
+    The gradient of the unit quaternion is projected to the tangent of the unit sphere, and divided by the length of the
+    quaternion. A zero quaternion gets a zero gradient.
 
     Args:
+        quaternion: from `_unit_quaternion`.
         p: rows of the projector.
         ga, gb: rows of dLoss/d(root) diag(scales).
     """
@@ -324,9 +394,16 @@ def _quaternion_backward(quaternion, p, ga, gb):
 
 @inlined
 def _projector_backward(view, x, y, z_inverse, r, p, ga, gb):
-    """Gradient through the projector's rows fx/z (R0 - slope_x R2) and fy/z (R1 - slope_y R2) to camera coordinates.
+    """Return the gradient of the camera coordinates x, y and z of the means through the projector.
 
-    The caller adds the dependence of the slopes x/z and y/z on z, which has the same form for the 2D mean.
+    The projector has the rows fx/z (W0 - slope_x W2) and fy/z (W1 - slope_y W2), with the rows W0, W1 and W2 of the
+    camera's rotation and the slopes x/z and y/z. A clamped slope has no gradient. The returned gradient of z leaves out
+    that the slopes depend on z; the caller adds this part, which has the same form for the 2D mean.
+
+    Args:
+        r: the Gaussians' rotation R.
+        p: rows of the projector.
+        ga, gb: rows of dLoss/d(root) diag(scales).
     """
     gp0 = _dot(ga, r[0]), _dot(ga, r[1]), _dot(ga, r[2])
     gp1 = _dot(gb, r[0]), _dot(gb, r[1]), _dot(gb, r[2])

@@ -1,6 +1,6 @@
 """Splatting in plain torch: slow and simple, in any dtype, with gradients from autograd.
 
-Every pixel evaluates every Gaussian. In float64 this is the oracle for the fast implementations.
+Every pixel evaluates every Gaussian. The fast implementations are tested against this one in float64.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from reffusion.splat.conventions import (
 )
 from reffusion.types import Camera, Gaussians, Rendering
 
-_CHUNK = 2**22  # pixel-Gaussian pairs in memory at once
+_CHUNK = 2**22  # pairs of a pixel and a Gaussian that are in memory at once
 
 
 class Projected(NamedTuple):
-    """The M Gaussians that reach the image, front to back.
+    """The 2D Gaussians (footprints) of the M Gaussians that reach the image, front to back.
 
     Attributes:
         order: [M] indices of the Gaussians.
-        means: [M, 2] pixels.
-        covariances: [M, 3] px^2: xx, xy, yy, with low-pass.
-        determinants: [M] px^4, of these covariances.
+        means: [M, 2] 2D means in pixels.
+        covariances: [M, 3] xx, xy and yy of the 2D covariances in px^2, with low-pass.
+        determinants: [M] determinants of these covariances in px^4.
         depths: [M] camera z.
-        opacities: [M].
+        opacities: [M], compensated for the low-pass if the Gaussians are antialiased.
     """
 
     order: Tensor
@@ -52,7 +52,7 @@ class Projected(NamedTuple):
 def render(
     gaussians: Gaussians, camera: Camera, features: Tensor | None, background: Tensor, degree: int, probe: Tensor | None
 ) -> Rendering:
-    """See `reffusion.splat.rasterizer.render`."""
+    """Render Gaussians; see `reffusion.splat.rasterizer.render`, which checks the arguments."""
     projected, radii = project(gaussians, camera, probe)
     order = projected.order
     columns = [colors(gaussians, camera, degree)[order], projected.depths[:, None]]
@@ -77,7 +77,7 @@ def render(
 
 
 def accumulate(gaussians: Gaussians, camera: Camera, values: Tensor, count: bool) -> Tensor:
-    """See `reffusion.splat.rasterizer.accumulate`."""
+    """Sum pixel values by Gaussian; see `reffusion.splat.rasterizer.accumulate`, which checks the arguments."""
     projected, _ = project(gaussians, camera, None)
     gathered = values.new_zeros(len(projected.order), values.shape[-1])
     flat = values.reshape(camera.height * camera.width, -1)
@@ -94,10 +94,13 @@ def accumulate(gaussians: Gaussians, camera: Camera, values: Tensor, count: bool
 
 
 def project(gaussians: Gaussians, camera: Camera, probe: Tensor | None) -> tuple[Projected, Tensor]:
-    """Footprints of the Gaussians in the image (EWA splatting), sorted by depth, equal depths by index.
+    """Project the Gaussians into the image (EWA splatting), and sort them by depth, equal depths by index.
+
+    Args:
+        probe: [N, 2] added to the 2D means, in pixels, or None.
 
     Returns:
-        The footprints that reach the image, and radii [N] int32 of all Gaussians (0 = culled).
+        The footprints that reach the image; and [N] int32, the radii of all Gaussians in pixels, 0 for culled ones.
     """
     like = gaussians.means
     pose = torch.as_tensor(camera.world_to_camera, dtype=like.dtype, device=like.device)
@@ -155,7 +158,7 @@ def project(gaussians: Gaussians, camera: Camera, probe: Tensor | None) -> tuple
 
 
 def rotations(quaternions: Tensor) -> Tensor:
-    """[M, 4] wxyz of any length -> [M, 3, 3]; the zero quaternion is the identity."""
+    """Return rotation matrices [M, 3, 3] for wxyz quaternions [M, 4] of any length; zero is the identity."""
     zero = (quaternions == 0).all(1, keepdim=True)
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quaternions.dtype, device=quaternions.device)
     safe = torch.where(zero, identity, quaternions)
@@ -169,14 +172,17 @@ def rotations(quaternions: Tensor) -> Tensor:
 
 
 def colors(gaussians: Gaussians, camera: Camera, degree: int) -> Tensor:
-    """[N, 3]: colours in the direction from the camera, max(0, 0.5 + sum_k Y_k(direction) sh_k)."""
+    """Return the colours [N, 3] of the Gaussians as the camera sees them: max(0, 0.5 + sum_k Y_k(direction) sh_k).
+
+    Directions point from the camera to the Gaussians; `degree` is the degree of the spherical harmonics used.
+    """
     center = torch.as_tensor(camera.center, dtype=gaussians.means.dtype, device=gaussians.means.device)
     weights = harmonics(gaussians.means - center, degree)
     return torch.clamp_min(0.5 + (weights[:, :, None] * gaussians.sh[:, : weights.shape[1]]).sum(1), 0)
 
 
 def harmonics(directions: Tensor, degree: int) -> Tensor:
-    """[..., (degree + 1)^2]: the spherical harmonics of 3DGS in directions [..., 3] of any length."""
+    """Return the spherical harmonics [..., (degree + 1)^2] of 3DGS in directions [..., 3] of any length."""
     x, y, z = (directions / directions.norm(dim=-1, keepdim=True).clamp_min(1e-30)).unbind(-1)
     basis = [torch.full_like(x, SH0)]
     if degree >= 1:
@@ -192,10 +198,14 @@ def harmonics(directions: Tensor, degree: int) -> Tensor:
 
 
 def blending_weights(projected: Projected, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Front-to-back blending at pixel centres [P, 2].
+    """Compute the weights of front-to-back blending at P pixels.
+
+    Args:
+        projected: M Gaussians, front to back.
+        pixels: [P, 2], centres of the pixels.
 
     Returns:
-        weights [P, M] alpha_k prod_{j<k} (1 - alpha_j), and the remaining transmittance [P].
+        The weights [P, M], alpha_k prod_{j<k} (1 - alpha_j), and the transmittance [P] behind all Gaussians.
     """
     dx, dy = (pixels[:, None, :] - projected.means).unbind(2)
     _, xy, yy = projected.covariances.unbind(1)
@@ -213,7 +223,7 @@ def blending_weights(projected: Projected, pixels: Tensor) -> tuple[Tensor, Tens
 
 
 def _pixel_chunks(camera: Camera, projected: Projected) -> tuple[Tensor, ...]:
-    """Pixel centres [P, 2] of the image in row-major order, in chunks that fit in memory."""
+    """Return the pixel centres of the image in row-major order, in chunks [P, 2] of at most `_CHUNK` / M pixels."""
     like = projected.means
     x = torch.arange(camera.width, dtype=like.dtype, device=like.device) + 0.5
     y = torch.arange(camera.height, dtype=like.dtype, device=like.device) + 0.5

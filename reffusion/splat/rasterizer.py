@@ -1,7 +1,7 @@
 """3D Gaussian splatting: one interface, three implementations of the same conventions (docs/method.md#splatting).
 
-`torch` uses autograd in any dtype (the oracle of the tests), `cpu` is compiled by numba, and `cuda` is gsplat. Each is
-imported at its first use.
+`torch` uses autograd in any dtype, and is the standard of the tests; `cpu` is compiled by numba; `cuda` is gsplat. Each
+implementation is imported at its first use.
 """
 
 from __future__ import annotations
@@ -29,12 +29,13 @@ def render(
     """Render Gaussians: colour, depth, alpha and blended features in one pass, all differentiable.
 
     Args:
-        gaussians: N Gaussians, N = 0 allowed. Culled ones (docs/method.md#splatting) get zero gradients.
+        gaussians: N Gaussians; N may be 0. Culled Gaussians (docs/method.md#splatting) get zero gradients.
         camera: the view, of size 1 x 1 or larger.
-        features: [N, C] values to blend like colours, over a background of zeros; differentiable.
+        features: [N, C] values that are blended like colours, over a background of zeros; differentiable. None: none.
         background: [3] colour behind everything, black if None; differentiable.
-        impl: "auto" selects "cuda" for tensors on a GPU, else "cpu". "torch" supports float64 and any device.
-        sh_degree: highest degree of spherical harmonics used, 0 to the stored one (the default).
+        impl: the implementation. "auto" selects "cuda" for tensors on a GPU, else "cpu". "torch" supports any dtype,
+            such as float64, and any device.
+        sh_degree: highest degree of spherical harmonics used, from 0 to the stored one; None: the stored one.
         probe: [N, 2] added to the 2D means, in pixels. Pass zeros that require a gradient; after the backward pass
             their gradient is dLoss/d(2D mean).
 
@@ -42,7 +43,8 @@ def render(
         A Rendering on the device and of the dtype of the Gaussians.
 
     Raises:
-        ValueError: shapes, dtypes or devices do not match, or "cuda" is not available.
+        ValueError: shapes, dtypes or devices do not match, `sh_degree` is not stored, the camera's size or focal
+            lengths are not positive, or the implementation is unknown or not available.
     """
     _check_gaussians(gaussians, camera)
     count, means = len(gaussians), gaussians.means
@@ -61,7 +63,16 @@ def render(
 
 
 def prepare(device: str) -> None:
-    """Loads gsplat if the device is CUDA, so that compiling its extension is not timed. On the CPU nothing is done."""
+    """Load gsplat if the device is CUDA, so that timings leave out its loading and the compilation of its extension.
+
+    On the CPU nothing is done.
+
+    Args:
+        device: a torch device, such as "cpu" or "cuda".
+
+    Raises:
+        ValueError: the device is CUDA, and there is no GPU or no compiled gsplat.
+    """
     if torch.device(device).type == "cuda":
         _implementation("cuda", torch.zeros(1, device=device))
 
@@ -70,19 +81,23 @@ def prepare(device: str) -> None:
 def accumulate(
     gaussians: Gaussians, camera: Camera, values: Tensor, *, impl: Implementation = "auto", count: bool = False
 ) -> Tensor:
-    """Sum of blending weight x value over the pixels, for each Gaussian. Not differentiable.
+    """Sum blending weight x value over the pixels of a view, for each Gaussian. Not differentiable.
 
-    With 1 - mask and mask as two channels of `values`, the columns are the votes of the paper's mask lifting.
+    With 1 - mask and mask as two channels of `values`, the sums are the votes of the paper's mask lifting.
 
     Args:
+        gaussians: N Gaussians.
+        camera: the view.
         values: [H, W, C] of the dtype of the Gaussians.
-        count: use weight 1 wherever the Gaussian is blended.
+        impl: the implementation, as for `render`.
+        count: True takes weight 1 at each pixel where the Gaussian is blended, instead of its blending weight. Then the
+            votes are counts of pixels, as in the paper.
 
     Returns:
-        [N, C].
+        [N, C], the sums.
 
     Raises:
-        ValueError: as `render`.
+        ValueError: as for `render`.
     """
     _check_gaussians(gaussians, camera)
     _check_tensor("values", values, (camera.height, camera.width, None), gaussians.means)
@@ -90,6 +105,7 @@ def accumulate(
 
 
 def _implementation(impl: Implementation, means: Tensor):
+    """Return the module that implements `impl`, or raise ValueError if it does not support tensors like `means`."""
     if impl == "auto":
         impl = "cuda" if means.is_cuda else "cpu"
     if impl == "torch":
@@ -114,6 +130,7 @@ def _implementation(impl: Implementation, means: Tensor):
 
 
 def _check_gaussians(gaussians: Gaussians, camera: Camera) -> None:
+    """Raise ValueError if a parameter of the Gaussians has a wrong shape, dtype or device, or the camera is invalid."""
     count, means = gaussians.means.shape[0], gaussians.means
     if camera.width < 1 or camera.height < 1 or camera.fx <= 0 or camera.fy <= 0:
         raise ValueError(f"view {camera.name!r}: size and focal lengths must be positive, not {camera}")
@@ -131,6 +148,7 @@ def _check_gaussians(gaussians: Gaussians, camera: Camera) -> None:
 
 
 def _check_tensor(name: str, tensor: Tensor, shape: tuple[int | None, ...], like: Tensor) -> None:
+    """Raise ValueError unless `tensor` has this shape (None: any size) and the dtype and device of `like`."""
     fits = tensor.ndim == len(shape) and all(
         want is None or want == have for want, have in zip(shape, tensor.shape, strict=True)
     )

@@ -1,4 +1,4 @@
-"""`python -m reffusion.weights`: download the weights of LPIPS if they are missing, as `make` does once."""
+"""`python -m reffusion.weights`: downloads the weights of LPIPS if they are missing. `make` runs this once."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from reffusion.weights.local import lpips_need
 
 
 def main() -> None:
-    """Download and report it in one line; a failure is only a warning."""
+    """Download the weights of LPIPS if they are missing, and announce this in one line.
+
+    A failure only prints a warning.
+    """
     need = lpips_need()
     if need.problem is None:
         return

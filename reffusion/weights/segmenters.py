@@ -1,6 +1,6 @@
-"""Segmentation networks on this machine: where the one of a setting lies, and a name for the key of its results.
+"""Segmentation networks on this machine: the folder of the network that a setting names, and a hash of its files.
 
-Imports nothing heavy, so that `plan` can use it.
+The module imports no large libraries, so that `plan` can use it.
 """
 
 from __future__ import annotations
@@ -15,12 +15,17 @@ AUTO, NONE = "auto", "none"
 
 
 def segmenter_folder(source: str) -> Path:
-    """The folder that the setting `segmenter` means: "auto" is where `reffusion weights` puts the network."""
+    """Return the folder that the parameter `segmenter` names; "auto" is the folder of `reffusion weights`."""
     return segmenter_cache() if source == AUTO else Path(source).expanduser()
 
 
 def segmenter_facts(source: str) -> dict[str, str]:
-    """What masks from clicks depend on: the hash of the network's files, or that there is none."""
+    """Return the facts about the segmentation network on which masks from clicks depend.
+
+    Returns:
+        {"segmenter": 16 digits of the sha256 of the network's ONNX files}. Without ONNX files: {"segmenter": "none"}
+        if `source` is "auto", else {"segmenter": source}.
+    """
     files = [segmenter_folder(source) / name for name in SEGMENTER_FILES]
     if source == NONE or not all(file.is_file() for file in files):
         return {"segmenter": NONE if source == AUTO else source}

@@ -1,4 +1,4 @@
-"""What the plan says of the stage `distill` before it runs: weights, missing hardware, cost."""
+"""Facts about the stage `distill` that the runner needs before the stage runs; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ __all__ = ["Params", "cost", "lacks", "needed_weights"]
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """The weights that the stage needs, each with what of it is missing on this machine.
+    """Return the weights that the stage needs, each with what prevents its use on this machine (None if nothing).
 
     Args:
-        brings: the keys of scene.yaml.
+        brings: the keys of scene.yaml and the names of the scene's folders; not used here.
     """
     needs = [local.model_need(params.prior, params.dtype)] if params.needs_prior else []
     if params.depth.weight > 0 and params.depth.model:
@@ -25,10 +25,17 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
 
 
 def lacks(params: Params) -> list[str]:
-    """What the stage needs on CUDA and this machine lacks."""
+    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
     return machine.find_missing(machine.detect(), params.memory_gb, splats=True, memory_param="distill.memory_gb")
 
 
 def cost(params: Params, gpu: str) -> Mapping[str, object] | None:
-    """The estimated cost on a GPU, by name; "" is this machine's. ValueError if the name is not in the table."""
+    """Estimate seconds and GB of GPU memory of the stage; None if it does not run on a GPU or the GPU is unknown.
+
+    Args:
+        gpu: name of the GPU; "" for this machine's.
+
+    Raises:
+        ValueError: the name is not in the table of GPUs.
+    """
     return estimate.format_estimate(gpu, params.device, estimate.distill(params))

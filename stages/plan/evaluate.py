@@ -1,4 +1,4 @@
-"""What can be told of `evaluate` before it runs."""
+"""Facts about the stage `evaluate` that the runner needs before the stage runs; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from reffusion.weights import local, painters
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """The weights that the stage works with, and which of them are missing on this machine.
+    """Return the weights that the stage uses, each with what prevents its use on this machine (None if nothing).
 
     Args:
-        brings: the keys of scene.yaml.
+        brings: the keys of scene.yaml and the names of the scene's folders; not used here.
     """
     painting = painters.weights_needs(params.inpainter, "evaluate.inpainter") if params.inpaint else []
     return [local.lpips_need(), *painting]
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """What the result depends on beside the parameters: the content of the inpainter's file."""
+    """Return what the result depends on besides the parameters: the 2D inpainter, and the hash of its file."""
     return painters.inpainter_facts(params.inpainter) if params.inpaint else {}
 
 
 def unavailable(params: Params) -> list[str]:
-    """The scores that cannot be computed on this machine; once they can, the stage runs again."""
+    """Return the scores that cannot be computed on this machine. The stage runs again once they can be computed."""
     return ["LPIPS"] if local.lpips_need().problem else []
 
 
 def lacks(params: Params) -> list[str]:
-    """What this machine lacks and the stage needs on CUDA."""
+    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
     return machine.find_missing(machine.detect())

@@ -1,4 +1,4 @@
-"""What can be told of `finish` before it runs."""
+"""Facts about the stage `finish` that the runner needs before the stage runs; imports nothing heavy."""
 
 from reffusion.io import machine
 from reffusion.params.finish import Params
@@ -7,5 +7,5 @@ __all__ = ["Params", "lacks"]
 
 
 def lacks(params: Params) -> list[str]:
-    """What this machine lacks and the stage needs on CUDA."""
+    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
     return machine.find_missing(machine.detect())

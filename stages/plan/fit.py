@@ -1,4 +1,4 @@
-"""What `plan` reports of the stage `fit` before it runs."""
+"""Facts about the stage `fit` that the runner needs before the stage runs; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -13,15 +13,27 @@ __all__ = ["Params", "cost", "lacks", "preview"]
 
 
 def preview(params: Params, *, poses: Path | None, **_: Path | None) -> list[str]:
+    """Say if the stage takes over Gaussians that the scene brings; an empty list if it fits Gaussians.
+
+    Args:
+        poses: folder of the stage `poses`; None if it has not run.
+    """
     has_gaussians = poses is not None and (poses / "gaussians.ply").exists() and params.pixels == "all"
     return ["takes over the scene's gaussians.ply: no optimisation"] if has_gaussians else []
 
 
 def lacks(params: Params) -> list[str]:
-    """What the stage needs on CUDA and this machine lacks."""
+    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
     return machine.find_missing(machine.detect())
 
 
 def cost(params: Params, gpu: str) -> Mapping[str, object] | None:
-    """Estimated cost on a GPU ("": that of this machine). Raises ValueError for a GPU that is not in the table."""
+    """Estimate seconds and GB of GPU memory of the stage; None if it does not run on a GPU or the GPU is unknown.
+
+    Args:
+        gpu: name of the GPU; "" for this machine's.
+
+    Raises:
+        ValueError: the name is not in the table of GPUs.
+    """
     return estimate.format_estimate(gpu, params.device, estimate.fit(params))

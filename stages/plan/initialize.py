@@ -1,4 +1,4 @@
-"""What `plan` reports of the stage `initialize` before it runs."""
+"""Facts about the stage `initialize` that the runner needs before the stage runs; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -13,23 +13,27 @@ __all__ = ["Params", "lacks", "needed_weights", "preview"]
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """Weights that the stage needs, and whether they are here; `brings`: the keys of scene.yaml."""
+    """Return the weights that the stage needs, each with what prevents its use on this machine (None if nothing).
+
+    Args:
+        brings: the keys of scene.yaml and the names of the scene's folders; not used here.
+    """
     needs = [local.model_need(params.depth.model, "float32")] if params.depth.model else []
     return needs + (painters.weights_needs(params.inpainter, "initialize.inpainter") if params.extra_views else [])
 
 
 def optional_weights(params: Params) -> list[local.Need]:
-    """Weights that the stage could use instead."""
+    """Return the weights of a depth network that the stage could use, if the parameters name none."""
     return [] if params.depth.model else [local.model_need(DEPTH_ANYTHING, "float32")]
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """What the result depends on besides the parameters: the inpainter, and the content of its file."""
+    """Return what the result depends on besides the parameters: the 2D inpainter, and the hash of its file."""
     return painters.inpainter_facts(params.inpainter) if params.extra_views else {}
 
 
 def preview(params: Params, **_: Path | None) -> list[str]:
-    """What the stage will do, as far as it is known in advance."""
+    """Describe what the stage will do, a sentence each, as far as it is known before it runs."""
     if not (params.extra_views and params.start == "reference"):
         return []
     kind = painters.resolve_inpainter(params.inpainter).kind
@@ -38,5 +42,5 @@ def preview(params: Params, **_: Path | None) -> list[str]:
 
 
 def lacks(params: Params) -> list[str]:
-    """What the stage needs on CUDA and this machine lacks."""
+    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
     return machine.find_missing(machine.detect())

@@ -1,4 +1,4 @@
-"""What `plan` reports of the stage `lift` before it runs."""
+"""Facts about the stage `lift` that the runner needs before the stage runs; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -8,17 +8,21 @@ from reffusion.weights import local, painters
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """Weights that the stage needs, and whether they are here; `brings`: the keys of scene.yaml."""
+    """Return the weights that the stage needs, each with what prevents its use on this machine (None if nothing).
+
+    Args:
+        brings: the keys of scene.yaml and the names of the scene's folders; not used here.
+    """
     if params.inpainter.kind == "diffusion":
         return [local.model_need(params.prior, "float32")]
     return painters.weights_needs(params.inpainter, "lift.inpainter")
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """What the result depends on besides the parameters: the content of the inpainter's file."""
+    """Return what the result depends on besides the parameters: the 2D inpainter, and the hash of its file."""
     return painters.inpainter_facts(params.inpainter)
 
 
 def lacks(params: Params) -> list[str]:
-    """What the stage needs on CUDA and this machine lacks."""
+    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
     return machine.find_missing(machine.detect(), splats=False)

@@ -1,4 +1,4 @@
-"""What `plan` reports of the stage `masks` before it runs."""
+"""Facts about the stage `masks` that the runner needs before the stage runs; imports nothing heavy."""
 
 from pathlib import Path
 
@@ -11,27 +11,31 @@ __all__ = ["Params", "lacks", "needed_weights", "optional_weights", "preview"]
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """The network that refines masks."""
+    """Return the segmentation network that refines masks, if the parameters ask for it.
+
+    Args:
+        brings: the keys of scene.yaml and the names of the scene's folders; not used here.
+    """
     return [local.segmenter_need()] if params.segmenter == AUTO and params.refine else []
 
 
 def optional_weights(params: Params) -> list[local.Need]:
-    """The network that makes masks from clicks."""
+    """Return the segmentation network that makes masks from clicks; without it the stage still works."""
     return [local.segmenter_need()] if params.segmenter == AUTO and not params.refine else []
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """What masks from clicks depend on besides the parameters: the network's files."""
+    """Return what masks from clicks and refined masks depend on besides the parameters: the network and its files."""
     return segmenter_facts(params.segmenter) if params.clicks or params.refine else {}
 
 
 def preview(params: Params, **_: Path | None) -> list[str]:
-    """What the stage will do, as far as it is known in advance."""
+    """Describe what the stage will do, a sentence each, as far as it is known before it runs."""
     if not params.clicks or segmenter_facts(params.segmenter)["segmenter"] != NONE:
         return []
     return ["clicks are segmented by colours and surfaces; with the network of `make weights`, fewer clicks suffice"]
 
 
 def lacks(params: Params) -> list[str]:
-    """What the stage needs on CUDA and this machine lacks."""
+    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
     return machine.find_missing(machine.detect())

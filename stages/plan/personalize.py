@@ -1,4 +1,4 @@
-"""What `plan` reports of the stage `personalize` before it runs."""
+"""Facts about the stage `personalize` that the runner needs before the stage runs; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -13,15 +13,26 @@ __all__ = ["Params", "cost", "lacks", "needed_weights"]
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """Weights that the stage needs, and whether they are here; `brings`: the keys of scene.yaml."""
+    """Return the weights that the stage needs, each with what prevents its use on this machine (None if nothing).
+
+    Args:
+        brings: the keys of scene.yaml and the names of the scene's folders; not used here.
+    """
     return [local.model_need(params.prior, params.dtype)]
 
 
 def lacks(params: Params) -> list[str]:
-    """What the stage needs on CUDA and this machine lacks."""
+    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
     return machine.find_missing(machine.detect(), params.memory_gb, splats=False, memory_param="personalize.memory_gb")
 
 
 def cost(params: Params, gpu: str) -> Mapping[str, object] | None:
-    """Estimated cost on a GPU ("": that of this machine). Raises ValueError for a GPU that is not in the table."""
+    """Estimate seconds and GB of GPU memory of the stage; None if it does not run on a GPU or the GPU is unknown.
+
+    Args:
+        gpu: name of the GPU; "" for this machine's.
+
+    Raises:
+        ValueError: the name is not in the table of GPUs.
+    """
     return estimate.format_estimate(gpu, params.device, estimate.personalize(params))

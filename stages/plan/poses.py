@@ -1,4 +1,4 @@
-"""What `poses` reads, checks and announces before it runs."""
+"""The stage `poses` before it runs: the files that it reads, checks of the scene, and the notes that `plan` prints."""
 
 from __future__ import annotations
 
@@ -13,20 +13,28 @@ from reffusion.params.clicks import CLICKS
 from reffusion.params.poses import Params
 from reffusion.references.files import PAINTED, describe_references, load_reference_files
 
-# Endings of files that this stage reads only as photographs or depth maps of the capture; others belong to references.
+# Endings of pictures and depth maps. Of such files the stage reads only those of the capture; others are masks or
+# references, which later stages read.
 NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".npy", ".exr")
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
-    """The scene's files that this stage reads: the photographs, and everything that is neither a picture nor a depth
-    map. So new masks and references, wherever they lie, rerun nothing here."""
+    """Return the sorted files of the scene that the stage reads.
+
+    They are the photographs and depth maps of the capture, the Gaussians that the scene brings, and all files that are
+    neither pictures nor depth maps. So the stage does not run again when masks or references are added.
+
+    Args:
+        scene: folder of the scene.
+        files: all files of the scene.
+    """
     others = [path for path in files if path.parent != scene or path.name not in ("scene.yaml", CLICKS)]
     brought = {scene / name for name in (params.gaussians, params.cleaned) if name is not None}
     try:
         if is_gaussians_only(params, scene):
             return sorted({path for path in others if path.suffix.lower() not in NOT_READ} | brought)
         capture, roles = read_scene(params, scene, params.longest)
-    except ValueError:  # `preview` refuses it
+    except ValueError:  # `preview` reports this error
         return others
     shown = {path for name, path in capture.pictures.items() if name not in roles.blank}
     read = shown | brought | set(capture.depth_maps)
@@ -35,7 +43,13 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
-    """The role of each view, which may depend on the names of masks."""
+    """Return the names of training, test, clean and cameras-only views.
+
+    The stage depends on these roles, which may depend on the names of masks, while it does not read the masks.
+
+    Args:
+        scene: folder of the scene.
+    """
     if is_gaussians_only(params, scene):
         return {}
     roles = read_scene(params, scene, params.longest)[1]
@@ -43,8 +57,15 @@ def scene_facts(params: Params, scene: Path) -> dict[str, object]:
 
 
 def preview(params: Params, scene: Path) -> list[str]:
-    """What the stage will do, from headers. ValueError where it would fail, or where a reference of the scene, which a
-    later stage reads, belongs to none of its views."""
+    """Describe what the stage will do, a sentence each. Of pictures and Gaussians only headers are read.
+
+    Args:
+        scene: folder of the scene.
+
+    Raises:
+        ValueError: the stage would fail; or a reference that the scene brings, which a later stage reads, belongs to
+            none of its views.
+    """
     if is_gaussians_only(params, scene):
         brought = check_gaussian_files(params, scene)
         found = cameras.read(scene)
@@ -60,7 +81,7 @@ def preview(params: Params, scene: Path) -> list[str]:
 
 
 def _describe_poses(capture: Capture, scene: Path) -> list[str]:
-    """Where the poses come from, and what their lenses need."""
+    """Describe in sentences where the poses come from, and whether the pictures need undistortion."""
     if capture.poses is None:
         return [f"SfM: {len(capture.pictures)} photos bring no poses"]
     shifts = {each: lens.largest_shift(each) for each in set(capture.poses.lenses.values())}

@@ -1,4 +1,4 @@
-"""What `raw_masks` reads, checks and announces before it runs."""
+"""The stage `raw_masks` before it runs: the files that it reads, checks of them, and the notes that `plan` prints."""
 
 from __future__ import annotations
 
@@ -10,16 +10,25 @@ from reffusion.params.raw_masks import Params
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
-    """The mask files that this stage reads."""
+    """Return the sorted files of the scene that the stage reads: masks, test masks and fill masks.
+
+    Args:
+        scene: folder of the scene.
+        files: all files of the scene; returned if the scene cannot be read.
+    """
     try:
         roles = None if is_gaussians_only(params, scene) else read_scene(params, scene)[1]
-    except ValueError:  # `preview` refuses it
+    except ValueError:  # `preview` reports this error
         return files
     return sorted({path for views in roles.mask_files.values() for path in views.values()}) if roles else []
 
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
-    """Which file is the mask of which view, and the region."""
+    """Return which file is the mask of which view, and the region that the scene names.
+
+    Args:
+        scene: folder of the scene.
+    """
     region: dict[str, object] = {}
     if params.region:
         region["region"] = params.region.model_dump() | {"holds": params.has_masks}
@@ -31,7 +40,14 @@ def scene_facts(params: Params, scene: Path) -> dict[str, object]:
 
 
 def preview(params: Params, *, scene: Path, poses: Path | None = None) -> list[str]:
-    """What the stage will do. ValueError where a mask is unreadable, or all are empty or full."""
+    """Describe what the stage will do, a sentence each, after all masks were read.
+
+    Args:
+        scene: folder of the scene.
+
+    Raises:
+        ValueError: a mask is unreadable, or all masks are empty or all are full.
+    """
     if is_gaussians_only(params, scene):
         return []
     _, roles = read_scene(params, scene)

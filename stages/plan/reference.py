@@ -1,4 +1,4 @@
-"""What `reference` reads, checks, needs and announces before it runs."""
+"""The stage `reference` before it runs: its files and weights, checks of given references, and notes of `plan`."""
 
 from __future__ import annotations
 
@@ -16,8 +16,13 @@ from reffusion.weights.published import PAINTERS
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """The weights that the stage needs, and what of them is missing; `brings`: the keys of scene.yaml, and its
-    folders."""
+    """Return the weights that the stage needs, each with what prevents its use on this machine (None if nothing).
+
+    A scene that brings references needs none.
+
+    Args:
+        brings: the keys of scene.yaml and the names of the scene's folders.
+    """
     given = params.reference is not None or PAINTED in brings
     if given:
         return []
@@ -27,25 +32,39 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
 
 
 def optional_weights(params: Params) -> list[local.Need]:
-    """The weights that `inpainter: auto` would use."""
+    """Return the weights of the inpainters from which `inpainter: auto` selects."""
     return [need for kind in PAINTERS for need in painters.weights_needs(Inpainter(kind=kind))]
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """What the result depends on beside the parameters: the inpainter, and the content of its file."""
+    """Return what the result depends on besides the parameters: the 2D inpainter, and the hash of its file."""
     return painters.inpainter_facts(params.inpainter)
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
-    """The scene's files that this stage reads, and those that it reads elsewhere."""
+    """Return the sorted files that the stage reads: those of the references and their depth maps.
+
+    scene.yaml may name files outside the scene's folder.
+
+    Args:
+        scene: folder of the scene.
+        files: all files of the scene.
+    """
     named = {scene / name for each in reference_list(params.reference) for name in (each.image, each.depth) if name}
     return sorted({path for path in named if path.is_file()} | {p for p in files if p.parent == scene / PAINTED})
 
 
 def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path | None) -> list[str]:
-    """What the stage will do. ValueError where it would refuse a reference for its name, file or view, as far as that
-    can be checked: against the views that `poses` placed (before it has run, `poses` checks them against the
-    capture's)."""
+    """Describe what the stage will do, a sentence each, and check the references that the scene brings.
+
+    Args:
+        scene: folder of the scene.
+        poses: folder of the stage `poses`. None if it has not run; then nothing is checked here, and the preview of
+            `poses` checks references against the views of the capture.
+
+    Raises:
+        ValueError: the stage would refuse a reference because of its name, file or view.
+    """
     if reference_list(params.reference) or list_paintings(scene):
         views = (
             describe_references(load_reference_files(scene, load_placed_views(poses), params.reference))
@@ -63,10 +82,17 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
 
 
 def lacks(params: Params) -> list[str]:
-    """What this machine lacks for the stage on CUDA."""
+    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
     return machine.find_missing(machine.detect(), params.memory_gb, splats=False, memory_param="reference.memory_gb")
 
 
 def cost(params: Params, gpu: str) -> Mapping[str, object] | None:
-    """The stage's cost on a GPU; "" is this machine's. ValueError for a GPU that is not in the table."""
+    """Estimate seconds and GB of GPU memory of the stage; None if it does not run on a GPU or the GPU is unknown.
+
+    Args:
+        gpu: name of the GPU; "" for this machine's.
+
+    Raises:
+        ValueError: the name is not in the table of GPUs.
+    """
     return estimate.format_estimate(gpu, params.device, estimate.reference(params))

@@ -1,10 +1,13 @@
 """Finds photographs that contradict their poses: another picture under the same name, a pose that is wrong by degrees.
 
-The sparse points connect the views: where two views see the same points, their pictures must show the same there. For
-each view we take what its nearest views show at the points, place it where the view's pose projects the points, and
-correlate it with the view's own picture at every shift of the picture. A right photograph correlates best without a
-shift, by a wide margin, whatever its exposure and however few points it shares. A photograph that belongs elsewhere
-correlates best at some other shift, or nowhere.
+Where two views see the same sparse points, their pictures must look alike. So the picture of a view is predicted from
+its nearest views: the values of their pictures at the points are put where the view's pose projects the points. This
+prediction is correlated with the view's own picture at every shift of the picture. A photograph that fits its pose
+correlates best without a shift, by a wide margin, whatever its exposure and however few points it shares. A photograph
+that does not fit its pose correlates best at some other shift, or at no shift.
+
+Pictures are compared at low resolution; one pixel of the reduced picture is called a *cell*. The compared quantity is
+the *detail*, the local contrast of brightness (`_detail`).
 
 PAPER leaves open: it takes photographs and poses as given.
 """
@@ -25,22 +28,22 @@ from reffusion.geometry import project
 from reffusion.io.images import to_gray
 from reffusion.types import Camera, Scene
 
-LONGER_SIDE = 128  # cells along a picture's longer side, at which pictures are compared
-WINDOW = 12  # cells: variation over larger distances is brightness, not detail
-NOISE = 4.0  # levels of 255: standard deviation in a window, well under which there is no detail
-POINTS = 5000  # at most, that are compared
-DENSITY = 12  # mean number of points per cell of the picture, so that the nearest hide those behind them
-LEAST_SHARED = 50  # points that two compared views have in common
-LEAST_POINTS = 250  # points that a view shares with all its neighbours together: with fewer, chance correlates too
-NEIGHBOURS = 6  # views that each view is compared with
-LEAST_NEIGHBOURS = 2  # with fewer, a view is not judged
-# cosine of 35 degrees: views whose axes differ by more see other sides of things, and are not compared
+LONGER_SIDE = 128  # cells along a picture's longer side
+WINDOW = 12  # cells: side of the window in which local contrast is computed
+NOISE = 4.0  # levels of 255, added to the standard deviation in a window, so that noise gives no detail
+POINTS = 5000  # largest number of points that are compared
+DENSITY = 12  # mean number of points per square of the visibility test, in which the nearest point hides others
+LEAST_SHARED = 50  # visible points that two views must share to be compared
+LEAST_POINTS = 250  # points that a view must share with all its neighbours together; fewer correlate by chance
+NEIGHBOURS = 6  # number of views with which each view is compared
+LEAST_NEIGHBOURS = 2  # with fewer neighbours, a view is not judged
+# cosine of 35 degrees: views whose axes differ by more see different sides of objects, and are not compared
 TURN = np.cos(np.radians(35))
-LEAST_DETAIL = 0.2  # root mean square of the detail at the points, under which the pictures are too plain
-SAME, ELSEWHERE = 2, 4  # cells of shift up to which the pose is right, and from which it is wrong
-LEAST_MARGIN = 0.1  # of the correlation at the pose over that at the best other shift; right views have 0.2 to 0.7
-CLEAR = 0.6  # correlation at the pose from which another shift must be better, by this margin, to count
-LEAST_OVERLAP = 0.5  # share of the points that a shift must leave in the picture
+LEAST_DETAIL = 0.2  # root mean square of the detail at the points, below which pictures are too plain to compare
+SAME, ELSEWHERE = 2, 4  # cells: shifts up to the first count as the pose, shifts above the second as another place
+LEAST_MARGIN = 0.1  # by which the correlation at the pose must exceed that at other shifts; right views have 0.2 to 0.7
+CLEAR = 0.6  # above this correlation at the pose, a view is wrong only if another shift is better by LEAST_MARGIN
+LEAST_OVERLAP = 0.5  # share of the points that must lie in the picture after a shift
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class PoseCheck:
     """The result of `check_poses`.
 
     Attributes:
-        judged: number of views that share enough with others to be judged.
+        judged: number of views that share enough points with other views to be judged.
         contradicting: sorted names of the views whose photographs contradict their poses.
     """
 
@@ -57,20 +60,22 @@ class PoseCheck:
 
     @property
     def is_widespread(self) -> bool:
-        """Do half of the views or more contradict the others? Then it cannot be told which of them are right."""
+        """True if at least half of the judged views contradict their poses. It is then unknown which are right."""
         return 2 * len(self.contradicting) >= max(self.judged, 1)
 
 
 def check_poses(cameras: Sequence[Camera], points: np.ndarray, image_of: Callable[[str], np.ndarray]) -> PoseCheck:
-    """Compare each photograph with those of the nearest views at the points that both see.
+    """Find the views whose photographs contradict their poses.
 
-    The worst view is set aside and its neighbours are compared again, until the rest agree. In the end the views set
-    aside are compared with the rest once more.
+    Each photograph is compared with those of its nearest views at the points that both see. The worst view is set
+    aside, and the views that were compared with it are compared again without it. This is repeated until the remaining
+    views agree, or half of the views are set aside. In the first case each view that was set aside is compared with the
+    remaining views once more, and taken back if it agrees with them.
 
     Args:
-        cameras: undistorted views in the normalised frame.
-        points: [P, 3] sparse points or those of flow.
-        image_of: view name -> uint8 [H, W, 3].
+        cameras: cameras of undistorted views in the normalised frame.
+        points: [P, 3], sparse points, or points triangulated from optical flow.
+        image_of: function from a view's name to its picture, uint8 [H, W, 3].
     """
     points = points[:: max(1, -(-len(points) // POINTS))]
     cells = max(4, round((len(points) / DENSITY) ** 0.5))
@@ -100,13 +105,14 @@ def _is_low(margin: float | None) -> bool:
 
 @dataclass(frozen=True)
 class _View:
-    """The picture of a view in cells, and what it shows at the points.
+    """The detail of a view's picture, and its values at the points.
 
     Attributes:
+        camera: camera of the view.
         places: [P, 2] int, column and row of the cell that shows each point; valid where `seen`.
-        seen: [P] bool, the visible points.
-        detail: float32 [h, w], see `_detail`.
-        values: float32 [P], the detail at the points; 0 where they are not seen.
+        seen: [P] bool, True if the point is visible in the view.
+        detail: float32 [h, w], local contrast of the picture in cells, see `_detail`.
+        values: float32 [P], the detail at each point; 0 where not `seen`.
     """
 
     camera: Camera
@@ -117,6 +123,11 @@ class _View:
 
     @classmethod
     def of(cls, camera: Camera, points: np.ndarray, image: np.ndarray, cells: int) -> _View:
+        """Compute the detail of a picture, uint8 [H, W, 3], and its values at points [P, 3].
+
+        Args:
+            cells: number of squares along the picture's width in which the nearest point hides others.
+        """
         detail = _detail(image)
         height, width = detail.shape
         at = project(points, camera)[0] * (width / camera.width, height / camera.height)
@@ -128,26 +139,26 @@ class _View:
 
     @property
     def padded(self) -> tuple[int, int]:
-        """Rows and columns of the Fourier transforms, so that no shift wraps around."""
+        """The (rows, columns) of the Fourier transforms: twice the picture, so that shifts do not wrap around."""
         return 2 * self.detail.shape[0], 2 * self.detail.shape[1]
 
     @cached_property
     def spectra(self) -> list[np.ndarray]:
-        """Fourier transforms of the detail, of its square, and of the picture's area."""
+        """The Fourier transforms of the detail, of its square, and of an array of ones in the size of the picture."""
         pictures = (self.detail, self.detail**2, np.ones_like(self.detail))
         return [np.fft.rfft2(each, self.padded) for each in pictures]
 
     def distance(self, other: _View) -> float:
-        """How differently two cameras look: distance of their centres, plus the angle between their axes in radians."""
+        """Return the distance between the centres of two cameras, plus the angle between their axes in radians."""
         cosine = float(self.camera.world_to_camera[2, :3] @ other.camera.world_to_camera[2, :3])
         return float(np.linalg.norm(self.camera.center - other.camera.center) + np.arccos(np.clip(cosine, -1, 1)))
 
 
 def _detail(image: np.ndarray) -> np.ndarray:
-    """float32 [h, w]: local contrast of the brightness in cells, about -1 to 1.
+    """Return the detail of a picture, float32 [h, w] in cells: the local contrast of its brightness, about -1 to 1.
 
-    It is the brightness less its mean in a window, over its standard deviation there. So it does not depend on exposure
-    and shading, and is near 0 where the picture is plain.
+    The detail is the brightness minus its mean in a window, divided by its standard deviation there (plus `NOISE`). So
+    it does not depend on exposure and shading, and is near 0 where the picture is plain.
     """
     gray = to_gray(image)
     factor = LONGER_SIDE / max(gray.shape)
@@ -158,7 +169,7 @@ def _detail(image: np.ndarray) -> np.ndarray:
 
 
 def _nearest(view: _View, others: Collection[_View]) -> list[str]:
-    """Names of the views that look in the same direction and share points with this one, the nearest first."""
+    """Return the names of the views that share points and about the same direction with `view`, the nearest first."""
     axis = view.camera.world_to_camera[2, :3]
     others = [each for each in others if each is not view and each.camera.world_to_camera[2, :3] @ axis > TURN]
     shared = [each for each in others if (each.seen & view.seen).sum() >= LEAST_SHARED]
@@ -166,8 +177,15 @@ def _nearest(view: _View, others: Collection[_View]) -> list[str]:
 
 
 def _margin(view: _View, others: Sequence[_View]) -> float | None:
-    """The correlation at the view's pose less that at the best other shift, and a bonus where it is clear; None where
-    nothing can be said."""
+    """Return by how much a view's picture fits its pose better than the best other shift, or None if unknown.
+
+    This is the correlation at the pose, minus the best correlation at another shift. A correlation above `CLEAR` at the
+    pose adds 2 * `LEAST_MARGIN`. The result is None if there are too few neighbours or shared points, or if the
+    pictures are too plain.
+
+    Args:
+        others: the neighbours, whose detail at the points predicts that of `view`.
+    """
     if len(others) < LEAST_NEIGHBOURS:
         return None
     count = sum(each.seen & view.seen for each in others)
@@ -178,13 +196,21 @@ def _margin(view: _View, others: Sequence[_View]) -> float | None:
         return None
     correlation, shift = _correlations(view, view.places[known], expected)
     here, elsewhere = correlation[shift <= SAME].max(), correlation[shift > ELSEWHERE].max()
-    # A pattern that repeats, bricks or tiles, correlates as well one period on.
+    # Repeating patterns (bricks, tiles) correlate as well after a shift by one period; hence the bonus.
     return float(here - elsewhere + (2 * LEAST_MARGIN if here > CLEAR else 0))
 
 
 def _correlations(view: _View, places: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Correlation of `expected` [K] with the view's detail at the cells [K, 2], for every shift that keeps enough of
-    them in the picture; and the lengths of these shifts in cells."""
+    """Correlate predicted detail with a view's detail for every shift, by Fourier transforms.
+
+    Args:
+        places: [K, 2], columns and rows of the cells.
+        expected: [K], the detail predicted at these cells.
+
+    Returns:
+        [S] correlations for the S shifts that leave at least `LEAST_OVERLAP` of the cells in the picture; and [S]
+        lengths of these shifts in cells.
+    """
     templates = np.zeros((3, *view.padded))
     for template, weight in zip(templates, (expected, np.ones_like(expected), expected**2), strict=True):
         np.add.at(template, (places[:, 1], places[:, 0]), weight)
@@ -198,17 +224,18 @@ def _correlations(view: _View, places: np.ndarray, expected: np.ndarray) -> tupl
     return correlation[enough], np.hypot(rows[:, None], columns[None])[enough]
 
 
-# ---------------------------------------------------------------------------------------------- what follows from it
+# ---------------------------------------------------------------------------------------------- verdict
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What follows from a `PoseCheck`.
+    """The consequences of a `PoseCheck`: the views to leave out, and the messages to the user.
 
     Attributes:
-        outliers: training views to leave out of the scene, sorted.
-        suspects: views that contradict their poses and stay: test views, clean views, and all if too few would be left.
-        sentences: what the user should know, with the line of scene.yaml that decides otherwise.
+        outliers: names of the training views to leave out of the scene, sorted.
+        suspects: names of the views that contradict their poses but stay in the scene. These are test views and clean
+            views; and training views too, if too few would be left, or if at least half of the views contradict.
+        sentences: messages to the user. They suggest lines of scene.yaml that change the decision.
     """
 
     outliers: tuple[str, ...] = ()
@@ -216,7 +243,7 @@ class Verdict:
     sentences: tuple[str, ...] = ()
 
     def apply(self, scene: Scene) -> Scene:
-        """The scene without the outliers."""
+        """Return the scene without the cameras of the outliers, and with the names of the outliers and suspects."""
         return replace(
             scene,
             cameras={name: camera for name, camera in scene.cameras.items() if name not in self.outliers},
@@ -227,11 +254,11 @@ class Verdict:
 
 
 def judge(check: PoseCheck, scene: Scene, keep: Collection[str] = (), exclude: Sequence[str] = ()) -> Verdict:
-    """Decide which views to leave out, and what to tell the user.
+    """Decide which of the contradicting views are left out of the scene, and write the messages to the user.
 
     Args:
-        keep: views that the user wants to stay.
-        exclude: what scene.yaml excludes already, to be repeated in the line that the message suggests.
+        keep: names of views that scene.yaml keeps in any case.
+        exclude: names of views that scene.yaml excludes already; the suggested line repeats them.
     """
     wrong = [name for name in check.contradicting if name not in keep]
     if not wrong:
@@ -263,5 +290,5 @@ def judge(check: PoseCheck, scene: Scene, keep: Collection[str] = (), exclude: S
 
 
 def _yaml_line(key: str, named: Collection[str], names: Sequence[str]) -> str:
-    """The line of scene.yaml that names these views beside those that it names already."""
+    """Return the line of scene.yaml whose `key` names the views of `named` (its present value) and of `names`."""
     return f"`{key}: {json.dumps(sorted({*named, *names}), ensure_ascii=False)}`"

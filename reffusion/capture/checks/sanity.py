@@ -1,7 +1,7 @@
-"""Finds oddities in a capture: input that can be read, but is more likely a mistake than intended.
+"""Warns of masks and photographs that can be used, but are probably mistakes.
 
-PAPER leaves open: it takes masks, poses and photographs as given. The thresholds are loose: a warning should be worth a
-look, and nothing is refused.
+PAPER leaves open: it takes masks, poses and photographs as given. The thresholds are chosen so that a warning is
+seldom wrong. No input is refused.
 """
 
 from __future__ import annotations
@@ -16,22 +16,28 @@ from reffusion.geometry import pixel_rays, project, sample_nearest
 from reffusion.io.images import to_gray
 from reffusion.types import Camera, Scene
 
-LARGE = 0.5  # share of a picture: a mask that covers more is more often inverted than intended
-LOOKED_AT = 24  # number of masks, spread evenly, that each is compared with in 3D
-RAYS, DEPTHS = 64, 128  # pixels of a mask, and points along the ray of each: a small object is thin in a deep scene
-AGREE = 0.75  # share of the other masks that must contain a point for it to be the object
-SUPPORTED = 0.3  # share of a mask's pixels, under which it shows something else than the others
-BRIGHTER = 1.5  # ratio of brightness to the others from which a photograph is odd
-POINTS = 5000  # at most, at which photographs are compared
-LEAST_SEEN = 50  # points in a view, for anything to be said about it
+LARGE = 0.5  # share of a picture: a mask that covers more is probably inverted
+LOOKED_AT = 24  # largest number of masks, spread evenly, with which each mask is compared in 3D
+RAYS, DEPTHS = 64, 128  # pixels of a mask, and points on the ray of each; many, since the object is short on a ray
+AGREE = 0.75  # share of the other masks that must contain a point, so that it may be on the object
+SUPPORTED = 0.3  # share of a mask's pixels with such a point; a mask with less shows something else
+BRIGHTER = 1.5  # a photograph is odd if it is this many times as bright as the others, or as dark
+POINTS = 5000  # largest number of points at which photographs are compared
+LEAST_SEEN = 50  # points that must be visible in a view to judge it
 
 
 def find_odd_exposures(scene: Scene, image_of: Callable[[str], np.ndarray]) -> list[str]:
-    """A sentence for photographs much brighter or darker than the others.
+    """Return a warning about photographs that are much brighter or darker than the other photographs.
+
+    Brightness is compared at points that several views see.
 
     Args:
-        scene: undistorted, in the normalised frame; its points are sparse ones or those of flow, no random ones.
-        image_of: view name -> uint8 [H, W, 3].
+        scene: undistorted views in the normalised frame. Its points must be sparse points or points from optical flow,
+            not random points.
+        image_of: function from a view's name to its picture, uint8 [H, W, 3].
+
+    Returns:
+        A list with one sentence about all such photographs; empty if there are none, or too few points or views.
     """
     cameras = [scene.cameras[name] for name in (*scene.train, *scene.test) if name not in scene.suspects]
     points = scene.points[:: max(1, -(-len(scene.points) // POINTS))]
@@ -57,17 +63,22 @@ def find_odd_exposures(scene: Scene, image_of: Callable[[str], np.ndarray]) -> l
 
 
 def find_odd_masks(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
-    """Sentences for masks that cover most of their pictures, and for those that contradict the others in 3D.
+    """Return warnings about masks that cover most of their pictures, or that contradict other masks in 3D.
 
     Args:
         masks: view name -> bool [H, W], True = the object.
+
+    Returns:
+        Sentences for the user; empty if all masks are plausible.
     """
     return [*_warn_large(masks), *_warn_inconsistent(scene, masks)]
 
 
 def _warn_large(masks: Mapping[str, np.ndarray]) -> list[str]:
-    """Warn of masks that cover most of their pictures and of their borders; even an object seen from near leaves much
-    free."""
+    """Return a warning about masks that cover more than half of their pictures and of the pictures' borders.
+
+    Such masks are probably inverted: even an object close to the camera leaves most of the border free.
+    """
     shares = {name: float(mask.mean()) for name, mask in masks.items()}
     border = lambda mask: np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
     large = sorted(name for name, share in shares.items() if share > LARGE and border(masks[name]) > LARGE)
@@ -86,8 +97,11 @@ def _warn_large(masks: Mapping[str, np.ndarray]) -> list[str]:
 
 
 def _warn_inconsistent(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
-    """Warn of masks that show something else than the others: no point along the rays of their pixels is inside the
-    others."""
+    """Return warnings about masks that show something else than the other masks.
+
+    A pixel of a mask is supported if some point on its ray projects into most of the other masks (`AGREE`), among the
+    views whose pictures contain the point. A mask is odd if too few of its pixels are supported (`SUPPORTED`).
+    """
     names = [name for name in scene.train if name in masks and name not in scene.clean]
     marked = [name for name in names if masks[name].any()]
     if len(marked) < 3:
@@ -116,8 +130,15 @@ def _warn_inconsistent(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[st
 
 
 def _along_rays(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """[R, D, 3]: points behind pixels of the mask, evenly in disparity from the nearest to the farthest scene point
-    shown."""
+    """Return world points [R, D, 3] on the rays of R pixels of a mask, D points on each ray.
+
+    They are spaced evenly in disparity, over a range of depths somewhat larger than that of the scene's points in the
+    view.
+
+    Args:
+        mask: bool [H, W], not empty.
+        points: [P, 3], the scene's points.
+    """
     rows, columns = np.nonzero(mask)
     chosen = np.unique(np.linspace(0, len(rows) - 1, RAYS).astype(int))
     at, depth = project(points, camera)
@@ -132,11 +153,12 @@ def _along_rays(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndar
 
 
 def _brightness(camera: Camera, points: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """[P] the photograph's brightness where its pose projects the points; NaN where it does not show them."""
+    """Return [P], the smoothed brightness of a photograph at the projections of points [P, 3]; NaN if not visible."""
     gray = to_gray(image)
     return sample_visible(camera, points, cv2.blur(gray, (max(3, camera.width // 40),) * 2)[..., None])[:, 0]
 
 
 def _join_names(names: Iterable[str], most: int = 4) -> str:
+    """Return the names joined by commas; after `most` names, only the number of the remaining ones."""
     names = list(names)
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

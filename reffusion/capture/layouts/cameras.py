@@ -1,4 +1,4 @@
-"""Reads a capture's cameras without its photographs, for a scene that brings Gaussians whose renders stand for them."""
+"""Reads the cameras of a capture without photographs, for a scene of Gaussians whose renders replace photographs."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS
 
 FOLDERS = ("images", "images_2", "images_4", "images_8", "photos", "input")
-LEAST = 3  # cameras that are needed
+LEAST = 3  # smallest number of cameras
 
 
 def has_pictures(folder: Path, but: frozenset[str] = frozenset()) -> bool:
-    """Is there a photograph where a layout looks for one? `but`: names of pictures in the folder that are no
-    photographs."""
+    """Return whether a scene folder holds photographs, in the places where a layout looks for them.
+
+    Args:
+        but: names of files in the scene's own folder that are not photographs (references).
+    """
     if transforms.split_files(folder) and transforms.has_pictures(folder):
         return True
     beside = (path for path in folder.iterdir() if path.name not in but and not path.name.startswith("."))
@@ -24,11 +27,14 @@ def has_pictures(folder: Path, but: frozenset[str] = frozenset()) -> bool:
 
 
 def read(folder: Path) -> tuple[Poses, Path] | None:
-    """Lenses and poses, and the file they come from; None where the folder has neither transforms.json nor a COLMAP
-    model.
+    """Read the lenses and poses of a scene folder without photographs.
+
+    Returns:
+        The cameras, without points, and the transforms file or COLMAP model from which they were read; None if the
+        folder has neither.
 
     Raises:
-        BadInput: as for a capture with pictures; or there are fewer than three cameras.
+        BadInput: a file is wrong, as for a capture with pictures; or there are fewer than three cameras.
     """
     model = colmap.find_model(folder)
     if sources := transforms.split_files(folder):

@@ -1,4 +1,4 @@
-"""What every layout is read into, and what the readers share."""
+"""The data types into which every layout of a scene folder is read, and functions that its readers share."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ NO_POINTS: PointCloud = (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
 @dataclass(frozen=True)
 class Poses:
-    """Cameras in the scene's own frame.
+    """Cameras and sparse points in the scene's own frame.
 
     Attributes:
-        lenses: view name -> lens at the size of the view's picture file.
+        lenses: view name -> lens, at the size of the view's picture file (from structure from motion: of the reduced
+            picture).
         world_to_camera: view name -> [4, 4] float64, rigid; the camera looks along +z, x right, y down.
-        points, colors: [P, 3] float64 and uint8; P may be 0.
-        bounds: view name -> (near, far) depths; empty where the layout has none.
+        points, colors: [P, 3] float64 positions and [P, 3] uint8 colours of sparse points; P may be 0.
+        bounds: view name -> (near, far) depth; empty if the layout has none.
     """
 
     lenses: dict[str, Lens]
@@ -40,17 +41,19 @@ class Capture:
     """The contents of a scene folder.
 
     Attributes:
-        layout: llff, colmap, transforms or photos.
-        pictures: view name -> picture file, in the order of the files' paths; all of them have poses, if any has.
-        paths: name of a view, or of one that is left out -> the paths by which its mask may call it.
-        poses: None where structure from motion has to find them.
-        pose_source: the file the poses come from, for messages; None without poses.
-        label_folder: where masks (`label`) and test masks (`test_label`) are looked for: the pictures' folder, or that
-            of the same pictures at another size.
+        layout: "llff", "colmap", "transforms" or "photos".
+        pictures: view name -> picture file, sorted by path. Either all of them have poses, or none.
+        paths: name of a view, or path of a picture that is left out -> the paths by which its mask file may be named.
+            Pictures that are left out are listed so that their masks are not refused.
+        poses: cameras and sparse points; None if structure from motion has to find them.
+        pose_source: the file from which the poses were read, for messages; None without poses.
+        label_folder: the folder whose sub-folders `label` and `test_label` are searched for masks and test masks. It is
+            the folder of the pictures, or of the same pictures at another size.
         warnings: sentences for the user.
         test: names of the views that the layout itself holds out (Blender's transforms_test.json).
-        depth_maps: files that points may be made from.
-        ignore_masks: view name -> the mask that the layout names for it, black where training ignores the picture.
+        ignore_masks: view name -> the mask file that the layout names for the view. Such a mask is black where training
+            should ignore the picture.
+        depth_maps: files of depth maps from which points may be made.
     """
 
     layout: str
@@ -66,12 +69,15 @@ class Capture:
 
     @property
     def upright(self) -> bool:
-        """Are orientation tags obeyed? Poses that come along refer to the stored pixels instead."""
+        """True if EXIF orientation tags are obeyed, as for photographs without poses.
+
+        Poses that come with a capture refer to the stored pixels, so tags are ignored there.
+        """
         return self.layout == "photos"
 
 
 def find_pictures(folder: Path, nested: bool = False) -> dict[str, Path]:
-    """View name -> picture, in the order of their paths (`list_pictures`); empty where the folder does not exist.
+    """Return view name -> picture file in a folder, sorted by path (`list_pictures`); empty if there is no such folder.
 
     Raises:
         BadInput: two pictures have the same view name.
@@ -80,19 +86,36 @@ def find_pictures(folder: Path, nested: bool = False) -> dict[str, Path]:
 
 
 def has_pictures(folder: Path, nested: bool = False) -> bool:
+    """Return whether a folder holds pictures. `nested`: sub-folders count too, see `list_pictures`."""
     return bool(list_pictures(folder, nested))
 
 
 def relative_paths(folder: Path, pictures: dict[str, Path]) -> dict[str, tuple[str, ...]]:
-    """`Capture.paths` of pictures in a folder: their relative paths, and their views' names with the endings."""
+    """Return the `Capture.paths` of pictures in a folder.
+
+    For each view these are the picture's path relative to `folder`, and the view's name with the picture's ending.
+
+    Args:
+        pictures: view name -> picture file.
+    """
     below = {name: normalize_path(path.relative_to(folder).as_posix()) for name, path in pictures.items()}
     return {name: (path, name + Path(path).suffix) for name, path in below.items()}
 
 
 def find_image_folder(folder: Path, images: str | None, usual: tuple[str, ...]) -> Path:
-    """The named folder; else the first usual one that holds pictures, preferring one with a `label` folder inside.
+    """Return the folder of a scene's pictures.
 
-    Pictures may lie in sub-folders, except in those of the scene's own folder, which holds masks and more.
+    Without `images`, it is the first usual folder that holds pictures, or the first of these that has a sub-folder
+    `label` (masks). Pictures in sub-folders count, except in sub-folders of the scene's own folder ("."), which hold
+    masks and other files.
+
+    Args:
+        folder: the scene's folder.
+        images: folder of pictures that scene.yaml names, relative to the scene; None if not named.
+        usual: the layout's usual folders, in order of preference.
+
+    Raises:
+        BadInput: no usual folder holds pictures.
     """
     if images is not None:
         return folder / images
@@ -103,7 +126,7 @@ def find_image_folder(folder: Path, images: str | None, usual: tuple[str, ...]) 
 
 
 def lens_from_model(camera: ModelCamera, source: Path) -> Lens:
-    """`from_colmap`, for a camera in the file `source`."""
+    """Return the lens of a camera in COLMAP's file `source`. Raises BadInput if its camera model is not supported."""
     try:
         return from_colmap(camera.model, camera.width, camera.height, camera.params)
     except BadInput as error:
@@ -111,7 +134,7 @@ def lens_from_model(camera: ModelCamera, source: Path) -> Lens:
 
 
 def resize_lens(lens: Lens, picture: Path) -> Lens:
-    """The lens at the size of the picture file; BadInput where the two have different proportions."""
+    """Return the lens, resized to a picture file. Raises BadInput if the aspect ratios differ by more than 2%."""
     width, height = image_size(picture)
     if abs(width * lens.height - height * lens.width) > 0.02 * width * lens.height:
         raise BadInput(
@@ -122,7 +145,16 @@ def resize_lens(lens: Lens, picture: Path) -> Lens:
 
 
 def nearest_rigid(matrix: np.ndarray, name: str, source: Path) -> np.ndarray:
-    """[4, 4] with the nearest rotation; BadInput where the matrix is not finite, or mirrors, shears or scales."""
+    """Return a pose [4, 4] with its rotation part replaced by the nearest rotation.
+
+    Args:
+        matrix: [4, 4], a pose with rounding errors.
+        name, source: the view and the file of the pose, for messages.
+
+    Raises:
+        BadInput: the matrix is not finite, mirrors, stretches some axis by over 2% more than another (shears count
+            too), or scales to zero.
+    """
     if not np.isfinite(matrix).all():
         raise BadInput(f"{source}: the pose of '{name}' is not finite; remove the view or solve its pose again")
     u, stretch, v = np.linalg.svd(matrix[:3, :3])
@@ -134,12 +166,12 @@ def nearest_rigid(matrix: np.ndarray, name: str, source: Path) -> np.ndarray:
 
 
 def invert_pose(pose: np.ndarray) -> np.ndarray:
-    """Inverse of a rigid pose [4, 4]."""
+    """Return the inverse of a rigid pose [4, 4]."""
     result = np.eye(4)
     result[:3, :3], result[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
     return result
 
 
 def count_message(what: str, names: list[str]) -> str | None:
-    """`17 of the ... : a, b, c`, or None for no names."""
+    """Return a message such as `2 pictures are left out: a, b`, with `what` after the number; None for no names."""
     return f"{len(names)} {what}: {', '.join(names)}" if names else None

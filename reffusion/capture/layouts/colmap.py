@@ -1,4 +1,4 @@
-"""Reads a COLMAP model and its pictures."""
+"""Reads a capture in the layout "colmap": a COLMAP model (cameras, images, points3D) and its pictures."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from reffusion.io.colmap import ModelImage, is_model, load_cameras, load_images,
 from reffusion.io.files import BadInput
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap", ".")
-RENAMED = re.compile(r"image\d+")  # what LLFF calls its smaller copies, in the order of the originals' names
+RENAMED = re.compile(r"image\d+")  # names of LLFF's reduced copies, numbered in the order of the originals' names
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder of the model with most images, of equal ones the first; None where there is no model."""
+    """Return the folder of the scene's COLMAP model with the most images, the first of equals; None without a model."""
     return max(found, key=found.__getitem__) if (found := _count_images(folder)) else None
 
 
 def other_models(folder: Path, model: Path) -> str | None:
-    """A sentence about the models that are not used, or None."""
+    """Return a message to the user about the COLMAP models that are not used; None if `model` is the only one."""
     found = _count_images(folder)
     others = [f"{_relative(folder, path)} ({count})" for path, count in found.items() if path != model]
     if not others:
@@ -44,7 +44,11 @@ def _relative(folder: Path, path: Path) -> str:
 
 
 def _count_images(folder: Path) -> dict[Path, int]:
-    """Model folder -> number of images. A model that is written as .bin and .txt, or found twice, counts once."""
+    """Return folder of a model -> number of its images, for all COLMAP models of a scene.
+
+    If there is only one model, its images are not counted, and the number is 0. A model that is stored both as .bin and
+    as .txt appears once.
+    """
     numbered = sorted(path for place in ("sparse", "colmap/sparse") for path in (folder / place).glob("[0-9]*"))
     places = dict.fromkeys([*(folder / name for name in MODEL_FOLDERS), *numbered])
     models = [place for place in places if is_model(place)]
@@ -54,14 +58,21 @@ def _count_images(folder: Path) -> dict[Path, int]:
 
 
 def _files(model: Path) -> tuple[Path, Path]:
-    """The files of a model's images and cameras; it is one (`is_model`), so both exist."""
+    """Return the files of images and of cameras of a model; both exist in a model (`is_model`)."""
     images, cameras = model_file(model, "images"), model_file(model, "cameras")
     assert images is not None and cameras is not None
     return images, cameras
 
 
 def read(folder: Path, images: str | None) -> Capture:
-    """Read a scene in this layout, see `load_capture`."""
+    """Read a scene folder with a COLMAP model.
+
+    Args:
+        images: folder of pictures, relative to the scene; None for the usual folders.
+
+    Raises:
+        BadInput: there is no model; or as for `capture_from_model`.
+    """
     model = find_model(folder)
     if model is None:
         raise BadInput(f"{folder}: no COLMAP model (cameras and images, .bin or .txt) in {', '.join(MODEL_FOLDERS)}")
@@ -70,9 +81,22 @@ def read(folder: Path, images: str | None) -> Capture:
 
 
 def capture_from_model(folder: Path, model: Path, image_folder: Path, layout: str, label_folder: Path) -> Capture:
-    """Pair the pictures with the model's images by their paths (`pair_pictures`).
+    """Return the capture of a COLMAP model whose images are paired with picture files.
 
-    Only LLFF's renamed copies, `image000.png` and so on, are paired by order, with a warning.
+    Pairs are found by paths (`pair_pictures`). LLFF's renamed copies (`image000.png` and so on) are paired by order,
+    with a warning, if there are as many as images in the model and none has an image's name. Images without a picture
+    and pictures without an image are left out, with a warning.
+
+    Args:
+        folder: the scene's folder.
+        model: the model's folder.
+        image_folder: the folder of the pictures.
+        layout, label_folder: see `Capture`.
+
+    Raises:
+        BadInput: no image has a picture; a camera is missing, its model is not supported, or it has another aspect
+            ratio than the picture; two images have the same name; or pictures that are paired by order do not show the
+            model's points.
     """
     source, camera_file = _files(model)
     images, identities = _images_by_name(source)
@@ -121,7 +145,11 @@ def capture_from_model(folder: Path, model: Path, image_folder: Path, layout: st
 
 
 def _images_by_name(source: Path) -> tuple[dict[str, ModelImage], dict[str, int]]:
-    """Name -> image, and name -> image id; BadInput where a name comes twice."""
+    """Read a model's file of images. Returns name -> image, and name -> image id.
+
+    Raises:
+        BadInput: two images have the same name.
+    """
     images: dict[str, ModelImage] = {}
     identities: dict[str, int] = {}
     for identity, image in load_images(source).items():
@@ -136,7 +164,7 @@ def _stem(path: str) -> str:
 
 
 def _pairing_error(image_folder: Path, images: list[str], files: list[str]) -> str:
-    """Why no image of a model could be paired, and what would help."""
+    """Return the part of a message that says why no image of a model has a picture, and what would help."""
     if not files:
         return f"none of its images is in {image_folder}; name their folder as `images` in scene.yaml"
     ours, theirs = (", ".join(sorted(names)[:3]) for names in (files, images))
@@ -149,7 +177,15 @@ def _pairing_error(image_folder: Path, images: list[str], files: list[str]) -> s
 def _points(
     model: Path, poses: Poses, pictures: dict[str, Path], identities: dict[str, int]
 ) -> tuple[PointCloud, str | None]:
-    """The model's points, none where they are not in the frame of its cameras; and in that case a sentence about it."""
+    """Return a model's points if they are in the frame of its cameras, else no points (`keep_points_in_frame`).
+
+    Args:
+        pictures: view name -> picture file.
+        identities: view name -> the model's image id.
+
+    Returns:
+        The points; and a message to the user if they were refused, else None.
+    """
     file = model_file(model, "points3D")
     if file is None:
         return NO_POINTS, None
@@ -161,7 +197,11 @@ def _points(
 
 
 def read_cameras(model: Path) -> Poses:
-    """Lenses and poses alone, of a model whose pictures are missing."""
+    """Read the lenses and poses of a model without its pictures. The result has no points.
+
+    Raises:
+        BadInput: an image's camera is missing in the model.
+    """
     source, camera_file = _files(model)
     images, _ = _images_by_name(source)
     cameras = load_cameras(camera_file)
@@ -173,10 +213,15 @@ def read_cameras(model: Path) -> Poses:
 
 
 def _pictures_of_model(folder: Path, image_folder: Path, names: list[str]) -> list[str]:
-    """Paths of the pictures in a folder that a model may mean.
+    """Return the paths, relative to `image_folder`, of the pictures that a model's images may mean.
 
-    Sub-folders count where the model's names have folders, or the folder itself holds no pictures. In the scene's own
-    folder only those of their pictures count that the model names exactly.
+    Pictures in sub-folders are included if the model's names contain folders, or if the folder itself holds no
+    pictures. If the folder is the scene's own folder, only those pictures in sub-folders are included whose paths the
+    model names exactly.
+
+    Args:
+        folder: the scene's folder.
+        names: names of the model's images.
     """
     loose = list_pictures(image_folder)
     in_folders = any("/" in normalize_path(name) for name in names)

@@ -1,4 +1,4 @@
-"""Makes points from the depth maps that a capture names for its frames, where it brings no points."""
+"""Makes points from depth maps of a capture's views, for captures without sparse points."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from reffusion.capture.lens import Lens, to_directions
 from reffusion.io.depth_maps import load_depth
 from reffusion.io.images import load_thumbnail
 
-FRAMES = 16  # depth maps that are read, spread evenly
-POINTS = 10_000  # at most, that are made from them
+FRAMES = 16  # largest number of depth maps that are read, spread evenly over the views
+POINTS = 10_000  # points for which the grid is chosen; rounding its spacing gives up to about four times as many
 
 
 def points_from_depth(
@@ -23,11 +23,18 @@ def points_from_depth(
     lenses: Mapping[str, Lens],
     world_to_camera: Mapping[str, np.ndarray],
 ) -> PointCloud:
-    """Unproject a grid of pixels and colour them by their pictures: positions [P, 3] and colours [P, 3].
+    """Unproject a grid of pixels of up to `FRAMES` depth maps, and colour the points by the views' pictures.
 
     Args:
-        depths: view name -> depth map, depth along the camera's axis.
-        scale: units of the scene per 1 in a map of integers; maps of floats are in the scene's units.
+        depths: view name -> file of its depth map; depth is along the camera's axis.
+        scale: length in the scene's units of the number 1 in a depth map of integers (a picture). Depth maps of floats
+            (.npy, .exr) are in the scene's units.
+        pictures: view name -> picture file.
+        lenses: view name -> lens, at any size.
+        world_to_camera: view name -> pose [4, 4].
+
+    Returns:
+        Positions [P, 3] in the scene's frame and colours uint8 [P, 3].
     """
     names = sorted(depths)[:: -(-len(depths) // FRAMES)] if depths else []
     positions, colors = [NO_POINTS[0]], [NO_POINTS[1]]

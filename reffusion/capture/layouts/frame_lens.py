@@ -1,4 +1,4 @@
-"""Lenses from the frames of transforms.json."""
+"""Reads lenses from the frames of transforms.json."""
 
 from __future__ import annotations
 
@@ -29,17 +29,25 @@ MODELS = (
 
 
 def load_frame_lens(values: dict[str, Any], picture: Path, source: Path) -> Lens:
-    """`frame_lens` at the size of the frame's picture file."""
+    """Return a frame's lens, resized to the frame's picture file (see `frame_lens` and `resize_lens`).
+
+    Raises:
+        BadInput: the frame's keys are wrong, or the picture's aspect ratio is another than that of the keys w and h.
+    """
     return resize_lens(frame_lens(values, picture, source, image_size(picture)), picture)
 
 
 def frame_lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[int, int]) -> Lens:
-    """The lens that a frame's keys describe.
+    """Return the lens that the keys of a frame describe (fl_x or camera_angle_x, cx, k1, camera_model ...).
 
     Args:
-        values: the frame's keys over the file's.
-        picture, source: for messages.
-        size: (width, height) where w and h are missing.
+        values: the keys of the frame, together with the keys of the whole file that the frame does not have.
+        picture, source: the frame's picture and the transforms file, for messages.
+        size: (width, height) to use if the keys w and h are missing.
+
+    Raises:
+        BadInput: a value is no finite number, the focal length is missing, a size or focal length is not positive, or
+            the camera model is not supported.
     """
     lens = _lens(values, picture, source, size)
     if min(lens.fx, lens.fy) <= 0:
@@ -50,7 +58,15 @@ def frame_lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[
 
 
 def read_number(values: dict[str, Any], key: str, default: float, picture: Path, source: Path) -> float:
-    """A number of a frame; BadInput where it is no number, or not finite."""
+    """Return the number under a key of a frame, or `default` if the key is missing.
+
+    Args:
+        values: the keys of the frame.
+        picture, source: the frame's picture and the transforms file, for messages.
+
+    Raises:
+        BadInput: the value is no number, or not below 1e12 in size.
+    """
     value = values.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
         raise BadInput(f"{source}: {key} = {shorten(value)} of '{picture.name}' is no finite number")
@@ -58,6 +74,7 @@ def read_number(values: dict[str, Any], key: str, default: float, picture: Path,
 
 
 def _lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[int, int]) -> Lens:
+    """Return `frame_lens`, before sizes and focal lengths are checked to be positive."""
     number = lambda key, default=0.0: read_number(values, key, default, picture, source)
     width, height = number("w", size[0]), number("h", size[1])
     fx = _focal_length(values, "x", width, number)
@@ -87,7 +104,16 @@ def _lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[int, 
 
 
 def _focal_length(values: dict[str, Any], axis: str, extent: float, number: Callable[..., float]) -> float | None:
-    """Focal length in px along one axis of `extent` px, from fl_ or camera_angle_; None where both are missing."""
+    """Return the focal length in pixels along one axis, from the key fl_<axis>, else from camera_angle_<axis>.
+
+    Args:
+        axis: "x" or "y".
+        extent: size of the picture along the axis in pixels.
+        number: function from a key to its value.
+
+    Returns:
+        None if both keys are missing; 0 if the angle is not between 0 and pi.
+    """
     if f"fl_{axis}" in values:
         return number(f"fl_{axis}")
     if f"camera_angle_{axis}" in values:
@@ -97,7 +123,7 @@ def _focal_length(values: dict[str, Any], axis: str, extent: float, number: Call
 
 
 def _strip_zeros(coefficients: list[float]) -> tuple[float, ...]:
-    """The coefficients without trailing zeros."""
+    """Return the coefficients without trailing zeros."""
     while coefficients and coefficients[-1] == 0.0:
         coefficients = coefficients[:-1]
     return tuple(coefficients)

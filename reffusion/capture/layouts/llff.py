@@ -1,7 +1,8 @@
-"""Reads LLFF's poses_bounds.npy, as in SPIn-NeRF's scenes. A COLMAP model beside it is preferred, or helps if
-incomplete.
+"""Reads a capture in the layout "llff": LLFF's poses_bounds.npy, as in SPIn-NeRF's scenes.
 
-The same pictures lie there in several sizes, and the masks beside one of them; in SPIn-NeRF beside those of a quarter.
+If the folder has a COLMAP model with images, poses are read from the model instead. A *partial model* without images
+still gives the lens and the points. The folder holds the same pictures in several sizes, and the masks beside one of
+these sizes (in SPIn-NeRF's scenes beside the quarter size).
 """
 
 from __future__ import annotations
@@ -36,12 +37,23 @@ USUAL = ("images_4", "images_2", "images_8", "images")
 
 
 def read(folder: Path, images: str | None, longest: int, references: frozenset[Path] = frozenset()) -> Capture:
-    """Read a scene in this layout, see `load_capture`."""
+    """Read a scene folder in this layout.
+
+    Args:
+        images: folder of pictures, relative to the scene; None to choose a size of the usual folders.
+        longest: requested longer side of the pictures in pixels, see `_choose_image_folder`.
+        references: files of references (inpainted views), which are not views. They are left out if the numbers of
+            pictures and poses differ.
+
+    Raises:
+        BadInput: there is neither poses_bounds.npy nor a COLMAP model; the numbers of poses and pictures differ; or a
+            pose is wrong.
+    """
     source = folder / "poses_bounds.npy"
     label_folder = _label_folder(folder, images)
     image_folder, warnings = (folder / images, []) if images else _choose_image_folder(folder, label_folder, longest)
     model = find_model(folder)
-    if model is not None:  # exact poses, the lens's distortion and the points
+    if model is not None:  # with its exact poses, distortion and points
         found = capture_from_model(folder, model, image_folder, "llff", label_folder)
         return replace(found, warnings=(*warnings, *found.warnings))
     if not is_file(source):
@@ -75,7 +87,11 @@ def read(folder: Path, images: str | None, longest: int, references: frozenset[P
 
 
 def _label_folder(folder: Path, images: str | None) -> Path:
-    """The named folder of pictures if it holds masks, else the usual one that does."""
+    """Return the folder of pictures that has a sub-folder `label` (masks).
+
+    `images` (the folder that scene.yaml names) is preferred, then the usual folders. If none has masks, the result is
+    the folder of pictures that `find_image_folder` returns.
+    """
     if images and (folder / images / "label").is_dir():
         return folder / images
     labelled = [folder / name for name in USUAL if (folder / name / "label").is_dir()]
@@ -83,9 +99,16 @@ def _label_folder(folder: Path, images: str | None) -> Path:
 
 
 def _choose_image_folder(folder: Path, label_folder: Path, longest: int) -> tuple[Path, list[str]]:
-    """The smallest size of the pictures that is `longest` px or more, else the largest; and warnings.
+    """Choose among folders that hold the same pictures in several sizes.
 
-    Only folders that hold all the pictures of the folder with the masks, under the same names, count as sizes of them.
+    The smallest size whose longer side has at least `longest` px is chosen, else the largest size. A folder counts as a
+    size of the pictures only if it holds all pictures of `label_folder` under the same names.
+
+    Args:
+        label_folder: the folder of pictures that has masks.
+
+    Returns:
+        The folder; and warnings about folders that do not count, if no size is large enough.
     """
     names, sizes, other = find_pictures(label_folder).keys(), {}, []
     for place in dict.fromkeys([label_folder, *(folder / name for name in USUAL)]):
@@ -103,7 +126,15 @@ def _choose_image_folder(folder: Path, label_folder: Path, longest: int) -> tupl
 
 
 def _load_poses_bounds(source: Path) -> np.ndarray:
-    """[V, 17] float64, checked."""
+    """Read poses_bounds.npy as [V, 17] float64.
+
+    A row holds a 3x5 matrix (the camera-to-world pose, and a column of height, width and focal length), then near and
+    far depth.
+
+    Raises:
+        BadInput: the array is not [V, 17] or not of finite numbers; sizes, focal lengths or bounds are not positive; or
+            far is not greater than near.
+    """
     rows = load_array(source)
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise BadInput(f"{source}: {list(rows.shape)}, expected [views, 17] as LLFF writes it")
@@ -121,7 +152,17 @@ def _load_poses_bounds(source: Path) -> np.ndarray:
 def _lens_of_partial_model(
     model: Path, lenses: dict[str, Lens], pictures: dict[str, Path], warnings: list[str]
 ) -> dict[str, Lens]:
-    """The lens of a model without images, where it has a single camera that agrees with poses_bounds.npy."""
+    """Return the lenses with distortion from a partial model (COLMAP files without images), or `lenses` as they are.
+
+    The partial model's lens is used if it has a single camera, whose focal length agrees with poses_bounds.npy within
+    2%.
+
+    Args:
+        model: folder of the partial model, which may be missing.
+        lenses: view name -> lens from poses_bounds.npy.
+        pictures: view name -> picture file.
+        warnings: a warning is appended if the focal lengths differ.
+    """
     file = model_file(model, "cameras") if model.is_dir() else None
     cameras = list(load_cameras(file).values()) if file else []
     if file is None or len(cameras) != 1:
@@ -142,11 +183,20 @@ def _points_of_partial_model(
     bounds: dict[str, tuple[float, float]],
     warnings: list[str],
 ) -> PointCloud:
-    """The points of a model without images, where they are in the frame of the poses; else none.
+    """Return the points of a partial model (COLMAP files without images) if they are in the frame of the poses.
 
-    If as many images observe the points as there are poses, tracks decide: 95% of the observations must lie in front of
-    and inside the view that made them, with its views taken in order of their ids. Otherwise at least a fifth of the
-    points must lie inside the picture of the median view and, half of those, between near and far.
+    If the tracks name as many images as there are poses, image ids in ascending order stand for the views in order of
+    their names. Then 95% of the observed points must lie inside the picture of the median view. Otherwise at least a
+    fifth of all points must lie inside the picture of the median view; a view counts only if half of its points lie
+    about between its near and far depth.
+
+    Args:
+        model: folder of the partial model, which may be missing.
+        lenses, poses, bounds: view name -> lens, world-to-camera pose [4, 4], and (near, far) depth.
+        warnings: a warning is appended if the points are not in the frame.
+
+    Returns:
+        Positions and colours; no points if the model has none or they are not in the frame.
     """
     file = model_file(model, "points3D") if model.is_dir() else None
     if file is None:

@@ -1,4 +1,7 @@
-"""Finds the masks that a scene brings: where they lie, which view each belongs to, and which are of the same object."""
+"""Finds the masks in a scene folder: their files, the view of each mask, and the object that it marks.
+
+Masks may distinguish between several objects: each object then has a folder of masks, which is named like the object.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from reffusion.io.images import ENDINGS, WHITE, MaskValues
 from reffusion.params.capture import MaskSpec
 
 NONE = "none"
-USUAL = ("masks", "mask", "label")  # folders of the scene, tried after `label` inside the folder of pictures
+USUAL = ("masks", "mask", "label")  # usual folders, searched after `label` in the folder of pictures
 
 
 @dataclass(frozen=True)
@@ -21,8 +24,9 @@ class FoundMasks:
     """The masks of a scene.
 
     Attributes:
-        files: object -> view -> mask; "" is the object of masks that tell no objects apart. Empty without masks.
-        values: which pixel values are the object.
+        files: object -> view -> mask file. The object is "" if the masks do not distinguish between objects. Empty if
+            the scene has no masks.
+        values: the pixel values that mark the object.
         warning: a sentence for the user, or None.
     """
 
@@ -32,14 +36,19 @@ class FoundMasks:
 
 
 def find_masks(folder: Path, capture: Capture, spec: str | MaskSpec | None, optional: bool) -> FoundMasks:
-    """Find the masks of a scene, and check that each has its picture.
+    """Find the masks of a scene, and check that each mask belongs to a picture.
+
+    If no folder is named, masks are taken from the first of these places that has some: `label` in the folder of
+    pictures, the usual folders, masks beside their pictures (`A_mask.png` beside `A.png`), the files that the layout
+    names (`Capture.ignore_masks`).
 
     Args:
-        spec: the parameter `masks` (`reffusion.params.capture`).
-        optional: the scene may lack masks.
+        spec: the key `masks` of scene.yaml (`reffusion.params.capture`): a folder, optionally with the numbers that
+            mark the object; "none" for no masks; None to search.
+        optional: True if a scene without masks is no error.
 
     Raises:
-        BadInput: naming the file or folder and the remedy.
+        BadInput: there are no masks, or a mask is wrong; the message names the file or folder and the remedy.
     """
     named = spec if isinstance(spec, MaskSpec) else MaskSpec(folder=spec)
     if named.folder is not None and named.folder.lower() == NONE:
@@ -74,13 +83,17 @@ def find_masks(folder: Path, capture: Capture, spec: str | MaskSpec | None, opti
 
 
 def _pictures_folder(capture: Capture) -> Path | None:
-    """The folder that all pictures lie in, or None."""
+    """Return the folder that holds all pictures of a capture; None if they lie in several folders."""
     parents = {path.parent for path in capture.pictures.values()}
     return parents.pop() if len(parents) == 1 else None
 
 
 def _mask_paths(place: Path, capture: Capture) -> list[str]:
-    """Paths of the masks in a folder. If photographs lie there too, only those called `A_mask.png` beside `A.png`."""
+    """Return the paths of the masks in a folder and its sub-folders, sorted, relative to the folder.
+
+    All pictures in the folder are masks, unless it holds photographs of the capture. Then only files such as
+    `A_mask.png` beside `A.png` are masks.
+    """
     if not place.is_dir():
         return []
     found = sorted(
@@ -95,13 +108,18 @@ def _mask_paths(place: Path, capture: Capture) -> list[str]:
 
 
 def group_by_object(place: Path, files: Collection[str], capture: Capture) -> dict[str, dict[str, Path]]:
-    """Object -> view -> mask of the files in a folder.
+    """Return object -> view -> mask file, for the masks in a folder.
 
-    Sub-folders are objects if a view has masks in several of them, or if there is only one sub-folder. If each view has
-    a mask in exactly one sub-folder, as for pictures that lie in folders themselves, all masks are of one object.
+    Sub-folders are objects if a view has masks in several of them, or if there is only one sub-folder. All masks are of
+    one object, called "", if there are no sub-folders; if each view has a mask in only one of several sub-folders; or
+    if the pictures lie in sub-folders of the same names.
+
+    Args:
+        place: the folder.
+        files: paths of the masks, relative to the folder.
 
     Raises:
-        BadInput: a mask belongs to no picture, or two to one; masks lie beside folders of masks.
+        BadInput: a mask belongs to no picture; two masks belong to one picture; or masks lie beside folders of masks.
     """
     folders = {PurePosixPath(path).parts[0] for path in files if "/" in path}
     if not folders or _are_picture_folders(folders, capture):
@@ -122,16 +140,21 @@ def group_by_object(place: Path, files: Collection[str], capture: Capture) -> di
 
 
 def _are_picture_folders(folders: Collection[str], capture: Capture) -> bool:
-    """Are these all folders that pictures lie in?"""
+    """Return whether all these folder names also occur in the paths of the capture's pictures."""
     ours = {part for paths in capture.paths.values() for path in paths for part in PurePosixPath(path).parent.parts}
     return set(folders) <= ours
 
 
 def match_masks(place: Path, files: Collection[str], capture: Capture, strict: bool = True) -> dict[str, str]:
-    """Mask -> the view it belongs to, or the picture that is left out.
+    """Return mask -> the view to which it belongs, or the path of a left-out picture to which it belongs.
+
+    Args:
+        place: the folder of the masks.
+        files: paths of the masks, relative to the folder.
+        strict: True to refuse masks that belong to no picture; False to leave them out of the result.
 
     Raises:
-        BadInput: with `strict`, a mask belongs to none.
+        BadInput: `strict`, and a mask belongs to no picture, or not to a single one.
     """
     everything = {name: (name, *paths) for name, paths in capture.paths.items()}
     found = pair_masks(files, everything)
@@ -151,7 +174,15 @@ def match_masks(place: Path, files: Collection[str], capture: Capture, strict: b
 
 
 def _assign_masks(place: Path, views: Mapping[str, str], capture: Capture) -> dict[str, Path]:
-    """View -> mask, sorted; BadInput where a view has two."""
+    """Return view -> mask file, sorted by view. Masks of left-out pictures are dropped.
+
+    Args:
+        place: the folder of the masks.
+        views: mask, relative to the folder -> its view (`match_masks`).
+
+    Raises:
+        BadInput: a view has two masks.
+    """
     result: dict[str, Path] = {}
     for path, view in sorted(views.items()):
         if view in result:

@@ -1,4 +1,4 @@
-"""Reads photographs without poses, for structure from motion."""
+"""Reads a capture in the layout "photos": photographs without poses, for structure from motion."""
 
 from __future__ import annotations
 
@@ -9,12 +9,19 @@ from reffusion.io.images import image_size
 
 
 def read(folder: Path, images: str | None, references: frozenset[Path] = frozenset()) -> Capture:
-    """Read a scene in this layout, see `load_capture`. Sizes may differ, so a phone may be held both ways. References
-    among the photographs are no views."""
+    """Read a scene folder that holds photographs only. Their sizes may differ, as in portrait and landscape.
+
+    Args:
+        images: folder of pictures, relative to the scene; None for the usual folders.
+        references: files of references (inpainted views). They may lie among the photographs, but are not views.
+
+    Raises:
+        BadInput: there are no pictures, two share a view name, or one is unreadable.
+    """
     image_folder = find_image_folder(folder, images, ("images", "photos", "input", "."))
     found = find_pictures(image_folder, nested=not has_pictures(image_folder))
     pictures = {name: path for name, path in found.items() if path not in references}
     for path in pictures.values():
-        image_size(path)  # an unreadable one is refused here, before any work
+        image_size(path)  # raises BadInput for an unreadable picture now, before long computations
     paths = relative_paths(image_folder, pictures)
     return Capture("photos", pictures, paths, None, None, image_folder, ())

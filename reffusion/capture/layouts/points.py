@@ -1,7 +1,8 @@
-"""Tests whether sparse points are in the frame of the cameras, and of their pictures.
+"""Tests whether sparse points are in the same frame as the cameras, and whether pictures belong to their poses.
 
-People replace the points of a model by another cloud, or the order of its pictures is lost. Where geometry cannot tell
-(a cloud of another scale around the same middle), colours can: the views of a point show its colour.
+Users replace the points of a model by another point cloud, or lose the order of its pictures. Geometry alone does not
+reveal every such mistake, for example a cloud of another scale around the same middle. Colours do: at a point's
+projection, a picture shows the point's colour.
 """
 
 from __future__ import annotations
@@ -17,25 +18,37 @@ from reffusion.capture.lens import Lens, to_pixels
 from reffusion.io.colmap import ModelPoints
 from reffusion.io.images import load_thumbnail
 
-INSIDE = 0.02  # share of the points that the median view must show
-FARTHEST = 100.0  # times the cameras' distance from their middle: points further away show no parallax
-TRACKED = 0.9  # share of the observations that must lie inside the view that made them
-VIEWS, POINTS = 8, 8000  # number of views and points for comparing colours, spread evenly
-SIDE = 320  # px, the longer side of the pictures that colours are read from
-LEAST_POINTS = 50  # in a view
-LEAST_CONTRAST = 6.0  # levels of 255: standard deviation, of points and of picture, from which they can be compared
-CELLS, NEARLY = 40, 1.1  # cells along a side; times the nearest depth of a cell, up to which points are visible
-# Median correlation under which colours contradict the frame. Right clouds of five captures have .38 to .86; those that
-# were scaled by 2, turned, mirrored or moved have up to .31.
+INSIDE = 0.02  # share of the points that must lie inside the picture of the median view
+FARTHEST = 100.0  # times the largest distance of a camera from the cameras' mean: farther points have no parallax
+TRACKED = 0.9  # share of the observations whose points must lie inside the observing view
+VIEWS, POINTS = 8, 8000  # about how many views and points, spread evenly, are used to compare colours
+SIDE = 320  # px, longer side of the reduced pictures from which colours are read
+LEAST_POINTS = 50  # visible points that a view needs for the comparison
+LEAST_CONTRAST = 6.0  # levels of 255: smallest standard deviation of the points' brightness, and of the picture's
+CELLS, NEARLY = 40, 1.1  # cells along each side; points up to this many times the nearest depth of a cell are visible
+# Median correlation, below which colours contradict the frame. Right point clouds of five captures have .38 to .86; the
+# same clouds scaled by 2, turned, mirrored or moved have up to .31.
 CORRELATED = 0.25
 GREY = np.full(3, 1 / 3)  # weights of red, green and blue
-BETTER = 0.02  # by how much another view's points must fit a picture better than its own
+BETTER = 0.02  # a picture contradicts its pose if the correlation at another view's pose is higher by more than this
 
 
 def keep_points_in_frame(
     path: Path, points: PointCloud, poses: Poses, pictures: Mapping[str, Path]
 ) -> tuple[PointCloud, str | None]:
-    """The points, none where they are not in the frame of the poses; and in that case a sentence about it."""
+    """Return the points if they are in the frame of the poses, else no points.
+
+    The points are refused if too few lie inside the pictures, if they are very far away, or if the pictures do not show
+    their colours. Points that are not finite are dropped.
+
+    Args:
+        path: file of the points, for the message.
+        points: positions [P, 3] and colours [P, 3].
+        pictures: view name -> picture file.
+
+    Returns:
+        The points; and a message to the user if they were refused, else None.
+    """
     finite = np.isfinite(points[0]).all(axis=1)
     positions, colors = points[0][finite], points[1][finite]
     refused = NO_POINTS, f"{path}: its points are not in the frame of the cameras and are not used"
@@ -58,10 +71,13 @@ def keep_points_in_frame(
 
 
 def are_tracks_inside(points: ModelPoints, poses: Mapping[int, tuple[Lens, np.ndarray]]) -> bool:
-    """Do the points lie in front of and inside the images that their tracks name? True where no tracks are known.
+    """Return whether at least 90% of the observations (`TRACKED`) have a point inside the observing image.
+
+    The result is True if the model has no tracks.
 
     Args:
-        poses: image id -> its lens and [4, 4] world-to-camera.
+        points: points and tracks of a COLMAP model.
+        poses: image id -> its lens and its world-to-camera pose [4, 4].
     """
     inside = seen = 0
     for identity, (lens, pose) in poses.items():
@@ -74,10 +90,14 @@ def are_tracks_inside(points: ModelPoints, poses: Mapping[int, tuple[Lens, np.nd
 def contradicts_order(
     pictures: Sequence[Path], lenses: Sequence[Lens], poses: Sequence[np.ndarray], points: PointCloud
 ) -> bool:
-    """Do most of the pictures show the points where another view's pose projects them, rather than their own?
+    """Return whether pictures seem to be in the wrong order: most fit another view's pose better than their own.
+
+    A picture fits a pose if it shows the points' colours at their projections (`correlate_colors`). At most `VIEWS`
+    pictures, spread evenly, are tested with the poses of all views. The result is False if no picture can be tested.
 
     Args:
-        pictures, lenses, poses: view k has pictures[k], lenses[k] and the [4, 4] world-to-camera poses[k].
+        pictures, lenses, poses: view k has pictures[k], lenses[k] and the world-to-camera pose poses[k], [4, 4].
+        points: positions [P, 3] and colours [P, 3].
     """
     if not _has_contrast(points[1] @ GREY):
         return False
@@ -96,11 +116,17 @@ def contradicts_order(
 def correlate_colors(
     grey: np.ndarray, lens: Lens, pose: np.ndarray, positions: np.ndarray, colors: np.ndarray
 ) -> float:
-    """Correlation of the points' brightness with a picture's at their projections; NaN with too few points or contrast.
+    """Correlate the brightness of points with that of a picture at the points' projections.
 
     Args:
-        grey: [H, W] of any size. lens: of the same view at any size. pose: [4, 4] world-to-camera.
-        positions: [P, 3]. colors: uint8 [P, 3].
+        grey: [H, W], brightness of the picture, at any size.
+        lens: lens of the view, at any size.
+        pose: [4, 4], world-to-camera pose of the view.
+        positions: [P, 3].
+        colors: uint8 [P, 3].
+
+    Returns:
+        The correlation over the visible points, in [-1, 1]; NaN if there are too few points or too little contrast.
     """
     some = slice(None, None, max(1, len(positions) // POINTS))
     at = positions[some] @ pose[:3, :3].T + pose[:3, 3]
@@ -118,15 +144,21 @@ def correlate_colors(
 
 
 def _is_nearest(uv: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """bool [P]: points not hidden by others in the same of `CELLS` x `CELLS` cells of the picture [0, 1]^2."""
+    """Return bool [P], True for points that no clearly nearer point in the same cell of the picture hides.
+
+    Args:
+        uv: [P, 2], coordinates in the picture as shares of its width and height. The cells are `CELLS` x `CELLS`.
+        depth: [P].
+    """
     cells = (uv * CELLS).astype(int) @ (CELLS, 1)
     return depth < NEARLY * nearest_depths(cells, depth)
 
 
 def read_grey(path: Path) -> np.ndarray:
-    """float64 [h, w], at most `SIDE` px."""
+    """Read a picture's brightness as float64 [h, w], reduced so that its longer side has at most `SIDE` px."""
     return load_thumbnail(path, SIDE) @ GREY
 
 
 def _has_contrast(values: np.ndarray) -> bool:
+    """Return whether the standard deviation of brightnesses exceeds `LEAST_CONTRAST`."""
     return len(values) > 0 and float(values.std()) > LEAST_CONTRAST

@@ -1,4 +1,9 @@
-"""Places cameras around a hole, for a scene that brings Gaussians and neither photographs nor cameras."""
+"""Places cameras around a hole, for a scene that has only Gaussians, and neither photographs nor cameras.
+
+The hole is where the user deleted Gaussians (also called splats). Its middle is the median of their means; its radius
+is the distance from the middle within which 95% of the means lie. Rays test what a camera sees: a ray hits a remaining
+opaque splat if it comes within `REACH` standard deviations of the splat's mean.
+"""
 
 from __future__ import annotations
 
@@ -15,30 +20,32 @@ from reffusion.io.files import BadInput
 
 ANGLE = np.radians(60)  # horizontal field of view
 ASPECT = 4 / 3
-DIRECTIONS, MOST = 400, 40  # directions that are tried, all over the sphere, and views that are kept at most
-BESIDE = 500  # splats next to the hole, which tell the direction up
-RAYS, GRID = 24, (8, 6)  # rays to the hole, which tell if something hides it; and the grid of rays over the picture
-CLOSE = 0.25  # of the hole's radius: what is that near to its splats is the ground they stand on
-CLEAR = 0.25  # of the hole's radius: smallest distance of a camera from a splat, so that it stands in no surface
+DIRECTIONS, MOST = 400, 40  # number of directions that are tried, all over the sphere; largest number of cameras
+BESIDE = 500  # number of splats next to the hole from which the direction up is estimated
+RAYS, GRID = 24, (8, 6)  # number of rays to the hole; (columns, rows) of the grid of rays over the picture
+CLOSE = 0.25  # hole radii: rays end this far before the hole, so that the ground under it hides nothing
+CLEAR = 0.25  # hole radii: smallest distance of a camera from a splat, so that no camera is inside a surface
 REACH = 2.0  # standard deviations of a splat within which a ray hits it
-FAR = 20.0  # of the hole's radius: where rays end
-MARCH = 80  # steps of a ray
-AROUND, BESIDES = 16, 1.5  # number of rays past the hole, and their distance from its middle, in its radii
-BEYOND = 0.35  # share of these that must get further than the hole; if the camera is behind a wall, all end in it
-NEAR, IN_FRONT = 0.5, 0.1  # share of the distance to the hole; share of the picture that may show nearer things
-LEAST = 3  # views
+FAR = 20.0  # hole radii: length of the rays over the picture
+MARCH = 80  # largest number of steps of a ray
+AROUND, BESIDES = 16, 1.5  # number of rays that pass the hole, and their distance from its middle in hole radii
+BEYOND = 0.35  # share of these rays that must get as far as the hole; behind a wall, none does
+NEAR, IN_FRONT = 0.5, 0.1  # at most this share of the picture shows splats within NEAR times the hole's distance
+LEAST = 3  # smallest number of cameras
 
 
 @dataclass(frozen=True)
 class ViewRequirements:
-    """What a camera position must offer.
+    """The requirements for a camera position.
 
     Attributes:
-        distances: from the hole, in its radii; of each direction the first suitable one is taken.
-        free: share of the rays to the hole that must reach it.
-        filled: share of the rays over the picture that must hit something; where fewer do, nobody photographed from
-            there.
-        height: cosine of the angle between the direction and up, at least; 0 is level with the hole.
+        distances: distances from the middle of the hole to try, in hole radii. Of each direction, the first suitable
+            distance is taken.
+        free: smallest share of the rays to the hole that reach the hole.
+        filled: smallest share of the rays over the picture that hit a splat. From places with a smaller share, nobody
+            photographed the scene.
+        height: the cosine of the angle between up and the direction from the hole to the camera must be above this
+            value; 0 is level with the hole.
     """
 
     distances: tuple[float, ...]
@@ -47,8 +54,9 @@ class ViewRequirements:
     height: float
 
 
-# Tried in turn, until three positions are found: a table-top scene fills pictures from above only, a room with an open
-# side or a hole in its corner from hardly anywhere, and a hole between other things is visible in part.
+# These are tried in turn, from strict to loose, until three positions are found. A table-top scene fills pictures from
+# above only. A room with an open side, or with the hole in a corner, fills pictures from hardly anywhere. A hole
+# between other things is visible only in part.
 REQUIREMENTS = (
     ViewRequirements((4.0, 2.8, 2.0), 0.7, 0.9, 0.0),
     ViewRequirements((4.0, 2.8, 2.0), 0.7, 0.8, 0.0),
@@ -59,26 +67,31 @@ REQUIREMENTS = (
 
 @dataclass(frozen=True)
 class ViewQuality:
-    """What is visible from a position, as shares for `ViewRequirements`; both 0 where no camera can stand."""
+    """The shares `free` and `filled` (`ViewRequirements`) of a position; both are 0 if no camera can be there."""
 
     free: float
     filled: float
 
 
 def place_cameras(means: np.ndarray, sizes: np.ndarray, opaque: np.ndarray, deleted: np.ndarray, width: int) -> Poses:
-    """Cameras around the hole, where nothing hides it and the scene fills the picture.
+    """Place cameras around the hole, at positions where nothing hides the hole and the scene fills the picture.
 
-    Such places are where the scene was photographed from, or can be looked at from. Where fewer than three are found,
-    `REQUIREMENTS` are relaxed. No camera stands in a surface.
+    From such positions the scene was probably photographed, or can at least be looked at. If fewer than three are
+    found, looser `REQUIREMENTS` are tried. No camera is inside a surface. All cameras look at the middle of the hole.
 
     Args:
-        means: [N, 3] of the whole scene, in its own frame; sizes: [N], the middle of each splat's three standard
-            deviations: needles are what nobody photographed.
-        opaque: bool [N]; deleted: bool [N], the hole.
-        width: of the views, in pixels.
+        means: [N, 3], means of all splats of the scene before deletion, in the scene's own frame.
+        sizes: [N], the median of each splat's three standard deviations. The median does not count the length of a
+            needle (a long, thin splat), because no photograph shows needles.
+        opaque: bool [N], True for opaque splats.
+        deleted: bool [N], True for the splats that were deleted.
+        width: width of the views in pixels.
+
+    Returns:
+        Up to `MOST` cameras without points, called around_00, around_01 and so on.
 
     Raises:
-        BadInput: there are fewer than three such places.
+        BadInput: fewer than three positions are found, or hardly any splats remain.
     """
     hole, keep = means[deleted], opaque & ~deleted
     if np.count_nonzero(keep) < BESIDE:
@@ -115,7 +128,7 @@ def place_cameras(means: np.ndarray, sizes: np.ndarray, opaque: np.ndarray, dele
 
 
 def _directions(count: int) -> np.ndarray:
-    """[count, 3], unit vectors spread evenly on the sphere; consecutive ones are far apart."""
+    """Return `count` unit vectors, [count, 3], spread evenly over the sphere; consecutive vectors are far apart."""
     height = 1 - 2 * (np.arange(count) + 0.5) / count
     turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
     level = np.sqrt(1 - height**2)
@@ -123,7 +136,13 @@ def _directions(count: int) -> np.ndarray:
 
 
 def _estimate_up(hole: np.ndarray, stays: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """[3], the normal of the surface next to the hole, towards the hole."""
+    """Return the direction up, a unit vector [3]: the normal of the surface next to the hole, on the hole's side.
+
+    Args:
+        hole: [D, 3], means of the deleted splats.
+        stays: [M, 3], means of the remaining opaque splats.
+        center: [3], middle of the hole.
+    """
     beside = stays[np.argsort(cKDTree(hole).query(stays)[0])[:BESIDE]]
     middle = np.median(beside, 0)
     normal = np.linalg.svd(beside - middle, full_matrices=False)[2][2]
@@ -133,9 +152,18 @@ def _estimate_up(hole: np.ndarray, stays: np.ndarray, center: np.ndarray) -> np.
 def _rate_view(
     pose: np.ndarray, away: float, lens: Lens, aim: np.ndarray, stays: tuple[cKDTree, np.ndarray], radius: float
 ) -> ViewQuality:
-    """What a camera, `away` from the middle of the hole, sees of the hole (its splats `aim` [P, 3]) and of the scene.
+    """Return the share of the hole that a camera sees (`free`), and the share of its picture that the scene fills.
 
-    Nothing where it stands in a splat, right in front of one, or behind the surface that the hole is on.
+    Both are 0 if the camera is in a splat or right in front of one, if it is behind the surface on which the hole is,
+    or if splats much nearer than the hole cover too much of its picture (`IN_FRONT`). `filled` alone is 0 if `free` is
+    too small for all `REQUIREMENTS`.
+
+    Args:
+        pose: [4, 4], world-to-camera pose.
+        away: distance of the camera from the middle of the hole.
+        aim: [P, 3], points in the hole.
+        stays: a tree of the remaining opaque splats' means, and the radii [M] within which rays hit them.
+        radius: radius of the hole.
     """
     place = -pose[:3, :3].T @ pose[:3, 3]
     distance, nearest = stays[0].query(place)
@@ -160,8 +188,16 @@ def _rate_view(
 
 
 def _hits(place: np.ndarray, rays: np.ndarray, ends: np.ndarray, stays: tuple[cKDTree, np.ndarray]) -> np.ndarray:
-    """bool [R]: the rays [R, 3] that hit a splat before their ends [R]. Each advances by about the distance to the
-    nearest splat, so that it misses none (sphere tracing)."""
+    """Return bool [R], True for rays that hit a splat before they end.
+
+    Each ray advances by about the distance to the nearest splat, so that it misses none (sphere tracing).
+
+    Args:
+        place: [3], origin of the rays.
+        rays: [R, 3], directions of any length.
+        ends: [R], lengths of the rays.
+        stays: a tree of the splats' means, and the radii [M] within which rays hit them.
+    """
     tree, near = stays
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     hit, traveled, on = np.zeros(len(rays), bool), np.zeros(len(rays)), np.arange(len(rays))
@@ -176,10 +212,10 @@ def _hits(place: np.ndarray, rays: np.ndarray, ends: np.ndarray, stays: tuple[cK
 
 
 def _look_at(place: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """[4, 4] world to camera."""
+    """Return the world-to-camera pose [4, 4] of a camera at `place` that looks at `target`, with `up` upwards."""
     forward = (target - place) / np.linalg.norm(target - place)
     right = np.cross(forward, up)
-    if np.linalg.norm(right) < 0.05:  # straight from above: any side will do
+    if np.linalg.norm(right) < 0.05:  # straight from above or below: any side may be up
         right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
     right /= np.linalg.norm(right)
     pose = np.eye(4)

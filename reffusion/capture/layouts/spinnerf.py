@@ -1,7 +1,8 @@
-"""SPIn-NeRF's published scenes: which are in a folder, and what each of them lacks.
+"""Lists the published scenes of SPIn-NeRF in a folder, and the parts that each scene lacks.
 
-Sorted by name the first 40 views are test views, photographs without the object; the last 60 are training views. Poses,
-lens (SIMPLE_RADIAL) and points belong to the full size, `images`; masks lie beside the quarter size, `images_4`.
+In each scene, in order of names, the first 40 views are test views (photographs without the object) and the last 60 are
+training views. Poses, lens (SIMPLE_RADIAL) and points are for the full size, in `images`. The masks lie beside the
+quarter size, in `images_4`.
 """
 
 from __future__ import annotations
@@ -17,24 +18,28 @@ from reffusion.io.images import image_size
 
 SCENES = ("1", "2", "3", "4", "7", "9", "10", "12", "book", "trash")
 TRAIN, TEST = 60, 40
-PARTS = {  # what a scene holds, and what is lost without it
+PARTS = {  # file or folder of a scene -> what the scene lacks without it
     "images_4": "its pictures",
     "images_4/label": "no masks, so nothing is removed",
     "images_4/test_label": "no test views, so nothing is scored",
     "poses_bounds.npy": "near and far; the COLMAP model stands for the rest",
     "sparse/0": "the lens's distortion and the points",
     "images": "full size: the scene stays at that of images_4",
-}  # what a scene holds, and what is lost without it
+}
 
 
 def scene_folders(data: Path) -> list[Path]:
-    """The published scenes in a folder; where there is none of these, every folder with the same layout."""
+    """Return the folders of the published scenes in `data`; if there are none, all folders that have an `images_4`."""
     folders = sorted(p for p in data.iterdir() if p.is_dir() and p.name[0] not in "._") if data.is_dir() else []
     return [p for p in folders if p.name in SCENES] or [p for p in folders if (p / "images_4").is_dir()]
 
 
 def summarize_scenes(data: Path) -> list[str]:
-    """A line per scene: what it holds, what it lacks, or that it is missing. ValueError where there is no scene."""
+    """Return a line for each published scene: the views it holds and the parts it lacks, or that it is not there.
+
+    Raises:
+        ValueError: `data` holds no scene at all.
+    """
     folders = scene_folders(data)
     if not folders:
         raise ValueError(f"{data}: no scenes of SPIn-NeRF there; expected the folders {', '.join(SCENES)}")
@@ -44,7 +49,7 @@ def summarize_scenes(data: Path) -> list[str]:
 
 
 def summarize_scene(folder: Path) -> str:
-    """What a scene holds and lacks, in a line."""
+    """Return a line about a scene: numbers of views, sizes of pictures, and missing parts; or why it cannot be run."""
     missing = [f"{part} ({loss})" for part, loss in PARTS.items() if not _has(folder, part)]
     lacks = f"lacks {'; '.join(missing)}" if missing else ""
     try:
@@ -59,6 +64,7 @@ def summarize_scene(folder: Path) -> str:
 
 
 def _has(folder: Path, part: str) -> bool:
+    """Return whether a scene has a part, which is a key of `PARTS`."""
     if part == "sparse/0":
         return find_model(folder) is not None
     path = folder / part
@@ -66,5 +72,6 @@ def _has(folder: Path, part: str) -> bool:
 
 
 def _size(folder: Path) -> str:
+    """Return the name of a folder of pictures and the size of its first picture: `images_4 <width>x<height>`."""
     width, height = image_size(next(iter(find_pictures(folder).values())))
     return f"{folder.name} {width}x{height}"

@@ -1,4 +1,7 @@
-"""Reads nerfstudio's transforms.json, and Blender's transforms_train.json with _test and _val."""
+"""Reads a capture in the layout "transforms": nerfstudio's transforms.json, or Blender's transforms_<split>.json.
+
+Blender's files are transforms_train.json and optionally transforms_test.json and transforms_val.json.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ from reffusion.io.images import ENDINGS
 from reffusion.io.ply import load_points
 
 SPLITS = ("train", "test", "val")
-USUAL = ("images", "images_2", "images_4", "images_8", "input", "rgb")  # folders of pictures
+USUAL = ("images", "images_2", "images_4", "images_8", "input", "rgb")  # usual folders of pictures
 
 
 @dataclass(frozen=True)
@@ -38,10 +41,10 @@ class Frame:
     """A frame of a transforms file.
 
     Attributes:
-        values: its keys over the file's.
-        file_path: its key of that name, the path of the picture.
-        source: the file.
-        split: "", or for Blender's files "train", "test" or "val".
+        values: the keys of the frame, together with the keys of the whole file that the frame does not have.
+        file_path: the frame's key of this name, a path of its picture.
+        source: the transforms file.
+        split: "" for transforms.json; "train", "test" or "val" for Blender's files.
     """
 
     values: dict[str, Any]
@@ -51,8 +54,11 @@ class Frame:
 
 
 def split_files(folder: Path) -> dict[str, Path]:
-    """Split -> file: {"": transforms.json}, or Blender's transforms_train.json with _test and _val; empty without
-    either."""
+    """Return split -> transforms file of a scene folder.
+
+    This is {"": transforms.json} if that file exists; else Blender's files that exist, by "train", "test" and "val", if
+    transforms_train.json is among them; else empty.
+    """
     if is_file(folder / "transforms.json"):
         return {"": folder / "transforms.json"}
     found = {
@@ -62,8 +68,18 @@ def split_files(folder: Path) -> dict[str, Path]:
 
 
 def read(folder: Path, images: str | None) -> Capture:
-    """Read a scene in this layout, see `load_capture`. Blender's test views are those of _test, or without it those of
-    _val."""
+    """Read a scene folder with transforms files.
+
+    The test views of Blender's files are the frames of transforms_test.json, or without that file those of
+    transforms_val.json.
+
+    Args:
+        images: folder of pictures, relative to the scene; None to use the paths in the frames, or else the
+            usual folders.
+
+    Raises:
+        BadInput: a file or frame is wrong; no frame has a picture; or two frames have the same picture.
+    """
     sources = split_files(folder)
     unread = [sources.pop("val").name] if {"test", "val"} <= sources.keys() else []
     frames = [frame for split, source in sources.items() for frame in _load_frames(source, split)]
@@ -104,7 +120,11 @@ def read(folder: Path, images: str | None) -> Capture:
 
 
 def read_cameras(folder: Path) -> Poses:
-    """Lenses and poses alone, of a capture whose pictures are missing; sizes are the file's w and h."""
+    """Read the lenses and poses of a capture without its pictures. The result has no points.
+
+    Raises:
+        BadInput: a frame has no w and h, which tell the size of its picture; or two frames have the same file_path.
+    """
     frames = [each for split, source in split_files(folder).items() for each in _load_frames(source, split)]
     listed = {normalize_path(each.file_path): each for each in frames}
     if len(listed) < len(frames):
@@ -123,17 +143,19 @@ def read_cameras(folder: Path) -> Poses:
 
 
 def has_pictures(folder: Path) -> bool:
-    """Does a picture of one of the frames exist?"""
+    """Return whether a picture of at least one frame exists."""
     frames = [each for split, source in split_files(folder).items() for each in _load_frames(source, split)]
     return bool(_find_pictures(folder, None, frames))
 
 
 def _load_frames(source: Path, split: str) -> list[Frame]:
+    """Read the frames of a transforms file. `split`: see `Frame`."""
     record = load_json(source)
     return [Frame({**record, **frame}, frame["file_path"], source, split) for frame in _frames(record, source)]
 
 
 def _frames(record: object, source: Path) -> list[dict]:
+    """Return the list `frames` of a parsed transforms file. Raises BadInput if it is missing or a frame lacks a key."""
     frames = record.get("frames") if isinstance(record, dict) else None
     if not isinstance(frames, list) or not frames:
         raise BadInput(f"{source}: it has no list `frames`")
@@ -148,11 +170,15 @@ def _is_path(value: object) -> bool:
 
 
 def _find_pictures(folder: Path, images: str | None, frames: list[Frame]) -> dict[int, Path]:
-    """Index of a frame -> its picture, for the frames that have one.
+    """Return index of a frame -> its picture file, for the frames that have a picture.
 
-    Pictures lie where file_path says, possibly with another ending. With `images`, or where none lies there, pictures
-    are looked for in that folder, or in a usual one, by their names (`pair_pictures`): file_path may be of another
-    machine, or name the folder of another size.
+    A picture lies at the frame's file_path, which may lack the ending. If `images` is given, or if no picture lies at
+    such a path, pictures are searched by their names (`pair_pictures`) in the folder `images`, or in the usual folders.
+    This is because a file_path may come from another machine, or name the folder of another picture size.
+
+    Args:
+        folder: the scene's folder.
+        images: folder of pictures, relative to the scene, or None.
     """
     listed = {
         k: path for k, frame in enumerate(frames) if (path := _existing_picture(folder, frame.file_path)) is not None
@@ -168,23 +194,33 @@ def _find_pictures(folder: Path, images: str | None, frames: list[Frame]) -> dic
 
 
 def _existing_picture(folder: Path, listed: str) -> Path | None:
-    """The file that file_path names, with the usual endings tried; None where it does not exist."""
+    """Return the file that a frame's file_path (`listed`) names, as it is or with an ending added; None if missing."""
     base = folder / listed.replace("\\", "/")
     if base.suffix.lower() in ENDINGS:
-        is_file(base)  # a folder or a pipe of that name is no missing picture
+        is_file(base)  # raises BadInput for a folder or pipe, which would else count as a missing picture
     candidates = [base, *(base.with_name(base.name + end) for e in ENDINGS for end in (e, e.upper()))]
     return next((path for path in candidates if path.is_file()), None)
 
 
 def _named_files(folder: Path, placed: Mapping[str, Frame], key: str) -> dict[str, Path]:
-    """View name -> the file that its frame names under a key (`mask_path`, `depth_file_path`), where it exists."""
+    """Return view name -> the existing file that its frame names under `key`, such as mask_path or depth_file_path."""
     named = {view: each.values[key] for view, each in placed.items() if _is_path(each.values.get(key))}
     files = {view: folder / path.replace("\\", "/") for view, path in named.items()}
     return {view: path for view, path in files.items() if path.is_file()}
 
 
 def _frame_pose(frame: dict, name: str, source: Path) -> np.ndarray:
-    """OpenGL camera-to-world (y up, looking along -z) -> our world-to-camera [4, 4]."""
+    """Return the world-to-camera pose [4, 4] (y down, looking along +z) of a frame.
+
+    The key transform_matrix is OpenGL's camera-to-world pose (y up, looking along -z), 3x4 or 4x4.
+
+    Args:
+        frame: the keys of the frame.
+        name, source: the view and the transforms file, for messages.
+
+    Raises:
+        BadInput: the matrix is not of numbers, has another shape, or is no rigid pose.
+    """
     with as_bad_input(source, f"a number in each place of the transform_matrix of '{name}'"):
         matrix = np.array(frame["transform_matrix"])
         if matrix.dtype.kind not in "fiu":
@@ -205,11 +241,20 @@ def _points(
     poses: Poses,
     pictures: Mapping[str, Path],
 ) -> tuple[PointCloud, list[str | None]]:
-    """The points of `ply_file_path` (or sparse_pc.ply) in the frame of the poses, else those of the depth maps; and
-    sentences about what is not used.
+    """Return the sparse points of a capture, in the frame of the poses.
 
-    `applied_transform` and `applied_scale` describe what was done to poses and points alike, so there is nothing to
-    undo.
+    The points are read from the file that the key ply_file_path names, or from sparse_pc.ply. If there are none, or if
+    they are not in the frame of the poses, points are made from the depth maps that the frames name. The keys
+    applied_transform and applied_scale are ignored: they describe what was done to both poses and points.
+
+    Args:
+        source: the transforms file.
+        record: the keys of the file.
+        placed: view name -> its frame.
+        pictures: view name -> picture file.
+
+    Returns:
+        The points, perhaps none; and messages to the user (None among them is no message).
     """
     listed = record.get("ply_file_path")
     if listed is not None and not _is_path(listed):

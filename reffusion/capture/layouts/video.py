@@ -1,4 +1,9 @@
-"""Turns a video into photographs: its sharpest frames, evenly spaced by how far the picture moves."""
+"""Turns a video into photographs: its sharpest frames, evenly spaced by the motion of the picture.
+
+The motion of the picture is measured by tracked corners, in widths of the picture. The motion since the first frame is
+called the *distance* of a frame. The distance of the last frame is divided into equal *windows*; each window gives at
+most one frame.
+"""
 
 from __future__ import annotations
 
@@ -19,34 +24,36 @@ from reffusion.io.arrays import save_json
 from reffusion.io.files import BadInput, reading
 from reffusion.io.images import resize_image
 
-MOST = 80  # frames at most: what can be matched pair by pair within minutes
-FEWEST = 12  # frames
-SPACING = 0.04  # of the picture's width that it moves between two frames: neighbours share most of what they show
-STILL = 0.25  # of the width: a picture that moves less in total shows everything from one place
-LOOKED_AT = 3000  # frames at most that are measured; of a longer video every few
-SHARP, FLOW = 640, 320  # px, the longer side at which sharpness and motion are measured
-ANCHOR = 0.02  # of the width, from which motion is measured anew: the trembling of a hand does not add up
-CORNERS, KEPT = 200, 0.25  # corners that are tracked; share of them under which tracking is lost
-PATIENCE, JUMP = 3, 0.3  # frames for which tracking may be lost, before a jump of this share of the width is assumed
-MIDDLE, ASIDE = 0.5, 0.6  # central share of a window; factor for the sharpness outside, so that few frames are adjacent
-NEAR = 4  # windows to either side whose frames a frame is compared with
-BLURRED = 0.4  # of the sharpness of those, under which a frame is left out
-NOISE = 4.0  # variance of the Laplacian, levels of 255 squared, that rounding and coding leave in a plain picture
-TOO_BLURRED = 0.003  # sharpness; photographs of grass, stone and rooms have 0.5 to 0.9, blurred by 2 px 0.003 to 0.01
-QUALITY = 95  # of the JPEGs: the video lost more
+MOST = 80  # largest number of selected frames: all their pairs can be matched within minutes
+FEWEST = 12  # smallest number of windows, and of frames that a video must have
+SPACING = 0.04  # distance between selected frames, in widths: neighbours still show mostly the same
+STILL = 0.25  # widths: a video whose picture moves less in total was taken from one place
+LOOKED_AT = 3000  # largest number of measured frames; in longer videos only every n-th is measured
+SHARP, FLOW = 640, 320  # px, longer side of the reduced frames for measuring sharpness, and motion
+ANCHOR = 0.02  # widths of motion after which the anchor frame is renewed; the trembling of a hand does not add up
+CORNERS, KEPT = 200, 0.25  # number of tracked corners; if a smaller share of them is found again, tracking failed
+PATIENCE, JUMP = 3, 0.3  # frames in a row in which tracking may fail; widths of motion assumed after more of them
+MIDDLE, ASIDE = 0.5, 0.6  # central share of a window; factor for sharpness outside, so that frames are far apart
+NEAR = 4  # windows on either side, with whose frames the sharpness of a frame is compared
+BLURRED = 0.4  # ratio to their median sharpness, below which a frame is left out
+NOISE = 4.0  # (levels of 255)^2: variance of the Laplacian of a plain picture, from rounding and compression
+# Median sharpness of the selected frames, below which a video is refused. Photographs of grass, stone and rooms have
+# 0.5 to 0.9; blurred by 2 px they have 0.003 to 0.01.
+TOO_BLURRED = 0.003
+QUALITY = 95  # of the JPEGs; compression of the video lost more
 RECORD, TABLE = "frames.json", "frames.csv"
 TAKEN, LESS_SHARP, SOFT = "taken", "another nearby is sharper", "blurred like all nearby"
 
 
 @dataclass(frozen=True)
 class FrameStats:
-    """Measurements of a frame.
+    """The measurements of a video frame.
 
     Attributes:
-        number: of the frame in the file, from 0.
-        seconds: its time.
-        sharpness: variance of the Laplacian over that of the brightness, at `SHARP` px.
-        distance: by how much of its width the picture has moved since the first frame.
+        number: number of the frame in the file, from 0.
+        seconds: time of the frame in the video.
+        sharpness: variance of the Laplacian over variance of the brightness, at `SHARP` px (`sharpness`).
+        distance: motion of the picture since the first frame, in widths of the picture.
     """
 
     number: int
@@ -56,18 +63,19 @@ class FrameStats:
 
 
 def extract_frames(video: Path, folder: Path, content: str) -> str:
-    """Write the selected frames to folder/images, all measurements to frames.csv, and frames.json last.
+    """Select the sharpest frames of a video and write them as pictures.
 
-    The same file gives the same frames. Rotation that the file declares is obeyed.
+    Writes the frames to images/ in `folder`, the measurements of all frames to frames.csv, and at the end frames.json,
+    a summary. The same file gives the same frames. A rotation that the video file declares is applied.
 
     Args:
-        content: a hash of the file, for frames.json.
+        content: a hash of the video file, which is written to frames.json.
 
     Returns:
-        What was taken and what was not, in a sentence.
+        A sentence about the frames that were taken and those that were left out.
 
     Raises:
-        BadInput: it is no video, too short, shows the same all the time, or is blurred throughout.
+        BadInput: the file is no video, is too short, has a picture that hardly moves, or is blurred throughout.
     """
     seen = measure_frames(video)
     if not seen:
@@ -98,7 +106,7 @@ def extract_frames(video: Path, folder: Path, content: str) -> str:
 
 
 def measure_frames(video: Path) -> list[FrameStats]:
-    """Sharpness of the frames, and how far the picture has moved; of a long video every few frames."""
+    """Return the sharpness and distance of each frame, or of every n-th frame if there are more than `LOOKED_AT`."""
     count = _count(video)
     every, way, seen = max(1, -(-count // LOOKED_AT)), _MotionTracker(), []
     frames = _frames(video, lambda number: number % every == 0)
@@ -111,7 +119,7 @@ def measure_frames(video: Path) -> list[FrameStats]:
 
 
 def _count(video: Path) -> int:
-    """Number of frames; counted by decoding where the file does not say, as browsers' recordings do not."""
+    """Return the number of frames. If the file does not tell it (recordings of browsers), the frames are counted."""
     video_file = _open_video(video)
     count = int(video_file.get(cv2.CAP_PROP_FRAME_COUNT))
     if count <= 0:
@@ -121,7 +129,7 @@ def _count(video: Path) -> int:
 
 
 def _codec(video: Path) -> str:
-    """The codec's four letters, as `av01`."""
+    """Return the four letters of the video's codec, such as `av01`; "unknown" if there are none."""
     video_file = _open_video(video)
     code = int(video_file.get(cv2.CAP_PROP_FOURCC))
     video_file.release()
@@ -129,13 +137,18 @@ def _codec(video: Path) -> str:
 
 
 def sharpness(gray: np.ndarray) -> float:
-    """Sharpness of a grey picture, uint8 [H, W]; 0 where it is plain."""
+    """Return the sharpness of a grey picture, uint8 [H, W]; 0 if it is plain.
+
+    The sharpness is (variance of the Laplacian - `NOISE`) / (variance of the brightness + `NOISE`).
+    """
     return max(0.0, float((cv2.Laplacian(gray, cv2.CV_32F).var() - NOISE) / (gray.var() + NOISE)))
 
 
 class _MotionTracker:
-    """Measures how far a picture has moved, by tracking corners from an anchor frame that is renewed when they have
-    moved on."""
+    """Measures the motion of a video's picture, by tracking corners from an anchor frame to later frames.
+
+    When the corners have moved by `ANCHOR`, the current frame becomes the anchor.
+    """
 
     def __init__(self) -> None:
         self._anchor: np.ndarray | None = None
@@ -144,25 +157,34 @@ class _MotionTracker:
         self._lost = 0
 
     def update(self, gray: np.ndarray, sharp: float) -> float:
-        """Add the next frame, grey uint8 [H, W], and its sharpness; returns the distance so far in widths, which never
-        decreases."""
+        """Add the next frame and return its distance: the motion since the first frame, which never decreases.
+
+        Args:
+            gray: grey picture of the frame, uint8 [H, W].
+            sharp: sharpness of the frame.
+
+        Returns:
+            The distance in widths of the picture.
+        """
         step = self._distance_from_anchor(gray)
         if self._corners is None or self._lost > PATIENCE:
             self._renew(gray, sharp, JUMP if self._lost else 0.0)
-        elif step >= (ANCHOR if sharp >= BLURRED * self._sharpness else 3 * ANCHOR):  # few corners last in a smear
+        # A blurred frame becomes the anchor later, since few of its corners can be tracked.
+        elif step >= (ANCHOR if sharp >= BLURRED * self._sharpness else 3 * ANCHOR):
             self._renew(gray, sharp, step)
         else:
             self._longest = max(self._longest, self._before + step)
         return self._longest
 
     def _renew(self, gray: np.ndarray, sharp: float, step: float) -> None:
+        """Make the frame `gray` the anchor. `step`: motion since the old anchor, in widths."""
         self._before += step
         self._longest, self._lost = max(self._longest, self._before), 0
         self._anchor, self._sharpness = gray, sharp
         self._corners = cv2.goodFeaturesToTrack(gray, CORNERS, 0.01, 8)
 
     def _distance_from_anchor(self, gray: np.ndarray) -> float:
-        """Distance from the anchor; 0 where tracking is lost, or the picture is plain."""
+        """Return the corners' median motion since the anchor, in widths; 0 if tracking fails or without corners."""
         if self._corners is None:
             return 0.0
         found, tracked, _ = cv2.calcOpticalFlowPyrLK(self._anchor, gray, self._corners, None)
@@ -175,13 +197,22 @@ class _MotionTracker:
 
 
 def _spacing(seen: list[FrameStats]) -> float:
-    """The distance between two selected frames."""
+    """Return the size of a window: the distance between two selected frames, in widths of the picture."""
     return seen[-1].distance / min(MOST, max(FEWEST, round(seen[-1].distance / SPACING)))
 
 
 def select_frames(seen: list[FrameStats]) -> tuple[list[FrameStats], list[FrameStats]]:
-    """The sharpest frame of each window of equal distance, and those of them that are blurred compared with their
-    neighbours."""
+    """Select at most one frame of each window of equal distance.
+
+    The candidate of a window is its sharpest frame; sharpness outside the window's middle counts less (`ASIDE`). A
+    candidate is blurred if its sharpness is below `BLURRED` times the median of the candidates around it.
+
+    Args:
+        seen: the measured frames, in order.
+
+    Returns:
+        The selected frames, and the blurred candidates, which are left out.
+    """
     spacing = _spacing(seen)
     windows: dict[int, list[FrameStats]] = {}
     for each in seen:
@@ -198,7 +229,7 @@ def select_frames(seen: list[FrameStats]) -> tuple[list[FrameStats], list[FrameS
 
 
 def _write(video: Path, folder: Path, chosen: list[FrameStats]) -> tuple[int, int]:
-    """Write the frames as frame_<number>.jpg; returns their (width, height)."""
+    """Write the chosen frames as frame_<number>.jpg to `folder`, which is replaced. Returns their (width, height)."""
     numbers, size = {each.number for each in chosen}, (0, 0)
     partial = folder.with_name(f".{folder.name}-{os.getpid()}")
     shutil.rmtree(partial, ignore_errors=True)
@@ -215,7 +246,7 @@ def _write(video: Path, folder: Path, chosen: list[FrameStats]) -> tuple[int, in
 
 
 def _frames(video: Path, is_chosen: Callable[[int], bool]) -> Iterator[tuple[int, float, np.ndarray]]:
-    """Number, seconds and picture, uint8 [H, W, 3] BGR, of the frames whose number `is_chosen`."""
+    """Yield number, time in seconds and picture, uint8 [H, W, 3] BGR, of frames whose numbers `is_chosen` accepts."""
     video_file, number = _open_video(video), 0
     while video_file.grab():
         if is_chosen(number):
@@ -228,7 +259,9 @@ def _frames(video: Path, is_chosen: Callable[[int], bool]) -> Iterator[tuple[int
 
 
 def _open_video(video: Path) -> cv2.VideoCapture:
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what they say on standard error is in our line
+    """Open a video; its frames will be rotated as the file declares. Raises BadInput if OpenCV cannot open it."""
+    # no messages of the libraries on standard error: BadInput tells what is wrong
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     with reading(video, "a video that OpenCV reads"):
         video_file = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
@@ -239,6 +272,7 @@ def _open_video(video: Path) -> cv2.VideoCapture:
 
 
 def _save_table(path: Path, seen: list[FrameStats], chosen: list[FrameStats], blurred: list[FrameStats]) -> None:
+    """Write the measurements of all frames, and whether each was taken, as a CSV file."""
     what = {each.number: TAKEN for each in chosen} | {each.number: SOFT for each in blurred}
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")

@@ -21,13 +21,13 @@ from reffusion.types import Gaussians, Rendering
 
 
 def build(inputs: TermInputs, settings: Params) -> Term | None:
-    """The term with its critic; None if its weight is 0 or no view has a hole.
+    """Build the adversarial term with its critic. Return None if its weight is 0 or no view has a hole.
 
-    In each step the real patches come from one reference and the fake ones from one training view. The gradient
-    reaches the spherical harmonics of the masked Gaussians, or of all with `adversarial.reaches: all`.
+    In each step the real patches come from one reference and the fake ones from one training view. The gradient reaches
+    the spherical harmonics of the masked Gaussians, or with `adversarial.reaches: all` those of all Gaussians.
 
     Raises:
-        ValueError: no reference has a hole.
+        ValueError: No reference has a hole.
     """
     adversarial = settings.adversarial
     if adversarial.weight == 0 or not inputs.hole_views:
@@ -63,22 +63,27 @@ def evaluate_adversarial(
     adversary: Adversary,
     generator: torch.Generator,
 ) -> tuple[Tensor, Rendering, dict[str, float]]:
-    """Trains the critic for one step, then judges the view's patches by it.
+    """Train the critic for one step, then evaluate the adversarial loss of patches of one view.
 
     PAPER leaves open: how the patches are drawn. A masked pixel is drawn first, as for SDS (`windows.window_around`).
     All fake patches of a step come from one training view, and all real ones from one reference. A view or reference
-    that is smaller than a patch is enlarged until one fits.
+    that is smaller than a patch is enlarged until a patch fits.
 
     Args:
-        reached: [N] bool, the Gaussians whose spherical harmonics the gradient reaches. It reaches nothing else.
-        view: with at least one pixel to repaint: patches lie around those.
-        image: [H, W, 3] in [0, 1], a reference. hole: [H, W] bool, the pixels it was made for, at least one.
-        adversary: its critic takes a step.
-        generator: on the CPU; draws the windows.
+        gaussians: All Gaussians of the scene.
+        reached: bool [N], True for the Gaussians whose spherical harmonics get a gradient. Nothing else gets one.
+        view: A training view with at least one pixel to repaint. The fake patches lie around such pixels.
+        image: [H, W, 3] in [0, 1], a reference.
+        hole: bool [H, W], True at the pixels that the reference invents, at least one. The real patches lie around
+            them.
+        adversary: The critic, which takes a step.
+        generator: Draws the windows, on the CPU.
+
     Returns:
-        The generator's loss, the rendering, and what to log.
+        The generator's loss, the rendering, and values for the trace.
+
     Raises:
-        FloatingPointError: see `Adversary.train_step`.
+        FloatingPointError: See `Adversary.train_step`.
     """
     choices = adversary.choices
     shaded = replace(gaussians.map(Tensor.detach), sh=confine(gaussians, reached).sh)
@@ -91,10 +96,14 @@ def evaluate_adversarial(
 
 
 def draw_patches(image: Tensor, mask: Tensor, count: int, size: int, generator: torch.Generator) -> Tensor:
-    """[count, 3, size, size] in [-1, 1]: random patches of an image that contain a masked pixel; differentiable.
+    """Draw random patches of an image that contain a masked pixel, [count, 3, size, size] in [-1, 1]; differentiable.
 
     Args:
-        image: [H, W, 3] in [0, 1]. mask: [H, W] bool.
+        image: [H, W, 3] in [0, 1].
+        mask: bool [H, W], with at least one True pixel.
+        count: Number of patches.
+        size: Side of a patch in pixels.
+        generator: Draws the windows, on the CPU.
     """
     view = enlarge_to_fit(image.permute(2, 0, 1) * 2 - 1, size)
     mask = enlarge_to_fit(mask.to(view)[None], size)[0] > 1e-4

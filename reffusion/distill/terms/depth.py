@@ -1,4 +1,4 @@
-"""The depth term: the invented surface lies where a depth estimate of the repainted view puts it (section 4.3)."""
+"""The depth term: invented surfaces are drawn to the depth that is estimated from the repainted view (section 4.3)."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from reffusion.splat.rasterizer import render
 from reffusion.types import Camera, Gaussians, Rendering
 
 # PAPER leaves open: the range of the "random timestep" from which a view is repainted, as fractions of the schedule,
-# and the size at which it is painted: its prior's 512 px are all that the depth model sees of a view.
+# and the size at which the view is painted. Here it is the native size of the prior (512 px for the paper's prior).
 T_LOW, T_HIGH = 0.02, 0.98
-LEVELS = 0  # finer sizes at which the view is painted as well, see `inpaint.repaint`
+LEVELS = 0  # number of finer sizes at which the view is painted as well, see `inpaint.repaint`
 FINEST = 0.6  # the latest timestep from which a finer size would start, as a fraction of the schedule
-MAX_SIDE = 512  # px, the longer side at which a larger view is rendered: painter and estimator see no more of the hole
-EXTENT = 1.0  # PAPER leaves open: the unit of the loss. The scene's extent, which is 1 in the normalised frame
+MAX_SIDE = 512  # px, the longer side at which a larger view is rendered: prior and estimator use no finer detail
+EXTENT = 1.0  # PAPER leaves open: the unit of the loss. Here it is the scene's extent, 1 in the normalised frame
 
 
 def build(inputs: TermInputs, settings: Params) -> Term | None:
-    """The term; None if its weight is 0 or no view has a hole.
+    """Build the depth term. Return None if its weight is 0 or no view has a hole.
 
-    Its gradient reaches the masked Gaussians, all parameters but the spherical harmonics.
+    Its gradient reaches the masked Gaussians, in all parameters except the spherical harmonics.
 
     Raises:
-        ValueError: there is no prior, its prompts are not embedded, or there is no estimator of depth.
+        ValueError: There is no prior, its prompts are not embedded, or there is no depth estimator.
     """
     depth = settings.depth
     if depth.weight == 0 or not inputs.hole_views:
@@ -50,7 +50,7 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
 
     def loss(gaussians: Gaussians, reached: Tensor, view: TrainView, step: int) -> TermValue:
         draws = seeding.generator(settings.seed, "distill", "depth", step)
-        # PAPER leaves open: the guidance with which the view is repainted; SDS's.
+        # PAPER leaves open: the guidance with which the view is repainted. Here it is that of SDS.
         guidance = settings.sds.guidance
         value, rendering = evaluate_depth(gaussians, reached, view, prior, text, depth, guidance, draws, estimator)
         return TermValue(value, rendering, latest={"depth": float(value.detach())})
@@ -79,21 +79,28 @@ def evaluate_depth(
     max_side: int = MAX_SIDE,
     extent: float = EXTENT,
 ) -> tuple[Tensor, Rendering]:
-    """Mean squared difference of rendered and estimated depth in the hole over the extent squared, and the rendering.
+    """Return the depth loss of one view, and its rendering.
 
-    The view is rendered, its hole is repainted from a random timestep, and the depth of that image is estimated.
+    The view is rendered, its hole is repainted by the prior from a random timestep, and the depth of the repainted
+    picture is estimated. The loss is the mean of ((rendered depth - estimated depth) / extent)^2 over the pixels of the
+    hole that can be compared (see `depth_target`).
 
     Args:
-        reached: [N] bool, the Gaussians whose geometry the gradient reaches. It reaches no spherical harmonics.
-        view: with at least one pixel to repaint.
-        text: [3, L, D], the hidden states of the global, the local and the empty prompt.
-        guidance: the paper's a.
-        generator: on the CPU; draws timestep and noise.
-        max_side: px, the longer side at which a larger view is rendered.
-        extent: the unit of depth.
+        gaussians: All Gaussians of the scene.
+        reached: bool [N], True for the Gaussians whose geometry gets a gradient. No spherical harmonics get one.
+        view: A training view with at least one pixel to repaint.
+        prior: The adapted prior.
+        text: [3, L, D], the embeddings of the global, the local and the empty prompt.
+        depth: Parameters of the depth term.
+        guidance: The paper's a, the strength of classifier-free guidance.
+        generator: Draws timestep and noise, on the CPU.
+        estimator: The depth estimator.
+        max_side: Longer side, in pixels, at which a larger view is rendered.
+        extent: The unit of depth.
+
     Raises:
-        Degenerate: no pixel of this view can be compared, or its estimate cannot be aligned with the scene.
-        FloatingPointError: an estimate is not finite.
+        Degenerate: No pixel of the view can be compared, or its estimate cannot be aligned with the scene.
+        FloatingPointError: An estimate is not finite.
     """
     camera, hole, hidden = _downscale(view, max_side)
     geometry_only = confine(replace(gaussians, sh=gaussians.sh.detach()), reached)
@@ -117,16 +124,22 @@ def evaluate_depth(
 
 
 def depth_target(view: ViewDepth, disparity: np.ndarray, covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The depth that the hole should have, [H, W] float64, and the pixels to compare it in, [H, W] bool.
+    """Return the depth that the hole should have, [H, W] float64, and the pixels to compare, bool [H, W].
 
-    Left out are pixels that no Gaussian covers, and those whose estimate is farther than everything known of the scene
-    or beyond infinity.
+    Not compared are pixels that no Gaussian covers, and pixels whose estimate is beyond infinity or farther than the
+    limit `ViewDepth.least_disparity`.
 
     Args:
-        disparity: [H, W], in the scene's units. covered: [H, W] bool, the pixels whose rendered depth is meaningful.
+        view: The rendered depth of the view.
+        disparity: [H, W], the estimate in the unit of the scene.
+        covered: bool [H, W], True at pixels that Gaussians cover enough for their rendered depth to be meaningful.
+
+    Returns:
+        The target, which is 0 at pixels that are not compared, and the pixels to compare.
+
     Raises:
-        Degenerate: no pixel is compared, or no depth is known.
-        FloatingPointError: the disparity is not finite.
+        Degenerate: There is no pixel to compare, or no depth is known.
+        FloatingPointError: The disparity is not finite.
     """
     if not np.isfinite(disparity).all():
         raise FloatingPointError(f"view {view.camera.name}: the estimated depth is not finite")
@@ -137,16 +150,23 @@ def depth_target(view: ViewDepth, disparity: np.ndarray, covered: np.ndarray) ->
 
 
 def depth_loss(depth: Tensor, target: Tensor, compared: Tensor, extent: float) -> Tensor:
-    """Mean over the compared pixels of ((depth - target) / extent)^2.
+    """Return the mean of ((depth - target) / extent)^2 over the compared pixels.
 
     Args:
-        depth, target: [H, W]; compared: [H, W] bool, at least one pixel.
+        depth, target: [H, W].
+        compared: bool [H, W], with at least one True pixel.
+        extent: The unit of depth.
     """
     return ((depth[compared] - target[compared].to(depth.dtype)) / extent).square().mean()
 
 
 def _downscale(view: TrainView, max_side: int) -> tuple[Camera, Tensor, Tensor]:
-    """(camera, hole [H, W] bool, hidden [H, W] bool) of a view whose longer side is at most `max_side` px."""
+    """Return the camera, the hole and the hidden pixels of a view, scaled down to at most `max_side` pixels.
+
+    Returns:
+        The camera, whose longer side is at most `max_side`; the hole, bool [H, W]; and the hidden pixels, bool [H, W],
+            whose photograph may not supervise.
+    """
     camera, hole, hidden = view.camera, view.repaint, ~view.supervises
     factor = max_side / max(camera.width, camera.height)
     if factor >= 1:

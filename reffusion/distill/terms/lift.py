@@ -1,4 +1,4 @@
-"""The lift term: images inpainted in 2D supervise the hole, as in NeRF-In and SPIn-NeRF. For baselines only."""
+"""The lift term: images inpainted in 2D supervise the hole, as in NeRF-In and SPIn-NeRF. It serves baselines only."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ from reffusion.types import Gaussians, Rendering
 
 
 def build(inputs: TermInputs, settings: Params) -> Term | None:
-    """The term; None if its weight is 0 or no inpainted view has a hole. Its gradient reaches the masked Gaussians.
+    """Build the lift term. Return None if its weight is 0 or no inpainted view has a hole.
+
+    Its gradient reaches the masked Gaussians.
 
     Raises:
-        ValueError: no view was inpainted, or the perceptual loss has no distance.
+        ValueError: No view was inpainted, or the perceptual loss has no distance.
     """
     lift = settings.lift
     if lift.weight == 0:
@@ -56,16 +58,18 @@ def evaluate_lift(
     distance: Distance | None,
     generator: torch.Generator,
 ) -> tuple[Tensor, Rendering]:
-    """The difference between a view and its image inpainted in 2D, and the rendering.
+    """Return the difference between a rendered view and its image inpainted in 2D, and the rendering.
 
-    NeRF-In takes the squared error of the hole's pixels. Where the images of several views disagree, its minimum is
-    their mean, which is blurred; SPIn-NeRF therefore compares patches around the hole by LPIPS.
+    NeRF-In takes the squared error of the hole's pixels. Where the images of several views disagree, the minimum of
+    this error is their mean, which is blurred. Therefore SPIn-NeRF compares patches around the hole by LPIPS.
 
     Args:
-        reached: [N] bool, the Gaussians that the gradient reaches.
-        view: with at least one pixel to repaint, and its `lifted` image.
-        distance: of patches; not used by the squared error.
-        generator: on the CPU; draws the patch.
+        gaussians: All Gaussians of the scene.
+        reached: bool [N], True for the Gaussians that get a gradient.
+        view: A training view with at least one pixel to repaint and with a lifted image.
+        lift: Parameters of the term, which choose the squared error or the perceptual distance.
+        distance: Perceptual distance of patches. The squared error does not use it.
+        generator: Draws the patch, on the CPU.
     """
     rendering = render(confine(gaussians, reached), view.camera)
     if lift.loss == "mse":

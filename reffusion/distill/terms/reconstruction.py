@@ -14,10 +14,10 @@ from reffusion.types import Gaussians, Rendering
 
 
 def build(inputs: TermInputs, settings: Params) -> Term | None:
-    """The term; None if it never runs or no photo may supervise.
+    """Build the reconstruction term. Return None if it never runs or no photograph may supervise.
 
-    Its gradient reaches the unmasked Gaussians, or all with `reconstruction.reaches: shown`. In a clean view it reaches
-    all, because what such a view shows behind the object is true.
+    Its gradient reaches the unmasked Gaussians, or with `reconstruction.reaches: shown` all. In a clean view, from
+    which the object is absent, it reaches all Gaussians, because such a view shows the true background.
     """
     views = [view for view in inputs.views if view.supervises.any()]
     if not settings.reconstruction.every or not views:
@@ -45,10 +45,12 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
 
 
 def evaluate_reconstruction(gaussians: Gaussians, reached: Tensor, view: TrainView) -> tuple[Tensor, Rendering]:
-    """(1 - 0.2) L1 + 0.2 D-SSIM over the pixels whose photo may supervise, and the rendering.
+    """Return (1 - 0.2) L1 + 0.2 D-SSIM over the pixels whose photograph may supervise, and the rendering.
 
     Args:
-        reached: [N] bool, the Gaussians that the gradient reaches.
+        gaussians: All Gaussians of the scene.
+        reached: bool [N], True for the Gaussians that get a gradient.
+        view: A training view.
     """
     rendering = render(confine(gaussians, reached), view.camera)
     return reconstruction_loss(rendering.color, view.picture, view.supervises), rendering

@@ -14,12 +14,12 @@ from reffusion.types import Camera, Gaussians, Rendering
 
 
 def build(inputs: TermInputs, settings: Params) -> Term | None:
-    """The term; None if its weight is 0. It takes the references in turn.
+    """Build the reference term, which takes the references in turn. Return None if its weight is 0.
 
-    Its gradient reaches the masked Gaussians, or all that show in the hole with `reference.reaches: all`.
+    Its gradient reaches the masked Gaussians, or with `reference.reaches: all` all that show in the hole.
 
     Raises:
-        ValueError: there is no reference.
+        ValueError: There is no reference.
     """
     if settings.reference.weight == 0:
         return None
@@ -43,16 +43,19 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
 def evaluate_reference(
     gaussians: Gaussians, reached: Tensor, camera: Camera, image: Tensor, hole: Tensor
 ) -> tuple[Tensor, Rendering]:
-    """The reconstruction loss over the reference's hole, and the rendering of the part of the view around it.
+    """Return the reconstruction loss over a reference's hole, and the rendering of the part of the view around it.
 
-    The value is that of the whole view, in which the hole is rendered with its bounding box only.
+    Only the bounding box of the hole is rendered. The loss is scaled to the value that it would have if the whole view
+    were rendered.
 
     PAPER leaves open: whether the reference supervises directly. In the paper it only initialises and personalises.
 
     Args:
-        reached: [N] bool, the Gaussians that the gradient reaches.
+        gaussians: All Gaussians of the scene.
+        reached: bool [N], True for the Gaussians that get a gradient.
+        camera: The camera of the reference.
         image: [H, W, 3] in [0, 1], the reference.
-        hole: [H, W] bool, the pixels it was made for.
+        hole: bool [H, W], True at the pixels that the reference invents.
     """
     box = mask_box(hole.cpu().numpy(), dilation=0) or Box(0, 0, camera.width, camera.height)
     part = camera.cropped(box.left, box.top, box.right - box.left, box.bottom - box.top)

@@ -1,4 +1,4 @@
-"""The SDS term: multi-scale score distillation pulls a view towards what the adapted prior expects (section 4.2)."""
+"""The SDS term: multi-scale score distillation makes views more probable under the adapted prior (section 4.2)."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from reffusion.prior.windows import enlarge_to_fit, two_scale_masks, two_scales,
 from reffusion.splat.rasterizer import render
 from reffusion.types import Camera, Gaussians, Rendering
 
-T_LOW = 0.02  # PAPER leaves open: the lowest timestep of SDS, as a fraction of the schedule; threestudio's
+T_LOW = 0.02  # PAPER leaves open: the lowest timestep of SDS, as a fraction of the schedule. This is threestudio's
 
 
 def build(inputs: TermInputs, settings: Params) -> Term | None:
-    """The term; None if SDS is off, or no view has a hole and is near enough to a reference.
+    """Build the SDS term. Return None if SDS is off, or if no view has a hole and is near enough to a reference.
 
-    All views with a hole take their turn, and the turns of those that are too far from every reference are left out.
-    The gradient reaches the masked Gaussians, or all that show with `sds.reaches: all`.
+    All views with a hole take turns. A view that is too far from every reference is left out in its turn. The gradient
+    reaches the masked Gaussians, or with `sds.reaches: all` all that show in the view.
 
     Raises:
-        ValueError: there is no prior, or its prompts are not embedded.
+        ValueError: There is no prior, or its prompts are not embedded.
     """
     sds, views = settings.sds, inputs.hole_views
     if not sds.is_on or not views:
@@ -68,9 +68,16 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
 def views_near_references(
     views: Sequence[TrainView], references: Sequence[Camera], means: Tensor, max_angle: float
 ) -> frozenset[str]:
-    """Names of the views that are at most `max_angle` degrees from a reference.
+    """Return the names of the views whose direction differs by at most `max_angle` from that of some reference.
 
-    The angle is measured at the median of `means` [M, 3], the middle of the hole.
+    The angle is that between the directions to both cameras, as seen from the median of `means`, the middle of the
+    hole.
+
+    Args:
+        views: The views to choose from.
+        references: The cameras of the references.
+        means: [M, 3], centres of the masked Gaussians. If M = 0, all views are returned.
+        max_angle: Degrees. With 180 all views are returned.
     """
     if max_angle >= 180 or len(means) == 0:
         return frozenset(view.camera.name for view in views)
@@ -82,7 +89,14 @@ def views_near_references(
 def describe_sds_views(
     sds: SdsTerm, means: Tensor, views: Sequence[TrainView], references: Sequence[ReferenceHole]
 ) -> str:
-    """A sentence that says how many of the views with a hole are distilled. `means`: [M, 3] of masked Gaussians."""
+    """Return a sentence that says how many of the views with a hole are distilled.
+
+    Args:
+        sds: Parameters of the SDS term.
+        means: [M, 3], centres of the masked Gaussians.
+        views: The training views.
+        references: The references.
+    """
     with_hole = [view for view in views if view.repaint.any()]
     near = views_near_references(with_hole, [each.camera for each in references], means, sds.max_angle)
     degrees = f"{sds.max_angle:g} degrees"
@@ -100,20 +114,27 @@ def evaluate_sds(
     probe: Tensor | None = None,
     t_low: float = T_LOW,
 ) -> tuple[Tensor, Rendering]:
-    """L_global + mean(L_local) of one view, all samples in one batch of the UNet, and the rendering.
+    """Return the SDS loss L_global + mean(L_local) of one view, and the rendering.
 
-    PAPER leaves open: what conditions the UNet. The photo where it may supervise; elsewhere the rendering itself
-    (background that other views see behind the object), with the hole blanked. No gradient flows through it.
+    The whole view and its patches are one batch of the UNet.
+
+    PAPER leaves open: what conditions the UNet. Here the condition is the photograph where the photograph may
+    supervise, and elsewhere the rendering itself (background that other views see behind the object), with a blank
+    hole. No gradient flows through this condition.
 
     Args:
-        reached: [N] bool, the Gaussians that the gradient reaches.
-        view: with at least one pixel to repaint.
-        text: [3, L, D], the hidden states of the global, the local and the empty prompt.
-        generator: on the CPU; draws windows, timesteps and noise.
-        probe: [N, 2], see `splat.render`; its gradient is zero for Gaussians that are not reached, too.
-        t_low: lowest timestep, as a fraction of the schedule.
+        gaussians: All Gaussians of the scene.
+        reached: bool [N], True for the Gaussians that get a gradient.
+        view: A training view with at least one pixel to repaint.
+        prior: The adapted prior.
+        text: [3, L, D], the embeddings of the global, the local and the empty prompt.
+        sds: Parameters of the SDS term.
+        generator: Draws windows, timesteps and noise, on the CPU.
+        probe: [N, 2], see `splat.render`. Its gradient is zero for Gaussians that are not reached. None: no probe.
+        t_low: Lowest timestep, as a fraction of the schedule.
+
     Raises:
-        FloatingPointError: the prior's prediction is not finite.
+        FloatingPointError: The prior's prediction is not finite.
     """
     size = prior.native_size
     probe = None if probe is None else probe * reached[:, None]

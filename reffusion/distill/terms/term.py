@@ -1,4 +1,4 @@
-"""What a term of the distillation loss is, and what terms are built from."""
+"""The interface of a term of the distillation loss, and the inputs from which terms are built."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ from reffusion.types import Camera, Gaussians, Rendering
 
 
 class TermView(Protocol):
-    """What a term is computed on in one step: a `TrainView` or a `ReferenceHole`."""
+    """The view on which a term is computed in one step: a training view or the hole of a reference.
+
+    It is a `TrainView` or a `ReferenceHole`.
+    """
 
     @property
     def camera(self) -> Camera: ...
@@ -30,12 +33,13 @@ class TermValue(NamedTuple):
     """The value of a term in one step.
 
     Attributes:
-        loss: scalar, before the term's weight.
-        rendering: what the loss was computed from. Gaussians that are not in it do not move.
-        log: what the term adds to the trace in this step.
-        latest: what it adds in this step and in all later ones, until it is computed again. For terms that are not
-            computed in every step.
-        probe: [N, 2], the rendering's probe (see `splat.render`): its gradient selects the Gaussians to densify.
+        loss: Scalar, before the term's weight.
+        rendering: The rendering from which the loss was computed. Gaussians that it does not contain are not moved.
+        log: Values that are added to the trace for this step.
+        latest: Values that are added to the trace for this step and for all later steps, until the term is computed
+            again. For terms that are not computed in every step.
+        probe: [N, 2], the probe of the rendering (see `splat.render`). Its gradient selects the Gaussians to densify.
+            None if the term does not drive densification.
     """
 
     loss: Tensor
@@ -46,7 +50,7 @@ class TermValue(NamedTuple):
 
 
 class Stateful(Protocol):
-    """What a term trains beside the Gaussians. It is kept in checkpoints, under the term's name."""
+    """An object that a term trains beside the Gaussians. Checkpoints contain its state, under the term's name."""
 
     def state_dict(self) -> dict[str, Any]: ...
 
@@ -57,22 +61,27 @@ class Stateful(Protocol):
 class Term:
     """One term of the weighted sum (Eq. 5 of the paper), confined to its own Gaussians.
 
-    A term is computed in the steps that `every` divides. Its turn, step / every, selects the view.
+    A term is computed in every `every`-th step, from step 0 on. The number step / `every`, called its turn, selects the
+    view.
 
     Attributes:
-        name: as error messages call it; in lower case the prefix of what the loop logs of it.
-        weight: its factor lambda in the sum.
-        select_view: turn -> the view to compute the term on, or None to leave it out of this step.
-        reaches: (masked [N] bool, view) -> [N] bool, the Gaussians that its gradient reaches.
-        loss: (Gaussians, the ones it reaches [N] bool, view, step) -> `TermValue`. No gradient goes to Gaussians that
-            it does not reach. Raises Degenerate where the view determines nothing: the loop counts these and goes on.
-        every: steps between two in which it is computed.
-        fills_hole: it acts on the masked Gaussians, and is left out where there are none.
-        uses_one_thread: torch computes it on one thread, which is faster where most of the work is rendering.
-        runs_apart: its gradient is accumulated apart from that of the others, so that its norm can be logged, and
-            in another thread where that is faster.
-        allows_overlap: it may be computed at the same time as a term that runs apart.
-        state: what it trains; None for nothing.
+        name: The name in error messages. In lower case it is the prefix of keys in the trace.
+        weight: The factor lambda of the term in the sum.
+        select_view: Function of the turn that returns the view on which the term is computed, or None to leave the term
+            out of this step.
+        reaches: Function of the labels `masked`, bool [N], and of the view. It returns bool [N], the Gaussians that the
+            term's gradient reaches.
+        loss: Function of the Gaussians, of the Gaussians that the gradient reaches (bool [N]), of the view and of the
+            step. It returns a `TermValue`. All other Gaussians get no gradient. It raises Degenerate if the view does
+            not determine the loss; the loop counts such views and goes on.
+        every: Number of steps from one computation of the term to the next.
+        fills_hole: Whether the term acts on masked Gaussians. Such a term is left out if there are none.
+        uses_one_thread: Whether torch computes the term on one thread, which is faster if most of the work is
+            rendering.
+        runs_apart: Whether the term's gradient is accumulated separately from that of all other terms, so that its norm
+            can be logged. Such a term runs in another thread if this is faster.
+        allows_overlap: Whether the term may be computed at the same time as a term that runs apart.
+        state: The object that the term trains; None if it trains nothing.
     """
 
     name: str
@@ -90,16 +99,16 @@ class Term:
 
 @dataclass(frozen=True)
 class TermInputs:
-    """What the scene provides for the terms.
+    """The inputs from the scene with which terms are built.
 
     Attributes:
-        views: the training views. Terms that fill the hole use only those with pixels to repaint.
-        references: the reference images with their holes.
-        masked_means: [M, 3], centres of the initialization's masked Gaussians; on the device of everything else.
-        prior: adapted to the reference; None if there is neither SDS nor the depth term.
-        text: [3, L, D], hidden states of the global, the local and the empty prompt.
-        estimator: of depth, for the depth term.
-        distance: of patches, for the perceptual loss of lifted images.
+        views: The training views. Terms that fill the hole use only views with pixels to repaint.
+        references: The references with their holes.
+        masked_means: [M, 3], centres of the masked Gaussians of the initialization, on the device of all other tensors.
+        prior: The prior adapted to the reference. None if neither SDS nor the depth term is on.
+        text: [3, L, D], the embeddings of the global, the local and the empty prompt. None without a prior.
+        estimator: The depth estimator of the depth term. None if this term is off.
+        distance: The perceptual distance of the lift term. None if this term does not use one.
     """
 
     views: Sequence[TrainView]
@@ -112,16 +121,26 @@ class TermInputs:
 
     @cached_property
     def hole_views(self) -> Sequence[TrainView]:
-        """The training views with pixels to repaint."""
+        """Return the training views with pixels to repaint."""
         return [view for view in self.views if view.repaint.any()]
 
 
 def cycle_through(views: Sequence[TrainView], seed: int, label: str) -> Callable[[int], TrainView]:
-    """Turn -> view: every view once an epoch, in a random order that `seed`, `label` and epoch determine."""
+    """Return a function that selects the view of each turn: every view once per epoch, in a random order.
+
+    Args:
+        views: The views.
+        seed, label: With the number of the epoch they determine the order.
+    """
     return lambda turn: views[seeding.epoch_index(turn, len(views), seed, "distill", label)]
 
 
 def reach_hole(settings: Params, everywhere: bool = False) -> Callable[[Tensor, TermView], Tensor]:
-    """The Gaussians that a term which fills the hole reaches: the masked ones; all if `everywhere` or unconfined."""
+    """Return the `reaches` of a term that fills the hole: the masked Gaussians, or all.
+
+    Args:
+        settings: If `settings.confined` is False, the term reaches all Gaussians.
+        everywhere: If True, the term reaches all Gaussians.
+    """
     reaches_all = everywhere or not settings.confined
     return lambda masked, view: torch.ones_like(masked) if reaches_all else masked

@@ -1,7 +1,8 @@
-"""Fills a hole with patches of photographs, coarse to fine.
+"""Completion of a hole with patches of photographs, from coarse to fine.
 
-PatchMatch with voting (after Wexler et al. 2007, Barnes et al. 2009, Newson et al. 2017), with patches that follow the
-perspective of planes (after Huang et al. 2014), blended by their gradients. Nothing is invented or downloaded.
+The method is PatchMatch with voting (after Wexler et al. 2007, Barnes et al. 2009, Newson et al. 2017). Patches follow
+the perspective of planes (after Huang et al. 2014), and are blended by their gradients. Every colour comes from a
+source image; no weights are needed.
 
 PAPER leaves open: who inpaints the reference (it shows results of several tools, and of people).
 """
@@ -24,22 +25,23 @@ from reffusion.inpaint.poisson import blend
 from reffusion.inpaint.source_image import SourceImage
 from reffusion.io.images import to_gray
 
-COARSEST_WIDTH = 40.0  # px, width of the hole at the coarsest level, where its parts are laid out
+COARSEST_WIDTH = 40.0  # px, largest width of the hole at the coarsest level, where its content is laid out
 SINGLE_LEVEL_WIDTH = 16.0  # px: a wider hole has at least two levels
-ROUGHNESS_WEIGHT = 2.0  # of the local mean gradient beside the colours: it tells gravel from a wall of its colour
-PLANE_FEATURE = 50.0  # levels, the difference of two planes beside that of colours
-LAYER_FEATURE = 75.0  # levels, the difference of two foreground layers
-NORMAL_FEATURE = 40.0  # levels, by the difference of normals
-CHANNELS, VOTED = 9, 5  # features compared, and the first of them, on which patches vote; the others are known
-ROUGHNESS_WINDOW = 15  # px, a side of the window of the local mean gradient
-TRUST_FALLOFF = 1.2  # factor by which trust falls with each pixel from the hole's border
+# Weights of the features by which patches are compared, beside the colours in levels of 255
+ROUGHNESS_WEIGHT = 2.0  # of the local mean gradient, which distinguishes gravel from a wall of the same colour
+PLANE_FEATURE = 50.0  # levels by which two smooth planes differ
+LAYER_FEATURE = 75.0  # levels by which two foreground layers differ
+NORMAL_FEATURE = 40.0  # levels per difference of normals
+CHANNELS, VOTED = 9, 5  # features; the first ones, on which patches vote, since the others are known in the hole too
+ROUGHNESS_WINDOW = 15  # px, side of the window of the local mean gradient
+TRUST_FALLOFF = 1.2  # factor by which trust falls with each pixel inwards from the hole's border
 MIN_TRUST = 0.02
-MASK_MARGIN = 1.5  # of PATCH_RADIUS: how far from masked pixels a patch's middle must lie
-MIN_PLACES = 200  # for patches: with fewer there is no coarser level, or Telea's method instead
-FIRST_ROUNDS, FIRST_TRIES = 3, 60  # rounds, and tries anywhere, of the first layout
-TRIES = 20  # tries anywhere at the coarsest level; a fifth at the others
-ROUNDS = (8, 5, 3)  # of search and vote: at the coarsest level, between, at the finest
-NO_SPREAD = 1e12  # spread of misfit at which all patches vote alike
+MASK_MARGIN = 1.5  # in units of PATCH_RADIUS: distance that the centre of a patch keeps from masked pixels
+MIN_PLACES = 200  # patches that the sources must offer at a level; if the finest has fewer, Telea's method is used
+FIRST_ROUNDS, FIRST_TRIES = 3, 60  # rounds of search, and random tries per pixel, of the first layout
+TRIES = 20  # random tries per pixel at the coarsest level; a fifth of it at all others
+ROUNDS = (8, 5, 3)  # rounds of search and vote at the coarsest level, at the levels between, and at the finest
+NO_SPREAD = 1e12  # spread of misfit with which all patches vote alike
 
 
 @dataclass(frozen=True)
@@ -48,8 +50,9 @@ class Completion:
 
     Attributes:
         image: uint8 [H, W, 3].
-        misfit: how badly its patches fit on the whole: of several completions, the one with the least mostly looks
-            best.
+        misfit: how badly the patches fit on the whole: the weighted mean of their misfits (`search.misfit`). Of several
+            completions, the one with the least misfit mostly looks best. It is `NO_MATCH` if there were too few patches
+            and Telea's method filled the hole.
     """
 
     image: np.ndarray
@@ -59,12 +62,14 @@ class Completion:
 def complete(
     target: SourceImage, hole: np.ndarray, sources: Sequence[SourceImage], smooth: Sequence[int] = (), seed: int = 0
 ) -> Completion:
-    """The target with its hole, bool [H, W], filled with patches of the sources, which may include the target itself.
+    """Fill the hole of a view with patches of source images.
 
     Args:
-        target: its image is read outside the hole only.
-        smooth: indices of the planes whose perspective patches follow; on rough ground that would smear grass.
-        seed: of the search.
+        target: the view; its image is read outside the hole only.
+        hole: bool [H, W], the pixels to fill.
+        sources: images from which patches are taken, which may include the view's own photograph.
+        smooth: indices of the smooth planes, whose perspective patches follow. On rough ground this would smear grass.
+        seed: seed of the random search.
     """
     if not hole.any():
         return Completion(target.image.copy(), 0.0)
@@ -80,7 +85,7 @@ def complete(
         hole_pixels = _gather_hole(target, mask, 2 ** (len(pyramid) - 1 - k), smooth, level_sources)
         level = Level(hole_pixels, level_sources, current, _trust(mask))
         positions = _patch_positions(level_sources, int(hole_pixels.plane.max()))
-        if matches is None or coarser is None:  # the first
+        if matches is None or coarser is None:  # the coarsest level
             matches = _first_layout(level, mask, positions, state)
         else:
             matches = _from_coarser(matches, coarser, level)
@@ -98,8 +103,20 @@ def complete(
 
 
 def _blend_patches(image: np.ndarray, hole: np.ndarray, level: Level, matches: Matches) -> np.ndarray:
-    """uint8 [H, W, 3], the image with its hole filled from the middles of the patches, without seams. No colour lies
-    beyond theirs and those outside the hole."""
+    """Fill the hole of the image by the patches' gradients, without seams.
+
+    Each pixel gets about the colour at the centre of its patch. Colours are limited to the range of those at the
+    centres of the patches and those outside the hole.
+
+    Args:
+        image: uint8 [H, W, 3].
+        hole: bool [H, W].
+        level: the finest level of the pyramid.
+        matches: the patch of each pixel of the hole.
+
+    Returns:
+        uint8 [H, W, 3].
+    """
     own = level.current[..., :3].copy()
     right, below = np.zeros_like(own), np.zeros_like(own)
     count_right, count_below = np.zeros(hole.shape, np.float32), np.zeros(hole.shape, np.float32)
@@ -115,8 +132,12 @@ def _blend_patches(image: np.ndarray, hole: np.ndarray, level: Level, matches: M
 def _build_pyramid(
     target: SourceImage, hole: np.ndarray, sources: Sequence[SourceImage], smooth: Sequence[int]
 ) -> list[tuple[np.ndarray, np.ndarray, Sources]]:
-    """The levels, coarsest first: the target's features [h, w, C], its hole, bool [h, w], and the sources. Empty where
-    there is too little to take patches from."""
+    """Build the image pyramid of the target and the sources; arguments as of `complete`.
+
+    Returns:
+        For each level, the coarsest first: the features of the target, [h, w, C], its hole, bool [h, w], and the
+        sources. The list is empty if the sources offer fewer than `MIN_PLACES` patches.
+    """
     width = 2 * _distance_inside(hole).max()
     count = 1 + int(np.ceil(np.log2(max(width / COARSEST_WIDTH, 2.0 if width > SINGLE_LEVEL_WIDTH else 1.0))))
     current, mask, scale = _color_features(target.image, hole), hole, 1
@@ -137,8 +158,15 @@ def _build_pyramid(
 
 
 def _color_features(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
-    """[H, W, 5] float32, colours, and the local mean of the grey image's absolute gradient along x and y. Masked pixels
-    take the colours of the nearest others."""
+    """Return [H, W, 5] float32, the colours of an image, and the roughness along x and y.
+
+    Roughness is the local mean of the grey image's absolute gradient, times `ROUGHNESS_WEIGHT`. A masked pixel takes
+    the colour of the nearest pixel that is not masked.
+
+    Args:
+        image: uint8 [H, W, 3].
+        masked: bool [H, W].
+    """
     if masked.any() and not masked.all():
         nearest = ndimage.distance_transform_edt(masked, return_distances=False, return_indices=True)
         image = image[tuple(nearest)]
@@ -151,8 +179,20 @@ def _color_features(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
 
 
 def _with_geometry(values: np.ndarray, source: SourceImage, smooth: Sequence[int], scale: int) -> np.ndarray:
-    """[h, w, 9], features [h, w, 5], then one channel for smooth plane and foreground layer (where two meet, patches
-    must show the same edge), and the normal. `scale`: of the source's size to that of the features."""
+    """Append the geometry to the features of an image.
+
+    One channel encodes the smooth plane and the foreground layer of a pixel, so that a patch that covers the edge
+    between two surfaces must show the same edge. Three channels hold the normal.
+
+    Args:
+        values: [h, w, 5], the result of `_color_features`, at the size of the level.
+        source: the surfaces that the image shows, at full size.
+        smooth: indices of the smooth planes.
+        scale: full size divided by the size of the level.
+
+    Returns:
+        [h, w, 9].
+    """
     of_plane = np.zeros(max([*smooth, int(source.plane.max())]) + 1, np.float32)
     of_plane[list(smooth)] = PLANE_FEATURE * np.arange(1, len(smooth) + 1)
     marks = of_plane[source.plane] + LAYER_FEATURE * source.layer.astype(np.float32)
@@ -161,7 +201,10 @@ def _with_geometry(values: np.ndarray, source: SourceImage, smooth: Sequence[int
 
 
 def _halve(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both at half the size, rounded up; a pixel is masked if any part of it is."""
+    """Reduce features, [h, w, C], and a mask, bool [h, w], to half their size, rounded up.
+
+    Features are averaged over the pixels that are not masked. A reduced pixel is masked if any part of it was.
+    """
     even = lambda a: np.pad(a, [(0, a.shape[0] % 2), (0, a.shape[1] % 2)] + [(0, 0)] * (a.ndim - 2), mode="edge")
     values, known = even(values), even((~masked).astype(np.float32))
     size = (known.shape[1] // 2, known.shape[0] // 2)
@@ -173,7 +216,14 @@ def _halve(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def _stack_sources(
     values: Sequence[np.ndarray], masks: Sequence[np.ndarray], sources: Sequence[SourceImage], scale: int
 ) -> Sources:
-    """The sources at 1 / `scale` of their size; features `values` [h, w, C] and `masks` [h, w] have it already."""
+    """Collect the sources of one level of the pyramid in common arrays.
+
+    Args:
+        values: the features of each source, [h, w, C], at the size of the level.
+        masks: the masked pixels of each source, bool [h, w], at the size of the level.
+        sources: the source images at full size, whose geometry is reduced here.
+        scale: full size divided by the size of the level.
+    """
     height, width = (max(masked.shape[axis] for masked in masks) for axis in (0, 1))
     shape = (len(masks), height, width)
     stack = Sources(
@@ -192,8 +242,17 @@ def _stack_sources(
 
 
 def _gather_hole(target: SourceImage, mask: np.ndarray, scale: int, smooth: Sequence[int], sources: Sources) -> Hole:
-    """The hole's pixels at 1 / `scale` of the target's size. Patches do not follow planes that hardly any source
-    shows."""
+    """Collect the pixels of the hole at one level of the pyramid, with their geometry.
+
+    Patches follow the smooth planes of which the sources show enough (`MIN_PLACES` pixels).
+
+    Args:
+        target: the view at full size.
+        mask: bool [h, w], the hole at the size of the level.
+        scale: full size divided by the size of the level.
+        smooth: indices of the smooth planes.
+        sources: the sources of the level.
+    """
     rows, columns = np.nonzero(mask)
     index = np.full(mask.shape, -1)
     index[rows, columns] = np.arange(len(rows))
@@ -206,7 +265,7 @@ def _gather_hole(target: SourceImage, mask: np.ndarray, scale: int, smooth: Sequ
 
 
 def _patch_positions(sources: Sources, last_plane: int) -> Positions:
-    """All places, then those of each plane up to index `last_plane`."""
+    """List all places at which patches may have their centre, then those on each plane up to index `last_plane`."""
     places = np.argwhere(sources.plane >= 0).astype(np.int32)
     plane = sources.plane[tuple(places.T)]
     parts = [places] + [places[plane == k] for k in range(1, last_plane + 1)]
@@ -214,13 +273,24 @@ def _patch_positions(sources: Sources, last_plane: int) -> Positions:
 
 
 def _trust(mask: np.ndarray) -> np.ndarray:
-    """[H, W] float32: 1 where known, falling from the hole's border inwards."""
+    """Return [H, W] float32, the trust in each pixel: 1 outside the hole, and falling inwards from the hole's border.
+
+    It weights pixels in the comparison of patches, and patches in the vote.
+    """
     return np.where(mask, np.maximum(TRUST_FALLOFF ** -_distance_inside(mask), MIN_TRUST), 1).astype(np.float32)
 
 
 def _first_layout(level: Level, mask: np.ndarray, positions: Positions, state: np.ndarray) -> Matches:
-    """The first matches, ring by ring from the hole's border inwards: each ring is compared with what is known outside
-    it."""
+    """Find the first matches at the coarsest level, ring by ring from the hole's border inwards.
+
+    The patches of a ring of pixels are compared only with pixels outside this ring, which are known or already filled.
+
+    Args:
+        level: the coarsest level. The hole of `level.current` is filled in place.
+        mask: bool [h, w], the hole.
+        positions: the places that random search draws from.
+        state: [1] uint64, state of the random numbers.
+    """
     row, column, trust = level.hole.row, level.hole.column, level.weight
     count = len(row)
     zeros = lambda kind: np.zeros(count, kind)
@@ -237,7 +307,7 @@ def _first_layout(level: Level, mask: np.ndarray, positions: Positions, state: n
 
 
 def _from_coarser(matches: Matches, coarser: Hole, level: Level) -> Matches:
-    """The matches of the coarser level's hole, for the pixels of this level."""
+    """Convert the matches of the coarser level to this level: each pixel inherits the match of its coarser pixel."""
     (height, width), hole = coarser.index.shape, level.hole
     row, column = np.minimum(hole.row // 2, height - 1), np.minimum(hole.column // 2, width - 1)
     parent = coarser.index[row, column]
@@ -248,13 +318,25 @@ def _from_coarser(matches: Matches, coarser: Hole, level: Level) -> Matches:
 
 
 def _vote(level: Level, matches: Matches, trust: np.ndarray, spread: float, todo: np.ndarray | None = None) -> None:
-    """Fills the hole of `level.current`, or its pixels `todo`, by the vote of the patches: the first `VOTED` features,
-    for the geometry is known."""
+    """Fill the hole of `level.current`, in place, with the weighted mean of all patches that cover each pixel.
+
+    Only the first `VOTED` features change, since the geometry is known in the hole too.
+
+    Args:
+        level: the level of the pyramid.
+        matches: the patch of each pixel of the hole.
+        trust: [h, w] float32, weight of each patch, read at its pixel.
+        spread: misfit over which the weight of a patch falls by a factor of e.
+        todo: [T], indices of the pixels of the hole to fill; None for all.
+    """
     todo, voted = np.arange(len(level.hole.row)) if todo is None else todo, level.current.copy()
     voting.vote(todo, matches, level.hole, trust, level.sources, spread, voted)
     level.current[..., :VOTED] = voted[..., :VOTED]
 
 
 def _distance_inside(mask: np.ndarray) -> np.ndarray:
-    """[H, W], distance to the outside of the mask, in px; beyond the image's border counts as outside."""
+    """Return [H, W], the distance of each masked pixel from the outside of the mask, in px.
+
+    The area beyond the image's border counts as outside. The distance is 0 for pixels that are not masked.
+    """
     return ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]

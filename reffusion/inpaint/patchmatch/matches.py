@@ -1,4 +1,4 @@
-"""The arrays that the patch search works on, and the transform of a patch from a source image to the hole."""
+"""The arrays of the patch search, and the transform that relates a patch of a source image to the hole."""
 
 from __future__ import annotations
 
@@ -9,23 +9,25 @@ import numpy as np
 
 from reffusion.kernels.compiled import inlined
 
-PATCH_RADIUS = 3  # px from a patch's middle to its border
+PATCH_RADIUS = 3  # px, so that a patch has 7 x 7 px
 MAX_TURN = 0.15  # radians by which a patch may be turned in its plane
-MIN_SCALE, MAX_SCALE = 0.8, 1.4  # bounds of the scale between two patches off planes
-SCALE_TOLERANCE = 0.1  # a scale so near to 1 is taken as 1: sampling between pixels would only blur
-MIN_AREA, MAX_AREA = 0.6, 3.0  # source pixels for one pixel of the hole, bounds along a plane
-MAX_STRETCH = 6.0  # bound of the transform's squared Frobenius norm, along a plane
-NO_MATCH = np.float32(1e29)  # misfit where there is no patch
+MIN_SCALE, MAX_SCALE = 0.8, 1.4  # bounds of the scale of a patch that does not follow a plane
+SCALE_TOLERANCE = 0.1  # a scale that differs from 1 by less is taken as 1, because sampling between pixels blurs
+MIN_AREA, MAX_AREA = 0.6, 3.0  # bounds of the source pixels per pixel of the hole, for a patch that follows a plane
+MAX_STRETCH = 6.0  # bound of the squared Frobenius norm of the transform of such a patch
+NO_MATCH = np.float32(1e29)  # misfit of a pixel that has no patch
 
 
 class Sources(NamedTuple):
-    """K images that patches are taken from, padded to one size.
+    """K images from which patches are taken, padded to one size.
 
     Attributes:
-        values: [K, H, W, C] float32, colours in [0, 255] and the other features compared.
-        plane: [K, H, W] int32, index of the plane shown, 1, 2, ...; 0: none; -1: no patch may have its middle here.
-        to_pixels: [K, H, W, 4] float32, derivative of pixels (x, y) by the coordinates on the plane, 2 x 2 by rows.
-        pixel_size: [K, H, W] float32, length of a pixel on the surface, in the world's unit.
+        values: [K, H, W, C] float32, colours in [0, 255], followed by the other features by which patches are compared.
+        plane: [K, H, W] int32, index of the plane that a pixel shows, 1, 2, ...; 0 for none; -1 if no patch may have
+            its centre here.
+        to_pixels: [K, H, W, 4] float32, derivative of the pixel (x, y) with respect to the coordinates on the plane, a
+            2 x 2 matrix by rows.
+        pixel_size: [K, H, W] float32, length of a pixel on the surface, in world units.
     """
 
     values: np.ndarray
@@ -38,12 +40,13 @@ class Hole(NamedTuple):
     """The N pixels to be filled.
 
     Attributes:
-        row, column: [N] int64.
-        index: [H, W] int64, a pixel's index, or -1 outside.
-        plane: [N] int32 as in `Sources`.
-        along_plane: [N] bool, whether patches may follow the plane's perspective.
-        to_plane: [N, 4] float32, derivative of the coordinates on the plane by pixels (x, y), 2 x 2 by rows.
-        pixel_size: [N] float32 as in `Sources`.
+        row, column: [N] int64, their positions.
+        index: [H, W] int64, the index 0..N-1 of each pixel of the hole; -1 outside the hole.
+        plane: [N] int32, index of the plane on which the pixel lies; 0 for none.
+        along_plane: [N] bool, True if the pixel's patch may follow the perspective of this plane.
+        to_plane: [N, 4] float32, derivative of the coordinates on the plane with respect to the pixel (x, y), a 2 x 2
+            matrix by rows.
+        pixel_size: [N] float32, length of the pixel on the surface, in world units.
     """
 
     row: np.ndarray
@@ -60,9 +63,9 @@ class Level(NamedTuple):
 
     Attributes:
         hole: the pixels to be filled.
-        sources: the images that patches are taken from.
-        current: [H, W, C] float32, the target's features as they are now, with the hole filled.
-        weight: [H, W] float32, of each of its pixels in the comparison.
+        sources: the images from which patches are taken.
+        current: [H, W, C] float32, the features of the target, with the present content of the hole. Votes change it.
+        weight: [H, W] float32, weight of each pixel of `current` in the comparison of patches.
     """
 
     hole: Hole
@@ -72,14 +75,14 @@ class Level(NamedTuple):
 
 
 class Matches(NamedTuple):
-    """The patch that each pixel of the hole takes (nearest-neighbour field); all [N].
+    """The match of each of the N pixels of the hole (nearest-neighbour field): the source patch that it takes.
 
     Attributes:
-        source: int32, index of the image, -1 for none.
-        row, column: float32, the patch's middle.
-        angle: float32, radians by which it is turned in its plane.
-        along_plane: bool, whether it follows the plane's perspective.
-        misfit: float32, see `search.misfit`; `NO_MATCH` for none.
+        source: [N] int32, index of the source image; -1 for no patch.
+        row, column: [N] float32, centre of the patch in the source image.
+        angle: [N] float32, radians by which the patch is turned in its plane.
+        along_plane: [N] bool, True if the patch follows the perspective of its plane.
+        misfit: [N] float32, how badly the patch fits (`search.misfit`); `NO_MATCH` for no patch.
     """
 
     source: np.ndarray
@@ -91,8 +94,13 @@ class Matches(NamedTuple):
 
 
 class Positions(NamedTuple):
-    """Where a patch may have its middle: places, [M, 3] int32 (source, row, column), sorted by plane; and [S + 2]
-    int64, where those of each plane start. Those of plane 0 are all places."""
+    """The places at which a patch may have its centre, as a list for random draws.
+
+    Attributes:
+        places: [M, 3] int32 (source, row, column): first all places, then again those on plane 1, on plane 2, ...
+        starts: [S + 2] int64 for S planes. `starts[k]` is the first entry of plane k in `places`, and `starts[k + 1]`
+            the end of its entries; k = 0 stands for all places.
+    """
 
     places: np.ndarray
     starts: np.ndarray
@@ -100,8 +108,22 @@ class Positions(NamedTuple):
 
 @inlined
 def patch_transform(hole, n, sources, along_plane, source, row, column, angle):
-    """Whether the transform is within bounds, and its matrix xx, xy, yx, yy, from steps (x, y) around pixel n to steps
-    around a pixel of a source."""
+    """Compute the linear transform that takes steps (x, y) around a pixel of the hole to steps around a source pixel.
+
+    For a patch that follows a plane, the transform contains the perspective of both images and a turn in the plane.
+    For any other patch it is a scale, the ratio of the pixels' lengths on their surfaces, within bounds.
+
+    Args:
+        hole: `Hole`.
+        n: index of the pixel of the hole.
+        sources: `Sources`.
+        along_plane: whether the patch follows the perspective of a plane.
+        source, row, column: the source pixel.
+        angle: radians by which the patch is turned in its plane.
+
+    Returns:
+        Whether the transform is within bounds, and its matrix [[xx, xy], [yx, yy]] as xx, xy, yx, yy.
+    """
     if not along_plane:
         scale = hole.pixel_size[n] / sources.pixel_size[source, row, column]
         scale = min(max(scale, np.float32(MIN_SCALE)), np.float32(MAX_SCALE))
@@ -121,6 +143,6 @@ def patch_transform(hole, n, sources, along_plane, source, row, column, angle):
 
 @inlined
 def match_transform(hole, n, sources, matches):
-    """The transform of the patch that pixel n takes; see `patch_transform`."""
+    """Return the transform of the patch that pixel n of the hole takes at present; see `patch_transform`."""
     row, column = math.floor(matches.row[n] + 0.5), math.floor(matches.column[n] + 0.5)
     return patch_transform(hole, n, sources, matches.along_plane[n], matches.source[n], row, column, matches.angle[n])

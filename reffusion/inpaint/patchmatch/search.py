@@ -1,8 +1,8 @@
-"""Kernels of the patch search: for each pixel of a hole, the most similar patch of the source images (PatchMatch).
+"""Compiled kernels of the patch search (PatchMatch): for each pixel of a hole, the most similar patch of the sources.
 
-Patches are compared in the frame of their surface. On a plane the perspective of source and target is applied, and the
-patch may be turned in the plane, so that planks continue in their own perspective. Off planes the patch is shifted, and
-scaled by its distance.
+Patches are compared on their surface. On a plane the perspective of source and target is taken into account, and the
+patch may be turned in the plane, so that planks continue in their own perspective. Elsewhere a patch is only shifted,
+and scaled by its distance.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from reffusion.inpaint.patchmatch.matches import (
 )
 from reffusion.kernels.compiled import FREE_ROUNDING, inlined, kernel
 
-OTHER_SURFACE_PENALTY = 1.5  # factor of the misfit of a patch of another surface, or of one much nearer or farther
-MUCH_NEARER = 1.25  # scale above which a patch is so much nearer that views would have seen it in the hole
-FOREIGN_PENALTY = 4.0  # further factor of such a patch, and of one from one plane to another
+OTHER_SURFACE_PENALTY = 1.5  # factor on the misfit of a patch from another surface, or much nearer or farther away
+MUCH_NEARER = 1.25  # scale above which a patch's surface is so near that other views would have seen it in the hole
+FOREIGN_PENALTY = 4.0  # further factor on the misfit of such a patch, and of a patch from a different plane
 
 
 @inlined
 def _random(state):
-    """A random number in [0, 1), float32, by xorshift64; changes `state`."""
+    """Draw a random number in [0, 1), float32, by xorshift64, and advance `state`, [1] uint64."""
     x = state[0]
     x ^= x << np.uint64(13)
     x ^= x >> np.uint64(7)
@@ -40,7 +40,14 @@ def _random(state):
 
 @inlined
 def _penalty(hole, n, plane, size):
-    """Factor of the misfit between pixel n and a patch of a plane (0: none) with pixels of that size in the world."""
+    """Return the factor on the misfit of a patch that comes from another surface than pixel n of the hole.
+
+    Args:
+        hole: `Hole`.
+        n: index of the pixel.
+        plane: index of the patch's plane; 0 for none.
+        size: length of the patch's pixels on the surface, in world units.
+    """
     ratio, same = hole.pixel_size[n] / size, plane == hole.plane[n]
     penalty = np.float32(1) if same and MIN_SCALE < ratio < MAX_SCALE else np.float32(OTHER_SURFACE_PENALTY)
     foreign = ratio > MUCH_NEARER or (not same and plane > 0 and hole.plane[n] > 0)
@@ -48,8 +55,20 @@ def _penalty(hole, n, plane, size):
 
 
 def misfit(n, along_plane, source, y, x, angle, limit, level):
-    """Weighted mean squared difference between the patch around pixel n and the one at (y, x) of a source, times its
-    penalty; `NO_MATCH` where the pixel must not take it, or the value exceeds `limit`. `level`: see `Level`."""
+    """Compute how badly a patch of a source fits the patch around a pixel of the hole.
+
+    Args:
+        n: index of the pixel of the hole.
+        along_plane: whether the patch follows the perspective of the pixel's plane.
+        source, y, x: index of the source image, and row and column of the patch's centre.
+        angle: radians by which the patch is turned in its plane.
+        limit: the largest misfit of interest, for example that of the present patch.
+        level: `Level`.
+
+    Returns:
+        The weighted mean squared difference of the features, times the penalty for another surface. `NO_MATCH` if the
+        pixel must not take this patch, or if the misfit exceeds `limit`.
+    """
     hole, sources = level.hole, level.sources
     row, column = math.floor(y + 0.5), math.floor(x + 0.5)
     height, width, channels = sources.values.shape[1:]
@@ -58,7 +77,7 @@ def misfit(n, along_plane, source, y, x, angle, limit, level):
     plane = sources.plane[source, row, column]
     if plane < 0 or (along_plane and plane != hole.plane[n]):
         return NO_MATCH
-    if hole.along_plane[n] and not along_plane and plane == hole.plane[n]:  # a shift would keep the wrong perspective
+    if hole.along_plane[n] and not along_plane and plane == hole.plane[n]:  # a shift would keep a wrong perspective
         return NO_MATCH
     ok, xx, xy, yx, yy = patch_transform(hole, n, sources, along_plane, source, row, column, angle)
     if not ok:
@@ -99,7 +118,7 @@ misfit = kernel(misfit, FREE_ROUNDING)
 
 @inlined
 def _try_match(matches, n, along_plane, source, y, x, angle, level):
-    """Gives pixel n the patch if it fits better than its present one."""
+    """Give pixel n the patch if this patch fits better than the present one; arguments as of `misfit`."""
     value = misfit(n, along_plane, source, y, x, angle, matches.misfit[n], level)
     if value < matches.misfit[n]:
         matches.source[n], matches.row[n], matches.column[n] = source, y, x
@@ -108,7 +127,7 @@ def _try_match(matches, n, along_plane, source, y, x, angle, level):
 
 @inlined
 def _propagate(matches, n, level):
-    """Tries the patches of the four neighbours, moved by one pixel."""
+    """Try for pixel n the patches of its four neighbours in the hole, moved by one pixel."""
     hole, (height, width) = level.hole, level.current.shape[:2]
     for side in range(4):
         dy, dx = (-1, 1, 0, 0)[side], (0, 0, -1, 1)[side]
@@ -125,7 +144,7 @@ def _propagate(matches, n, level):
 
 @inlined
 def _search_nearby(matches, n, span, level, state):
-    """Tries random places near the present one, within `span` pixels first, then half as far each time."""
+    """Try for pixel n random places near its present patch, first within `span` pixels, then half as far each time."""
     while span >= 1 and matches.source[n] >= 0:
         y = matches.row[n] + (2 * _random(state) - 1) * span
         x = matches.column[n] + (2 * _random(state) - 1) * span
@@ -141,7 +160,10 @@ def _search_nearby(matches, n, span, level, state):
 
 @inlined
 def _search_anywhere(matches, n, level, positions, state):
-    """Tries a random place anywhere; half of the time on the pixel's own plane, if patches follow that plane."""
+    """Try for pixel n one random place anywhere in the sources.
+
+    If patches may follow the pixel's plane, the place is drawn from this plane half of the time.
+    """
     along_plane = level.hole.along_plane[n] and _random(state) < 0.5
     plane = level.hole.plane[n] if along_plane else 0
     first, count = positions.starts[plane], positions.starts[plane + 1] - positions.starts[plane]
@@ -153,14 +175,19 @@ def _search_anywhere(matches, n, level, positions, state):
 
 @kernel
 def search(todo, rounds, tries, matches, level, positions, state):
-    """Improves the matches of the pixels `todo`: propagation, random places nearby, and `tries` anywhere.
+    """Improve the matches of pixels of the hole, in place.
+
+    For each pixel the patches of its neighbours, random places near its present patch, and `tries` random places
+    anywhere are tried.
 
     Args:
-        todo: [T] indices of pixels in reading order; every second round goes backwards.
-        matches: is changed in place.
-        level: see `Level`.
-        positions: the places that random search draws from.
-        state: [1] uint64, of the random numbers, is changed.
+        todo: [T], indices of the pixels, in row-major order; every second round goes backwards.
+        rounds: number of passes over the pixels.
+        tries: number of random places anywhere, per pixel and round.
+        matches: `Matches`, changed in place.
+        level: `Level`.
+        positions: `Positions`, the places from which random places are drawn.
+        state: [1] uint64, state of the random numbers, changed in place.
     """
     span = max(level.sources.values.shape[1], level.sources.values.shape[2]) // 3
     for turn in range(rounds):

@@ -1,4 +1,7 @@
-"""Kernels that turn matches into pictures: votes of overlapping patches, sampling, and gradients."""
+"""Compiled kernels that turn matches into pictures: votes of overlapping patches, sampling, and gradients.
+
+A match is the source patch that a pixel of the hole takes (`matches.Matches`).
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from reffusion.kernels.compiled import inlined, kernel
 
 @inlined
 def _cubic(t):
+    """Return the weight of a sample at distance `t`, in px, in bicubic interpolation (Catmull-Rom)."""
     t = abs(t)
     if t < 1:
         return 1.5 * t * t * t - 2.5 * t * t + 1
@@ -20,7 +24,16 @@ def _cubic(t):
 
 @kernel
 def sample_cubic(values, source, y, x, c):
-    """Channel c of a source at (y, x), bicubic, clamped to the range of the four pixels around."""
+    """Return channel c of a source image at row y and column x, by bicubic interpolation.
+
+    The value is clamped to the range of the four pixels around, so that interpolation does not overshoot.
+
+    Args:
+        values: [K, H, W, C] float32, the features of all sources.
+        source: index of the source image.
+        y, x: float, row and column.
+        c: index of the channel.
+    """
     height, width = values.shape[1:3]
     i, j = math.floor(y), math.floor(x)
     total, low, high = 0.0, 1e9, -1e9
@@ -35,12 +48,16 @@ def sample_cubic(values, source, y, x, c):
 
 @kernel
 def vote(todo, matches, hole, trust, sources, spread, voted):
-    """Writes the weighted mean of all patches that cover a pixel into `voted` [H, W, C], at the pixels `todo`.
+    """Write into `voted` the weighted mean of all patches that cover each pixel.
 
     Args:
-        todo: [T] indices of pixels of the hole.
-        trust: [H, W] float32, weight of the patches by their middles.
-        spread: misfit over which a patch's weight falls by a factor of e.
+        todo: [T], indices of the pixels of the hole that are computed.
+        matches: `Matches`.
+        hole: `Hole`.
+        trust: [H, W] float32, weight of a patch, read at the pixel that takes it.
+        sources: `Sources`.
+        spread: misfit over which the weight of a patch falls by a factor of e.
+        voted: [H, W, C] float32, changed in place. Pixels that no patch covers keep their values.
     """
     height, width, channels = voted.shape
     total = np.empty(channels)
@@ -66,11 +83,14 @@ def vote(todo, matches, hole, trust, sources, spread, voted):
 
 @kernel
 def upsample_matches(matches, coarse_row, coarse_column, hole, sources):
-    """Moves matches of a coarser level to this level, in place.
+    """Convert the positions of matches from a coarser level of the pyramid to this level, in place.
 
     Args:
-        matches: N of them, whose rows and columns are those of the coarser level.
-        coarse_row, coarse_column: [N] int64, the coarser pixel that each was copied from.
+        matches: `Matches` of the N pixels of this level, copied from the coarser level, with the coarser level's rows
+            and columns of patches.
+        coarse_row, coarse_column: [N] int64, the pixel of the coarser level from which each match was copied.
+        hole: `Hole` of this level.
+        sources: `Sources` of this level.
     """
     height, width = sources.plane.shape[1:]
     for n in range(len(hole.row)):
@@ -85,13 +105,19 @@ def upsample_matches(matches, coarse_row, coarse_column, hole, sources):
 
 @kernel
 def gather_gradients(matches, hole, sources, right, below, count_right, count_below, own):
-    """Adds up the colour gradients of the matched patches, and samples their middles.
+    """Sum the colour differences between neighbouring pixels as the matched patches show them, and sample the patches.
+
+    For each pair of neighbours, each pixel of the pair that lies in the hole adds the difference that its own patch
+    shows between the two.
 
     Args:
-        right, below: [H, W, 3] float32 zeros, to which each hole pixel of a pair adds its patch's change of colour to
-            the next pixel.
-        count_right, count_below: [H, W] float32 zeros, to which the number of these is added.
-        own: [H, W, 3] float32, gets the colours at the patches' middles.
+        matches: `Matches`.
+        hole: `Hole`.
+        sources: `Sources`.
+        right, below: [H, W, 3] float32, zeros at first; get the sums of the differences from each pixel to the next one
+            on the right, and below.
+        count_right, count_below: [H, W] float32, zeros at first; get the number of summands.
+        own: [H, W, 3] float32; gets the colour at the centre of each pixel's patch.
     """
     height, width = own.shape[:2]
     for n in range(len(hole.row)):

@@ -1,8 +1,12 @@
-"""Fills a hole with a few large pieces of photographs, each moved by a candidate motion (after He and Sun 2012).
+"""Assembly of a hole from a few large pieces of photographs (after He and Sun 2012).
 
-A graph cut chooses one candidate for each pixel, so that pieces meet where they look alike; Poisson blending removes
-the seams. Where candidates come from is left to `photo_offsets` (shifts of the view's own photograph) and
-`plane_motions` (photographs of a plane, moved by motions that map the plane onto itself).
+A candidate is a photograph that is laid over the hole after a motion, for example a shift. A graph cut chooses one
+candidate for each pixel, so that adjacent pieces meet where they look alike. Poisson blending then removes the seams.
+The candidates come from `photo_offsets` (shifts of the view's own photograph) or `plane_motions` (photographs of a
+plane, moved by motions that map the plane's texture onto itself).
+
+Levels are colours in 0..255. The target is the view with the hole. The ring is a strip of known pixels around the hole,
+in which candidates are compared with the known picture.
 """
 
 from __future__ import annotations
@@ -19,23 +23,23 @@ from reffusion.inpaint.poisson import blend
 from reffusion.inpaint.shift_map.expansion import expand, feature_distance, features, neighbor_pairs
 from reffusion.inpaint.source_image import SourceImage
 
-RING = 6  # px around the hole in which candidates are compared with the known picture
-MAX_PIXELS = 15000  # that the cut works on: of a larger hole it takes every second, third, ... row and column
-MAX_COMPARED = 800  # pixels, at most, in which single candidates are judged before the cut
-MASK_MARGIN = 2  # px that a piece keeps away from masked pixels of its photograph
-INVALID_COST = 500.0  # of a pixel that a candidate does not show
-MAX_DIFFERENCE = 60.0  # levels of detail, a difference above which two pixels do not match at all
-DETAIL_SIGMA = 0.015  # of the image's width: what changes over more is tone, which blending evens out
+RING = 6  # px, width of the ring
+MAX_PIXELS = 15000  # pixels of the graph cut: in a larger hole only every second, third, ... row and column takes part
+MAX_COMPARED = 800  # pixels, at most, on which single candidates are judged before the cut
+MASK_MARGIN = 2  # px, distance that a piece keeps from masked pixels of its photograph
+INVALID_COST = 500.0  # cost of a pixel that a candidate does not show
+MAX_DIFFERENCE = 60.0  # levels: larger differences of detail count as this much
+DETAIL_SIGMA = 0.015  # of the image's width: blur that separates detail from tone, which blending evens out
 
 
 @dataclass(frozen=True)
 class HolePixels:
-    """N pixels of a hole and of the known ring around it.
+    """N pixels of a hole and of the ring of known pixels around it.
 
     Attributes:
-        rows, columns: [N] int.
-        in_hole: bool [N].
-        colors, detail: [N, 3] float32 of the known picture, see `split_detail`; meaningless in the hole.
+        rows, columns: [N] int, positions in the target.
+        in_hole: bool [N], True for pixels of the hole, False for pixels of the ring.
+        colors, detail: [N, 3] float32, colours and detail of the target (`split_detail`); meaningless in the hole.
     """
 
     rows: np.ndarray
@@ -48,23 +52,30 @@ class HolePixels:
         return len(self.rows)
 
     def select(self, which: np.ndarray) -> HolePixels:
-        """The pixels of a mask, bool [N], or of indices, int [M]."""
+        """Return the pixels that `which` selects: a mask, bool [N], or indices, int [M]."""
         return HolePixels(*(each[which] for each in vars(self).values()))
 
     def spread(self, most: int) -> HolePixels:
-        """At most `most` of the pixels, evenly spaced in reading order."""
+        """Return at most `most` of the pixels, evenly spaced in row-major order."""
         return self.select(np.linspace(0, len(self) - 1, min(len(self), most)).astype(int))
 
     def subsample(self) -> tuple[HolePixels, int]:
-        """Every `stride`-th row and column, so that about `MAX_PIXELS` are left; and the stride, in px."""
+        """Return the pixels in every k-th row and column, and k, the stride in px.
+
+        The stride is chosen so that about `MAX_PIXELS` pixels are left; with fewer pixels it is 1, and all are kept.
+        """
         stride = max(1, int(np.ceil(np.sqrt(len(self) / MAX_PIXELS))))
         return self.select((self.rows % stride == 0) & (self.columns % stride == 0)), stride
 
 
 @dataclass(frozen=True)
 class Samples:
-    """What a candidate shows at N pixels: colors and detail, [N, 3] float32 each, see `split_detail`; and where its
-    photograph may be read, `valid`, bool [N]."""
+    """The appearance of a candidate at N pixels.
+
+    Attributes:
+        colors, detail: [N, 3] float32, see `split_detail`.
+        valid: bool [N], True where the candidate's photograph may be used.
+    """
 
     colors: np.ndarray
     detail: np.ndarray
@@ -72,26 +83,26 @@ class Samples:
 
 
 class Candidates(Protocol):
-    """Photographs laid over the hole, each moved by one motion. Index k counts motions."""
+    """Photographs laid over the hole, one for each of K motions; candidate k is the k-th of them."""
 
     def __len__(self) -> int: ...
 
     def sample(self, k: int, pixels: HolePixels) -> Samples:
-        """What candidate k shows at the pixels."""
+        """Return the appearance of candidate k at the pixels."""
 
     def costs(self, k: int, pixels: HolePixels) -> np.ndarray:
-        """[N], cost of taking each pixel from candidate k; `INVALID_COST` where it must not be taken."""
+        """Return [N], the cost of each pixel if candidate k fills it; `INVALID_COST` where it must not."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """How pieces are chosen and blended.
+    """Settings of the choice and the blending of pieces.
 
     Attributes:
-        ring_weight: of the difference between a candidate and the known picture in the ring.
-        color_weight: of the pieces' own colours in the Poisson blending, against their gradients.
-        max_cost: pixels that cost as much or more take no candidate.
-        max_median_cost: if half of the hole costs more, nothing is filled: no candidate suits it.
+        ring_weight: weight of the difference between a candidate and the known picture in the ring.
+        color_weight: weight of the pieces' colours in the Poisson blending; their gradients have weight 1.
+        max_cost: pixels with this cost or a higher one are not filled.
+        max_median_cost: if the median cost of the hole's pixels is higher, no candidate suits and nothing is filled.
     """
 
     ring_weight: float = 1.0
@@ -102,12 +113,13 @@ class Options:
 
 @dataclass(frozen=True)
 class Assembly:
-    """A picture with its hole filled from pieces.
+    """A picture whose hole is filled from pieces, as far as they suit.
 
     Attributes:
         image: uint8 [H, W, 3].
         filled: bool [H, W], the pixels of the hole that pieces fill.
-        cost: per pixel of the hole, in levels: differences along seams and from the ring, and the candidates' costs.
+        cost: in levels, the total cost divided by the number of the hole's pixels. The total cost consists of the
+            differences along seams, the differences from the known picture in the ring, and the candidates' own costs.
     """
 
     image: np.ndarray
@@ -116,20 +128,40 @@ class Assembly:
 
 
 def split_detail(image: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[H, W, 3] float32 each: an image's colours in levels, and their difference from the mean of the unmasked pixels
-    around (`DETAIL_SIGMA`)."""
+    """Return the colours of an image in levels, and their detail, [H, W, 3] float32 each.
+
+    The detail of a pixel is the difference of its colour from the mean colour of the unmasked pixels around
+    (`DETAIL_SIGMA`).
+
+    Args:
+        image: uint8 [H, W, 3].
+        masked: bool [H, W], pixels that do not count in the mean.
+    """
     known, colors = (~masked).astype(np.float32)[..., None], image.astype(np.float32)
     blur = lambda a: cv2.GaussianBlur(a, (0, 0), DETAIL_SIGMA * image.shape[1]).reshape(*a.shape[:2], -1)
     return colors, colors - blur(colors * known) / np.maximum(blur(known), 1e-3)
 
 
 def erode_readable(source: SourceImage, masked: np.ndarray) -> np.ndarray:
-    """bool [H, W], pixels of a source from which pieces may be taken: usable, and `MASK_MARGIN` away from `masked`."""
+    """Return bool [H, W], the usable pixels of a source that lie at least `MASK_MARGIN` from `masked`, bool [H, W].
+
+    Pieces may be taken from these pixels.
+    """
     return ndimage.binary_erosion(~masked, iterations=MASK_MARGIN) & source.usable
 
 
 def hole_pixels(target: SourceImage, hole: np.ndarray, area: np.ndarray, allowed: np.ndarray) -> HolePixels:
-    """Pixels of the hole and the unmasked ones around an `area` in it, bool [H, W], that are `allowed`, bool [H, W]."""
+    """Select the pixels to fill and the ring around them.
+
+    Args:
+        target: the view with the hole.
+        hole: bool [H, W].
+        area: bool [H, W], the part of the hole to fill.
+        allowed: bool [H, W], the pixels that may be selected.
+
+    Returns:
+        The allowed pixels within `RING` px of the area that lie in the hole or are not masked.
+    """
     near = ndimage.distance_transform_edt(~area) <= RING if area.any() else area
     rows, columns = np.nonzero(near & allowed & (hole | ~target.masked))
     values = split_detail(target.image, hole | target.masked)
@@ -144,12 +176,16 @@ def assemble(
     regions: Sequence[np.ndarray],
     options: Options,
 ) -> Assembly:
-    """The target with its hole, bool [H, W], filled from the candidates.
+    """Fill the hole of the target from the candidates.
 
     Args:
-        target: its image is read outside the hole only.
-        pixels: of the hole and its ring, some of each.
-        regions: bool [H, W] each, which cover the hole; no tone is blended from one into another.
+        target: the view; its image is read outside the hole only.
+        hole: bool [H, W].
+        pixels: pixels of the hole and of its ring, at least one of each.
+        candidates: the photographs from which pieces are taken.
+        regions: masks, bool [H, W] each, that together cover the hole. Each region is blended by itself, so that no
+            tone spreads from one into another.
+        options: settings.
     """
     coarse, stride = pixels.subsample()
     labels, cost = _choose(coarse, candidates, hole.shape, stride, options)
@@ -163,7 +199,19 @@ def assemble(
 def _choose(
     pixels: HolePixels, candidates: Candidates, shape: tuple[int, int], stride: int, options: Options
 ) -> tuple[np.ndarray, float]:
-    """[N], the candidate that each pixel takes, `len(candidates)` for none; and the cost per pixel of the hole."""
+    """Choose a candidate for each of N pixels by a graph cut.
+
+    Args:
+        pixels: pixels of the hole and of its ring, on a grid of the given stride.
+        candidates: the candidates.
+        shape: height and width of the target.
+        stride: px, the distance of neighbouring pixels.
+        options: settings.
+
+    Returns:
+        [N] int, the index of the candidate that each pixel takes, or `len(candidates)` for none; and the cost per pixel
+        of the hole (`Assembly.cost`).
+    """
     grid = pixels.rows, pixels.columns
     costs, looks = [], []
     for k in range(len(candidates)):
@@ -193,8 +241,16 @@ def _blend(
     regions: Sequence[np.ndarray],
     color_weight: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The picture, uint8 [H, W, 3], whose gradients are nearest to those of the pieces, and the filled pixels, bool
-    [H, W]. `labels`: [N], the candidate that each pixel takes."""
+    """Blend the chosen pieces into the picture whose gradients are nearest to those of the pieces.
+
+    Args:
+        labels: [N] int, the candidate that each pixel takes, or `len(candidates)` for none.
+        color_weight: weight of the pieces' colours; their gradients have weight 1.
+        target, hole, pixels, candidates, regions: as of `assemble`.
+
+    Returns:
+        The picture, uint8 [H, W, 3], and the pixels that were filled, bool [H, W].
+    """
     window = tuple(slice(side.min(), side.max() + 1) for side in (pixels.rows, pixels.columns))
     at = tuple(side - part.start for side, part in zip((pixels.rows, pixels.columns), window, strict=True))
     inner = hole[window]
@@ -208,7 +264,7 @@ def _blend(
         for axis, (down, right) in enumerate(((0, 1), (1, 0))):
             before = (slice(None, -down or None), slice(None, -right or None))
             after = (slice(down, None), slice(right, None))
-            for pixel in (mine[before], mine[after]):  # where two pieces meet, the mean of their gradients
+            for pixel in (mine[before], mine[after]):  # where two pieces meet, their gradients are averaged
                 both = pixel & valid[before] & valid[after]
                 gradients[axis][before][both] += (piece[after] - piece[before])[both]
                 counts[axis][before] += both

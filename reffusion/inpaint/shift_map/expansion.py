@@ -1,5 +1,8 @@
-"""Chooses one candidate for each pixel by expansion moves (Boykov et al. 2001), so that neighbouring candidates look
-alike where they meet (after Kwatra et al. 2003)."""
+"""Choice of one candidate for each pixel by expansion moves (Boykov et al. 2001).
+
+Neighbouring pixels with different candidates form a seam. The choice makes both candidates look alike along seams
+(after Kwatra et al. 2003).
+"""
 
 from __future__ import annotations
 
@@ -7,20 +10,25 @@ import numpy as np
 
 from reffusion.graph_cut import min_cut
 
-COLOR_WEIGHT = 0.7  # weight of plain colour, beside that of detail, which is 1
-GRADIENT_WEIGHT = 2.0  # weight of the detail's change to the next pixel
+COLOR_WEIGHT = 0.7  # weight of colour; the weight of detail (colour minus local mean) is 1
+GRADIENT_WEIGHT = 2.0  # weight of the difference of detail to the next pixel
 ROUNDS = 2  # passes of expansion moves over all candidates
-COST_SCALE = 0.1  # of all costs, so that their sum fits the cut's 32-bit integers
+COST_SCALE = 0.1  # factor on all costs, so that their sum fits the 32-bit integers of the cut
 
 
 def features(
     rows: np.ndarray, columns: np.ndarray, colors: np.ndarray, detail: np.ndarray, shape: tuple[int, int], stride: int
 ) -> np.ndarray:
-    """[N, 8] float32, the features by which candidates are compared at N pixels.
+    """Return [N, 8] float32, the features by which the appearance of a candidate is compared at N pixels.
+
+    They are the weighted colour, the detail, and the weighted gradient of the grey detail.
 
     Args:
-        rows, columns: [N] pixels of a picture of `shape` (height, width), every `stride`-th in both directions.
-        colors, detail: [N, 3] each, colour in levels and its difference from the local mean.
+        rows, columns: [N], positions of the pixels, on a grid with a spacing of `stride` px.
+        colors: [N, 3], colours in levels of 255.
+        detail: [N, 3], colours minus their local mean.
+        shape: height and width of the picture.
+        stride: px, distance to the next pixel of the grid.
     """
     grid = np.zeros(shape, np.float32)
     grey = detail.mean(1)
@@ -36,12 +44,18 @@ def features(
 
 
 def feature_distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """[..., N], the difference of features [..., N, 8], in levels."""
+    """Return [..., N], the Euclidean distance of features [..., N, 8] divided by sqrt(3), in levels."""
     return np.linalg.norm(first - second, axis=-1) / np.sqrt(3)
 
 
 def neighbor_pairs(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int], stride: int) -> np.ndarray:
-    """[E, 2], indices into the N pixels of all pairs that lie side by side, `stride` apart."""
+    """Return [E, 2], all pairs of pixels that lie side by side on a grid, as indices into the N pixels.
+
+    Args:
+        rows, columns: [N], positions of the pixels.
+        shape: height and width of the picture.
+        stride: px, the spacing of the grid.
+    """
     index = np.full(shape, -1)
     index[rows, columns] = np.arange(len(rows))
     sides = ((index[:, :-stride], index[:, stride:]), (index[:-stride], index[stride:]))
@@ -50,15 +64,18 @@ def neighbor_pairs(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]
 
 
 def expand(cost: np.ndarray, look: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """[N] int, labels of low total cost.
+    """Choose one of L candidates for each of N pixels, so that the total cost is low.
 
-    The total is the sum of each pixel's cost and, for each pair of neighbours, the feature distance of their two
-    candidates at both pixels.
+    The total cost is the sum of all pixels' own costs and of a seam cost for each pair of neighbours. The seam cost is
+    the feature distance between the candidates of the two neighbours, at the one pixel and at the other.
 
     Args:
-        cost: [L, N], of each candidate at each pixel.
-        look: [L, N, 8], `features` of the candidates.
-        pairs: [E, 2], indices of neighbours.
+        cost: [L, N], the cost of each candidate at each pixel.
+        look: [L, N, 8], the `features` of the candidates.
+        pairs: [E, 2], indices of neighbouring pixels.
+
+    Returns:
+        [N] int, the index of the candidate of each pixel.
     """
     (first, second), pixels, labels = pairs.T, np.arange(cost.shape[1]), cost.argmin(0)
     at_both = lambda label: (look[label, first], look[label, second])
@@ -70,7 +87,8 @@ def expand(cost: np.ndarray, look: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         look_candidate = at_both(candidate)
         first_moves, second_moves = seam(look_candidate, look_second), seam(look_first, look_candidate)
         keep, move = cost[labels, pixels].copy(), cost[candidate].copy()
-        # As in Kolmogorov and Zabih 2004: a pair's cost is split into a cost of each pixel and one of a cut between.
+        # As in Kolmogorov and Zabih 2004, the cost of a pair is split into costs of its pixels and a cost of a cut
+        # between them.
         cut = np.maximum(first_moves + second_moves - seams, 0) / 2
         np.add.at(move, first, first_moves - seams - cut)
         np.add.at(move, second, cut - first_moves)

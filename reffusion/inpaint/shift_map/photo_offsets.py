@@ -1,8 +1,8 @@
-"""Candidates for a hole from its own photograph: shifts by which the photograph repeats itself (He and Sun 2012).
+"""Candidates for a hole from the view's own photograph: shifts by which it repeats itself (He and Sun 2012).
 
-The most frequent offsets between similar patches are the candidates. A piece should lie on a surface of the same
-orientation and about the same depth as the hole's. So paths and edges continue from one side to the other, and grass
-stays as sharp as it is.
+The candidates are the photograph, shifted by the most frequent offsets between similar patches. A piece should come
+from a surface of about the same orientation and depth as the surface in the hole. Large pieces continue paths and edges
+from one side of the hole to the other, and keep grass as sharp as it is. Levels are colours in 0..255.
 """
 
 from __future__ import annotations
@@ -32,44 +32,44 @@ from reffusion.inpaint.shift_map.assemble import (
 from reffusion.inpaint.source_image import SourceImage
 
 # Offsets
-MAX_PEAKS = 400  # offsets that are looked at, the most frequent ones
-MIN_PATCHES = 400  # places for patches; with fewer there are no offsets
-MAX_PATCHES, MAX_QUERIES = 12000, 6000  # patches that are compared, and how many of them look for their like
-QUERY_BATCH = 1500  # queries whose distances are held at a time
-QUERY_JITTER = 40.0  # px, random change of the distance from the hole that orders the queries
-ARM = 3  # px between the nine points in which a patch is compared
+MAX_PEAKS = 400  # most frequent offsets that are examined
+MIN_PATCHES = 400  # patches that the photograph must have; with fewer there are no offsets
+MAX_PATCHES, MAX_QUERIES = 12000, 6000  # patches that are compared; those for which a similar patch is sought
+QUERY_BATCH = 1500  # queries whose distances to all patches are computed at a time
+QUERY_JITTER = 40.0  # px, random amount added to the distance from the hole, by which the queries are ordered
+ARM = 3  # px, distance between the nine points at which two patches are compared
 MIN_OFFSET_SHARE = 1 / 8  # of the hole's width: nearer patches look alike because they overlap or touch
-MIN_OFFSET_PX = 8.0  # the least such distance
-PEAK_SIGMA, PEAK_WINDOW = 1.5, 9  # px: blur of the histogram of offsets, and the window in which it has one peak
-NORMAL_FEATURE = 30.0  # levels that a difference of normals counts in the comparison of patches
+MIN_OFFSET_PX = 8.0  # px, lower bound of this distance
+PEAK_SIGMA, PEAK_WINDOW = 1.5, 9  # px: blur of the histogram of offsets, and side of the window that has one peak
+NORMAL_FEATURE = 30.0  # levels: weight of normals in the comparison of patches
 MAX_OFFSETS = 60  # candidates of the cut
 MIN_COVERAGE = 0.05  # share of the hole that a candidate must cover
 # Costs of a pixel, in levels
-NORMAL_COST = 20.0  # times the squared difference of normals
-STRETCH_COST, FREE_STRETCH = 40.0, 0.1  # times the change of perspective on the same plane, beyond the free one
-DEPTH_COST, FREE_OCTAVES = 12.0, 0.3  # for each doubling of the distance, beyond the free part of one
-MAX_GEOMETRY_COST = 40.0  # of the three together: the geometry in the hole is a guess itself
-OFF_PLANE_COST = 15.0  # of a pixel on a plane that is taken from beside that plane
-TONE_COST, TONE_SIGMA_PX = 0.2, 6.0  # times the difference from the tone around the hole; the blur that tells tone
+NORMAL_COST = 20.0  # per squared difference of normals
+STRETCH_COST, FREE_STRETCH = 40.0, 0.1  # per change of perspective on the same plane; a change up to the second is free
+DEPTH_COST, FREE_OCTAVES = 12.0, 0.3  # per doubling of distance; a change up to the second, in doublings, is free
+MAX_GEOMETRY_COST = 40.0  # limit of these three costs together, because the geometry in the hole is itself a guess
+OFF_PLANE_COST = 15.0  # if a pixel on a plane is filled from a pixel that is not on this plane
+TONE_COST, TONE_SIGMA_PX = 0.2, 6.0  # per difference from the tone around the hole; px, the blur that defines tone
 OPTIONS = Options(
     ring_weight=3.0,
     color_weight=0.003,
     max_cost=INVALID_COST,
-    max_median_cost=20.0,  # above it the photograph shows nothing like the hole
+    max_median_cost=20.0,  # at a higher median cost the photograph shows nothing similar to the hole
 )
 
 
 def fill_from_photo(
     target: SourceImage, hole: np.ndarray, own: SourceImage, smooth: Sequence[int] = (), seed: int = 0
 ) -> Assembly:
-    """The target with its hole, bool [H, W], filled from shifted pieces of its own photograph, where it shows some that
-    suit.
+    """Fill the hole of a view with shifted pieces of the view's own photograph, as far as suitable pieces exist.
 
     Args:
-        target: its image is read outside the hole only, its geometry everywhere.
-        own: the view's own photograph.
-        smooth: indices of planes that no other of them may replace.
-        seed: of the random choice of patches that are compared.
+        target: the view; its image is read outside the hole only, its geometry everywhere.
+        hole: bool [H, W], the pixels to fill.
+        own: the view's own photograph as a source.
+        smooth: indices of the smooth planes. A pixel on one of them is not filled from another one.
+        seed: seed of the random choice of patches that are compared.
     """
     nothing = Assembly(target.image, np.zeros_like(hole), 0.0)
     if not hole.any():
@@ -88,17 +88,17 @@ def fill_from_photo(
 
 @dataclass(frozen=True)
 class _ShiftedPhoto:
-    """The candidates: the view's own photograph, shifted by each of the offsets.
+    """The candidates: the view's own photograph, shifted by each of M offsets.
 
     Attributes:
-        target: the view.
-        colors, detail: [H, W, 3] float32 of the photograph, see `split_detail`.
-        tone: [H, W, 3] float32, the colours blurred.
-        hole_tone: [H, W, 3] float32, the tone, interpolated across the hole from around it.
-        readable: bool [H, W], pixels that may be taken.
-        layer: int [H, W], the foreground layer of the photograph's pixels.
-        smooth_plane: int [H, W], the smooth plane that the target shows, 0 for none.
-        offsets: [M, 2] int (rows, columns), from a pixel to where it is taken from.
+        target: the view with the hole.
+        colors, detail: [H, W, 3] float32, colours and detail of the photograph (`split_detail`).
+        tone: [H, W, 3] float32, the blurred colours.
+        hole_tone: [H, W, 3] float32, the tone, interpolated across the hole from its surroundings.
+        readable: bool [H, W], the pixels of the photograph from which pieces may be taken.
+        layer: int [H, W], the foreground layer that each pixel of the photograph shows.
+        smooth_plane: int [H, W], the index of the smooth plane that each pixel of the target shows; 0 for none.
+        offsets: [M, 2] int (rows, columns), the position from which a pixel is taken minus the pixel's own position.
     """
 
     target: SourceImage
@@ -113,7 +113,7 @@ class _ShiftedPhoto:
 
     @classmethod
     def of(cls, target: SourceImage, hole: np.ndarray, own: SourceImage, smooth: Sequence[int]) -> _ShiftedPhoto:
-        """Without offsets."""
+        """Prepare the photograph, with an empty list of offsets; arguments as of `fill_from_photo`."""
         missing = hole | target.masked
         colors, detail = split_detail(target.image, missing)
         tone = _blur_known(colors, missing)
@@ -123,7 +123,12 @@ class _ShiftedPhoto:
         return cls(target, colors, detail, tone, hole_tone, readable, own.layer, smooth_plane, none)
 
     def with_offsets(self, offsets: np.ndarray, pixels: HolePixels) -> _ShiftedPhoto:
-        """The candidates of the first `MAX_OFFSETS` of offsets [M, 2] that cover enough of the hole."""
+        """Return candidates for those of the offsets [M, 2] that cover enough of the hole, at most `MAX_OFFSETS`.
+
+        Args:
+            offsets: [M, 2], the most frequent offsets first.
+            pixels: pixels of the hole, on which coverage is tested (`MIN_COVERAGE`).
+        """
         tried = _ShiftedPhoto(**{**vars(self), "offsets": offsets})
         inside = pixels.select(np.flatnonzero(pixels.in_hole)).spread(MAX_COMPARED)
         covers = [k for k in range(len(tried)) if (tried.costs(k, inside) < INVALID_COST).mean() >= MIN_COVERAGE]
@@ -137,7 +142,11 @@ class _ShiftedPhoto:
         return Samples(self.colors[source], self.detail[source], inside & self.readable[source])
 
     def costs(self, k: int, pixels: HolePixels) -> np.ndarray:
-        """[N], cost of each pixel; `INVALID_COST` where it may not be read, or shows another layer or smooth plane."""
+        """Return [N], the cost of each pixel if candidate k fills it.
+
+        It is `INVALID_COST` where the photograph may not be used, or shows another foreground layer or smooth plane
+        than the hole.
+        """
         target, here = self.target, (pixels.rows, pixels.columns)
         source, valid = self._source_pixels(k, pixels)
         valid &= self.readable[source] & (self.layer[source] == target.layer[here])
@@ -153,8 +162,11 @@ class _ShiftedPhoto:
         return np.where(valid, cost, INVALID_COST)
 
     def _source_pixels(self, k: int, pixels: HolePixels) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-        """[N] rows and columns that offset k takes the pixels from, clipped to the photograph; bool [N], which lie
-        inside it."""
+        """Return the positions from which candidate k takes the pixels.
+
+        Returns:
+            Rows and columns, [N] each, clipped to the photograph; and bool [N], True where the position lies inside it.
+        """
         height, width = self.readable.shape
         row, column = pixels.rows + self.offsets[k][0], pixels.columns + self.offsets[k][1]
         inside = (row >= 0) & (column >= 0) & (row < height) & (column < width)
@@ -162,8 +174,18 @@ class _ShiftedPhoto:
 
 
 def _stretch(target: SourceImage, source: tuple[np.ndarray, ...], here: tuple[np.ndarray, ...]) -> np.ndarray:
-    """[N], Frobenius norm of how the step of a pixel along a plane differs between two pixels (rows, columns) on it;
-    0 off planes, infinite where the plane is seen edge on."""
+    """Return [N], how much the perspective of a plane differs between two pixels that lie on it.
+
+    The same small step on the plane is expressed in pixels at both positions. The map from one to the other is the
+    identity if the perspective is the same; the result is the Frobenius norm of its difference from the identity.
+
+    Args:
+        target: the view.
+        source, here: rows and columns, [N] each, of the two pixels of each pair.
+
+    Returns:
+        0 if the pixels do not lie on the same plane; infinite if the plane is seen edge on.
+    """
     stretch = np.zeros(len(here[0]))
     on = (target.plane[here] > 0) & (target.plane[here] == target.plane[source])
     with np.errstate(invalid="ignore"):
@@ -173,14 +195,17 @@ def _stretch(target: SourceImage, source: tuple[np.ndarray, ...], here: tuple[np
 
 
 def _blur_known(colors: np.ndarray, missing: np.ndarray) -> np.ndarray:
-    """[H, W, 3], the tone: the mean of the known colours around."""
+    """Return [H, W, 3], the tone: the mean of the colours around each pixel, without `missing` pixels, bool [H, W]."""
     known = (~missing).astype(np.float32)
     blur = lambda a: cv2.GaussianBlur(a, (0, 0), TONE_SIGMA_PX).reshape(*missing.shape, -1)
     return blur(colors * known[..., None]) / np.maximum(blur(known), 1e-3)
 
 
 def _interpolate_tone(tone: np.ndarray, hole: np.ndarray, target: SourceImage) -> np.ndarray:
-    """[H, W, 3], the tone, interpolated across the hole from what is around it, each foreground layer by itself."""
+    """Return the tone, [H, W, 3], interpolated across the hole, bool [H, W], from the pixels around it.
+
+    Each foreground layer is interpolated from its own pixels only.
+    """
     result = tone.copy()
     for k in np.unique(target.layer[hole]):
         mine, beside = hole & (target.layer == k), ~hole & ~target.masked & (target.layer == k)
@@ -192,14 +217,20 @@ def _interpolate_tone(tone: np.ndarray, hole: np.ndarray, target: SourceImage) -
 def frequent_offsets(
     features: np.ndarray, readable: np.ndarray, distance: np.ndarray, width: float, seed: int
 ) -> np.ndarray:
-    """[M, 2] int (rows, columns), the offsets between similar patches, and their opposites, the most frequent first.
+    """Find the most frequent offsets between similar patches of a picture.
+
+    For patches near the hole the most similar other patch is sought, and the offsets to these are counted. Each offset
+    is also counted in the opposite direction.
 
     Args:
-        features: [H, W, C], what is compared, in levels.
-        readable: bool [H, W], where.
-        distance: [H, W], px from the hole: patches near it look for their like.
-        width: of the hole, px.
-        seed: of the random choice of these.
+        features: [H, W, C], the values by which patches are compared, in levels.
+        readable: bool [H, W], the pixels that patches may cover.
+        distance: [H, W], the distance of each pixel from the hole, in px.
+        width: px, width of the hole. Patches nearer to each other than `MIN_OFFSET_SHARE` of it are not compared.
+        seed: seed of the random choice of patches near the hole.
+
+    Returns:
+        [M, 2] int (rows, columns), the most frequent offset first; M = 0 if there are too few patches.
     """
     draws = np.random.default_rng(seeding.seed_for(seed, "offsets"))
     rows, columns = np.nonzero(ndimage.binary_erosion(readable, iterations=ARM + 1))
@@ -225,7 +256,15 @@ def frequent_offsets(
 
 
 def _histogram_peaks(offsets: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """[M, 2], the most frequent of offsets [N, 2] and their opposites, in a picture of `shape` (height, width)."""
+    """Return the most frequent of the offsets [N, 2] and of their opposites, the most frequent first.
+
+    Args:
+        offsets: [N, 2] int (rows, columns).
+        shape: height and width of the picture.
+
+    Returns:
+        [M, 2] int, the peaks of the blurred histogram.
+    """
     height, width = shape
     count = np.zeros((2 * height + 1, 2 * width + 1), np.float32)
     np.add.at(count, (offsets[:, 0] + height, offsets[:, 1] + width), 1)

@@ -1,6 +1,8 @@
-"""Candidates for a hole in a plane that repeats itself: photographs of the plane, moved along it by its symmetries.
+"""Candidates for a hole in a plane whose texture repeats itself: photographs of the plane, moved along the plane.
 
-So joints of planks continue straight, and what is round about the plane's centre stays round.
+The motions are those that map the texture onto itself (`plane_symmetry`): shifts, or turns about a centre. So joints
+between planks continue straight, and circles about the centre stay circles. Levels are colours in 0..255. The ring is
+the strip of known pixels around the hole, in which candidates are compared with the known picture.
 """
 
 from __future__ import annotations
@@ -28,31 +30,34 @@ from reffusion.inpaint.shift_map.assemble import (
 from reffusion.inpaint.shift_map.plane_symmetry import PlaneSymmetry
 from reffusion.inpaint.source_image import SourceImage
 
-MIN_PHOTO_PIXELS = MAX_PIXELS // 50  # pixels of the plane below which a photograph hardly shows it
-HOMOGRAPHY_PIXELS = 1000  # that a photograph's homography is fitted to
-MAX_CANDIDATES = 48  # motions that the cut chooses from; twice as many are refined
-MIN_COVERAGE = 0.1  # share of the hole that one must cover
-MIN_RING_PIXELS = 60  # pixels of the ring that a motion must be compared in
-RING_WINDOW = 25  # px, a side of the window in which motions compete for a part of the ring
-REFINE_STEPS = (1.0, 0.5, 0.25)  # steps of the refinement, of the symmetry's resolution
+MIN_PHOTO_PIXELS = MAX_PIXELS // 50  # pixels of the plane that a photograph must show to be used
+HOMOGRAPHY_PIXELS = 1000  # pixels to which the homography of a photograph is fitted
+MAX_CANDIDATES = 48  # motions from which the cut chooses; twice as many are refined
+MIN_COVERAGE = 0.1  # share of the hole that a motion must cover
+MIN_RING_PIXELS = 60  # pixels of the ring on which a motion must be compared
+RING_WINDOW = 25  # px, side of the window within which motions compete for a part of the ring
+REFINE_STEPS = (1.0, 0.5, 0.25)  # steps of the refinement, in units of the symmetry's resolution
 SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
-BLUR_COST = 12.0  # levels, of a pixel for each time that its photograph shows it at half the size
-FULL_SCALE = 0.8  # source pixels for a pixel of the hole below which it counts as blurred
-MIN_SCALE, MAX_SCALE = 0.35, 3.0  # bounds of these, along any direction
-OTHER_PHOTO_COST = 6.0  # levels, of a pixel from another photograph, whose light may differ
-OPTIONS = Options(color_weight=3e-4)  # what a plane reflects is known from around the hole better than from the pieces
+BLUR_COST = 12.0  # levels: cost of a pixel per halving of the scale below `FULL_SCALE`
+FULL_SCALE = 0.8  # source pixels per pixel of the hole (the scale), below which the pixel is blurred
+MIN_SCALE, MAX_SCALE = 0.35, 3.0  # bounds of the scale, along any direction
+OTHER_PHOTO_COST = 6.0  # levels: cost of a pixel from another photograph, whose light may differ
+# Colours of the pieces have a low weight in the blending, because the surroundings of the hole tell better what the
+# plane reflects there than the pieces do.
+OPTIONS = Options(color_weight=3e-4)
 
 
 def fill_plane(
     target: SourceImage, hole: np.ndarray, sources: Sequence[SourceImage], plane: int, symmetry: PlaneSymmetry
 ) -> Assembly:
-    """The target with the plane's part of its hole, bool [H, W], filled from the sources, where one shows it, moved.
+    """Fill the part of the hole that lies on one plane, from photographs of the plane that are moved along it.
 
     Args:
-        target: its image is read outside the hole only, its geometry everywhere.
-        sources: photographs, the view's own first.
+        target: the view; its image is read outside the hole only, its geometry everywhere.
+        hole: bool [H, W], the pixels to fill; those on other planes stay unfilled.
+        sources: photographs, of which the view's own is the first.
         plane: index of the plane in the sources and the target.
-        symmetry: how the plane repeats itself.
+        symmetry: how the texture of the plane repeats itself.
     """
     nothing = Assembly(target.image, np.zeros_like(hole), 0.0)
     on_plane = _without_specks(target.plane == plane)
@@ -71,8 +76,8 @@ class PlanePhoto:
 
     Attributes:
         colors, detail: [H, W, 3] float32, see `split_detail`.
-        readable: bool [H, W], pixels of the plane that may be taken.
-        homography: [3, 3], from coordinates on the plane to pixels (x, y).
+        readable: bool [H, W], the pixels of the plane from which pieces may be taken.
+        homography: [3, 3], from coordinates on the plane to pixels (x, y) of the photograph.
     """
 
     colors: np.ndarray
@@ -82,7 +87,15 @@ class PlanePhoto:
 
     @classmethod
     def of(cls, source: SourceImage, plane: int) -> PlanePhoto | None:
-        """None where the source hardly shows the plane."""
+        """Return the photograph of a plane that a source shows.
+
+        Args:
+            source: the image and its surfaces.
+            plane: index of the plane.
+
+        Returns:
+            None if the source shows fewer than `MIN_PHOTO_PIXELS` pixels of the plane, or they fit no homography.
+        """
         on_plane = source.plane == plane
         readable = erode_readable(source, source.masked) & _without_specks(on_plane)
         rows, columns = np.nonzero(readable & on_plane)
@@ -100,8 +113,8 @@ class Motion:
 
     Attributes:
         photo: index of the photograph.
-        base: one of the symmetry's motions, [2] or [1].
-        shift: [2], a small shift after it that refines it, in the plane's unit.
+        base: a motion of the symmetry: a shift, [2], or a turn, [1] in radians. The refinement may change a turn.
+        shift: [2], in world units, a small shift that is applied after `base`. It refines the motion.
     """
 
     photo: int
@@ -111,13 +124,13 @@ class Motion:
 
 @dataclass(frozen=True)
 class PlaneMotions:
-    """The candidates: photographs of the plane, moved.
+    """The candidates: photographs of the plane, each moved by one motion.
 
     Attributes:
         target: the view with the hole.
-        photos: the photographs; from all but the first pixels cost more.
-        symmetry: how the plane repeats itself.
-        motions: one for each candidate.
+        photos: the photographs; the first, usually the view's own, is preferred by a lower cost.
+        symmetry: how the texture of the plane repeats itself.
+        motions: the motion of each candidate.
     """
 
     target: SourceImage
@@ -126,6 +139,7 @@ class PlaneMotions:
     motions: Sequence[Motion]
 
     def with_motions(self, motions: Sequence[Motion]) -> PlaneMotions:
+        """Return candidates with other motions."""
         return PlaneMotions(self.target, self.photos, self.symmetry, motions)
 
     def __len__(self) -> int:
@@ -137,18 +151,30 @@ class PlaneMotions:
         return Samples(_sample(photo.colors, at), _sample(photo.detail, at), _is_set(photo.readable, at))
 
     def covers(self, motion: Motion, pixels: HolePixels) -> np.ndarray:
-        """bool [N], which of the pixels the motion fills."""
+        """Return bool [N], True for the pixels that a candidate with this motion could fill."""
         return _is_set(self.photos[motion.photo].readable, self._source_pixels(motion, pixels))
 
     def detail_difference(self, motion: Motion, pixels: HolePixels) -> tuple[np.ndarray, np.ndarray]:
-        """[N], difference of detail from the known picture, in levels; bool [N], where the motion shows something."""
+        """Compare the detail (colour minus local mean) of the moved photograph with that of the known picture.
+
+        Args:
+            motion: the motion of the photograph.
+            pixels: N known pixels.
+
+        Returns:
+            The difference in levels, [N], at most `MAX_DIFFERENCE`; and bool [N], True where the moved photograph shows
+            the plane.
+        """
         at, photo = self._source_pixels(motion, pixels), self.photos[motion.photo]
         difference = np.linalg.norm(_sample(photo.detail, at) - pixels.detail, axis=1)
         return np.minimum(difference, MAX_DIFFERENCE), _is_set(photo.readable, at)
 
     def costs(self, k: int, pixels: HolePixels) -> np.ndarray:
-        """[N], cost of each pixel for blur and other light; `INVALID_COST` where it is not shown, or far too small or
-        large."""
+        """Return [N], the cost of each pixel if candidate k fills it.
+
+        Pixels cost more if they would be blurred, or come from another photograph, whose light may differ. The cost is
+        `INVALID_COST` where the candidate does not show the pixel, or shows it far too small or too large.
+        """
         motion = self.motions[k]
         at = self._source_pixels(motion, pixels)
         low, high = self._scales(motion, pixels, at)
@@ -158,18 +184,26 @@ class PlaneMotions:
         return np.where(valid, cost, INVALID_COST)
 
     def _moved(self, motion: Motion, pixels: HolePixels) -> np.ndarray:
-        """[N, 2], coordinates on the plane from which the motion takes the pixels."""
+        """Return [N, 2], the coordinates on the plane from which the motion takes each pixel."""
         coordinates = self.target.plane_xy[pixels.rows, pixels.columns].astype(np.float64)
         return self.symmetry.move(coordinates, motion.base) + motion.shift
 
     def _source_pixels(self, motion: Motion, pixels: HolePixels) -> np.ndarray:
-        """[N, 2] float32, pixels (x, y) of the photograph from which the motion takes the pixels."""
+        """Return [N, 2] float32, the position (x, y) in the photograph from which the motion takes each pixel."""
         at = cv2.perspectiveTransform(self._moved(motion, pixels)[None], self.photos[motion.photo].homography)[0]
         return at.clip(-1e6, 1e6).astype(np.float32)
 
     def _scales(self, motion: Motion, pixels: HolePixels, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[N] each: how many source pixels a pixel of the hole spans, along the direction of the fewest and
-        of the most. `at`: `_source_pixels`."""
+        """Return how many source pixels a pixel of the hole spans, along two directions.
+
+        Args:
+            motion: the motion of the photograph.
+            pixels: N pixels of the hole.
+            at: [N, 2], the result of `_source_pixels` for these arguments.
+
+        Returns:
+            [N] each: the number along the direction in which it is smallest, and along that in which it is largest.
+        """
         moved, homography = self._moved(motion, pixels), self.photos[motion.photo].homography
         weight = moved @ homography[2, :2] + homography[2, 2]
         jacobian = (homography[None, :2, :2] - at[:, :, None] * homography[2, :2]) / weight[:, None, None]
@@ -180,7 +214,14 @@ class PlaneMotions:
 
 
 def _select_motions(pixels: HolePixels, candidates: PlaneMotions) -> PlaneMotions:
-    """Candidates with the motions that match the known ring best, each some part of it, refined by it."""
+    """Select and refine the motions with which the photographs match the known pixels of the ring best.
+
+    Each motion may match another part of the ring.
+
+    Args:
+        pixels: pixels of the hole and of the ring.
+        candidates: the photographs and the symmetry; their motions are ignored.
+    """
     ring = pixels.select(~pixels.in_hole).spread(MAX_COMPARED)
     inside = pixels.select(pixels.in_hole).spread(MAX_COMPARED)
     motions = [
@@ -195,7 +236,13 @@ def _select_motions(pixels: HolePixels, candidates: PlaneMotions) -> PlaneMotion
 
 
 def _refine_motion(ring: HolePixels, motion: Motion, candidates: PlaneMotions) -> Motion:
-    """The motion, shifted along the plane and turned a little, so that it matches the ring best."""
+    """Shift the motion a little, and turn it a little about the centre if it is a turn, to match the ring best.
+
+    Args:
+        ring: known pixels around the hole.
+        motion: the motion to refine.
+        candidates: the photographs and the symmetry.
+    """
     symmetry = candidates.symmetry
 
     def misfit(motion: Motion) -> float:
@@ -221,7 +268,16 @@ def _refine_motion(ring: HolePixels, motion: Motion, candidates: PlaneMotions) -
 
 
 def _best_motions(ring: HolePixels, motions: Sequence[Motion], candidates: PlaneMotions, most: int) -> list[Motion]:
-    """Up to `most` of the motions, chosen one after the other so that together they match the ring best."""
+    """Choose up to `most` motions that together match the ring best, one after the other (greedily).
+
+    A motion gains wherever it matches a window of the ring better than all motions chosen before.
+
+    Args:
+        ring: known pixels around the hole.
+        motions: the motions to choose from.
+        candidates: the photographs and the symmetry.
+        most: the largest number of motions.
+    """
     top, left = ring.rows.min(), ring.columns.min()
     shape = (ring.rows.max() - top + 1, ring.columns.max() - left + 1)
     at = ring.rows - top, ring.columns - left
@@ -245,12 +301,15 @@ def _best_motions(ring: HolePixels, motions: Sequence[Motion], candidates: Plane
 
 
 def _without_specks(mask: np.ndarray) -> np.ndarray:
-    """bool [H, W], the mask without specks and gaps of a pixel or two."""
+    """Return the mask, bool [H, W], without specks and gaps of a pixel or two."""
     return cv2.medianBlur(mask.astype(np.uint8), 5) > 0
 
 
 def _is_set(mask: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """bool [N], the mask, bool [H, W], at the pixels nearest to (x, y) [N, 2]; false outside and on its border."""
+    """Return bool [N], the values of a mask, bool [H, W], at the pixels nearest to positions (x, y), [N, 2].
+
+    The value is False outside the mask's array and on its outermost pixels.
+    """
     height, width = mask.shape
     column, row = np.round(at).astype(int).T
     inside = (row >= 1) & (column >= 1) & (row < height - 1) & (column < width - 1)
@@ -259,7 +318,7 @@ def _is_set(mask: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def _sample(picture: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """[N, 3], a picture at (x, y) [N, 2], bicubic."""
+    """Return [N, 3], the values of a picture at positions (x, y), float32 [N, 2], by bicubic interpolation."""
     grid = np.full((-(-len(at) // 1024) * 1024, 2), -1, np.float32)  # cv2.remap takes no side above 32767
     grid[: len(at)] = at
     x, y = (np.ascontiguousarray(grid[:, axis]).reshape(-1, 1024) for axis in (0, 1))

@@ -1,8 +1,9 @@
-"""Finds how a plane's texture repeats itself: the motions along it that map planks onto planks, tiles onto tiles.
+"""Detection of how a plane's texture repeats itself: motions along the plane that map the texture onto itself.
 
-The plane is resampled from a photograph in its own metric coordinates and correlated with itself. Where correlation
-peaks, a shift maps the texture onto itself, in every photograph. Where the texture's lines meet in a point, as the
-joints of a round table do, the motions are turns about that point instead.
+Such a motion maps planks onto planks, or tiles onto tiles. A photograph of the plane is resampled to a map in metric
+coordinates on the plane, and the map is correlated with itself. A peak of the correlation is a shift that maps the
+texture onto itself, in every photograph. If the lines of the texture meet in one point, as the joints of a round table
+do, the motions are turns about this point instead. They are found in a polar map about it.
 """
 
 from __future__ import annotations
@@ -16,39 +17,40 @@ from scipy import ndimage
 
 from reffusion import seeding
 
-SIDE = 224  # cells, the longest side of a plane's map
-MIN_SIDE = 16  # cells, the shortest
+SIDE = 224  # cells, longest side of a plane's map
+MIN_SIDE = 16  # cells, shortest side that a map may have
 MIN_CELLS = 400  # cells of the plane that must be seen
-MIN_OVERLAP = 0.1  # of the cells seen: as many must overlap after a shift, and at least `MIN_CELLS`
-SHADING_SIGMA = 6.0  # cells: what changes over more is shading, and is not compared
-MIN_SHIFT = 3  # cells: nearer every texture is like itself
-MIN_CORRELATION = 0.6  # of the best motion; stone reaches 0.5, planks 0.7
+MIN_OVERLAP = 0.1  # share of the seen cells that must overlap after a motion; at least `MIN_CELLS` cells must
+SHADING_SIGMA = 6.0  # cells: blur that separates shading, which is not compared, from texture
+MIN_SHIFT = 3  # cells: smaller shifts are ignored, since every texture resembles itself there
+MIN_CORRELATION = 0.6  # correlation that the best motion must reach; stone reaches 0.5, planks 0.7
 MIN_OF_BEST = 0.5  # share of `MIN_CORRELATION` that the other motions must reach
-MIN_OF_PEAK = 0.75  # share of the highest peak from which the smallest turn counts as the one that generates the others
-TURN_TOLERANCE = 0.2  # of that turn, by which a multiple may miss its expected place
+MIN_OF_PEAK = 0.75  # share of the highest peak that the basic turn, of which all others are multiples, must exceed
+TURN_TOLERANCE = 0.2  # of the basic turn: distance by which a peak may miss the multiple that it stands for
 MAX_MOTIONS = 60
-PEAK_WINDOW = 9  # cells, a side of the window that has one peak
-MIN_SHIFTS = 4  # that a plane must have: both ways, and twice as far, say
-CLOSE_PX = 9  # px: narrower gaps in the pixels of a plane are closed, where its depth is uneven
-MAX_EDGES, LINE_PAIRS = 3000, 400  # steepest cells, whose edges are taken as lines, and pairs of them that are crossed
+PEAK_WINDOW = 9  # cells, side of the window that has one peak
+MIN_SHIFTS = 4  # shifts that a plane must have, for example a shift and its double, in both directions
+CLOSE_PX = 9  # px: gaps in the pixels of a plane up to this width are closed, since uneven depth leaves such gaps
+MAX_EDGES, LINE_PAIRS = 3000, 400  # steepest cells, whose edges are taken as lines; pairs of lines that are intersected
 SIN_TOLERANCE = 0.035  # sine of the angle by which a line may miss the centre
-MIN_CONVERGENCE = 1.25  # times as many lines must meet in the centre as run in one direction
-MAX_CENTRE_DISTANCE = 3.0  # map sides from the map's middle within which the centre is sought
-CENTRE_REACH = 8.0  # cells to each side of the lines' centre within which it is refined
-CENTRE_STEPS, MIN_GAIN = (2.0, 1.0, 0.5), 1e-3  # cells, steps of that, and the gain in correlation that continues it
-CENTRE_ITERATIONS = 5  # of the least squares fit of the centre to its lines
-HOMOGRAPHY_PIXELS = 2000  # that the homography is fitted to
-SEED = 0  # of the random pairs of lines
+MIN_CONVERGENCE = 1.25  # this many times as many lines must meet in the centre as are parallel to each other
+MAX_CENTRE_DISTANCE = 3.0  # distance from the map's middle within which the centre is sought, in units of `SIDE`
+CENTRE_REACH = 8.0  # cells to each side of the first estimate of the centre within which the centre is refined
+CENTRE_STEPS, MIN_GAIN = (2.0, 1.0, 0.5), 1e-3  # cells, steps of the refinement; gain in correlation that continues it
+CENTRE_ITERATIONS = 5  # iterations of the least squares fit of the centre to its lines
+HOMOGRAPHY_PIXELS = 2000  # pixels to which the homography is fitted
+SEED = 0  # seed of the random pairs of lines
 
 
 @dataclass(frozen=True)
 class PlaneSymmetry:
-    """How a plane's texture repeats itself.
+    """The motions along a plane that map its texture onto itself: all shifts, or all turns about one centre.
 
     Attributes:
-        centre: [2], the point on the plane about which it turns; None: it shifts.
-        motions: [M, 2], shifts in the plane's unit; or [M, 1], turns in radians.
-        resolution: to which the motions are known, in the plane's unit; of a turn, at most, at the points seen.
+        centre: [2], the point on the plane about which the texture turns; None if the motions are shifts.
+        motions: [M, 2], shifts in world units; or [M, 1], turns in radians.
+        resolution: the accuracy of the motions, in world units: the side of a cell of the map. For turns it is the
+            accuracy of the positions of turned points.
     """
 
     centre: np.ndarray | None
@@ -56,20 +58,26 @@ class PlaneSymmetry:
     resolution: float
 
     def move(self, points: np.ndarray, motion: np.ndarray) -> np.ndarray:
-        """Points [N, 2] on the plane, moved by a shift [2] or a turn [1]."""
+        """Return the points on the plane, [N, 2], after a motion: a shift, [2], or a turn, [1]."""
         if self.centre is None:
             return points + motion
         cosine, sine = np.cos(motion[0]), np.sin(motion[0])
         return (points - self.centre) @ np.array([[cosine, sine], [-sine, cosine]]) + self.centre
 
     def rotation(self, motion: np.ndarray) -> np.ndarray:
-        """[2, 2], the derivative of `move`: the motion's rotation, the identity for a shift."""
+        """Return [2, 2], the derivative of `move` by the point: a rotation matrix for a turn, else the identity."""
         angle = 0.0 if self.centre is None else motion[0]
         return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
 class PlanePixels(NamedTuple):
-    """What an image shows of a plane: pixels [M, 2] (x, y), their coordinates [M, 2] on the plane, and the image."""
+    """The pixels of an image that show a plane.
+
+    Attributes:
+        pixels: [M, 2] int (x, y).
+        coordinates: [M, 2], their coordinates on the plane, in world units.
+        image: uint8 [H, W, 3].
+    """
 
     pixels: np.ndarray
     coordinates: np.ndarray
@@ -77,8 +85,14 @@ class PlanePixels(NamedTuple):
 
 
 class PlaneMap(NamedTuple):
-    """A plane's texture on a grid: values [h, w, 3] float32, where they are known, bool [h, w], and the two sides of a
-    cell, in the plane's unit (or radians, see `_polar_map`)."""
+    """The texture of a plane, sampled on a grid of cells.
+
+    Attributes:
+        values: [h, w, 3] float32, colours in levels of 255.
+        known: bool [h, w], True where the image shows the plane.
+        pitch: [2], the sides of a cell along x and y, in world units. In a polar map these are the steps of the radius,
+            in world units, and of the angle, in radians.
+    """
 
     values: np.ndarray
     known: np.ndarray
@@ -86,7 +100,14 @@ class PlaneMap(NamedTuple):
 
 
 def find_symmetry(seen: PlanePixels) -> PlaneSymmetry | None:
-    """How the plane's texture repeats itself, from what an image shows of it; None: it does not."""
+    """Find how the texture of a plane repeats itself.
+
+    Args:
+        seen: the pixels of an image that show the plane.
+
+    Returns:
+        None if no motion maps the texture onto itself well enough, or too little of the plane is visible.
+    """
     low, high = seen.coordinates.min(0), seen.coordinates.max(0)
     plane_map = _cartesian_map(seen, low, high)
     if plane_map is None:
@@ -103,11 +124,19 @@ def find_symmetry(seen: PlanePixels) -> PlaneSymmetry | None:
 
 
 def _refine_centre(seen: PlanePixels, centre: np.ndarray, cell: float) -> tuple[np.ndarray, PlaneMap | None]:
-    """The centre [2], near a first estimate, about which the texture is like itself at every turn; and the polar map
-    about it.
+    """Refine the centre about which the texture turns.
 
-    About a wrong centre the texture may look like itself once: a short arc fits many circles. Where fewer than two
-    turns are seen, the estimate stays.
+    The centre is chosen for which the correlation of the texture with itself, averaged over all its turns, is highest.
+    One turn alone would not do, because a short arc fits many circles, and so correlates about wrong centres too. If
+    fewer than two turns are seen, the first estimate stays.
+
+    Args:
+        seen: the pixels of the plane.
+        centre: [2], the first estimate, on the plane.
+        cell: side of a cell, in world units: the unit of the steps.
+
+    Returns:
+        The centre, [2], and the polar map about it, or None instead of a map if there is none (`_resample`).
     """
 
     def judge(at: np.ndarray) -> tuple[float, PlaneMap | None]:
@@ -131,8 +160,15 @@ def _refine_centre(seen: PlanePixels, centre: np.ndarray, cell: float) -> tuple[
 
 
 def _mean_correlation(correlation: np.ndarray, full_turn: float) -> float:
-    """Mean of a correlation, [h] by turn, over all turns that map the texture onto itself and of which enough is seen;
-    0 for fewer than 2. `full_turn`: in rows."""
+    """Average a correlation over all turns that map the texture onto itself, as far as they are seen.
+
+    Args:
+        correlation: [h], correlation of a polar map with itself after a turn by 0, 1, ... rows.
+        full_turn: a turn by 360 degrees, in rows.
+
+    Returns:
+        0 if fewer than two turns are seen.
+    """
     turns = _find_turns(correlation, full_turn)
     values = np.interp(turns[turns > 0], np.arange(len(correlation)), correlation)
     values = values[values != 0]
@@ -140,8 +176,12 @@ def _mean_correlation(correlation: np.ndarray, full_turn: float) -> float:
 
 
 def _autocorrelation(plane_map: PlaneMap) -> np.ndarray:
-    """[h, w], normalised correlation of a map with itself, moved by a row and a column (negative ones from the end);
-    0 where too little overlaps."""
+    """Compute the normalised correlation of a map with itself, for all shifts by whole cells.
+
+    Returns:
+        [h, w], where entry (i, j) is the correlation after a shift by i rows and j columns; as in an FFT, negative
+        shifts count from the end. It is 0 if too few cells overlap after the shift.
+    """
     known = cv2.erode(plane_map.known.astype(np.uint8), np.ones((5, 5)), borderValue=0) > 0
     grey = plane_map.values.mean(2)
     detail = np.where(known, grey - cv2.GaussianBlur(grey, (0, 0), SHADING_SIGMA), 0.0).astype(np.float64)
@@ -154,7 +194,10 @@ def _autocorrelation(plane_map: PlaneMap) -> np.ndarray:
 
 
 def _find_shifts(correlation: np.ndarray) -> np.ndarray:
-    """[M, 2], the shifts (x, y) in cells at which an autocorrelation [h, w] peaks, the highest first."""
+    """Return [M, 2], the shifts (x, y) in cells at which an autocorrelation, [h, w], has peaks, the highest first.
+
+    M is 0 if the highest peak is below `MIN_CORRELATION`, or if there are fewer than `MIN_SHIFTS` peaks.
+    """
     height, width = (side // 2 for side in correlation.shape)
     centred = np.fft.fftshift(correlation)
     peak = (centred == ndimage.maximum_filter(centred, PEAK_WINDOW)) & (centred > MIN_OF_BEST * MIN_CORRELATION)
@@ -167,12 +210,17 @@ def _find_shifts(correlation: np.ndarray) -> np.ndarray:
 
 
 def _find_turns(correlation: np.ndarray, full_turn: float) -> np.ndarray:
-    """[M], the turns, in rows, that map the texture onto itself: multiples, either way, of the smallest one that is
-    about as good as any.
+    """Find the turns that map the texture onto itself.
+
+    They are the multiples, in both directions, of the basic turn: the smallest turn whose correlation is about as high
+    as that of any other (`MIN_OF_PEAK`). A multiple near a peak takes the position of this peak.
 
     Args:
-        correlation: [h], of a polar map with itself, by turn in rows.
-        full_turn: in rows.
+        correlation: [h], correlation of a polar map with itself after a turn by 0, 1, ... rows.
+        full_turn: a turn by 360 degrees, in rows.
+
+    Returns:
+        [M], turns in rows; M = 0 if no turn reaches `MIN_CORRELATION`.
     """
     half = correlation[: min(len(correlation) // 2, int(full_turn / 2) + 1)]
     rows = np.arange(MIN_SHIFT, len(half) - 1)
@@ -191,24 +239,29 @@ def _find_turns(correlation: np.ndarray, full_turn: float) -> np.ndarray:
 
 
 def _cartesian_map(seen: PlanePixels, low: np.ndarray, high: np.ndarray) -> PlaneMap | None:
-    """The map between two corners [2], along the plane's axes; None as in `_resample`."""
+    """Return the map of the rectangle between two corners, [2] each, along the plane's axes; None as in `_resample`."""
     pitch = np.full(2, _cell_side(seen, float((high - low).max())))
     steps = [low[axis] + pitch[axis] * np.arange(int((high - low)[axis] / pitch[axis]) + 1) for axis in (0, 1)]
     return _resample(seen, np.stack(np.meshgrid(*steps), -1), pitch)
 
 
 def _cell_side(seen: PlanePixels, length: float) -> float:
-    """Side of a cell of a map of this length: on the whole no finer than the image's pixels."""
+    """Return the side of a cell, in world units, for a map whose longest side has this length.
+
+    The map has at most `SIDE` cells along a side, and its cells are on average no smaller than the pixels of the image.
+    """
     area = cv2.contourArea(cv2.convexHull(seen.coordinates.astype(np.float32)))
     return max(length / SIDE, (area / len(seen.coordinates)) ** 0.5, 1e-9)
 
 
 def _polar_map(seen: PlanePixels, centre: np.ndarray) -> PlaneMap | None:
-    """The map about a centre: a column for each radius, a row for each angle (its pitch is in radians). At the median
-    radius cells are square. None as in `_resample`."""
+    """Return the polar map about a centre, [2], with a column for each radius and a row for each angle.
+
+    At the median radius its cells are square. None as in `_resample`.
+    """
     away = seen.coordinates - centre
     distance = np.hypot(*away.T)
-    direction = np.angle(np.exp(1j * np.arctan2(away[:, 1], away[:, 0])).mean())  # the seam lies opposite
+    direction = np.angle(np.exp(1j * np.arctan2(away[:, 1], away[:, 0])).mean())  # the jump of the angle lies opposite
     angle = np.angle(np.exp(1j * (np.arctan2(away[:, 1], away[:, 0]) - direction)))
     length = max(float(np.ptp(distance)), float(np.median(distance)) * float(np.ptp(angle)) / 2)
     step = _cell_side(seen, length)
@@ -220,7 +273,16 @@ def _polar_map(seen: PlanePixels, centre: np.ndarray) -> PlaneMap | None:
 
 
 def _resample(seen: PlanePixels, coordinates: np.ndarray, pitch: np.ndarray) -> PlaneMap | None:
-    """The map at coordinates [h, w, 2] on the plane; None where it is too small, or the pixels fit no homography."""
+    """Sample the image at given coordinates on the plane.
+
+    Args:
+        seen: the pixels of the plane.
+        coordinates: [h, w, 2], the coordinates of each cell on the plane.
+        pitch: [2], the sides of a cell.
+
+    Returns:
+        None if a side of the map is shorter than `MIN_SIDE`, or the pixels fit no homography.
+    """
     some = np.linspace(0, len(seen.coordinates) - 1, min(len(seen.coordinates), HOMOGRAPHY_PIXELS)).astype(int)
     points, pixels = (each[some].astype(np.float64) for each in (seen.coordinates, seen.pixels))
     homography, _ = cv2.findHomography(points, pixels, 0)
@@ -236,8 +298,17 @@ def _resample(seen: PlanePixels, coordinates: np.ndarray, pitch: np.ndarray) -> 
 
 
 def _find_centre(plane_map: PlaneMap, draws: np.random.Generator) -> np.ndarray | None:
-    """[2], the cell (x, y), perhaps outside the map, in which the texture's lines meet; None where they are rather
-    parallel."""
+    """Find the point in which the lines of the texture meet.
+
+    Each steep edge in the map is a line. The centre is the point that the most lines pass through.
+
+    Args:
+        plane_map: the map of the plane along its axes.
+        draws: draws the pairs of lines whose intersections are tried.
+
+    Returns:
+        The point, [2] (x, y) in cells, perhaps outside the map; None if the lines are rather parallel, or too few.
+    """
     grey = cv2.GaussianBlur(plane_map.values.mean(2), (0, 0), 1.0)
     gradient = np.stack([cv2.Scharr(grey, cv2.CV_32F, *way) for way in ((1, 0), (0, 1))], -1)
     inner = cv2.erode(plane_map.known.astype(np.uint8), np.ones((7, 7)), borderValue=0) > 0
@@ -270,6 +341,12 @@ def _find_centre(plane_map: PlaneMap, draws: np.random.Generator) -> np.ndarray 
 
 
 def _meets(point: np.ndarray, at: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """bool [L], which lines, through points `at` [L, 2] with unit normals [L, 2], go through a point [2]."""
+    """Return bool [L], True for the lines that pass through a point, [2], up to a small angle (`SIN_TOLERANCE`).
+
+    Args:
+        point: [2].
+        at: [L, 2], a point on each line.
+        normals: [L, 2], the unit normal of each line.
+    """
     away = point - at
     return np.abs((normals * away).sum(1)) < SIN_TOLERANCE * np.linalg.norm(away, axis=1)
