@@ -1,1 +1,1 @@
-"""Measurements: suites `bench`, `stability` and `gpu`; `studies`, one question each. `python -m benchmarks.<suite>`."""
+"""Measurements: suites `bench`, `stability` and `gpu` (`python -m benchmarks.SUITE`); `studies`: one question each."""

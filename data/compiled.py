@@ -1,4 +1,4 @@
-"""How the ray caster's kernels are compiled and kept."""
+"""Compilation of the ray caster's numba kernels, and their cache on disk."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from pathlib import Path
 
 import numba
 
-_CACHE = "kernels-"  # folders of machine code in __pycache__, one per state of these sources
+_CACHE = "kernels-"  # beginning of the names of cache folders in __pycache__
 
 
 @functools.cache
 def _folder() -> Path:
-    """Cache folder of machine code, named by the content of all files here.
+    """Return the cache folder of machine code, whose name contains a hash of all Python files in this folder.
 
-    numba checks only the file of a function, and would keep code whose constants or callees changed in another file.
+    numba checks only the file of a function. Without the hash it would reuse machine code although constants or called
+    functions in other files have changed. Folders of earlier hashes are deleted.
     """
     here = Path(__file__).parent
     state = hashlib.blake2b(b"".join(path.read_bytes() for path in sorted(here.glob("*.py"))), digest_size=8)
@@ -29,9 +30,13 @@ def _folder() -> Path:
 
 
 def kernel(parallel: bool = False, inline: str = "never") -> Callable:
-    """Compile a function at its first call; later processes load it from disk.
+    """Return a decorator that compiles a function with numba at its first call and caches the machine code on disk.
 
-    If this folder is not writable, numba uses the user's cache.
+    Later processes load the machine code from the cache. If this folder is not writable, numba uses the user's cache.
+
+    Args:
+        parallel: True runs `prange` loops in several threads.
+        inline: numba's option `inline`, "never" or "always".
     """
 
     def compiled(function: Callable) -> Callable:

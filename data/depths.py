@@ -1,8 +1,11 @@
-"""Depth of a made scene without its object: `python data/depths.py --seed 0 --kind table --view in.npz --out z.npy`.
+"""True depth of a made scene without its object.
 
-`benchmarks/studies/depth.py` runs it in a process of its own. `in.npz` holds a view of the scene frame:
-`world_to_camera` [4, 4] and `rays` [H, W, 2], where its pixels lie at camera z = 1; `z.npy` is camera z [H, W] in the
-unit of the scene frame. Lens, textures and light are ignored.
+python data/depths.py --seed 0 --kind table --view in.npz --out z.npy
+
+`benchmarks/studies/depth.py` runs this script in a process of its own. The input in.npz describes a view: its pose
+`world_to_camera` [4, 4] in the scene frame (the frame of the written poses), and `rays` [H, W, 2], the points (x, y)
+of its pixels on the plane at camera z = 1. The output z.npy is camera z [H, W] in the unit of the scene frame. Lens,
+textures and light are ignored.
 """
 
 from __future__ import annotations
@@ -19,16 +22,28 @@ from room import furnish
 
 
 def camera_row(world_to_camera: np.ndarray, frame: Frame) -> np.ndarray:
-    """[16]: a camera of the ray caster, with focal length 1 and without distortion, at a pose of the scene frame."""
+    """Return a camera of the ray caster, [16], with focal length 1 and without distortion.
+
+    Args:
+        world_to_camera: pose [4, 4] in the scene frame.
+        frame: transform from the room to the scene frame.
+    """
     turn = world_to_camera[:3, :3].T
     center = frame.rotation.T @ (-turn @ world_to_camera[:3, 3] - frame.offset) / frame.scale
     return np.array([1.0, 0.0, 0.0, 0.0, *(frame.rotation.T @ turn).ravel(), *center])
 
 
 def background_depth(seed: int, kind: Kind, world_to_camera: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Camera z [...], in the scene frame's unit, of what the rays (x, y, 1) [..., 2] hit first without the object."""
+    """Return camera z [...], in the scene frame's unit, of the first surface on each ray, without the object.
+
+    Args:
+        seed: seed of the scene.
+        kind: kind of the scene.
+        world_to_camera: pose [4, 4] in the scene frame.
+        rays: [..., 2], the (x, y) of ray directions (x, y, 1) in the camera's frame.
+    """
     furniture, _ = furnish(seed, kind)
-    solids, _ = furniture.arrays(defaultdict(int), kind.node)  # any textures: only shapes count
+    solids, _ = furniture.arrays(defaultdict(int), kind.node)  # texture 0 for all faces, as only shapes matter here
     frame = scene_frame(seed)
     camera = camera_row(world_to_camera, frame)
     points, _ = raycast.surface_points(solids, camera, np.ascontiguousarray(rays.reshape(-1, 2), float), False)

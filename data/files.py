@@ -1,4 +1,7 @@
-"""The files of a scene: COLMAP's model, LLFF's poses, pictures, and the cameras of the truth."""
+"""Writers of a scene's files: COLMAP's model, LLFF's poses, pictures, and the true cameras.
+
+A camera is a row [16] of the ray caster, see `raycast`. The *scene frame* is the arbitrary frame of the written poses.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,16 @@ from reconstruction import Frame, SparsePoints
 
 
 def write_model(folder: Path, kind: Kind, names: list[str], cameras: np.ndarray, frame: Frame, points: SparsePoints):
-    """COLMAP's cameras.bin, images.bin, points3D.bin. Training views come last and alone have image points."""
+    """Write COLMAP's cameras.bin, images.bin and points3D.bin at full resolution.
+
+    Args:
+        folder: folder to write to.
+        kind: kind of the scene.
+        names: names of the views; training views come last.
+        cameras: [V, 16], one row per view.
+        frame: transform from the room to the scene frame.
+        points: sparse points with their image points in the training views; test views get no image points.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     first = len(names) - points.tracks.shape[1]
     seen = [np.flatnonzero(np.isfinite(points.tracks[:, v, 0])) for v in range(points.tracks.shape[1])]
@@ -40,13 +52,13 @@ def write_model(folder: Path, kind: Kind, names: list[str], cameras: np.ndarray,
 
 
 def _camera_record(kind: Kind, camera: np.ndarray) -> bytes:
-    """One camera, model 2: SIMPLE_RADIAL, of the full resolution."""
+    """Return the content of cameras.bin: one camera of full resolution, of COLMAP's model 2, SIMPLE_RADIAL."""
     f, cx, cy = FULL * camera[:3]
     return struct.pack("<QiiQQ4d", 1, 1, 2, FULL * kind.width, FULL * kind.height, f, cx, cy, camera[3])
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """wxyz of a rotation matrix, w >= 0: the eigenvector of Bar-Itzhack's symmetric matrix."""
+    """Return the quaternion wxyz of a rotation matrix, with w >= 0, as an eigenvector of Bar-Itzhack's matrix."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
     _, vectors = np.linalg.eigh(np.array([
         [a - e - i, d + b, g + c, h - f],
@@ -59,7 +71,12 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def write_poses_bounds(path: Path, kind: Kind, cameras: np.ndarray, frame: Frame, points: SparsePoints) -> None:
-    """LLFF's [V, 17]: columns down, right, backwards, centre, (height, width, focal) row by row; near and far."""
+    """Write LLFF's poses_bounds.npy, [V, 17], at full resolution.
+
+    Each row has a 3 x 5 matrix, row by row, and the near and far depth. The columns of the matrix are the directions
+    down, right and backwards, the camera centre, and (height, width, focal length). Near and far are the 0.1 and 99.9
+    percentiles of the sparse points' depths.
+    """
     rows = []
     positions = frame.points(points.positions)
     for camera in cameras:
@@ -74,12 +91,16 @@ def write_poses_bounds(path: Path, kind: Kind, cameras: np.ndarray, frame: Frame
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
+    """Write an image, uint8 [H, W] or RGB [H, W, 3]; missing folders are created."""
     path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image, [cv2.IMWRITE_PNG_COMPRESSION, 4])
 
 
 def write_truth_cameras(path: Path, kind: Kind, names: list[str], cameras: np.ndarray, frame: Frame) -> None:
-    """SIMPLE_RADIAL intrinsics at the size of the written images and each view's pose in the scene frame."""
+    """Write a JSON file with the true cameras.
+
+    It has the SIMPLE_RADIAL intrinsics at the size of the written images, and each view's pose in the scene frame.
+    """
     f, cx, cy, k1 = cameras[0, :4].tolist()
     views = {name: frame.world_to_camera(c).tolist() for name, c in zip(names, cameras, strict=True)}
     record = {"width": kind.width, "height": kind.height, "f": f, "cx": cx, "cy": cy, "k1": k1}

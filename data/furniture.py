@@ -1,4 +1,9 @@
-"""Furniture: pieces composed of solids with materials on their faces."""
+"""Furniture: pieces composed of solids with materials on their faces.
+
+The functions below the class add one piece each to a `Furniture`, here called `f`, with random details from the
+generator `draw`. Room frame: metres, x right, y up, z towards the cameras; the back wall is z = 0. Angles are in
+degrees. A solid is *removable* if it belongs to an object that the scene asks to remove or to insert.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +15,14 @@ from solids import BOX, CYLINDER, ROOM, SPHERE, THICKET, Faces, Solids
 
 @dataclass(frozen=True)
 class Material:
-    """A texture on a face: metres a tile (0: fitted to the face), factor on its colour, turned by 90 degrees."""
+    """Texture on a face.
+
+    Attributes:
+        texture: name of the texture.
+        tile: side of the repeated texture in metres; 0 stretches one texture over the whole face.
+        tint: factor on the texture's linear colour.
+        turned: True turns the texture by 90 degrees.
+    """
 
     texture: str
     tile: float = 0.0
@@ -19,7 +31,11 @@ class Material:
 
 
 class Furniture:
-    """Solids and their materials while the room is being furnished."""
+    """List of solids and materials, to which furniture is added piece by piece.
+
+    The argument `removable` of the methods is False for solids that stay, True for solids of the object, or the name
+    of the object if there are several with masks of their own. `yaw` is a rotation about the vertical axis in degrees.
+    """
 
     def __init__(self) -> None:
         self.solids: list[tuple] = []
@@ -28,7 +44,7 @@ class Furniture:
 
     @property
     def objects(self) -> dict[str, np.ndarray]:
-        """Name -> bool [n], the solids of each object with a name of its own."""
+        """The named objects as {name: bool [n], True for the object's solids}."""
         of = [removable for *_, removable in self.solids]
         return {name: np.array([each == name for each in of]) for name in sorted({n for n in of if isinstance(n, str)})}
 
@@ -38,24 +54,43 @@ class Furniture:
         self.materials += materials
 
     def room(self, center, half, right, left, ceiling, floor, front, back):
+        """Add the room, which must come first. The other arguments are a centre, half extents and six materials."""
         self._add(ROOM, center, half, 0.0, [right, left, ceiling, floor, front, back], False)
 
     def box(self, x, bottom, z, size, sides, front=None, top=None, yaw=0.0, removable=False):
-        """An upright box of size (wide, high, deep) that stands on `bottom`; `front` faces +z before the yaw."""
+        """Add an upright box.
+
+        Args:
+            x: centre, metres.
+            bottom: height of its lower face, metres.
+            z: centre, metres.
+            size: (wide, high, deep) in metres.
+            sides: material of all faces except those with a material of their own.
+            front: material of the face that points to +z before the yaw; None for `sides`.
+            top: material of the upper face; None for `sides`.
+        """
         half = np.array(size) / 2
         faces = [sides, sides, top or sides, sides, front or sides, sides]
         self._add(BOX, (x, bottom + half[1], z), half, yaw, faces, removable)
 
     def sphere(self, x, bottom, z, radius, material, yaw=0.0, removable=False):
+        """Add a sphere whose lowest point is at the height `bottom`, metres."""
         self._add(SPHERE, (x, bottom + radius, z), (radius,) * 3, yaw, [material], removable)
 
     def cylinder(self, x, bottom, z, radius, high, side, top=None, removable=False):
+        """Add an upright cylinder whose lower face is at the height `bottom`, metres, with the material `side`."""
         half = (radius, high / 2, radius)
         self._add(CYLINDER, (x, bottom + high / 2, z), half, 0.0, [side, top or side, side], removable)
 
     def thicket(self, x, bottom, z, size, cell, leaf, material, seed, yaw=0.0):
-        """A box of size (wide, high, deep) full of leaves, one in each cell of about the size `cell`, metres; `leaf`:
-        its width, length, thickness in metres, and by how many degrees it leans at most; seed: of their places."""
+        """Add a box full of leaves, see `thicket.py`.
+
+        Args:
+            size: (wide, high, deep) of the box, metres.
+            cell: approximate size of a cell with one leaf, metres; one number, or (wide, high, deep).
+            leaf: (width, length, thickness) of a leaf in metres, and its largest lean in degrees.
+            seed: seed of the leaves' shapes and positions.
+        """
         half = np.array(size) / 2
         cells = np.maximum(np.round(np.array(size) / cell), 1).astype(int)
         *extents, lean = leaf
@@ -63,7 +98,12 @@ class Furniture:
         self._add(THICKET, (x, bottom + half[1], z), half, yaw, [material], False)
 
     def arrays(self, index: dict[str, int], node: float) -> tuple[Solids, Faces]:
-        """Everything as the arrays that kernels read; `index`: texture name -> number, `node`: metres."""
+        """Return all solids and faces as the arrays that the ray caster's kernels read.
+
+        Args:
+            index: name of a texture -> its index.
+            node: distance between nodes of the light map, metres.
+        """
         return self._solid_arrays(), self._face_arrays(index, node)
 
     def _solid_arrays(self) -> Solids:
@@ -81,13 +121,13 @@ class Furniture:
         solids = zip(self.solids, lawns, strict=True)
         sizes = np.array([size for solid, lawn in solids for size in _face_sizes(solid[0], solid[2], lawn)])
         spacing = np.full((len(sizes), 1), node)
-        spacing[[2, 4]] *= 4  # ceiling and front wall: hardly ever in a picture
+        spacing[[2, 4]] *= 4  # ceiling and front wall are hardly ever in a picture
         nodes = np.clip(np.ceil(sizes / spacing).astype(int) + 1, 5, 256)
         start = np.cumsum([0, *nodes.prod(1)])[:-1]
         mapping = np.zeros((len(sizes), 4))
         for face, (size, material) in enumerate(zip(sizes, self.materials, strict=True)):
             if material.tile:
-                # Each face shows another part of the texture.
+                # The offsets differ from face to face, so that faces show different parts of the texture.
                 mapping[face] = 1 / material.tile, 1 / material.tile, face * 0.377 % 1, face * 0.619 % 1
             else:
                 mapping[face, :2] = 1 / (size[::-1] if material.turned else size)
@@ -99,13 +139,14 @@ class Furniture:
 
 
 def _reach(kind: int, half) -> float:
-    """Radius of the bounding sphere."""
+    """Return the radius of a solid's bounding sphere."""
     if kind == SPHERE:
         return half[0]
     return np.hypot(half[0], half[1]) if kind == CYLINDER else np.linalg.norm(half)
 
 
 def _face_sizes(kind: int, half, lawn: bool) -> list[tuple[float, float]]:
+    """Return the extents (u, v) of a solid's faces in metres; `lawn` is True for a thicket of one layer of leaves."""
     a, b, c = (2 * h for h in half)
     if kind == THICKET:
         return [(a, c) if lawn else (a, b)]
@@ -121,6 +162,7 @@ WOOD = Material("wood", 0.9)
 
 
 def plant(f: Furniture, draw, x: float, z: float, high: float) -> None:
+    """Add a plant in a pot, about `high` metres high."""
     f.cylinder(x, 0, z, 0.17, 0.3, Material("pot"), Material("wicker", 0.6, (0.3, 0.22, 0.16)))
     f.cylinder(x, 0.3, z, 0.025, high - 0.6, WOOD)
     for k in range(7):
@@ -131,7 +173,7 @@ def plant(f: Furniture, draw, x: float, z: float, high: float) -> None:
 
 
 def shelf(f: Furniture, draw, x: float, z: float, wide: float, yaw: float = 0.0) -> None:
-    """A low bookshelf with things on it; its back towards -z before the yaw."""
+    """Add a low bookshelf of width `wide` with things on it. Its back points to -z before the yaw."""
     c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
     f.box(x, 0, z, (wide, 0.44, 0.3), WOOD, Material("books"), yaw=yaw)
     f.box(x, 0.44, z, (wide + 0.06, 0.03, 0.34), WOOD, yaw=yaw)
@@ -146,7 +188,7 @@ def shelf(f: Furniture, draw, x: float, z: float, wide: float, yaw: float = 0.0)
 
 
 def cabinet(f: Furniture, draw, x: float, z: float, wide: float, high: float, deep: float) -> None:
-    """The object of demo: a cabinet against the wall, a ball and a jar on it. z is its back."""
+    """Add the removable object of the kind "demo": a cabinet with a ball and a jar on it; z is the cabinet's back."""
     body = Material("paint", 1.3)
     f.box(x, 0, z + deep / 2, (wide, high, deep), body, Material("front"), removable=True)
     f.box(x, high, z + deep / 2, (wide + 0.04, 0.025, deep + 0.02), WOOD, removable=True)
@@ -159,7 +201,12 @@ def cabinet(f: Furniture, draw, x: float, z: float, wide: float, high: float, de
 
 
 def pair(f: Furniture, draw, side: int, z: float) -> None:
-    """The two objects of pair, a box and a ball on a foot, side by side before a wall; z is the wall."""
+    """Add the two removable objects of the kind "pair" side by side: a box, and a ball on a foot.
+
+    Args:
+        side: 1 if the box is on the right, -1 if on the left.
+        z: position of the objects' backs.
+    """
     wide, deep, high = draw.uniform(0.5, 0.58), draw.uniform(0.2, 0.24), draw.uniform(0.62, 0.74)
     f.box(side * 0.44, 0, z + deep / 2, (wide, high, deep), Material("paint", 1.3), Material("front"), removable="box")
     f.box(side * 0.44, high, z + deep / 2, (wide + 0.03, 0.02, deep + 0.02), WOOD, removable="box")
@@ -169,14 +216,14 @@ def pair(f: Furniture, draw, side: int, z: float) -> None:
 
 
 def lantern(f: Furniture, draw, x: float, z: float) -> None:
-    """The object of seen: a lantern that hangs on nothing, well away from all that stands behind it."""
+    """Add the removable object of the kind "seen": a lantern in mid-air, far from everything behind it."""
     low, radius = draw.uniform(0.72, 0.8), draw.uniform(0.11, 0.13)
     f.sphere(x, low, z, radius, Material("ball"), draw.uniform(0, 360), removable=True)
     f.cylinder(x, low + 1.8 * radius, z, 0.5 * radius, 0.07, Material("jar"), WOOD, removable=True)
 
 
 def table(f: Furniture, x: float, z: float, size: tuple[float, float, float]) -> None:
-    """A table of size (wide, high, deep) on four legs, nothing but air under its thin top."""
+    """Add a table of size (wide, high, deep) with a thin top on four legs."""
     wide, high, deep = size
     f.box(x, high - 0.04, z, (wide, 0.04, deep), WOOD)
     for a, b in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
@@ -184,7 +231,10 @@ def table(f: Furniture, x: float, z: float, size: tuple[float, float, float]) ->
 
 
 def chest(f: Furniture, draw, x: float, bottom: float, z: float) -> None:
-    """The object of table: a chest with a ball and a jar on its lid. z is its front; it stands straight."""
+    """Add the object of the kinds "table" and "insert": a chest with a ball and a jar on its lid.
+
+    The chest is parallel to the walls; z is its front.
+    """
     wide, high, deep = draw.uniform(0.6, 0.7), draw.uniform(0.36, 0.42), draw.uniform(0.4, 0.46)
     z -= deep / 2
     f.box(x, bottom, z, (wide, high, deep), Material("paint", 1.3), Material("front"), removable=True)
@@ -196,7 +246,10 @@ def chest(f: Furniture, draw, x: float, bottom: float, z: float) -> None:
 
 
 def keepsake(f: Furniture, draw, x: float, z: float) -> None:
-    """What stays and stands before the object of behind: a large ball, or a stool with a globe on it."""
+    """Add an object that is not removed: a large ball, or a stool with a globe.
+
+    In the kind "behind" it stands before the removable object.
+    """
     if draw.random() < 0.5:
         f.sphere(x, 0, z, draw.uniform(0.24, 0.28), Material("globe"), draw.uniform(0, 360))
     else:
@@ -206,8 +259,10 @@ def keepsake(f: Furniture, draw, x: float, z: float) -> None:
 
 
 def hedge(f: Furniture, draw, z: float, wide: float, high: float) -> None:
-    """Foliage 0.4 m deep over a dark core, from wall to wall; z is its front. Layers of unlike cells hide each other's
-    rows."""
+    """Add a hedge of width `wide` and height `high`: three layers of leaves before a dark core; z is the hedge's front.
+
+    The layers have cells of different sizes, so that the rows of cells are not visible.
+    """
     f.box(0, 0, z - 0.4, (wide, high - 0.06, 0.2), Material("leaves", 0.6, (0.5, 0.6, 0.4)))
     for cell, back, tint in ((0.065, 0.05, 1.4), (0.08, 0.02, 2.0), (0.1, 0.0, 2.6)):
         leaf, material = (0.8 * cell, 1.1 * cell, 0.008, 80), Material("foliage", 0.8, (tint,) * 3)
@@ -216,7 +271,10 @@ def hedge(f: Furniture, draw, z: float, wide: float, high: float) -> None:
 
 
 def lawn(f: Furniture, draw, z: float, wide: float) -> None:
-    """Two layers of grass that do not lie in the same rows, a low dark one and a high light one."""
+    """Add a square lawn of side `wide` around z: a low dark layer of grass and a high light one.
+
+    The two layers are turned against each other, so that the rows of cells are not visible.
+    """
     for high, tint in ((0.07, 1.2), (0.12, 2.4)):
         blade, material = (0.014, high + 0.01, 0.006, 14), Material("foliage", 0.8, (tint,) * 3)
         seed, yaw = int(draw.integers(1 << 20)), draw.uniform(0, 90)
@@ -225,7 +283,10 @@ def lawn(f: Furniture, draw, z: float, wide: float) -> None:
 
 
 def daybed(f: Furniture, draw, x: float, z: float) -> None:
-    """The object of 360: a low daybed with a ball and a jar on it; all around, only the floor below is hidden."""
+    """Add the removable object of the kind "360": a low daybed with a ball and a jar on it.
+
+    For cameras all around it hides only the floor below.
+    """
     wide, deep, high = draw.uniform(1.1, 1.3), draw.uniform(0.8, 0.95), draw.uniform(0.14, 0.18)
     yaw = draw.uniform(-20, 20)
     f.box(x, 0.008, z, (wide, high - 0.008, deep), Material("paint", 1.3), yaw=yaw, removable=True)

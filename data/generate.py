@@ -1,25 +1,26 @@
-"""Generates synthetic scenes with known truth: `python data/generate.py --out data/demo --seed 0 --kind demo`.
+"""Generator of synthetic scenes with known truth: `python data/generate.py --out data/demo --seed 0 --kind demo`.
 
 A furnished room is ray-cast with and without one object. Kinds:
   demo    100 views in SPIn-NeRF's layout: 40 test views without the object, 60 training views with it
-  mini    the same, 3 + 8 views of 64 x 48 px, for tests
+  mini    demo with 3 test and 8 training views of 64 x 48 px, for tests
   wide    demo with cameras +-50 degrees around the object
   360     demo with cameras all around an object that lies on the floor
-  seen    demo with an object that hangs in mid-air: other views see all that it hides, nothing is to be invented
-  behind  wide with an object that stays in front, and hides a part of what is to be filled from the reference
+  seen    demo with an object in mid-air: other views see everything that it hides, so nothing has to be invented
+  behind  wide with a second object in front, which stays and hides a part of what the reference is to fill
   table   an object on the edge of a table, free space under it, some cameras low enough to look there
-  corner  an object in front of the corner of a wall that juts out: behind it the depth has a step
+  corner  an object in front of the corner of a projecting wall: behind the object the depth has a step
   pair    two objects side by side, each with masks of its own, and two references
   sparse  nothing to remove; only four training views have pixels, the others are cameras
   grass   an object on a lawn in front of a hedge: thousands of blades and leaves, nothing flat
-  insert  the reverse: an object on the floor, only in the test views and four references; it is to be inserted
+  insert  an object on the floor that only the test views and four references show, and that is to be inserted
   outpaint  the room as photographed, and a sphere beyond which references continue it
   photos  26 larger photographs and masks without poses, for structure from motion
 
-Poses are written in a scene frame of arbitrary scale, rotation and origin, as SfM leaves it. As in SPIn-NeRF the
-COLMAP model and poses_bounds.npy belong to the full resolution, 4 times `images_4`; the model names `<view>.jpg`.
-`truth/` holds what the pipeline must not read, every picture with the photographs' lens. Outside the masks, views with
-and without the object are equal: it casts no shadow, and masks hold every pixel it touches.
+Poses are written in a scene frame of arbitrary scale, rotation and origin, as structure from motion gives. As in
+SPIn-NeRF, the COLMAP model and poses_bounds.npy are for the full resolution, 4 times that of `images_4`, and the model
+names the images `<view>.jpg`. The folder `truth/` has the ground truth, which the pipeline must not read; its pictures
+have the same lens as the photographs. Outside the masks, views with and without the object are equal: the object casts
+no shadow, and the masks cover every pixel that the object touches.
 """
 
 from __future__ import annotations
@@ -40,18 +41,21 @@ from room import furnish
 from tasks import SPHERE, bounding_region, choose_covering_views, depth, outside_sphere, point_on_axis, without_object
 from world import World, bake
 
-AWAY = 2.5  # metres from the middle camera to the sphere's centre, about where the views look
-MOST_NEVER_SEEN = 0.005  # share of the masks, where the object hangs: crannies behind furniture
+AWAY = 2.5  # distance from the middle camera to the sphere's centre, metres; about the point that the cameras look at
+# Largest share of the masks that may be never seen if the object hangs. Only crannies behind furniture are never seen.
+MOST_NEVER_SEEN = 0.005
 PROFILE = "profile: laptop # small pictures, made for it; `make profile=paper` has precedence\n"
 
 
 def generate(out: Path, seed: int, kind: Kind) -> dict:
-    """Write the scene to `out` atomically, and return its facts.
+    """Write a scene to the folder `out` atomically, replacing an earlier one, and return its facts.
+
+    Returns:
+        The facts as in truth/facts.json, see `_facts`.
 
     Raises:
-        ValueError: `out` holds something that this script did not write, or that was changed since; or less than the
-            kind's share of the masks hides background that no training view sees (for a hanging object: or too much
-            does).
+        ValueError: `out` has files that this script did not write or that have changed since; or the share of the masks
+            whose background no training view shows is below the kind's `least` (for a hanging object: too large).
     """
     if out.exists() and any(out.iterdir()) and not (out / "truth/facts.json").exists():
         raise ValueError(f"{out} holds files that data/generate.py did not write; name another folder, or empty it")
@@ -67,7 +71,15 @@ def generate(out: Path, seed: int, kind: Kind) -> dict:
 
 
 def _changed_by_hand(out: Path, new_scene: Path) -> list[Path]:
-    """Files of `out` that are not in the new scene, or that are younger than the stamp of their generation."""
+    """Return the files of an existing scene that somebody has added or changed by hand.
+
+    These are files that the new scene does not have, and files younger than the stamp `.generated`. Without this stamp
+    the list is empty.
+
+    Args:
+        out: folder of the existing scene.
+        new_scene: folder of the newly generated scene.
+    """
     sign = out / ".generated"
     files = [path for path in out.rglob("*") if path.is_file() and path != sign] if sign.exists() else []
     young = lambda path: path.stat().st_mtime > sign.stat().st_mtime
@@ -105,6 +117,12 @@ def _write_scene(out: Path, seed: int, kind: Kind) -> dict:
 
 
 def _facts(seed: int, session: Session) -> dict:
+    """Return the facts of a scene.
+
+    They are the seed; the name of the middle view; the mean share of pixels that are masked and the mean share of the
+    masks that is never seen, for training and test views; the shift of the image corners by the lens, px; and the names
+    of training views that are far apart.
+    """
     shares = [float(h.sum() / max(m.sum(), 1)) for h, m in zip(session.hidden, session.masks, strict=True)]
     return {
         "seed": seed,
@@ -127,7 +145,7 @@ def _write_photos(out: Path, session: Session) -> None:
 
 
 def _write_pictures(out: Path, session: Session) -> None:
-    """Photographs, in SPIn-NeRF's layout."""
+    """Write the photographs in SPIn-NeRF's layout."""
     for name, photo in zip(session.names, session.photos, strict=True):
         write_image(out / f"images_4/{name}.png", photo)
 
@@ -139,7 +157,10 @@ def _write_test_masks(out: Path, session: Session, masks: Sequence[np.ndarray]) 
 
 
 def _write_removal(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
-    """Write masks of the object, or of each object, and the references if something has to be invented."""
+    """Write masks of the object, or of each object, and the references unless the object hangs.
+
+    Behind a hanging object nothing has to be invented.
+    """
     _write_test_masks(out, session, session.masks[: session.test])
     for k, name in enumerate(session.names):
         write_image(out / f"truth/never_seen/{name}.png", session.hidden[k] * np.uint8(255))
@@ -153,7 +174,7 @@ def _write_removal(out: Path, session: Session, kind: Kind, world: World, frame:
 
 
 def _write_references(out: Path, session: Session) -> str:
-    """Write the completed views; returns the lines of scene.yaml that name them."""
+    """Write the completed views and return the lines of scene.yaml that name them as references."""
     files = ["reference.png", *(f"reference_{session.names[k]}.png" for k in list(session.completions)[1:])]
     entries = []
     for (k, picture), file in zip(session.completions.items(), files, strict=True):
@@ -165,7 +186,10 @@ def _write_references(out: Path, session: Session) -> str:
 
 
 def _write_sparse_views(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
-    """Name a few photographs as training views and references; the other training views are cameras only."""
+    """Write scene.yaml, in which a few photographs are training views and references.
+
+    All other training views are cameras without pixels.
+    """
     shown = [session.names[k] for k in session.spread[: kind.shown]]
     references = "".join(f"- {{view: {name}, image: images_4/{name}.png}}\n" for name in shown)
     listed = lambda names: f"[{', '.join(names)}]\n"
@@ -176,7 +200,7 @@ def _write_sparse_views(out: Path, session: Session, kind: Kind, world: World, f
 
 
 def _write_insertion(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
-    """Write references that show the object, with depth, and a sphere that contains it."""
+    """Write test masks, references that show the object, their depth, and a region (a sphere) around the object."""
     _write_test_masks(out, session, session.masks[: session.test])
     center, radius = bounding_region(world.solids)
     region = {"center": frame.points(center).tolist(), "radius": frame.scale * radius}
@@ -184,7 +208,10 @@ def _write_insertion(out: Path, session: Session, kind: Kind, world: World, fram
 
 
 def _write_outpainting(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
-    """Write a sphere on the middle view's optical axis, and whole pictures of some views with depth."""
+    """Write test masks, a region, and references with depth. The region is everything outside a sphere.
+
+    The centre of the sphere is on the middle view's optical axis. The references are photographs of training views.
+    """
     center = point_on_axis(session.cameras[session.middle], AWAY)
     masks = [outside_sphere(camera, kind, world, center, SPHERE) for camera in session.cameras[: session.test]]
     _write_test_masks(out, session, masks)
@@ -199,7 +226,7 @@ def _write_outpainting(out: Path, session: Session, kind: Kind, world: World, fr
 def _write_measured(
     out: Path, session: Session, pictures: dict[int, np.ndarray], kind: Kind, world: World, frame: Frame
 ) -> str:
-    """Write pictures of views and their depth; returns the lines of scene.yaml that name them."""
+    """Write pictures of views with their depth, and return the lines of scene.yaml that name them as references."""
     entries = ["reference:\n"]
     for k, picture in pictures.items():
         name = session.names[k]

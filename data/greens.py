@@ -1,4 +1,4 @@
-"""The texture of grass and leaves: [N, N, 3] float32 sRGB in [0, 1], tileable."""
+"""The texture of grass and leaves."""
 
 from __future__ import annotations
 
@@ -13,6 +13,6 @@ GREENS = (
 
 
 def foliage(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Greens that differ from leaf to leaf, and in drifts."""
+    """Return a tileable texture of greens, [size, size, 3] float32 sRGB in [0, 1], with fine and coarse variations."""
     tone = 0.5 + 0.2 * fbm(rng, size, 64, 64, 2) + 0.1 * fbm(rng, size, 4, 4, 3)
     return ramp(np.clip(tone, 0, 1), *GREENS[rng.integers(len(GREENS))])

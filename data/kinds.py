@@ -1,4 +1,4 @@
-"""The kinds of synthetic scenes, and the source of their randomness."""
+"""The kinds of synthetic scenes, and the random generators that all scenes draw from."""
 
 from __future__ import annotations
 
@@ -7,29 +7,37 @@ from dataclasses import dataclass
 
 import numpy as np
 
-FULL = 4  # full resolution over that of images_4
+FULL = 4  # ratio of the full resolution to that of the written images in images_4
 
 
 @dataclass(frozen=True)
 class Kind:
-    """The parameters of a kind of scene.
+    """Parameters of a kind of scene.
 
     Attributes:
-        width, height: pixels of the written images; samples: rays along a side of a pixel.
-        train, test: numbers of views; photos: write photographs and masks only.
-        spread: degrees that the cameras reach to either side of the object; from 180 on they circle it.
-        texture: pixels along a side of the largest textures; node: metres between nodes of the light map.
-        bend: largest k1 of SIMPLE_RADIAL; points: number of sparse points.
-        hangs: the object hangs in mid-air, so that other views show all that it hides.
-        place: where the object is: "room", "behind" (an object that stays is in front), "table" (on its edge), "corner"
-            (in front of the corner of a wall), "grass", "floor" or "pair" (two objects side by side).
-        task: what the scene asks for: "remove" the object; "insert" it: it is only in the test views and the
-            references; "outpaint" what lies beyond a sphere, nothing else is changed; "sparse": nothing is changed, but
-            few views have pixels.
-        references: number of completed views that the scene brings; for outpainting, as many as show everything.
-        shown: number of training views with pixels, the others are cameras only; 0: all have pixels.
-        least: smallest share of the masks that no training view shows.
-        low: metres above the floor of the lowest cameras; None: all are at eye level.
+        width: width of the written images, px.
+        height: height of the written images, px.
+        samples: rays along a side of a pixel, i.e. samples² rays per pixel.
+        train: number of training views.
+        test: number of test views.
+        photos: True writes photographs, masks and the truth only, without poses, e.g. for structure from motion.
+        spread: degrees that the cameras reach to either side of the object; from 180 on the cameras circle the object.
+        texture: pixels along a side of the largest textures.
+        node: distance between nodes of the light map, metres.
+        bend: largest distortion coefficient k1 of COLMAP's SIMPLE_RADIAL.
+        points: number of sparse points.
+        hangs: True if the object hangs in mid-air, so that other views show everything that it hides.
+        place: where the object is: "room" (against a wall), "behind" (another object, which stays, is in front),
+            "table" (on the edge of a table), "corner" (in front of the corner of a wall), "grass" (on a lawn), "floor"
+            or "pair" (two objects side by side).
+        task: what the scene asks for. "remove": remove the object. "insert": insert the object, which only the test
+            views and the references show. "outpaint": continue the scene beyond a sphere. "sparse": no object is
+            removed or inserted, but few views have pixels.
+        references: number of completed views in the scene's folder. For outpainting it has no effect: there are as many
+            references as are needed to show everything.
+        shown: number of training views with pixels; the other training views are cameras only. 0: all have pixels.
+        least: smallest allowed share of the masks whose background no training view shows, in [0, 1].
+        low: height of the lowest cameras above the floor, metres; None for cameras at eye level.
     """
 
     width: int = 320
@@ -53,7 +61,7 @@ class Kind:
 
     @property
     def is_circle(self) -> bool:
-        """Do the cameras circle the object?"""
+        """True if the cameras circle the object."""
         return self.spread >= 180
 
 
@@ -76,5 +84,12 @@ KINDS = {
 
 
 def randomness(seed: int, label: str) -> np.random.Generator:
-    """A generator for each part, so that changing one part leaves the others as they were."""
+    """Return the random generator of one part of a scene.
+
+    Each part has a generator of its own, so that a change to one part does not change the other parts.
+
+    Args:
+        seed: seed of the scene.
+        label: name of the part.
+    """
     return np.random.default_rng([seed, zlib.crc32(label.encode())])

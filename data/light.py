@@ -1,4 +1,7 @@
-"""Bakes a light map: nodes on every face, direct light of lamps, bounces between faces."""
+"""Baking of the light map: nodes on every face, direct light of lamps, light reflected between faces.
+
+The light map stores irradiance / pi, the radiance that a white diffuse surface would reflect.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from solids import is_blocked, nearest, on_face, surface
 
 @kernel()
 def irradiance(faces, light, face, u, v, out):
-    """Bilinear lookup in the face's light map."""
+    """Interpolate the face's light map bilinearly at (u, v), in metres, and write the result to `out` [3]."""
     start, columns, rows = faces.grid[face, 0], faces.grid[face, 1], faces.grid[face, 2]
     x = min(max(u / faces.size[face, 0], 0.0), 1.0) * (columns - 1)
     y = min(max(v / faces.size[face, 1], 0.0), 1.0) * (rows - 1)
@@ -26,7 +29,13 @@ def irradiance(faces, light, face, u, v, out):
 
 @kernel(parallel=True)
 def light_nodes(solids, faces):
-    """The light map's nodes: room points [M, 3] just off the surface, normals [M, 3], solid [M]."""
+    """Return the M nodes of the light map.
+
+    Returns:
+        points: [M, 3], room points 1 mm in front of the surface.
+        normals: [M, 3].
+        owner: [M], index of the solid.
+    """
     total = 0
     for f in range(faces.grid.shape[0]):
         total += faces.grid[f, 1] * faces.grid[f, 2]
@@ -37,7 +46,7 @@ def light_nodes(solids, faces):
             start, columns, rows = faces.grid[f, 0], faces.grid[f, 1], faces.grid[f, 2]
             for j in range(rows):
                 for k in range(columns):
-                    # Nodes on an edge move inwards a little, else they would lie inside the neighbouring face.
+                    # Nodes on an edge are moved inwards a little, so that they are not inside another face.
                     a = 0.004 + 0.992 * k / (columns - 1)
                     b = 0.004 + 0.992 * j / (rows - 1)
                     px, py, pz, nx, ny, nz = on_face(
@@ -52,10 +61,16 @@ def light_nodes(solids, faces):
 
 @kernel(parallel=True)
 def direct_light(solids, points, normals, owner, lamps, side):
-    """Irradiance / pi [M, 3] at the nodes from rectangular lamps, side x side shadow rays each.
+    """Compute the light [M, 3] at the nodes that comes directly from rectangular lamps, as irradiance / pi.
 
-    lamps: [L, 15] centre, half edge a, half edge b, direction it shines in, radiance. The object shades only itself:
-    nothing else in the room may change when it goes.
+    The object casts shadows only on itself, because nothing else in the room may change when the object is removed.
+
+    Args:
+        points: [M, 3] nodes.
+        normals: [M, 3].
+        owner: [M] index of the solid of each node.
+        lamps: [L, 15]: centre, half edge a, half edge b, direction of emission, radiance, three numbers each.
+        side: side x side shadow rays per lamp.
     """
     light = np.zeros((points.shape[0], 3))
     for n in prange(points.shape[0]):
@@ -71,7 +86,10 @@ def direct_light(solids, points, normals, owner, lamps, side):
 
 @kernel()
 def _lamp_sum(solids, with_object, point, normal, lamp, side):
-    """Sum of both cosines over the squared distance, over side x side points of the lamp; hidden points add 0."""
+    """Return the sum of cos(surface) cos(lamp) / distance² over side x side points of a lamp, for one node.
+
+    Points that the node does not see add 0.
+    """
     total = 0.0
     for s in range(side * side):
         a, b = 2.0 * (s % side + 0.5) / side - 1.0, 2.0 * (s // side + 0.5) / side - 1.0
@@ -91,10 +109,15 @@ def _lamp_sum(solids, with_object, point, normal, lamp, side):
 
 @kernel(parallel=True)
 def bounced_light(solids, faces, textures, points, normals, owner, light, ambient, rays):
-    """One bounce [M, 3]: mean radiance over a cosine-weighted hemisphere of the surfaces that reflect light to each
-    node.
+    """Compute the light [M, 3] at the nodes that surfaces reflect, after one bounce.
 
-    Every node uses the same low-discrepancy directions, so neighbours agree and nothing is noisy.
+    This is the mean radiance of the surfaces in a cosine-weighted hemisphere about the normal. All nodes use the same
+    low-discrepancy directions, so that neighbouring nodes do not differ by noise.
+
+    Args:
+        light: [M, 3] light at the nodes before this bounce.
+        ambient: constant that is added to the light of all surfaces.
+        rays: number of directions.
     """
     bounce = np.zeros((points.shape[0], 3))
     for n in prange(points.shape[0]):
@@ -117,7 +140,7 @@ def bounced_light(solids, faces, textures, points, normals, owner, light, ambien
 
 @kernel()
 def _direction(s, rays, nx, ny, nz):
-    """Direction s of `rays`, cosine-weighted about the normal (nx, ny, nz)."""
+    """Return direction number s of `rays` directions, cosine-weighted about the normal (nx, ny, nz)."""
     ax, ay, az = (0.0, nz, -ny) if abs(nx) < 0.7 else (-nz, 0.0, nx)
     length = math.sqrt(ax * ax + ay * ay + az * az)
     ax, ay, az = ax / length, ay / length, az / length

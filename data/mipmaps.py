@@ -1,4 +1,4 @@
-"""Pictures with all their mip levels, and the colour of a face at a point."""
+"""Textures with all their mip levels, and the colour of a face at a point."""
 
 from __future__ import annotations
 
@@ -10,11 +10,16 @@ from compiled import kernel
 
 
 class Textures(NamedTuple):
-    """Square tileable pictures with all their mip levels, sRGB bytes in one array.
+    """K square tileable textures with all their mip levels, in one array of texels.
+
+    Level 0 is the full texture; each further level has half the side.
 
     Attributes:
-        texels: [total, 3] uint8; start: [k, levels] first texel of each level; side: [k] pixels at level 0.
-        mean: [k, 3] linear mean colour; linear: [256] sRGB byte -> linear.
+        texels: [total, 3] uint8 sRGB, all levels of all textures.
+        start: [K, levels] index in `texels` of the first texel of each level.
+        side: [K] pixels along a side at level 0.
+        mean: [K, 3] mean colour, linear.
+        linear: [256] linear intensity of each sRGB byte.
     """
 
     texels: np.ndarray
@@ -25,7 +30,14 @@ class Textures(NamedTuple):
 
 
 def build_mipmaps(pictures: dict[str, np.ndarray]) -> tuple[Textures, dict[str, int]]:
-    """Mip levels of each picture, computed in linear light; and each name's index."""
+    """Build the mip levels of all textures, averaged in linear light.
+
+    Args:
+        pictures: name -> [N, N, 3] sRGB in [0, 1], N a power of two.
+
+    Returns:
+        The textures, and {name: index of the texture}.
+    """
     linear = (np.arange(256) / 255.0) ** 2.2
     levels = max(int(np.log2(p.shape[0])) for p in pictures.values()) + 1
     texels, start, side, mean, total = [], [], [], [], 0
@@ -47,7 +59,10 @@ def build_mipmaps(pictures: dict[str, np.ndarray]) -> tuple[Textures, dict[str, 
 
 @kernel()
 def _texel(textures, k, level, a, b, out, weight):
-    """Add the bilinear sample at (a, b) in tiles, times weight, to out."""
+    """Add a bilinear sample of mip level `level` of texture k, times `weight`, to the linear colour `out` [3].
+
+    The sample is at (a, b), in tiles.
+    """
     side = max(textures.side[k] >> level, 1)
     x, y = (a - math.floor(a)) * side - 0.5, (b - math.floor(b)) * side - 0.5
     i, j = math.floor(x), math.floor(y)
@@ -65,7 +80,10 @@ def _texel(textures, k, level, a, b, out, weight):
 
 @kernel()
 def albedo(faces, textures, face, u, v, footprint, out):
-    """Linear colour of a face, averaged over about `footprint` metres."""
+    """Write the linear colour of a face at the point (u, v) to `out` [3], averaged over about `footprint` metres.
+
+    u and v are metres on the face. The two mip levels around the footprint are interpolated.
+    """
     if faces.swap[face]:
         u, v = v, u
     k = faces.texture[face]

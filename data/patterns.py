@@ -1,4 +1,8 @@
-"""Components of textures: tileable noise, coordinates, colour ramps. Pictures are [N, N] or [N, N, 3] float32."""
+"""Components of textures: tileable noise, coordinates, colour ramps.
+
+Pictures are [N, N] or [N, N, 3] float32. A *tile* is the whole picture; coordinates in tiles run from 0 to 1. A *cell*
+is one of the equal parts into which a pattern divides the tile, e.g. the place of a brick.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ import numpy as np
 
 
 def noise(rng, size, rows, columns):
-    """Smooth tileable noise [N, N] with rows x columns random nodes, about -1..1."""
+    """Return smooth tileable noise [size, size] in about [-1, 1], interpolated from rows x columns random values."""
     nodes = np.pad(rng.random((rows, columns), dtype=np.float32) * 2 - 1, 2, mode="wrap")
     high, wide = size // rows, size // columns
     big = cv2.resize(nodes, (nodes.shape[1] * wide, nodes.shape[0] * high), interpolation=cv2.INTER_CUBIC)
@@ -15,7 +19,14 @@ def noise(rng, size, rows, columns):
 
 
 def fbm(rng, size, rows, columns, octaves=5, gain=0.55):
-    """Noise at several scales, each twice as fine; zero mean, unit deviation."""
+    """Return tileable noise [size, size] summed over several scales, with mean 0 and standard deviation 1.
+
+    Args:
+        rows: random values along y at the coarsest scale.
+        columns: random values along x at the coarsest scale.
+        octaves: number of scales, each twice as fine as the scale before; scales too fine for `size` are omitted.
+        gain: amplitude of a scale over that of the coarser scale before.
+    """
     total, weight = np.zeros((size, size), np.float32), 1.0
     rows, columns = min(rows, size // 2), min(columns, size // 2)
     for _ in range(octaves):
@@ -27,28 +38,30 @@ def fbm(rng, size, rows, columns, octaves=5, gain=0.55):
 
 
 def grid(size):
-    """(x, y) of the pixel centres in tiles, [N, N] each."""
+    """Return the coordinates (x, y) of the pixel centres, [size, size] each, in (0, 1)."""
     line = (np.arange(size, dtype=np.float32) + 0.5) / size
     return np.meshgrid(line, line)
 
 
 def step(edge0, edge1, x):
+    """Return a smooth step from 0 at x = edge0 to 1 at x = edge1; a falling one if edge0 > edge1."""
     t = np.clip((x - edge0) / (edge1 - edge0), 0, 1)
     return t * t * (3 - 2 * t)
 
 
 def ramp(t, *colors):
-    """Colours [N, N, 3] along a palette, t in [0, 1]."""
+    """Return colours [N, N, 3] in [0, 1], interpolated along a palette of byte colours at t [N, N] in [0, 1]."""
     palette = np.asarray(colors, np.float32) / 255
     return np.stack([np.interp(t, np.linspace(0, 1, len(palette)), palette[:, c]) for c in range(3)], -1)
 
 
 def blend(a, b, t):
+    """Return the mixture of two colours or pictures [N, N, 3]: a where t [N, N] is 0, b where t is 1."""
     return a + (b - a) * t[..., None]
 
 
 def shift(image, x, y):
-    """A tileable picture [N, N] read at (x, y) in tiles."""
+    """Return a tileable picture [N, N] sampled bilinearly at the coordinates (x, y), [N, N] each, in tiles."""
     size = np.float32(image.shape[0])
     return cv2.remap(
         image,
@@ -60,21 +73,28 @@ def shift(image, x, y):
 
 
 def srgb(color):
-    """[3] float32 in [0, 1] of bytes."""
+    """Return a colour [3] in [0, 1] as float32 from a colour in bytes."""
     return np.asarray(color, np.float32) / 255
 
 
 def cell(t):
-    """(number of the unit cell, place within it in [0, 1)) of a coordinate."""
+    """Return (index of the unit cell, position within the cell in [0, 1)) of each coordinate t."""
     number = np.floor(t).astype(int)
     return number, t - number
 
 
 def rim(t):
-    """Distance to the nearer end of the unit cell."""
+    """Return the distance of a position t within a unit cell, in [0, 1), to the nearer end of the cell."""
     return np.minimum(t, 1 - t)
 
 
 def random_per_cell(rng, rows, columns, row, column):
-    """Three random values in [0, 1) for each of rows x columns pieces, at the pixels of piece (row, column)."""
+    """Draw three random values in [0, 1) for each cell of a pattern, and return them as three pictures.
+
+    Args:
+        rows: number of cells along y.
+        columns: number of cells along x.
+        row: [N, N] index of the cell's row at each pixel.
+        column: [N, N] index of the cell's column at each pixel.
+    """
     return tuple(rng.random((rows, columns)).astype(np.float32)[row, column] for _ in range(3))

@@ -1,5 +1,7 @@
-"""Photographs a made scene: a walk with a camera, exposure, and the masked pixels whose background no photograph
-shows."""
+"""Photographs of a made scene: camera positions along a walk, exposure, masks, and never-seen background.
+
+A camera is one row [16] of the ray caster, see `raycast`.
+"""
 
 from __future__ import annotations
 
@@ -10,21 +12,26 @@ import raycast
 from kinds import Kind, randomness
 from world import World
 
-SPREAD = 8  # views of `Session.spread`
+SPREAD = 8  # largest number of views in `Session.spread`
 
 
 @dataclass(frozen=True)
 class Session:
-    """V photographs; those of test views come first, without the object (`shows_object`).
+    """V photographs of a scene. Test views come first; `shows_object` says which views show the object.
 
     Attributes:
-        names: of the views; cameras: [V, 16]; test: number of test views.
-        photos: [V, H, W, 3] uint8; masks: bool [V, H, W], pixels that the object touches or would touch.
-        hidden: bool [V, H, W], masked pixels whose background no training view shows.
-        middle: the view from the middle of the training views' walk.
-        completions: view -> uint8 [H, W, 3], the desired picture, of the middle view and those farthest from it.
-        spread: training views, each the one farthest from those before it, the middle one first.
-        object_masks: object -> bool [V, H, W], its mask, for objects with masks of their own.
+        names: names of the V views.
+        cameras: [V, 16].
+        test: number of test views.
+        photos: uint8 [V, H, W, 3].
+        masks: bool [V, H, W], True for pixels that the object touches, or would touch in a view without the object.
+        hidden: bool [V, H, W], True for masked pixels whose background no training view shows.
+        middle: index of the training view nearest to the middle of the walk.
+        completions: view index -> uint8 [H, W, 3], the picture that the task asks for (without the object where it is
+            to be removed). The first `Kind.references` views of `spread` have one.
+        spread: indices of training views that are far apart: the middle view, then each time the view farthest from
+            all views before.
+        object_masks: name of an object -> bool [V, H, W], the object's mask; only objects with masks of their own.
     """
 
     names: list[str]
@@ -40,7 +47,14 @@ class Session:
 
 
 def take_photographs(seed: int, kind: Kind, world: World, target: np.ndarray) -> Session:
-    """All photographs of a scene, at one exposure."""
+    """Take all photographs of a scene at one exposure, with their masks.
+
+    Args:
+        seed: seed of the scene.
+        kind: kind of the scene.
+        world: the furnished room with materials and light.
+        target: [3], the point that the cameras look at, metres.
+    """
     train, test = (path(seed, kind, target, n, label) for n, label in ((kind.train, "train"), (kind.test, "test")))
     cameras = np.concatenate([test, train])
     names = [f"IMG_{k + 2000:04d}" for k in range(len(cameras))]
@@ -59,7 +73,7 @@ def take_photographs(seed: int, kind: Kind, world: World, target: np.ndarray) ->
 
 
 def _spread(cameras: np.ndarray, first: int, count: int) -> list[int]:
-    """`count` cameras, each the one farthest from those before it."""
+    """Return the indices of `count` cameras: `first`, then each time the camera farthest from all chosen ones."""
     chosen, distance = [first], np.full(len(cameras), np.inf)
     while len(chosen) < count:
         distance = np.minimum(distance, np.linalg.norm(cameras[:, 13:] - cameras[chosen[-1], 13:], axis=1))
@@ -68,18 +82,33 @@ def _spread(cameras: np.ndarray, first: int, count: int) -> list[int]:
 
 
 def _object_mask(world: World, camera: np.ndarray, kind: Kind, own: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels whose ray hits this object, bool [n] of the solids, first."""
+    """Return bool [H, W], the pixels in which an object is the first surface of at least one ray.
+
+    Args:
+        own: bool [n], True for the solids of the object.
+    """
     alone = replace(world, solids=world.solids._replace(removable=own))
     return _radiance(alone, camera, kind, True, kind.samples)[1]
 
 
 def shows_object(kind: Kind, k: int) -> bool:
-    """Does the photograph of view k show the object?"""
+    """Return True if the photograph of view k shows the object.
+
+    For removal these are the training views, for insertion the test views, for outpainting all views.
+    """
     return (k >= kind.test) != (kind.task == "insert") or kind.task == "outpaint"
 
 
 def path(seed: int, kind: Kind, target: np.ndarray, count: int, label: str) -> np.ndarray:
-    """Cameras [count, 16] along an unsteady walk around the target; `label` names the walk."""
+    """Return cameras [count, 16] along an unsteady walk around the target.
+
+    Args:
+        seed: seed of the scene.
+        kind: kind of the scene.
+        target: [3], the point that the cameras look at, metres.
+        count: number of cameras.
+        label: "train" or "test"; each has a walk of its own, and the test cameras reach less far to the sides.
+    """
     draw = randomness(seed, f"path {label}")
     azimuth, height, radius = _walk(kind, count, 1.0 if label == "train" else 0.88, draw)
     angle = np.radians(azimuth + draw.normal(0, 0.6, count))
@@ -97,7 +126,10 @@ def path(seed: int, kind: Kind, target: np.ndarray, count: int, label: str) -> n
 
 
 def _middle(cameras: np.ndarray, kind: Kind) -> int:
-    """The camera nearest to the mean of all; if some are low, to the mean at the height of the highest."""
+    """Return the index of the camera nearest to the mean position of all cameras.
+
+    If the kind has low cameras, the mean position is raised to the height of the highest camera.
+    """
     mean_position = cameras[:, 13:].mean(0)
     if kind.low is not None:
         mean_position[1] = cameras[:, 14].max()
@@ -105,23 +137,33 @@ def _middle(cameras: np.ndarray, kind: Kind) -> int:
 
 
 def _walk(kind: Kind, count: int, reach: float, draw: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Azimuth [count] in degrees, height and horizontal distance from the target in metres."""
+    """Return the positions of the cameras along the walk.
+
+    Args:
+        count: number of cameras.
+        reach: factor on the azimuth to either side.
+        draw: random generator.
+
+    Returns:
+        Azimuth in degrees, height above the floor in metres, and horizontal distance from the target in metres, [count]
+        each.
+    """
     s = (np.arange(count) + 0.5) / max(count, 1)
     phase = draw.random(4) * 6.28
     if kind.is_circle:
         azimuth = 360 * (2 * s + draw.random())
         height = 1.15 + 0.12 * np.sin(6.28 * 3 * s + phase[1]) + np.where(s < 0.5, 0.2, -0.1)
         return azimuth, height, 2.25 + 0.1 * np.sin(6.28 * 5 * s + phase[2])
-    # Few views walk one arc and back; many go to and fro, so that heights and sides mix.
+    # The azimuth swings 2.5 times, the height 1.5 times, so that different heights occur on both sides.
     azimuth = reach * kind.spread * np.sin(6.28 * 2.5 * s + phase[0])
     swing = np.sin(6.28 * 1.5 * s + phase[1])
-    # With a low end, most views still come from above.
+    # The square keeps most views high even if the lowest cameras are near the floor.
     height = 1.22 + 0.2 * swing if kind.low is None else 1.42 - (1.42 - kind.low) * (0.5 - 0.5 * swing) ** 2
     return azimuth, height, 2.45 + 0.08 * np.sin(6.28 * 4 * s + phase[2])
 
 
 def _look_at(along: np.ndarray, roll: float) -> np.ndarray:
-    """[3, 3] camera-to-room rotation that looks along a direction, rolled by `roll` radians."""
+    """Return the camera-to-room rotation [3, 3] of a camera that looks along a direction, rolled by `roll` radians."""
     forward = along / np.linalg.norm(along)
     right = np.cross(forward, (0, 1, 0))
     right /= np.linalg.norm(right)
@@ -131,13 +173,18 @@ def _look_at(along: np.ndarray, roll: float) -> np.ndarray:
 
 
 def develop(color: np.ndarray, exposure: float) -> np.ndarray:
-    """Linear radiance -> sRGB bytes, with a shoulder instead of clipped highlights."""
+    """Convert linear radiance to sRGB bytes with a curve that compresses highlights instead of clipping them."""
     tone = 1 - np.exp(-exposure * color)
     return np.round(255 * tone ** (1 / 2.2)).astype(np.uint8)
 
 
 def shoot(world: World, camera: np.ndarray, kind: Kind, with_object: bool) -> tuple[np.ndarray, np.ndarray]:
-    """(photograph uint8 [H, W, 3], bool [H, W]: pixels that the object touches, or would touch)."""
+    """Take a photograph with or without the object.
+
+    Returns:
+        The photograph, uint8 [H, W, 3], and the mask, bool [H, W], True for pixels that the object touches, or would
+        touch if it were there.
+    """
     color, mask = _radiance(world, camera, kind, with_object, kind.samples)
     return develop(color, world.exposure), mask
 
@@ -149,7 +196,11 @@ def _radiance(world: World, camera, kind: Kind, with_object: bool, samples: int)
 
 
 def set_exposure(world: World, camera: np.ndarray, kind: Kind) -> World:
-    """The world with the exposure that makes the mean of this view, without the object, a medium grey."""
+    """Return the world with the exposure at which the mean of a view is 128 of 255, without the object.
+
+    Args:
+        camera: [16], camera of the view.
+    """
     color, _ = _radiance(world, camera, kind, False, 1)
     low, high = 0.01, 1000.0
     for _ in range(40):
@@ -159,12 +210,21 @@ def set_exposure(world: World, camera: np.ndarray, kind: Kind) -> World:
 
 
 def pixel_centers(mask: np.ndarray) -> np.ndarray:
-    """[P, 2] image points of a mask's pixels."""
+    """Return the image points (x, y) of the centres of a mask's P True pixels, [P, 2]."""
     return np.argwhere(mask)[:, ::-1] + 0.5
 
 
 def never_seen(world: World, camera, mask, train_cameras, train_masks) -> np.ndarray:
-    """Bool [H, W]: pixels of the mask whose background no training view shows outside its own mask."""
+    """Return bool [H, W], the pixels of a view's mask whose background no training view shows.
+
+    A training view shows a background point only outside the view's own mask.
+
+    Args:
+        camera: [16], camera of the view.
+        mask: bool [H, W], mask of the view.
+        train_cameras: [V, 16].
+        train_masks: bool [V, H, W].
+    """
     points, _ = raycast.surface_points(world.solids, camera, pixel_centers(mask), False)
     result = np.zeros(mask.shape, bool)
     result[mask] = raycast.never_seen(world.solids, train_cameras, train_masks, points)
@@ -172,7 +232,7 @@ def never_seen(world: World, camera, mask, train_cameras, train_masks) -> np.nda
 
 
 def corner_shift(camera: np.ndarray) -> float:
-    """Pixels by which the lens moves the image's corners."""
+    """Return the distance in px by which the lens distortion moves the corners of the image."""
     radius = np.hypot(camera[1], camera[2]) / camera[0]
     undone = radius
     for _ in range(8):

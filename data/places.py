@@ -1,6 +1,8 @@
-"""Places where removal is harder than against a wall: the edge of a table, the corner of a wall, a garden.
+"""Places where the removal of an object is harder than before a wall: a table's edge, a wall's corner, a garden.
 
-Each function furnishes an empty room and returns the point that the cameras look at, metres.
+`table_room`, `wall_corner` and `garden` furnish an empty room and return the point [3] that the cameras look at, in
+metres. Their arguments are the furniture to fill, a random generator, and the material of the floor. Room frame: x
+right, y up, z towards the cameras; the back wall is z = 0.
 """
 
 from __future__ import annotations
@@ -14,7 +16,15 @@ RUG = Material("rug")
 
 
 def shell(f: Furniture, draw, planks: Material, side: int, corner: float) -> None:
-    """The room with its skirting; the near side wall is `corner` metres from the middle."""
+    """Add an empty room with skirting boards.
+
+    Args:
+        f: furniture to add to.
+        draw: random generator.
+        planks: material of the floor.
+        side: 1 if the near side wall is on the right, -1 if on the left.
+        corner: distance of the near side wall from the middle, metres.
+    """
     left, right = (-corner, 4.0) if side < 0 else (-4.0, corner)
     middle = (left + right) / 2
     f.room((middle, 1.35, 3.2), ((right - left) / 2, 1.35, 3.2), PLAIN, PLAIN, WHITE, planks, PLAIN, WALL)
@@ -24,7 +34,10 @@ def shell(f: Furniture, draw, planks: Material, side: int, corner: float) -> Non
 
 
 def table_room(f: Furniture, draw, planks: Material) -> np.ndarray:
-    """The object sticks out a little over a table's edge; things under the table and behind it show that it is free."""
+    """Furnish a room in which the object stands on a table and projects a little over the table's edge.
+
+    Things under and behind the table make visible that the space there is free.
+    """
     side, high, deep = draw.choice((-1, 1)), draw.uniform(0.64, 0.7), draw.uniform(0.8, 0.9)
     shell(f, draw, planks, side, 2.2)
     edge = 1.5  # z of the table's edge
@@ -44,7 +57,10 @@ def table_room(f: Furniture, draw, planks: Material) -> np.ndarray:
 
 
 def wall_corner(f: Furniture, draw, planks: Material) -> np.ndarray:
-    """A wall that juts out ends behind the object: left and right of its edge the depths differ."""
+    """Furnish a room in which a projecting wall ends behind the object.
+
+    To the left and to the right of the wall's edge the depth behind the object differs.
+    """
     side, deep = draw.choice((-1, 1)), draw.uniform(0.45, 0.8)
     shell(f, draw, planks, side, 1.55)
     edge, skirt = side * draw.uniform(-0.12, 0.12), WOOD
@@ -65,7 +81,7 @@ def wall_corner(f: Furniture, draw, planks: Material) -> np.ndarray:
 
 
 def garden(f: Furniture, draw, planks: Material) -> np.ndarray:
-    """The object stands on a lawn before a hedge; `planks` lie in no garden."""
+    """Furnish a garden in which the object stands on a lawn before a hedge; `planks` is not used."""
     side, front = draw.choice((-1, 1)), 0.8  # z of the hedge's front
     soil = Material("foliage", 1.1, (0.3, 0.26, 0.2))
     f.room((0, 1.35, 3.2), (4.0, 1.35, 3.2), PLAIN, PLAIN, WHITE, soil, PLAIN, PLAIN)

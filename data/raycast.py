@@ -1,8 +1,8 @@
-"""Renders the room: pictures, surface points, and which points are hidden from a camera.
+"""The ray caster: renders pictures of the room, finds surface points, and tests which points a camera sees.
 
-A camera is one row of 16 numbers: f, cx, cy [pixels], k1, camera-to-room rotation (9, row by row; the camera looks
-along +z, x right, y down), centre (3). The lens is COLMAP's SIMPLE_RADIAL: a ray (x, y, 1) lands at
-f (1 + k1 r^2) (x, y) + (cx, cy), r^2 = x^2 + y^2.
+A camera is one row of 16 numbers: f, cx, cy in px; k1; the camera-to-room rotation (9 numbers, row by row; the camera
+looks along +z, x right, y down); the centre (3 numbers). The lens is COLMAP's SIMPLE_RADIAL: a ray (x, y, 1) in the
+camera's frame is projected to f (1 + k1 r^2) (x, y) + (cx, cy), r^2 = x^2 + y^2.
 """
 
 from __future__ import annotations
@@ -17,12 +17,15 @@ from numba import prange
 from solids import EPSILON, THICKET, distance, is_blocked, nearest, surface
 from thicket import leaf_light
 
-TILE = 16  # pixels
+TILE = 16  # side of the tiles in which pictures are rendered, px
 
 
 @kernel(inline="always")
 def ray(camera, x, y):
-    """Unit direction in the room through image point (x, y); the distortion is inverted by Newton's method."""
+    """Return the unit direction, in the room, of the ray through the image point (x, y).
+
+    The lens distortion is inverted by Newton's method.
+    """
     f, k = camera[0], camera[3]
     x, y = (x - camera[1]) / f, (y - camera[2]) / f
     bent = math.hypot(x, y)
@@ -41,7 +44,7 @@ def ray(camera, x, y):
 
 @kernel()
 def project(camera, px, py, pz):
-    """(x, y, z): distorted image point and camera z of a room point."""
+    """Project a room point: return (x, y, z), the distorted image point and camera z; (0, 0, z) if z is below 1e-6."""
     ax, ay, az = px - camera[13], py - camera[14], pz - camera[15]
     x = camera[4] * ax + camera[7] * ay + camera[10] * az
     y = camera[5] * ax + camera[8] * ay + camera[11] * az
@@ -55,7 +58,16 @@ def project(camera, px, py, pz):
 
 @kernel()
 def _in_tile(solids, camera, left, top, listed):
-    """Write the numbers of the solids that may be visible in a tile into `listed`, the room first; return how many."""
+    """List the solids that may be visible in a tile, by comparing bounding spheres with the tile's cone of rays.
+
+    Args:
+        left: column of the tile's first pixel.
+        top: row of the tile's first pixel.
+        listed: int [n], receives the indices of the solids, the room first.
+
+    Returns:
+        Number of listed solids.
+    """
     ax, ay, az = ray(camera, left + 0.5 * TILE, top + 0.5 * TILE)
     widest = 1.0
     for corner in range(4):
@@ -79,7 +91,13 @@ def _in_tile(solids, camera, left, top, listed):
 
 @kernel()
 def _first(solids, listed, camera, with_object, dx, dy, dz):
-    """(distance, solid) that the ray hits, with or without the object; and whether it would hit the object first."""
+    """Find the first surface on a ray, with or without the object.
+
+    Returns:
+        distance: distance to the surface, or 1e30 if there is none.
+        solid: index of the solid, or -1 if there is none.
+        on_object: True if the first surface of the room with the object belongs to the object.
+    """
     t, i, least, on_object = 1e30, -1, 1e30, False
     for solid in listed:
         far = distance(solids, solid, camera[13], camera[14], camera[15], dx, dy, dz)
@@ -92,9 +110,16 @@ def _first(solids, listed, camera, with_object, dx, dy, dz):
 
 @kernel()
 def _add_radiance(solids, faces, textures, light, camera, i, t, dx, dy, dz, samples, scratch, out):
-    """Add the radiance along the ray, at distance t on solid i, to `out` [3]; `scratch` is [2, 3]."""
+    """Add the radiance of the surface point at distance t on solid i along a ray to `out` [3].
+
+    Args:
+        samples: rays along a side of a pixel.
+        scratch: [2, 3], working memory.
+        out: [3] linear colour, changed in place.
+    """
     face, u, v, nx, ny, nz = surface(solids, i, camera[13] + t * dx, camera[14] + t * dy, camera[15] + t * dz)
-    # The footprint of one ray on the surface; its long side is shared between blur and supersampling.
+    # The footprint of a ray on a slanted surface is an ellipse with axes 1 and 1 / cosine. The geometric mean is a
+    # compromise: the mip level blurs a part of the long axis, supersampling resolves the rest.
     cosine = max(abs(nx * dx + ny * dy + nz * dz), 0.05)
     color, falling = scratch[0], scratch[1]
     albedo(faces, textures, face, u, v, t / (camera[0] * samples * math.sqrt(cosine)), color)
@@ -106,8 +131,15 @@ def _add_radiance(solids, faces, textures, light, camera, i, t, dx, dy, dz, samp
 
 @kernel(parallel=True)
 def render(solids, faces, textures, light, camera, width, height, with_object, samples):
-    """Linear radiance [H, W, 3] box-filtered over samples x samples rays a pixel, with the object or without it,
-    and bool [H, W]: where any of those rays would meet the object first.
+    """Render a picture with or without the object.
+
+    Args:
+        light: [M, 3] irradiance / pi at the nodes of the light map.
+        samples: rays along a side of a pixel; the picture is box-filtered over samples² rays per pixel.
+
+    Returns:
+        Linear radiance [H, W, 3], and bool [H, W], True where at least one ray of the pixel hits the object first (if
+        the object were there).
     """
     color = np.zeros((height, width, 3))
     mask = np.zeros((height, width), np.bool_)
@@ -134,7 +166,15 @@ def render(solids, faces, textures, light, camera, width, height, with_object, s
 
 @kernel(parallel=True)
 def surface_points(solids, camera, pixels, with_object):
-    """Where the rays through image points [P, 2] first hit a surface: points [P, 3] in the room, solid [P]."""
+    """Return the first surface points on the rays through image points.
+
+    Args:
+        pixels: image points [P, 2], (x, y).
+        with_object: False ignores the removable solids.
+
+    Returns:
+        Room points [P, 3], and the index of the solid [P] on which each point lies.
+    """
     points, which = np.empty((pixels.shape[0], 3)), np.empty(pixels.shape[0], np.int32)
     for n in prange(pixels.shape[0]):
         dx, dy, dz = ray(camera, pixels[n, 0], pixels[n, 1])
@@ -146,6 +186,7 @@ def surface_points(solids, camera, pixels, with_object):
 
 @kernel()
 def _reaches(solids, camera, with_object, px, py, pz):
+    """Return True if no solid is between the camera's centre and a room point."""
     ax, ay, az = px - camera[13], py - camera[14], pz - camera[15]
     far = math.sqrt(ax * ax + ay * ay + az * az)
     return not is_blocked(
@@ -155,7 +196,11 @@ def _reaches(solids, camera, with_object, px, py, pz):
 
 @kernel(parallel=True)
 def observations(solids, cameras, width, height, points):
-    """Image points [P, V, 2] of room points in V views with the object, NaN where hidden or outside the frame."""
+    """Project room points [P, 3] into V views with the object.
+
+    Returns:
+        Image points [P, V, 2], NaN where the point is occluded or outside the frame.
+    """
     pixels = np.full((points.shape[0], cameras.shape[0], 2), np.nan)
     for n in prange(points.shape[0]):
         for v in range(cameras.shape[0]):
@@ -169,7 +214,13 @@ def observations(solids, cameras, width, height, points):
 
 @kernel(parallel=True)
 def never_seen(solids, cameras, masks, points):
-    """bool [P]: background points [P, 3] that no training view shows outside its mask, bool [V, H, W]."""
+    """Return bool [P], True for the background points that no training view shows outside the view's own mask.
+
+    Args:
+        cameras: [V, 16], cameras of the training views.
+        masks: bool [V, H, W], masks of the training views.
+        points: [P, 3], room points.
+    """
     unseen = np.ones(points.shape[0], np.bool_)
     for n in prange(points.shape[0]):
         px, py, pz = points[n, 0], points[n, 1], points[n, 2]

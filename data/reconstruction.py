@@ -1,4 +1,4 @@
-"""Imitates structure from motion of the photographs: an arbitrary frame, and sparse points."""
+"""Imitation of structure from motion on the photographs: an arbitrary frame, and sparse points with errors."""
 
 from __future__ import annotations
 
@@ -13,17 +13,21 @@ from world import World
 
 @dataclass(frozen=True)
 class Frame:
-    """x_scene = scale * rotation @ x_room + offset: the arbitrary frame of an SfM model."""
+    """Similarity transform from the room to the scene frame, the arbitrary frame of a structure-from-motion model.
+
+    x_scene = scale * rotation @ x_room + offset.
+    """
 
     scale: float
     rotation: np.ndarray
     offset: np.ndarray
 
     def points(self, points: np.ndarray) -> np.ndarray:
+        """Transform room points [..., 3] to the scene frame."""
         return self.scale * points @ self.rotation.T + self.offset
 
     def world_to_camera(self, camera: np.ndarray) -> np.ndarray:
-        """[4, 4] of a camera row."""
+        """Return the world-to-camera pose [4, 4] in the scene frame of a camera row [16], see `raycast`."""
         turn = self.rotation @ camera[4:13].reshape(3, 3)
         result = np.eye(4)
         result[:3, :3] = turn.T
@@ -32,6 +36,7 @@ class Frame:
 
 
 def scene_frame(seed: int) -> Frame:
+    """Return the random scene frame of a scene."""
     draw = randomness(seed, "frame")
     rotation, _ = np.linalg.qr(draw.normal(size=(3, 3)))
     return Frame(draw.uniform(0.7, 3.0), rotation * np.sign(np.linalg.det(rotation)), draw.normal(0, 2, 3))
@@ -39,7 +44,14 @@ def scene_frame(seed: int) -> Frame:
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """COLMAP's points: room positions [P, 3], colours [P, 3], image points [P, V, 2] at full resolution or NaN."""
+    """P sparse points with errors like those of structure from motion.
+
+    Attributes:
+        positions: [P, 3] in the room, metres.
+        colors: [P, 3] uint8.
+        tracks: [P, V, 2] image points in V training views, px of the full resolution; NaN where the point is not
+            matched.
+    """
 
     positions: np.ndarray
     colors: np.ndarray
@@ -47,7 +59,15 @@ class SparsePoints:
 
 
 def sparse_points(seed: int, kind: Kind, world: World, cameras: np.ndarray, photos: np.ndarray) -> SparsePoints:
-    """Points on textured surfaces that at least 3 training views see, with errors like those of SfM."""
+    """Make sparse points on textured surfaces that are matched in at least 3 training views.
+
+    Args:
+        seed: seed of the scene.
+        kind: kind of the scene.
+        world: the room as photographed.
+        cameras: [V, 16], training views.
+        photos: uint8 [V, H, W, 3], training photographs.
+    """
     draw = randomness(seed, "points")
     per_view = -(-kind.points * 3 // (2 * len(cameras)))
     positions, colors = [], []
@@ -58,7 +78,7 @@ def sparse_points(seed: int, kind: Kind, world: World, cameras: np.ndarray, phot
         colors.append(photo[row, column])
     positions, colors = np.concatenate(positions), np.concatenate(colors)
     tracks = raycast.observations(world.solids, cameras, kind.width, kind.height, positions) * FULL
-    # A feature is matched in only some of the views that show it.
+    # As in structure from motion, a point is matched in only some of the views that show it.
     tracks[draw.random(tracks.shape[:2]) > max(0.2, 4 / len(cameras))] = np.nan
     good = np.flatnonzero(np.isfinite(tracks[..., 0]).sum(1) >= 3)
     good = np.sort(draw.permutation(good)[: kind.points])
@@ -67,7 +87,7 @@ def sparse_points(seed: int, kind: Kind, world: World, cameras: np.ndarray, phot
 
 
 def _textured_pixels(photo: np.ndarray, count: int, draw: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """(rows, columns) drawn with the gradient of the photograph's grey levels as probability."""
+    """Draw `count` pixels, more often where the gradient of the grey levels is large; return (rows, columns)."""
     grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY).astype(np.float32)
     edges = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)).ravel() + 4
     return np.divmod(draw.choice(edges.size, count, replace=False, p=edges / edges.sum()), photo.shape[1])

@@ -1,5 +1,7 @@
-"""Furnishes the room: a corner with a cabinet or a lantern, or a room all around a daybed. `places.py` has the harder
-places."""
+"""Furnishing of the room: a corner of a room with the object, or a whole room around a daybed.
+
+`places.py` has the places in which the removal of the object is harder.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ from places import PLAIN, RUG, WALL, garden, shell, table_room, wall_corner
 
 
 def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
-    """The furnished room, and the point that the cameras look at."""
+    """Furnish the room of a scene; return the furniture and the point [3] that the cameras look at, metres."""
     f, draw = Furniture(), randomness(seed, "layout")
     planks = Material("floor", 3.0, turned=bool(draw.integers(2)))
     if kind.is_circle:
@@ -18,8 +20,8 @@ def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
     others = {"table": table_room, "corner": wall_corner, "grass": garden}
     if kind.place in others:
         return f, others[kind.place](f, draw, planks)
-    side = draw.choice((-1, 1))  # where the corner is
-    # The corner does not reach the outermost camera.
+    side = draw.choice((-1, 1))  # the side of the near side wall, which makes a corner with the back wall
+    # The distance of this wall is so large that no camera is behind it.
     corner = 1.45 + max(0.0, 2.6 * np.sin(np.radians(kind.spread)) - 0.97)
     shell(f, draw, planks, side, corner)
     if kind.place == "floor":

@@ -17,20 +17,24 @@ EPSILON = 1e-4  # metres
 
 
 class Solids(NamedTuple):
-    """n solids; the first is the room, seen from inside. Their faces are numbered from first_face on.
+    """Arrays of n solids; solid 0 is the room, seen from inside.
 
-    Faces of a box: +x, -x, +y, -y, +z, -z; of a sphere: one; of a cylinder (upright): side, top, bottom.
-    A thicket is a box full of leaves (`thicket.py`), which all share one face: its top where the leaves make one layer
-    (a lawn), else its +z side (a hedge).
+    The faces of all solids are numbered consecutively. A box has the faces +x, -x, +y, -y, +z, -z; a sphere has one
+    face; an upright cylinder has the faces side, top, bottom. A thicket is a box full of leaves (`thicket.py`) that
+    share one face: the top of the box if the leaves make one layer (a lawn), else its +z side (a hedge).
 
     Attributes:
         kind: [n] ROOM, BOX, SPHERE, CYLINDER or THICKET.
-        center: [n, 3]; half: [n, 3] half extents (radius, half height, - for round ones); turn: [n, 2] cos, sin of yaw.
-        first_face: [n]; removable: [n] bool, True for the object.
-        reach: [n] radius of the bounding sphere.
-        leaves: [n, 8] of a thicket: its cells along x, y, z; half a leaf's width, length and thickness, metres; how far
-            it leans at most, radians; a number that its leaves are drawn from. Otherwise 0. (One array: a second one
-            makes every kernel half as slow again.)
+        center: [n, 3] metres.
+        half: [n, 3] half extents of a box, metres; radius and half height in the first two places of a cylinder, and
+            the radius in the first place of a sphere.
+        turn: [n, 2] cosine and sine of the yaw, the rotation about the vertical axis.
+        first_face: [n] number of the solid's first face.
+        removable: [n] bool, True for the solids of the object that the scene asks to remove or to insert.
+        reach: [n] radius of the bounding sphere, metres.
+        leaves: [n, 8] for a thicket: the numbers of cells along x, y, z; half a leaf's width, length and thickness in
+            metres; the largest lean of a leaf in radians; the seed of the leaves. Zeros for other solids. All of these
+            are in one array, because a second array makes every kernel half as slow again.
     """
 
     kind: np.ndarray
@@ -44,13 +48,17 @@ class Solids(NamedTuple):
 
 
 class Faces(NamedTuple):
-    """f faces with metric coordinates (u, v), v downwards on upright ones.
+    """Arrays of f faces of solids, with the materials. A point of a face has coordinates (u, v) in metres.
+
+    On upright faces v points down.
 
     Attributes:
-        texture: [f] index; mapping: [f, 4] tiles per metre along u and v, offsets.
-        swap: [f] bool, u and v change place before the mapping.
-        tint: [f, 3] factor on the linear texture; size: [f, 2] extent in metres.
-        grid: [f, 3] first node, columns, rows of the light map.
+        texture: [f] index of the texture.
+        mapping: [f, 4] tiles of the texture per metre along u and along v, then the offsets of both in tiles.
+        swap: [f] bool, True if u and v are exchanged before the mapping.
+        tint: [f, 3] factor on the linear colour of the texture.
+        size: [f, 2] extent along u and v, metres.
+        grid: [f, 3] first node, number of columns and number of rows of the face's light map.
     """
 
     texture: np.ndarray
@@ -63,7 +71,7 @@ class Faces(NamedTuple):
 
 @kernel(inline="always")
 def _slab(o, d, h):
-    """(near, far) along a ray of the stretch in which |o + t d| <= h; near > far where there is none."""
+    """Return the interval (near, far) of the ray parameter t in which |o + t d| <= h; near > far if it is empty."""
     if abs(d) < 1e-12:
         return (1e30, -1e30) if abs(o) > h else (-1e30, 1e30)
     a, b = (-h - o) / d, (h - o) / d
@@ -72,6 +80,7 @@ def _slab(o, d, h):
 
 @kernel(inline="always")
 def _in_box(ox, oy, oz, dx, dy, dz, hx, hy, hz):
+    """Return the interval (near, far) of a ray in an axis-aligned box around 0; near > far if the ray misses."""
     near, far = _slab(ox, dx, hx)
     for o, d, h in ((oy, dy, hy), (oz, dz, hz)):
         enters, leaves = _slab(o, d, h)
@@ -81,6 +90,7 @@ def _in_box(ox, oy, oz, dx, dy, dz, hx, hy, hz):
 
 @kernel(inline="always")
 def _in_cylinder(ox, oy, oz, dx, dy, dz, radius, half):
+    """Return the interval (near, far) of a ray in an upright cylinder around 0; near > far if the ray misses."""
     near, far = _slab(oy, dy, half)
     a = dx * dx + dz * dz
     if a <= 1e-12:
@@ -95,8 +105,11 @@ def _in_cylinder(ox, oy, oz, dx, dy, dz, radius, half):
 
 @kernel(inline="always")
 def distance(solids, i, ox, oy, oz, dx, dy, dz):
-    """Distance along the ray to solid i, 1e30 if missed. From inside a solid: to its far side."""
-    if solids.kind[i] == THICKET:  # a function of its own: in one function all solids would take twice the time
+    """Return the distance to solid i along the ray from o in the unit direction d, or 1e30 if the ray misses it.
+
+    For a ray that starts inside the solid, this is the distance to the solid's far side.
+    """
+    if solids.kind[i] == THICKET:  # a separate function, because in one function all solids would take twice the time
         return _to_thicket(solids, i, ox, oy, oz, dx, dy, dz)
     return _to_solid(solids, i, ox, oy, oz, dx, dy, dz)
 
@@ -137,7 +150,11 @@ def _to_solid(solids, i, ox, oy, oz, dx, dy, dz):
 
 @kernel()
 def nearest(solids, with_object, ox, oy, oz, dx, dy, dz):
-    """(distance, solid) of the first surface on the ray."""
+    """Return (distance, index of the solid) of the first surface on the ray, or (1e30, -1) if there is none.
+
+    Args:
+        with_object: False ignores the removable solids.
+    """
     best, which = 1e30, -1
     for i in range(solids.kind.shape[0]):
         if solids.removable[i] and not with_object:
@@ -150,7 +167,11 @@ def nearest(solids, with_object, ox, oy, oz, dx, dy, dz):
 
 @kernel()
 def is_blocked(solids, with_object, ox, oy, oz, dx, dy, dz, limit):
-    """Is a solid nearer than `limit`? The room itself hides nothing inside it."""
+    """Return True if a solid is on the ray nearer than `limit`. The room, solid 0, is ignored.
+
+    Args:
+        with_object: False ignores the removable solids.
+    """
     for i in range(1, solids.kind.shape[0]):
         if solids.removable[i] and not with_object:
             continue
@@ -161,7 +182,7 @@ def is_blocked(solids, with_object, ox, oy, oz, dx, dy, dz, limit):
 
 @kernel()
 def surface(solids, i, px, py, pz):
-    """(face, u, v, normal x, y, z) of a point on solid i; u, v in metres."""
+    """Return (face, u, v, normal x, normal y, normal z) of a room point on the surface of solid i; u, v in metres."""
     ax, ay, az = px - solids.center[i, 0], py - solids.center[i, 1], pz - solids.center[i, 2]
     c, s = solids.turn[i, 0], solids.turn[i, 1]
     x, y, z = c * ax - s * az, ay, s * ax + c * az
@@ -191,7 +212,16 @@ def surface(solids, i, px, py, pz):
 
 @kernel()
 def on_face(solids, i, local, u, v):
-    """The inverse of `_surface`: room point and outward normal of (u, v) on face `local` of solid i."""
+    """Return the room point and the outward normal at (u, v) of a face of solid i, as six numbers.
+
+    This is the inverse of `surface`, except that the point of a thicket is on the face of its box, not on a leaf. The
+    normal of the room points into the room.
+
+    Args:
+        local: number of the face within the solid.
+        u: metres.
+        v: metres.
+    """
     hx, hy, hz = solids.half[i, 0], solids.half[i, 1], solids.half[i, 2]
     kind = solids.kind[i]
     if kind == SPHERE:

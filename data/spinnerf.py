@@ -1,4 +1,4 @@
-"""Lists which of SPIn-NeRF's published scenes a folder holds, one per line: `python data/spinnerf.py --data FOLDER`."""
+"""List of SPIn-NeRF's published scenes that are in a folder, one per line: `python data/spinnerf.py --data FOLDER`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The tasks of scenes other than removal: an object to insert, or the space beyond a sphere to continue."""
+"""Regions, depth and references for scenes that insert an object or continue the space beyond a sphere.
+
+A camera is one row [16] of the ray caster, see `raycast`.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +12,20 @@ from reconstruction import Frame
 from solids import Solids
 from world import World
 
-ROOM_FOR_IT = 1.08  # radius of the region over that of the object inside
-# distance of the pixels that tell what is covered; relative depth within which a point is visible
+ROOM_FOR_IT = 1.08  # radius of the region over the radius of the object inside
+# Coverage is measured on every 61st pixel; a point is visible if its depth differs by less than 3 % from the view's.
 GRID, NEAR = 61, 0.03
-COVERED = 0.995  # share that references must show of what lies beyond the sphere and any view shows
+COVERED = 0.995  # share of the points beyond the sphere, visible in any view, that the references must show
 SPHERE = 0.95  # metres: radius of the sphere beyond which the scene is to be continued
 
 
 def without_object(solids: Solids) -> Solids:
-    """The room without the object."""
+    """Return the solids without the removable ones."""
     return solids._replace(**{name: each[~solids.removable] for name, each in solids._asdict().items()})
 
 
 def bounding_region(solids: Solids) -> tuple[np.ndarray, float]:
-    """A sphere (centre [3], radius) around the object, in metres."""
+    """Return a sphere around the removable solids as (centre [3], radius), in metres."""
     center, reach = solids.center[solids.removable], solids.reach[solids.removable]
     half = solids.half[solids.removable]
     middle = ((center - half).min(0) + (center + half).max(0)) / 2
@@ -30,7 +33,10 @@ def bounding_region(solids: Solids) -> tuple[np.ndarray, float]:
 
 
 def rays(camera: np.ndarray, kind: Kind, world: World) -> tuple[np.ndarray, np.ndarray]:
-    """Surface points [H, W, 3] and directions of the rays [H, W, 3] of all pixels, the object included."""
+    """Return the first surface points [H, W, 3] and the unit directions [H, W, 3] of all pixels' rays.
+
+    The object is included.
+    """
     rows, columns = np.mgrid[: kind.height, : kind.width]
     centers = np.stack([columns, rows], -1).reshape(-1, 2) + 0.5
     points, _ = raycast.surface_points(world.solids, camera, centers, True)
@@ -39,20 +45,29 @@ def rays(camera: np.ndarray, kind: Kind, world: World) -> tuple[np.ndarray, np.n
 
 
 def depth(camera: np.ndarray, kind: Kind, world: World, frame: Frame) -> np.ndarray:
-    """[H, W] camera z of the photograph, in the scene frame's unit."""
+    """Return the true depth map of a view with the object, [H, W] camera z in the scene frame's unit."""
     points, _ = rays(camera, kind, world)
     return (frame.scale * ((points - camera[13:]) @ camera[4:13].reshape(3, 3)[:, 2])).astype(np.float32)
 
 
 def outside_sphere(camera: np.ndarray, kind: Kind, world: World, center: np.ndarray, radius: float) -> np.ndarray:
-    """bool [H, W]: pixels whose rays miss the sphere."""
+    """Return bool [H, W], True for the pixels whose rays miss the sphere around `center` [3]."""
     _, along = rays(camera, kind, world)
     offset = center - camera[13:]
     return offset @ offset - (along @ offset) ** 2 > radius**2
 
 
 def choose_covering_views(cameras: np.ndarray, kind: Kind, world: World, center: np.ndarray, first: int) -> list[int]:
-    """Cameras that show `COVERED` of what lies beyond the sphere: `first`, then greedily the one that adds most."""
+    """Choose cameras greedily until they show `COVERED` of the points beyond the sphere that any camera shows.
+
+    Args:
+        cameras: [V, 16].
+        center: [3], centre of the sphere.
+        first: index of the camera to begin with.
+
+    Returns:
+        Indices of the chosen cameras, `first` first.
+    """
     depths, pooled = [], []
     for camera in cameras:
         points, _ = rays(camera, kind, world)
@@ -67,7 +82,12 @@ def choose_covering_views(cameras: np.ndarray, kind: Kind, world: World, center:
 
 
 def _is_visible(points: np.ndarray, camera: np.ndarray, depth: np.ndarray, kind: Kind) -> np.ndarray:
-    """bool [N]: points that the camera shows; distortion is ignored."""
+    """Return bool [N], True for the room points that a camera shows; the lens distortion is ignored.
+
+    Args:
+        points: [N, 3].
+        depth: [H, W], camera z of the view's surfaces, metres.
+    """
     at = (points - camera[13:]) @ camera[4:13].reshape(3, 3)
     z = np.maximum(at[:, 2], 1e-6)
     column, row = (np.floor(camera[0] * at[:, k] / z + camera[1 + k]).astype(int) for k in (0, 1))
@@ -78,5 +98,5 @@ def _is_visible(points: np.ndarray, camera: np.ndarray, depth: np.ndarray, kind:
 
 
 def point_on_axis(camera: np.ndarray, distance: float) -> np.ndarray:
-    """The point at that distance along a camera's optical axis."""
+    """Return the room point [3] on a camera's optical axis at a distance in metres."""
     return camera[13:] + distance * camera[4:13].reshape(3, 3)[:, 2]

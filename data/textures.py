@@ -1,6 +1,7 @@
 """Procedural textures: square, tileable (or fitted to one face), [N, N, 3] float32 sRGB in [0, 1], N a power of two.
 
-Each maker takes a numpy random generator and N.
+Each function makes one kind of texture. Its arguments are a numpy random generator `rng` and N, called `size`. Colours
+are in bytes. A texture *fitted to its face* is stretched over one whole face instead of repeated.
 """
 
 from __future__ import annotations
@@ -18,7 +19,13 @@ WOODS = (
 
 
 def wood_planks(rng, size, rows=24, pieces=3, palette=None):
-    """Floor boards along x: each with its own tone, grain and rings, a dark joint between them."""
+    """Make floor boards along x, each with a tone, grain and rings of its own, and dark joints between them.
+
+    Args:
+        rows: number of rows of boards.
+        pieces: number of boards per row.
+        palette: colours from dark to light; None draws one of `WOODS`.
+    """
     palette = WOODS[rng.integers(len(WOODS))] if palette is None else palette
     x, y = grid(size)
     row, across = cell(y * rows)
@@ -34,12 +41,17 @@ def wood_planks(rng, size, rows=24, pieces=3, palette=None):
 
 
 def herringbone(rng, size, cells=32, long=4):
-    """Narrow blocks, `long` times as long as wide, laid at right angles in steps, grain along each."""
+    """Make a herringbone floor: narrow blocks at right angles to each other, with the grain along each block.
+
+    Args:
+        cells: number of block widths along a side.
+        long: length of a block over its width.
+    """
     palette = WOODS[rng.integers(len(WOODS))]
     x, y = grid(size)
     a, b = x * cells, y * cells
     i, j = np.floor(a).astype(int), np.floor(b).astype(int)
-    phase = (i - j) % (2 * long)  # counts along a block lying in x, then down one lying in y
+    phase = (i - j) % (2 * long)  # position along a block that is parallel to x, then along one that is parallel to y
     flat = phase < long
     left = np.where(flat, i - phase, i)
     top = np.where(flat, j, j - (2 * long - 1 - phase))
@@ -59,7 +71,7 @@ STONES = (
 
 
 def stone_tiles(rng, size, cells=8):
-    """Veined tiles with light grout."""
+    """Make cells x cells veined stone tiles with light grout."""
     *palette, grout = STONES[rng.integers(len(STONES))]
     x, y = grid(size)
     (i, fx), (j, fy) = cell(x * cells), cell(y * cells)
@@ -82,7 +94,7 @@ BRICKS = (
 
 
 def bricks(rng, size, rows=24, columns=8):
-    """Running bond, rounded edges lit from above left."""
+    """Make a brick wall in running bond, with rounded edges lit from above left."""
     *palette, mortar = BRICKS[rng.integers(len(BRICKS))]
     x, y = grid(size)
     wobble = 0.012 * fbm(rng, size, 16, 16, 3)
@@ -110,14 +122,14 @@ PAPERS = (
 
 
 def wallpaper(rng, size, repeats=4):
-    """Flowers in a half drop, each in a pointed frame with leaves, over fine stripes."""
+    """Make wallpaper: flowers in a half-drop repeat, each in a pointed frame with leaves, over fine stripes."""
     ground, figure, second = (srgb(c) for c in PAPERS[rng.integers(len(PAPERS))])
     x, y = grid(size)
     petals, turns = int(rng.integers(5, 8)), rng.random() * 6.28
     stripe = 0.5 + 0.5 * np.cos(6.2832 * x * repeats * 6)
     color = blend(np.broadcast_to(ground, (size, size, 3)), second, 0.25 * step(0.55, 0.8, stripe))
     u = x * repeats
-    # Two families of waves, half a period apart, that touch: the frames.
+    # The frames are two families of vertical waves, half a period apart, that touch each other.
     swing = 0.235 * np.cos(6.2832 * y * repeats)
     for sign in (-1, 1):
         off = np.abs((u + sign * swing + 0.25 * (1 + sign)) % 1 - 0.5)
@@ -138,13 +150,13 @@ def wallpaper(rng, size, repeats=4):
 
 
 def plaster(rng, size, color=(214, 208, 198)):
-    """A painted wall: clouds, trowel marks, grain."""
+    """Make painted plaster with cloudy variations, trowel marks and grain."""
     rough = 0.022 * fbm(rng, size, 4, 4, 4) + 0.02 * fbm(rng, size, 64, 16, 4) + 0.018 * fbm(rng, size, 128, 128, 2)
     return srgb(color) * (1 + rough)[..., None]
 
 
 def rug(rng, size):
-    """A woven carpet with a border and diamonds, fitted to its face."""
+    """Make a woven carpet with a border and diamonds, fitted to its face."""
     hues = [srgb(c) for c in ((116, 34, 42), (28, 52, 84), (220, 196, 150), (194, 128, 60))]
     rng.shuffle(hues)
     x, y = grid(size)
@@ -164,7 +176,7 @@ def rug(rng, size):
 
 
 def books(rng, size, thick=1.0):
-    """A row of spines, fitted to its face; `thick` makes them fewer."""
+    """Make a row of book spines, fitted to its face; `thick` is a factor on their width."""
     color = np.full((size, size, 3), 0.05, np.float32)
     x = 0
     while x < size:
@@ -184,7 +196,7 @@ def books(rng, size, thick=1.0):
 
 
 def picture(rng, size):
-    """A framed landscape, fitted to its face: sky, sun, ranges of hills."""
+    """Make a framed landscape with sky, sun and ranges of hills, fitted to its face."""
     x, y = grid(size)
     hue = rng.uniform(0, 60)
     sky = ramp(y, (60 + hue, 110, 170), (236, 190 - hue, 140), (250, 220, 170))
@@ -203,7 +215,7 @@ def picture(rng, size):
 
 
 def leaves(rng, size):
-    """Overlapping leaves, light at the rim of each cell."""
+    """Make overlapping leaves on a dark ground."""
     color = ramp(np.full((size, size), 0.05), (16, 34, 16), (90, 150, 60))
     for k in range(420):
         u, v, angle, length = rng.integers(size), rng.integers(size), rng.random() * 6.28, rng.uniform(0.05, 0.09)
@@ -220,7 +232,7 @@ def leaves(rng, size):
 
 
 def wicker(rng, size, cells=16):
-    """A basket's over-and-under weave."""
+    """Make the weave of a basket, with cells x cells crossings."""
     x, y = grid(size)
     a, b = x * cells, y * cells
     over = (np.floor(a) + np.floor(b)) % 2 > 0
@@ -232,7 +244,7 @@ def wicker(rng, size, cells=16):
 
 
 def plain_paint_front(rng, size, color=(30, 120, 120)):
-    """A cabinet's front, fitted to its face: two doors with sunk panels and brass knobs, a drawer above each."""
+    """Make a cabinet's front, fitted to its face: two doors with sunk panels and brass knobs, a drawer above each."""
     x, y = grid(size)
     base = srgb(color) * (1 + 0.05 * fbm(rng, size, 16, 128, 4))[..., None]
     light = np.ones((size, size), np.float32)
@@ -255,13 +267,13 @@ def plain_paint_front(rng, size, color=(30, 120, 120)):
 
 
 def plain_paint(rng, size, color=(30, 120, 120)):
-    """Brushed paint."""
+    """Make brushed paint of one colour."""
     relief = 1 + 0.05 * fbm(rng, size, 16, 128, 4) + 0.03 * fbm(rng, size, 4, 4, 3)
     return srgb(color) * relief[..., None]
 
 
 def ball(rng, size, first=(214, 66, 48), second=(240, 226, 196)):
-    """Beach-ball wedges about a tilted axis, for a sphere's longitude and latitude."""
+    """Make the wedges of a beach ball about a tilted axis; x is the longitude and y the latitude of a sphere."""
     x, y = grid(size)
     longitude, latitude = x * 6.2832, y * 3.1416
     p = np.stack([np.sin(latitude) * np.cos(longitude), np.cos(latitude), np.sin(latitude) * np.sin(longitude)], -1)
@@ -269,7 +281,7 @@ def ball(rng, size, first=(214, 66, 48), second=(240, 226, 196)):
     q, _ = np.linalg.qr(np.stack([axis, (0, 1, 0), (1, 0, 0.3)], 1))
     p = p @ q
     wedge = np.sin(4 * np.arctan2(p[..., 2], p[..., 1]))
-    # An edge's width in wedge values grows towards the poles; dividing by the radius keeps it even.
+    # Without the division by the radius, the soft edges between wedges would become narrower towards the poles.
     soft = 0.05 / np.maximum(np.hypot(p[..., 1], p[..., 2]), 0.1)
     one, two = (srgb(c) for c in (first, second))
     color = blend(np.broadcast_to(one, (size, size, 3)), two, step(-1, 1, wedge / soft))
@@ -277,7 +289,7 @@ def ball(rng, size, first=(214, 66, 48), second=(240, 226, 196)):
 
 
 def quilt(rng, size, first=(214, 66, 48), second=(240, 226, 196), cells=8):
-    """Patchwork of triangles in two hues and their shades, stitched along the seams."""
+    """Make a patchwork of triangles in shades of two hues, stitched along the seams; cells x cells squares of two."""
     x, y = grid(size)
     (i, fx), (j, fy) = cell(x * cells), cell(y * cells)
     flip = rng.integers(0, 2, (cells, cells))[j, i] > 0
@@ -292,7 +304,7 @@ def quilt(rng, size, first=(214, 66, 48), second=(240, 226, 196), cells=8):
 
 
 def glaze(rng, size, color=(40, 70, 130), bands=(236, 230, 214)):
-    """Pottery: a wash with rings, fitted to its face."""
+    """Make glazed pottery with wavy rings of the colour `bands`, fitted to its face."""
     x, y = grid(size)
     wash = srgb(color) * (1 + 0.1 * fbm(rng, size, 4, 4, 5))[..., None]
     ring = np.zeros_like(x)

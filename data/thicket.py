@@ -1,8 +1,8 @@
-"""Grass and foliage: a box divided into cells with a leaf each. A ray walks from cell to cell.
+"""Grass and foliage: a box divided into cells, with one leaf in most cells. A ray is traced from cell to cell.
 
-No leaf is stored: its shape follows from the number of its cell, so a lawn of a hundred thousand blades costs as much
-as its box and a few steps per ray. A leaf never sticks out of its cell, so the first one that a ray hits is the
-nearest. Coordinates are those of the box: its centre is the origin, its edges lie along the axes.
+No leaf is stored: the number of a cell determines the shape of its leaf. So a lawn of a hundred thousand blades costs
+as much as its box and a few steps per ray. A leaf is always inside its cell, so the first leaf that a ray hits is the
+nearest one. Coordinates are those of the box: the origin is its centre, the axes are parallel to its edges.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import math
 import numpy as np
 from compiled import kernel
 
-BARE = 0.12  # share of the cells that hold no leaf
-SKY = (0.36, 0.8, 0.48)  # unit direction of most of the light
-SHADE = 0.3  # share of the light on a leaf that is edge-on to it
+BARE = 0.12  # share of the cells that have no leaf
+SKY = (0.36, 0.8, 0.48)  # unit direction from which most of the light comes
+SHADE = 0.3  # share of the light that a leaf parallel to this direction still receives
 
 
 @kernel(inline="always")
 def _mix_bits(state):
-    """The next of a sequence of pseudo-random 32-bit numbers (xorshift and multiplication)."""
+    """Return the pseudo-random 32-bit number that follows `state` (xorshift and multiplication)."""
     state = ((state >> 16) ^ state) * 0x45D9F3B & 0xFFFFFFFF
     state = ((state >> 15) ^ state) * 0x2C1B3C6D & 0xFFFFFFFF
     return (state >> 16) ^ state
@@ -27,8 +27,14 @@ def _mix_bits(state):
 
 @kernel()
 def _leaf(solids, n, i, j, k, leaf):
-    """Write cell (i, j, k)'s leaf of solid n to `leaf` [4, 3]: its centre, and the three axes of its ellipsoid, wide,
-    long and thin, each of the length 1 / half extent. False for a bare cell."""
+    """Compute the leaf, an ellipsoid, in cell (i, j, k) of solid n and write it to `leaf` [4, 3].
+
+    Row 0 is the leaf's centre. Rows 1 to 3 are the axes of the ellipsoid along its width, length and thickness; the
+    length of each is 1 / half extent.
+
+    Returns:
+        False if the cell has no leaf.
+    """
     columns, layers = int(solids.leaves[n, 0]), int(solids.leaves[n, 1])
     state = _mix_bits(((k * layers + j) * columns + i + 1) * 7919 + int(solids.leaves[n, 7]))
     if state < BARE * 4294967296.0:
@@ -41,7 +47,7 @@ def _leaf(solids, n, i, j, k, leaf):
     leaf[1, 0], leaf[1, 1], leaf[1, 2] = c, 0.0, -s
     leaf[2, 0], leaf[2, 1], leaf[2, 2] = down * s, up, down * c
     leaf[3, 0], leaf[3, 1], leaf[3, 2] = up * s, -down, up * c
-    # A leaf that would stick out of its cell shrinks; its place in the cell is random.
+    # A leaf that would extend beyond its cell is shrunk to fit. Its position within the cell is random.
     smaller = 1.0
     for axis in range(3):
         half = solids.half[n, axis] / solids.leaves[n, axis]
@@ -60,7 +66,10 @@ def _leaf(solids, n, i, j, k, leaf):
 
 @kernel()
 def _extent(solids, n, leaf, axis):
-    """Half the width of the unshrunk leaf along an axis; leaf[1:] are still of unit length."""
+    """Return half the extent of a leaf along an axis of the box, before it is shrunk to fit its cell.
+
+    The axes leaf[1:] must still have unit length.
+    """
     total = 0.0
     for side in range(3):
         total += (leaf[1 + side, axis] * solids.leaves[n, 3 + side]) ** 2
@@ -69,7 +78,7 @@ def _extent(solids, n, leaf, axis):
 
 @kernel()
 def _in_leaf(leaf, ox, oy, oz, dx, dy, dz):
-    """(near, far) along the ray of its stretch in the leaf; near > far where there is none."""
+    """Return the interval (near, far) of the ray parameter inside a leaf; near > far if the ray misses the leaf."""
     a, b, c = 0.0, 0.0, -1.0
     for side in range(1, 4):
         p = (ox - leaf[0, 0]) * leaf[side, 0] + (oy - leaf[0, 1]) * leaf[side, 1] + (oz - leaf[0, 2]) * leaf[side, 2]
@@ -84,7 +93,7 @@ def _in_leaf(leaf, ox, oy, oz, dx, dy, dz):
 
 @kernel(inline="always")
 def _cell(solids, n, axis, x):
-    """(the cell that x lies in, its width); the outermost ones hold what lies outside."""
+    """Return (index of the cell that contains x along an axis, width of the cells); clamped to the outermost cells."""
     cells = int(solids.leaves[n, axis])
     wide = 2.0 * solids.half[n, axis] / cells
     return min(max(math.floor((x + solids.half[n, axis]) / wide), 0), cells - 1), wide
@@ -92,7 +101,19 @@ def _cell(solids, n, axis, x):
 
 @kernel(inline="always")
 def _crossings(solids, n, axis, cell, wide, o, d):
-    """(step, distance to the next wall, distance between walls) of a ray along one axis."""
+    """Return where a ray crosses the walls between cells along one axis.
+
+    Args:
+        cell: index of the cell in which the ray is.
+        wide: width of the cells.
+        o: coordinate of the ray's origin.
+        d: coordinate of the ray's direction.
+
+    Returns:
+        step: 1, -1 or 0, the change of the cell index at a wall.
+        distance: ray parameter at the next wall; 1e30 if there is none.
+        spacing: increase of the ray parameter from one wall to the next; 1e30 if there is none.
+    """
     if abs(d) < 1e-12:
         return 0, 1e30, 1e30
     step = 1 if d > 0.0 else -1
@@ -102,8 +123,13 @@ def _crossings(solids, n, axis, cell, wide, o, d):
 
 @kernel()
 def first_leaf(solids, n, ox, oy, oz, dx, dy, dz, near, far, min_distance):
-    """Distance along the ray to the first leaf of solid n that is more than `min_distance` away, 1e30 if it meets
-    none; the ray is within the box from `near` to `far`."""
+    """Return the distance along a ray to the first leaf of solid n, or 1e30 if the ray hits no leaf.
+
+    Args:
+        near: distance at which the ray enters the box.
+        far: distance at which the ray leaves the box.
+        min_distance: surfaces nearer than this are ignored.
+    """
     near = max(near, 0.0)
     i, wide_x = _cell(solids, n, 0, ox + near * dx)
     j, wide_y = _cell(solids, n, 1, oy + near * dy)
@@ -132,13 +158,19 @@ def first_leaf(solids, n, ox, oy, oz, dx, dy, dz, near, far, min_distance):
 
 @kernel(inline="always")
 def leaf_light(nx, ny, nz):
-    """Share of the light on a leaf with this normal; light shines through leaves, so the side does not matter."""
+    """Return the share of the light that a leaf with the given normal receives, in [`SHADE`, 1].
+
+    The sign of the normal has no effect, because light shines through leaves.
+    """
     return SHADE + (1.0 - SHADE) * abs(nx * SKY[0] + ny * SKY[1] + nz * SKY[2])
 
 
 @kernel()
 def leaf_normal(solids, n, x, y, z):
-    """Unit outward normal (3) of the leaf on which a point lies."""
+    """Return the unit outward normal (x, y, z) of the leaf on whose surface the point (x, y, z) lies.
+
+    If there is no leaf in the point's cell, the result is (0, 1, 0).
+    """
     i, _ = _cell(solids, n, 0, x)
     j, _ = _cell(solids, n, 1, y)
     k, _ = _cell(solids, n, 2, z)

@@ -1,4 +1,4 @@
-"""A furnished room with painted textures and baked light, ready for the ray caster."""
+"""A furnished room with procedural textures and baked light, the input of the ray caster."""
 
 from __future__ import annotations
 
@@ -16,8 +16,16 @@ from solids import Faces, Solids
 
 @dataclass(frozen=True)
 class World:
-    """Input of `raycast.render`: geometry, materials, baked light [M, 3] and exposure; and for masks `objects`, name ->
-    bool [n], the solids of each object with masks of its own."""
+    """Room with materials and light, ready to be rendered.
+
+    Attributes:
+        solids: the n solids.
+        faces: the faces of the solids, with their materials.
+        textures: all textures with their mip levels.
+        light: [M, 3] baked irradiance / pi at the nodes of the light map.
+        exposure: factor on the radiance in photographs.
+        objects: name -> bool [n], True for the solids of this object; only objects that have masks of their own.
+    """
 
     solids: Solids
     faces: Faces
@@ -28,7 +36,10 @@ class World:
 
 
 def paint_textures(seed: int, size: int) -> dict[str, np.ndarray]:
-    """Every texture of the scene, in a style drawn from the seed; full size for floor and walls, half for the rest."""
+    """Return all textures of a scene, {name: [N, N, 3] float32 sRGB in [0, 1]}, in styles drawn from the seed.
+
+    Textures of floor, walls and rug have N = `size`; all other textures have half of `size`, at least 128.
+    """
     small = max(size // 2, 128)
     draw = randomness(seed, "styles")
     floors = (paint.wood_planks, paint.wood_planks, paint.stone_tiles, paint.herringbone)
@@ -71,7 +82,10 @@ def paint_textures(seed: int, size: int) -> dict[str, np.ndarray]:
 
 
 def bake(furniture: Furniture, seed: int, kind: Kind) -> World:
-    """Textures and light: a ceiling lamp, a window, two bounces."""
+    """Add textures and light to the furniture of a room, and return the room ready to be rendered.
+
+    The light comes from a ceiling lamp and a window, and includes two bounces between surfaces. The exposure is 1.
+    """
     pictures, index = build_mipmaps(paint_textures(seed, kind.texture))
     solids, faces = furniture.arrays(index, kind.node)
     draw = randomness(seed, "light")

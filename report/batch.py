@@ -1,6 +1,9 @@
 """Page of a batch: runs/results.html, one row per scene with its scores or the reason of its failure, and a picture.
 
-python -m report.batch --runs runs (`make data=FOLDER batch` draws it)
+A batch runs all scenes of a folder and records them in runs/results.json. `make data=FOLDER batch` writes this page at
+its end.
+
+python -m report.batch --runs runs
 """
 
 from __future__ import annotations
@@ -23,10 +26,13 @@ MAX_PICTURES = 200  # more pictures would make a page of tens of MB
 
 
 def make(record: Path) -> Path:
-    """Write the page beside runs/results.json and return its path.
+    """Write the page of a batch beside the batch's record, and return the page's path.
+
+    Args:
+        record: runs/results.json, or runs/results@<variant>.json.
 
     Raises:
-        ValueError: no batch has been run.
+        ValueError: the record does not exist, because no batch has been run.
     """
     if not record.is_file():
         raise ValueError(f"{record} is missing; `make data=FOLDER batch` writes it")
@@ -49,7 +55,16 @@ def make(record: Path) -> Path:
 
 
 def _line(run: dict[str, Any], names: list[str], runs: Path, with_picture: bool) -> str:
-    """A row of the table. A failed run shows its reason instead of scores, and no picture."""
+    """Return a row of the table: the scene's name, scores, seconds and picture.
+
+    A run that is not done shows its state, or the reason of its failure, instead of scores and picture.
+
+    Args:
+        run: the scene's entry in the batch's record.
+        names: the scores to show.
+        runs: folder of the runs.
+        with_picture: True if the row may have a picture.
+    """
     name, home = escape(run["scene"]), run.get("home", run["scene"])
     if (runs / home / "report.html").is_file():
         name = f'<a href="{escape(home)}/report.html">{name}</a>'
@@ -65,7 +80,7 @@ def _line(run: dict[str, Any], names: list[str], runs: Path, with_picture: bool)
 
 
 def _picture(home: Path, scene: str) -> str:
-    """The first rendered view, reduced to `WIDTH`, as an `img` element; empty if there is none."""
+    """Return the first rendered view, resized to `WIDTH` px, as an `img` element; empty if no view was rendered."""
     first = next(iter(sorted((home / "evaluate" / "renders").glob("*.png"))), None)
     if first is None:
         return ""

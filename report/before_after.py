@@ -1,4 +1,7 @@
-"""Before-and-after slider: two pictures of the same view, from any two stages, one over the other."""
+"""Before-and-after slider of the report: two pictures of the same view, one over the other, with a movable border.
+
+A reader chooses the view and the kinds of pictures (`TITLES`), e.g. photograph and result.
+"""
 
 from __future__ import annotations
 
@@ -84,7 +87,7 @@ addEventListener('beforeprint', () => document.querySelectorAll('details').forEa
 
 
 def before_after_section(job: JobFiles) -> list[str]:
-    """Heading and slider, or a sentence that says which stage is missing."""
+    """Return the section as HTML parts: a heading and the slider, or a sentence that no view has been rendered yet."""
     views = {name: pictures for name in rendered_views(job) if (pictures := find_pictures(job, name))}
     top = page.heading("Before and after")
     if not views:
@@ -108,13 +111,16 @@ def before_after_section(job: JobFiles) -> list[str]:
 
 
 def rendered_views(job: JobFiles) -> list[str]:
-    """Sorted names of the views that the stage `evaluate` rendered."""
+    """Return the sorted names of the views that the stage `evaluate` rendered; empty before this stage."""
     folder = job.folders.get("evaluate", Path()) / "renders"
     return sorted(path.stem for path in folder.glob("*.png")) if "evaluate" in job.folders else []
 
 
 def find_pictures(job: JobFiles, name: str) -> dict[str, Path]:
-    """Kind of picture (`TITLES`) -> file, for the pictures of a view that exist."""
+    """Return the existing pictures of a view as {kind of picture, a key of `TITLES`: file}.
+
+    The photograph of a test view without a mask is ground truth, since it shows the scene without the object.
+    """
     evaluate = job.folders["evaluate"]
     poses, raw_masks = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))
     paths = {kind: evaluate / kind / f"{name}.png" for kind in TITLES}
@@ -126,7 +132,7 @@ def find_pictures(job: JobFiles, name: str) -> dict[str, Path]:
 
 
 def _left(kinds: list[str]) -> str:
-    """The kind shown first on the left: a picture with the object, if there is one."""
+    """Return the kind of picture that the left side shows at first: photograph, fit or ground truth, if available."""
     return next((kind for kind in ("photograph", "renders_fit", "truth") if kind in kinds), kinds[0])
 
 
@@ -139,7 +145,15 @@ def _select(options: dict[str, str | None], chosen: str = "") -> str:
 
 
 def _pair(name: str, pictures: dict[str, Path], row: dict[str, float], longest: int, first: bool) -> str:
-    """The pictures of a view, stacked. Without JavaScript only the first view is visible."""
+    """Return the HTML figure of one view: all pictures in one place, the slider, and a caption with the scores.
+
+    Args:
+        name: name of the view.
+        pictures: kind of picture -> file.
+        row: the view's row of per_view.csv; may be empty.
+        longest: longer side of the embedded pictures, px.
+        first: True for the view that is visible at first. Without JavaScript only this view is visible.
+    """
     kinds, images = list(pictures), []
     width, height = image_size(pictures[kinds[0]])
     sides = {_left(kinds): "left", kinds[-1]: "right"}

@@ -1,4 +1,4 @@
-"""Closed camera paths through a capture, for views from new positions."""
+"""Closed camera paths through a capture, along which a scene is rendered from new positions."""
 
 from __future__ import annotations
 
@@ -8,21 +8,24 @@ import numpy as np
 
 from reffusion.types import Camera
 
-POINT_WEIGHT = 1e-2  # weight of the points' median in the focus, relative to that of a camera's axis
+POINT_WEIGHT = 1e-2  # weight of the points' median in the focus point; the optical axis of a camera has weight 1
 
 
 def ellipse_path(cameras: Sequence[Camera], points: np.ndarray, frames: int) -> list[Camera]:
-    """Cameras on an ellipse in the plane of the capture's cameras, with their extent, looking at their common focus.
+    """Return cameras on an ellipse that fits the positions of a capture's cameras, all looking at the same point.
 
-    Cameras on a circle give that circle; cameras side by side give a small loop in front of the scene.
+    The ellipse lies in the principal plane of the camera positions and has their extent. Cameras on a circle give this
+    circle. Cameras side by side give a small loop in front of the scene. The point looked at is `focus_point`.
 
     Args:
-        cameras: at least one; the middle one provides size and lens.
-        points: [P, 3] of the scene; their median fixes the depth if the axes are parallel. May be empty.
-        frames: number of cameras; the last is one step before the first.
+        cameras: cameras of the capture, at least one; the middle one of the sequence provides image size and focal
+            lengths.
+        points: [P, 3] sparse points of the scene. Their median determines the distance of the focus point if the
+            optical axes are parallel. May be empty.
+        frames: number of cameras to return; the path is closed, and the last camera is one step before the first.
 
     Raises:
-        ValueError: no camera, or frames < 1.
+        ValueError: there is no camera, or frames < 1.
     """
     if not cameras or frames < 1:
         raise ValueError(f"a camera path needs a camera and a frame, not {len(cameras)} and {frames}")
@@ -43,7 +46,11 @@ def ellipse_path(cameras: Sequence[Camera], points: np.ndarray, frames: int) -> 
 
 
 def focus_point(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
-    """[3], the point nearest to all optical axes in the least-squares sense, pulled slightly to the points' median."""
+    """Return the point [3] nearest to all optical axes in the least-squares sense, drawn slightly to the sparse points.
+
+    The attracting point is the median of `points` [P, 3]. If there are none, it is the mean of the points at distance 1
+    in front of the cameras.
+    """
     matrix, right = np.zeros((3, 3)), np.zeros(3)
     anchor = np.median(points, 0) if len(points) else np.mean([c.center + c.world_to_camera[2, :3] for c in cameras], 0)
     for camera in cameras:
@@ -55,7 +62,11 @@ def focus_point(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
 
 
 def look_at(center: np.ndarray, target: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """[4, 4] world-to-camera pose at `center` looking at `target`, with image rows along `down` as far as possible."""
+    """Return the world-to-camera pose [4, 4] of a camera at `center` [3] that looks at `target` [3].
+
+    Args:
+        down: [3], the direction in the world that points down in the image, as far as the viewing direction allows.
+    """
     forward = target - center
     length = np.linalg.norm(forward)
     forward = forward / length if length > 0 else np.array([0.0, 0.0, 1.0])

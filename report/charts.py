@@ -1,4 +1,4 @@
-"""Common style of all charts, and the charts of a comparison: error against run time, differences to `full`."""
+"""Common style of all charts, and charts of a comparison: error against run time, differences to the full method."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ if TYPE_CHECKING:
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
 BLUE, ORANGE, GREEN, GREY, INK = "#0072B2", "#D55E00", "#009E73", "#8a8a8a", "#222222"
 WIDTH, DPI = 9.6, 200  # inches (page width) and dots per inch
-LABEL_GAP = 12  # least distance of a label to its neighbours, px
+LABEL_GAP = 12  # least horizontal distance of a label to its neighbours, px
 LABEL_OFFSETS = [(6, 0), (-6, 0), (5, 7), (-5, 7), (5, -7), (-5, -7), (0, 10), (0, -10),
           (14, 14), (-14, 14), (14, -14), (-14, -14), (0, 22), (0, -22), (26, 24), (-26, 24), (26, -24), (-26, -24),
           (0, 34), (0, -34), (40, 34), (-40, 34), (40, -34), (-40, -34)]  # fmt: skip
 
 
 def new_figure(height: float, rows: int = 1, columns: int = 1, **options) -> tuple[Figure, np.ndarray]:
-    """A figure of page width and its axes [rows, columns], in the common style.
+    """Return a figure of page width and an array of its axes [rows, columns], in the common style.
 
     Args:
-        height: of the figure, inches. options: of matplotlib's `Figure.subplots`.
+        height: height of the figure, inches.
+        options: further options of matplotlib's `Figure.subplots`.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -53,19 +54,29 @@ def save_chart(chart: Figure, path: Path) -> None:
 
 
 def annotate(axes: Axes, text: str, at, offset=(0, 0), colour: str = INK, ha: str = "left", va: str = "center") -> None:
-    """Write text beside a point of a chart; `offset` is in points."""
+    """Write text beside a data point of a chart.
+
+    Args:
+        at: (x, y) of the data point.
+        offset: (x, y) from the data point to the text, in points (1/72 inch).
+        ha: horizontal alignment of the text.
+        va: vertical alignment of the text.
+    """
     look = {"fontsize": 9, "color": colour, "ha": ha, "va": va}
     axes.annotate(text, at, offset, textcoords="offset points", **look)
 
 
 def needs_log_axis(values: Iterable[float], factor: float = 12) -> bool:
-    """True if the positive values span more than `factor`, so that a logarithmic axis serves them better."""
+    """Return True if the largest value is more than `factor` times the smallest positive value.
+
+    A logarithmic axis then shows the values better than a linear axis.
+    """
     positive = [value for value in values if value > 0]
     return len(positive) > 1 and max(positive) > factor * min(positive)
 
 
 def use_plain_log_ticks(axes: Axes, which: str = "x") -> None:
-    """Label a logarithmic axis with 10, 20, 50, 100 instead of powers of ten."""
+    """Label a logarithmic axis, "x" or "y", with numbers such as 10, 20, 50 and 100 instead of powers of ten."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis = axes.xaxis if which == "x" else axes.yaxis
@@ -81,7 +92,14 @@ def use_plain_log_ticks(axes: Axes, which: str = "x") -> None:
 def draw_tradeoff(
     names: Sequence[str], seconds: Sequence[float], errors: dict[str, Sequence[float]], path: Path
 ) -> None:
-    """Chart all methods, one panel per error (title -> one value per method, less is better), with the Pareto front."""
+    """Draw the errors of all methods against their run times, one panel per kind of error, with the Pareto front.
+
+    Args:
+        names: names of the n methods.
+        seconds: run times [n].
+        errors: title of a panel -> errors [n] of the methods; less is better.
+        path: PNG to write.
+    """
     chart, grid = new_figure(0.5 + 3.6 * len(errors), len(errors), sharex=True)
     for axes, (title, values) in zip(grid[:, 0], errors.items(), strict=True):
         front = pareto_front(seconds, values)
@@ -101,7 +119,7 @@ def draw_tradeoff(
     grid[-1, 0].set_xlabel("seconds of the whole job, evaluation included", fontsize=10)
     note = "filled, on the line: Pareto front (no other method is both as fast and as good)"
     grid[0, 0].set_title(note, fontsize=9, color=BLUE, loc="left")
-    chart.canvas.draw()  # fixes the layout, so that labels can be placed
+    chart.canvas.draw()  # computes the layout, which must not change after the labels are placed
     chart.set_layout_engine("none")
     for axes, values in zip(grid[:, 0], errors.values(), strict=True):
         label_points(axes, np.column_stack([seconds, values]), names, pareto_front(seconds, values))
@@ -109,16 +127,21 @@ def draw_tradeoff(
 
 
 def label_points(axes: Axes, points: np.ndarray, names: Sequence[str], strong: np.ndarray) -> None:
-    """Write each name [n] beside its point [n, 2] where it covers no other point or name, with a thin line if far away.
+    """Write the name of each point beside the point, where it covers other points and names least.
 
-    `strong` marks the points on the Pareto front, bool [n].
+    A thin line connects a name to its point if the two are far apart.
+
+    Args:
+        points: [n, 2] in data units.
+        names: [n].
+        strong: bool [n], True for the points on the Pareto front.
     """
     renderer = axes.figure.canvas.get_renderer()
     unit = axes.figure.dpi / 72
     pixels = axes.transData.transform(points)
     obstacles = [np.array([x - 5 * unit, y - 5 * unit, x + 5 * unit, y + 5 * unit]) for x, y in pixels]
     steps = pixels[strong][np.argsort(pixels[strong][:, 0], kind="stable")]
-    for (x, y), (to_x, to_y) in pairwise(steps):  # the front's own line
+    for (x, y), (to_x, to_y) in pairwise(steps):  # names must not cover the line of the Pareto front either
         obstacles += [np.array([x, y - unit, to_x, y + unit]), np.array([to_x - unit, to_y, to_x + unit, y])]
     inside = axes.get_window_extent(renderer)
     for index in np.argsort(-pixels[:, 0], kind="stable"):
@@ -142,14 +165,32 @@ def label_points(axes: Axes, points: np.ndarray, names: Sequence[str], strong: n
 
 
 def _box(point: np.ndarray, place: tuple[float, float], wide: float, high: float, unit: float) -> np.ndarray:
-    """[left, bottom, right, top] in px of a text of the given size, placed at an offset in points."""
+    """Return the box [left, bottom, right, top] in px of a text that is placed beside a point.
+
+    Args:
+        point: [2], px.
+        place: offset of the text from the point, in points (1/72 inch). A positive x puts the text on the right, a
+            negative x on the left, and 0 centres it.
+        wide: width of the text, px.
+        high: height of the text, px.
+        unit: px per point (1/72 inch).
+    """
     x, y = point + np.array(place) * unit
     left = x - wide / 2 if place[0] == 0 else x if place[0] > 0 else x - wide
     return np.array([left, y - high / 2, left + wide, y + high / 2])
 
 
 def _cost(box: np.ndarray, place: tuple[float, float], boxes: list[np.ndarray], inside) -> float:
-    """Overlap with other boxes in px^2, plus penalties for leaving the axes (largest) and for distance to the point."""
+    """Return the cost of placing a text in `box`: its overlap with other boxes in px^2, plus penalties.
+
+    The largest penalty is for leaving the axes, the smallest for the distance to the point.
+
+    Args:
+        box: [left, bottom, right, top], px.
+        place: offset of the text from its point, in points (1/72 inch).
+        boxes: boxes of other points, names and lines.
+        inside: matplotlib box of the axes, px.
+    """
     box = box + np.array([-LABEL_GAP, 0, LABEL_GAP, 0])
     covered = sum(
         max(0, min(box[2], other[2]) - max(box[0], other[0])) * max(0, min(box[3], other[3]) - max(box[1], other[1]))
@@ -165,9 +206,17 @@ def _cost(box: np.ndarray, place: tuple[float, float], boxes: list[np.ndarray], 
 def draw_forest(
     differences: dict[str, dict[str, Difference]], titles: dict[str, str], more: set[str], path: Path
 ) -> None:
-    """One panel per metric with the difference of each method to `full` and its intervals; left is always worse.
+    """Draw one panel per metric with each method's difference to the full method and its confidence intervals.
 
-    `more` names the metrics of which more is better. Coloured: the interval over views excludes zero.
+    The left side of a panel is always worse than the full method. A difference is blue (better) or orange (worse) if
+    its interval over views excludes zero, else grey. A thick line is the interval over views, a thin line the interval
+    over scenes.
+
+    Args:
+        differences: metric -> method -> its difference to the full method.
+        titles: metric -> title of its axis.
+        more: metrics of which more is better.
+        path: PNG to write.
     """
     names = list(dict.fromkeys(name for by_method in differences.values() for name in by_method))
     chart, grid = new_figure(0.9 + 0.3 * len(names), 1, len(differences), sharey=True)
@@ -190,7 +239,13 @@ def draw_forest(
 
 
 def _interval(axes: Axes, difference: Difference, row: int, sign: int, far: float) -> None:
-    """One row of a panel. Differences beyond `far` become an arrow with the number."""
+    """Draw one method's difference and its intervals into a row of a panel.
+
+    Args:
+        row: index of the row.
+        sign: 1 if more of the metric is better, else -1.
+        far: largest difference that fits the panel. A larger one is drawn as an arrow with the number.
+    """
     mean, views = difference.mean, difference.views or 0
     colour = GREY if abs(mean) <= views else BLUE if sign * mean > 0 else ORANGE
     if abs(mean) > far:
@@ -207,7 +262,10 @@ def _interval(axes: Axes, difference: Difference, row: int, sign: int, far: floa
 
 
 def _far(differences: Sequence[Difference]) -> float:
-    """Reach of a panel: three times the median difference, so that a few failing methods do not squeeze the others."""
+    """Return the largest absolute difference to draw to scale: three times the median, or infinity if none is larger.
+
+    Without this limit a few failing methods would make the differences of all other methods indistinguishable.
+    """
     sizes = np.abs([difference.mean for difference in differences])
     usual = 3 * float(np.median(sizes))
     return usual if sizes.max() > usual > 0 else np.inf

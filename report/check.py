@@ -1,6 +1,7 @@
 """Overview of a scene's input, after its stage `raw_masks`: `python -m report.check --scene X` (`make scene=X check`).
 
-Writes runs/<scene>/check.png, each mask over its photograph, and prints warnings about photographs, masks and poses.
+The command writes runs/<scene>/check.png, which shows each mask over its photograph. It also prints the warnings that
+the stages `poses`, `raw_masks` and `masks` recorded about photographs, masks and poses.
 """
 
 from __future__ import annotations
@@ -17,14 +18,20 @@ from report import cli, sheet
 
 WIDTH, HEIGHT, GAP = 240, 180, 4  # largest width and height of a picture, and the gap between pictures, px
 COLUMNS = 6
-TINT = (255, 0, 160)  # colour of masks; test masks take the complement
+TINT = (255, 0, 160)  # colour of the training views' masks; masks for scoring test views get the complementary colour
 
 
 def make(home: Path) -> tuple[Path, list[str]]:
-    """Write runs/<scene>/check.png; return its path and the warnings, one sentence each.
+    """Write check.png into a scene's run folder; return the path of the picture and the recorded warnings.
+
+    Args:
+        home: runs/<scene> or runs/<scene>@<variant>.
+
+    Returns:
+        The path of check.png, and the warnings of the stages `poses`, `raw_masks` and `masks`, one sentence each.
 
     Raises:
-        ValueError: the stage `raw_masks` has not run.
+        ValueError: the stage `raw_masks` has not run, or the scene has no photographs.
     """
     poses, raw_masks = (sheet.stage_folder(home, stage) for stage in ("poses", "raw_masks"))
     if not (poses / "views.json").is_file() or not raw_masks.is_dir():
@@ -41,14 +48,27 @@ def make(home: Path) -> tuple[Path, list[str]]:
 
 
 def view_role(name: str, views: dict[str, list[str]]) -> str:
-    """Role of a view: "left out", "clean", "test" or "training"."""
+    """Return the role of a view: "left out", "clean", "test" or "training".
+
+    A view is "left out" if its photograph contradicts its pose, and "clean" if it is a training view without the
+    object.
+
+    Args:
+        views: content of views.json of the stage `poses`: list of view names for each role.
+    """
     if name in views.get("outliers", ()):
         return "left out"
     return "clean" if name in views["clean"] else "test" if name in views["test"] else "training"
 
 
 def overlay_masks(poses: Path, raw_masks: Path, name: str) -> np.ndarray:
-    """uint8 [h, w, 3], at most `WIDTH` x `HEIGHT`: the photograph with its masks tinted."""
+    """Return a reduced photograph with its masks tinted, uint8 [h, w, 3], at most `WIDTH` x `HEIGHT`.
+
+    Args:
+        poses: folder of the stage `poses`, which has the photographs.
+        raw_masks: folder of the stage `raw_masks`, which has the masks and test masks.
+        name: name of the view.
+    """
     image = load_image(poses / "images" / f"{name}.png")
     factor = min(WIDTH / image.shape[1], HEIGHT / image.shape[0])
     size = max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor))
@@ -61,7 +81,11 @@ def overlay_masks(poses: Path, raw_masks: Path, name: str) -> np.ndarray:
 
 
 def contact_sheet(cells: list[tuple[str, np.ndarray, str]]) -> np.ndarray:
-    """uint8 [H, W, 3]: the pictures in rows on white, each with its view's name and role below."""
+    """Return one image, uint8 [H, W, 3], with all pictures in rows on white and a caption below each picture.
+
+    Args:
+        cells: (view name, picture uint8 [h, w, 3], role); the caption has the name and the role.
+    """
     font, line = ImageFont.load_default(13), 20
     columns = min(COLUMNS, len(cells))
     rows = -(-len(cells) // columns)

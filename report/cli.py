@@ -7,7 +7,13 @@ from pathlib import Path
 
 
 def scene_parser(name: str, description: str, needs_scene: bool = True) -> argparse.ArgumentParser:
-    """Parser with --scene, --variant and --runs; the help shows the first line of `description`."""
+    """Return an argument parser with the options --scene, --variant and --runs.
+
+    Args:
+        name: name of the command, as in `reffusion NAME`.
+        description: docstring of the command's module; the help shows the first line.
+        needs_scene: True if the command refuses to run without --scene.
+    """
     parser = argparse.ArgumentParser(prog=f"reffusion {name}", description=description.split("\n")[0])
     parser.add_argument("--scene", type=Path, required=needs_scene, help="name of the scene, or path of its folder")
     parser.add_argument("--variant", default="", help="variant of the scene")
@@ -16,7 +22,12 @@ def scene_parser(name: str, description: str, needs_scene: bool = True) -> argpa
 
 
 def run_folder(arguments: argparse.Namespace) -> Path:
-    """runs/<scene>, or runs/<scene>@<variant>."""
+    """Return the folder of a scene's stages: runs/<scene>, or runs/<scene>@<variant> if a variant is named.
+
+    Args:
+        arguments: the result of a parser of `scene_parser`. The scene may be a name, the path of a folder, or the path
+            of a file, whose name without its ending is then the scene's name.
+    """
     scene = arguments.scene.expanduser().resolve()
     name = scene.stem if scene.is_file() else scene.name
     return arguments.runs / (f"{name}@{arguments.variant}" if arguments.variant else name)

@@ -1,5 +1,10 @@
-"""Tables and pictures of what `make scene=X compare` ran: runs/X/compare.md, .csv and .html; of a folder of scenes
-runs/compare/compare.md, .csv and .html.
+"""Tables and pictures of all methods that `make scene=X compare` ran: runs/X/compare.md, .csv and .html.
+
+For a folder of scenes (`make data=FOLDER compare`) the files are runs/compare/compare.md, .csv and .html.
+
+A *method* is the full method or one of the variants. The *box* is the bounding box of a view's mask, 10% wider on each
+side, in which scores are measured. In many functions `table` is the result of `results.summarize_methods`: one
+dictionary per method, whose keys are `results.COLUMNS` and whose values are None where unknown.
 
 python -m report.compare --scene X --runs runs
 """
@@ -56,17 +61,20 @@ FACTS = {"inpainter": "2D inpainter", "perceptual": "perceptual distance"}  # ke
 
 
 def make(home: Path) -> dict[str, Path]:
-    """Write the tables and the pages of runs/<scene>; return their paths as {"csv", "md", "html"}.
+    """Write the table (.csv) and the pages (.md, .html) of a comparison; return their paths as {"csv", "md", "html"}.
 
-    Pictures go to runs/<scene>/compare/ and into the HTML page, which needs no other file.
+    Pictures are written to `home`/compare/. The HTML page embeds the pictures, so that it needs no other file.
+
+    Args:
+        home: folder of the comparison: runs/<scene>, or runs/compare for a folder of scenes.
 
     Raises:
-        ValueError: nothing was compared yet.
+        ValueError: nothing was compared yet, or FOLDER/published.csv is malformed.
     """
     comparison = load_comparison(home)
     out = home / "compare"
     out.mkdir(exist_ok=True)
-    for chart in ("tradeoff", "differences"):  # left by an earlier call; there may be nothing to draw now
+    for chart in ("tradeoff", "differences"):  # an earlier call may have drawn a chart for which there is no data now
         (out / f"{chart}.png").unlink(missing_ok=True)
     table = summarize_methods(comparison)
     paths = {kind: home / f"compare.{kind}" for kind in ("csv", "md", "html")}
@@ -85,7 +93,11 @@ def make(home: Path) -> dict[str, Path]:
 
 
 def save_tradeoff(table: list[dict[str, Any]], path: Path) -> Path | None:
-    """Chart error against seconds of the finished methods: box errors, or without ground truth the inconsistency."""
+    """Draw the methods' errors against their run times; return the chart's path, or None if there is nothing to draw.
+
+    The errors are those in the box. Without ground truth the chart shows the inconsistency between views instead. Only
+    methods that have all drawn errors appear.
+    """
     errors = {}
     for name, title in {**ERRORS, "consistency": "inconsistency between views"}.items():
         rows = [row for row in table if row[name] is not None]
@@ -100,7 +112,13 @@ def save_tradeoff(table: list[dict[str, Any]], path: Path) -> Path | None:
 
 
 def save_forest(comparison: Comparison, path: Path) -> Path | None:
-    """Chart method minus full: in the box, or outside the masks if there is no ground truth inside."""
+    """Draw each method's score minus the full method's score, with confidence intervals, as a forest chart.
+
+    The chart shows the scores in the box, or the scores outside the masks if no box scores are known.
+
+    Returns:
+        The chart's path, or None if there is nothing to draw.
+    """
     differences = {metric: by_method for metric in BOX_SCORES if (by_method := differences_to_full(comparison, metric))}
     differences = differences or {
         metric: by_method for metric in OUTSIDE_SCORES if (by_method := differences_to_full(comparison, metric))
@@ -116,11 +134,18 @@ def save_forest(comparison: Comparison, path: Path) -> Path | None:
 
 
 def method_table(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]], list[list[bool]]]:
-    """Header, cells, and which cells are the best in their column, [rows][columns]; a dash marks a missing value."""
+    """Return the main table as (header, cells, bold).
+
+    Returns:
+        header: titles of the columns. Columns of `OPTIONAL_COLUMNS` are omitted if no method has a value.
+        cells: text [rows][columns], one row per method; a dash marks a missing value.
+        bold: [rows][columns], True for the best values of a column, after rounding.
+    """
     names = [name for name in TITLES if name not in OPTIONAL_COLUMNS or any(row[name] is not None for row in table)]
     best = {}
     most = max(row["scenes"] for row in table)
-    # `consistency` has no best (blur is consistent), nor has a mean over fewer scenes.
+    # No value of `consistency` is marked as best, because blurred renders are consistent too. A mean over fewer scenes
+    # than other methods have is not considered either.
     for name, better in SCORES.items():
         values = [round(row[name], DIGITS[name]) for row in table if row[name] is not None and row["scenes"] == most]
         best[name] = (max if better == "more" else min)(values, default=None) if len(values) > 1 else None
@@ -140,7 +165,11 @@ def _cell(row: dict[str, Any], name: str) -> str:
 
 
 def difference_table(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]] | None:
-    """Method minus full: the mean, half its interval over views, and over scenes if there are several."""
+    """Return header and rows of the table of differences: each method's score minus the full method's score.
+
+    A cell has the mean difference, half its 95% confidence interval over views and, in brackets, half its interval over
+    scenes if there are several. The result is None if no differences are known.
+    """
     metrics = [metric for metric in SCORES if any(row[f"{metric}_minus_full"] is not None for row in table)]
     others = [row for row in table if row["method"] != FULL and not row["same_as"]]
     lines = [[row["method"], *(_signed(row, metric) for metric in metrics)] for row in others]
@@ -157,7 +186,10 @@ def _signed(row: dict[str, Any], metric: str) -> str:
 
 
 def extra_tables(comparison: Comparison, table: list[dict[str, Any]]) -> dict[str, compare_tables.Table]:
-    """Title -> header and rows: each scene, if there are several, and published figures.
+    """Return the further tables as {title: (header, rows)}.
+
+    If there are several scenes, each score in the box gets a table with its values in each scene. If the folder of the
+    scenes has published.csv, a table shows published scores beside the measured ones.
 
     Raises:
         ValueError: FOLDER/published.csv is malformed.
@@ -177,7 +209,10 @@ def extra_tables(comparison: Comparison, table: list[dict[str, Any]]) -> dict[st
 
 
 def summary(comparison: Comparison, table: list[dict[str, Any]]) -> str:
-    """Sentence with what was compared and the best method in each metric."""
+    """Return a sentence with the numbers of methods and scenes, and the best method in each metric.
+
+    The metrics are those in the box, or those outside the masks if no method has box scores.
+    """
     done = sum(run.state == "done" for run in comparison.runs.values())
     place = f"{len(comparison.scenes)} scenes ({', '.join(comparison.scenes)})"
     parts = [f"{len(table)} methods on {place if len(comparison.scenes) > 1 else comparison.scenes[0]}"]
@@ -194,7 +229,7 @@ def summary(comparison: Comparison, table: list[dict[str, Any]]) -> str:
 
 
 def table_notes(comparison: Comparison, table: list[dict[str, Any]]) -> list[str]:
-    """What a reader of the tables needs to know, each fact once."""
+    """Return the notes below the tables: definitions of columns, protocol, failed runs and machines, one per item."""
     done = [run for method in comparison.methods for run in comparison.finished_runs(method)]
     lines = [
         "Box: the bounding box of the view's mask, 10% wider on each side. Means over the test views"
@@ -227,7 +262,10 @@ def table_notes(comparison: Comparison, table: list[dict[str, Any]]) -> list[str
 
 
 def method_facts(run: Run) -> list[str]:
-    """Inpainter and perceptual distance of a run in words, from metrics.json or facts.json of its stages."""
+    """Return a sentence with the 2D inpainter and the perceptual distance that a run used; empty if none is recorded.
+
+    The names are recorded in metrics.json, or in facts.json of one of the run's stages.
+    """
     paths = [folder / "facts.json" for folder in run.folders.values()]
     records = [run.metrics, *(load_json(path) for path in paths if path.is_file())]
     named = {words: facts[key] for facts in records for key, words in FACTS.items() if facts.get(key)}
@@ -235,7 +273,7 @@ def method_facts(run: Run) -> list[str]:
 
 
 def explain_intervals(comparison: Comparison) -> str:
-    """Sentence on the intervals of the difference table and of the forest chart."""
+    """Return a sentence that explains the intervals in the table of differences and in the forest chart."""
     text = "Method minus full, ± half the 95% interval of the paired t over pairs of equal views"
     if len(comparison.scenes) == 1:
         return f"{text} (the line through a dot). It holds for this scene, not for others."
@@ -248,6 +286,7 @@ def explain_intervals(comparison: Comparison) -> str:
 def markdown(
     comparison: Comparison, table: list[dict], chart_paths: dict[str, Path | None], views: dict[str, Path]
 ) -> str:
+    """Return the page in Markdown; the arguments are those of `html`."""
     header, texts, bold = method_table(table)
     strong = [[f"**{c}**" if b else c for c, b in zip(*line, strict=True)] for line in zip(texts, bold, strict=True)]
     lines = [f"# {comparison.name}: methods compared", "", summary(comparison, table), ""]
@@ -270,6 +309,12 @@ def markdown(
 
 
 def html(comparison: Comparison, table: list[dict], chart_paths: dict[str, Path | None], views: dict[str, Path]) -> str:
+    """Return the page in HTML with all pictures embedded.
+
+    Args:
+        chart_paths: title -> PNG of a chart, or None if the chart was not drawn.
+        views: view -> PNG with the results of all methods in this view.
+    """
     header, texts, bold = method_table(table)
     title = f"{comparison.name}: methods compared"
     full = next((number for number, row in enumerate(table) if row["method"] == FULL), None)

@@ -1,4 +1,4 @@
-"""The same test views by every method: crops around the box, side by side."""
+"""Pictures of the same test views by every method, side by side, cropped to the box (the bounding box of the mask)."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from report.results import FULL, Comparison, Run
 from report.sheet import GAP, enlarge, pick_evenly
 
 WIDTH = 1920  # approximate width of a sheet, px
-CONTEXT = 0.15  # margin of the crop on each side, as a share of the box
-BOX = ("left", "top", "right", "bottom")
+CONTEXT = 0.15  # margin of the crop on each side, as a share of the box's width or height
+BOX = ("left", "top", "right", "bottom")  # columns of per_view.csv
 
 
 def save_sheets(comparison: Comparison, out: Path, count: int = 3) -> dict[str, Path]:
-    """View -> PNG with the result of every method and the truth.
+    """Write a picture for a few views with the photograph and every method's render; return {view: PNG}.
 
-    With one scene, `count` evenly spread views; with several, one view each of `count` scenes.
+    One scene gets pictures of `count` evenly spread views. Of several scenes, `count` evenly spread ones get a picture
+    of one view each, whose key begins with the scene's name.
     """
     if len(comparison.scenes) == 1:
         return _sheets_of(comparison, comparison.scenes[0], out, "", count)
@@ -72,7 +73,11 @@ def _title(run: Run, view: str) -> str:
 
 
 def crop_to_box(picture: np.ndarray, row: dict[str, float]) -> np.ndarray:
-    """[H, W, 3]: the box of a row of per_view.csv with `CONTEXT` around it; the whole picture if the row has no box."""
+    """Return a picture, [H, W, 3], cropped to a view's box plus the margin `CONTEXT`.
+
+    Args:
+        row: the view's row of per_view.csv. The picture stays whole if the row has no box.
+    """
     if not all(side in row for side in BOX):
         return picture
     left, top, right, bottom = (int(row[side]) for side in BOX)
@@ -81,7 +86,12 @@ def crop_to_box(picture: np.ndarray, row: dict[str, float]) -> np.ndarray:
 
 
 def arrange_crops(cells: list[np.ndarray], titles: list[str]) -> np.ndarray:
-    """uint8 [H, W, 3]: pictures of one size in rows, enlarged by a whole factor, with titles of one or two lines."""
+    """Return one image, uint8 [H, W, 3], with pictures in rows of at most four, each below its title.
+
+    Args:
+        cells: pictures of about one size, uint8 [h, w, 3], which are enlarged by a whole factor.
+        titles: one per picture, of one line or of two lines separated by a newline.
+    """
     height, width = (max(cell.shape[axis] for cell in cells) for axis in (0, 1))
     columns = min(len(cells), 4)
     scale = max(1, round(WIDTH / columns / width))

@@ -1,4 +1,7 @@
-"""Tables over several scenes: each method in each scene, and published figures beside ours."""
+"""Tables of a comparison over several scenes: each method in each scene, and published scores beside the measured ones.
+
+In these functions `table` is the result of `results.summarize_methods`: one dictionary per method.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,18 @@ from report.results import BOX_SCORES, Comparison, Run
 
 PUBLISHED = "published.csv"  # file in the folder of the scenes
 COLUMNS = ("method", "metric", "value", "protocol")
-Table = tuple[list[str], list[list[str]]]
+Table = tuple[list[str], list[list[str]]]  # header, rows
 
 
 def scene_table(comparison: Comparison, table: list[dict], metric: str, digits: int) -> Table | None:
-    """Header and rows: a method's score in each scene, then its mean as in `table`; None if there are no scores."""
+    """Return a table of one metric with a row per method: the score in each scene, then the mean as in `table`.
+
+    Args:
+        digits: decimals of the scores.
+
+    Returns:
+        Header and rows, or None if no method has this score.
+    """
     means = {row["method"]: row[metric] for row in table}
     methods = comparison.distinct_methods
     if all(means[method] is None for method in methods):
@@ -28,7 +38,14 @@ def scene_table(comparison: Comparison, table: list[dict], metric: str, digits: 
 
 
 def describe_protocol(done: list[Run]) -> list[str]:
-    """Which views of what size were rendered in which scenes, as one phrase; empty if unknown."""
+    """Return which views were rendered, and at which size, in which scenes.
+
+    Args:
+        done: finished runs.
+
+    Returns:
+        A list of one phrase; empty if the runs did not record the size.
+    """
     scenes_by_size: dict[str, dict[str, None]] = {}
     for run in done:
         sizes = ", ".join(run.metrics.get("protocol", {}).get("resolution", ()))
@@ -39,10 +56,16 @@ def describe_protocol(done: list[Run]) -> list[str]:
 
 
 def load_published(data: Path | None) -> list[dict[str, str]]:
-    """The rows of FOLDER/published.csv; empty if there is no such file.
+    """Load the published scores in published.csv of the scenes' folder: a dictionary with keys `COLUMNS` per row.
+
+    Args:
+        data: folder of the scenes; None if a single scene was compared.
+
+    Returns:
+        Empty if there is no such file.
 
     Raises:
-        ValueError: it has other columns, a metric that is not compared, or a value that is not a number.
+        ValueError: the file has other columns, a metric that is not compared, or a value that is not a number.
     """
     path = data / PUBLISHED if data else None
     if path is None or not path.is_file():
@@ -64,9 +87,13 @@ def load_published(data: Path | None) -> list[dict[str, str]]:
 def published_table(
     rows: list[dict[str, str]], table: list[dict], short: dict[str, str], digits: dict[str, int], protocol: str
 ) -> Table:
-    """Header and rows: per metric the published values, then ours with intervals over scenes.
+    """Return a table with the published scores of each metric, followed by the measured ones with their intervals.
 
-    `short` and `digits` give the name and the decimals of a metric; `here` is our protocol.
+    Args:
+        rows: published scores, from `load_published`.
+        short: metric -> name to show.
+        digits: metric -> decimals.
+        protocol: how the measured scores were obtained, in words.
     """
     lines = []
     for metric in dict.fromkeys(row["metric"] for row in rows):
@@ -83,6 +110,11 @@ def published_table(
 
 
 def format_spread(row: dict, metric: str, digits: int) -> str:
-    """The mean and, if there are several scenes, half its interval over them."""
+    """Return a method's mean score as text, with ± half its 95 % interval over scenes if there are several scenes.
+
+    Args:
+        row: the method's row of the table.
+        digits: decimals.
+    """
     half = row[f"{metric}_interval"]
     return page.format_number(row[metric], digits) + ("" if half is None else f" ± {half:.{digits}f}")

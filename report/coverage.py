@@ -1,4 +1,9 @@
-"""How much of the removed region each view had to make up, and how much stayed uncovered."""
+"""Section of the report on coverage: which shares of the removed object's pixels are made up, or stay uncovered.
+
+*Made up* are the pixels of the invent mask I, whose content the reference and the diffusion prior decide. *Uncovered*
+are pixels where the Gaussians after the stage `initialize` are still partly transparent (alpha below 0.9). *Mask* means
+the consistent mask C, the pixels of a training view that show the removed object.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +17,11 @@ from report.job_data import JobFiles
 from report.results import load_views
 
 HEADER = ("view", "mask, of the picture", "made up, of the mask", "uncovered, of the mask")
-MIN_UNCOVERED = 0.01  # share of a mask above which a view counts as uncovered; `initialize` names the same views
+MIN_UNCOVERED = 0.01  # a view is listed if a larger share is uncovered or unseen; `initialize` warns of the same views
 
 
 def coverage_section(job: JobFiles) -> list[str]:
-    """A sentence, and a table with a bar for each share."""
+    """Return the section as HTML parts: a summary, a table of the shares of all views, and a note on unseen pixels."""
     top = page.heading("What was covered")
     shares = view_shares(job)
     if not shares:
@@ -39,9 +44,11 @@ def coverage_section(job: JobFiles) -> list[str]:
 
 
 def view_shares(job: JobFiles) -> dict[str, tuple[float, float, float | None]]:
-    """Training view that shows the object -> shares: mask of the picture, made up of the mask, uncovered of the mask.
+    """Return three shares in [0, 1] for each training view that shows the object, from the masks on disk.
 
-    The uncovered share is None before the stage `initialize`.
+    Returns:
+        View name -> (the mask's share of the picture, the made-up share of the mask, the uncovered share of the mask).
+        The last share is None before the stage `initialize`. The dictionary is empty before the stage `masks`.
     """
     masks, folder = job.folders.get("masks", Path()), job.folders.get("initialize", Path())
     facts = folder / "facts.json"
@@ -67,7 +74,7 @@ def _table(rows: list[tuple[str, tuple[float, float, float | None]]]) -> str:
 
 
 def _bar(share: float | None) -> str:
-    """Table cell with a share as a number on a bar."""
+    """Return a table cell with a share in [0, 1] as a percentage on a bar, or with a dash if the share is None."""
     if share is None:
         return "<td>–</td>"
     part = f"{min(100 * share, 100):.1f}%"
@@ -75,7 +82,11 @@ def _bar(share: float | None) -> str:
 
 
 def _unseen(job: JobFiles) -> list[str]:
-    """Paragraph on the test views with pixels that no training view saw."""
+    """Return a paragraph on the test views in which more than 1 % of the pixels outside the mask were never seen.
+
+    The paragraph names at most twelve test views, those with the largest unseen shares first. The list is empty if
+    there is no such view or the stage `evaluate` has not run.
+    """
     rows = load_views(job.folders["evaluate"] / "per_view.csv") if "evaluate" in job.folders else {}
     shares = {name: row["unseen_share"] for name, row in rows.items() if row.get("unseen_share", 0) > MIN_UNCOVERED}
     if not shares:

@@ -1,4 +1,4 @@
-"""A finished scene for other tools: `python -m report.export --scene X` (`make scene=X export`)."""
+"""Export of a finished scene for other tools: `python -m report.export --scene X` (`make scene=X export`)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,13 @@ LORA_FILE = "pytorch_lora_weights.safetensors"
 
 
 def make(home: Path) -> list[str]:
-    """Write runs/<scene>/export/; return one line for each file or folder.
+    """Write runs/<scene>/export/: the Gaussians, cameras, photographs and the LoRA in common formats.
+
+    Args:
+        home: runs/<scene> or runs/<scene>@<variant>, with a finished stage `evaluate`.
+
+    Returns:
+        One line for each written file or folder, with its path and a description.
 
     Raises:
         ValueError: the stage `evaluate` has not run, or gsply is not installed.
@@ -60,7 +66,12 @@ def make(home: Path) -> list[str]:
 
 
 def viewer_caveats(path: Path, antialiased: bool) -> str:
-    """Properties of the file that some viewers do not support, as text to append."""
+    """Return a text with the properties of a .ply file that some viewers do not support; empty if there are none.
+
+    Args:
+        path: the .ply file.
+        antialiased: True if its Gaussians were fitted with the 2D filter of Mip-Splatting.
+    """
     with open(path, "rb") as file:
         exact = b"property double x" in file.read(HEADER)
     doubles = (

@@ -1,4 +1,9 @@
-"""Gaussians of a finished scene that were kept, added and removed, from the initialization to the result."""
+"""Gaussians of a finished scene in three layers: kept, added and removed.
+
+*Kept* Gaussians belong to the fit and remain in the result. *Added* Gaussians fill the hole. *Removed* Gaussians are
+those that the stage `masks` labelled: the object. The *states* of a scene are the initialization, snapshots during the
+distillation, and the result.
+"""
 
 from __future__ import annotations
 
@@ -15,30 +20,41 @@ from reffusion.io.ply import load_ply
 from reffusion.types import Gaussians, Similarity
 from report.sheet import stage_folder
 
-SAME_DISTANCE = 1e-5  # in units of the extent (1): nearer Gaussians of two files are the same one
+SAME_DISTANCE = 1e-5  # in units of the scene's extent (1): Gaussians of two files closer than this are the same one
 
 
 @dataclass(frozen=True)
 class GaussianLayers:
-    """Gaussians of a finished scene.
+    """Kept, added and removed Gaussians of a finished scene, in the normalised frame.
 
     Attributes:
-        states: title -> (kept, added) Gaussians, from the initialization to the result.
-        removed: Gaussians that were removed; may be empty.
+        states: title of a state -> (kept Gaussians, added Gaussians), in order from the initialization to the result.
+        removed: Gaussians of the object; may be empty.
     """
 
     states: dict[str, tuple[Gaussians, Gaussians]]
     removed: Gaussians
 
     def select(self, state: str, kept: bool, added: bool, removed: bool) -> Gaussians:
-        """The chosen parts of a state, as one scene."""
+        """Return the chosen layers of a state as one set of Gaussians.
+
+        Args:
+            state: title of the state, a key of `states`.
+            kept: True includes the kept Gaussians.
+            added: True includes the added Gaussians.
+            removed: True includes the removed Gaussians, which are the same in all states.
+        """
         parts = zip((*self.states[state], self.removed), (kept, added, removed), strict=True)
         chosen = [part if include else part.map(lambda p: p[:0]) for part, include in parts]
         return reduce(lambda one, other: one.zip_map(other, lambda a, b: torch.cat([a, b])), chosen)
 
 
 def load_layers(home: Path, similarity: Similarity) -> GaussianLayers:
-    """Load the layers of runs/<scene> or runs/<scene>@<variant>; `similarity` is the scene's.
+    """Load the layers of runs/<scene> or runs/<scene>@<variant>.
+
+    Args:
+        home: the folder.
+        similarity: transform from the scene's own frame to the normalised frame.
 
     Raises:
         ValueError: the stage `evaluate` has not run.
@@ -60,21 +76,25 @@ def load_layers(home: Path, similarity: Similarity) -> GaussianLayers:
 
 
 def list_snapshots(distill: Path) -> list[Path]:
-    """Snapshots of the added Gaussians that `distill` saved, in the order of their steps."""
+    """Return the files of the added Gaussians that the stage `distill` saved, in the order of the steps."""
     return sorted((distill / "snapshots").glob("*.ply"), key=lambda path: int(path.stem))
 
 
 def split_new(folder: Path) -> tuple[Gaussians, Gaussians]:
-    """A stage's Gaussians, as (kept, new)."""
+    """Load a stage's Gaussians and split them by their labels into (kept Gaussians, new Gaussians)."""
     gaussians, new = load_ply(folder / "gaussians.ply"), load_labels(folder / "labels.npy")
     return gaussians.map(lambda p: p[~new]), gaussians.map(lambda p: p[new])
 
 
 def find_added(result: Gaussians, folder: Path) -> Tensor:
-    """bool [N]: Gaussians of the finished scene that a stage labelled as new.
+    """Return bool [N], True for the Gaussians of the finished scene that a stage labelled as new.
 
-    They are matched by position, since `finish` removes and adds Gaussians; what it adds around the capture counts as
-    kept.
+    Gaussians are matched by position, because the stage `finish` removes and adds Gaussians. Those that `finish` adds
+    around the capture (the backdrop) count as kept.
+
+    Args:
+        result: the N Gaussians of the finished scene.
+        folder: folder of the stage `distill` or `initialize`.
     """
     from scipy.spatial import cKDTree
 
@@ -86,7 +106,13 @@ def find_added(result: Gaussians, folder: Path) -> Tensor:
 
 
 def load_removed(home: Path, used: set[str], none: Gaussians) -> Gaussians:
-    """Gaussians of the fit that the stage `masks` labelled; `none`, an empty scene, if they are unknown."""
+    """Load the removed Gaussians: those of the fit that the stage `masks` labelled.
+
+    Args:
+        home: runs/<scene> or runs/<scene>@<variant>.
+        used: names of the stages that the result depends on.
+        none: an empty set of Gaussians, which is returned if the removed ones are unknown.
+    """
     masks, fit = stage_folder(home, "masks") / "labels.npy", stage_folder(home, "fit") / "gaussians.ply"
     if not {"masks", "fit"} <= used or not masks.exists() or not fit.exists():
         return none
@@ -95,6 +121,6 @@ def load_removed(home: Path, used: set[str], none: Gaussians) -> Gaussians:
 
 
 def finish_command(home: Path) -> str:
-    """The command that finishes a scene."""
+    """Return the command that runs all stages of a scene, in backticks."""
     scene, _, variant = home.name.partition("@")
     return f"`make scene={scene}{f' variant={variant}' if variant else ''} all`"

@@ -1,4 +1,4 @@
-"""Pictures embedded in a page as data URLs, small enough that a page with a hundred of them can be sent."""
+"""Pictures embedded in a page as data URLs, reduced so that a page with a hundred pictures is small enough to send."""
 
 from __future__ import annotations
 
@@ -18,14 +18,17 @@ COLOURS = 64  # palette size of a chart
 
 
 def photo_address(array: np.ndarray, longest: int) -> str:
-    """Data URL of a picture, uint8 [H, W, 3], reduced to at most `longest` px a side."""
+    """Return the data URL of a picture, uint8 [H, W, 3], as WebP. Its longer side is reduced to `longest` px."""
     factor = min(1.0, longest / max(array.shape[:2]))
     small = resize_image(array, (max(1, round(array.shape[1] * factor)), max(1, round(array.shape[0] * factor))))
     return _address(Image.fromarray(small), "webp", quality=QUALITY)
 
 
 def chart_element(path: Path, alt: str) -> str:
-    """Element of a chart's PNG, wide enough to scroll on a phone, so that its text stays readable."""
+    """Return the HTML element of a chart, with the PNG at `path` embedded.
+
+    The chart scrolls sideways on a narrow screen instead of shrinking, so that its text stays readable.
+    """
     with Image.open(path) as image:
         reduced = image.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
     source = _address(reduced, "png", optimize=True)
@@ -33,13 +36,19 @@ def chart_element(path: Path, alt: str) -> str:
 
 
 def affordable_side(count: int, megabytes: float, least: int, most: int, aspect: float) -> int:
-    """Longer side in px, between `least` and `most`, at which `count` pictures take about `megabytes`."""
+    """Return the longer side in px at which `count` pictures together take about `megabytes`.
+
+    Args:
+        least: smallest result, px.
+        most: largest result, px.
+        aspect: width over height of the pictures, or height over width.
+    """
     pixels = megabytes * 1e6 / max(count, 1) / BYTES_PER_PIXEL
     return round(min(most, max(least, (pixels * max(aspect, 1 / aspect)) ** 0.5)))
 
 
 def picture_grid(cells: list[tuple[str, str]]) -> str:
-    """Pictures in a responsive grid; cells are (address, caption)."""
+    """Return an HTML grid of pictures that adapts to the width of the screen; cells are (address, caption)."""
     lines = [
         f'<figure><img src="{address}" alt="{escape(words)}"><figcaption>{escape(words)}</figcaption></figure>'
         for address, words in cells

@@ -1,4 +1,6 @@
-"""Report on a scene's job: errors against time, seconds, pictures, what was left out and why.
+"""Report on a scene's job: errors against time, seconds, pictures, and skipped stages with the reasons.
+
+A *job* is all stages of one scene, or of one variant of a scene, that have run.
 
 python -m report.job --scene X --runs runs          runs/X/report.html, one file
 python -m report.job --data FOLDER --runs runs      runs/report/index.html, of all scenes in the folder
@@ -51,7 +53,14 @@ RESULTS = {
 
 
 def make(home: Path) -> Path:
-    """Write runs/<scene>/report.html, which needs no other file, and return its path."""
+    """Write the report of a job to `home`/report.html and return its path. The page needs no other file.
+
+    Args:
+        home: runs/<scene> or runs/<scene>@<variant>.
+
+    Raises:
+        ValueError: no stage has been done.
+    """
     job = load_job(home)
     title = f"{home.name}: what was done"
     seconds = sum(receipt["seconds"] for receipt in job.receipts.values())
@@ -84,7 +93,7 @@ def make(home: Path) -> Path:
 
 
 def summarize_result(job: JobFiles) -> str:
-    """The result in one sentence."""
+    """Return one sentence on the result: its number of Gaussians and its mean scores, as far as known."""
     mean, counts = job.metrics.get("mean", {}), job.metrics.get("gaussians", {})
     if not job.metrics:
         return "It is not evaluated yet."
@@ -103,7 +112,7 @@ def summarize_result(job: JobFiles) -> str:
 
 
 def unfinished_note(job: JobFiles) -> list[str]:
-    """Paragraph with the stages that still have to run."""
+    """Return a paragraph with the names of the stages that still have to run; empty if there are none."""
     due = [stage for stage, entry in job.plan.items() if entry["word"] not in ("cached", "skip", "provided")]
     if not job.plan:
         due = [stage for stage in ("poses", "fit", "evaluate") if stage not in job.folders]
@@ -111,7 +120,11 @@ def unfinished_note(job: JobFiles) -> list[str]:
 
 
 def capture_notes(job: JobFiles) -> list[str]:
-    """Selected video frames, the outcome of structure from motion, and warnings about the photographs."""
+    """Return a list of notes on the capture; empty if there are none.
+
+    The notes are on the frames selected from a video, on structure from motion, and the warnings of the stages
+    `poses`, `raw_masks` and `masks`.
+    """
     record = job.home.with_name(job.home.name.split("@")[0]) / "frames" / "frames.json"
     lines = [load_json(record)["said"]] if record.is_file() else []
     if "poses" in job.folders:
@@ -123,7 +136,11 @@ def capture_notes(job: JobFiles) -> list[str]:
 
 
 def whole_job_section(job: JobFiles, out: Path) -> list[str]:
-    """The whole job over time, and the scores of initialization and result."""
+    """Return the section with the chart of the whole job over time, and the scores of initialization and result.
+
+    Args:
+        out: folder for the chart's file.
+    """
     draw_job(job, out / "job.png")
     parts = [
         page.heading("The whole job"),
@@ -138,7 +155,11 @@ def whole_job_section(job: JobFiles, out: Path) -> list[str]:
 
 
 def draw_job(job: JobFiles, path: Path, ceiling: float | None = None) -> None:
-    """Chart PSNR and stages against seconds; for `ceiling` see `trace_charts.draw_job_chart`."""
+    """Draw the PSNR and the stages of a job against seconds into the PNG `path`.
+
+    Args:
+        ceiling: PSNR in dB of a dashed line, see `trace_charts.draw_job_chart`.
+    """
     seconds = {stage: receipt["seconds"] for stage, receipt in job.receipts.items()}
     lines = {stage: series.get("", []) for stage, series in job.traces.items()}
     result = job.metrics.get("result", "")
@@ -148,7 +169,7 @@ def draw_job(job: JobFiles, path: Path, ceiling: float | None = None) -> None:
 
 
 def score_table(job: JobFiles) -> list[str]:
-    """Mean metrics of the result, and of the initialization beside them."""
+    """Return a table of mean scores with a row for the initialization and one for the result; empty without scores."""
     after, initial = job.metrics.get("mean", {}), job.metrics.get("initialize", {})
     names = [name for name, value in after.items() if value is not None]
     if not names:
@@ -162,7 +183,11 @@ def score_table(job: JobFiles) -> list[str]:
 
 
 def stage_sections(job: JobFiles, out: Path) -> list[str]:
-    """A chart for each stage with a trace."""
+    """Return headings and charts of all stages with a trace, and the reasons why traces could not be read.
+
+    Args:
+        out: folder for the charts' files.
+    """
     parts = []
     for stage, series in job.traces.items():
         path = out / f"{stage}.png"
@@ -176,7 +201,7 @@ def stage_sections(job: JobFiles, out: Path) -> list[str]:
 
 
 def skipped_section(job: JobFiles) -> list[str]:
-    """The runner's reasons for stages that were left out, brought by the scene, or still have to run."""
+    """Return a table of the stages that were skipped, provided by the scene, or still have to run, with the reasons."""
     if not job.plan:
         return []
     rows = [
@@ -189,7 +214,7 @@ def skipped_section(job: JobFiles) -> list[str]:
 
 
 def receipts_section(job: JobFiles) -> list[str]:
-    """Seconds, memory and machine of each stage; versions once."""
+    """Return a table of seconds, memory and machine of each stage, and the versions of libraries."""
     total = sum(receipt["seconds"] for receipt in job.receipts.values())
     rows = []
     for stage, r in job.receipts.items():
@@ -209,7 +234,7 @@ def receipts_section(job: JobFiles) -> list[str]:
 
 
 def files_section(job: JobFiles) -> list[str]:
-    """Links to the result files."""
+    """Return a list of links to the result files that exist."""
     targets = {"turntable.webm: video around the capture": "turntable.webm"}
     targets = targets if (job.home / "turntable.webm").is_file() else {}
     for name, words in RESULTS.items():

@@ -1,4 +1,8 @@
-"""Files of a scene's job: its plan, artifacts, receipts, traces and scores."""
+"""Files of a scene's job: the plan, and the stages' folders, receipts, traces and scores.
+
+A *job* is all stages of one scene, or of one variant of a scene. A *receipt* (receipt.json) records a stage's inputs,
+parameters, seconds and memory. A *trace* (trace.jsonl) records a stage's errors over time.
+"""
 
 from __future__ import annotations
 
@@ -19,17 +23,20 @@ STAGES = (
 
 @dataclass(frozen=True)
 class JobFiles:
-    """A scene's job as it lies on the disk.
+    """Files of a job, as loaded from the disk.
 
     Attributes:
         home: runs/<scene>, or runs/<scene>@<variant>.
-        plan: stage -> word, reason, notes, as the runner wrote them to plan.json; may be empty, see `load_plan`.
-        unset: stage -> all its parameters without the command line's `set=` and `budget=`; may be empty.
-        folders: stage -> its artifact, in order; a variant shares artifacts with the scene's own run.
-        receipts: stage -> receipt.json.
-        traces: stage -> series -> lines.
-        unread: reasons why traces could not be read.
-        metrics: metrics.json, or empty.
+        plan: stage -> {"word": status such as "cached", "skip" or "run", "reason", "notes", "folder"}, from plan.json;
+            may be empty, see `load_plan`.
+        unset: stage -> all parameters as they would be without `set=` and `budget=` on the command line; empty if no
+            plan was recorded.
+        folders: stage -> folder that the stage wrote, in the order of the stages, for stages that are done and not
+            skipped. A variant shares folders with the scene's own run.
+        receipts: stage -> content of receipt.json.
+        traces: stage -> series -> lines of the trace.
+        unread: reasons why traces could not be read, one per trace.
+        metrics: content of metrics.json; empty if the job is not evaluated.
     """
 
     home: Path
@@ -43,7 +50,11 @@ class JobFiles:
 
 
 def load_job(home: Path) -> JobFiles:
-    """Load a job; ValueError if no stage has been done."""
+    """Load the job in runs/<scene> or runs/<scene>@<variant>.
+
+    Raises:
+        ValueError: no stage has been done.
+    """
     plan = load_plan(home)
     names = list(plan or STAGES)
     planned = {s: home.parent / plan[s]["folder"] if plan and plan[s]["folder"] else None for s in plan}
@@ -67,7 +78,10 @@ def load_job(home: Path) -> JobFiles:
 
 
 def load_plan(home: Path) -> dict[str, dict[str, Any]]:
-    """Stages of plan.json; empty if there is none, or a stage was done after it was written."""
+    """Load the stages of plan.json, see `JobFiles.plan`.
+
+    The result is empty if there is no plan.json, or if a stage was done later and plan.json is therefore out of date.
+    """
     path = home / "plan.json"
     if not path.exists() or any(r.stat().st_mtime > path.stat().st_mtime for r in home.glob("*/receipt.json")):
         return {}

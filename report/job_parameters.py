@@ -1,4 +1,4 @@
-"""Parameters of a job that differ from their defaults, and the command that repeats the job."""
+"""Sections of the report on parameters that differ from their defaults, and on the command that repeats the job."""
 
 from __future__ import annotations
 
@@ -14,7 +14,11 @@ from report.job_data import JobFiles
 
 
 def flatten_parameters(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted names and values of nested groups."""
+    """Yield (dotted name, value) of all parameters in nested groups, e.g. ("lora.rank", 8) of {"lora": {"rank": 8}}.
+
+    Args:
+        prefix: text to put before each name.
+    """
     for name, value in values.items():
         if isinstance(value, dict):
             yield from flatten_parameters(value, f"{prefix}{name}.")
@@ -23,7 +27,7 @@ def flatten_parameters(values: dict[str, Any], prefix: str = "") -> Iterator[tup
 
 
 def default_parameters(stage: str) -> dict[str, Any]:
-    """Dotted name -> default value; empty for a stage that this code does not know."""
+    """Return {dotted name: default value} of a stage's parameters; empty for a stage that this code does not know."""
     try:
         params = import_module(f"reffusion.params.{stage}").Params()
     except ModuleNotFoundError:
@@ -32,7 +36,10 @@ def default_parameters(stage: str) -> dict[str, Any]:
 
 
 def command_line_parameters(job: JobFiles) -> dict[str, Any]:
-    """stage.parameter -> value, for parameters set by `set=` or `budget=`; empty if no plan was recorded."""
+    """Return {"stage.parameter": value} for the parameters that `set=` or `budget=` changed on the command line.
+
+    The result is empty if no plan was recorded.
+    """
     unset = {stage: dict(flatten_parameters(values)) for stage, values in job.unset.items()}
     return {
         f"{stage}.{name}": value
@@ -43,7 +50,10 @@ def command_line_parameters(job: JobFiles) -> dict[str, Any]:
 
 
 def parameters_section(job: JobFiles) -> list[str]:
-    """Table of parameters that differ from the defaults, those set on the command line first."""
+    """Return the section with the parameters that differ from their defaults.
+
+    Parameters changed on the command line get a table of their own, which comes first.
+    """
     overrides, override_rows, rows = command_line_parameters(job), [], []
     for stage, receipt in job.receipts.items():
         defaults = default_parameters(stage)
@@ -72,7 +82,7 @@ def _short(value: Any) -> str:
 
 
 def reproduce_section(job: JobFiles) -> list[str]:
-    """The command that repeats the job."""
+    """Return the section with the command that repeats the job."""
     name, _, variant = job.home.name.partition("@")
     source = job.home.with_name(name) / "source"
     scene = load_scene_argument(source, name)
@@ -86,7 +96,14 @@ def reproduce_section(job: JobFiles) -> list[str]:
 
 
 def load_scene_argument(path: Path, name: str) -> str:
-    """The scene's name on the command line: its name below data/, else its path, or the path of a video."""
+    """Return the value of `scene=` on the command line that runs the scene.
+
+    This is the name of a folder in data/, the path of another folder, or the path of a video.
+
+    Args:
+        path: file that records the path of the scene's folder.
+        name: name of the scene.
+    """
     source = path.read_text(encoding="utf-8").strip() if path.is_file() else name
     record = path.parent / "frames" / "frames.json"
     if record.is_file() and Path(source).name == "frames":

@@ -1,4 +1,8 @@
-"""Picture sections of a job's page: masks, references, extra completed views, depth."""
+"""Sections of the report with pictures: masks, references, extra views, depth.
+
+An *extra view* is a further view that the stage `initialize` completed from photographs, because no reference shows
+some places that the object hid.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +22,20 @@ from report.check import overlay_masks, view_role
 from report.job_data import JobFiles
 from report.sheet import pick_evenly
 
-MAX_MASK_VIEWS, FIRST_MASK_VIEWS, MASK_SIDE = 60, 12, 240  # most views, views visible at once, longer side in px
+MAX_MASK_VIEWS, FIRST_MASK_VIEWS, MASK_SIDE = 60, 12, 240  # most views, views shown unfolded, longer side in px
 REFERENCE_SIDE, DEPTH_SIDE = 640, 480  # longer side, px
 DEPTH_VIEWS = 4  # number of views
-REMOVED, INVENTED = (255, 210, 0), (0, 230, 230)  # outline colours
+REMOVED, INVENTED = (255, 210, 0), (0, 230, 230)  # outline colours of consistent masks and of invent masks
 MIN_ALPHA = 0.5  # below this alpha there is no depth
 RESULTS = ("distill", "initialize", "fit")  # stages with Gaussians, latest first
 
 
 def masks_section(job: JobFiles) -> list[str]:
-    """Masks over photographs: input masks tinted, the classes from the stage `masks` outlined."""
+    """Return the section on masks: photographs with tinted input masks and the outlines of the pixel classes.
+
+    The outlined classes are the consistent mask (pixels that show the object, the same in all views) and the invent
+    mask (pixels that are made up). Both come from the stage `masks`.
+    """
     poses, raw_masks = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))
     top = page.heading("Masks")
     if not (poses / "views.json").is_file() or not any((raw_masks / "masks").rglob("*.png")):
@@ -56,7 +64,10 @@ def masks_section(job: JobFiles) -> list[str]:
 
 
 def remnant_pictures(job: JobFiles) -> list[str]:
-    """Pictures of the parts of the object that the masks seem to leave out, largest first."""
+    """Return HTML parts with pictures of the parts of the object that the masks seem to leave out, largest first.
+
+    The list is empty if the stage `masks` has not run or found no such part.
+    """
     pictures = sorted((job.folders.get("masks", Path()) / "remnants").glob("*.png"), key=lambda path: int(path.stem))
     if "masks" not in job.folders or not pictures:
         return []
@@ -66,7 +77,12 @@ def remnant_pictures(job: JobFiles) -> list[str]:
 
 
 def draw_mask_classes(job: JobFiles, poses: Path, name: str) -> np.ndarray:
-    """uint8 [h, w, 3]: the reduced photograph with its mask tinted and its pixel classes outlined."""
+    """Return a reduced photograph, uint8 [h, w, 3], with its input mask tinted and its pixel classes outlined.
+
+    Args:
+        poses: folder of the stage `poses`, which has the photographs.
+        name: name of the view.
+    """
     small = np.ascontiguousarray(overlay_masks(poses, job.folders.get("raw_masks", Path()), name))
     for kind, colour in (("consistent", REMOVED), ("invent", INVENTED)):
         path = job.folders.get("masks", Path()) / kind / f"{name}.png"
@@ -76,7 +92,12 @@ def draw_mask_classes(job: JobFiles, poses: Path, name: str) -> np.ndarray:
 
 
 def draw_outline(picture: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int]) -> None:
-    """Draw the outline of a mask of any size into a picture, uint8 [H, W, 3], in place."""
+    """Draw the outline of a mask into a picture, uint8 [H, W, 3], in place.
+
+    Args:
+        mask: bool [h, w], True inside, of the picture's aspect but of any size.
+        colour: RGB.
+    """
     scale = picture.shape[1] / mask.shape[1]
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     moved = [((contour + 0.5) * scale - 0.5).round().astype(np.int32) for contour in contours]
@@ -84,7 +105,10 @@ def draw_outline(picture: np.ndarray, mask: np.ndarray, colour: tuple[int, int, 
 
 
 def references_section(job: JobFiles) -> list[str]:
-    """Each reference beside its photograph, the hole outlined, with its origin and fit."""
+    """Return the section on references: each reference with its outlined hole, beside its photograph and its depth.
+
+    The caption says where the reference comes from and, if it was given by the user, how well it fits its photograph.
+    """
     folder, poses = job.folders.get("reference", Path()), job.folders.get("poses", Path())
     top = page.heading("References")
     if "reference" not in job.folders:
@@ -120,7 +144,13 @@ def _facts(folder: Path) -> dict:
 
 
 def _origin(facts: dict, folder: Path, name: str) -> str:
-    """Where a reference comes from and how well it fits."""
+    """Return in words where a reference comes from and, if it was given, how well it fits its photograph.
+
+    Args:
+        facts: content of facts.json of the stage `reference`.
+        folder: folder of the stage `reference`.
+        name: name of the reference's view.
+    """
     if name in facts.get("given", ()):
         return f"given; {facts.get('fits', {}).get(name, 'how well it fits was not recorded')}"
     path = folder / "candidates.json"
@@ -133,7 +163,7 @@ def _origin(facts: dict, folder: Path, name: str) -> str:
 
 
 def extra_views_section(job: JobFiles) -> list[str]:
-    """Views that were completed in addition to the references, and why."""
+    """Return HTML parts with the extra views and the reason for them; empty if there are none."""
     folder = job.folders.get("initialize", Path())
     shares = _facts(folder).get("extra_views", {}) if "initialize" in job.folders else {}
     if not shares:
@@ -150,7 +180,7 @@ def extra_views_section(job: JobFiles) -> list[str]:
 
 
 def depth_section(job: JobFiles) -> list[str]:
-    """Depth of a few views before and after, in the same colours."""
+    """Return the section on depth: a few views of the fit and of the latest Gaussians, coloured on the same scale."""
     stages = [s for s in RESULTS if s in job.folders and (job.folders[s] / "gaussians.ply").is_file()]
     top = page.heading("Depth, before and after")
     if not stages or "fit" not in stages or "poses" not in job.folders:
@@ -169,13 +199,19 @@ def depth_section(job: JobFiles) -> list[str]:
 
 
 def render_depth(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """[H, W]: camera z, 0 where alpha is below `MIN_ALPHA`."""
+    """Render a depth map [H, W] of camera z, 0 where alpha is `MIN_ALPHA` or less."""
     rendering = rasterizer.render(gaussians, camera, sh_degree=0)
     return np.where(rendering.alpha.numpy() > MIN_ALPHA, rendering.depth.numpy(), 0.0)
 
 
 def color_disparity(depths: list[np.ndarray]) -> list[np.ndarray]:
-    """uint8 [H, W, 3] each: disparity in colours, on the scale of the first map."""
+    """Return a picture of each depth map, uint8 [H, W, 3], with disparity (1 / depth) in colours.
+
+    Bright means near, grey means unknown. The first map determines the scale of colours for all maps.
+
+    Args:
+        depths: [H, W] each, camera z, 0 where unknown.
+    """
     from matplotlib import colormaps
 
     near = [np.where(depth > 0, 1 / np.where(depth > 0, depth, 1.0), np.nan) for depth in depths]

@@ -1,7 +1,7 @@
 """Masks from clicks in a browser: `python -m report.mask --scene demo` (`make scene=X mask`).
 
-Runs the stages `poses` and `raw_masks`, serves the page on this machine only, and meanwhile fits the scene, which masks
-of all views need.
+The command runs the stages `poses` and `raw_masks`, then serves the page on this machine only. The stage `fit` runs in
+the background, because masks of all views need the fitted Gaussians.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PAGE = Path(__file__).with_name("mask.html")
 THUMBNAIL = 160  # longer side, px
 MAX_REQUEST_BYTES = 2_000_000
 LOG_TAIL_BYTES = 4000
-BAR = re.compile(r"(\d+)/(\d+) \[[^<\]]*<([\d:]+)")  # of a progress bar: done, total, time left
+BAR = re.compile(r"(\d+)/(\d+) \[[^<\]]*<([\d:]+)")  # a progress bar's steps done, total steps, and time left
 TINT = (255, 0, 160)
 # The page is one file and contacts no other server.
 POLICY = "default-src 'none'; img-src 'self' data:; connect-src 'self'; "
@@ -37,7 +37,17 @@ POLICY += "style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
 
 class Server(ThreadingHTTPServer):
-    """HTTP server of a session on the loopback interface; takes the next free port if `port` is in use."""
+    """HTTP server of the mask page for one session, on the loopback interface.
+
+    Args:
+        session: marks and masks that the page shows and changes.
+        port: port to listen on; if it is in use, the next free one of the following 99 is taken.
+        fit: process of the stage `fit`; None if no fit runs.
+        next_command: command that the page suggests after saving.
+
+    Raises:
+        ValueError: none of the 100 ports is free.
+    """
 
     daemon_threads = True
 
@@ -56,7 +66,7 @@ class Server(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_address[1]}/"
 
     def state(self) -> dict:
-        """The session's state, and that of the fit."""
+        """Return the JSON state of the page: the session's state, whether the fit runs, and the progress of the fit."""
         running = self.fit is not None and self.fit.poll() is None
         log = self.session.capture.fit.with_suffix(".log")
         progress = read_progress(log) if running and log.is_file() else None
@@ -64,8 +74,12 @@ class Server(ThreadingHTTPServer):
 
 
 def read_progress(log: Path) -> dict[str, object] | None:
-    """The share done and the time left of a running stage, from the last progress bar in its log; None if there is
-    none."""
+    """Read the progress of a running stage from the last progress bar in the stage's log.
+
+    Returns:
+        {"share": done steps over all steps in [0, 1], "left": remaining time as the bar prints it, e.g. "01:20"}, or
+        None if the log has no progress bar.
+    """
     with open(log, "rb") as file:
         file.seek(max(0, log.stat().st_size - LOG_TAIL_BYTES))
         found = BAR.findall(file.read().decode("utf-8", "replace"))
@@ -76,6 +90,8 @@ def read_progress(log: Path) -> dict[str, object] | None:
 
 
 class Handler(BaseHTTPRequestHandler):
+    """Handler of the page's requests: GET sends page, state, photographs and masks; POST changes marks or saves."""
+
     server: Server
 
     def do_GET(self) -> None:
@@ -119,7 +135,11 @@ class Handler(BaseHTTPRequestHandler):
             self._send_json(HTTPStatus.BAD_REQUEST, {"error": str(error)})
 
     def _is_local_request(self) -> bool:
-        """False for requests that other pages in the same browser send, under their own origin or another host name."""
+        """Return True if the request comes from this server's own page.
+
+        Other pages in the same browser can send requests to this server too. Their requests have another origin or host
+        name and are refused.
+        """
         own = f"127.0.0.1:{self.server.server_address[1]}"
         local = (own, own.replace("127.0.0.1", "localhost"))
         origin = self.headers.get("Origin")
@@ -138,7 +158,7 @@ class Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, *_: object) -> None:
-        """Log nothing: the terminal shows the progress of the fit."""
+        """Ignore log messages of the server, because the terminal shows the progress of the fit."""
 
 
 def _jpeg(image: np.ndarray, small: bool) -> bytes:
@@ -150,7 +170,7 @@ def _jpeg(image: np.ndarray, small: bool) -> bytes:
 
 
 def _mask_png(mask: np.ndarray) -> bytes:
-    """PNG of a mask: tinted inside, opaque border, transparent elsewhere."""
+    """Return a mask, bool [H, W], as PNG bytes: translucent inside, with an opaque border, transparent elsewhere."""
     inner = mask.copy()
     inner[1:-1, 1:-1] = mask[1:-1, 1:-1] & mask[:-2, 1:-1] & mask[2:, 1:-1] & mask[1:-1, :-2] & mask[1:-1, 2:]
     overlay = np.zeros((*mask.shape, 4), np.uint8)
@@ -162,7 +182,11 @@ def _mask_png(mask: np.ndarray) -> bytes:
 
 
 def stage_command(stage: str, arguments: argparse.Namespace) -> list[str]:
-    """Command that runs a stage of a scene that may have no masks yet."""
+    """Return the command line that runs a stage of a scene, even if the scene has no masks yet.
+
+    The option `poses.clicks={}` announces that masks will come from clicks, so that the stages accept a scene without
+    masks.
+    """
     options = {"--profile": arguments.profile, "--budget": arguments.budget}
     flags = [word for name, value in options.items() if value for word in (name, value)]
     words = ["run", stage, "--scene", str(arguments.scene), "--runs", str(arguments.runs), *flags]
@@ -193,7 +217,11 @@ def main() -> None:
 
 
 def serve(session: Session, arguments: argparse.Namespace, fit: subprocess.Popen) -> None:
-    """Serve the page until Ctrl-C. ValueError if no port is free."""
+    """Print the page's address and serve the page until Ctrl-C.
+
+    Raises:
+        ValueError: no port is free.
+    """
     profile = f" profile={arguments.profile}" if arguments.profile else ""
     server = Server(session, arguments.port, fit, f"make scene={arguments.scene}{profile} all")
     port = server.server_address[1]

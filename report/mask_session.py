@@ -1,4 +1,8 @@
-"""State behind the mask page: the marks, the masks that follow from them, and the files they are saved to."""
+"""State of the mask page: the user's marks, the masks computed from the marks, and the files to which both are saved.
+
+A *mark* is a click or a brush stroke in one view, on the object or on the background. A *given* mask is one that the
+user put into the scene's folder; the page never changes it.
+"""
 
 from __future__ import annotations
 
@@ -38,17 +42,19 @@ from reffusion.params.raw_masks import Params
 from reffusion.types import Gaussians
 from report import sheet
 
-KEPT_RESULTS = 64  # numbers of marks whose masks stay in memory
+KEPT_RESULTS = 64  # number of intermediate results (masks after some of the marks) that stay in memory
 
 
 @dataclass(frozen=True)
 class Capture:
-    """What the page knows of a scene.
+    """Folders and given masks of the scene that is marked.
 
     Attributes:
-        folder: of the scene; masks: its folder of masks.
-        poses: artifact of the stage `poses`; fit: where the artifact of `fit` is, or will be.
-        given: view -> bool [H, W], masks that the page did not write.
+        folder: folder of the scene.
+        masks: folder to which the page writes masks, inside `folder` or where the scene keeps its masks.
+        poses: folder of the stage `poses`.
+        fit: folder of the stage `fit`; may not exist yet.
+        given: view -> bool [H, W], True on the object: the masks that the page did not write.
     """
 
     folder: Path
@@ -59,10 +65,14 @@ class Capture:
 
 
 def load_capture(home: Path) -> Capture:
-    """Load runs/<scene>, after its stage `raw_masks`.
+    """Load folders and given masks of a scene whose stage `raw_masks` has run.
+
+    Args:
+        home: runs/<scene> or runs/<scene>@<variant>.
 
     Raises:
-        ValueError: the stage has not run, or scene.yaml leaves the page no place to write masks to.
+        ValueError: the stage has not run, or masks that the page could write would not suit the scene, because
+            scene.yaml has `masks: none`, or the scene's masks distinguish several objects or are not white on black.
     """
     poses, raw_masks = (sheet.stage_folder(home, stage) for stage in ("poses", "raw_masks"))
     if not (raw_masks / "receipt.json").is_file():
@@ -84,7 +94,7 @@ def load_capture(home: Path) -> Capture:
 
 
 def file_digest(path: Path) -> str:
-    """Hash of a file's content."""
+    """Return a hash of a file's content, as hexadecimal digits."""
     return hashlib.blake2b(path.read_bytes(), digest_size=10).hexdigest()
 
 
@@ -97,21 +107,27 @@ def _saved_marks(folder: Path) -> dict:
 
 
 class Superseded(Exception):
-    """The marks changed while masks were computed from them."""
+    """Exception that stops the computation of masks because the user has changed the marks."""
 
 
 class Session:
-    """The marks on a scene. Safe to call from several threads.
+    """The user's marks on a scene, and the masks of its views. All methods may be called from several threads.
 
-    A background thread computes the masks. Before the scene is fitted, a mark changes the mask of its own view alone;
-    afterwards the masks of all views follow, see `reffusion.clicks.scene_segmentation`. The masks after each mark are
-    kept, so that a further mark, or undoing the last one, computes little.
+    A background thread computes the masks. Until the scene is fitted, a mark changes only the mask of its own view.
+    After the fit, marks determine the masks of all views, see `reffusion.clicks.scene_segmentation`. The masks after
+    each mark stay in memory, so that adding a mark, or removing the last one, takes little computation.
+
+    Args:
+        capture: folders and given masks of the scene.
+        is_fitted: returns True once the stage `fit` has finished.
+        segmenter: network that segments around clicks; None segments by colours and surfaces.
     """
 
     def __init__(self, capture: Capture, is_fitted: Callable[[], bool], segmenter: Segmenter | None = None):
         self.capture, self.scene = capture, load_scene(capture.poses)
         self.segmenter, self.unsaved = segmenter, False
-        self.is_fitted = is_fitted  # of these poses? the folder may still hold a fit of earlier ones
+        # A callback, because the folder of the fit may still contain a fit to earlier poses.
+        self.is_fitted = is_fitted
         self.views = [name for name in self.scene.train if name not in self.scene.clean]
         self.lenses, self.sizes = load_lenses(capture.poses)[0], load_photograph_sizes(capture.poses)
         self.images = load_views(capture.poses, self.views)
@@ -119,8 +135,9 @@ class Session:
         self.masks, self.versions = dict(capture.given), dict.fromkeys(self.views, 0)
         self.gaussians: Gaussians | None = None
         self.results: dict[Hashable, Masks] = {}  # keys of `segment_scene` -> masks
-        self.revision, self.solved_revision = 0, 0  # of the marks, and of the marks that the masks include
-        self.error = ""  # why the masks of the latest revision could not be computed
+        # `revision` grows with each change of the marks. The current masks belong to `solved_revision`.
+        self.revision, self.solved_revision = 0, 0
+        self.error = ""  # reason why the masks of the latest revision could not be computed
         self.lock = threading.Condition(threading.RLock())
         self.features_of = lru_cache(KEPT_VIEWS)(self._encode)
         self.evidence_of = lru_cache(None)(self._load_evidence)
@@ -133,10 +150,17 @@ class Session:
             threading.Thread(target=self._encode_all, daemon=True).start()
 
     def mark(self, name: str, points: Sequence[tuple[float, float]], positive: bool, radius: float = 0.0) -> None:
-        """Add a click (radius 0), or a stroke of a brush; points are in the view's undistorted pixels.
+        """Add a click or a brush stroke.
+
+        Args:
+            name: name of the view.
+            points: (x, y) in pixels of the undistorted view; one point of a click, the path of a stroke.
+            positive: True = on the object, False = on the background.
+            radius: radius of the brush, px; 0 for a click.
 
         Raises:
-            ValueError: the view is unknown or has a mask of its own, or a point lies outside it.
+            ValueError: the view is unknown or has a given mask, there is no point or one lies outside the view, or the
+                radius is negative or larger than the view.
         """
         if name not in self.images:
             raise ValueError(f"there is no view '{name}'")
@@ -151,7 +175,11 @@ class Session:
         self._change(lambda events: [*events, event])
 
     def remove(self, index: int) -> None:
-        """Remove a mark by its index in the order of all marks; -1 is the last one. IndexError if there is none."""
+        """Remove a mark by its index in the order in which all marks were made; -1 is the last one.
+
+        Raises:
+            IndexError: there is no such mark.
+        """
         with self.lock:
             removed = self.events[index]
             self._change(lambda events: [event for event in events if event is not removed])
@@ -161,13 +189,16 @@ class Session:
         self._change(lambda events: [event for event in events if event.view != name])
 
     def save(self) -> dict[str, int]:
-        """Write masks and clicks.json; return how many masks were "written" and how many of the user's were "kept".
+        """Wait for the masks of the latest marks, then write all masks, and the marks to clicks.json.
 
-        Waits for the masks of the latest marks.
+        Masks are written in the pixels of the original, distorted photographs.
+
+        Returns:
+            {"written": number of masks written, "kept": number of given masks, which stay as they are}.
 
         Raises:
             ValueError: there is no mask to write, the masks could not be computed, or a file that the page did not
-                write is in the way.
+                write has the name of a mask to write.
         """
         with self.lock:
             self.lock.wait_for(lambda: self.solved_revision == self.revision)
@@ -193,7 +224,14 @@ class Session:
             return {"written": len(masks), "kept": len(self.capture.given)}
 
     def state(self) -> dict:
-        """What the page shows, as plain JSON values."""
+        """Return the state that the page shows, as plain JSON values.
+
+        Returns:
+            "views": name, size, marks, mask (a number that grows when the mask changes; None without a mask) and
+            whether the mask is given; "fit": True once the fit is loaded; "busy": True while masks are computed;
+            "error": reason why the masks could not be computed, or ""; "unsaved": True if marks have changed since the
+            last save; "folder": folder of the masks.
+        """
         with self.lock:
             views = [
                 {
@@ -231,19 +269,20 @@ class Session:
             self.lock.notify_all()
 
     def _from_photograph(self, saved: dict) -> Event:
-        """A saved mark, whose points are pixels of the distorted photograph."""
+        """Return the mark of an entry of clicks.json, whose points are pixels of the distorted photograph."""
         name = saved["view"]
         points = undistort_points(np.array(saved["points"], float).reshape(-1, 2), self.lenses[name], self.sizes[name])
         return Event(name, Mark(points, saved["sign"] == "+", saved["radius"] / self._photograph_scale(name)))
 
     def _to_photograph(self, event: Event) -> dict:
+        """Return a mark's entry for clicks.json, the inverse of `_from_photograph`."""
         name, mark = event.view, event.mark
         points = distort_points(mark.points, self.lenses[name], self.sizes[name]).round(1).tolist()
         radius = round(mark.radius * self._photograph_scale(name), 2)
         return {"view": name, "points": points, "sign": "+" if mark.positive else "-", "radius": radius}
 
     def _photograph_scale(self, name: str) -> float:
-        """Pixels of the photograph per pixel of the view."""
+        """Return the scale of a view: the number of pixels of the photograph per pixel of the undistorted view."""
         return self.sizes[name][0] / self.lenses[name].width
 
     def _encode(self, name: str) -> ImageFeatures:
@@ -251,7 +290,10 @@ class Session:
         return encode_image(self.segmenter, self.images[name])
 
     def _encode_all(self) -> None:
-        """Encode all views ahead of their use; the fit leaves time for it."""
+        """Encode the first `KEPT_VIEWS` views with the segmentation network before the user marks them.
+
+        A background thread does this while the scene is being fitted.
+        """
         for name in self.views[:KEPT_VIEWS]:
             self.features_of(name)
 
@@ -260,7 +302,7 @@ class Session:
         return load_evidence(self.images[name], self.gaussians, self.scene.cameras[name], self.segmenter, features_of)
 
     def _update_masks(self) -> None:
-        """Background thread: remake the masks whenever marks change, and once the scene is fitted."""
+        """Compute the masks whenever marks change, and once when the scene is fitted; runs in a background thread."""
         while True:
             with self.lock:
                 self.lock.wait_for(lambda: self.solved_revision < self.revision, None if self.gaussians else 1.0)
@@ -275,7 +317,7 @@ class Session:
                 error = ""
             except Superseded:
                 continue
-            except Exception as failure:  # the thread goes on, and the page says why there is no mask
+            except Exception as failure:  # the thread must not end; the page shows the reason
                 traceback.print_exc()
                 error = f"no masks: {failure}"
             with self.lock:
@@ -287,15 +329,19 @@ class Session:
         gaussians = load_ply(self.capture.fit / "gaussians.ply")
         with self.lock:
             self.gaussians = gaussians
-            self.evidence_of.cache_clear()  # the surfaces are known now
+            self.evidence_of.cache_clear()  # evidence from before the fit has no surfaces
             self.results.clear()
             self.revision += bool(self.events)
 
     def _solve(self, events: list[Event], revision: int) -> None:
-        """Compute and show the masks after the events.
+        """Compute the masks that follow from the marks and show them on the page.
+
+        Args:
+            events: the marks, in the order in which they were made.
+            revision: revision of the marks.
 
         Raises:
-            Superseded: the marks changed meanwhile.
+            Superseded: the user changed the marks during the computation.
         """
 
         def evidence_of(name: str) -> ViewEvidence:
@@ -308,7 +354,7 @@ class Session:
             for name in dict.fromkeys(event.view for event in events):
                 masks |= segment_own_view(evidence_of, [event for event in events if event.view == name], self._recall)
         elif events:
-            if not given:  # the marked view first: all views take longer
+            if not given:  # show the marked view's mask early, because the masks of all views take longer
                 first = segment_own_view(evidence_of, events[: count_first(events)], self._recall)
                 self._show(self.masks | first, revision)
             cameras = {name: self.scene.cameras[name] for name in {*self.views, *given}}
@@ -316,7 +362,7 @@ class Session:
         self._show(masks, revision)
 
     def _recall(self, key: Hashable, compute: Callable[[], Masks]) -> Masks:
-        """The result of an earlier computation with this key, or of this one."""
+        """Return the remembered result for a key, or call `compute` and remember its result."""
         if key not in self.results:
             self.results[key] = compute()
             while len(self.results) > KEPT_RESULTS:
@@ -324,6 +370,7 @@ class Session:
         return self.results[key]
 
     def _show(self, masks: dict[str, np.ndarray], revision: int) -> None:
+        """Replace the shown masks; raises Superseded if they do not belong to the latest revision of the marks."""
         with self.lock:
             if revision != self.revision:
                 raise Superseded

@@ -1,4 +1,4 @@
-"""Plain HTML pages: one file without fonts or addresses of other machines."""
+"""Building blocks of plain HTML pages, which load neither fonts nor other content from the network."""
 
 from __future__ import annotations
 
@@ -26,7 +26,14 @@ pre { white-space: pre-wrap; overflow-wrap: anywhere; font-size: .85rem; backgro
 
 
 def document(title: str, body: Sequence[str], style: str = "", script: str = "") -> str:
-    """A whole page. `title` is plain text, the parts of `body` are HTML, `style` and `script` add to the page's own."""
+    """Return a whole HTML page.
+
+    Args:
+        title: plain text.
+        body: parts of the body, HTML.
+        style: CSS to add after `STYLE`.
+        script: JavaScript to run at the end of the page.
+    """
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
     head += f"<title>{escape(title)}</title><style>{STYLE}{style}</style>"
     top = f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>'
@@ -54,9 +61,14 @@ def table(
     text: Sequence[int] = (),
     marked: int | None = None,
 ) -> str:
-    """HTML table.
+    """Return an HTML table.
 
-    `bold` [rows][columns] marks cells, `text` the columns of words (set to the left), `marked` one row.
+    Args:
+        header: plain text, one cell per column.
+        rows: plain text, [rows][columns].
+        bold: [rows][columns], True for cells in bold type; empty for none.
+        text: indices of the columns with words, which are aligned to the left.
+        marked: index of the row with a coloured background; None for no row.
     """
     alignment = lambda column: ' class="text"' if column in text else ""
     lines = ["<tr>" + "".join(f"<th{alignment(n)}>{escape(cell)}</th>" for n, cell in enumerate(header)) + "</tr>"]
@@ -70,35 +82,39 @@ def table(
 
 
 def picture(path: Path, alt: str, embed: bool = False) -> str:
-    """Element of a PNG, by its name beside the page or embedded in the page."""
+    """Return the HTML element of a PNG file.
+
+    Args:
+        embed: True puts the file's content into the page. False refers to the file by name, beside the page.
+    """
     source = f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}" if embed else escape(path.name)
     return f'<img src="{source}" alt="{escape(alt)}">'
 
 
 def code(line: str) -> str:
-    """A command to copy."""
+    """Return a command line as a preformatted HTML block that can be copied."""
     return f"<pre><code>{escape(line)}</code></pre>"
 
 
 def links(targets: dict[str, str]) -> str:
-    """List of links, {text: relative address}."""
+    """Return an HTML list of links from {link text: relative address}."""
     lines = [f'<li><a href="{escape(to)}">{escape(name)}</a></li>' for name, to in targets.items()]
     return "<ul>" + "".join(lines) + "</ul>"
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """The table in Markdown."""
+    """Return a Markdown table; `|` in a cell is replaced by `/`."""
     lines = [header, ["---"] * len(header), *rows]
     return "".join("| " + " | ".join(cell.replace("|", "/") for cell in line) + " |\n" for line in lines)
 
 
 def format_number(value: float | None, digits: int = 0) -> str:
-    """Number with commas between thousands; a dash for None."""
+    """Return a number as text with `digits` decimals and commas between thousands, or a dash for None."""
     return "–" if value is None else f"{value:,.{digits}f}"
 
 
 def format_duration(seconds: float | None) -> str:
-    """Duration as people write it: 48 s, 5 min 20 s, 1 h 5 min."""
+    """Return a duration as text, e.g. "48 s", "5 min 20 s" or "1 h 5 min", or a dash for None."""
     if seconds is None:
         return "–"
     if seconds < 100:

@@ -12,15 +12,15 @@ LEVEL = 0.95  # of confidence
 
 @dataclass(frozen=True)
 class Difference:
-    """Difference of one method to another in a metric.
+    """Difference of one method to another in a metric, on pairs of renders of the same view.
 
     Attributes:
-        mean: over all pairs.
-        pairs: how many.
-        views: half the width of the 95% interval of the paired t over views of all scenes: holds for these scenes. None
-            for fewer than two pairs.
-        scenes: the same over the means of the scenes: holds for another scene of their kind. None for fewer than two
-            scenes.
+        mean: mean difference over all pairs, in units of the metric.
+        pairs: number of pairs.
+        views: half the width of the 95% confidence interval of the mean, from a paired t-test over the views of all
+            scenes. This interval is valid for these scenes only. None for fewer than two pairs.
+        scenes: half the width of the 95% confidence interval of the mean, from a paired t-test over one mean per scene.
+            This interval is valid for other scenes of the same kind too. None for fewer than two scenes.
     """
 
     mean: float
@@ -30,9 +30,11 @@ class Difference:
 
 
 def paired_difference(differences: Sequence[np.ndarray]) -> Difference | None:
-    """Difference over all pairs, or None without pairs.
+    """Return the mean difference over all pairs with its confidence intervals, or None if there are no pairs.
 
-    `differences` holds one array [views] per scene: method minus the other, on the same views.
+    Args:
+        differences: one array [views] per scene: the metric of the first method minus the metric of the second method,
+            for each view.
     """
     scenes = [np.asarray(d, np.float64) for d in differences if len(d)]
     if not scenes:
@@ -42,7 +44,10 @@ def paired_difference(differences: Sequence[np.ndarray]) -> Difference | None:
 
 
 def confidence_half_width(values: np.ndarray) -> float | None:
-    """Half the width of Student's interval of the mean of [n] independent values; None for n < 2."""
+    """Return half the width of Student's 95% confidence interval of the mean of `values` [n]; None for n < 2.
+
+    The values are taken as independent.
+    """
     if len(values) < 2:
         return None
     from scipy.stats import t
@@ -51,9 +56,14 @@ def confidence_half_width(values: np.ndarray) -> float | None:
 
 
 def pareto_front(seconds: Sequence[float], errors: Sequence[float]) -> np.ndarray:
-    """bool [n]: points for which no other is as fast and as good, and better in one of the two.
+    """Return bool [n], True for the points on the Pareto front of run time and error.
 
+    A point is on the front unless another point is at least as fast and at least as good, and better in one of the two.
     Equal points are on the front together.
+
+    Args:
+        seconds: [n] run times.
+        errors: [n] errors; less is better.
     """
     front = np.zeros(len(seconds), bool)
     best = np.inf  # least error of all faster points

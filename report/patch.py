@@ -1,5 +1,8 @@
-"""A patched hole as files for an editor: `python -m report.patch --scene X` (`make scene=X patch`), or without a scene
-`reffusion patch before.ply after.ply --out patched.ply`."""
+"""Export of a filled hole as splat files for an editor: `python -m report.patch --scene X` (`make scene=X patch`).
+
+The scene must consist of two splat files, from before and after a user deleted something in an editor. Without a scene
+folder, the command `reffusion patch before.ply after.ply --out patched.ply` takes the two files and fills the hole.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +18,15 @@ WHOLE, NEW = "patched.ply", "new.ply"
 
 
 def make(home: Path) -> str:
-    """Write patch/patched.ply (the whole scene) and patch/new.ply (the new Gaussians); return what to print.
+    """Write patch/patched.ply (the whole scene) and patch/new.ply (the new Gaussians); return a text to print.
 
-    Both files are in the scene's own frame, with properties in the order of the file that the scene brought.
+    Both files are in the scene's own frame, with properties in the order of the .ply file that the user gave.
 
     Args:
-        home: runs/<scene> or runs/<scene>@<variant>, its stage `evaluate` finished.
+        home: runs/<scene> or runs/<scene>@<variant>, with a finished stage `evaluate`.
 
     Raises:
-        ValueError: nothing was deleted, or that stage has not run.
+        ValueError: the scene does not say what was deleted, or the stage `evaluate` has not run.
     """
     patch = load_result(home)
     similarity, properties = load_scene(patch.poses).similarity, load_property_names(patch.poses / "gaussians.ply")

@@ -1,7 +1,9 @@
-"""Fill a hole from two splat files, without a scene folder: `reffusion patch before.ply after.ply --out patched.ply`.
+"""Filling a hole that two splat files show: `reffusion patch before.ply after.ply --out patched.ply`.
 
-The files, and cameras if given, are linked into runs/patches/<name>/, an ordinary scene folder. A reference can be
-painted there; the same command then continues from what runs/<name>/ holds.
+before.ply is a scene of splats, after.ply the same scene after something was deleted in an editor. No scene folder is
+needed: the command makes one in runs/patches/<name>/, with links to the two files and to the cameras, if given. A user
+may paint a reference and save it in this folder's `painted/`. The same command then continues with the painted
+reference and the cached stages in runs/<name>/.
 """
 
 from __future__ import annotations
@@ -22,11 +24,16 @@ from reffusion.io.splats import summarize_splats
 from report.patch_result import load_result
 
 BEFORE, AFTER, PATCHES = "before", "after", "patches"
-RESERVED_NAMES = (BEFORE, AFTER, "painted", "scene.yaml")  # names in the folder that no linked camera file replaces
+RESERVED_NAMES = (BEFORE, AFTER, "painted", "scene.yaml")  # a camera file of such a name is not linked into the folder
 
 
 def check_arguments(arguments: argparse.Namespace) -> None:
-    """Raise ValueError if the files' headers show that they cannot be used, or the result could not be written."""
+    """Check the command's arguments and the headers of its files before any work.
+
+    Raises:
+        BadInput: there are not exactly two files, a file is not usable, an option is missing or does not fit, or the
+            format of `--out` cannot be written.
+    """
     if len(arguments.files) != 2:
         raise BadInput(f"{arguments.files[0]}: name two files, the scene before and after the object was deleted")
     if arguments.scene or arguments.variant:
@@ -41,7 +48,10 @@ def check_arguments(arguments: argparse.Namespace) -> None:
 
 
 def write_scene_folder(arguments: argparse.Namespace) -> Path:
-    """Write the scene's folder anew, except what was painted there, and return it."""
+    """Write scene.yaml and the links into the scene folder, and return this folder.
+
+    Links of an earlier call are replaced. References that the user painted stay.
+    """
     files = [file.expanduser().resolve() for file in arguments.files]
     folder, names = find_folder(arguments.runs, *files), {}
     for key, file in zip((BEFORE, AFTER), files, strict=True):
@@ -61,7 +71,7 @@ def write_scene_folder(arguments: argparse.Namespace) -> Path:
 
 
 def find_folder(runs: Path, before: Path, after: Path) -> Path:
-    """The scene folder of two files; it depends on their paths only."""
+    """Return the path of the scene folder for two files, which depends on the files' paths but not on their content."""
     files = [file.expanduser().resolve() for file in (before, after)]
     identity = hashlib.blake2b("\n".join(map(str, files)).encode(), digest_size=3).hexdigest()
     stem = re.sub(r"[^\w.,+'() -]", "_", files[0].name.split(".")[0]) or "scene"
@@ -76,10 +86,10 @@ def _link(place: Path, file: Path) -> None:
 
 
 def make(arguments: argparse.Namespace) -> str:
-    """Fill the hole, write `out`, and return what to print.
+    """Fill the hole, write the filled scene to `arguments.out`, and return a text to print.
 
     Raises:
-        ValueError: the files cannot be used.
+        ValueError: the arguments or the files cannot be used.
         SystemExit: a stage was refused, failed or was interrupted.
     """
     check_arguments(arguments)
@@ -97,14 +107,18 @@ def make(arguments: argparse.Namespace) -> str:
 
 
 def run_stages(folder: Path, arguments: argparse.Namespace) -> None:
-    """Run all stages. SystemExit with the runner's code if it fails; the runner has printed the reason."""
+    """Run all stages of the scene folder in a subprocess.
+
+    Raises:
+        SystemExit: the runner failed, with the runner's exit status. The runner has printed the reason.
+    """
     options = {"--profile": arguments.profile, "--budget": arguments.budget, "--set": arguments.set}
     flags = [word for name, value in options.items() if value for word in (name, value)]
     words = ["run", "all", "--scene", str(folder), "--runs", str(arguments.runs.resolve()), *flags]
     process = subprocess.Popen([sys.executable, "-m", "reffusion.command", *words])
     try:
         status = process.wait()
-    except KeyboardInterrupt:  # the runner gets it too and prints how to continue
+    except KeyboardInterrupt:  # the runner receives the same signal and prints how to continue
         status = process.wait()
     if status:
         raise SystemExit(status)

@@ -1,4 +1,4 @@
-"""The result of a scene from which something was deleted."""
+"""Result of a scene whose object a user deleted in an editor, and whose hole was then filled."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PatchResult:
-    """A filled scene.
+    """Scene of Gaussians whose hole is filled.
 
     Attributes:
-        gaussians: in the normalised frame.
-        new: bool [N], the Gaussians that fill the hole.
+        gaussians: all N Gaussians of the result, in the normalised frame.
+        new: bool [N], True for the Gaussians that fill the hole.
         poses: folder of the stage `poses`.
     """
 
@@ -34,7 +34,11 @@ class PatchResult:
 
 
 def load_result(home: Path) -> PatchResult:
-    """Load runs/<scene> or runs/<scene>@<variant>. ValueError if nothing was deleted, or `evaluate` has not run."""
+    """Load the result of runs/<scene> or runs/<scene>@<variant>.
+
+    Raises:
+        ValueError: the scene does not say what was deleted, or the stage `evaluate` has not run.
+    """
     require_deleted(home)
     poses, result = stage_folder(home, "poses"), home / "evaluate" / "scene.ply"
     if not result.exists():
@@ -45,7 +49,11 @@ def load_result(home: Path) -> PatchResult:
 
 
 def require_deleted(home: Path) -> None:
-    """Raise ValueError if the scene does not say what was deleted, according to its stage `poses`."""
+    """Check that the scene says what was deleted: that its stage `poses` has written deleted.npy.
+
+    Raises:
+        ValueError: the file is missing; the message names the keys of scene.yaml to set.
+    """
     if not (stage_folder(home, "poses") / "deleted.npy").is_file():
         raise ValueError(
             "scene.yaml: nothing says what was deleted; `gaussians: scene.ply` names the scene before, "
@@ -54,6 +62,6 @@ def require_deleted(home: Path) -> None:
 
 
 def result_stage_folder(home: Path) -> Path:
-    """Folder of the stage whose Gaussians are the result."""
+    """Return the folder of the stage whose Gaussians are the result: `distill`, or `initialize` if that was skipped."""
     used = load_receipts({"evaluate": home / "evaluate"})["evaluate"]["needs"]
     return stage_folder(home, next(stage for stage in ("distill", "initialize") if used.get(stage)))

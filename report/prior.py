@@ -1,5 +1,9 @@
 """Page of the measurements of `benchmarks/studies/prior.py`: tables, charts and sheets of pictures.
 
+The benchmark measures the diffusion prior on holes at three *scales*: the reference's own hole (`reference`), whole
+unseen views (`whole`), and windows around the hole in unseen views (`window`). It does so before and after the prior is
+personalized to the reference.
+
 python -m report.prior runs/prior-report
 """
 
@@ -30,7 +34,7 @@ def make(folder: Path) -> Path:
     """Write prior.md, sheets and charts into the benchmark's folder; return the page's path.
 
     Raises:
-        ValueError: nothing was measured there yet.
+        ValueError: the folder has no measurements (prior.json).
     """
     if not (folder / "prior.json").exists():
         raise ValueError(f"{folder / 'prior.json'}: missing; first `python -m benchmarks.studies.prior --out {folder}`")
@@ -56,7 +60,14 @@ def make(folder: Path) -> Path:
 
 
 def save_sheet(folder: Path, name: str, columns: list[str]) -> list[str]:
-    """Join the rows of pictures in folder/name as folder/name.png; return the page's lines for it."""
+    """Join the rows of pictures in the folder `folder`/`name` into `folder`/`name`.png.
+
+    Args:
+        columns: titles of the columns. Each file in the folder is one row of as many pictures of equal width.
+
+    Returns:
+        Lines in Markdown that show the sheet.
+    """
     paths = sorted((folder / name).glob("*.png"))
     rows = [np.split(load_image(path), len(columns), 1) for path in paths]
     cells = [[enlarge(picture, ENLARGE) for picture in row] for row in rows]
@@ -65,7 +76,11 @@ def save_sheet(folder: Path, name: str, columns: list[str]) -> list[str]:
 
 
 def inpainting_table(scores: dict[str, dict[str, dict[str, float]]]) -> str:
-    """Markdown table with a row for each kind of picture and method."""
+    """Return a Markdown table of scores inside the hole, with a row for each kind of picture and method.
+
+    Args:
+        scores: method -> kind of picture -> scores (keys of `SCORES`, "psnr_error" and "pictures", their number).
+    """
     lines = [f"| inside the hole | pictures | {' | '.join(SCORES.values())} |", "|---" * (len(SCORES) + 2) + "|"]
     kinds = dict.fromkeys(kind for by_kind in scores.values() for kind in by_kind)
     for kind in kinds:
@@ -77,14 +92,17 @@ def inpainting_table(scores: dict[str, dict[str, dict[str, float]]]) -> str:
 
 
 def format_score(row: dict[str, float], column: str) -> str:
-    """A score; PSNR with its standard error."""
+    """Return a score of a row as text; PSNR with its standard error."""
     if column == "psnr":
         return f"{row['psnr']:.2f} ± {row['psnr_error']:.2f}"
     return f"{row[column]:.3f}"
 
 
 def personalization_table(personal: dict[str, Any]) -> str:
-    """Markdown table: samples of unseen views, and errors over all timesteps, before and after."""
+    """Return a Markdown table of errors and scores at each scale, before and after personalization.
+
+    The clean-latent error and the variance of the SDS gradient are means over all measured timesteps.
+    """
     titles = ("clean-latent error", "variance of the SDS gradient")
     lines = [
         f"| holes, {personal['steps']} steps | {' | '.join((*titles, *SCORES.values()))} |",
@@ -99,7 +117,11 @@ def personalization_table(personal: dict[str, Any]) -> str:
 
 
 def sampler_table(by_name: dict[str, dict[str, dict[str, float]]]) -> str:
-    """Markdown table with a row for each set of holes and number of sampler steps."""
+    """Return a Markdown table with a row for each set of holes and number of sampler steps.
+
+    Args:
+        by_name: set of holes -> number of steps -> scores and "seconds" per picture.
+    """
     lines = [
         f"| holes, sampler steps | {' | '.join(SCORES.values())} | CPU ms each |",
         "|---" * (len(SCORES) + 2) + "|",
@@ -112,7 +134,13 @@ def sampler_table(by_name: dict[str, dict[str, dict[str, float]]]) -> str:
 
 
 def seeds_table(seeds: dict[str, dict[str, Any]]) -> str:
-    """Markdown table: mean and range over seeds for each kind of holes, before, after, and with a wrong reference."""
+    """Return a Markdown table with the mean and the range of scores over seeds, with a row for each scale and state.
+
+    The states are before personalization, after, and after personalization to a wrong reference, if it was measured.
+
+    Args:
+        seeds: seed -> state ("before", "after", "wrong") -> scale -> scores.
+    """
     lines = [
         f"| holes, {len(seeds)} seeds: mean (lowest to highest) | {' | '.join(SCORES.values())} |",
         "|---" * (len(SCORES) + 1) + "|",
@@ -127,13 +155,13 @@ def seeds_table(seeds: dict[str, dict[str, Any]]) -> str:
 
 
 def format_range(values: list[float], digits: int) -> str:
-    """Mean, and the range from lowest to highest if there are several values."""
+    """Return the mean as text, followed by the range from the lowest to the highest value if there are several."""
     mean = f"{np.mean(values):.{digits}f}"
     return f"{mean} ({min(values):.{digits}f} to {max(values):.{digits}f})" if len(values) > 1 else mean
 
 
 def save_charts(personal: dict[str, Any], path: Path) -> None:
-    """Chart error against steps, and error and variance against the timestep, before and after."""
+    """Draw the error against personalization steps, and error and SDS variance against the diffusion timestep."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

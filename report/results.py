@@ -1,4 +1,9 @@
-"""Results of a comparison: compare.json, the artifacts that it names, and the table of all methods."""
+"""Results of a comparison: its record compare.json, the results of its runs, and the table of all methods.
+
+A comparison runs the full method and its variants, here called *methods*, on one scene or on all scenes of a folder.
+A *run* is one method on one scene. Scores named `*_box` are measured in the bounding box of a view's mask, 10% wider on
+each side; scores named `*_outside` are measured outside the masks.
+"""
 
 from __future__ import annotations
 
@@ -25,9 +30,10 @@ BOX_SCORES = {
 }
 OUTSIDE_SCORES = {"psnr_outside": "more", "ssim_outside": "more", "flip_outside": "less"}  # outside the masks
 SCORES = BOX_SCORES | OUTSIDE_SCORES
-PSNR_CAP = 100.0  # dB, for a view that equals the truth; as in metrics.json
+PSNR_CAP = 100.0  # dB, instead of infinity for a view that equals the ground truth; as in metrics.json
 MEASURED = ("consistency", "seconds", "own_seconds", "peak_memory_mb", "gaussians", "scenes")
-# Mean difference, and half intervals; see report.paired_statistics.Difference.
+# Endings of column names: the mean difference, and half the widths of its intervals; see
+# report.paired_statistics.Difference.
 DIFFERENCE_COLUMNS = ("minus_full", "interval_views", "interval_scenes")
 COLUMNS = (
     "method",
@@ -42,15 +48,18 @@ COLUMNS += tuple(f"{metric}_interval" for metric in SCORES)  # half the 95 % int
 
 @dataclass(frozen=True)
 class Run:
-    """One method on one scene.
+    """Run of one method on one scene.
 
     Attributes:
+        method: name of the method.
+        scene: name of the scene.
         state: "done", "failed" or "not run yet".
-        error: reason of the failure, in one line.
-        folders: stage -> its artifact, for stages that were not left out.
-        receipts: stage -> its receipt.json.
-        metrics: metrics.json, or empty.
-        views: view -> the numbers of its row in per_view.csv.
+        error: reason of the failure, in one line; empty if the run did not fail.
+        folders: stage -> folder that the stage wrote, for stages that were not skipped. Methods share folders of stages
+            in which they do not differ.
+        receipts: stage -> content of the stage's receipt.json.
+        metrics: content of metrics.json; empty if the run is not evaluated.
+        views: view -> the numbers of the view's row in per_view.csv.
     """
 
     method: str
@@ -65,14 +74,16 @@ class Run:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All methods on all scenes.
+    """Runs of all methods on all scenes.
 
     Attributes:
-        home: runs/<scene>, or runs/compare.
-        data: the folder of the scenes, if a whole folder was compared.
-        methods: the first is the full one.
+        home: folder of the comparison: runs/<scene>, or runs/compare for a folder of scenes.
+        data: folder of the scenes, or None if a single scene was compared.
+        scenes: names of the scenes.
+        methods: names of the methods; the first one is the full method.
         runs: (method, scene) -> run.
-        same_as: method -> an earlier method that is the very same job in every scene.
+        same_as: method -> an earlier method that computes exactly the same in every scene. The method is then called a
+            duplicate.
     """
 
     home: Path
@@ -84,20 +95,24 @@ class Comparison:
 
     @property
     def distinct_methods(self) -> list[str]:
-        """The methods that are not the same job as an earlier one."""
+        """Methods without the duplicates, i.e. without those that compute exactly the same as an earlier method."""
         return [method for method in self.methods if method not in self.same_as]
 
     @property
     def name(self) -> str:
+        """Title of the comparison: the scene's name, or the folder's name and the number of scenes."""
         return f"{self.data.name}, {len(self.scenes)} scenes" if self.data else self.home.name
 
     def finished_runs(self, method: str) -> list[Run]:
-        """The method's finished runs."""
+        """Return a method's finished runs, in the order of the scenes."""
         return [run for scene in self.scenes if (run := self.runs[method, scene]).state == "done"]
 
 
 def load_comparison(home: Path) -> Comparison:
-    """Read compare.json of runs/<scene>, or of runs/compare for a folder of scenes, and what it names.
+    """Load a comparison: its compare.json, and the receipts and scores of all runs that compare.json names.
+
+    Args:
+        home: runs/<scene>, or runs/compare for a folder of scenes.
 
     Raises:
         ValueError: nothing was compared yet.
@@ -116,7 +131,7 @@ def load_comparison(home: Path) -> Comparison:
 def _find_same_jobs(
     methods: tuple[str, ...], scenes: tuple[str, ...], runs: dict[tuple[str, str], Run]
 ) -> dict[str, str]:
-    """Method -> an earlier one whose last stage had the same inputs in every scene."""
+    """Return {method: earlier method} for methods whose stage `evaluate` had the same inputs in every scene."""
     first: dict[tuple[str, ...], str] = {}
     same_as = {}
     for method in methods:
@@ -127,7 +142,12 @@ def _find_same_jobs(
 
 
 def load_run(record: dict[str, Any], runs: Path) -> Run:
-    """Load one entry of compare.json; `runs` is the folder that its paths are relative to."""
+    """Load the run of one entry of compare.json.
+
+    Args:
+        record: the entry.
+        runs: folder to which the entry's paths are relative.
+    """
     folders = {stage: runs / folder for stage, folder in record.get("stages", {}).items() if folder}
     evaluate = folders.get("evaluate", Path())
     metrics = evaluate / "metrics.json"
@@ -144,13 +164,23 @@ def load_run(record: dict[str, Any], runs: Path) -> Run:
 
 
 def load_receipts(folders: dict[str, Path]) -> dict[str, dict[str, Any]]:
-    """Stage -> receipt. A stage that scene.yaml replaces has another stage's folder, which counts only once."""
+    """Return {stage: content of receipt.json} for the stages that have a receipt.
+
+    A stage whose folder has another stage's name is omitted: scene.yaml may replace a stage by another stage's result,
+    whose receipt must count only once.
+
+    Args:
+        folders: stage -> folder with the stage's results.
+    """
     paths = {stage: folder / "receipt.json" for stage, folder in folders.items() if folder.name == stage}
     return {stage: load_json(path) for stage, path in paths.items() if path.is_file()}
 
 
 def load_views(path: Path) -> dict[str, dict[str, float]]:
-    """View -> its numbers, without empty cells; the PSNR of a view that equals the truth is `PSNR_CAP`."""
+    """Load per_view.csv as {view: {column: number}}, without empty cells; empty if the file does not exist.
+
+    A PSNR is at most `PSNR_CAP`, also where a view equals the ground truth.
+    """
     if not path.is_file():
         return {}
     with open(path, newline="", encoding="utf-8") as file:
@@ -173,10 +203,11 @@ def _number(column: str, text: str | None) -> float | None:
 
 
 def summarize_methods(comparison: Comparison) -> list[dict[str, Any]]:
-    """One dict of `COLUMNS` per method: means over its finished scenes.
+    """Return the table of all methods: one dictionary per method with the keys `COLUMNS`.
 
-    None marks missing values, and all values of a method that is the same job as another. The best in `MAIN` comes
-    first; methods without it keep their order.
+    Values are means over the method's finished scenes, None where unknown. Of a method that computes the same as an
+    earlier method, only "method", "state", "scenes" and "same_as" are filled. The method with the best score `MAIN`
+    comes first. Methods without this score come next in their order, then the duplicates of earlier methods.
     """
     table = [_row(comparison, method) for method in comparison.methods]
     table.sort(key=lambda row: (row["same_as"] is not None, row[MAIN] is None, row[MAIN] or 0.0))
@@ -212,23 +243,34 @@ def _row(comparison: Comparison, method: str) -> dict[str, Any]:
 
 
 def finite_mean(values: list[float | None]) -> float | None:
-    """Mean of the values that are finite numbers; None if there are none."""
+    """Return the mean of the values that are finite numbers, or None if no value is."""
     finite = [value for value in values if value is not None and math.isfinite(value)]
     return sum(finite) / len(finite) if finite else None
 
 
 def mean_interval(values: list[float | None]) -> float | None:
-    """Half the 95 % interval of the mean of the values that are finite numbers; None for fewer than two."""
+    """Return half the width of the 95 % confidence interval of the mean of the finite values.
+
+    None if fewer than two values are finite numbers.
+    """
     return confidence_half_width(np.array([value for value in values if value is not None and math.isfinite(value)]))
 
 
 def total_seconds(run: Run) -> float:
-    """Seconds of the whole job, evaluation included."""
+    """Return the seconds of all stages of a run, evaluation included."""
     return round(sum(receipt["seconds"] for receipt in run.receipts.values()), 2)
 
 
 def own_seconds(run: Run, full: Run) -> float | None:
-    """Seconds of the stages that a run does not share with the full method; 0 for the full method itself."""
+    """Return the seconds of the stages that a run does not share with the full method; 0 for the full method itself.
+
+    Args:
+        run: a run of any method.
+        full: the run of the full method on the same scene.
+
+    Returns:
+        None if the full method's run is not done.
+    """
     if full.state != "done":
         return None
     own = [receipt["seconds"] for s, receipt in run.receipts.items() if run.folders[s] != full.folders.get(s)]
@@ -236,13 +278,16 @@ def own_seconds(run: Run, full: Run) -> float | None:
 
 
 def view_consistency(run: Run) -> float | None:
-    """Mean over pairs of neighbouring views, if metrics.json has it."""
+    """Return the inconsistency between views: the mean colour difference in [0, 1] of the same points in two views.
+
+    Each view is compared with the next view by name. None if metrics.json does not have the value.
+    """
     value = (run.metrics.get("consistency") or {}).get("consistency")
     return None if value is None else float(value)
 
 
 def save_csv(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Write the table with all digits; missing values are empty cells."""
+    """Write the table of methods as .csv, unrounded; missing values are empty cells."""
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(COLUMNS), lineterminator="\n")
         writer.writeheader()
@@ -253,7 +298,10 @@ def save_csv(path: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def differences_to_full(comparison: Comparison, metric: str) -> dict[str, Difference]:
-    """Method -> its difference to the full method in a score, over the views that both have."""
+    """Return {method: its score minus the full method's score}, paired over the test views that both methods have.
+
+    Methods without common views, and methods that compute the same as an earlier one, are omitted.
+    """
     differences = {}
     for method in comparison.distinct_methods:
         if method == FULL:

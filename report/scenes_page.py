@@ -1,4 +1,4 @@
-"""Statistics over many scenes on a page: median and quartiles of errors, seconds and scores."""
+"""Page of statistics over many scenes: median and quartiles of errors, seconds, memory and scores."""
 
 from __future__ import annotations
 
@@ -16,7 +16,12 @@ SCORES = ("lpips_vgg_box", "psnr_box", "ssim_box", "flip_box")
 
 
 def make(jobs: list[JobFiles], out: Path) -> Path:
-    """Write index.html, stages.png and stages.csv into `out`; return the page's path."""
+    """Write index.html, stages.png and stages.csv into `out`; return the page's path.
+
+    Args:
+        jobs: one per scene, at least one.
+        out: folder of the page; created if missing.
+    """
     out.mkdir(parents=True, exist_ok=True)
     rows = summarize_stages(jobs)
     with open(out / "stages.csv", "w", newline="", encoding="utf-8") as file:
@@ -37,7 +42,11 @@ def make(jobs: list[JobFiles], out: Path) -> Path:
 
 
 def statistics_tables(rows: list[tuple]) -> list[str]:
-    """A table with seconds, memory and error of each stage, and one with the scores."""
+    """Return an HTML table with seconds, memory and error of each stage, and a table with the scores if known.
+
+    Args:
+        rows: result of `summarize_stages`.
+    """
     by_stage: dict[str, dict[str, tuple]] = {}
     for stage, quantity, *values in rows:
         by_stage.setdefault(stage, {})[quantity] = tuple(values)
@@ -59,7 +68,12 @@ def statistics_tables(rows: list[tuple]) -> list[str]:
 
 
 def format_quartiles(values: tuple, digits: int | None = None) -> str:
-    """Median and quartiles, with `digits` decimals or else four significant digits."""
+    """Return a text "median [first quartile, third quartile]".
+
+    Args:
+        values: result of `quartiles`.
+        digits: decimals; None for four significant digits.
+    """
     _, low, middle, high = values
     if digits is None:
         return f"{middle:.4g} [{low:.4g}, {high:.4g}]"
@@ -67,7 +81,13 @@ def format_quartiles(values: tuple, digits: int | None = None) -> str:
 
 
 def main_error_curves(jobs: list[JobFiles]) -> dict[str, tuple[str, list[np.ndarray]]]:
-    """Stage -> its main quantity (the one most traces have), and a curve [moments, 2] for each scene that has it."""
+    """Return the main error of each stage with its curve in each scene, from the stages' traces.
+
+    The main error of a stage is the quantity that is the main one in most scenes.
+
+    Returns:
+        Stage -> (name of the quantity, curves [moments, 2] of seconds and value, one for each scene that has it).
+    """
     curves: dict[str, tuple[str, list[np.ndarray]]] = {}
     for stage in dict.fromkeys(stage for job in jobs for stage in job.traces):
         traces = [job.traces[stage][""] for job in jobs if job.traces.get(stage, {}).get("")]
@@ -82,7 +102,11 @@ def main_error_curves(jobs: list[JobFiles]) -> dict[str, tuple[str, list[np.ndar
 
 
 def summarize_stages(jobs: list[JobFiles]) -> list[tuple]:
-    """Rows of `COLUMNS`: seconds, memory and last main error of each stage; scores of the result."""
+    """Return the rows of stages.csv, with the columns `COLUMNS`.
+
+    Each stage has rows for seconds, peak memory and the last value of its main error. The rows of the whole job have
+    the sum of seconds and the scores of the result.
+    """
     errors = main_error_curves(jobs)
     rows = []
     for stage in dict.fromkeys(stage for job in jobs for stage in job.receipts):
@@ -102,13 +126,13 @@ def summarize_stages(jobs: list[JobFiles]) -> list[tuple]:
 
 
 def quartiles(values: list[float]) -> tuple[int, float, float, float]:
-    """Number of values and their three quartiles."""
+    """Return (number of values, first quartile, median, third quartile)."""
     low, middle, high = (float(v) for v in np.percentile(values, [25, 50, 75]))
     return len(values), low, middle, high
 
 
 def scene_table(jobs: list[JobFiles], out: Path) -> str:
-    """HTML table with a row per scene: stages done, seconds and scores."""
+    """Return an HTML table with a row per scene: the number of stages done, their seconds, and the scores."""
     names = [n for n in SCORES if any(job.metrics.get("mean", {}).get(n) is not None for job in jobs)]
     rows = []
     for job in jobs:

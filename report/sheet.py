@@ -1,5 +1,7 @@
 """Contact sheet of a finished scene, a row per view: with the object, ground truth, initialization, result.
 
+This module also has helpers for other sheets of pictures.
+
 python -m report.sheet runs/demo --views 3 --out docs/images/demo.png
 """
 
@@ -15,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, save_image
 
-GAP = 6  # between pictures, px
+GAP = 6  # space between pictures, px
 TITLES = {
     "renders_fit": "with the object",
     "truth": "ground truth",
@@ -25,14 +27,16 @@ TITLES = {
 
 
 def make(scene_dir: Path, out: Path, *, views: list[str] | int = 3, scale: int | None = None) -> Path:
-    """Write the sheet of runs/<scene> to `out` and return its path.
+    """Write the contact sheet of a scene as a PNG and return its path.
 
     Args:
-        views: names, or how many evenly spread views to take.
+        scene_dir: runs/<scene> or runs/<scene>@<variant>.
+        out: the PNG to write.
+        views: names of views, or a number of views to choose evenly.
         scale: whole factor by which pixels are repeated; None enlarges to a width of about 480 px.
 
     Raises:
-        ValueError: the scene is not evaluated yet, or a named view is not among its renders.
+        ValueError: the scene is not evaluated yet, or a named view has not been rendered.
     """
     evaluate, poses = (stage_folder(scene_dir, stage) for stage in ("evaluate", "poses"))
     rendered = sorted(path.stem for path in (evaluate / "renders").glob("*.png"))
@@ -52,21 +56,35 @@ def make(scene_dir: Path, out: Path, *, views: list[str] | int = 3, scale: int |
 
 
 def pick_evenly(names: list[str], count: int) -> list[str]:
-    """`count` evenly spread names; the first and the last are slightly inside."""
+    """Return `count` names evenly spread over a list, or all names if there are fewer.
+
+    Each name is from the middle of one of `count` equal parts of the list, so the first and the last name of a long
+    list are not chosen.
+    """
     places = (np.arange(min(count, len(names))) + 0.5) * len(names) / min(count, len(names))
     return [names[int(place)] for place in places]
 
 
 def stage_folder(scene_dir: Path, stage: str) -> Path:
-    """runs/<scene>/<stage>; for a variant its own stage, or the scene's own one if the variant shares it."""
+    """Return the folder of a stage; for a variant that has no such folder, the folder of the scene's own run.
+
+    A variant shares the stages in which it does not differ from the scene's own run.
+
+    Args:
+        scene_dir: runs/<scene> or runs/<scene>@<variant>.
+    """
     own = scene_dir / stage
     return own if own.exists() else scene_dir.with_name(scene_dir.name.split("@")[0]) / stage
 
 
 def load_view_pictures(evaluate: Path, poses: Path | None, name: str) -> dict[str, np.ndarray]:
-    """Column -> uint8 [H, W, 3], for pictures that exist.
+    """Load the existing pictures of a view as {column, a key of `TITLES`: uint8 [H, W, 3]}.
 
-    `poses` is None for a training view, whose photograph shows the object and is no ground truth.
+    Args:
+        evaluate: folder of the stage `evaluate`.
+        poses: folder of the stage `poses`, whose photograph of a test view is ground truth; None for a training view,
+            whose photograph shows the object.
+        name: name of the view.
     """
     paths = {key: evaluate / key / f"{name}.png" for key in TITLES}
     if poses:
@@ -75,12 +93,18 @@ def load_view_pictures(evaluate: Path, poses: Path | None, name: str) -> dict[st
 
 
 def enlarge(picture: np.ndarray, scale: int) -> np.ndarray:
-    """Repeat each pixel `scale` times in both directions, which blurs nothing."""
+    """Enlarge a picture without blur: repeat each pixel `scale` times in both directions."""
     return picture.repeat(scale, 0).repeat(scale, 1)
 
 
 def compose_sheet(cells: Sequence[Sequence[np.ndarray | None]], titles: list[str], names: list[str]) -> np.ndarray:
-    """uint8 [H, W, 3]: the cells on white, column titles above, each view's name on its first picture."""
+    """Return one image, uint8 [H, W, 3], of a table of pictures on white.
+
+    Args:
+        cells: [rows][columns] of pictures uint8 [h, w, 3]; None leaves a cell empty.
+        titles: titles of the columns, written above them.
+        names: names of the rows, written on the first column.
+    """
     heights = [max(cell.shape[0] for cell in row if cell is not None) for row in cells]
     width = max(cell.shape[1] for row in cells for cell in row if cell is not None)
     size = max(12, width // 20)

@@ -1,4 +1,8 @@
-"""Preference study (the paper's Table 2) as a static page: the method's clip beside another's, in random order.
+"""Preference study (the paper's Table 2) as a static page: the full method's clip beside another's, in random order.
+
+Participants watch two clips of a scene and say which one looks better and which one is more faithful to the reference.
+*Attention checks* are pairs of a clip and a corrupted copy of the clip; `report.votes` excludes participants who prefer
+a corrupted copy. The clips show the runs of the comparison that `make scene=X compare` made.
 
 python -m report.study --scene X --runs runs (`make scene=X study`, `make data=FOLDER study`), after `compare`
 """
@@ -31,14 +35,20 @@ PAGE = Path(__file__).with_name("study.html")
 FRAMES = 96  # of a clip: four seconds, repeated
 VIEWS_RATE = 4  # frames per second of a clip through the test views
 STILLS = 3  # views side by side, if no video can be written
-MIN_CHECKS = 2  # least number of attention checks; one for every ten pairs
+MIN_CHECKS = 2  # least number of attention checks; longer studies have about one in ten trials
 BLOCK_SIZE = 24  # blocks of a corrupted clip, px
-KEY = "study-key.json"  # tells who made which clip; beside the study's folder, never in it
+KEY = "study-key.json"  # says which method made which clip; beside the study's folder, which participants receive
 
 
 @dataclass(frozen=True)
 class Clip:
-    """One run's pictures: uint8 [H, W, 3] each, at `rate` frames per second."""
+    """Clip of one method's result on one scene.
+
+    Attributes:
+        run: the method's run on the scene.
+        frames: uint8 [H, W, 3] each.
+        rate: frames per second.
+    """
 
     run: Run
     frames: list[np.ndarray]
@@ -46,15 +56,16 @@ class Clip:
 
 
 def make(home: Path, methods: list[str], seed: int = 0, frames: int = FRAMES) -> Path:
-    """Write runs/<scene>/study/ or runs/compare/study/, and study-key.json beside it; return the page's path.
+    """Write the study's page and clips to `home`/study/, and the key to `home`/study-key.json; return the page's path.
 
-    The folder can be served statically or opened as files.
+    The folder study/ can be served by any static web server or opened from the disk.
 
     Args:
-        home: of a comparison.
-        methods: to compare with the full method; empty for all that are done.
-        seed: of the clips' names and, with each participant's name, of the order.
-        frames: length of a clip.
+        home: folder of the comparison: runs/<scene>, or runs/compare for a folder of scenes.
+        methods: methods to compare with the full method; if empty, all methods of the comparison.
+        seed: seed of the clips' random names. The page combines the seed with each participant's name into the seed of
+            the order of trials.
+        frames: number of frames of a clip along a camera path.
 
     Raises:
         ValueError: nothing was compared, an unknown method is named, or no pair of clips can be made.
@@ -100,14 +111,15 @@ def make(home: Path, methods: list[str], seed: int = 0, frames: int = FRAMES) ->
 
 
 def _random_name(draws: torch.Generator) -> str:
-    """Random name of ten hexadecimal digits."""
+    """Return a random name of ten hexadecimal digits."""
     return f"{int(torch.randint(16**10, (1,), generator=draws)):010x}"
 
 
 def _pairs(comparison: Comparison, methods: list[str], frames: int) -> Iterator[tuple[str, list[tuple[Clip, Clip]]]]:
-    """Yield each scene with pairs of clips, of the full method and another one.
+    """Yield each scene's name with pairs of clips: (clip of the full method, clip of another method).
 
-    Both follow one camera path if both results can be rendered, else the test views.
+    If both results are Gaussians, both clips follow the same camera path of `frames` frames. Otherwise both clips show
+    the rendered test views one after the other. A pair is omitted if a clip cannot be made.
     """
     for scene in comparison.scenes:
         runs = [comparison.runs[method, scene] for method in (FULL, *methods)]
@@ -122,7 +134,7 @@ def _pairs(comparison: Comparison, methods: list[str], frames: int) -> Iterator[
 
 
 def _render_path(run: Run, frames: int) -> Clip | None:
-    """Clip along a path around the capture; None if the result is not a scene but pictures."""
+    """Render a clip along an elliptical path through the capture; None if the result is pictures, not Gaussians."""
     evaluate, poses = run.folders.get("evaluate"), run.folders.get("poses")
     if not evaluate or not poses or not (evaluate / "scene.ply").exists() or "inpainter" in run.metrics:
         return None
@@ -133,13 +145,17 @@ def _render_path(run: Run, frames: int) -> Clip | None:
 
 
 def _load_test_views(run: Run) -> Clip | None:
-    """Clip through the rendered test views; None if there are none."""
+    """Return a clip of the rendered test views in the order of their names; None if there are no rendered views."""
     paths = sorted((run.folders["evaluate"] / "renders").glob("*.png")) if "evaluate" in run.folders else []
     return Clip(run, [load_image(path) for path in paths], VIEWS_RATE) if paths else None
 
 
 def _save_clip(frames: list[np.ndarray], rate: int, folder: Path, name: str) -> str:
-    """Save a .webm, or views side by side if no encoder is available; return its address on the page."""
+    """Save a clip as a .webm, or as a PNG with `STILLS` frames side by side if no video encoder is available.
+
+    Returns:
+        Address of the file relative to the page.
+    """
     try:
         save_video(folder / f"{name}.webm", frames, rate)
     except ValueError:
@@ -156,7 +172,10 @@ def _save_clip(frames: list[np.ndarray], rate: int, folder: Path, name: str) -> 
 
 
 def _corrupt(picture: np.ndarray, draws: torch.Generator) -> np.ndarray:
-    """The picture in coarse blocks, a third of them in random colours: clearly worse, for attention checks."""
+    """Return a picture reduced to coarse blocks, a third of which have random colours.
+
+    The result is clearly worse than the picture, so that a participant who prefers it did not pay attention.
+    """
     high, wide = picture.shape[:2]
     rows, columns = (max(2, round(side / BLOCK_SIZE)) for side in (high, wide))
     small = cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA)
@@ -167,7 +186,7 @@ def _corrupt(picture: np.ndarray, draws: torch.Generator) -> np.ndarray:
 
 
 def _save_reference(run: Run, out: Path, name: str) -> str | None:
-    """Save the first reference of a run for the page; return its address, or None without a reference."""
+    """Save a run's first reference for the page; return its address on the page, or None if there is no reference."""
     folder = run.folders.get("reference")
     first = next(iter(sorted((folder / "references").glob("*.png"))), None) if folder else None
     if first is None:

@@ -1,6 +1,8 @@
-"""The table of a batch or a comparison, as .csv and .md, while it runs: a row per run, and means over scenes.
+"""Table of a batch or a comparison, as .csv and .md, with a row per run and means over scenes.
 
-python -m report.table runs/results.json (or runs/X/compare.json); the runner calls it after each run
+The runner calls this module after each run, so that the table can be read while the batch or the comparison runs.
+
+python -m report.table runs/results.json (or runs/X/compare.json)
 """
 
 from __future__ import annotations
@@ -15,9 +17,13 @@ from typing import Any
 
 
 def write_table(record: Path) -> None:
-    """Write a record's table beside it: results.csv and .md of a batch, compare-runs.csv and .md of a comparison.
+    """Write the table of a record beside the record.
 
-    The table of a batch begins with the reasons of scenes that failed.
+    The files are results.csv and results.md for a batch, compare-runs.csv and compare-runs.md for a comparison. The .md
+    of a batch begins with the scenes that failed and the reasons.
+
+    Args:
+        record: results.json of a batch, or compare.json of a comparison.
     """
     content = json.loads(record.read_text(encoding="utf-8"))
     is_comparison, runs = "methods" in content, content["runs"]
@@ -33,7 +39,14 @@ def write_table(record: Path) -> None:
 
 
 def table_rows(runs: list[dict[str, Any]], keys: tuple[str, ...]) -> tuple[list[str], list[list[str]]]:
-    """Header and rows: one per run, named by `keys`, then each method's mean over the scenes that have a value."""
+    """Return the header and the rows of the table: one row per run, then one row of means per method.
+
+    A mean is over the scenes that are done and have a value.
+
+    Args:
+        runs: entries of the record.
+        keys: keys of an entry that name the run: ("method", "scene") or ("scene",).
+    """
     names = list(dict.fromkeys(name for run in runs for name in run.get("mean", {})))
     lines = [[*(run[key] for key in keys), run["state"], *_cells(run.get("mean", {}), names)] for run in runs]
     for method in dict.fromkeys(run.get("method", "") for run in runs):
@@ -50,7 +63,7 @@ def _cells(mean: dict[str, Any], names: list[str]) -> list[str]:
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a file atomically: it may be read while the batch runs."""
+    """Write a file atomically, because a reader may open the file while the batch runs."""
     partial = path.with_name(f".{path.name}.writing")
     partial.write_text(text, encoding="utf-8")
     os.replace(partial, path)

@@ -1,4 +1,9 @@
-"""Charts of traces and receipts: a stage's error against seconds, a whole job, many scenes."""
+"""Charts of traces and receipts: a stage's error against seconds, a whole job, many scenes.
+
+A stage writes a *trace* (trace.jsonl): lines of an iteration, the seconds of work so far, and quantities such as a loss
+or a PSNR. A trace may have several *series* of lines, e.g. one per solver and view. The *main quantity* of a stage
+stands for its error; `reffusion.io.traces` lists the quantities and whether more or less is better.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +37,10 @@ NO_ERRORS = ("sds_gradient_mean", "sds_gradient_max", "gaussians", "masked_gauss
 
 
 def pick_errors(stage: str, lines: Lines) -> list[str]:
-    """Errors in these lines, the stage's main one first; all numbers if the stage has no known error."""
+    """Return the names of at most `MAX_PANELS` error quantities that the lines of a trace contain, for a chart.
+
+    The stage's main quantity comes first. If the lines contain no known error, all unknown numbers are returned.
+    """
     present = {name for line in lines for name, value in line.items() if isinstance(value, int | float)}
     main = [name for name in MAIN.get(stage, ()) if name in present][:1]
     others = [name for name, quantity in QUANTITIES.items() if name in present and quantity.better and name not in main]
@@ -41,7 +49,7 @@ def pick_errors(stage: str, lines: Lines) -> list[str]:
 
 
 def axis_title(name: str) -> str:
-    """Title of an axis: the quantity, its unit, and an arrow towards the better side."""
+    """Return the title of an axis: the quantity, its unit if it is dB, and an arrow up if more is better, else down."""
     if name not in QUANTITIES:
         return name
     quantity = QUANTITIES[name]
@@ -50,13 +58,21 @@ def axis_title(name: str) -> str:
 
 
 def best_index(name: str, values: Sequence[float] | np.ndarray) -> int:
-    """Index of the best value."""
+    """Return the index of the best value of a quantity: of the largest if more is better, else of the smallest."""
     more = name in QUANTITIES and QUANTITIES[name].better == "more"
     return int((np.argmax if more else np.argmin)(values))
 
 
 def draw_stage_chart(stage: str, series: dict[str, Lines], path: Path) -> list[str]:
-    """Chart error against seconds of work, one panel per quantity; return the quantities drawn."""
+    """Draw a stage's errors against seconds of work, one panel per quantity and one curve per series.
+
+    Args:
+        series: name of a series -> lines of the trace.
+        path: PNG to write; nothing is written if the lines contain no quantity to draw.
+
+    Returns:
+        Names of the quantities drawn; may be empty.
+    """
     names = pick_errors(stage, [line for lines in series.values() for line in lines])
     if not names:
         return []
@@ -80,12 +96,17 @@ def draw_stage_chart(stage: str, series: dict[str, Lines], path: Path) -> list[s
 
 
 def quantity_curve(lines: Lines, name: str) -> np.ndarray:
-    """[moments, 2]: seconds and the quantity, for the lines that have it."""
+    """Return a quantity's curve, float64 [moments, 2]: seconds and value, for the lines that have the quantity."""
     return np.array([(line["seconds"], line[name]) for line in lines if name in line], np.float64).reshape(-1, 2)
 
 
 def _curve(axes: Axes, name: str, points: np.ndarray, colour: str, words: str, main: bool) -> None:
-    """A line with its last value; for the main quantity also its best moment, if that is not the last."""
+    """Draw one curve, labelled with its last value and `words`.
+
+    Args:
+        points: [moments, 2], seconds and value.
+        main: True also marks the best value, if it differs from the last value.
+    """
     axes.plot(*points.T, color=colour, linewidth=1.8, marker="o", markersize=3)
     last, top = points[-1], points[best_index(name, points[:, 1])]
     annotate(axes, f"{last[1]:.3g}{words}", last, (6, 0), colour if main or not words else INK)
@@ -95,12 +116,18 @@ def _curve(axes: Axes, name: str, points: np.ndarray, colour: str, words: str, m
 
 
 def clamp_first_seconds(points: np.ndarray) -> np.ndarray:
-    """The curve [moments, 2] with times below 1/300 of the total moved there, so that a log axis can start."""
+    """Return a curve [moments, 2] whose times are at least 1/300 of its last time.
+
+    Earlier moments, such as second 0, are moved to this time, because a logarithmic axis cannot show 0.
+    """
     return np.column_stack([np.maximum(points[:, 0], points[:, 0].max() / 300), points[:, 1]])
 
 
 def set_time_axis(axes: Axes, seconds: np.ndarray) -> None:
-    """Use a logarithmic axis if the moments span much (they are log-spaced), with room on the right for a number."""
+    """Use a logarithmic time axis if the latest moment is more than ten times the earliest.
+
+    Traces are written at logarithmically spaced moments. The axis leaves room on the right for a number.
+    """
     if needs_log_axis(seconds, 10):
         axes.set_xscale("log")
         axes.set_xlim(seconds[seconds > 0].min() / 1.1, seconds.max() * 1.9)
@@ -119,13 +146,18 @@ def draw_job_chart(
     path: Path,
     ceiling: float | None = None,
 ) -> dict[str, float]:
-    """Chart PSNR against seconds since the beginning, above a bar for each stage; return when each stage began.
+    """Draw PSNR against seconds since the job's beginning, above a bar for each stage's seconds.
 
     Args:
-        seconds: stage -> seconds in its receipt, in order.
-        traces: stage -> its lines; drawn if the main quantity is in dB.
-        box: stage -> mean PSNR of the stage's result in the box of the test views.
-        ceiling: the same for a fit to photographs without the object, if there is one.
+        seconds: stage -> seconds in its receipt, in the order of the stages.
+        traces: stage -> lines of its trace; drawn if the stage's main quantity is in dB.
+        box: stage -> mean PSNR in dB of the stage's result in the box of the test views; None if unknown.
+        path: PNG to write.
+        ceiling: mean PSNR in the box of a fit to photographs without the object, drawn as a dashed line; None for no
+            line.
+
+    Returns:
+        Stage -> seconds since the job's beginning at which the stage began, if the stages ran one after the other.
     """
     begins = dict(zip(seconds, np.cumsum([0.0, *seconds.values()]), strict=False))
     curves = {}
@@ -155,9 +187,9 @@ def _errors(
     for (stage, (name, points)), colour in zip(curves.items(), (BLUE, GREEN, ORANGE), strict=False):
         axes.plot(*points.T, color=colour, linewidth=1.8)
         words = f"{stage}: {QUANTITIES[name].label}, {points[-1, 1]:.1f}"
-        late = points[-1, 0] > total / 2  # no room on its right side
+        late = points[-1, 0] > total / 2  # a label on the right of the curve's end would leave the chart
         annotate(axes, words, points[-1], *(((-8, 4), colour, "right") if late else ((6, 0), colour)))
-    for row, (stage, at) in enumerate(ends.items()):  # one below the other, as they may be close in time
+    for row, (stage, at) in enumerate(ends.items()):  # labels are staggered, as the points may be close in time
         axes.plot(*at, "D", color=INK, markersize=6)
         words = f"box of the test views\nafter {stage}: {at[1]:.2f}"
         annotate(axes, words, at, (0, -10 - 26 * row), ha="right", va="top")
@@ -183,9 +215,17 @@ def _bars(axes: Axes, seconds: dict[str, float], begins: dict[str, float]) -> No
 
 
 def quartile_band(curves: Sequence[np.ndarray], count: int = 200) -> tuple[np.ndarray, np.ndarray]:
-    """Quartiles of curves: seconds [M], from when all have begun to when the last has ended, and values [3, M].
+    """Return the quartiles of several curves over time.
 
-    Curves are linear in the logarithm of time and keep their last value.
+    A curve is interpolated linearly in the logarithm of time, and keeps its last value after its end.
+
+    Args:
+        curves: [moments, 2] each: seconds and value.
+        count: number M of moments of the result.
+
+    Returns:
+        Seconds [M], logarithmically spaced from the moment when all curves have begun to the moment when the last curve
+        has ended, and values [3, M]: first quartile, median, third quartile.
     """
     low = max(max(points[0, 0] for points in curves), 1e-3)
     high = max(max(points[-1, 0] for points in curves), low)
@@ -196,7 +236,12 @@ def quartile_band(curves: Sequence[np.ndarray], count: int = 200) -> tuple[np.nd
 
 
 def draw_scenes_chart(curves: dict[str, tuple[str, list[np.ndarray]]], path: Path) -> None:
-    """One panel per stage: its main error in every scene, with median and quartiles."""
+    """Draw one panel per stage with the stage's main quantity in every scene, their median and their quartiles.
+
+    Args:
+        curves: stage -> (name of the main quantity, curves [moments, 2] of the scenes: seconds and value).
+        path: PNG to write.
+    """
     figure, grid = new_figure(3.3, 1, len(curves))
     for axes, (stage, (name, raw)) in zip(grid[0], curves.items(), strict=True):
         lines = [clamp_first_seconds(points) for points in raw]

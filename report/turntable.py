@@ -20,13 +20,16 @@ CODEC = "VP90"
 
 
 def make(home: Path, frames: int = FRAMES) -> Path:
-    """Write turntable.webm beside the scene's stages, the result on a path around the capture, and return its path.
+    """Render the result along a closed camera path, write the frames as `home`/turntable.webm, and return this path.
+
+    The camera path is `camera_path.ellipse_path`, an ellipse through the capture.
 
     Args:
-        home: runs/<scene> or runs/<scene>@<variant>, its stage `evaluate` finished.
+        home: runs/<scene> or runs/<scene>@<variant>, with a finished stage `evaluate`.
+        frames: number of frames, at `RATE` frames per second.
 
     Raises:
-        ValueError: that stage has not run, or this OpenCV writes no such video.
+        ValueError: the stage `evaluate` has not run, or the installed OpenCV cannot write this kind of video.
     """
     result = home / "evaluate" / "scene.ply"
     if not result.exists():
@@ -40,7 +43,15 @@ def make(home: Path, frames: int = FRAMES) -> Path:
 
 
 def save_video(path: Path, pictures: Iterable[np.ndarray], rate: int = RATE) -> None:
-    """Save pictures, uint8 [H, W, 3], at least one, as a .webm. ValueError if this OpenCV cannot write it."""
+    """Save pictures as a .webm video.
+
+    Args:
+        pictures: at least one, uint8 [H, W, 3] RGB, all of one size.
+        rate: frames per second.
+
+    Raises:
+        ValueError: the installed OpenCV cannot write this kind of video.
+    """
     writer = None
     for picture in pictures:
         if writer is None:

@@ -1,4 +1,4 @@
-"""Hatching over the parts of a picture that no photograph shows."""
+"""Hatching over the parts of a rendered picture that show surfaces which no training photograph shows."""
 
 from __future__ import annotations
 
@@ -20,7 +20,15 @@ WORDS = "hatched: no photograph shows it"
 
 
 def load_seen_views(home: Path, scene: Scene) -> list[training_coverage.CoverageView]:
-    """What the training views saw, according to the fit; empty if there is no fit."""
+    """Render from the fit what each training view saw: depth, and pixels that the object hides.
+
+    Args:
+        home: runs/<scene> or runs/<scene>@<variant>.
+        scene: the scene of the stage `poses`.
+
+    Returns:
+        One entry per training view; empty if the scene has no fit.
+    """
     fit = stage_folder(home, "fit") / "gaussians.ply"
     if not fit.exists():
         return []
@@ -34,12 +42,17 @@ def load_seen_views(home: Path, scene: Scene) -> list[training_coverage.Coverage
 def hatch_unseen(
     picture: np.ndarray, gaussians: Gaussians, camera: Camera, seen_by: list[training_coverage.CoverageView]
 ) -> np.ndarray:
-    """uint8 [H, W, 3]: the picture with everything that no training view saw hatched, and a label.
+    """Return a picture with hatching over all pixels that no training view saw, and a label.
 
-    The picture is returned unchanged if less than `MIN_SHARE` is unseen.
+    The picture is returned unchanged if less than `MIN_SHARE` of it is unseen.
 
     Args:
-        camera: of any size; a small one is faster.
+        picture: uint8 [H, W, 3], a render of `gaussians`.
+        camera: camera of the picture; its size may differ from the picture's, and a small one is faster.
+        seen_by: result of `load_seen_views`.
+
+    Returns:
+        uint8 [H, W, 3].
     """
     unseen = resize_nearest(training_coverage.unseen_pixels(gaussians, camera, seen_by), picture.shape[:2])
     if unseen.mean() < MIN_SHARE:

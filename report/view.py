@@ -1,7 +1,8 @@
 """Viewer of a finished scene in a browser: `python -m report.view --scene demo` (`make scene=X view`).
 
-This machine renders each visitor's camera with the rasterizer of all stages, small while the camera moves, then in
-full. So the picture is what `evaluate` scores, and the browser needs no GPU.
+The machine that runs the viewer also renders each visitor's camera, with the same rasterizer as all stages. So pictures
+look as in the stage `evaluate`, and the browser needs no GPU. While the camera moves, pictures are small; at rest they
+have full size. A *visitor* is a browser window connected to the viewer.
 """
 
 from __future__ import annotations
@@ -22,19 +23,22 @@ from report.sheet import stage_folder
 
 PORT = 8080
 MOVING, STILL = 180, 480  # picture heights in px while the camera moves, and at rest
-FRUSTUM_SCALE = 0.04  # size of a drawn camera, in units of the extent (1)
+FRUSTUM_SCALE = 0.04  # size of a drawn camera, in units of the scene's extent (1)
 # Width in px of the picture in the frustum, colour, and thickness of the lines.
 FRUSTUM_STYLES = {
     "cameras": (160, (20, 20, 20), FRUSTUM_SCALE / 40),
     "references": (480, (230, 120, 0), FRUSTUM_SCALE / 15),
 }
-RENDER_LOCK = threading.Lock()  # the rasterizer's threads serve one picture at a time
+RENDER_LOCK = threading.Lock()  # the rasterizer uses all threads for one picture, so pictures are rendered in turn
 
 
 def visitor_camera(place: Any, height: int) -> Camera:
-    """Pinhole camera of a visitor, with an image of `height` px.
+    """Return the pinhole camera of a visitor, with an image of `height` px.
 
-    `place` has `position` [3], `wxyz` [4] (camera to world), vertical `fov` in radians, and `aspect`, width / height.
+    Args:
+        place: the visitor's camera in viser. Used are `position` [3], `wxyz` [4] (quaternion, camera to world), `fov`
+            (vertical, radians) and `aspect` (width over height).
+        height: image height, px.
     """
     from scipy.spatial.transform import Rotation
 
@@ -46,20 +50,25 @@ def visitor_camera(place: Any, height: int) -> Camera:
 
 
 def render_picture(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """uint8 [H, W, 3]: the Gaussians from a camera."""
+    """Render Gaussians from a camera as uint8 [H, W, 3]."""
     with RENDER_LOCK:
         return to_uint8(rasterizer.render(gaussians, camera).color.numpy())
 
 
 def scene_home(home: Path) -> Path:
-    """Folder of the scene's own run, which holds `poses`, for any of its variants."""
+    """Return the folder of the scene's own run, runs/<scene>, which has the stage `poses` for all variants too."""
     return home.with_name(home.name.split("@")[0])
 
 
 def move_to_view(place: Any, camera: Camera, target: np.ndarray) -> None:
-    """Move a visitor's camera, or the initial one, to the position of a photograph.
+    """Move a visitor's camera to the pose of a training view.
 
-    The centre of rotation is on the optical axis, as far away as `target` [3].
+    The camera then turns about the point on the optical axis at the distance of `target` [3].
+
+    Args:
+        place: the visitor's camera in viser, or the initial camera of new visitors; changed in place.
+        camera: the training view's camera.
+        target: a point in the scene.
     """
     place.position = camera.center
     place.look_at = camera.center + camera.world_to_camera[2, :3] * np.linalg.norm(target - camera.center)
@@ -67,12 +76,16 @@ def move_to_view(place: Any, camera: Camera, target: np.ndarray) -> None:
 
 
 def vertical_fov(camera: Camera) -> float:
-    """Vertical field of view in radians, with the principal point taken as the image centre."""
+    """Return the vertical field of view in radians, as if the principal point were the image centre."""
     return float(2 * np.arctan(camera.height / (2 * camera.fy)))
 
 
 class Viewer:
-    """The server, the Gaussians it shows, and a thread per visitor that renders the latest requested camera.
+    """Viewer of one scene: a web server, and a thread per visitor that renders the visitor's latest camera.
+
+    Args:
+        home: runs/<scene> or runs/<scene>@<variant>, finished.
+        port: port to listen on; if it is in use, the next free one is taken.
 
     Raises:
         ValueError: viser is not installed, or the scene is not finished.
@@ -99,7 +112,7 @@ class Viewer:
         self.server.on_client_disconnect(lambda client: self._request_picture(client.client_id))
 
     def _add_controls(self) -> None:
-        """Controls for the state and its parts."""
+        """Add controls that select the state (from initialization to result) and the layers of Gaussians to show."""
         gui, titles = self.server.gui, list(self.layers.states)
         last = len(titles) - 1
         marks = tuple((k, title if k in (0, last) else "") for k, title in enumerate(titles))
@@ -124,7 +137,7 @@ class Viewer:
         changed()
 
     def _add_cameras(self, home: Path, scene: Scene) -> None:
-        """Frusta of the training views with photographs and of the references; a click moves the visitor there."""
+        """Add camera frusta of the training views and the references; a click moves the visitor's camera there."""
         train, poses = [scene.cameras[name] for name in scene.train], scene_home(home) / "poses"
         photographed = load_views(poses, [name for name in scene.train if has_photograph(poses, name)])
         photos = {name: photographed.get(name) for name in scene.train}
@@ -141,7 +154,14 @@ class Viewer:
             checkbox.on_update(lambda _, frusta=frusta, box=checkbox: _set_visible(frusta, box.value))
 
     def _add_frustum(self, kind: str, camera: Camera, image: np.ndarray | None, target: np.ndarray) -> Any:
-        """A camera frustum with its picture, if it has one; initially hidden."""
+        """Add a camera frustum, hidden at first, and return its handle in viser.
+
+        Args:
+            kind: key of `FRUSTUM_STYLES`.
+            camera: camera of the frustum.
+            image: picture to show in the frustum, uint8 [H, W, 3]; None for no picture.
+            target: [3], a point in the scene, for `move_to_view`.
+        """
         width, color, thickness = FRUSTUM_STYLES[kind]
         step = max(1, camera.width // width)
         small = image[::step, ::step] if image is not None else None
@@ -164,7 +184,11 @@ class Viewer:
             self.requests[visitor].set()
 
     def _render_loop(self, client: Any) -> None:
-        """Render for one visitor until they leave: small at once, in full when no other request has come meanwhile."""
+        """Render pictures for one visitor until the visitor leaves.
+
+        Each request is answered by a small picture at once. A picture of full size follows unless another request has
+        arrived.
+        """
         request = self.requests[client.client_id]
         while self.open and client.client_id in self.server.get_clients():
             request.wait(1.0)
@@ -177,7 +201,15 @@ class Viewer:
         self.requests.pop(client.client_id, None)
 
     def _render_for(self, camera: Camera, place: Any) -> np.ndarray:
-        """uint8 [H, W, 3]; at rest with unseen parts hatched."""
+        """Render a visitor's picture, uint8 [H, W, 3].
+
+        In full size, parts that no photograph shows are hatched, unless the visitor switched this off or shows the
+        removed Gaussians.
+
+        Args:
+            camera: camera of the picture.
+            place: the visitor's camera in viser, for a small camera of the same pose.
+        """
         gaussians = self.gaussians
         picture = render_picture(gaussians, camera)
         if camera.height == STILL and self.marks_unseen:
@@ -196,7 +228,7 @@ def _set_visible(things: list[Any], visible: bool) -> None:
 
 
 def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """[4], wxyz."""
+    """Return the quaternion [4], wxyz, of a rotation matrix [3, 3]."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(rotation).as_quat(scalar_first=True)

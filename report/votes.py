@@ -1,4 +1,6 @@
-"""Result of a preference study: how often the method was preferred to each other, with intervals over participants.
+"""Result of a preference study: how often the full method was preferred to each other method.
+
+The confidence intervals hold for other participants of the same kind. `report.study` makes the study's page.
 
 python -m report.votes ANSWERS.json ... --key runs/X/study-key.json (`reffusion study-votes`)
 """
@@ -24,9 +26,16 @@ RESAMPLES = 5000
 
 @dataclass(frozen=True)
 class Preference:
-    """How often the full method was preferred to `method`.
+    """Share of votes in which the full method was preferred to another method, for one question.
 
-    `share` with its 95 % interval `low` to `high` are parts of 1, from `votes` of `participants`.
+    Attributes:
+        method: the other method.
+        question: key of `QUESTIONS`.
+        share: share of votes for the full method, in [0, 1].
+        low: lower end of the share's 95 % confidence interval.
+        high: upper end of this interval.
+        votes: number of votes.
+        participants: number of participants who voted.
     """
 
     method: str
@@ -39,14 +48,17 @@ class Preference:
 
 
 def count_votes(answers: list[dict[str, Any]], key: dict[str, Any]) -> tuple[list[Preference], list[str]]:
-    """Preferences, and sentences that name the participants who were excluded by the attention checks.
+    """Count the votes of all participants who finished the study and passed all attention checks.
 
     Args:
-        answers: what the page saved, one entry per participant.
-        key: study-key.json.
+        answers: contents of the files that the study's page saved, one per participant.
+        key: content of study-key.json, which says which method made which clip.
+
+    Returns:
+        The preferences for each method and question, and a sentence for each excluded participant with the reason.
 
     Raises:
-        ValueError: answers of another study, of one participant twice, or to an unknown pair.
+        ValueError: answers belong to another study, to a participant who has already answered, or to an unknown pair.
     """
     accepted, excluded, names = [], [], set()
     for entry in answers:
@@ -72,7 +84,12 @@ def count_votes(answers: list[dict[str, Any]], key: dict[str, Any]) -> tuple[lis
 def _preference(
     accepted: list[list[dict[str, Any]]], key: dict[str, Any], method: str, question: str
 ) -> Preference | None:
-    """One row; None if nobody was asked."""
+    """Return the preference for one method and question; None if no participant answered it.
+
+    Args:
+        accepted: the answers of each participant who counts, without attention checks.
+        key: content of study-key.json.
+    """
     counts = []
     for each in accepted:
         pairs = [(answer, _pair(key, answer["trial"])) for answer in each if question in answer]
@@ -94,10 +111,16 @@ def _pair(key: dict[str, Any], trial: str) -> dict[str, str]:
 
 
 def share_interval(wins: np.ndarray, totals: np.ndarray, seed: int) -> tuple[float, float]:
-    """95 % interval of the share of all votes won, in parts of 1, from wins [n] and totals [n] per participant.
+    """Return the 95 % confidence interval (low, high) of the share of votes won, in [0, 1].
 
-    A bootstrap over participants, as one person's votes are not independent. If all agree, which a bootstrap would take
-    for certain, or there is only one participant, Wilson's interval for one vote per participant.
+    The interval is a bootstrap over participants, because the votes of one participant are not independent. If all
+    votes agree, a bootstrap would give an interval of width zero. In this case, and for a single participant, the
+    result is Wilson's interval with one vote per participant.
+
+    Args:
+        wins: [n] number of votes for the full method of each participant.
+        totals: [n] number of all votes of each participant, at least 1.
+        seed: seed of the bootstrap.
     """
     people, share = len(wins), wins.sum() / totals.sum()
     agreed = (wins.min() == 0 and wins.max() == 0) or bool((wins == totals).all())
@@ -119,7 +142,7 @@ def share_interval(wins: np.ndarray, totals: np.ndarray, seed: int) -> tuple[flo
 
 
 def preference_table(preferences: list[Preference]) -> str:
-    """Markdown table."""
+    """Return the preferences as a Markdown table, one row each."""
     header = ["preferred to", "question", "share", "95 % interval", "votes", "participants"]
     percent = lambda part: f"{100 * part:.1f} %"
     rows = [

@@ -17,8 +17,8 @@ def fetch_weights(request: Request, offline: bool) -> int:
         offline: True only lists the weights.
 
     Returns:
-        Number of missing weights. Weights that cannot be downloaded and failed downloads count; with `offline`, also
-        weights that could be downloaded, unless they are optional.
+        Number of missing weights that are not optional and cannot be downloaded, or with `offline` are not downloaded;
+        and of downloads that failed.
     """
     job = resolve(request, scene=bool(request.scene))
     answers = list(zip(job.stages, ask_stages(job.root, list(map(job.question, job.stages))), strict=True))
@@ -39,7 +39,7 @@ def fetch_weights(request: Request, offline: bool) -> int:
     _print_problems(missing)
     unsized = " and what has no known size" if any(need["bytes"] is None for need in to_fetch) else ""
     print(f"to fetch: about {format_bytes(sum(need['bytes'] or 0 for need in to_fetch))}{unsized}", flush=True)
-    unusable = len(missing) - len(to_fetch)
+    unusable = sum(not need["fetched"] and not need["optional"] for need in missing)
     if offline or not to_fetch:
         return unusable + sum(not need["optional"] for need in to_fetch)
     process = start_worker(request.root, "fetch")

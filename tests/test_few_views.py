@@ -130,7 +130,9 @@ def test_depth_stays_where_photographs_have_no_texture():
     assert np.abs((planes * geometry.pixel_rays(views[0])).sum(-1) - 0.5).max() < 1e-6
 
 
-def test_other_photographs_may_be_of_another_size_and_threads_do_not_matter():
+@pytest.mark.parametrize("spacing", [1, 2, 3])
+def test_other_photographs_may_be_of_another_size_and_threads_do_not_matter(monkeypatch, spacing):
+    monkeypatch.setattr(patchmatch, "REFERENCE_WIDTH", 96 / spacing)
     views = [
         front_camera("a", 0.0),
         front_camera("b", 0.5),
@@ -139,13 +141,13 @@ def test_other_photographs_may_be_of_another_size_and_threads_do_not_matter():
     (true, picture), *others = map(render_slanted_plane, views)
     seen = [(view, image) for view, (_, image) in zip(views[1:], others, strict=True)]
     found, before = [], torch.get_num_threads()
-    for count in (1, 2):
+    for count in (1, 4):
         torch.set_num_threads(count)
         found.append(patchmatch.estimate_planes(views[0], picture, seen, 1.06 * true, np.random.default_rng(3)))
     torch.set_num_threads(before)
     assert np.array_equal(*found)
     depth = 1 / (found[0] * geometry.pixel_rays(views[0])).sum(-1)
-    assert np.median(np.abs(depth / true - 1)) < 1e-3
+    assert spacing > 1 or np.median(np.abs(depth / true - 1)) < 1e-3  # larger windows need larger pictures
 
 
 def render_aperiodic_square(view):

@@ -377,6 +377,9 @@ def test_a_dense_start_looks_at_half_the_size_first():
     assert sizes == [(4, 2, (2, 4, 3), (2, 4))] * 2 + [(7, 4, (4, 7, 3), (4, 7))]
     small, _, weights = view_loader.downsample(camera, image, counts)
     assert weights[0, 0] == 0 and weights[1, 2] == 1 and small.cy == 1.0
+    counts[0, 0], counts[1, 3] = 1, 0
+    mean = cv2.resize(np.where(counts == 0, 0, 1.0), (4, 2), interpolation=cv2.INTER_AREA)
+    assert (view_loader.downsample(camera, image, counts)[2][mean < 1] == 0).all()
     assert (
         step.coarse_steps(Params(iterations=10)) == 0 < step.coarse_steps(Params(iterations=10, init=Init(flow_cell=3)))
     )

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from scenes import wall_scene
 from scenes.cameras import make_scene
+from scenes.wall_scene import front_camera
 
+from reffusion import geometry
 from reffusion.capture.checks import sanity
 from reffusion.capture.checks.sanity import find_odd_exposures, find_odd_masks
+from reffusion.capture.image_detail import sample_visible
 from reffusion.geometry import pixel_rays
 from reffusion.io.arrays import save_json
 from reffusion.io.images import image_size
@@ -108,3 +111,11 @@ def test_check_says_how_structure_from_motion_went(tmp_path, monkeypatch, capsys
 def test_the_sheet_needs_the_stage_raw_masks(tmp_path):
     with pytest.raises(ValueError, match=r"run `make scene=x raw_masks` first"):
         check.make(tmp_path / "x")
+
+
+def test_points_outside_a_picture_hide_nothing():
+    camera, picture = front_camera("v", 0.0), np.zeros((72, 96, 1))
+    corner = geometry.unproject(np.full((72, 96), 2.0), camera)[0, 0]
+    near_but_outside = corner * 0.5 - [1.0, 0.0, 0.0]
+    values = sample_visible(camera, np.stack([corner, near_but_outside]), picture)[:, 0]
+    assert values[0] == 0 and np.isnan(values[1])

@@ -1,16 +1,19 @@
 """Work-precision diagrams of the kernels: `python -m benchmarks.bench --out runs/bench` (`make bench`).
 
+A work-precision diagram shows the error of a method against its time, for several settings. The diagrams are:
+
   footprint, cutoff   the float32 rasterizer against its float64 oracle; the cost of skipping faint contributions
   bilateral           the fast bilateral solver along its iterations, by cell size
-  completion          the thin plate, by the size of its grid
-  alignment           plain and robust, over the share of outliers
-  personalization-recorded   the values recorded in LOG.md
-  tile                (--slow) the rasterizer, by height of a tile; each is compiled anew
-  personalization     (--slow) LoRA over steps, rank and learning rate; needs runs/demo with its stage `reference`
+  completion          depth completion by a thin plate, by the size of its grid
+  alignment           plain and robust alignment of depth, by the share of outliers
+  personalization-recorded   personalization, the values recorded in LOG.md
+  tile                (--slow) the rasterizer, by height of a tile; each height is compiled anew
+  personalization     (--slow) LoRA by steps, rank and learning rate; needs runs/demo with its stage `reference`
 
-Prints the recommended setting of each diagram; writes a PNG for each and precision.json (error and CPU seconds on one
-thread of every point). --gate compares with baselines.json beside this file and exits with 1 if a point is worse: its
-error beyond rounding, or its time beyond twice the baseline in units of the machine's speed.
+The command prints the recommended setting of each diagram. It writes a PNG for each diagram, and precision.json with
+the error and the CPU seconds (of one thread) of every point. --gate compares the points with baselines.json beside this
+file. The exit status is then 1 if a point is worse: if its error is larger by more than rounding, or its time is more
+than twice the baseline after both are divided by the machine's speed.
 """
 
 from __future__ import annotations
@@ -80,7 +83,7 @@ def main() -> int:
         measured["diagrams"] = old | measured["diagrams"]
         arguments.baselines.write_text(json.dumps(measured, indent=1) + "\n")
     worse = gate.regressions(diagrams, unit, baselines) if baselines else []
-    for _ in range(RETRIES if worse else 0):  # on a busy machine only repeated slowness counts
+    for _ in range(RETRIES if worse else 0):  # on a busy machine, a point is slow only if it is slow repeatedly
         named = {line.split(":")[0] for line in worse}
         diagrams = [gate.take_faster(d, every[d.name]()) if d.name in named else d for d in diagrams]
         worse = gate.regressions(diagrams, unit, baselines)

@@ -1,4 +1,4 @@
-"""Alignment of a depth map, plain and robust least squares, over the share of outliers."""
+"""Diagram of the alignment of a depth map by plain and by robust least squares, by the share of outliers."""
 
 from __future__ import annotations
 
@@ -8,17 +8,25 @@ from benchmarks.bench.points import Diagram, Point, cpu_seconds
 from reffusion import seeding
 from reffusion.depth.alignment import align
 
-SIZE = 120 * 160
-SHARES = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
-NOISE = 0.01  # of the inliers, relative to the map's spread
-SEEDS = 5
+SIZE = 120 * 160  # number of pixels
+SHARES = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)  # shares of outliers
+NOISE = 0.01  # standard deviation of the inliers' noise, relative to that of the map
+SEEDS = 5  # number of maps for each share
 
 
 def make_maps(share: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(estimate, target, truth), [SIZE] each; the truth is affine in the estimate.
+    """Make a disparity map and its noisy target with outliers.
 
-    A share of the target is displaced upwards by up to its whole range, as objects in front of a wall displace its
-    disparity.
+    Outliers are larger than the truth by up to the whole range, like the disparity of objects in front of a wall.
+
+    Args:
+        share: share of outliers.
+        seed: seed.
+
+    Returns:
+        estimate: [SIZE], the map to align.
+        target: [SIZE], the truth with noise and outliers.
+        truth: [SIZE], an affine function of the estimate.
     """
     random = np.random.default_rng(seeding.seed_for(seed, "alignment", share))
     estimate = random.uniform(0.2, 1.0, SIZE)
@@ -30,6 +38,7 @@ def make_maps(share: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def diagram() -> Diagram:
+    """Measure error and time of plain and robust alignment by the share of outliers."""
     points = []
     for curve, robust in (("plain", False), ("robust", True)):
         for share in SHARES:
@@ -39,7 +48,7 @@ def diagram() -> Diagram:
                 fitted = align(estimate, target, robust=robust).apply(estimate)
                 errors.append(np.sqrt(np.mean((fitted - truth) ** 2)) / truth.std())
             seconds = cpu_seconds(lambda r=robust, e=estimate, t=target: align(e, t, robust=r))
-            # The recommendation is for 10 % outliers, which masks cause along an object's border.
+            # The recommendation is made at 10 % outliers, a share that masks cause along an object's border.
             points.append(Point(curve, f"{share:.0%}", share, float(np.mean(errors)), seconds, share == 0.1))
     why = "At 10 % outliers; without outliers both are equally good, and plain is the paper's L2."
     return Diagram(

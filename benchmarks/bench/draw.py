@@ -1,4 +1,4 @@
-"""Charts of the work-precision diagrams."""
+"""Charts of the work-precision diagrams, which show the error against the time."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ from benchmarks.bench.points import Diagram
 
 
 def draw(diagram: Diagram, path: Path) -> None:
-    """Chart error against milliseconds, one line per curve, settings beside their points, the default ringed.
+    """Draw the error against CPU time, one line per curve, with each setting beside its point and the default ringed.
 
-    If `diagram.over` names a condition instead of "seconds", it is the x axis and milliseconds get a second chart.
+    If `diagram.over` names a condition instead of "seconds", two panels show error and CPU time against this condition.
+
+    Args:
+        diagram: what to draw.
+        path: PNG to write.
     """
     from matplotlib.figure import Figure
 

@@ -1,4 +1,8 @@
-"""Baselines of the diagrams: errors have a tight tolerance, times a loose one in units of the machine's speed."""
+"""Comparison of the diagrams with recorded baselines.
+
+Errors have a tight tolerance. Times have a loose one and are divided by the time of a fixed computation, the *machine
+unit*, so that baselines hold on machines of other speed too.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +15,13 @@ import numpy as np
 
 from benchmarks.bench.points import Diagram, cpu_seconds
 
-SLOWER = 2.0  # allowed factor on a baseline's time, in machine units; repeats on one machine differ by up to 1.6
-LEAST_SECONDS = 2e-3  # smaller differences are noise
-LEAST_ERROR = 1e-9
+SLOWER = 2.0  # allowed factor on a baseline's time in machine units; repeats on one machine differ by up to 1.6
+LEAST_SECONDS = 2e-3  # differences of time below this are noise
+LEAST_ERROR = 1e-9  # differences of errors below this are ignored
 
 
 def machine_unit() -> float:
-    """CPU seconds of a fixed piece of arithmetic and memory work, by which times are divided."""
+    """Return the CPU seconds of a fixed computation with arithmetic and memory work, by which times are divided."""
     random = np.random.default_rng(0)
     square, long = random.standard_normal((300, 300)), random.standard_normal(300_000)
 
@@ -31,13 +35,31 @@ def machine_unit() -> float:
 
 
 def baseline_table(diagrams: list[Diagram], unit: float) -> dict[str, Any]:
-    """Content of a baseline file: name -> {"curve, setting": [error, seconds]}."""
+    """Return the content of a file of baselines.
+
+    Args:
+        diagrams: measured diagrams.
+        unit: the machine unit, seconds.
+
+    Returns:
+        "machine_unit", and "diagrams": name of a diagram -> {"curve, setting": [error, seconds]}.
+    """
     points = {d.name: {f"{p.curve}, {p.setting}": [p.error, p.seconds] for p in d.points} for d in diagrams}
     return {"machine_unit": unit, "diagrams": points}
 
 
 def regressions(diagrams: list[Diagram], unit: float, baselines: dict[str, Any]) -> list[str]:
-    """One line for each point that is worse than its baseline, or exists on one side only."""
+    """Compare measured diagrams with baselines.
+
+    Args:
+        diagrams: measured diagrams.
+        unit: the machine unit of this machine, seconds.
+        baselines: result of `load`.
+
+    Returns:
+        One line of text for each point that is worse than its baseline, that has no baseline, or that is in the
+        baselines and was not measured. Empty if all is well.
+    """
     lines, pace = [], unit / baselines["machine_unit"]
     for diagram in diagrams:
         if diagram.name not in baselines["diagrams"]:
@@ -62,14 +84,23 @@ def regressions(diagrams: list[Diagram], unit: float, baselines: dict[str, Any])
 
 
 def take_faster(diagram: Diagram, repeated: Diagram) -> Diagram:
-    """The diagram with the shorter of two measured times at each point, and the errors of the first."""
+    """Return a diagram with the shorter of two measured times at each point.
+
+    Args:
+        diagram: first measurement, whose errors are kept.
+        repeated: second measurement of the same points.
+    """
     seconds = {(p.curve, p.setting): p.seconds for p in repeated.points}
     points = [replace(p, seconds=min(p.seconds, seconds[p.curve, p.setting])) for p in diagram.points]
     return replace(diagram, points=points)
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Load baselines. ValueError if the file is missing."""
+    """Load a file of baselines.
+
+    Raises:
+        ValueError: the file is missing.
+    """
     try:
         return json.loads(path.read_text())
     except FileNotFoundError:

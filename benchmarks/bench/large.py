@@ -1,19 +1,20 @@
 """Speed of CPU splatting: `python -m benchmarks.bench.large [--sizes 100000@512x384 ...] [--repeats 9] [--threads 2]`.
 
-A step is one rendering (colour, depth, alpha) and its backward pass. Times are medians of one thread's CPU time, with
-all sizes measured in turn; thread scaling is wall-clock time. Columns:
+A *step* is one rendering (colour, depth, alpha) and its backward pass. Times are medians of one thread's CPU time, with
+all sizes measured in turn; the scaling with threads is measured in wall time. Columns:
 
-  pairs      pixel-Gaussian pairs that blend, millions, by the oracle's rule
-  lanes      pixel-Gaussian slots that the kernel visits, millions
-  fwd, bwd   milliseconds
-  step/aim   step over the target time: 0.28 us per Gaussian + 4.2 ns per pair + 8 ns per pixel, stated for a core with
-             a measured peak of 214 GF/s
-  scaled     the same with the target multiplied by 214 / (peak measured in this run)
-  Glane/s    visited lanes per time of the pass, forward and backward
-  FMA share  operations that any renderer needs, over the peak: 31 per pair forward, 49 backward (an FMA is two; work
-             per Gaussian or per pixel is not counted)
-  threads    wall time of one thread over that of --threads: median and upper quartile over pairs of consecutive steps
-  ceiling    the same for independent arithmetic, run between those steps: what the machine could give at the time
+  pairs      millions of pixel-Gaussian pairs that are blended, by the oracle's rule
+  lanes      millions of pixel-Gaussian slots that the kernel visits, including those that do not blend
+  fwd, bwd   milliseconds of the forward and of the backward pass
+  step/aim   time of a step over its target time. The target is 0.28 us per Gaussian + 4.2 ns per pair + 8 ns per pixel,
+             for a core with a measured peak of 214 GF/s
+  scaled     the same, with the target multiplied by 214 / (peak measured in this run)
+  Glane/s    visited lanes per second, in the forward and in the backward pass, in 1e9
+  FMA share  necessary floating-point operations over what the peak allows in the time: 31 per pair forward, 49 backward
+             (a fused multiply-add is two; work per Gaussian or per pixel is not counted)
+  threads    speedup by --threads threads: median and upper quartile over pairs of consecutive steps, in wall time
+  ceiling    the same speedup for independent arithmetic, measured between these steps. It is the largest speedup that
+             the machine allowed at the time
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-# Imported before torch: it stops torch's idle threads from spinning, which would cost the second thread all its gain.
+# This import must precede torch. It stops torch's idle threads from spinning, which would undo the second thread's
+# gain.
 from reffusion.splat import rasterizer  # isort: skip
 
 import numba
@@ -43,15 +45,26 @@ from reffusion.splat.layout import ROWS
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 SIZES = ("5000@256x192", "20000@320x240", "100000@512x384", "100000@1008x756", "500000@1008x756")
-PER_GAUSSIAN, PER_PAIR, PER_PIXEL, PEAK = 0.28e-6, 4.2e-9, 8e-9, 214.0  # the target: seconds, and GF/s of its machine
-FORWARD_OPERATIONS = 2 + 4 + 13 + 3 + 9  # u; log2 alpha; exp2; weight and transmittance; colour, depth, alpha
-BACKWARD_OPERATIONS = 2 + 4 + 13 + 3 + 7 + 8 + 2 + 5 + 5  # the same; shade; colours; remainder; g; its moments
-LAYERS = 35  # approximate number of Gaussians over each pixel, hidden ones included
+PER_GAUSSIAN, PER_PAIR, PER_PIXEL, PEAK = 0.28e-6, 4.2e-9, 8e-9, 214.0  # the target's seconds, and its machine's GF/s
+# Operations per pair. Forward: u; log2 alpha; exp2; weight and transmittance; colour, depth, alpha. Backward: the first
+# four again; shade; colours; remainder; g; the moments of g.
+FORWARD_OPERATIONS = 2 + 4 + 13 + 3 + 9
+BACKWARD_OPERATIONS = 2 + 4 + 13 + 3 + 7 + 8 + 2 + 5 + 5
+LAYERS = 35  # approximate number of Gaussians over each pixel, including occluded ones
 
 
 @dataclass
 class Case:
-    """One scene and view, and its measurements in milliseconds."""
+    """Scene and view to measure, and the measurements.
+
+    Attributes:
+        gaussians: the scene.
+        camera: the view.
+        pairs: number of pixel-Gaussian pairs that are blended.
+        lanes: number of pixel-Gaussian slots that the kernel visits.
+        forward: measured times of the forward pass, ms.
+        backward: measured times of the backward pass, ms.
+    """
 
     gaussians: Gaussians
     camera: Camera
@@ -68,7 +81,13 @@ class Case:
 
 
 class Scaling(NamedTuple):
-    """Speedup of --threads over one thread: median and upper quartile for steps, median of the machine's ceiling."""
+    """Speedup by several threads over one thread, in wall time.
+
+    Attributes:
+        median: median over steps.
+        upper: upper quartile over steps.
+        ceiling: median speedup of independent arithmetic, the largest that the machine allows.
+    """
 
     median: float
     upper: float
@@ -79,7 +98,7 @@ class Scaling(NamedTuple):
 
 
 def make_scene(count: int, camera: Camera, seed: int = 0) -> Gaussians:
-    """Gaussians all over a view's frustum, of SH degree 3, sized so that about LAYERS of them cover each pixel."""
+    """Make random Gaussians of SH degree 3 all over a view's frustum; about `LAYERS` of them cover each pixel."""
     generator = torch.Generator().manual_seed(seed)
     uniform = lambda *shape: torch.rand(*shape, generator=generator)
     normal = lambda *shape: torch.randn(*shape, generator=generator)
@@ -96,7 +115,11 @@ def make_scene(count: int, camera: Camera, seed: int = 0) -> Gaussians:
 
 
 def prepare(size: str) -> Case:
-    """Case from a size like '100000@512x384'."""
+    """Make the case of a size such as "100000@512x384" (number of Gaussians, image size).
+
+    Raises:
+        ValueError: the text is not of this form.
+    """
     match = re.fullmatch(r"(\d+)@(\d+)x(\d+)", size)
     if not match:
         raise ValueError(f"size {size!r}: write it like {SIZES[0]}")
@@ -108,7 +131,7 @@ def prepare(size: str) -> Case:
 
 
 def visited_lanes(gaussians: Gaussians, camera: Camera) -> int:
-    """Slots of the tile lists that the kernel visits."""
+    """Return the number of pixel-Gaussian slots that the kernel visits."""
     parameters = [getattr(gaussians, name).numpy() for name in PARAMETERS]
     view = cpu.project_and_bin(parameters, gaussians.antialiased, np.empty((0, 2), np.float32), camera, 0)
     nothing, black = np.empty((len(gaussians), 0), np.float32), np.zeros(3, np.float32)
@@ -120,7 +143,7 @@ def visited_lanes(gaussians: Gaussians, camera: Camera) -> int:
 
 
 def time_step(case: Case, clock) -> tuple[float, float]:
-    """Milliseconds of one forward and one backward pass."""
+    """Run one forward and one backward pass; return the milliseconds of each by the given clock (in seconds)."""
     leaves = case.gaussians.map(lambda tensor: tensor.detach().requires_grad_())
     start = clock()
     rendering = rasterizer.render(leaves, case.camera)
@@ -132,7 +155,7 @@ def time_step(case: Case, clock) -> tuple[float, float]:
 
 @numba.njit(nogil=True)
 def _fma_chains(rounds):
-    """Ten independent chains of multiply-adds."""
+    """Compute ten independent chains of fused multiply-adds on vectors."""
     x, y = v.splat(0.999), v.splat(0.001)
     a, b, c, d, e = v.ramp(), v.ramp() * 2.0, v.ramp() * 3.0, v.ramp() * 4.0, v.ramp() * 5.0
     f, g, h, i, j = v.ramp() * 6.0, v.ramp() * 7.0, v.ramp() * 8.0, v.ramp() * 9.0, v.ramp() * 10.0
@@ -143,7 +166,7 @@ def _fma_chains(rounds):
 
 
 def fma_peak(rounds: int = 3_000_000, tries: int = 10) -> float:
-    """GF/s of one core, the best of a few tries."""
+    """Return the peak speed of one core in GF/s (1e9 floating-point operations per second), the best of some tries."""
     _fma_chains(1)
     seconds = []
     for _ in range(tries):
@@ -154,7 +177,10 @@ def fma_peak(rounds: int = 3_000_000, tries: int = 10) -> float:
 
 
 def time_first_image() -> tuple[float, float]:
-    """CPU seconds from starting Python to the first small image with warm caches, and those of torch's import."""
+    """Return the CPU seconds from the start of Python to the first small image, and those of torch's import alone.
+
+    The caches of compiled kernels are warm.
+    """
     image = (
         "import benchmarks.bench.large as b; import numpy as np; "
         "view = b.Camera('v', 64, 48, 70.0, 70.0, 32.0, 24.0, np.eye(4)); "
@@ -173,7 +199,7 @@ def time_first_image() -> tuple[float, float]:
 
 
 def measure_scaling(case: Case, threads: int, repeats: int) -> Scaling:
-    """Speedup in wall time of several threads over one, from pairs of consecutive steps."""
+    """Measure the speedup by several threads over one thread in wall time, from pairs of consecutive steps."""
     steps, ceilings = [], []
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(time.sleep, threads * [0.01]))  # starts the threads
@@ -185,14 +211,14 @@ def measure_scaling(case: Case, threads: int, repeats: int) -> Scaling:
 
 
 def _best_step(case: Case, threads: int, tries: int = 2) -> float:
-    """Milliseconds of wall time."""
+    """Return the wall time of a step with the given number of threads in milliseconds, the best of some tries."""
     torch.set_num_threads(threads)
     time_step(case, time.perf_counter)  # torch creates its threads again
     return min(sum(time_step(case, time.perf_counter)) for _ in range(tries))
 
 
 def _ceiling(pool: ThreadPoolExecutor, threads: int, rounds: int = 20_000_000) -> float:
-    """Speedup of independent arithmetic on that many threads."""
+    """Return the speedup of independent arithmetic by the given number of threads over one thread."""
     start = time.perf_counter()
     _fma_chains(rounds)
     middle = time.perf_counter()
@@ -201,7 +227,13 @@ def _ceiling(pool: ThreadPoolExecutor, threads: int, rounds: int = 20_000_000) -
 
 
 def format_row(case: Case, peak: float, speedup: Scaling | None) -> str:
-    """One row of the table."""
+    """Return a row of the table.
+
+    Args:
+        case: the case with its measurements.
+        peak: peak speed of a core, GF/s.
+        speedup: speedup by threads; None if not measured.
+    """
     fwd, bwd = float(np.median(case.forward)), float(np.median(case.backward))
     size = f"{len(case.gaussians)}@{case.camera.width}x{case.camera.height}"
     ratio = (fwd + bwd) / case.aim
@@ -229,7 +261,7 @@ def main() -> None:
     peak = fma_peak()
     for _ in range(options.repeats):
         for case in cases:
-            time_step(case, time.thread_time)  # warms the caches as in a fit, where one step follows another
+            time_step(case, time.thread_time)  # warms the caches, because in a fit one step follows another
             for series, ms in zip((case.forward, case.backward), time_step(case, time.thread_time), strict=True):
                 series.append(ms)
     peak = max(peak, fma_peak())

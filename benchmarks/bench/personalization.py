@@ -1,4 +1,4 @@
-"""Personalization over steps, rank and learning rate: as recorded in LOG.md and, slowly, measured again."""
+"""Diagrams of personalization by steps, rank and learning rate: as recorded in LOG.md, and (slowly) measured again."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import yaml
 from benchmarks.bench.points import Diagram, Point
 
 ROOT = Path(__file__).resolve().parents[2]
-# LOG.md, "Prior, personalization, SDS", 2026-11-21: demo, a whole view of 64 px painted from noise; CPU seconds of one
-# thread and PSNR (dB) in the reference's hole. The prior without personalization: 15.4 dB.
+# (curve, setting) -> (CPU seconds of one thread, PSNR in the reference's hole in dB) on the scene demo, where a whole
+# view of 64 px is painted from noise. From LOG.md, "Prior, personalization, SDS", 2026-11-21. The prior before
+# personalization has 15.4 dB.
 RECORDED = {
     ("rank 16, rectangles, 16 x 32 px", "120 steps"): (136.0, 16.8),
     ("rank 16, rectangles, 16 x 32 px", "400 steps"): (395.0, 17.8),
@@ -23,6 +24,7 @@ STEPS, RANKS, RATES = (50, 100, 200, 400), (8, 16, 64), (1.25e-3, 2.5e-3, 5e-3)
 
 
 def recorded_diagram() -> Diagram:
+    """Return the diagram of the recorded values."""
     points = [
         Point(curve, setting, 0.0, 10 ** (-psnr / 20), seconds)
         for (curve, setting), (seconds, psnr) in RECORDED.items()
@@ -38,7 +40,13 @@ def recorded_diagram() -> Diagram:
 
 
 def diagram(run: Path, out: Path) -> Diagram:
-    """Measure again with the laptop profile's other parameters: steps, and ranks and rates at 200 steps.
+    """Personalize with several numbers of steps, and with several ranks and learning rates at 200 steps, and measure.
+
+    All other parameters are those of the laptop profile. Finished personalizations in `out` are not run again.
+
+    Args:
+        run: runs/<scene>, with the stage `reference`.
+        out: folder of the benchmark.
 
     Raises:
         ValueError: the run has no stage `reference`.
@@ -60,7 +68,7 @@ def diagram(run: Path, out: Path) -> Diagram:
         single = {"steps": changed["steps"]} | changed.get("lora", {}) | changed.get("optimizer", {})
         name = ", ".join(f"{key} {value:g}" for key, value in single.items() if key not in ("alpha", "lr_text"))
         folder = out / "personalization" / name.replace(", ", "_").replace(" ", "")
-        if not (folder / "pytorch_lora_weights.safetensors").exists():  # an interrupted one continues
+        if not (folder / "pytorch_lora_weights.safetensors").exists():  # an interrupted personalization continues
             folder.mkdir(parents=True, exist_ok=True)
             personalize.run(personalize.Params(**{**usual, **changed, **grouped}), folder, **needs)
         last = trace.read_trace(folder / "trace.jsonl")[-1]

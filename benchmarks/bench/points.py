@@ -1,4 +1,4 @@
-"""A measured point, a diagram of points, and the setting that a diagram recommends."""
+"""Work-precision diagrams: measured points, diagrams of points, and the setting that a diagram recommends."""
 
 from __future__ import annotations
 
@@ -6,19 +6,21 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-NEAR_BEST = 1.1  # a setting is as good as the best if its error is within this factor
+NEAR_BEST = 1.1  # a setting counts as good as the best one if its error is at most this factor larger
 
 
 @dataclass(frozen=True)
 class Point:
-    """One setting of one curve.
+    """Measured error and time of one setting.
 
     Attributes:
-        curve, setting: names; together unique within a diagram.
-        x: the setting as a number, if it is one.
-        error: in the diagram's unit; less is better.
+        curve: name of the curve to which the point belongs.
+        setting: name of the setting; curve and setting together are unique within a diagram.
+        x: the setting as a number, if the setting is a number.
+        error: error in the diagram's unit; less is better.
         seconds: CPU time of one call.
-        stands: whether it can be recommended; False for points that are no choice, such as an earlier iterate.
+        stands: True if the setting can be recommended; False for points that are no choice, such as an earlier
+            iterate.
     """
 
     curve: str
@@ -31,15 +33,17 @@ class Point:
 
 @dataclass(frozen=True)
 class Diagram:
-    """Error against work.
+    """Diagram of error against time for several settings.
 
     Attributes:
-        name: short, also of the file.
-        title, error: what is varied, and what the error is, with its unit.
-        default: (curve, setting) that the project uses; None if there is no choice.
-        points: measured.
-        tolerance: factor on a baseline's error that is not yet a regression.
-        over: the x axis: "seconds", or the name of the setting if it is a condition and not a choice.
+        name: short name, also that of the file.
+        title: description of what is varied.
+        error: description of the error, with its unit.
+        default: (curve, setting) that the project uses; None if there is nothing to choose.
+        points: measured points.
+        tolerance: an error up to this factor larger than its baseline is not a regression.
+        over: quantity on the x axis: "seconds", or the name of the varied condition if it is not a choice (such as a
+            share of outliers).
         why: reasons for the default that errors and times do not show.
     """
 
@@ -54,6 +58,7 @@ class Diagram:
 
     @property
     def curves(self) -> dict[str, list[Point]]:
+        """The points by the names of their curves."""
         curves_by_name: dict[str, list[Point]] = {}
         for point in self.points:
             curves_by_name.setdefault(point.curve, []).append(point)
@@ -61,7 +66,10 @@ class Diagram:
 
 
 def recommendation(diagram: Diagram) -> str:
-    """The cheapest setting that is as good as the best, and how the default compares."""
+    """Return a text with the fastest setting that is about as good as the best one, and a comparison with the default.
+
+    About as good means: its error is at most `NEAR_BEST` times the smallest error.
+    """
     if diagram.default is None:
         return f"{diagram.name}: nothing to choose. {diagram.why}".strip()
     choices = [point for point in diagram.points if point.stands]
@@ -81,7 +89,7 @@ def recommendation(diagram: Diagram) -> str:
 
 
 def cpu_seconds(work: Callable[[], object], repeats: int = 3) -> float:
-    """Least CPU time of a few calls, so that other processes count little."""
+    """Return the least CPU time of a few calls, which other processes influence least."""
     least = float("inf")
     for _ in range(repeats):
         began = time.process_time()

@@ -1,4 +1,7 @@
-"""The bilateral solver over iterations and cell size, and the completion over its grid size, against the truth."""
+"""Diagrams of the bilateral solver, by iterations and cell size, and of depth completion, by the size of its grid.
+
+Both are measured against a known truth.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +15,20 @@ from reffusion import seeding, trace
 from reffusion.depth import bilateral, completion
 
 HEIGHT, WIDTH = 180, 240
-CELLS = (4.0, 8.0, 16.0, 32.0)  # px
-UNKNOWNS = (60_000, 5_000, 1_500, 500)  # largest numbers of unknowns
-NOISE = 0.01  # of the target, relative to the map's spread
+CELLS = (4.0, 8.0, 16.0, 32.0)  # sizes of the bilateral grid's cells, px
+UNKNOWNS = (60_000, 5_000, 1_500, 500)  # limits on the completion's number of unknowns
+NOISE = 0.01  # standard deviation of the target's noise, relative to that of the map
 
 
 def picture(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(truth, target, confidence, guide, part), [H, W] each, guide [H, W, 3].
+    """Make a disparity map with a hole, and a picture of the scene.
 
-    truth: disparity of three slanted planes that meet; target: with noise; confidence: 0 in a round hole over the
-    creases, else 1; guide: a picture whose colours change where the planes do; part: index of the plane.
+    Returns:
+        truth: [H, W], disparity of three slanted planes that meet.
+        target: [H, W], the truth with noise, 0 in the hole.
+        confidence: [H, W], 0 in a round hole over the creases between the planes, else 1.
+        guide: uint8 [H, W, 3], a picture whose colours change from plane to plane.
+        part: [H, W], index of the plane.
     """
     random = np.random.default_rng(seeding.seed_for(seed, "solvers"))
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] / WIDTH
@@ -35,9 +42,10 @@ def picture(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
 
 
 def bilateral_diagram() -> Diagram:
-    """The solver corrects, in the hole, an estimate with a different error on each surface, as monocular depth has.
+    """Measure the bilateral solver along its iterations, for several cell sizes.
 
-    The error is estimated from the misfit around the hole.
+    The solver gets an estimate with a different error on each surface, like monocular depth. It corrects the estimate
+    in the hole by the misfit around the hole.
     """
     truth, target, confidence, guide, part = picture()
     hole = confidence == 0
@@ -61,7 +69,16 @@ def bilateral_diagram() -> Diagram:
 
 
 def along(work: Callable, error: Callable, repeats: int = 3) -> dict[int, tuple[float, float]]:
-    """Iteration -> (least seconds until it, error there), at log-spaced iterations; measuring does not count."""
+    """Measure an iterative solver along its iterations, at logarithmically spaced iterations.
+
+    Args:
+        work: called with a function that it must call after each iteration.
+        error: returns the error of an iterate.
+        repeats: number of repetitions, of which the least time counts.
+
+    Returns:
+        Iteration -> (CPU seconds until then without the measurements, error).
+    """
     seconds: dict[int, float] = {}
     errors: dict[int, float] = {}
     for _ in range(repeats):
@@ -80,6 +97,7 @@ def along(work: Callable, error: Callable, repeats: int = 3) -> dict[int, tuple[
 
 
 def completion_diagram() -> Diagram:
+    """Measure depth completion with and without the picture, for several limits on the number of unknowns."""
     truth, target, confidence, guide, _ = picture()
     hole = confidence == 0
     points = []

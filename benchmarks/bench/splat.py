@@ -1,4 +1,7 @@
-"""The rasterizer in float32 against its float64 oracle: over footprint size, cut-off and tile height."""
+"""Diagrams of the rasterizer in float32 against the oracle, the plain torch implementation in float64.
+
+They vary the size of footprints, the cut-off of faint contributions, and the height of tiles.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +22,18 @@ from reffusion.types import PARAMETERS, Camera, Gaussians
 ROOT = Path(__file__).resolve().parents[2]
 VIEW = Camera("bench", 96, 72, 100.0, 100.0, 48.0, 36.0, np.eye(4))
 FOOTPRINTS = (0.3, 1.0, 3.0, 10.0, 30.0)  # standard deviation, px
-CUTOFFS = (1 / 2048, 1 / 1024, 1 / 512, 1 / 255, 1 / 128, 1 / 64, 1 / 32)
-TILES = (16, 32, 64, 128)  # height, px
+CUTOFFS = (1 / 2048, 1 / 1024, 1 / 512, 1 / 255, 1 / 128, 1 / 64, 1 / 32)  # alpha below which contributions are skipped
+TILES = (16, 32, 64, 128)  # heights of tiles, px
 LAYERS = 20  # approximate number of opaque layers over a pixel
 
 
 def scene(sigma: float, seed: int = 0) -> Gaussians:
-    """Gaussians all over the view's frustum, with a mean standard deviation of `sigma` px; float64."""
+    """Make random Gaussians all over the frustum of `VIEW`, in float64.
+
+    Args:
+        sigma: typical standard deviation of the footprints, px.
+        seed: seed.
+    """
     draw = torch.Generator().manual_seed(seed)
     count = int(np.clip(LAYERS * VIEW.width * VIEW.height / (2 * np.pi * max(sigma, 1.0) ** 2), 40, 1500))
     uniform = lambda *shape: torch.rand(*shape, generator=draw, dtype=torch.float64)
@@ -42,7 +50,11 @@ def scene(sigma: float, seed: int = 0) -> Gaussians:
 
 
 def step(gaussians: Gaussians, impl: str) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Colour, and the gradients of a fixed function of it with respect to all parameters."""
+    """Render the Gaussians with an implementation of the rasterizer, forward and backward.
+
+    Returns:
+        The colours [H, W, 3], and the gradients of a fixed function of the colours with respect to all parameters.
+    """
     leaves = gaussians.map(lambda p: p.detach().clone().requires_grad_())
     color = rasterizer.render(leaves, VIEW, impl=impl).color
     rows, columns = torch.meshgrid(torch.arange(VIEW.height), torch.arange(VIEW.width), indexing="ij")
@@ -52,21 +64,23 @@ def step(gaussians: Gaussians, impl: str) -> tuple[torch.Tensor, list[torch.Tens
 
 
 def relative(value: torch.Tensor, truth: torch.Tensor) -> float:
+    """Return the relative L2 error of a tensor."""
     return float((value.double() - truth).norm() / truth.norm())
 
 
 def errors(gaussians: Gaussians) -> tuple[float, float]:
-    """Relative errors of float32: of the image, and the largest of the gradients."""
+    """Return the relative L2 errors of the float32 rasterizer: of the image, and of its worst gradient."""
     (picture, slopes), (color, gradients) = step(gaussians.map(torch.Tensor.float), "cpu"), step(gaussians, "torch")
     return relative(picture, color), max(relative(a, b) for a, b in zip(slopes, gradients, strict=True))
 
 
 def footprint_diagram() -> Diagram:
+    """Measure the rasterizer's error and time by the size of footprints."""
     points = []
     for sigma in FOOTPRINTS:
         single = scene(sigma).map(torch.Tensor.float)
         seconds = cpu_seconds(lambda single=single: step(single, "cpu"), repeats=5)
-        # The median, as rarely a contribution of 1/255 falls on the other side of the cut-off in float32.
+        # The median of three scenes, because in rare cases a contribution near 1/255 is skipped in only one precision.
         image, worst = np.median([errors(scene(sigma, seed)) for seed in range(3)], 0).tolist()
         points.append(Point("image", f"{sigma:g} px", sigma, image, seconds))
         points.append(Point("worst gradient", f"{sigma:g} px", sigma, worst, seconds))
@@ -83,7 +97,10 @@ def footprint_diagram() -> Diagram:
 
 
 def cutoff_diagram() -> Diagram:
-    """Cost of skipping faint contributions, in the oracle: error against skipping none, and the remaining work."""
+    """Measure the effect of skipping faint contributions, in the oracle.
+
+    The error is that against skipping none. The work is counted: the number of blended pairs times a time per pair.
+    """
     gaussians, original = scene(3.0), pure_torch.MIN_ALPHA
     draw = lambda: step(gaussians, "torch")
     ones = torch.ones(VIEW.height, VIEW.width, 1, dtype=torch.float64)
@@ -96,7 +113,9 @@ def cutoff_diagram() -> Diagram:
         for cutoff in CUTOFFS:
             pure_torch.MIN_ALPHA = cutoff
             picture, slopes = draw()
-            per_pair = 4.2e-9  # seconds, docs/method.md#splatting: the oracle's own time does not depend on the cut-off
+            # Seconds per pair, docs/method.md#splatting. The oracle cannot be timed, as its time does not depend on the
+            # cut-off.
+            per_pair = 4.2e-9
             seconds, name = per_pair * pairs(), f"1/{1 / cutoff:.0f}"
             worst = max(relative(a, b) for a, b in zip(slopes, gradients, strict=True))
             points.append(Point("image", name, cutoff, relative(picture, color), seconds))
@@ -114,7 +133,10 @@ def cutoff_diagram() -> Diagram:
 
 
 def tile_diagram() -> Diagram:
-    """Other tile heights, each compiled in its own process (about a minute each)."""
+    """Measure the rasterizer by the height of tiles.
+
+    Each height is compiled in a process of its own, which takes about a minute.
+    """
     points = []
     for height in TILES:
         with tempfile.TemporaryDirectory() as cache:
@@ -134,7 +156,11 @@ def tile_diagram() -> Diagram:
 
 
 def measured() -> dict[str, tuple[float, float]]:
-    """Curve -> (error of the worst gradient, seconds), with the present constants."""
+    """Measure the rasterizer with the present tile height, for three sizes of footprints.
+
+    Returns:
+        Name of a curve -> (relative L2 error of the worst gradient, CPU seconds).
+    """
     torch.set_num_threads(1)
     diagrams = {}
     for sigma in (1.0, 3.0, 10.0):
@@ -148,6 +174,7 @@ if __name__ == "__main__":
     from reffusion.kernels import compiled
     from reffusion.splat import layout
 
-    layout.TILE_HEIGHT = int(sys.argv[1])  # before the import of the kernels, which take it as a constant
-    compiled._cache_folder = lambda: Path(sys.argv[2]) / "kernels"  # the usual folder depends on the sources only
+    layout.TILE_HEIGHT = int(sys.argv[1])  # set before the kernels are imported, because they compile it as a constant
+    # The usual cache folder depends on the sources only, and would give kernels of another height.
+    compiled._cache_folder = lambda: Path(sys.argv[2]) / "kernels"
     print(json.dumps(measured()))

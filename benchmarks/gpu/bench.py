@@ -1,4 +1,4 @@
-"""Shared by the parts of gpu-check: sizes, scene, prior, and the clock."""
+"""Helpers shared by the parts of gpu-check: sizes, scene, prior, and measurement of time and memory."""
 
 from __future__ import annotations
 
@@ -24,7 +24,19 @@ from reffusion.weights import local, published
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of what is measured: rows of a view (a quarter wider), Gaussians, samples, steps and views of the fit."""
+    """Sizes of the measured computations.
+
+    Attributes:
+        rows: height of a view, px; the width is a quarter larger.
+        gaussians: number of Gaussians.
+        batch: samples of a personalization step.
+        fit_steps: steps of the fit.
+        views: views of the fit.
+        repeats: number of timed repetitions.
+        critic: parameters of the adversarial term.
+        shape: configuration of the prior.
+        oracle: number of Gaussians and image width in px for comparisons with the oracle.
+    """
 
     rows: int
     gaussians: int
@@ -34,7 +46,7 @@ class Sizes:
     repeats: int
     critic: AdversarialTerm
     shape: full_size.Shape
-    oracle: tuple[int, int] = (400, 200)  # Gaussians and image width of the comparison with the oracle
+    oracle: tuple[int, int] = (400, 200)
 
 
 PAPER = Sizes(1280, 500_000, 16, 400, 12, 3, AdversarialTerm(), full_size.SD2)  # 1600 x 1280 px
@@ -45,10 +57,10 @@ TOY = Sizes(
 
 @dataclass
 class Bench:
-    """Device and sizes of the parts, and the last prior, which the next part may need again.
+    """Device and sizes of all parts. It also keeps the last prior, which the next part may need again.
 
     Attributes:
-        sizes: of what is measured.
+        sizes: sizes of the computations.
         device: "cuda" or "cpu".
         out: folder for files of a part.
     """
@@ -59,7 +71,13 @@ class Bench:
     _prior: tuple[str, Prior, str] | None = field(default=None, repr=False)
 
     def prior(self, half: str) -> tuple[Prior, str]:
-        """(prior, source): in that precision on a GPU, else float32; published weights if present, else random ones."""
+        """Return the prior and the source of its weights: the name of the published ones, or "random".
+
+        The published weights are used if they are on this machine, else random ones of the same shapes.
+
+        Args:
+            half: dtype on a GPU, "float16" or "bfloat16"; on the CPU the prior is in float32.
+        """
         if self._prior is None or self._prior[0] != half:
             self._prior = None
             gc.collect()
@@ -71,16 +89,22 @@ class Bench:
         return self._prior[1], self._prior[2]
 
     def forget_prior(self) -> None:
+        """Drop the kept prior, to free its memory or because a part has changed it."""
         self._prior = None
 
     def scene(self) -> tuple[Gaussians, Tensor]:
-        """Gaussians that fill the view, and labels."""
+        """Make random Gaussians that fill the view, and random labels, bool [N], about a tenth True (masked)."""
         gaussians = full_size.gaussians(self.sizes.gaussians, self.device)
         masked = torch.rand(len(gaussians), generator=generator(0, "labels")) < 0.1
         return gaussians, masked.to(self.device)
 
     def measure(self, work: Callable[[], dict[str, float] | None]) -> dict[str, Any]:
-        """Median seconds after a warm-up, peak memory of the GPU (or of live tensors), and the values of `work`."""
+        """Measure the time and memory of `work`, after a warm-up call.
+
+        Returns:
+            "seconds": median; "peak_gb": peak memory of the GPU, on the CPU that of live tensors; on a GPU
+            "reserved_gb"; and the values that `work` returns in its first call.
+        """
         values, seconds = work() or {}, []
         for _ in range(self.sizes.repeats):
             self._wait()

@@ -1,12 +1,14 @@
-"""Check of the production path on this GPU: does it work, how fast, in how much memory? Takes up to 8 minutes.
+"""Check of the method at the paper's sizes on this GPU: correctness, speed and memory. Takes up to 8 minutes.
 
-- gsplat against the float64 oracle: colour, depth, alpha, features, weights and their gradients; antialiased, and in a
-  crop; SSIM's gradient.
-- One step of each loss at the paper's sizes with the full-size SD2-inpainting, with its weights if they are on this
-  machine, else random ones of the same shapes: seconds per step (median of three), memory allocated and reserved.
-- A fit at 1600 px: images per second, and that it improves; the hours that the paper's steps would take.
+- gsplat against the float64 oracle (plain torch): colour, depth, alpha, features, weights and their gradients; the same
+  antialiased, and in a crop; SSIM's gradient.
+- One step of each loss at the paper's sizes with the full-size SD2-inpainting: seconds per step (median of three),
+  memory allocated and reserved. The weights are the published ones if they are on this machine, else random ones of the
+  same shapes.
+- A fit at 1600 px: images per second, and whether the fit improves; the hours that the paper's steps would take.
 
-A part that fails reports why in a line, and the others continue. A JSON file and a table are written after each part.
+A part that fails reports the reason in a line, and all other parts still run. A JSON file and a table are written after
+each part.
 
     python -m benchmarks.gpu.check --out runs/gpu-check      (--device cpu: the same parts, small, on the CPU)
 """
@@ -53,7 +55,14 @@ PARTS: dict[str, Callable[[Bench], dict[str, Any]]] = {
 
 
 def check(device: str, out: Path) -> dict[str, Any]:
-    """Run all parts and write the report; a failing part does not stop the others. On the CPU sizes are small."""
+    """Run all parts, write gpu_check.json and gpu_check.md after each part, and return the report.
+
+    A failing part does not stop the following parts.
+
+    Args:
+        device: "cuda", or "cpu" for the same parts at small sizes.
+        out: folder to write to.
+    """
     out.mkdir(parents=True, exist_ok=True)
     bench = Bench(PAPER if device == "cuda" else TOY, device, out)
     report: dict[str, Any] = {"machine": describe_machine(device), "parts": {}}
@@ -68,7 +77,13 @@ def check(device: str, out: Path) -> dict[str, Any]:
 
 
 def run_part(part: Callable[[Bench], dict[str, Any]], bench: Bench, seconds: float) -> dict[str, Any]:
-    """Result of a part, or the reason why it was skipped or failed."""
+    """Run a part and return its result, or {"skipped": reason} or {"failed": reason}.
+
+    Args:
+        part: the part.
+        bench: device and sizes.
+        seconds: seconds since the beginning of the check; a part is skipped after `SECONDS_LIMIT`.
+    """
     if seconds > SECONDS_LIMIT:
         return {"skipped": f"{SECONDS_LIMIT:.0f} s are over"}
     try:
@@ -84,14 +99,21 @@ def run_part(part: Callable[[Bench], dict[str, Any]], bench: Bench, seconds: flo
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Write a file completely or not at all."""
+    """Write a file atomically: an interruption leaves the old file unchanged."""
     partial = path.with_suffix(path.suffix + ".writing")
     partial.write_text(text)
     os.replace(partial, path)
 
 
 def project_hours(parts: dict[str, dict[str, Any]]) -> dict[str, float]:
-    """Hours of the paper's steps at the measured seconds per step, for stages of which all terms were measured."""
+    """Compute the hours that the paper's numbers of steps would take at the measured seconds per step.
+
+    Args:
+        parts: name of a part -> result.
+
+    Returns:
+        Stage -> hours, for the stages whose parts were all measured.
+    """
     seconds = {name: part["seconds"] for name, part in parts.items() if "seconds" in part}
     hours, distill = {}, Distill()
     if "images_per_second" in parts.get("fit", {}):
@@ -106,9 +128,10 @@ def project_hours(parts: dict[str, dict[str, Any]]) -> dict[str, float]:
 
 
 def describe_machine(device: str) -> dict[str, Any]:
-    """The machine that the figures hold for.
+    """Return facts on the machine: GPU, driver, versions and settings.
 
-    Loads gsplat's extension before all parts, and builds it if `make gpu` has not.
+    This also loads gsplat's extension before all parts, so that no part's time includes it. If `make gpu` has not built
+    the extension, it is built now.
     """
     facts: dict[str, Any] = {"device": device, "torch": torch.__version__}
     if device == "cpu":
@@ -132,7 +155,7 @@ def describe_machine(device: str) -> dict[str, Any]:
 
 
 def table(report: dict[str, Any]) -> str:
-    """The report as Markdown, a row per part."""
+    """Return the report as a Markdown table with a row per part, the machine and the projected hours."""
     rows = ["| what | seconds | peak GB | more |", "| --- | --- | --- | --- |"]
     for name, part in report["parts"].items():
         more = {key: value for key, value in part.items() if key not in ("seconds", "peak_gb")}

@@ -1,7 +1,8 @@
-"""Operations and bytes of the parts of a step at full size, counted without computing: the table of the cost model.
+"""Table of the cost model: operations and bytes of the parts of a step at full size, counted without computing.
 
-Counts floating-point operations of matrix products and convolutions, and the bytes that all operations read and write
-(without attention matrices, which GPU kernels do not write), on torch's meta device.
+The script runs the parts on torch's meta device. It counts the floating-point operations of matrix products and
+convolutions, and the bytes that all operations read and write. Attention matrices are left out, because GPU kernels do
+not write them.
 
     python -m benchmarks.gpu.counts > reffusion/cost/counts.py
 """
@@ -25,12 +26,12 @@ from reffusion.gaussians.ssim import dssim_torch
 from reffusion.prior import denoising, diffusion
 from reffusion.prior.model import Prior
 
-HEIGHT, WIDTH, GAUSSIANS = 300, 400, 1000  # of what is counted per pixel and per Gaussian
-PATCHES, SIDE = 64, 64  # the paper's
+HEIGHT, WIDTH, GAUSSIANS = 300, 400, 1000  # image size and number of Gaussians of counts per pixel and per Gaussian
+PATCHES, SIDE = 64, 64  # number and side in px of the critic's patches, as in the paper
 
 
 class _TrafficCounter(TorchDispatchMode):
-    """Counts the bytes of each operation's inputs and outputs; views move nothing."""
+    """Counter of the bytes of all operations' inputs and outputs. Views of tensors count nothing."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,21 +50,26 @@ class _TrafficCounter(TorchDispatchMode):
 
 
 def _attention(tensor: Tensor) -> bool:
-    """True for an attention matrix, with a row for each pixel of a latent."""
+    """Return True for an attention matrix, which has a row and a column for each pixel of a latent."""
     return tensor.ndim >= 3 and min(tensor.shape[-2:]) >= 1024
 
 
 def count_work(work: Callable[[], object]) -> dict[str, float]:
-    """TFLOP and GB (1e9 bytes) of one call."""
+    """Count the operations ("tflop", 1e12) and the moved bytes ("gb", 1e9) of one call of `work`."""
     with FlopCounterMode(display=False) as flops, _TrafficCounter() as moved:
         work()
     return {"tflop": round(flops.get_total_flops() / 1e12, 5), "gb": round(moved.bytes / 1e9, 5)}
 
 
 def count_prior(shape: full_size.Shape, name: str) -> dict[str, dict[str, float]]:
-    """Counts of one sample at the prior's native size.
+    """Count the work of a prior for one sample at its native size.
 
-    The UNet, encoding, encoding with its backward pass, decoding, and a personalization sample forward and backward.
+    Counted are the UNet, encoding, encoding with its backward pass, decoding, and a personalization sample forward and
+    backward. For SDXL, which only inpaints references, nothing is counted backward.
+
+    Args:
+        shape: configuration of the prior.
+        name: name of the prior, which begins the names of the counts.
     """
     with torch.device("meta"):
         models = full_size.networks(shape, torch.float16)
@@ -86,6 +92,8 @@ def count_prior(shape: full_size.Shape, name: str) -> dict[str, dict[str, float]
 
 
 def _without(function: Callable[..., Tensor], *arguments: Any) -> Callable[[], Tensor]:
+    """Return a function that calls `function` without recording gradients."""
+
     def work() -> Tensor:
         with torch.no_grad():
             return function(*arguments)
@@ -95,19 +103,26 @@ def _without(function: Callable[..., Tensor], *arguments: Any) -> Callable[[], T
 
 @torch.no_grad()
 def run_unet(prior: Prior, latents: Tensor) -> None:
+    """Run the UNet once, with dummy text and mask."""
     text = torch.zeros(1, 78, prior.unet.config.cross_attention_dim, device="meta")
     condition = torch.cat([latents[:, :1], latents], 1)
     diffusion.raw_prediction(prior, latents, torch.zeros(1, dtype=torch.long, device="meta"), condition, text)
 
 
 def count_critic_step(width: int) -> dict[str, float]:
-    """Counts of `Adversary.learn` and `.loss`: the critic's step with R1, then its answer to the fake patches."""
+    """Count one adversarial step: the critic's loss with R1 and its backward pass, then the generator's.
+
+    These are the computations of `Adversary.learn` and `Adversary.loss`.
+
+    Args:
+        width: channels of the critic.
+    """
     critic = Critic(SIDE, width, torch.Generator()).to("meta")
     real = torch.zeros(PATCHES, 3, SIDE, SIDE, device="meta")
     leaf = torch.zeros(PATCHES, 3, SIDE, SIDE, device="meta", requires_grad=True)
 
     def work() -> None:
-        fake = 1 * leaf  # the counter cannot follow a leaf
+        fake = 1 * leaf  # a product, because the counter cannot follow a leaf tensor
         scores = critic(fake)
         (critic_loss(critic(real), scores) + gradient_penalty(scores, fake)).backward()
         critic.requires_grad_(False)
@@ -117,7 +132,7 @@ def count_critic_step(width: int) -> dict[str, float]:
 
 
 def count_depth_network(height: int = 518, width: int = 686) -> dict[str, float]:
-    """Counts of Depth Anything V2 Small on a 4:3 view."""
+    """Count the work of Depth Anything V2 Small on a 4:3 view."""
     from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
     backbone = Dinov2Config(
@@ -134,9 +149,9 @@ def count_depth_network(height: int = 518, width: int = 686) -> dict[str, float]
 
 
 def count_pixel_loss() -> dict[str, float]:
-    """Counts of the reconstruction loss and its backward pass per million pixels of three channels.
+    """Count the reconstruction loss and its backward pass, per million pixels of three channels.
 
-    gsplat reads and writes as much again.
+    gsplat's reads and writes, about as much again, are not included.
     """
     image = torch.zeros(HEIGHT, WIDTH, 3, requires_grad=True)
 
@@ -148,7 +163,7 @@ def count_pixel_loss() -> dict[str, float]:
 
 
 def count_adam() -> dict[str, float]:
-    """Counts of one Adam step per million Gaussians of degree 3, all visible."""
+    """Count one Adam step, per million Gaussians of degree 3, all visible."""
     scene = full_size.gaussians(GAUSSIANS, "cpu")
     optimizer = optimize.GaussianOptimizer(scene)
     rates = optimizer.rates.at(0.0, optimizer.gaussians)
@@ -162,7 +177,7 @@ def count_adam() -> dict[str, float]:
 
 
 def _scaled(counts: dict[str, float], count: int) -> dict[str, float]:
-    """Values per million."""
+    """Return counts per million pixels or Gaussians, from the counts of `count` of them."""
     return {name: round(value * 1e6 / count, 5) for name, value in counts.items()}
 
 

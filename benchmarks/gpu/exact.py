@@ -1,4 +1,7 @@
-"""gsplat and SSIM on a device against float64 on the CPU: every output and every gradient."""
+"""Comparison of the rasterizer and SSIM on a device with float64 on the CPU: all outputs and all gradients.
+
+The rasterizer is gsplat on a GPU. The *oracle* is the plain torch implementation in float64.
+"""
 
 from __future__ import annotations
 
@@ -16,19 +19,33 @@ from reffusion.seeding import generator
 from reffusion.splat import rasterizer
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
-# Relative errors. Emulated in float32, gsplat's formulas err by 4e-7 in values and 2e-6 in gradients; its fast
-# exponential may add 8 units in the last place, 1e-6. The bounds are ten and fifty times that; errors of method are far
-# above.
+# Bounds of relative errors. Emulated in float32, gsplat's formulas have errors of 4e-7 in values and 2e-6 in gradients;
+# gsplat's fast exponential may add 8 units in the last place, 1e-6. The bounds are ten and fifty times as large. Errors
+# of a wrong formula would be far above.
 VALUES, GRADIENTS = 1e-5, 1e-4
-# A contribution that falls on the other side of 1/255 in float32 changes a pixel by as much, which is no error.
-FLIPPED = 1e-4  # share of the pixels that may differ by more
-COUNTED = 1e-3  # allowed relative change of the numbers of blended pixels by these
+# A contribution near the cut-off 1/255 may be skipped in only one precision. The pixel then differs by up to 1/255,
+# which is not an error.
+FLIPPED = 1e-4  # share of the pixels that may differ by more than `VALUES`
+COUNTED = 1e-3  # allowed relative change of the numbers of blended pixels for the same reason
 
 
 def render_with_gradients(
     bench: Bench, scene: Gaussians, camera: Camera, impl: str, dtype: torch.dtype
 ) -> dict[str, Tensor]:
-    """Images, sums of weights and counts of one implementation, and the gradients of a random sum over its images."""
+    """Render a scene with one implementation of the rasterizer, forward and backward.
+
+    Args:
+        bench: device and sizes.
+        scene: the Gaussians.
+        camera: the view.
+        impl: implementation, "cuda", "cpu" or "torch"; "torch" runs on the CPU.
+        dtype: precision.
+
+    Returns:
+        Tensors on the CPU in float64: the images "color", "depth", "alpha" and "features"; "gradient of <input>", the
+        gradients of a fixed random linear function of the images; "weights", for each Gaussian the sums of random
+        values of pixels times blending weights; and "counts", for each Gaussian the number of blended pixels.
+    """
     device = "cpu" if impl == "torch" else bench.device
     place = lambda tensor: tensor.detach().to(device, dtype).clone().requires_grad_()
     leaf = scene.map(place)
@@ -51,7 +68,15 @@ def render_with_gradients(
 
 
 def compare_blocks(results: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Any]:
-    """Relative errors: of images the one that only `FLIPPED` of the values exceed, over the maximum; else by norm."""
+    """Compare results with the truth and return their relative errors.
+
+    The error of an image is the difference that only the share `FLIPPED` of the values exceeds, relative to the image's
+    maximum. The error of any other result is an L2 norm, relative to that of the truth.
+
+    Returns:
+        "errors": name -> relative error; "ok": True if all errors are within their bounds; "beyond": names of those
+        that are not, if any.
+    """
     errors, limits = {}, {}
     for name, true in truth.items():
         difference = (results[name] - true).abs()
@@ -66,6 +91,13 @@ def compare_blocks(results: dict[str, Tensor], truth: dict[str, Tensor]) -> dict
 
 
 def check_splatting(bench: Bench, antialiased: bool = False, crop: bool = False) -> dict[str, Any]:
+    """Compare the rasterizer in float32 with the oracle.
+
+    Args:
+        bench: device and sizes.
+        antialiased: True renders with the 2D filter of Mip-Splatting.
+        crop: True renders a part of the image only.
+    """
     count, width = bench.sizes.oracle
     height = width * 4 // 5
     camera = Camera("oracle", width, height, width, width, width / 2, height / 2, np.eye(4))
@@ -77,10 +109,10 @@ def check_splatting(bench: Bench, antialiased: bool = False, crop: bool = False)
 
 
 def check_similarity(bench: Bench) -> dict[str, Any]:
-    """D-SSIM and its gradient in float32 on the device against float64; TF32 would err by a tenth."""
+    """Compare D-SSIM and its gradient in float32 on the device with float64; with TF32 the error would be a tenth."""
     draw, size = generator(0, "ssim"), bench.sizes.oracle[1]
     image, other = (torch.rand(size, size, 3, generator=draw, dtype=torch.float64) for _ in range(2))
-    image, other = 0.5 + 0.1 * image, 0.5 + 0.1 * other  # low contrast loses most digits in the subtraction
+    image, other = 0.5 + 0.1 * image, 0.5 + 0.1 * other  # with low contrast, subtractions lose most digits
     weights = torch.rand(size, size, generator=draw, dtype=torch.float64) > 0.3
 
     def evaluate(loss, dtype: torch.dtype, device: str) -> dict[str, Tensor]:

@@ -1,7 +1,7 @@
 """One personalization step and one SDS step of the full-size SD2-inpainting on this machine, with random weights.
 
-The configurations below are the published ones; the steps are the library's own. It also checks that the LoRA, saved
-and merged into a fresh model of the same weights, gives the trained model's epsilon.
+The configurations below are the published ones; the steps are those of the library. The script also checks the LoRA:
+saved and merged into a fresh model of the same weights, it must predict the same noise (epsilon) as the trained model.
 
     python -m benchmarks.gpu.full_size --dtype bfloat16 --out runs/full-size      (--toy: the same at a small size)
 """
@@ -36,7 +36,13 @@ TINY = Path(__file__).resolve().parents[2] / "priors" / "tiny"
 
 @dataclass(frozen=True)
 class Shape:
-    """Configurations of a prior's parts; `texts` has one entry, or two for SDXL."""
+    """Configuration of a diffusion prior, as arguments of the classes of diffusers and transformers.
+
+    Attributes:
+        unet: configuration of the UNet.
+        vae: configuration of the VAE.
+        texts: configurations of the text encoders: one, or two for SDXL.
+    """
 
     unet: dict[str, Any]
     vae: dict[str, Any]
@@ -103,7 +109,7 @@ SDXL = Shape(
 
 
 def shrink(shape: Shape) -> Shape:
-    """The same kinds of layers with few channels at 32 px, for forward passes in milliseconds."""
+    """Return a configuration with the same kinds of layers but few channels, at 32 px, which runs in milliseconds."""
     second = len(shape.texts) == 2
     depth = len(shape.unet["block_out_channels"])
     unet = shape.unet | {"sample_size": 16, "block_out_channels": (32, 64, 64, 64)[:depth], "cross_attention_dim": 64}
@@ -121,7 +127,10 @@ def shrink(shape: Shape) -> Shape:
 
 
 def networks(shape: Shape, dtype: torch.dtype) -> dict[str, torch.nn.Module]:
-    """UNet and text encoders in `dtype`, and the VAE in float32, on torch's default device (`meta` only counts)."""
+    """Create the networks of a prior on torch's default device: UNet and text encoders in `dtype`, the VAE in float32.
+
+    On the device `meta` nothing is allocated or computed, only counted.
+    """
     from diffusers import AutoencoderKL, UNet2DConditionModel
     from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection
 
@@ -138,15 +147,19 @@ def networks(shape: Shape, dtype: torch.dtype) -> dict[str, torch.nn.Module]:
 
 
 def count_parameters(shape: Shape) -> int:
-    """Number of parameters of all parts, without allocating them."""
+    """Return the number of parameters of all networks, without allocating them."""
     with torch.device("meta"):
         return sum(p.numel() for part in networks(shape, torch.float32).values() for p in part.parameters())
 
 
 def peak_memory(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
-    """GB of the weights and of the peak of live tensors for one sample, counted on the meta device.
+    """Count the memory of the weights, and the peak memory of live tensors for one sample, in GB (1e9 bytes).
 
-    Attention is decomposed there, so GPU kernels need less.
+    The memory is counted on the meta device. There, attention computes whole attention matrices; GPU kernels need less.
+
+    Returns:
+        "weights", and the peak of "inpainting", "SDS" and "personalization", the last two also with checkpointing of
+        activations.
     """
     with torch.device("meta"):
         models = networks(shape, dtype)
@@ -165,7 +178,7 @@ def peak_memory(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
 
 
 def build_prior(shape: Shape, dtype: torch.dtype, device: str = "cpu", seed: int = 0) -> Prior:
-    """A prior with random weights, created on the device; equal seeds give equal weights there."""
+    """Make a prior with random weights on a device; equal seeds give equal weights on the same device."""
     with torch.random.fork_rng(), torch.device(device):
         torch.manual_seed(seed)
         models = networks(shape, dtype)
@@ -173,7 +186,10 @@ def build_prior(shape: Shape, dtype: torch.dtype, device: str = "cpu", seed: int
 
 
 def assemble_prior(shape: Shape, models: dict[str, torch.nn.Module], device: str) -> Prior:
-    """Prior from networks, the embedded prior's tokenizer (words do not matter here) and SD2's schedule."""
+    """Make a prior from networks, with the embedded prior's tokenizer and SD2's noise schedule.
+
+    The tokenizer does not matter here, because the weights are random.
+    """
     from diffusers import DDIMScheduler
     from transformers import CLIPTokenizer
 
@@ -200,7 +216,7 @@ def assemble_prior(shape: Shape, models: dict[str, torch.nn.Module], device: str
 
 
 def reference(size: int) -> crops.Picture:
-    """Stripes with a hole in the middle, a quarter wider than high."""
+    """Make a reference of `size` px height, a quarter wider than high: stripes, with a hole in the middle."""
     rows, columns = torch.meshgrid(torch.arange(size), torch.arange(size + size // 4), indexing="ij")
     image = torch.stack([128 + 100 * torch.sin((rows + k * columns) / 9) for k in (1, 2, 3)], 2)
     hole = torch.zeros(rows.shape, dtype=torch.bool)
@@ -209,7 +225,11 @@ def reference(size: int) -> crops.Picture:
 
 
 def trainer(prior: Prior, batch: int) -> tuple[dict[str, list], torch.optim.Optimizer, Params]:
-    """The paper's LoRA on a prior (rank 8, alpha 16, dropout 0.1, attention layers), with AdamW."""
+    """Attach the paper's LoRA to a prior (rank 8, alpha 16, dropout 0.1, attention layers), and make AdamW for it.
+
+    Returns:
+        The trained parameters of "unet" and "text", the optimizer, and the parameters of the stage `personalize`.
+    """
     training = Params(optimizer=Optimizer(batch=batch))
     chosen, rates = training.lora, training.optimizer
     trained = lora.attach(prior, chosen.rank, chosen.alpha, chosen.dropout, chosen.layers, training.seed)
@@ -218,7 +238,11 @@ def trainer(prior: Prior, batch: int) -> tuple[dict[str, list], torch.optim.Opti
 
 
 def personalization_step(prior: Prior, picture: crops.Picture, batch: int, folder: Path) -> dict[str, float]:
-    """One optimiser step; the LoRA is saved to `folder`."""
+    """Make one personalization step and save the LoRA to `folder`.
+
+    Returns:
+        "loss", and "lora_unet" and "lora_text", the sums of absolute values of the LoRA's weights.
+    """
     trained, optimizer, training = trainer(prior, batch)
     loss = train_step(prior, optimizer, [picture], training, 0)
     lora.set_dropout(prior, False)
@@ -229,7 +253,7 @@ def personalization_step(prior: Prior, picture: crops.Picture, batch: int, folde
 
 @torch.no_grad()
 def epsilon(prior: Prior) -> torch.Tensor:
-    """The prior's answer to fixed noise, a fixed picture and a prompt, compared before and after saving."""
+    """Return the noise that the prior predicts for a fixed input, to be compared before and after saving the LoRA."""
     side, draw = prior.native_size // prior.factor, generator(0, "epsilon")
     channels = prior.vae.config.latent_channels
     noisy, blanked = (torch.randn(1, channels, side, side, generator=draw).to(prior.device) for _ in range(2))
@@ -239,7 +263,7 @@ def epsilon(prior: Prior) -> torch.Tensor:
 
 
 def train_view(size: int, device: str) -> TrainView:
-    """A view of `size` rows, a quarter wider, whose middle is to be repainted."""
+    """Make a training view of `size` px height, a quarter wider than high, whose middle is to be repainted."""
     width = size + size // 4
     camera = Camera("view", width, size, width, width, width / 2, size / 2, np.eye(4))
     hole = torch.zeros(size, width, dtype=torch.bool)
@@ -249,7 +273,7 @@ def train_view(size: int, device: str) -> TrainView:
 
 
 def gaussians(number: int, device: str, degree: int = 3) -> Gaussians:
-    """Random Gaussians that fill the view of `train_view`."""
+    """Make random Gaussians that fill the view of `train_view`; all parameters require gradients."""
     draw = generator(0, "gaussians")
     rand = lambda *shape: torch.rand(*shape, generator=draw)
     means = torch.cat([rand(number, 2) * 2.4 - 1.2, 2 + rand(number, 1)], 1)
@@ -262,7 +286,22 @@ def gaussians(number: int, device: str, degree: int = 3) -> Gaussians:
 def sds_step(
     prior: Prior, text: torch.Tensor, view: TrainView, scene: Gaussians, sds: SdsTerm, step: int = 0
 ) -> dict[str, float]:
-    """One SDS term of the library, and its backward pass into the Gaussians."""
+    """Evaluate the SDS term of the library once, with its backward pass into the Gaussians.
+
+    Args:
+        prior: the prior.
+        text: embedded prompts.
+        view: training view.
+        scene: the Gaussians; gradients are added to their `.grad`.
+        sds: parameters of the term.
+        step: number of the step, which seeds the draws.
+
+    Returns:
+        "gradient_norm": L2 norm of the gradient of the harmonics.
+
+    Raises:
+        FloatingPointError: this norm is 0 or not finite.
+    """
     masked = torch.ones(len(scene), dtype=torch.bool, device=scene.means.device)
     loss, _ = evaluate_sds(scene, masked, view, prior, text, sds, generator(0, "sds", step))
     (1e-3 * loss).backward()
@@ -276,7 +315,13 @@ def sds_step(
 
 
 def record_time(report: dict[str, Any], name: str, work: Any) -> Any:
-    """Run `work`, record its seconds and the process's peak memory in the report, and return its result."""
+    """Call `work`, record its seconds and the process's peak memory so far in the report, and return its result.
+
+    Args:
+        report: receives the measurements under `name`, with the result if it is a dictionary.
+        name: name of the measured work.
+        work: function to call.
+    """
     began, cpu = time.perf_counter(), time.process_time()
     result = work()
     line = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - cpu}
@@ -288,7 +333,7 @@ def record_time(report: dict[str, Any], name: str, work: Any) -> Any:
 
 
 def run(shape: Shape, dtype: torch.dtype, options: argparse.Namespace) -> dict[str, Any]:
-    """Both steps and the LoRA's round trip, with measurements."""
+    """Run one personalization step and one SDS step, check the saved LoRA, and return the measurements."""
     options.out.mkdir(parents=True, exist_ok=True)
     report: dict[str, Any] = {
         "parameters": count_parameters(shape),

@@ -1,4 +1,4 @@
-"""Check that this machine is ready for CUDA jobs; builds gsplat's extension if necessary, and loads it.
+"""Check that this machine is ready for CUDA jobs. gsplat's extension is built if necessary, and loaded.
 
 python -m benchmarks.gpu.ready      (--before: only check whether installing gsplat makes sense)
 """
@@ -14,18 +14,23 @@ import psutil
 
 from reffusion.io.machine import Machine, detect, find_missing
 
-COMPILER_GB = 1.0  # memory of one compiler; gsplat's largest file takes 0.85
+COMPILER_GB = 1.0  # memory of one compiler process, GB; gsplat's largest file takes 0.85 GB
 
 
 def refusal_reasons(machine: Machine, before_install: bool) -> list[str]:
-    """Reasons why CUDA jobs cannot run here, one line each."""
+    """Return the reasons why CUDA jobs cannot run on a machine, one line each; empty if they can.
+
+    Args:
+        machine: the machine.
+        before_install: True if gsplat need not be installed yet.
+    """
     if machine.driver is None and machine.gpu is None:
         return ["there is no NVIDIA driver on this machine: nothing to do; profile=laptop needs no GPU"]
     return find_missing(machine, splats=not before_install)
 
 
 def compiler_jobs(cores: int, free_gb: float) -> int:
-    """Number of compilers that may run at once."""
+    """Return the number of compilers that may run at once, 1 to 8, by cores and free memory (GB)."""
     return max(1, min(8, cores, int(free_gb / COMPILER_GB)))
 
 

@@ -1,4 +1,7 @@
-"""One step of each loss at the paper's sizes, and a fit: seconds and memory."""
+"""Parts of gpu-check that measure seconds and memory: one step of each loss at the paper's sizes, and a fit.
+
+Each part takes the `Bench` with device and sizes, and returns its measurements.
+"""
 
 from __future__ import annotations
 
@@ -35,18 +38,20 @@ from reffusion.weights import local, published
 
 
 def backpropagate(scene: Gaussians, loss: Tensor) -> None:
-    """Backward pass of a loss into a scene; the gradients are dropped."""
+    """Run the backward pass of a loss into the Gaussians of a scene, and drop the gradients."""
     loss.backward()
     for name in PARAMETERS:
         getattr(scene, name).grad = None
 
 
 def reconstruction(bench: Bench) -> dict[str, Any]:
+    """Measure a step of the reconstruction term."""
     (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
     return bench.measure(lambda: backpropagate(scene, evaluate_reconstruction(scene, ~masked, view)[0]))
 
 
 def reference(bench: Bench) -> dict[str, Any]:
+    """Measure a step of the reference term."""
     (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
     return bench.measure(
         lambda: backpropagate(scene, evaluate_reference(scene, masked, view.camera, view.picture, view.repaint)[0])
@@ -54,7 +59,7 @@ def reference(bench: Bench) -> dict[str, Any]:
 
 
 def personalization(bench: Bench) -> dict[str, Any]:
-    """Steps of the paper's LoRA, with as many samples at once as fit into 20 GB."""
+    """Measure a personalization step with the paper's LoRA; as many samples run at once as fit into 20 GB."""
     prior, source = bench.prior("bfloat16")
     picture = full_size.reference(prior.native_size)
     trained, optimizer, training = full_size.trainer(prior, bench.sizes.batch)
@@ -63,18 +68,19 @@ def personalization(bench: Bench) -> dict[str, Any]:
     )
     values = bench.measure(lambda: {"loss": train_step(prior, optimizer, [picture], training, 0)})
     moved = sum(float(p.detach().abs().sum()) for p in trained["text"])
-    bench.forget_prior()  # it has LoRA layers now
+    bench.forget_prior()  # its layers now have a LoRA
     return values | {"batch": bench.sizes.batch, "rows": prior.rows_with_grad, "lora_text": moved, "weights": source}
 
 
 def prior_and_prompts(bench: Bench) -> tuple[Prior, Tensor, str]:
-    """The prior without its text encoder, the embedded prompts, and the source of the weights."""
+    """Return the prior without its text encoder, the embedded prompts, and the source of the weights."""
     prior, source = bench.prior("float16")
     with torch.no_grad():
         return drop_text_encoders(prior), diffusion.embed_text(prior, list(crops.PROMPTS)), source
 
 
 def distillation(bench: Bench) -> dict[str, Any]:
+    """Measure a step of the SDS term."""
     prior, text, source = prior_and_prompts(bench)
     (scene, _), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
 
@@ -88,6 +94,7 @@ def distillation(bench: Bench) -> dict[str, Any]:
 
 
 def depth(bench: Bench) -> dict[str, Any]:
+    """Measure a step of the depth term, which inpaints a view and estimates its depth."""
     prior, text, source = prior_and_prompts(bench)
     (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
     estimator, whose = depth_estimator(bench.sizes, bench.device)
@@ -102,6 +109,7 @@ def depth(bench: Bench) -> dict[str, Any]:
 
 
 def adversarial(bench: Bench) -> dict[str, Any]:
+    """Measure a step of the adversarial term, with the critic's own step."""
     bench.forget_prior()
     (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
     critic = Adversary(bench.sizes.critic, 0, bench.device)
@@ -116,7 +124,12 @@ def adversarial(bench: Bench) -> dict[str, Any]:
 
 
 def depth_estimator(sizes: Sizes, device: str) -> tuple[DepthEstimator, str]:
-    """Depth Anything V2 Small, published or with random weights; the sign that fits the scene is taken."""
+    """Return a depth estimator with Depth Anything V2 Small, and the source of its weights.
+
+    The weights are the published ones if they are on this machine and `sizes` is `PAPER`, else random. With random
+    weights the disparity may have the wrong sign, so the opposite sign is tried if the first one does not fit the
+    scene.
+    """
     from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
     if sizes == PAPER and local.locate(published.DEPTH_ANYTHING) is not None:
@@ -131,7 +144,7 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[DepthEstimator, str]:
             backbone_config=backbone, reassemble_hidden_size=384, neck_hidden_sizes=[48, 96, 192, 384],
             fusion_hidden_size=64, head_hidden_size=32, initializer_range=0.1,
         ))  # fmt: skip
-        torch.nn.init.constant_(model.head.conv3.bias, 1e4)  # else the last ReLU would cut nearly all values to 0
+        torch.nn.init.constant_(model.head.conv3.bias, 1e4)  # so that the last ReLU does not cut nearly all values to 0
         network, source = monocular.make_network(model, device), "random"
     tries = [
         network_estimator(
@@ -151,7 +164,11 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[DepthEstimator, str]:
 
 
 def fit_scene(bench: Bench) -> dict[str, Any]:
-    """Fit coloured Gaussians to their own renders, starting from shifted ones with weaker colours."""
+    """Fit Gaussians to renders of known Gaussians, starting from shifted Gaussians with weaker colours.
+
+    Returns:
+        Image size, images per second, PSNR before and after in dB, and "ok": True if the PSNR has increased.
+    """
     sizes, device, out = bench.sizes, bench.device, bench.out
     truth = full_size.gaussians(sizes.gaussians, device, degree=1).map(Tensor.detach)
     cameras, images = [], {}
@@ -177,7 +194,7 @@ def fit_scene(bench: Bench) -> dict[str, Any]:
     before = psnr(start)
     densify, sh = Densify(stop=0.0, cap_max=2 * sizes.gaussians), SphericalHarmonics(degree=1)
     settings = Params(iterations=sizes.fit_steps, sh=sh, densify=densify)
-    trace.clear_checkpoint(out)  # left by an interrupted check
+    trace.clear_checkpoint(out)  # an interrupted check may have left a checkpoint, from which the fit would continue
     began = time.perf_counter()
     after = psnr(fit(cameras, images, start, settings, folder=out))
     seconds = time.perf_counter() - began

@@ -1,4 +1,7 @@
-"""Stiff and extreme cases, each with a bound that is derived beside it (docs/development.md#measuring)."""
+"""Stability suite: stiff and extreme inputs, each with a bound on the error (docs/development.md#measuring).
+
+A *case* measures an error, or counts wrong results, on an extreme input. A comment beside each case derives its bound.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,15 @@ SUBJECTS = (
 
 
 class Row(NamedTuple):
-    """One line of the table, and one object of stability.json."""
+    """Result of a case: one line of the table, and one object of stability.json.
+
+    Attributes:
+        case: name of the case.
+        quantity: description of the measured quantity.
+        bound: largest correct value.
+        measured: measured value; None if the case raised an exception or gave no finite number.
+        ok: True if the measured value is finite and within the bound.
+    """
 
     case: str
     quantity: str
@@ -34,12 +45,15 @@ class Row(NamedTuple):
 
 
 def all_cases() -> list[Case]:
-    """The cases of all subjects; names are unique."""
+    """Return the cases of all subjects; their names are unique."""
     return [case for subject in SUBJECTS for case in import_module(f"benchmarks.stability.{subject}").CASES]
 
 
 def run(case: Case) -> Row:
-    """Measure a case; `measured` is None, and the case fails, if it raised or gave no finite number."""
+    """Measure a case and compare the value with its bound.
+
+    A case that raises an exception or gives no finite number fails, with None as the measured value.
+    """
     try:
         measured = float(case.measure())
     except Exception:

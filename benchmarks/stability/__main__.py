@@ -1,4 +1,4 @@
-"""Run every case, print a table and write a file. Exits with 1 if a case is out of bound.
+"""Run all cases, print a table and write a JSON file. The exit status is 1 if a case is out of its bound.
 
 python -m benchmarks.stability [--out runs/stability.json] [--only WORDS]
 """
@@ -16,6 +16,7 @@ from benchmarks.stability import Row, all_cases, run
 
 
 def format_row(row: Row) -> str:
+    """Return a row of the printed table."""
     measured = "failed" if row.measured is None else f"{row.measured:.3g}"
     return f"{'ok ' if row.ok else 'BAD'} {row.case:<58} {measured:>10} <= {row.bound:<9.3g} {row.quantity}"
 
@@ -28,7 +29,7 @@ def main() -> int:
     cases = [case for case in all_cases() if arguments.only in case.name]
     if not cases:
         parser.error(f"no case's name contains {arguments.only!r}")
-    torch.set_num_threads(1)  # tiny scenes: other threads would only wait
+    torch.set_num_threads(1)  # the scenes are so small that more threads gain nothing
     rows = []
     for case in cases:
         rows.append(run(case))

@@ -1,4 +1,7 @@
-"""Cases of depth alignment: degenerate data, outliers, units."""
+"""Cases of depth alignment: degenerate data, outliers, units.
+
+Alignment fits scale and offset of an estimate to a target. The data have a known exact line, target = 2 estimate + 1.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +12,23 @@ import numpy as np
 from benchmarks.stability.cases import EPS64, EXACT, UNCLEAR, Case, count_unclear_refusal, nan_safe_max
 from reffusion.depth import alignment
 
-NOISE = 1e-3  # relative to the estimate's spread
+NOISE = 1e-3  # standard deviation of the target's noise
 PIXELS = 2000
 
 
 def make_samples(outliers: float, pixels: int = PIXELS, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(estimate, target, truth) with target = 2 estimate + 1; a share of the targets is anywhere in their range."""
+    """Draw samples with outliers.
+
+    Args:
+        outliers: share of the samples whose target is uniform over a range, in [0, 1].
+        pixels: number of samples.
+        seed: seed.
+
+    Returns:
+        estimate: [pixels].
+        target: [pixels], the truth with noise, or an outlier.
+        truth: [pixels], 2 estimate + 1.
+    """
     random = np.random.default_rng(seed)
     x = random.uniform(1.0, 3.0, pixels)
     truth = 2.0 * x + 1.0
@@ -24,7 +38,7 @@ def make_samples(outliers: float, pixels: int = PIXELS, seed: int = 0) -> tuple[
 
 
 def robust_error(outliers: float) -> float:
-    """Largest error of the robust line over its range and ten scenes, in standard deviations of the noise."""
+    """Return the largest error of the robust fit over all samples of ten draws, in standard deviations of the noise."""
     worst = 0.0
     for seed in range(10):
         x, y, truth = make_samples(outliers, seed=seed)
@@ -35,21 +49,33 @@ def robust_error(outliers: float) -> float:
 
 
 def robust_difference() -> float:
-    """Without outliers: difference of the robust line from plain L2, in L2's standard errors at the range's end."""
+    """Return the largest difference of the robust fit from plain least squares if there are no outliers.
+
+    The unit is the standard error of least squares at the ends of the range.
+    """
     x, y, _ = make_samples(0.0)
     difference = alignment.align(x, y, robust=True).apply(x) - alignment.align(x, y).apply(x)
     return float(np.abs(difference).max() / (NOISE * 2.0 / np.sqrt(len(x))))
 
 
 def two_lines_error() -> float:
-    """A third of the pixels lies on another line, and the larger group must win; error in standard deviations."""
+    """Return the largest error of the robust fit, in standard deviations of the noise, with samples of two lines.
+
+    A third of the samples is on another line; the fit must follow the larger group.
+    """
     x, y, truth = make_samples(0.0)
     y = np.where(np.arange(len(x)) % 3 == 0, y - truth + 4.0 - 0.5 * x, y)
     return float(np.abs(alignment.align(x, y, robust=True).apply(x) - truth).max() / NOISE)
 
 
 def unit_error(x_unit: float, y_unit: float, robust: bool) -> float:
-    """Relative error of the scale and of the aligned values, for noise-free data in these units."""
+    """Return the largest relative error of the scale and of the aligned values for data without noise.
+
+    Args:
+        x_unit: factor on the estimate.
+        y_unit: factor on the target.
+        robust: True for the robust fit.
+    """
     x, _, truth = make_samples(0.0)
     fitted = alignment.align(x_unit * x, y_unit * truth, robust=robust)
     scale = abs(fitted.scale * x_unit / y_unit / 2.0 - 1.0)
@@ -57,19 +83,25 @@ def unit_error(x_unit: float, y_unit: float, robust: bool) -> float:
 
 
 def offset_error() -> float:
-    """Offset of 1e5 spreads in the estimate: error of the aligned values, relative to their spread."""
+    """Return the largest error of the aligned values, relative to their spread, for an estimate with a large offset.
+
+    The offset is about 1e5 times the spread of the estimate.
+    """
     x, _, truth = make_samples(0.0)
     return float(np.abs(alignment.align(x + 5e4, truth).apply(x + 5e4) - truth).max() / np.ptp(truth))
 
 
 def refuse_too_far_offset() -> float:
-    """Offset of 1e8 spreads, at which an estimate in float32 holds nothing but the offset."""
+    """Return 0 if an estimate with an offset of about 1e8 times its spread is refused as constant, else 1.
+
+    In float32 such an estimate would contain nothing but the offset.
+    """
     x, _, truth = make_samples(0.0)
     return count_unclear_refusal(lambda: alignment.align(x + 5e7, truth), "constant")
 
 
 def constant_depth_error() -> float:
-    """The scene's depth is constant (a wall), the estimate is not: relative error of the aligned depth."""
+    """Return the relative error of the aligned depth if the scene's depth is constant (a wall), the estimate not."""
     estimate = np.random.default_rng(0).uniform(1.0, 3.0, (12, 10))
     aligned = [
         alignment.align_depth(estimate, np.full((12, 10), 2.5), np.ones((12, 10)), space=space, robust=robust)
@@ -79,30 +111,33 @@ def constant_depth_error() -> float:
 
 
 def refuse_constant_estimate() -> float:
+    """Count the refusals of a constant estimate, plain and robust, that do not name the cause and the value."""
     flat, depth = np.full((12, 10), 0.7), np.random.default_rng(0).uniform(1.0, 3.0, (12, 10))
     calls = [partial(alignment.align_depth, flat, depth, np.ones((12, 10)), robust=robust) for robust in (False, True)]
     return sum(count_unclear_refusal(call, "constant", "0.7") for call in calls)
 
 
 def four_pixels_error(robust: bool) -> float:
-    """The least accepted number of pixels, with exact data: relative error."""
+    """Return the largest relative error of a fit to four exact samples, the least accepted number."""
     x = np.array([1.0, 1.5, 2.5, 3.0])
     fitted = alignment.align(x, 2.0 * x + 1.0, robust=robust)
     return float(np.abs(fitted.apply(x) / (2.0 * x + 1.0) - 1.0).max())
 
 
 def refuse_three_pixels() -> float:
+    """Return 0 if a fit to three samples is refused with the cause, else 1."""
     return count_unclear_refusal(lambda: alignment.align(np.arange(3.0), np.arange(3.0)), "at least 4")
 
 
 def refuse_no_pixels() -> float:
+    """Return 0 if an alignment without known pixels is refused with the cause, else 1."""
     return count_unclear_refusal(
         lambda: alignment.align_depth(np.ones((3, 3)), np.ones((3, 3)), np.zeros((3, 3))), "at least 4"
     )
 
 
 def tiny_weights_error() -> float:
-    """Weights of 1e-12 against 1: the heavy pixels must define the line; relative error."""
+    """Return the largest relative error of a fit to samples of weight 1 among wrong samples of weight 1e-12."""
     x, y, truth = make_samples(0.5)
     weights = np.where(np.arange(len(x)) < len(x) // 2, 1e-12, 1.0)
     exact = np.where(weights < 1.0, y, truth)
@@ -110,7 +145,7 @@ def tiny_weights_error() -> float:
 
 
 def count_invalid_depths() -> float:
-    """Depths that are not finite and positive although some aligned disparities are zero or negative."""
+    """Count aligned depths that are not finite and positive; some of the aligned disparities are zero or negative."""
     disparity = np.linspace(-0.5, 2.0, 120).reshape(12, 10)
     known = disparity > 0.1
     depth = np.where(known, 1.0 / np.where(known, disparity, 1.0), 0.0)
@@ -119,14 +154,14 @@ def count_invalid_depths() -> float:
 
 
 def plain_condition() -> float:
-    """Condition number of the system that `align` solves if the estimate is 1e4 spreads from zero."""
+    """Return the condition number of the system that `align` solves if the estimate's offset is 1e4 spreads."""
     return alignment.condition_numbers(1e4 + np.random.default_rng(0).normal(size=1000))[1]
 
 
 # A float64 sum over n pixels rounds by about sqrt(n) 2^-53 of its terms; data and slopes are of order one.
 ROUNDING = 8 * np.sqrt(PIXELS) * EPS64
-# The line through k inliers has a standard error of at most 2 NOISE / sqrt(k) at the range's ends; six of those hold
-# for ten scenes at both ends.
+# The line through k inliers has a standard error of at most 2 NOISE / sqrt(k) at the ends of the range. Six standard
+# errors are a safe bound for ten draws at both ends.
 STD_ERRORS = lambda inliers: 6 * 2 / np.sqrt(inliers)
 
 CASES = (

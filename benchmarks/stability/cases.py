@@ -1,4 +1,4 @@
-"""Definition of a case, and helpers shared by all cases."""
+"""Definition of a case of the stability suite, and helpers shared by all cases."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Case:
-    """One stiff or extreme input, and what must hold for it.
+    """Stiff or extreme input, and the bound that must hold for it.
 
     Attributes:
-        name: what is extreme.
-        quantity: what is measured, with its unit.
-        bound: the largest correct value; derived beside the case.
-        measure: measures it.
+        name: description of the extreme input.
+        quantity: description of the measured quantity, with its unit.
+        bound: largest correct value of the quantity; a comment beside the case derives it.
+        measure: function that measures the quantity.
     """
 
     name: str
@@ -25,7 +25,7 @@ class Case:
 
 
 def count_unclear_refusal(call: Callable[[], object], *words: str, error: type[Exception] = ValueError) -> float:
-    """0 if `call` raises `error` with all of these words in its message, else 1."""
+    """Return 0 if `call` raises the exception `error` with all of `words` in its message, else 1."""
     try:
         call()
     except error as refusal:
@@ -34,7 +34,7 @@ def count_unclear_refusal(call: Callable[[], object], *words: str, error: type[E
 
 
 def nan_safe_max(*values: float) -> float:
-    """The largest value; infinite if one is NaN, which `max` might ignore."""
+    """Return the largest value, or infinity if a value is NaN, which `max` might ignore."""
     return math.inf if any(value != value for value in values) else float(max(values))
 
 

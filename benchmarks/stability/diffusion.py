@@ -1,4 +1,8 @@
-"""Cases of the diffusion model, of score distillation and of the discriminator, with the embedded prior."""
+"""Cases of the diffusion model, of score distillation and of the discriminator, with the embedded prior.
+
+Notation: z_t = a z_0 + s eps is the noised latent at timestep t, eps the noise, a² = alpha bar and s² = 1 - alpha bar.
+T is the number of timesteps. Masks are 1 where the picture is repainted.
+"""
 
 from __future__ import annotations
 
@@ -20,34 +24,46 @@ from reffusion.prior.model import Prior, load_prior
 from reffusion.types import PARAMETERS
 
 TINY = Path(__file__).resolve().parents[2] / "priors" / "tiny"
-SIZE = 32  # px; the UNet takes any size that its halvings divide
-HALF = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}
-LAYERS = 100  # upper bound of the UNet's consecutive layers
+SIZE = 32  # side of pictures, px; the UNet accepts any size that can be halved often enough
+HALF = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}  # relative error of one rounding
+LAYERS = 100  # upper bound of the number of consecutive layers of the UNet
 
 
 @cache
 def model(dtype: torch.dtype = torch.float32) -> Prior:
+    """Load the embedded prior."""
     return load_prior(TINY, dtype=dtype)
 
 
 @cache
 def prompts() -> Tensor:
-    """[3, L, D] hidden states of the global, the local and the empty prompt."""
+    """Return the hidden states [3, L, D] of the prompts for whole views and windows, and of the empty prompt."""
     with torch.no_grad():
         return diffusion.embed_text(model(), ["A photo of sks", "A photo of sks, cropped", ""])
 
 
 def normal(*shape: int, label: str = "") -> Tensor:
+    """Draw a standard normal tensor; `label` selects the seed."""
     return torch.randn(*shape, generator=seeding.generator(0, "stability", label))
 
 
 def images(label: str = "") -> Tensor:
+    """Draw a picture of uniform noise in [-1, 1], [1, 3, SIZE, SIZE]; `label` selects the seed."""
     return torch.rand(1, 3, SIZE, SIZE, generator=seeding.generator(0, "images", label)) * 2 - 1
 
 
 @torch.no_grad()
 def predict(t: int, guidance: float | None = None, empty: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-    """z_t, and the prior's eps and z_0 for it; a square in the middle of the picture is repainted."""
+    """Predict with the prior at one timestep; a square in the middle of the picture is repainted.
+
+    Args:
+        t: timestep.
+        guidance: strength of guidance, 0 = none; None predicts without guidance.
+        empty: hidden states that replace those of the empty prompt.
+
+    Returns:
+        A random z_t, and the predicted eps and z_0.
+    """
     mask = torch.zeros(1, 1, SIZE, SIZE)
     mask[..., 8:24, 8:24] = 1
     condition = diffusion.conditioning(model(), images(), mask)
@@ -59,7 +75,12 @@ def predict(t: int, guidance: float | None = None, empty: Tensor | None = None) 
 
 
 def reconstruction_error(t: int, guidance: float | None = None) -> float:
-    """Difference of a z_0 + s eps from z_t, relative to the largest number involved."""
+    """Return the error of a z_0 + s eps = z_t for the predicted z_0 and eps, relative to the largest term.
+
+    Args:
+        t: timestep; -1 is the last one.
+        guidance: strength of guidance; None for none.
+    """
     noisy, eps, clean = (x.double() for x in predict(t % model().timesteps, guidance))
     a = model().alphas_cumprod[t].double()
     size = max(noisy.abs().max(), eps.abs().max(), (a.sqrt() * clean).abs().max())
@@ -67,13 +88,16 @@ def reconstruction_error(t: int, guidance: float | None = None) -> float:
 
 
 def no_guidance_error() -> float:
-    """Guidance 0 must equal the conditional prediction bit for bit; largest difference."""
+    """Return the largest difference of guidance 0 from the conditional prediction; they must be equal bit for bit."""
     pairs = zip(predict(500, 0.0), predict(500), strict=True)
     return nan_safe_max(*((a - b).abs().max().item() for a, b in pairs))
 
 
 def strong_guidance_error() -> float:
-    """Guidance 100 against the same sum of two separate predictions in float64, relative to eps."""
+    """Return the error of guidance 100, relative to eps.
+
+    The exact value is the weighted sum, in float64, of two separate predictions with prompt and empty prompt.
+    """
     _, eps, _ = predict(500)
     other = predict(500, 0.0)
     with torch.no_grad():
@@ -86,13 +110,16 @@ def strong_guidance_error() -> float:
 
 
 def equal_prompts_error() -> float:
-    """Guidance 100 between equal prompts must change nothing; largest difference relative to eps."""
+    """Return the change of eps by guidance 100 between equal prompts, relative to eps; it must change nothing."""
     _, eps, _ = predict(500)
     return ((predict(500, 100.0, prompts()[:1])[1] - eps).abs().max() / eps.abs().max()).item()
 
 
 def half_precision_error(dtype: torch.dtype) -> float:
-    """The prior in half precision against float32: relative L2 of eps at the first and the last timestep."""
+    """Return the relative L2 difference of eps between half precision and float32, at the first or last timestep.
+
+    The larger of the two counts.
+    """
     mask, worst = torch.ones(1, 1, SIZE, SIZE), 0.0
     for t in (0, model().timesteps - 1):
         errors = []
@@ -106,9 +133,14 @@ def half_precision_error(dtype: torch.dtype) -> float:
 
 
 def sds_error(t: int, dtype: torch.dtype) -> float:
-    """SDS gradients of all weightings against float64, for unit-variance data of known score.
+    """Return the largest error of the SDS gradients of all weightings against float64.
 
-    The score is eps = s z_t, z_0 = a z_t. Relative L2 error, each relative to the terms of which it is a difference.
+    The data are normal with unit variance, so the exact prediction is known: eps = s z_t, z_0 = a z_t. A gradient is a
+    difference of two terms, and its L2 error is relative to the size of these terms.
+
+    Args:
+        t: timestep; -1 is the last one.
+        dtype: precision of the latents.
     """
     latents, noise = (normal(2, 4, 8, 8, label=name).to(dtype) for name in ("latents", "noise"))
     abar, times, worst = model().alphas_cumprod, torch.full((2,), t % model().timesteps), 0.0
@@ -119,14 +151,14 @@ def sds_error(t: int, dtype: torch.dtype) -> float:
         gradient = sds.sds_gradient(
             latents, lambda z, _: (s.to(z) * z, a.to(z) * z), times, noise, abar, weighting=weighting
         )
-        # Each is a difference of numbers of order one (at t = 0, or at T-1), relative to which its error is measured.
+        # The gradient is a difference of numbers of order one (at t = 0, or at T-1). Its error is relative to them.
         size = {"x0": latents.double(), "sigma2": s**2 * noise.double(), "one": noise.double()}[weighting].norm()
         worst = nan_safe_max(worst, ((gradient.double() - truth).norm() / size).item())
     return worst
 
 
 def empty_mask_gradient() -> float:
-    """Largest SDS gradient under an empty mask."""
+    """Return the largest SDS gradient if the mask is empty."""
     latents, noise, abar = normal(2, 4, 8, 8), normal(2, 4, 8, 8, label="noise"), model().alphas_cumprod
     times, nothing = torch.tensor([3, 700]), torch.zeros(2, 1, 8, 8)
     gradient = sds.sds_gradient(latents, lambda z, _: (z, z), times, noise, abar, keep_contrast=True, mask=nothing)
@@ -134,14 +166,20 @@ def empty_mask_gradient() -> float:
 
 
 def full_mask_leak() -> float:
-    """Difference of the conditioning of two pictures under a full mask."""
+    """Return the difference between the prior's conditioning on two pictures if all pixels are masked.
+
+    The conditioning must not depend on masked pixels.
+    """
     full = torch.ones(1, 1, SIZE, SIZE)
     one, other = (diffusion.conditioning(model(), images(name), full) for name in ("a", "b"))
     return (one - other).abs().max().item()
 
 
 def empty_mask_error() -> float:
-    """With an empty mask the conditioning must equal the picture's latents bit for bit."""
+    """Return the difference of the conditioning from the picture's latents if the mask is empty.
+
+    They must be equal bit for bit.
+    """
     with torch.no_grad():
         condition = diffusion.conditioning(model(), images(), torch.zeros(1, 1, SIZE, SIZE))
         difference = condition[:, 1:] - diffusion.encode(model(), images())
@@ -149,12 +187,19 @@ def empty_mask_error() -> float:
 
 
 def refuse_empty_window() -> float:
+    """Return 0 if a window around an empty mask is refused with the cause, else 1."""
     nothing = torch.zeros(20, 30, dtype=torch.bool)
     return count_unclear_refusal(lambda: windows.window_around(nothing, 8, seeding.generator(0)), "empty mask")
 
 
 def count_bad_gradients(low: float, high: float, guidance: float) -> float:
-    """Non-finite gradients of SDS for a scene that is repainted as a whole."""
+    """Count non-finite numbers in the SDS gradients of Gaussians, for a view that is repainted as a whole.
+
+    Args:
+        low: smallest timestep, as a fraction of the schedule.
+        high: largest timestep, as a fraction of the schedule.
+        guidance: strength of guidance.
+    """
     view, gaussians = camera(24, 18), cloud().map(lambda p: p.clone().requires_grad_())
     everything = torch.ones(18, 24, dtype=torch.bool)
     whole = TrainView(view, torch.rand(18, 24, 3, generator=seeding.generator(0)), ~everything, everything, clean=False)
@@ -166,7 +211,7 @@ def count_bad_gradients(low: float, high: float, guidance: float) -> float:
 
 
 def count_out_of_range() -> float:
-    """Inpainting in one step with a full mask: pixels that are outside [-1, 1] or NaN."""
+    """Count pixels that are outside [-1, 1] or NaN after inpainting in one sampler step with a full mask."""
     full, draws = torch.ones(1, 1, SIZE, SIZE), seeding.generator(0)
     sample = diffusion.sample(model(), images(), full, prompts()[:1], 1, draws, 100.0, prompts()[2:])
     return float((~(sample.abs() <= 1)).sum())
@@ -176,7 +221,11 @@ def count_out_of_range() -> float:
 
 
 def critic_error() -> float:
-    """The critic's losses and slopes at scores of +-1e4 against their limits, max(0, x) and 0 or 1; relative error."""
+    """Return the largest error of the critic's losses and their slopes at scores of +-1e4.
+
+    At such scores the loss log(1 + e^x) equals its limit max(0, x), and its slope 0 or 1. Errors of losses are relative
+    to 1e4.
+    """
     worst = 0.0
     for score in (1e4, -1e4):
         for loss, limit, slope in (
@@ -191,7 +240,10 @@ def critic_error() -> float:
 
 
 def generator_error() -> float:
-    """The generator's losses at +-1e4, both forms: errors of values (relative) and slopes."""
+    """Return the largest error of the generator's losses, in both forms, and of their slopes at scores of +-1e4.
+
+    Errors of losses are relative to 1e4.
+    """
     worst = 0.0
     for form in ("non-saturating", "saturating"):
         for score in (1e4, -1e4):
@@ -206,11 +258,15 @@ def generator_error() -> float:
 
 @cache
 def critic() -> discriminator.Critic:
+    """Make a small critic for patches of 16 px."""
     return discriminator.Critic(16, 8, seeding.generator(0, "critic"))
 
 
 def flat_critic_penalty() -> float:
-    """A critic with zero weights has no slope, so its penalty and the penalty's gradients must be 0."""
+    """Return the largest of the gradient penalty and its gradients for a critic whose weights are all zero.
+
+    Such a critic has no slope, so all of them must be 0.
+    """
     flat = discriminator.Critic(16, 8, seeding.generator(0))
     for weight in flat.parameters():
         weight.data.zero_()
@@ -222,7 +278,10 @@ def flat_critic_penalty() -> float:
 
 
 def count_invalid_scores() -> float:
-    """Eight equal patches, whose standard deviation is the root of zero: non-finite scores and slopes."""
+    """Count non-finite scores and gradients of a critic for eight equal patches.
+
+    The standard deviation over equal patches is the root of zero, whose slope is infinite.
+    """
     patches = torch.full((8, 3, 16, 16), 0.25, requires_grad=True)
     scores = critic()(patches)
     penalty = discriminator.gradient_penalty(scores, patches)
@@ -234,7 +293,8 @@ SDS = "numbers of the gradient that are not finite"
 CASES = (
     *(Case(f"timestep {name}", "error of a z_0 + s eps = z_t, relative", 8 * EPS32, partial(reconstruction_error, t))
       for name, t in (("0", 0), ("T-1", -1))),
-    # Both are sums of 101 and 100 parts that nearly cancel, each as exact as without guidance.
+    # With guidance 100, eps and z_0 are 101 times one prediction minus 100 times another; each prediction is as exact
+    # as without guidance.
     Case("timestep T-1, guidance 100", "error of a z_0 + s eps = z_t, relative", 201 * 8 * EPS32,
          partial(reconstruction_error, -1, 100.0)),
     *(Case(f"timestep {name}, score distillation", "relative L2 error against float64", 16 * EPS32,
@@ -245,7 +305,8 @@ CASES = (
     *(Case(f"{str(dtype)[6:]}, half precision of the prior", "relative L2 difference of eps from float32",
            LAYERS * epsilon, partial(half_precision_error, dtype)) for dtype, epsilon in HALF.items()),
     Case("guidance 0", "largest difference from no guidance", EXACT, no_guidance_error),
-    # 101 + 100 predictions, each rounded once per layer; batches of one and of two differ by that.
+    # The sum weighs two predictions by 101 and 100. Each is rounded once per layer, and differs by such roundings
+    # between batches of one and of two.
     Case("guidance 100", "error relative to eps", 201 * LAYERS * EPS32, strong_guidance_error),
     Case("guidance 100, equal prompts", "difference from no guidance, relative to eps", 201 * LAYERS * EPS32,
          equal_prompts_error),

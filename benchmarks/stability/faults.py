@@ -1,6 +1,7 @@
-"""Faults planted in the code, each with the case that must catch it: a test of the suite itself.
+"""Deliberate faults in the code, each with the case that must detect it: a test of the stability suite itself.
 
-A fault is derived from the correct function and replaces it wherever it was imported, while the case runs.
+A fault is a wrong version of a function. While the case runs, it replaces the correct function in all modules that
+imported it.
 """
 
 from __future__ import annotations
@@ -25,7 +26,15 @@ from reffusion.depth.alignment import Alignment
 
 
 class Fault(NamedTuple):
-    """A fault: its name, module and name of the replaced object, correct -> faulty object, and the catching case."""
+    """Deliberate fault.
+
+    Attributes:
+        name: description of the fault.
+        module: module of the replaced function (or constant).
+        function: name of the replaced function (or constant).
+        wrong: returns the faulty version, given the correct one.
+        caught_by: name of the case that must detect the fault.
+    """
 
     name: str
     module: str
@@ -35,7 +44,10 @@ class Fault(NamedTuple):
 
 
 def fold_filter_naively(log_scales: np.ndarray, logits: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mip-Splatting's filter as printed in its paper: exponentials that overflow, and a quotient of products."""
+    """Fold Mip-Splatting's 3D filter into scales and opacities by the formulas as printed in its paper.
+
+    The exponentials overflow, and the quotient of products loses digits. The arguments are those of `fold_filter`.
+    """
     with np.errstate(all="ignore"):
         squares = np.exp(2 * np.asarray(log_scales, np.float64))
         widened = squares + np.asarray(sizes, np.float64)[:, None] ** 2
@@ -44,11 +56,12 @@ def fold_filter_naively(log_scales: np.ndarray, logits: np.ndarray, sizes: np.nd
 
 
 def change_result(change: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Correct function -> one whose result is changed."""
+    """Return a function that maps a correct function to one whose result is changed by `change`."""
     return lambda right: lambda *arguments: change(right(*arguments))
 
 
 def log_of_sigmoid(real: torch.Tensor, fake: torch.Tensor) -> torch.Tensor:
+    """Return the critic's loss by logarithms of sigmoids, which are infinite for large scores."""
     return -torch.log(torch.sigmoid(real)).mean() - torch.log(torch.sigmoid(-fake)).mean()
 
 
@@ -102,10 +115,10 @@ FAULTS = (
 
 @contextmanager
 def plant(fault: Fault) -> Iterator[None]:
-    """Replace the correct object by the fault, under every name in every loaded module, while in the context.
+    """Replace the correct function by the fault, under every name in every loaded module, within the context.
 
-    A module first loaded in the context would keep the fault, so run the case once before. A compiled kernel keeps what
-    it was compiled with, so plant no fault inside one.
+    A module that is loaded for the first time within the context would keep the fault, so the case must run once
+    before. A compiled kernel keeps the functions with which it was compiled, so no fault may be inside a kernel.
     """
     right = getattr(import_module(fault.module), fault.function)
     wrong = fault.wrong(right)
@@ -118,11 +131,11 @@ def plant(fault: Fault) -> Iterator[None]:
 
 
 def is_caught(fault: Fault) -> bool:
-    """True if the case is out of its bound, or raises, with the fault.
+    """Return True if a fault's case, run with the fault, is out of its bound or raises an exception.
 
     Raises:
-        ValueError: the case is out of bound without the fault.
-        NameError, TypeError, AttributeError: the fault is broken code instead of wrong numbers.
+        ValueError: the case is out of its bound even without the fault.
+        NameError, TypeError, AttributeError: the fault is broken code, while it should give wrong numbers.
     """
     (case,) = (case for case in all_cases() if case.name == fault.caught_by)
     if not run(case).ok:

@@ -1,4 +1,9 @@
-"""Cases of the normalised frame: any extent, any offset, and the way back in exports."""
+"""Cases of the normalised frame: scenes of any extent and any offset, and exports to the scene's own frame.
+
+The stage `poses` transforms a scene to a normalised frame of extent about 1. The cases make the same small scene with
+several extents and offsets, and check that the results do not depend on them. Errors "in extents" are divided by the
+scene's extent.
+"""
 
 from __future__ import annotations
 
@@ -25,12 +30,12 @@ from reffusion.splat.rasterizer import render
 from reffusion.types import Camera, Gaussians, Scene, Similarity
 
 WIDTH, HEIGHT, VIEWS = 24, 18, 5
-OFFSET_DIRECTION = np.array([1.0, -0.6, 0.3])  # direction of the offset; the cases name its largest axis
-EXPORT_TOLERANCE = 1e-5  # in extents; accuracy of positions that `io.save_ply` promises
+OFFSET_DIRECTION = np.array([1.0, -0.6, 0.3])  # direction of the offset; the cases' offsets are those along x
+EXPORT_TOLERANCE = 1e-5  # accuracy of exported positions that `save_ply` guarantees, in extents
 
 
 def true_gaussians() -> Gaussians:
-    """Ground truth of the pictures: sixty coloured Gaussians in a box of extent 1."""
+    """Make the ground truth of the photographs: sixty coloured Gaussians in a box of extent 1 around the origin."""
     random = seeding.generator(0, "stability", "truth")
     uniform = lambda *shape: torch.rand(*shape, generator=random)
     return Gaussians(
@@ -40,7 +45,12 @@ def true_gaussians() -> Gaussians:
 
 
 def poses(extent: float, offset: np.ndarray) -> dict[str, np.ndarray]:
-    """View name -> world-to-camera in the scene's own frame: five views of the box, from 1.6 extents away."""
+    """Return world-to-camera poses [4, 4] of five views of the box, from 1.6 extents away, in the scene's own frame.
+
+    Args:
+        extent: extent of the scene.
+        offset: [3], position of the box.
+    """
     found = {}
     for k in range(VIEWS):
         turn, pose = 0.9 * (k / (VIEWS - 1) - 0.5), np.eye(4)
@@ -52,7 +62,12 @@ def poses(extent: float, offset: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def normalized_scene(extent: float, offset: float) -> Scene:
-    """The scene of this extent, `offset` extents from the origin, as the stage `poses` passes it on."""
+    """Make a scene in the normalised frame, as the stage `poses` does.
+
+    Args:
+        extent: extent of the scene in its own frame.
+        offset: distance of the scene from the origin along x, in extents.
+    """
     place = extent * offset * OFFSET_DIRECTION
     world, lens = poses(extent, place), Lens(WIDTH, HEIGHT, 26.0, 26.0, WIDTH / 2, HEIGHT / 2)
     points = extent * true_gaussians().means.double().numpy() + place
@@ -69,7 +84,13 @@ def normalized_scene(extent: float, offset: float) -> Scene:
 
 @cache
 def fit_scene(extent: float, offset: float, rate: float = 1.0) -> tuple[Scene, Gaussians, float]:
-    """The scene, its fit of 60 steps, and the PSNR of the fit over its views in dB."""
+    """Make a scene, fit it in 60 steps, and return scene, Gaussians and the PSNR over its views in dB.
+
+    Args:
+        extent: extent of the scene in its own frame.
+        offset: distance of the scene from the origin along x, in extents.
+        rate: factor on the learning rates.
+    """
     scene = normalized_scene(extent, offset)
     cameras = list(scene.cameras.values())
     pictures = render_photographs()
@@ -84,13 +105,13 @@ def fit_scene(extent: float, offset: float, rate: float = 1.0) -> tuple[Scene, G
 
 
 def scale_rates(rates: Rates, factor: float) -> Rates:
-    """All step sizes times `factor`."""
+    """Return the step sizes, all multiplied by `factor`."""
     return Rates(**{name: factor * value for name, value in vars(rates).items()})
 
 
 @cache
 def render_photographs() -> dict[str, np.ndarray]:
-    """View name -> uint8 [H, W, 3]: the truth in a frame of extent 1 at the origin, the same for every frame."""
+    """Render the photographs from the true Gaussians, {view: uint8 [H, W, 3]}; they are the same for all frames."""
     pictures = {}
     for name, pose in poses(1.0, np.zeros(3)).items():
         view = Camera(name, WIDTH, HEIGHT, 26.0, 26.0, WIDTH / 2, HEIGHT / 2, pose)
@@ -99,12 +120,12 @@ def render_photographs() -> dict[str, np.ndarray]:
 
 
 def psnr_difference(extent: float, offset: float) -> float:
-    """Difference in dB of the fit from that of the same scene with extent 1 at the origin."""
+    """Return the difference in PSNR (dB) between the fit and that of the same scene with extent 1 at the origin."""
     return abs(fit_scene(extent, offset)[2] - fit_scene(1.0, 0.0)[2])
 
 
 def camera_difference(extent: float, offset: float) -> float:
-    """Largest difference of normalised poses and points from those of the scene of extent 1 at the origin."""
+    """Return the largest difference of normalised poses and points from those with extent 1 at the origin."""
     scene, reference = normalized_scene(extent, offset), normalized_scene(1.0, 0.0)
     poses_apart = [
         np.abs(scene.cameras[n].world_to_camera - reference.cameras[n].world_to_camera).max() for n in reference.cameras
@@ -113,7 +134,7 @@ def camera_difference(extent: float, offset: float) -> float:
 
 
 def export_vertices(extent: float, offset: float) -> np.ndarray:
-    """Vertices of the fit's .ply in the scene's own frame."""
+    """Export the fit to a .ply in the scene's own frame, and return its vertices."""
     scene, gaussians, _ = fit_scene(extent, offset)
     with tempfile.TemporaryDirectory() as folder:
         save_ply(Path(folder) / "scene.ply", gaussians, similarity=scene.similarity)
@@ -121,7 +142,7 @@ def export_vertices(extent: float, offset: float) -> np.ndarray:
 
 
 def position_error(extent: float, offset: float) -> float:
-    """Largest error of exported positions, in extents."""
+    """Return the largest error of the exported positions, in extents."""
     scene, gaussians, _ = fit_scene(extent, offset)
     table = export_vertices(extent, offset)
     positions = np.stack([table[axis] for axis in "xyz"], 1).astype(np.float64)
@@ -129,7 +150,7 @@ def position_error(extent: float, offset: float) -> float:
 
 
 def scale_error(extent: float, offset: float) -> float:
-    """Largest error of an exported log-scale."""
+    """Return the largest error of the exported log-scales."""
     scene, gaussians, _ = fit_scene(extent, offset)
     table = export_vertices(extent, offset)
     scales = np.stack([table[f"scale_{k}"] for k in range(3)], 1).astype(np.float64)
@@ -137,7 +158,7 @@ def scale_error(extent: float, offset: float) -> float:
 
 
 def export_picture_error(extent: float, offset: float) -> float:
-    """Largest difference between renders of the fit and of its export, loaded back into the normalised frame."""
+    """Return the largest difference between renders of the fit and of its export, loaded into the normalised frame."""
     scene, gaussians, _ = fit_scene(extent, offset)
     with tempfile.TemporaryDirectory() as folder:
         save_ply(Path(folder) / "scene.ply", gaussians, similarity=scene.similarity)
@@ -147,7 +168,7 @@ def export_picture_error(extent: float, offset: float) -> float:
 
 
 def scene_file_error(extent: float, offset: float) -> float:
-    """Error of points after saving and loading the scene with its similarity, in extents."""
+    """Return the largest error, in extents, of points in the scene's own frame after saving and loading the scene."""
     scene = normalized_scene(extent, offset)
     with tempfile.TemporaryDirectory() as folder:
         save_scene(Path(folder), scene)
@@ -157,7 +178,10 @@ def scene_file_error(extent: float, offset: float) -> float:
 
 
 def refuse_one_place() -> float:
-    """All cameras at one place, without points or bounds, leave the scale open: 0 if the refusal says so."""
+    """Return 0 if cameras at a single place, without points or depth bounds, are refused with the cause, else 1.
+
+    Such cameras do not determine the scale of the scene.
+    """
     lens = Lens(WIDTH, HEIGHT, 26.0, 26.0, WIDTH / 2, HEIGHT / 2)
     try:
         frame.depth_ranges(np.stack([np.eye(4)] * 3), [lens] * 3, np.zeros((0, 3)), None)
@@ -167,7 +191,7 @@ def refuse_one_place() -> float:
 
 
 def similarity_error() -> float:
-    """A similarity and its inverse at an extent of 1e-3 and an offset of 1e6: error relative to the extent."""
+    """Return the error, in extents, of a similarity after its inverse, at an extent of 1e-3 and an offset of 1e6."""
     similarity = Similarity(1e3, 1e6 * OFFSET_DIRECTION)
     points = np.random.default_rng(0).uniform(-1, 1, (100, 3))
     return float(np.abs(similarity.apply(similarity.invert(points)) - points).max())

@@ -1,4 +1,4 @@
-"""Cases of the optimisation: everything pruned, learning rates ten times too large, gradients of any size."""
+"""Cases of the optimisation: all Gaussians pruned, too large learning rates, gradients of any size."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STOPS = "neither recovered nor stopped by name, or wrote NaN"
 
 
 def psnr(gaussians: Gaussians) -> float:
-    """PSNR over the views of `frames`, in dB."""
+    """Return the PSNR in dB of the Gaussians over the views of `frames`."""
     scene, pictures = frames.normalized_scene(1.0, 0.0), frames.render_photographs()
     error = np.mean([(render(gaussians, view).color.clamp(0, 1).numpy() - pictures[name] / 255.0) ** 2
                      for name, view in scene.cameras.items()])  # fmt: skip
@@ -41,17 +41,25 @@ def psnr(gaussians: Gaussians) -> float:
 
 
 def is_trace_finite(folder: Path) -> bool:
-    """True if every number of the trace is finite."""
+    """Return True if all numbers of the trace in a folder are finite."""
     values = [v for line in trace.read_trace(folder / "trace.jsonl") for v in line.values() if not isinstance(v, str)]
     return all(math.isfinite(v) for v in values)
 
 
 def names_step_and_term(error: FloatingPointError, term: str) -> bool:
+    """Return True if the message of an error names a step and the term."""
     return "step" in str(error) and term in str(error)
 
 
 def fast_fit_fails(factor: float) -> float:
-    """0 if a fit at `factor` times the usual rates improves, or reports the step and the term that failed."""
+    """Return 0 if a fit with too large learning rates either improves the PSNR or stops with a clear error, else 1.
+
+    A clear error names the step and the term that failed. For factors above 100, no improvement is required. All values
+    and the trace must be finite.
+
+    Args:
+        factor: factor on the usual learning rates.
+    """
     scene = frames.normalized_scene(1.0, 0.0)
     start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, seeding.generator(0))
     usual = Rates(means=2e-3, means_last=2e-4, log_scales=1.5e-2, sh_dc=1.5e-2)
@@ -70,7 +78,13 @@ def fast_fit_fails(factor: float) -> float:
 
 
 def fast_distillation_fails(factor: float) -> float:
-    """The same for a distillation by reconstruction and reference, with half of the Gaussians masked."""
+    """Return 0 if a distillation with too large learning rates improves the PSNR or stops with a clear error, else 1.
+
+    The terms are reconstruction and reference, and about half of the Gaussians are masked.
+
+    Args:
+        factor: factor on the usual learning rates.
+    """
     scene, fitted, _ = frames.fit_scene(1.0, 0.0)
     masked = fitted.means[:, 0] > 0
     start = replace(fitted, sh=torch.where(masked[:, None, None], 0.0, fitted.sh))
@@ -94,7 +108,10 @@ def fast_distillation_fails(factor: float) -> float:
 
 
 def empty_scene_errors() -> float:
-    """All Gaussians pruned: renders are background, steps do nothing, files are empty; number of violations."""
+    """Count the violations after all Gaussians were pruned.
+
+    Renders must then show the background, optimizer steps must do nothing, and saved files must have no Gaussians.
+    """
     optimizer, view = GaussianOptimizer(cloud()), camera()
     removed = prune(optimizer, 1.1, math.inf)
     picture = render(optimizer.gaussians, view, background=torch.full((3,), 0.25))
@@ -109,7 +126,7 @@ def empty_scene_errors() -> float:
 
 
 def refuse_empty_fit() -> float:
-    """0 if a fit whose pruning removes everything reports it with the step."""
+    """Return 0 if a fit whose pruning removes all Gaussians stops with an error that names the step, else 1."""
     scene = frames.normalized_scene(1.0, 0.0)
     start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, seeding.generator(0))
     densify = Densify(start=0.0, stop=1.0, every=4, prune_scale3d=1e-9, grow_grad2d=1e9)
@@ -123,7 +140,10 @@ def refuse_empty_fit() -> float:
 
 
 def count_unpruned() -> float:
-    """Log-scales of 100 and more, whose exponential overflows, must be pruned as too large; number that is not."""
+    """Count the Gaussians with log-scales of 100 and more that pruning does not remove as too large.
+
+    The exponentials of such log-scales overflow.
+    """
     gaussians = cloud()
     gaussians.log_scales[:4] = torch.tensor([100.0, 1e3, 1e4, 1e30])[:, None]
     optimizer = GaussianOptimizer(gaussians)
@@ -132,7 +152,10 @@ def count_unpruned() -> float:
 
 
 def first_step_excess() -> float:
-    """Adam's first step has the length of the step size for any gradient; relative excess."""
+    """Return by how much Adam's first step exceeds the step size, relative to it, over gradients of 1e-25 to 1e18.
+
+    The first step has the length of the step size for a gradient of any size.
+    """
     worst = 0.0
     for size in (1e-25, 1e-15, 1e-8, 1.0, 1e8, 1e18):
         optimizer = GaussianOptimizer(cloud(degree=0), rates=Rates(means=1e-3, means_last=1e-3))
@@ -145,7 +168,10 @@ def first_step_excess() -> float:
 
 
 def broken_gradient_errors() -> float:
-    """A NaN or infinite gradient must raise an error that names the parameter, and move nothing."""
+    """Count the violations for NaN and infinite gradients: they must raise an error and change no parameter.
+
+    The error must name the parameter.
+    """
     wrong = 0
     for value in (math.nan, math.inf):
         optimizer = GaussianOptimizer(cloud())

@@ -1,8 +1,9 @@
-"""The compiled rasterizer against plain torch in float64, with the compiled one's order and cut-offs.
+"""Comparison of the compiled rasterizer ("cpu", float32) with an oracle, the plain torch implementation in float64.
 
-A cut-off (alpha under 1/255, a finished pixel) is a discontinuity: if float32 and float64 fall on different sides of
-it, their difference says nothing about accuracy. So the oracle is given which Gaussian the kernel blended into which
-pixel, and sorts by depth in float32, as the kernel does. Everything else is float64.
+A cut-off (alpha below 1/255, a pixel whose transmittance is used up) is a discontinuity. If float32 and float64 decide
+differently there, the difference says nothing about accuracy. So the oracle uses the kernel's decisions about which
+Gaussian is blended into which pixel, and sorts by depth in float32, as the kernel does. Everything else is float64. A
+*block* is one image, or the gradient with respect to one input.
 """
 
 from __future__ import annotations
@@ -17,19 +18,19 @@ from reffusion.splat import pure_torch, rasterizer
 from reffusion.splat.conventions import MAX_ALPHA
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
-BLOCKS = (*PARAMETERS, "features", "background", "probe")
+BLOCKS = (*PARAMETERS, "features", "background", "probe")  # inputs with gradients
 IMAGES = ("color", "depth", "alpha", "features")
-CHANNELS = 2
+CHANNELS = 2  # channels of the features
 EPSILON = 2.0**-24  # relative error of one rounding to float32
 
 
 class Rendered(NamedTuple):
-    """Images of an implementation, and the gradients of a fixed random linear function of them.
+    """Images of an implementation, and the gradients of a fixed random linear function of these images.
 
     Attributes:
-        images: colour, depth, alpha, features.
-        gradients: by `BLOCKS`.
-        radii: [N] int32.
+        images: name in `IMAGES` -> [H, W, ...].
+        gradients: name in `BLOCKS` -> gradient.
+        radii: [N] int32, radii of the footprints, px; 0 for culled Gaussians.
     """
 
     images: Mapping[str, Tensor]
@@ -38,9 +39,14 @@ class Rendered(NamedTuple):
 
 
 def render_with_gradients(gaussians: Gaussians, camera: Camera, impl: str, seed: int = 0, far: float = 1.0) -> Rendered:
-    """Render with "cpu" in float32, or with "torch" in float64 with the cut-offs of "cpu".
+    """Render Gaussians and compute the gradients of a fixed random linear function of the images.
 
-    `far` is the unit of depth in the linear function.
+    Args:
+        gaussians: the Gaussians.
+        camera: the view.
+        impl: "cpu" for the compiled rasterizer in float32, "torch" for the oracle in float64.
+        seed: seed of features, background and linear function.
+        far: unit of depth in the linear function.
     """
     dtype = torch.float32 if impl == "cpu" else torch.float64
     random = torch.Generator().manual_seed(seed)
@@ -64,14 +70,18 @@ def render_with_gradients(gaussians: Gaussians, camera: Camera, impl: str, seed:
 
 
 def blended_pixels(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """bool [H * W, N]: which Gaussians the compiled kernel blends into which pixels. For small images."""
+    """Return bool [H * W, N], True where the compiled kernel blends a Gaussian into a pixel. For small images only."""
     pixels = camera.width * camera.height
     each = torch.eye(pixels).reshape(camera.height, camera.width, pixels)
     return rasterizer.accumulate(gaussians, camera, each, impl="cpu", count=True).T > 0
 
 
 def _render_reference(blended: Tensor, gaussians: Gaussians, camera: Camera, features, background, probe):
-    """The reference's images with given cut-offs, and its radii."""
+    """Render the images in float64 with given cut-offs; return the images by name and the radii.
+
+    Args:
+        blended: result of `blended_pixels`.
+    """
     projected, radii = pure_torch.project(gaussians, camera, probe)
     again = torch.sort(projected.depths.float(), stable=True).indices  # equal depths by index
     projected = pure_torch.Projected(*(array[again] for array in projected))
@@ -94,18 +104,28 @@ def _render_reference(blended: Tensor, gaussians: Gaussians, camera: Camera, fea
 
 
 FLOOR = {"values": 1e-6, "gradients": 1e-5}
-"""Absolute errors that do not count: a sum over up to 200 pixels of 8 channels, each term of order one (upstream
-gradients are standard normal) and rounded about ten times on its way, keeps a random walk of 10 * 2^-24 * sqrt(1600) =
-2e-5 in the worst case; a value is a sum over one pixel's list only."""
+"""Absolute errors that do not count. A gradient is a sum over up to 200 pixels of 8 channels. Each term is of order one
+(upstream gradients are standard normal) and is rounded about ten times, so the errors add up, as a random walk, to
+10 * 2^-24 * sqrt(1600) = 2e-5 in the worst case. A value is a sum over the Gaussians of one pixel only."""
 
 
 def errors(gaussians: Gaussians, camera: Camera, relative: float, seed: int = 0) -> dict[str, float]:
-    """Name of an image or parameter block -> relative L2 error |kernel - oracle| / (|oracle| + floor / relative).
+    """Return the relative L2 errors of the compiled rasterizer, |kernel - oracle| / (|oracle| + floor / relative).
 
-    A value of at most `relative` means an error within relative * |oracle| + floor. A quaternion's gradient is
-    multiplied by its length, which makes it one of a rotation: otherwise the shortest quaternion would dominate.
+    The floor is in `FLOOR`. An error of at most `relative` means |kernel - oracle| <= relative * |oracle| + floor.
+    Gradients of quaternions are multiplied by the quaternions' lengths. They are then gradients of rotations; otherwise
+    the gradient of the shortest quaternion would dominate.
+
+    Args:
+        gaussians: the Gaussians.
+        camera: the view.
+        relative: bound of the relative error.
+        seed: seed of the random inputs.
+
+    Returns:
+        Name of an image or "gradient of <input>" -> error. If the radii differ, only {"radii": infinity}.
     """
-    # Depth is in units of the farthest one, so that the terms of all sums are of order one, as `FLOOR` assumes.
+    # Depth is in units of the farthest depth, so that the terms of all sums are of order one, as `FLOOR` assumes.
     far = max(1.0, rasterizer.render(gaussians, camera, impl="cpu").depth.max().item())
     fast, exact = (render_with_gradients(gaussians, camera, impl, seed, far) for impl in ("cpu", "torch"))
     if not torch.equal(fast.radii, exact.radii):
@@ -124,12 +144,12 @@ def errors(gaussians: Gaussians, camera: Camera, relative: float, seed: int = 0)
 
 
 def _scale_quaternions(fast: Rendered, exact: Rendered, lengths: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Both gradients, with those of quaternions multiplied by their lengths."""
+    """Return the gradients of both renderings, with those of quaternions multiplied by the quaternions' lengths."""
     turn = lambda blocks: {**blocks, "quaternions": blocks["quaternions"].double() * lengths}
     return turn(fast.gradients), turn(exact.gradients)
 
 
 def worst_error(gaussians: Gaussians, camera: Camera, relative: float) -> float:
-    """The largest of `errors`; infinite if one is NaN."""
+    """Return the largest of the relative errors from `errors`, or infinity if an error is NaN."""
     values = errors(gaussians, camera, relative).values()
     return max(error if error == error else float("inf") for error in values)

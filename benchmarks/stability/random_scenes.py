@@ -1,7 +1,7 @@
 """Random small scenes, ordinary and extreme, on which the compiled rasterizer must agree with the oracle.
 
-A seeded generator makes them, the same for every version of the code; it often takes the ends of a range. Each scene
-has up to eight Gaussians and 12 x 10 pixels, since the oracle evaluates every pair.
+A seeded generator makes the same scenes for every version of the code. It often draws the ends of a range. Each scene
+has up to eight Gaussians and 12 x 10 pixels, because the oracle evaluates all pairs.
 """
 
 from __future__ import annotations
@@ -19,13 +19,20 @@ from benchmarks.stability import oracle
 from benchmarks.stability.cases import Case
 from reffusion.types import Camera, Gaussians
 
-ORDINARY, EXTREME = 2e-5, 1e-3
+ORDINARY, EXTREME = 2e-5, 1e-3  # bounds of the relative error
 MAX_GAUSSIANS = 8
-END_SHARE = 0.2  # share of numbers at an end of their range
+END_SHARE = 0.2  # share of drawn numbers that are at an end of their range
 
 
 class Worst(NamedTuple):
-    """The largest error over random scenes, its block, the scene's number (from 0), and the number of scenes."""
+    """Largest error over random scenes.
+
+    Attributes:
+        error: the error.
+        where: image or gradient that has this error.
+        scene: number of the scene, from 0.
+        scenes: number of scenes.
+    """
 
     error: float
     where: str
@@ -34,15 +41,20 @@ class Worst(NamedTuple):
 
 
 def _between(random: np.random.Generator, low: float, high: float) -> float:
+    """Draw a number from a range; with probability `END_SHARE` it is one of the ends."""
     return float(random.choice((low, high))) if random.random() < END_SHARE else random.uniform(low, high)
 
 
 def _integer(random: np.random.Generator, low: int, high: int) -> int:
+    """Draw an integer from `low` to `high`, inclusive."""
     return round(_between(random, low - 0.49, high + 0.49))
 
 
 def ordinary(random: np.random.Generator) -> tuple[Gaussians, Camera]:
-    """Gaussians of a tenth of the scene, at most 30 times longer than thick, seen from about one extent away."""
+    """Draw an ordinary scene: Gaussians of about a tenth of the extent, at most 30 times longer than thick.
+
+    The camera is 1 to 2 extents away.
+    """
     count, degree = _integer(random, 1, MAX_GAUSSIANS), _integer(random, 0, 3)
     view = _camera(random, _between(random, 1.0, 2.0), _between(random, 0.5, 3.0))
     scales = math.log(0.1) + np.clip(0.7 * random.normal(size=(count, 3)), -1.7, 1.7)
@@ -57,7 +69,11 @@ def ordinary(random: np.random.Generator) -> tuple[Gaussians, Camera]:
 
 
 def extreme(random: np.random.Generator) -> tuple[Gaussians, Camera]:
-    """Scales of 1e-7 to 1e4 extents, anisotropy to 1e6, logits to 30, any quaternion; at, behind and in the camera."""
+    """Draw an extreme scene.
+
+    Standard deviations are 1e-7 to 1e4 extents, anisotropies up to 1e6, opacity logits up to 30 in size. Quaternions
+    have any length, also 0. Gaussians may be near the near plane, behind the camera, or at its centre.
+    """
     count, degree = _integer(random, 1, MAX_GAUSSIANS), _integer(random, 0, 3)
     view = _camera(random, _between(random, 0.125, 4.0), _between(random, 0.25, 10.0))
     means, quaternions, scales, logits = [], [], [], []
@@ -73,7 +89,7 @@ def extreme(random: np.random.Generator) -> tuple[Gaussians, Camera]:
 
 
 def _place(random: np.random.Generator, view: Camera) -> np.ndarray:
-    """A mean [3] in the scene, near the near plane, behind the camera, in its centre, or far away."""
+    """Draw a mean [3] in the scene, near the near plane, behind the camera, at the camera's centre, or far away."""
     kind = random.choice(("scene", "scene", "near plane", "behind", "centre", "far"))
     if kind == "scene":
         return 0.4 * random.normal(size=3)
@@ -88,7 +104,12 @@ def _place(random: np.random.Generator, view: Camera) -> np.ndarray:
 
 
 def _camera(random: np.random.Generator, distance: float, focal: float) -> Camera:
-    """A view of the origin, up to 12 x 10 pixels; `focal` is relative to the image width."""
+    """Draw a camera that looks at the origin, with up to 12 x 10 pixels.
+
+    Args:
+        distance: distance to the origin.
+        focal: focal length relative to the image width.
+    """
     width, height = _integer(random, 1, 12), _integer(random, 1, 10)
     pose = np.eye(4)
     pose[:3, :3] = Rotation.random(random_state=int(random.integers(2**31))).as_matrix()
@@ -98,12 +119,19 @@ def _camera(random: np.random.Generator, distance: float, focal: float) -> Camer
 
 
 def _gaussians(arrays, antialiased: bool) -> Gaussians:
+    """Return Gaussians from arrays of all parameters."""
     tensors = (torch.tensor(np.array(array), dtype=torch.float32) for array in arrays)
     return Gaussians(*tensors, antialiased=antialiased)
 
 
 def find_worst(scenes: Callable, relative: float, count: int) -> Worst:
-    """Draw `count` scenes, the same ones each time, and compare each with the oracle."""
+    """Draw `count` scenes, the same ones in each call, compare each with the oracle, and return the largest error.
+
+    Args:
+        scenes: `ordinary` or `extreme`.
+        relative: bound of the relative error, see `oracle.errors`.
+        count: number of scenes.
+    """
     results = []
     for number in range(count):
         errors = oracle.errors(*scenes(np.random.default_rng((0, number))), relative, seed=number)
@@ -114,6 +142,7 @@ def find_worst(scenes: Callable, relative: float, count: int) -> Worst:
 
 
 def _measured(scenes: Callable, relative: float, count: int) -> float:
+    """Return the largest error over random scenes, and print where it occurs."""
     worst = find_worst(scenes, relative, count)
     print(f"  worst of {worst.scenes} {scenes.__name__} scenes: {worst.where}, scene {worst.scene}", flush=True)
     return worst.error

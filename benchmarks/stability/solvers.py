@@ -1,4 +1,7 @@
-"""Cases of depth completion and the bilateral solver: little known data, holes at the border, constant guides."""
+"""Cases of depth completion and of the bilateral solver: little known data, holes at the border, constant guides.
+
+The maps are disparity [40, 56], a plane. The *guide* of a solver is the picture whose edges it respects.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +20,12 @@ FLAT = np.full((40, 56, 3), 128, np.uint8)
 
 
 def noise_guide() -> np.ndarray:
+    """Return a guide of pure noise, uint8 [H, W, 3]."""
     return np.random.default_rng(0).integers(0, 255, (40, 56, 3)).astype(np.uint8)
 
 
 def confidence_at(*pixels: tuple[int, int]) -> np.ndarray:
+    """Return a confidence map [H, W] that is 1 at the given pixels (row, column) and 0 elsewhere."""
     confidence = np.zeros(PLANE.shape)
     for pixel in pixels:
         confidence[pixel] = 1.0
@@ -28,36 +33,46 @@ def confidence_at(*pixels: tuple[int, int]) -> np.ndarray:
 
 
 def plane_error(hole: np.ndarray, guide: np.ndarray | None = None, unit: float = 1.0, offset: float = 0.0) -> float:
-    """A plane behind the hole, in this unit and this many units from zero: largest relative error."""
+    """Complete a plane with a hole and return the largest relative error.
+
+    Args:
+        hole: bool [H, W], True for the unknown pixels.
+        guide: guide of the completion; None for none.
+        unit: factor on the disparity.
+        offset: number that is added to the disparity, in this unit.
+    """
     disparity = unit * (PLANE + offset)
     completed = completion.complete(np.where(hole, 9.0 * unit, disparity), ~hole, guide)
     return float(np.abs(completed / disparity - 1.0).max())
 
 
 def refuse_completion_without_data() -> float:
+    """Return 0 if a completion without known pixels is refused with the cause, else 1."""
     return count_unclear_refusal(lambda: completion.complete(PLANE, np.zeros(PLANE.shape)), "fix no plane")
 
 
 def refuse_solving_without_data() -> float:
+    """Return 0 if the bilateral solver refuses input without confidence and names the cause, else 1."""
     return count_unclear_refusal(
         lambda: bilateral.solve(PLANE, np.zeros(PLANE.shape), FLAT), "no pixel of positive confidence"
     )
 
 
 def refuse_completion_of_one_pixel() -> float:
+    """Return 0 if a completion from a single known pixel is refused with the cause, else 1."""
     return count_unclear_refusal(
         lambda: completion.complete(PLANE, confidence_at((3, 3))), "1 known pixels", "fix no plane"
     )
 
 
 def one_pixel_error() -> float:
-    """One known pixel fixes one value everywhere; relative error."""
+    """Return the relative error of the bilateral solver with one known pixel, whose value must result everywhere."""
     solved = [bilateral.solve(PLANE, confidence_at((3, 3)), guide) for guide in (FLAT, noise_guide())]
     return float(nan_safe_max(*(np.abs(s / PLANE[3, 3] - 1.0).max() for s in solved)))
 
 
 def two_pixels_error() -> float:
-    """Two known pixels: how far the solution leaves their range, relative to their difference."""
+    """Return how far the bilateral solver's result leaves the range of two known pixels, relative to this range."""
     known = confidence_at((3, 3), (30, 50))
     low, high = sorted((PLANE[3, 3], PLANE[30, 50]))
     solved = np.concatenate([bilateral.solve(PLANE, known, guide).ravel() for guide in (FLAT, noise_guide())])
@@ -65,13 +80,16 @@ def two_pixels_error() -> float:
 
 
 def faint_confidence_error() -> float:
-    """Confidence of 1e-8 everywhere must keep a constant; relative error."""
+    """Return the relative error of a constant map after the bilateral solver with a confidence of 1e-8 everywhere."""
     solved = bilateral.solve(np.full(PLANE.shape, 3.25), np.full(PLANE.shape, 1e-8), noise_guide())
     return float(np.abs(solved / 3.25 - 1.0).max())
 
 
 def unequal_confidence_error() -> float:
-    """Confidence from 1e-8 to 1e4: how far the solution leaves the range of its data, relative to that range."""
+    """Return how far the solver's result leaves the range of its data, relative to this range.
+
+    The confidence varies from 1e-8 to 1e4.
+    """
     random = np.random.default_rng(0)
     confidence = 10 ** random.uniform(-8, 4, PLANE.shape)
     solved = bilateral.solve(PLANE, confidence, noise_guide())
@@ -79,24 +97,30 @@ def unequal_confidence_error() -> float:
 
 
 def one_row_error() -> float:
-    """An image one pixel high: the solver must keep a constant; relative error."""
+    """Return the relative error of a constant map, one pixel high, after the bilateral solver."""
     solved = bilateral.solve(np.full((1, 56), 3.25), np.ones((1, 56)), noise_guide()[:1])
     return float(np.abs(solved / 3.25 - 1.0).max())
 
 
 def border_hole_error() -> float:
-    """A refinement without misfit and with a hole to the border: relative error of the kept estimate."""
+    """Return the relative error of an exact estimate after a refinement with a hole at the border.
+
+    The estimate has no misfit to the known data, so it must be kept.
+    """
     refined = bilateral.refine(PLANE, np.where(CORNER, 9.0, PLANE), (~CORNER).astype(float), FLAT)
     return float(np.abs(refined / PLANE - 1.0).max())
 
 
 def refuse_one_known_line() -> float:
-    """Only one column is known; a plane needs a band two pixels wide."""
+    """Return 0 if a completion from one known column is refused with the cause, else 1.
+
+    A plane needs a known band two pixels wide.
+    """
     return count_unclear_refusal(lambda: completion.complete(PLANE, COLUMNS < 1), "fix no plane")
 
 
 def constant_plane_error() -> float:
-    """Planes found among samples of one disparity: relative error."""
+    """Return the relative error of the planes that are found among samples of a constant disparity."""
     rows, columns = np.nonzero(~HOLE)
     pixels = np.stack([columns, rows], 1) + 0.5
     model = planar_model(pixels, np.full(len(rows), 0.7), PLANE.shape, generator(0, "stability"))

@@ -1,4 +1,8 @@
-"""Cases of splat files: Mip-Splatting's folded filter, values that editors clamp, quantised splats."""
+"""Cases of splat files: Mip-Splatting's 3D filter, values that editors clamp, quantised splats.
+
+Mip-Splatting stores a *3D filter*, a size per Gaussian that widens it. Reading such a file *folds* the filter into
+scales and opacities. *Rows* are the Gaussians of a file, before they become tensors.
+"""
 
 from __future__ import annotations
 
@@ -21,14 +25,23 @@ from reffusion.io.splats import load_splats
 from reffusion.splat import rasterizer
 from reffusion.types import PARAMETERS, Gaussians
 
-# Log-scales, filters and logits of similar and of very different size.
+# Log-scales, sizes of filters, and opacity logits: of similar and of very different size.
 LOG_SCALES = (-40.0, -20.0, -5.0, 0.0, 7.0, 40.0)
 FILTERS = (0.0, 1e-30, 1e-8, 3e-3, 1.0, 1e8)
 LOGITS = (-90.0, -20.0, -1.0, 0.0, 4.0, 30.0)
 
 
 def fold_filter_exactly(log_scale: float, size: float, logit: float) -> tuple[float, float, float]:
-    """The log-scale, and the logarithms of opacity and of its complement, in 80 decimal digits, with all axes alike."""
+    """Fold a filter exactly, with 80 decimal digits, for a Gaussian whose axes are all equal.
+
+    Args:
+        log_scale: log-scale of all axes.
+        size: size of the filter.
+        logit: opacity logit.
+
+    Returns:
+        The log-scale, the logarithm of the opacity o, and the logarithm of 1 - o.
+    """
     with localcontext() as context:
         context.prec = 80
         square, filter_ = (2 * Decimal(log_scale)).exp(), Decimal(size) ** 2
@@ -37,9 +50,9 @@ def fold_filter_exactly(log_scale: float, size: float, logit: float) -> tuple[fl
 
 
 def filter_error() -> float:
-    """Largest error of a folded log-scale, or of the logarithm of an opacity or of its complement.
+    """Return the largest error of folded log-scales and of the logarithms of opacities o and of 1 - o.
 
-    In units of the effect of rounding an input, or the logarithm itself.
+    Each error is divided by 1 + the size of the exact value.
     """
     errors = []
     for log_scale in LOG_SCALES:
@@ -54,7 +67,7 @@ def filter_error() -> float:
 
 
 def count_invalid_rows() -> float:
-    """Values that are not finite after reading rows of all extremes, with infinite logits and flat axes."""
+    """Count lost rows and non-finite values after reading extreme rows, with infinite logits and flat axes."""
     grid = np.array(np.meshgrid([*LOG_SCALES, -np.inf], FILTERS, [*LOGITS, np.inf, -np.inf])).reshape(3, -1)
     scales, logits = fold_filter(np.repeat(grid[0][:, None], 3, 1), grid[2], grid[1])
     count = len(logits)
@@ -66,15 +79,24 @@ def count_invalid_rows() -> float:
 
 
 def rows_of(gaussians: Gaussians) -> Rows:
+    """Return the rows of Gaussians."""
     means, *others = (getattr(gaussians, name).numpy() for name in PARAMETERS)
     return Rows(means.astype(np.float64), *others)
 
 
 def clamping_error(gradients: bool) -> float:
-    """Largest difference of a picture (or relative difference of its gradients) from the picture of the limits.
+    """Return the error of clamping infinite values when a file is read.
 
-    The scene has an opaque, a transparent and flat splats, written with infinite values. Infinite if a value is not
-    finite.
+    The scene has an opaque, a transparent and two flat splats, written with infinite logits and log-scales. Reading
+    clamps these to finite limits. The picture must be the same as with limits twice as large, which are practically
+    infinite.
+
+    Args:
+        gradients: False compares the pictures and returns the largest difference. True compares the gradients and
+            returns the largest relative L2 difference.
+
+    Returns:
+        Infinity if a value is NaN.
     """
     original = cloud()
     original.opacity_logits[:2] = torch.tensor([math.inf, -math.inf])
@@ -100,7 +122,11 @@ def clamping_error(gradients: bool) -> float:
 
 
 def splat_error(what: str) -> float:
-    """Largest error of a .splat after writing and reading, in steps of its format."""
+    """Return the largest error of splats after writing and reading a .splat.
+
+    Args:
+        what: "opacities", whose error is in steps of 1/255, or "scales", whose error is that of log-scales.
+    """
     original = cloud(500, degree=0)
     original.opacity_logits[:2] = torch.tensor([MOST_LOGIT, -MOST_LOGIT])
     original.log_scales[2] = FLAT
@@ -115,7 +141,11 @@ def splat_error(what: str) -> float:
 
 
 def spz_error(extent: float) -> float:
-    """Largest error of a position after a .spz, in extents; infinite if rows are lost."""
+    """Return the largest error of positions, in extents, after writing and reading a .spz; infinity if rows are lost.
+
+    Args:
+        extent: factor on the positions.
+    """
     original = cloud(500, degree=3)
     rows = rows_of(original)
     rows = Rows(rows.means * extent, *list(vars(rows).values())[1:])
@@ -131,7 +161,8 @@ CASES = (
          2 * 3 * 70 * EPS64, filter_error),
     Case("filter_3D with infinite logits and flat axes", "values that are not finite, and rows lost", EXACT,
          count_invalid_rows),
-    # The opacity is off by e^-20 = 2e-9, an axis by 2e-9 extents: below a rounding of float32 in what eight splats add.
+    # Clamping changes the opacity by e^-20 = 2e-9 and an axis by 2e-9 extents. Both are below a rounding of float32 in
+    # the sum over eight splats.
     Case("infinite opacities and flat scales, picture", "largest difference from their limits", 8 * EPS32,
          partial(clamping_error, False)),
     Case("infinite opacities and flat scales, gradients", "worst relative difference of a block from the limits'",

@@ -1,4 +1,7 @@
-"""Cases of the rasterizer: values and gradients against float64 (`oracle`), order, image sizes."""
+"""Cases of the rasterizer: values and gradients against float64 (`oracle`), order of depths, image sizes.
+
+Scenes have an extent of about 1.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +20,12 @@ from reffusion.splat import rasterizer
 from reffusion.splat.conventions import NEAR
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
-RELATIVE = 1e-3  # three digits of each block; float32 has seven, some of which the extremes cost
+RELATIVE = 1e-3  # bound of the relative error: three digits, as extreme inputs cost some of float32's seven
 QUANTITY = "relative L2 error of the worst value or gradient block against float64"
 
 
 def camera(width: int = 12, height: int = 10, distance: float = 1.0) -> Camera:
-    """A view of the origin, slightly turned and off-centre, so that no symmetry hides an error."""
+    """Make a camera that looks at the origin, slightly turned and off-centre, so that no symmetry hides an error."""
     turn, pose = 0.3, np.eye(4)
     pose[:3, :3] = [[math.cos(turn), 0, math.sin(turn)], [0, 1, 0], [-math.sin(turn), 0, math.cos(turn)]]
     pose[:3, 3] = 0.02, -0.01, distance
@@ -30,7 +33,7 @@ def camera(width: int = 12, height: int = 10, distance: float = 1.0) -> Camera:
 
 
 def cloud(count: int = 8, seed: int = 0, degree: int = 2) -> Gaussians:
-    """Gaussians of a tenth of the extent around the origin."""
+    """Make random Gaussians around the origin with standard deviations of about a tenth of the extent."""
     random = torch.Generator().manual_seed(seed)
     normal = lambda *shape: torch.randn(*shape, generator=random)
     return Gaussians(
@@ -43,51 +46,68 @@ def cloud(count: int = 8, seed: int = 0, degree: int = 2) -> Gaussians:
 
 
 def world_from_camera(points: list[list[float]], view: Camera) -> torch.Tensor:
-    """Points [N, 3] from camera axes to the world, float32."""
+    """Transform points [N, 3] from a camera's axes to the world; return float32."""
     pose = view.world_to_camera
     return torch.tensor((np.array(points) - pose[:3, 3]) @ pose[:3, :3], dtype=torch.float32)
 
 
 def oracle_error(change: Callable[[Gaussians], Gaussians], view: Camera | None = None) -> float:
-    """Error of the worst block; infinite if nothing is drawn, which would test nothing."""
+    """Return the largest relative error of the rasterizer's images and gradients on changed Gaussians.
+
+    The result is infinite if nothing is visible, because the case would then test nothing.
+
+    Args:
+        change: function that makes the Gaussians of `cloud` extreme.
+        view: camera; None for `camera()`.
+    """
     gaussians, view = change(cloud()), view or camera()
     is_visible = rasterizer.render(gaussians, view, impl="cpu").alpha.max() > 0
     return oracle.worst_error(gaussians, view, RELATIVE) if is_visible else math.inf
 
 
 def scale_all(scale: float, gaussians: Gaussians) -> Gaussians:
-    """All standard deviations about `scale` extents, more opaque, so that the footprint of a point is visible."""
+    """Set the standard deviations to about `scale` extents, and raise the opacities so that tiny ones are visible."""
     log_scales = gaussians.log_scales - math.log(0.1) + math.log(scale)
     return replace(gaussians, log_scales=log_scales, opacity_logits=gaussians.opacity_logits + 3)
 
 
 def make_needles(ratio: float, longest: float, gaussians: Gaussians) -> Gaussians:
+    """Make all Gaussians needles of standard deviation `longest`, `ratio` times longer than thick."""
     sizes = torch.tensor([longest, longest / ratio, longest / ratio]).log()
     return replace(gaussians, log_scales=sizes.repeat(len(gaussians), 1))
 
 
 def make_sheets(ratio: float, longest: float, gaussians: Gaussians) -> Gaussians:
+    """Make all Gaussians sheets of standard deviation `longest`, `ratio` times wider than thick."""
     sizes = torch.tensor([longest, longest, longest / ratio]).log()
     return replace(gaussians, log_scales=sizes.repeat(len(gaussians), 1))
 
 
 def set_opacity(logit: float, gaussians: Gaussians) -> Gaussians:
+    """Set all opacity logits."""
     return replace(gaussians, opacity_logits=torch.full_like(gaussians.opacity_logits, logit))
 
 
 def faint_contribution() -> float:
-    """Opacity e^-30 is under 1/255, so no pixel and no gradient may show it; largest value that does."""
+    """Return the largest value of alpha and of the gradients for opacities of e^-30.
+
+    Such opacities are below the cut-off 1/255, so all values must be 0.
+    """
     rendering = oracle.render_with_gradients(set_opacity(-30.0, cloud()), camera(), "cpu")
     blocks = [rendering.gradients[name] for name in PARAMETERS] + [rendering.images["alpha"]]
     return nan_safe_max(*(block.abs().max().item() for block in blocks))
 
 
 def set_quaternion_length(length: float, gaussians: Gaussians) -> Gaussians:
+    """Set the lengths of all quaternions."""
     return replace(gaussians, quaternions=torch.nn.functional.normalize(gaussians.quaternions) * length)
 
 
 def zero_quaternion_error() -> float:
-    """Zero is the identity bit for bit, with zero gradient; largest difference."""
+    """Return the largest difference between images with zero quaternions and with identity ones, or gradient.
+
+    A zero quaternion must give the same image as the identity, bit for bit, and have a zero gradient.
+    """
     zero = replace(cloud(), quaternions=torch.zeros(8, 4))
     one = replace(zero, quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(8, 1))
     rendering, expected = (
@@ -99,14 +119,20 @@ def zero_quaternion_error() -> float:
 
 
 def short_quaternion_error() -> float:
-    """Splitting rotates offsets by quaternions of any length: difference between lengths 1e-20 and 1."""
+    """Return the largest difference between offsets rotated by quaternions of length 1e-20 and of length 1.
+
+    Densification rotates offsets in this way when it splits Gaussians.
+    """
     gaussians, vectors = cloud(), torch.ones(8, 3)
     unit = torch.nn.functional.normalize(gaussians.quaternions)
     return (densify.rotate(unit * 1e-20, vectors) - densify.rotate(unit, vectors)).abs().max().item()
 
 
 def near_plane_errors() -> float:
-    """Gaussians just before, on and just behind z = 0.01 that are kept or dropped unlike z >= 0.01 in float64."""
+    """Count Gaussians near the near plane that are wrongly kept or dropped.
+
+    Their depths are just below, on and just above 0.01; those with z >= 0.01 in float64 must be kept.
+    """
     view = replace(camera(), world_to_camera=np.eye(4))
     below, above = np.nextafter(np.float32(NEAR), np.float32(0)), np.nextafter(np.float32(NEAR), np.float32(1))
     depths = torch.tensor([below, np.float32(NEAR), above, 0.0, -NEAR, -1.0])
@@ -116,27 +142,28 @@ def near_plane_errors() -> float:
 
 
 def move_to_near_plane(gaussians: Gaussians) -> Gaussians:
+    """Move the Gaussians to depths from just behind the near plane to 0.05, and make them small."""
     z = [0.0101, 0.0105, 0.011, 0.012, 0.015, 0.02, 0.03, 0.05]
     means = world_from_camera([[0.001 * k, -0.001 * k, depth] for k, depth in enumerate(z)], camera())
     return replace(scale_all(2e-3, gaussians), means=means)
 
 
 def move_behind_camera(gaussians: Gaussians) -> Gaussians:
-    """Half of them behind the camera, by 1e-6 to 1e6."""
+    """Move half of the Gaussians behind the camera, by distances of 1e-6 to 1e6."""
     means = gaussians.means.clone()
     means[::2] = world_from_camera([[0.1, 0.1, -1e-6], [0, 0, -1e-2], [0, 0.5, -1], [1, 1, -1e6]], camera())
     return replace(gaussians, means=means)
 
 
 def move_to_camera_center(gaussians: Gaussians) -> Gaussians:
-    """Two in the camera's centre, one 1e-30 in front of it."""
+    """Move two Gaussians to the camera's centre, and one to 1e-30 in front of the centre."""
     means = gaussians.means.clone()
     means[:3] = world_from_camera([[0, 0, 0], [0, 0, 0], [0, 0, 1e-30]], camera())
     return replace(gaussians, means=means)
 
 
 def unrotated_camera() -> Camera:
-    """A view without rotation."""
+    """Make the camera of `camera` without its rotation."""
     view = camera()
     pose = np.eye(4)
     pose[:3, 3] = view.world_to_camera[:3, 3]
@@ -144,7 +171,10 @@ def unrotated_camera() -> Camera:
 
 
 def make_far_needles(gaussians: Gaussians) -> Gaussians:
-    """Centres 1e4 extents beside the image, similar lengths, widths of 1e-2: they cross the image nevertheless."""
+    """Make needles whose centres are 1e4 extents away and that nevertheless cross the image.
+
+    Their standard deviations are 2e4 along the needle and 1e-2 across it.
+    """
     angles = torch.linspace(0.1, 1.4, len(gaussians))
     along = torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], 1)
     turn = torch.stack([(angles / 2).cos(), 0 * angles, 0 * angles, (angles / 2).sin()], 1)
@@ -153,7 +183,7 @@ def make_far_needles(gaussians: Gaussians) -> Gaussians:
 
 
 def equal_depth_differences() -> float:
-    """Forty opaque Gaussians in one place, rendered repeatedly with one and three threads: values that differ."""
+    """Count numbers that differ between renderings of Gaussians of equal depth, repeated with one and three threads."""
     place = replace(cloud(40), means=torch.zeros(40, 3), opacity_logits=torch.full((40,), 2.0))
     before, renderings = torch.get_num_threads(), []
     try:
@@ -167,13 +197,16 @@ def equal_depth_differences() -> float:
 
 
 def move_to_origin(gaussians: Gaussians) -> Gaussians:
+    """Move all Gaussians to the origin, so that their depths are equal."""
     return replace(gaussians, means=torch.zeros_like(gaussians.means))
 
 
 def wide_image_error() -> float:
-    """8192 x 2 px: footprints over a thousand tiles, pixel coordinates with 11 fewer fractional bits.
+    """Return the relative L2 error of the colour of an image of 8192 x 2 px.
 
-    Too many pixels to ask which Gaussian reached which, so values only, against the reference's own cut-offs.
+    Footprints span a thousand tiles, and pixel coordinates have 11 fewer fractional bits than usual. The image has too
+    many pixels for `oracle.blended_pixels`, so only values are compared, and the float64 reference decides on its own
+    which contributions are skipped.
     """
     view = camera(8192, 2)
     view, gaussians = replace(view, fx=4000.0, fy=4000.0), cloud(12)
@@ -183,7 +216,10 @@ def wide_image_error() -> float:
 
 
 def count_invalid_values() -> float:
-    """NaN and infinite Gaussians must be dropped: non-finite values, and radii that are not 0."""
+    """Count the violations for Gaussians with NaN and infinite parameters, which must be dropped.
+
+    A violation is a non-finite value or gradient, or a dropped Gaussian whose radius is not 0.
+    """
     gaussians, broken = cloud(), (math.nan, math.inf, -math.inf, math.nan)
     for row, (name, value) in enumerate(zip(("means", "quaternions", "means", "log_scales"), broken, strict=True)):
         getattr(gaussians, name)[row] = value
@@ -194,6 +230,7 @@ def count_invalid_values() -> float:
 
 
 def oracle_case(name: str, change: Callable[[Gaussians], Gaussians], view: Camera | None = None) -> Case:
+    """Return the case that measures `oracle_error`."""
     return Case(name, QUANTITY, RELATIVE, partial(oracle_error, change, view))
 
 

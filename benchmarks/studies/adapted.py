@@ -1,11 +1,12 @@
-"""The paper's Figure 2: views of a scene inpainted by the personalized prior, beside the prior as it is.
+"""The paper's Figure 2: views of a scene inpainted by the prior before and after personalization.
 
 `python -m benchmarks.studies.adapted --run runs/demo`, or `make scene=X adapted`; needs the stages up to `personalize`.
-Takes evenly spread training views with something to invent; their background comes from other views, as far as known.
-The hole is inpainted from pure noise, with the whole view at the prior's native size, as SDS sees it. Views, noise and
-sampler are the same for all columns. The prior as it is runs with the empty prompt and with the personalized prior's
-prompt, which may mean something to it.
-Writes sheet.png, each picture as <view>/<column>.png, and adapted.json to --out.
+The study takes evenly spread training views with pixels to invent. Where other views show the background behind the
+object, the background is filled in first. The remaining hole is inpainted from pure noise, with the whole view reduced
+to the prior's native size, as in SDS. Views, noise and sampler are the same for all columns. The prior before
+personalization runs twice: with the empty prompt, and with the prompt of the personalized prior, which may have a
+meaning for the prior even before.
+The study writes sheet.png, each picture as <view>/<column>.png, and adapted.json to --out.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from report.sheet import compose_sheet, enlarge, pick_evenly
 VIEWS = 5
 SEED = 0
 WIDTH = 400  # approximate width of a picture on the sheet, px
-COLUMNS = {  # column -> the prior, and its prompt
+COLUMNS = {  # column -> prior ("before" or "after" personalization), prompt
     "as it is, no prompt": ("before", ""),
     "as it is": ("before", PROMPTS[0]),
     "adapted": ("after", PROMPTS[0]),
@@ -40,12 +41,15 @@ COLUMNS = {  # column -> the prior, and its prompt
 
 
 def load_holes(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """View -> (picture, hole) of up to `count` training views with something to invent, without the reference's own.
+    """Load up to `count` training views with pixels to invent, except the views of the references.
 
-    The picture is uint8 [H, W, 3] with the background as far as known, the hole bool [H, W].
+    Returns:
+        View -> (picture, hole). The picture, uint8 [H, W, 3], has the object replaced by the remaining Gaussians (those
+        that the stage `masks` keeps), which show the background as far as it is known. The hole, bool [H, W], is True
+        for the pixels to invent.
 
     Raises:
-        ValueError: a stage is missing, or nothing is to be invented.
+        ValueError: a stage is missing, or nothing is to be invented outside the references' views.
     """
     for stage in ("poses", "fit", "masks", "reference"):
         if not (run / stage).is_dir():
@@ -66,7 +70,14 @@ def load_holes(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray]
 
 @torch.no_grad()
 def paint_hole(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str, steps: int) -> np.ndarray:
-    """uint8 [H, W, 3]: the hole inpainted from the noise of `SEED`."""
+    """Inpaint the hole of a picture from pure noise of the seed `SEED`; return uint8 [H, W, 3].
+
+    Args:
+        picture: uint8 [H, W, 3].
+        hole: bool [H, W], True for the pixels to inpaint.
+        prompt: prompt of the prior.
+        steps: number of sampler steps.
+    """
     inside = torch.from_numpy(hole)
     painting = inpaint.repaint(
         prior,
@@ -84,7 +95,7 @@ def paint_hole(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str,
 
 
 def save_sheet(models: dict[str, Prior], run: Path, count: int, steps: int, out: Path) -> list[str]:
-    """Write the pictures and sheet.png; return the views on it."""
+    """Inpaint the holes with all priors and prompts, write the pictures and sheet.png; return the views' names."""
     views, rows = load_holes(run, count), []
     for name, (picture, hole) in views.items():
         row = {"to paint": view_ranking.painting_template(picture, hole)}

@@ -1,11 +1,11 @@
 """Settings of distillation, error against seconds: `python -m benchmarks.studies.attempts --run runs/demo`.
 
-From one initialization, each setting in `ATTEMPTS` runs for the laptop profile's number of steps. At some of them test
-views are rendered, with the clock stopped, and scored in the mask's box. The initialization is the run's own; --start
-takes another folder with gaussians.ply and labels.npy, such as runs/demo@lift_mse/initialize, whose pictures are worse:
-the value of a prior depends on what is left to improve.
-Test views only measure; no setting is chosen by them. Writes attempts.json and attempts.png to --out; settings that
-are already in the file are not run again.
+Each setting in `ATTEMPTS` is distilled from the same initialization for 100 steps, as many as in the laptop profile.
+After some steps, test views are rendered and scored in the mask's box; this time is not counted. The initialization is
+that of the run. --start takes another folder with gaussians.ply and labels.npy, such as
+runs/demo@lift_mse/initialize, whose renders are worse: the value of a prior depends on how much is left to improve.
+Test views only measure; no setting is chosen by them. The study writes attempts.json and attempts.png to --out.
+Settings that are already in the file are not run again.
 """
 
 from __future__ import annotations
@@ -39,9 +39,10 @@ MEASURED_STEPS = (0, 5, 10, 20, 40, 70, 100)  # steps after which scores are mea
 VIEWS = 10  # test views, evenly spread
 SCORES = ("psnr_box", "ssim_box", "flip_box")
 NEEDS = ("poses", "fit", "masks", "reference", "initialize")
-BASE = "personalize"  # not a parameter of `distill`: False takes the prior without personalization
-FREE = {"lr": {"epsilon": 1e-15, "masked": 1.0, "opacities": 1.0}}  # 3DGS's full step sizes for masked Gaussians
-# Differences from the laptop profile.
+BASE = "personalize"  # key of an attempt, not a parameter of `distill`: False uses the prior before personalization
+# 3DGS's full step sizes for masked Gaussians, i.e. for those that the initialization added.
+FREE = {"lr": {"epsilon": 1e-15, "masked": 1.0, "opacities": 1.0}}
+# Name of a setting -> its differences from the laptop profile.
 ATTEMPTS: dict[str, dict] = {
     "the profile": {},
     "no SDS": {"sds": {"weight": 0}},
@@ -62,7 +63,7 @@ ATTEMPTS: dict[str, dict] = {
 
 
 def profile_params(overrides: dict) -> Params:
-    """The laptop profile's parameters of `distill` with overrides."""
+    """Return the laptop profile's parameters of `distill`, changed by the overrides of an attempt."""
     values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["distill"]
     for name, value in overrides.items():
         if name != BASE:
@@ -71,7 +72,7 @@ def profile_params(overrides: dict) -> Params:
 
 
 def load_test_views(run: Path) -> list[tuple]:
-    """(camera, truth uint8 [H, W, 3], box) of `VIEWS` test views.
+    """Load `VIEWS` evenly spread test views of a run as (camera, truth uint8 [H, W, 3], box of the mask).
 
     Raises:
         ValueError: no test view has ground truth and a mask.
@@ -90,7 +91,7 @@ def load_test_views(run: Path) -> list[tuple]:
 
 @torch.no_grad()
 def score_views(gaussians, views: list[tuple]) -> dict[str, float]:
-    """Means of `SCORES` over 8-bit renders, as `evaluate` computes them."""
+    """Return the means of `SCORES` over 8-bit renders of the test views, computed as in the stage `evaluate`."""
     rows = []
     for camera, truth, box in views:
         picture = (rasterizer.render(gaussians, camera).color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
@@ -99,7 +100,17 @@ def score_views(gaussians, views: list[tuple]) -> dict[str, float]:
 
 
 def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[dict[str, float]]:
-    """Lines {"seconds", "iteration", scores} of one setting."""
+    """Distil with one setting and return the measurements, one dictionary per measured step.
+
+    Args:
+        overrides: the setting, a value of `ATTEMPTS`.
+        run: runs/<scene>.
+        start: folder of the initialization.
+        views: result of `load_test_views`.
+
+    Returns:
+        {"seconds", "iteration", scores...} after each of `MEASURED_STEPS`; the seconds exclude the measurements.
+    """
     params = profile_params(overrides)
     space = Workspace(run / "poses", run / "fit", run / "masks")
     initial, masked, holes = load_initialization(params, space.scene, run / "reference", start)
@@ -110,7 +121,7 @@ def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> 
     optimizer = GaussianOptimizer(initial, masked, None, masked_factors(params.lr), epsilon=params.lr.epsilon)
     rasterizer.render(
         optimizer.gaussians, holes[0][0]
-    ).color.sum().backward()  # compiles the kernels before the clock starts
+    ).color.sum().backward()  # compiles the kernels, so that compilation is not timed
     optimizer.forget_gradients()
     with tempfile.TemporaryDirectory() as folder:
         log = trace.Trace(Path(folder))
@@ -125,7 +136,13 @@ def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> 
 
 
 def draw(curves: dict[str, list[dict]], path: Path, title: str) -> None:
-    """Chart PSNR and FLIP against seconds, one line per setting."""
+    """Draw PSNR and FLIP against seconds, one line per setting.
+
+    Args:
+        curves: setting -> result of `run_attempt`.
+        path: PNG to write.
+        title: title of the chart.
+    """
     figure, grid = charts.new_figure(4.6, 1, 2)
     for axes, (name, label) in zip(grid[0], (("psnr_box", "PSNR, dB ↑"), ("flip_box", "FLIP ↓")), strict=True):
         for index, (attempt, lines) in enumerate(curves.items()):

@@ -1,9 +1,11 @@
 """Accuracy of poses found from photographs alone: `python -m benchmarks.studies.bare_photographs ../shared/data/fox`.
 
-Photographs of captures with known poses go through the stage `poses` without them. After the best similarity transform,
-camera centres are compared in % of the extent (the largest distance between two centres), rotations in degrees. A
-principal point off the image centre, which structure from motion does not estimate, appears as a rotation. Two lines
-per capture: before and after the adjustment to optical flow (`poses.refine`). Writes bare_photographs.json to --out.
+The stage `poses` gets the photographs of captures with known poses, but not these poses, and finds poses by structure
+from motion. The found poses are aligned to the known ones by the best similarity transform. Errors of camera centres
+are in % of the extent (the largest distance between two centres), errors of rotations in degrees. Structure from motion
+does not estimate the principal point; a principal point off the image centre appears as an error of the rotations. The
+study prints two rows per capture, before and after the adjustment to optical flow (`poses.refine`), and writes
+bare_photographs.json to --out.
 """
 
 from __future__ import annotations
@@ -40,13 +42,15 @@ COLUMNS = (
 
 
 def pose_errors(estimate: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of the views that both have, after the similarity transform that brings the centres closest.
+    """Compare poses after the similarity transform that aligns the camera centres best in the least-squares sense.
 
     Args:
-        estimate, truth: view -> world-to-camera [4, 4].
+        estimate: view -> world-to-camera pose [4, 4].
+        truth: view -> world-to-camera pose [4, 4].
 
     Returns:
-        [V] distances of centres in % of the extent of the true ones, and [V] rotation errors in degrees.
+        For the V views that both have: distances of centres [V] in % of the extent of the true centres, and rotation
+        errors [V] in degrees.
     """
     names = sorted(set(estimate) & set(truth))
     poses_a, poses_b = (np.stack([poses[name] for name in names]) for poses in (estimate, truth))
@@ -62,7 +66,14 @@ def pose_errors(estimate: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarr
 
 
 def evaluate_capture(folder: Path, images: str | None, every: int, longest: int) -> list[dict]:
-    """Rows of the table for a capture: poses as solved, and as adjusted to flow."""
+    """Find poses of a capture's photographs and return two rows of the table: as solved, and as adjusted to flow.
+
+    Args:
+        folder: folder of the capture.
+        images: folder of pictures inside the capture; None for the default.
+        every: every n-th photograph by name is taken.
+        longest: longer side of the photographs, px.
+    """
     capture = load_capture(folder, images=images)
     names = sorted(capture.pictures)[::every]
     truth = {name: capture.poses.world_to_camera[name] for name in names}
@@ -95,7 +106,7 @@ def evaluate_capture(folder: Path, images: str | None, every: int, longest: int)
 
 
 def format_row(row: dict) -> str:
-    """A row of the Markdown table."""
+    """Return a row of the Markdown table."""
     cells = (f"{value:.2f}" if isinstance(value, float) else str(value) for value in row.values())
     return f"| {' | '.join(cells)} |"
 

@@ -1,9 +1,13 @@
-"""Does the lowest misfit select the best candidate? Reference candidates from patches of photographs against the truth.
+"""Scores of the reference's candidates against the truth: does the lowest misfit select the best candidate?
 
-`python -m benchmarks.studies.candidates --runs runs/composites/runs`, after `benchmarks.studies.composites --alone`.
-For each place with a run and an untouched run, and each seed, the candidates of the stage `reference` are scored in the
-box of their hole. Prints for each score the mean candidate, the one with the lowest misfit, and the best one. Writes
-candidates.json and sheets (truth, selected candidate, others) to --out.
+Without a given reference, the stage `reference` composes several candidates from patches of the photographs, one per
+seed, and selects the one with the lowest misfit of patches. The study scores all candidates in the box of their hole,
+for several seeds and for each place that has a run without a given reference and a run on the untouched photographs.
+
+`python -m benchmarks.studies.candidates --runs runs/composites/runs`, after `benchmarks.studies.composites --alone`
+
+The study prints for each score the mean candidate, the selected one and the best one. It writes candidates.json and
+sheets (truth, selected candidate, other candidates) to --out.
 """
 
 from __future__ import annotations
@@ -28,11 +32,23 @@ SCORES = {
     "psnr": max,
     "ssim": max,
     "flip": min,
-}  # and the function that picks the best
+}  # score -> function that returns the best value
 
 
 def score_candidates(run: Path, untouched: Path, out: Path, seed: int, models: dict[str, lpips.Lpips]) -> dict | None:
-    """{"view", "taken", SCORES of every candidate} of a place; None if nothing had to be invented."""
+    """Make the candidates of a place anew and score them.
+
+    Args:
+        run: run of the place without a given reference.
+        untouched: run on the same views without the object, which has the truth.
+        out: folder for the candidates and the sheet; emptied first.
+        seed: seed of the candidates.
+        models: name of a network -> LPIPS.
+
+    Returns:
+        "view": the reference's view; "taken": index of the selected candidate; and for each of `SCORES` the list of all
+        candidates' scores. None if the place has no candidates or nothing had to be invented.
+    """
     if not (run / "reference/candidates.json").is_file() or not load_json(run / "masks/facts.json")["invent_pixels"]:
         return None
     shutil.rmtree(out, ignore_errors=True)
@@ -55,7 +71,11 @@ def score_candidates(run: Path, untouched: Path, out: Path, seed: int, models: d
 
 
 def table(rows: list[dict]) -> str:
-    """Markdown table with a row per score: how often the selected candidate is the best, beside the share by chance."""
+    """Return a Markdown table with a row per score.
+
+    The columns are the means over all places and seeds of the mean candidate, the selected candidate and the best one;
+    the share of cases in which the selected candidate is the best; and this share for a random selection.
+    """
     lines = ["| score | mean candidate | taken | best | taken is best | by chance |", "|---" * 6 + "|"]
     for name, best in SCORES.items():
         complete = [row for row in rows if None not in row[name]]

@@ -1,11 +1,12 @@
 """Masks from simulated clicks against true masks: `python -m benchmarks.studies.clicks --runs runs/demo`.
 
-Each run needs the stages `poses`, `raw_masks` with true masks, and `fit`; --outlines names true masks of some views
-instead, such as benchmarks/studies/bear_outlines.json: the stone bear of instruct-nerf2nerf's `bear`, drawn by hand.
-Each click is placed like a person's correction, in the middle of the largest error of the middle view's mask so far,
-until that mask is good or there are --clicks clicks. Prints that view's IoU after each click, then mean and worst IoU
-over all views with masks; --segmenter none does without the segmentation network; --sheets writes the masks over three
-views and the worst one.
+Each run needs the stages `poses`, `raw_masks` with true masks, and `fit`. --outlines takes true masks of some views
+from a file instead, such as benchmarks/studies/bear_outlines.json: the stone bear of instruct-nerf2nerf's `bear`, drawn
+by hand. The study clicks on the middle view as a person would: each click is in the middle of the largest error of this
+view's current mask, until the mask is good or there are --clicks clicks. Masks of all views are then made from these
+clicks. The study prints the IoU of the clicked view after each click, then the mean and the worst IoU over all views
+with true masks. With --segmenter none, no segmentation network is used. --sheets writes pictures of the masks over
+three views and the worst view.
 """
 
 from __future__ import annotations
@@ -32,13 +33,21 @@ from reffusion.io.scene import load_raw_masks, load_scene, load_views
 from reffusion.types import Scene
 from reffusion.weights.segmenters import AUTO
 
-SHIFT = 4  # fractional bits of the corners of outlines
-GOOD_IOU = 0.94  # from this IoU on a person would not correct
+SHIFT = 4  # fractional bits of corner coordinates in cv2.fillPoly
+GOOD_IOU = 0.94  # a person would not correct a mask whose IoU is higher
 TINT = (255, 0, 160)
 
 
 def next_click(mask: np.ndarray, true: np.ndarray) -> tuple[float, float, bool]:
-    """(x, y, on the object) of the pixel deepest inside what is missing or superfluous."""
+    """Return the next click as (x, y, on the object), where the mask is most wrong.
+
+    The click is the pixel deepest inside the missing or the superfluous regions of the mask. It is on the object (True)
+    if the region is missing.
+
+    Args:
+        mask: bool [H, W], current mask.
+        true: bool [H, W], true mask.
+    """
     depths = [ndimage.distance_transform_edt(np.pad(wrong, 1))[1:-1, 1:-1] for wrong in (mask & ~true, true & ~mask)]
     missing = bool(depths[1].max() >= depths[0].max())
     row, column = np.unravel_index(depths[missing].argmax(), true.shape)
@@ -46,7 +55,7 @@ def next_click(mask: np.ndarray, true: np.ndarray) -> tuple[float, float, bool]:
 
 
 def simulate_clicks(view: ViewEvidence, true: np.ndarray, most: int) -> list[Mark]:
-    """The clicks that a person would make on a view, printing the IoU after each."""
+    """Simulate the clicks of a person on a view, at most `most`, and print the IoU after each click."""
     marks: list[Mark] = []
     mask = np.zeros_like(true)
     while len(marks) < most and iou(mask, true) < GOOD_IOU:
@@ -59,7 +68,10 @@ def simulate_clicks(view: ViewEvidence, true: np.ndarray, most: int) -> list[Mar
 
 
 def load_outlines(path: Path, scene: Scene) -> dict[str, np.ndarray]:
-    """View -> bool [H, W], from a JSON file: view -> polygons, each a list of [x, y] px of the undistorted view."""
+    """Load true masks from a JSON file of outlines, as {view: bool [H, W]}.
+
+    The file has a list of polygons for each view. A polygon is a list of corners [x, y] in px of the undistorted view.
+    """
     masks = {}
     for name, polygons in load_json(path).items():
         painted = np.zeros((scene.cameras[name].height, scene.cameras[name].width), np.uint8)
@@ -73,7 +85,18 @@ def load_outlines(path: Path, scene: Scene) -> dict[str, np.ndarray]:
 def evaluate_run(
     run: Path, most: int, segmenter: Segmenter | None, outlines: Path | None = None, sheet: Path | None = None
 ) -> str:
-    """One line of figures. ValueError if the run has no masks."""
+    """Simulate clicks on the middle view of a run, make masks of all views, and return a line of text with the scores.
+
+    Args:
+        run: runs/<scene>.
+        most: largest number of clicks.
+        segmenter: segmentation network; None for none.
+        outlines: file of true masks; None for the masks of the stage `raw_masks`.
+        sheet: picture of some masks to write; None for none.
+
+    Raises:
+        ValueError: the run has no true masks.
+    """
     scene = load_scene(run / "poses")
     true = load_outlines(outlines, scene) if outlines else load_raw_masks(run / "raw_masks", scene.train)
     if not true:
@@ -95,7 +118,7 @@ def evaluate_run(
 
 
 def overlay_mask(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3]: the picture with its mask tinted."""
+    """Return a picture with its mask tinted, uint8 [H, W, 3]."""
     return np.where(mask[..., None], 0.5 * image + 0.5 * np.array(TINT), image).round().astype(np.uint8)
 
 

@@ -1,11 +1,12 @@
 """Benchmark on real captures with synthetic objects: `python -m benchmarks.studies.composites --places dino-ground`.
 
-An object is drawn into the training photographs of a nerfstudio capture; the untouched photographs are the exact truth
-behind it. For each place: the scene, the job on it (with the true reference, unless --alone), and as the ceiling a fit
-to the untouched photographs of the same views, scored in the same boxes.
-Writes to --out composites.md, composites.json and per place a sheet of all test views (truth, with the object, ours,
-ceiling, difference) and a chart of errors against seconds. Settings are chosen only on the places that run without
---report; the others serve for reporting.
+A synthetic object is drawn into the training photographs of a nerfstudio capture. The untouched photographs are the
+exact truth behind the object. For each place in a capture the benchmark makes a scene and runs the whole method on it,
+with the true reference unless --alone is given. A fit to the untouched photographs of the same views is the *ceiling*,
+scored in the same boxes (bounding boxes of the masks).
+The benchmark writes to --out composites.md, composites.json and for each place a sheet of all test views (truth, with
+the object, our result, ceiling, difference) and a chart of errors against seconds. Settings of the method are chosen
+only on the places that run without --report; all other places serve for reporting.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ REPORT_PLACES = (
     Place("dino-gravel", "dinosaur", "frame_00055", (343, 423), 0.12, 60, 40, 6, near=40),
     Place("dino-plinth", "dinosaur", "frame_00019", (170, 440), 0.12, 60, 40, 6, near=40, shape="ellipsoid"),
 )
-# Places that run by name only; no setting was chosen on them either.
+# Places that run only if --places names them; no setting was chosen on them.
 NAMED_PLACES = (
     Place("paving", "garden", "frame_00001", (130, 440), 0.13, 60, 34, 6, near=30),
     Place("lawn", "dinosaur", "frame_00096", (400, 400), 0.13, 50, 36, 5, near=40, shape="ellipsoid"),
     # Photographs at half size, points of our own stage `poses`. The object is drawn over the fox's head.
     Place("fox-wall", "fox", "0001", (300, 830), 0.13, 62, 40, 6, near=70),
-    # LOG.md records photograph, pixel, size and shape of the following ones. Arc, numbers of views and `near` are new:
-    # they give the recorded numbers of photographs (10 to 30) to within 5.
+    # LOG.md records photograph, pixel, size and shape of the following places, but not the arc, the numbers of views
+    # and `near`. With these values, the numbers of photographs (10 to 30) differ by at most 5 from the recorded ones.
     Place("table-left", "garden", "frame_00056", (120, 262), 0.12, 30, 34, 6, near=30, shape="ellipsoid"),
     Place("t-right", "garden", "frame_00065", (420, 290), 0.10, 30, 34, 6, near=30),
     Place("t-small", "garden", "frame_00056", (330, 310), 0.05, 30, 34, 6, near=30),
@@ -63,7 +64,19 @@ NAMED_PLACES = (
 
 
 def make_scenes(place: Place, captures: Path, options: compositing.Options, out: Path) -> tuple[Path, Path]:
-    """(the place's scene, the same without the object) under out/scenes; made again only if their inputs changed."""
+    """Make the scene of a place and the same scene without the object, in out/scenes.
+
+    Scenes are made anew only if the place or the options have changed.
+
+    Args:
+        place: the place.
+        captures: folder of captures.
+        options: options of the scene.
+        out: folder of the benchmark.
+
+    Returns:
+        Folder of the scene, and folder of the scene without the object.
+    """
     scenes = out / "scenes"
     scene, untouched = scenes / (place.name + options.suffix), scenes / f"{place.name}-untouched"
     capture = None
@@ -81,7 +94,11 @@ def make_scenes(place: Place, captures: Path, options: compositing.Options, out:
 
 
 def run_job(scene: Path, runs: Path, profile: str, variant: str = "") -> Path:
-    """Run the whole job on a scene, skipping finished stages, and return its folder. ValueError if it fails."""
+    """Run all stages of a scene that are not finished yet, and return the folder of the run.
+
+    Raises:
+        ValueError: a stage failed.
+    """
     command = ["run", "all", "--scene", str(scene), "--runs", str(runs), "--profile", profile]
     command += ["--variant", variant] if variant else []
     if subprocess.run([sys.executable, "-m", "runner", *command], cwd=ROOT).returncode:
@@ -92,7 +109,19 @@ def run_job(scene: Path, runs: Path, profile: str, variant: str = "") -> Path:
 def evaluate_place(
     place: Place, captures: Path, options: compositing.Options, out: Path, profile: str, variants: list[str]
 ) -> dict:
-    """The place's row of the table; saves its sheet and its chart of errors against seconds."""
+    """Make and run the scenes of a place, save sheets and a chart of errors against seconds; return the scores.
+
+    Args:
+        place: the place.
+        captures: folder of captures.
+        options: options of the scene.
+        out: folder of the benchmark.
+        profile: name of the profile.
+        variants: names of variants to run and score as well.
+
+    Returns:
+        Row of the table, see `scoring.score_place`.
+    """
     scene, untouched = make_scenes(place, captures, options, out)
     run, ceiling = (scoring.Run.load(run_job(folder, out / "runs", profile)) for folder in (scene, untouched))
     others = {name: scoring.Run.load_variant(run, run_job(scene, out / "runs", profile, name)) for name in variants}
@@ -104,7 +133,15 @@ def evaluate_place(
 
 
 def select_places(names: str, report: bool) -> tuple[Place, ...]:
-    """The places of a set, or the named ones of all sets. ValueError for an unknown name."""
+    """Return the places to run.
+
+    Args:
+        names: names of places of any set, separated by commas; empty for a whole set.
+        report: True for the set of places that only report, False for the set on which settings are chosen.
+
+    Raises:
+        ValueError: a name is unknown.
+    """
     if not names:
         return REPORT_PLACES if report else TUNING_PLACES
     known = {place.name: place for place in (*TUNING_PLACES, *REPORT_PLACES, *NAMED_PLACES)}
@@ -115,6 +152,7 @@ def select_places(names: str, report: bool) -> tuple[Place, ...]:
 
 
 def run_benchmark(arguments: argparse.Namespace) -> int:
+    """Run the benchmark with parsed arguments and return the exit status."""
     options = compositing.Options(not arguments.alone, arguments.shadow, arguments.rough, arguments.seed)
     out, rows = arguments.out.resolve(), []
     for place in select_places(arguments.places, arguments.report):

@@ -1,7 +1,8 @@
-"""Rendering of a synthetic object into photographs: the scenes of `benchmarks/studies/composites.py`.
+"""Rendering of a synthetic object into photographs, for the scenes of `benchmarks/studies/composites.py`.
 
-The object is drawn over everything, so a place is valid only where nothing should occlude it. Photographs without the
-object stay as they are, so the truth behind it is exact.
+The object is drawn over everything else, so a place is valid only if nothing there should occlude the object.
+Photographs without the object stay as they are, so the truth behind the object is exact. Cameras are camera-to-world
+matrices, as in `placement.py`.
 """
 
 from __future__ import annotations
@@ -19,24 +20,26 @@ from benchmarks.studies import placement
 from reffusion.io.images import load_image, save_image
 
 SAMPLES = 3  # rays per side of a pixel
-DARKEST, SQUARES = 0.45, 3  # ambient light; squares of the pattern along half an edge
-LIGHT = (0.9, -0.2, 1.0)  # direction along the object's axes
-CELL = 12  # side of the cells in px in which only the nearest sparse points count
+DARKEST, SQUARES = 0.45, 3  # ambient light; squares of the checkerboard along half an edge of the object
+LIGHT = (0.9, -0.2, 1.0)  # direction to the light, along the object's axes
+CELL = 12  # side of image cells, px; in each cell only the nearest sparse points are used
+# Centre and reach of the shadow on the surface along the object's first two axes, relative to its height.
 SHADOW_AT, SHADOW_REACH = (
     (-0.8, 0.15),
     (0.95, 0.8),
-)  # centre and reach, in heights of the object
+)
 
 
 @dataclass(frozen=True)
 class Options:
-    """Options of a scene beside the object.
+    """Options of a scene beside its place.
 
     Attributes:
-        reference: whether the untouched photograph of the middle training view is handed over.
-        shadow: strength, 0 to 1, of a soft shadow on the surface that no mask contains.
-        rough: training masks are dilated or eroded, and shifted, each at random by up to this many px.
-        seed: of the object's colours and of these faults.
+        reference: True if the scene's reference is the untouched photograph of the middle training view; False if the
+            scene has no reference.
+        shadow: strength of the object's soft shadow on the surface, 0 to 1. Masks do not contain the shadow.
+        rough: largest perturbation of training masks, px: each is dilated or eroded, and shifted, at random.
+        seed: seed of the object's colours and of the masks' perturbations.
     """
 
     reference: bool = True
@@ -46,19 +49,23 @@ class Options:
 
     @property
     def suffix(self) -> str:
-        """Suffix of the scene's name that encodes the options."""
+        """Suffix of the scene's name, which encodes the options."""
         parts = [f"-shadow{self.shadow:g}" if self.shadow else "", f"-rough{self.rough}" if self.rough else ""]
         return "".join(parts) + ("" if self.reference else "-alone") + (f"-{self.seed}" if self.seed else "")
 
 
 @dataclass(frozen=True)
 class PixelRays:
-    """A capture with the undistorted rays of its pixels, which are the same in every view."""
+    """Rays through the pixels of a capture, with lens distortion removed. They are the same in every view."""
 
     capture: placement.Photographs
 
     def rays(self, samples: int) -> np.ndarray:
-        """[H samples W samples, 3]: rays with z = 1, row by row, in the camera's axes."""
+        """Return rays with z = 1 in the camera's axes, [H samples W samples, 3], row by row.
+
+        Args:
+            samples: rays per side of a pixel.
+        """
         k = self.capture
         u, v = np.meshgrid(*((np.arange(side * samples) + 0.5) / samples for side in (k.width, k.height)))
         distorted = np.stack([u, v], -1).reshape(-1, 1, 2)
@@ -67,14 +74,16 @@ class PixelRays:
 
     @cached_property
     def fine(self) -> np.ndarray:
+        """Rays with `SAMPLES` per side of a pixel."""
         return self.rays(SAMPLES)
 
     @cached_property
     def coarse(self) -> np.ndarray:
+        """Rays through the pixel centres."""
         return self.rays(1)
 
     def mean(self, values: np.ndarray) -> np.ndarray:
-        """[H, W, ...]: values [N, ...] of the fine rays averaged per pixel."""
+        """Average values [N, ...] of the fine rays over each pixel; return [H, W, ...]."""
         k = self.capture
         return values.reshape(k.height, SAMPLES, k.width, SAMPLES, *values.shape[1:]).mean((1, 3))
 
@@ -82,13 +91,24 @@ class PixelRays:
 def render_object(
     view: PixelRays, camera: np.ndarray, thing: placement.PlacedObject, tints: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(RGB [H, W, 3] times coverage, coverage [H, W]) of the object, in [0, 1]; `tints` [3, 3] colours its faces."""
-    # In the object's own axes, divided by its half extents: a cube, or a ball of radius 1.
+    """Render the object alone.
+
+    Args:
+        view: rays of the capture.
+        camera: camera-to-world matrix [4, 4].
+        thing: the object.
+        tints: [3, 3], RGB colours in [0, 1] of the faces of each axis.
+
+    Returns:
+        RGB [H, W, 3] multiplied by the coverage, and the coverage [H, W], all in [0, 1].
+    """
+    # In the object's axes and divided by its half extents, the object is a cube, or a ball of radius 1.
     ways = view.fine @ camera[:3, :3].T @ thing.axes.T / thing.half
     start = (camera[:3, 3] - thing.middle) @ thing.axes.T / thing.half
     far, hit, normal, face = (_cube if thing.shape == "box" else _ball)(ways, start, thing.half)
     at = start + np.where(hit, far, 0)[:, None] * ways
-    # A face of the cube lies on the border of two layers of squares: the offset decides, not rounding.
+    # A face of the cube is at the border of two layers of the checkerboard. Without the offset, rounding would decide
+    # which layer a point belongs to.
     pattern = np.floor(at * SQUARES + 1e-6).sum(1).astype(int) % 2 * 0.5 + 0.5
     light = np.array(LIGHT) / np.linalg.norm(LIGHT)
     lit = DARKEST + (1 - DARKEST) * np.clip(normal @ light, 0, 1)
@@ -99,14 +119,24 @@ def render_object(
 def composite_object(
     photo: np.ndarray, view: PixelRays, camera: np.ndarray, thing: placement.PlacedObject, tints: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(photograph with the object, mask [H, W] in {0, 255}), uint8; `photo` is [H, W, 3] in [0, 1]."""
+    """Draw the object into a photograph.
+
+    Args:
+        photo: [H, W, 3] in [0, 1].
+
+    Returns:
+        Photograph with the object, uint8 [H, W, 3], and the object's mask, uint8 [H, W] in {0, 255}.
+    """
     color, cover = render_object(view, camera, thing, tints)
     both = photo * (1 - cover[..., None]) + color
     return (both * 255 + 0.5).clip(0, 255).astype(np.uint8), (cover > 0).astype(np.uint8) * 255
 
 
 def composite_depth(view: PixelRays, camera: np.ndarray, thing: placement.PlacedObject) -> np.ndarray:
-    """[H, W]: camera z of the object, elsewhere interpolated between sparse points; NaN outside their hull."""
+    """Return a depth map [H, W] of camera z with the object.
+
+    Outside the object, depth is interpolated between sparse points; it is NaN outside the convex hull of these points.
+    """
     ways, shape = view.coarse @ camera[:3, :3].T, (view.capture.height, view.capture.width)
     start = (camera[:3, 3] - thing.middle) @ thing.axes.T / thing.half
     far, hit, _, _ = (_cube if thing.shape == "box" else _ball)(ways @ thing.axes.T / thing.half, start, thing.half)
@@ -114,7 +144,10 @@ def composite_depth(view: PixelRays, camera: np.ndarray, thing: placement.Placed
 
 
 def interpolate_points(view: PixelRays, camera: np.ndarray) -> np.ndarray:
-    """[H, W]: camera z, linear between the sparse points of the front surface per cell; NaN outside their hull."""
+    """Return a depth map [H, W] of camera z, interpolated linearly between sparse points.
+
+    In each cell of the image only points of the front surface are used. Depth is NaN outside their convex hull.
+    """
     image, z = view.capture.project(camera, view.capture.points)
     size = np.array([view.capture.width, view.capture.height])
     image, z = (each[(z > 0) & ((image >= 0) & (image < size)).all(1)] for each in (image, z))
@@ -127,7 +160,19 @@ def interpolate_points(view: PixelRays, camera: np.ndarray) -> np.ndarray:
 
 
 def _cube(ways: np.ndarray, start: np.ndarray, half: np.ndarray):
-    """(distance [N], hit [N], normal [N, 3] in the object's axes, face [N], i.e. its axis) of rays to the unit cube."""
+    """Intersect N rays with the cube of half extent 1.
+
+    Args:
+        ways: [N, 3], ray directions in the object's axes, divided by the half extents.
+        start: [3], origin of the rays in the same coordinates.
+        half: [3], half extents of the object (used for the ball only).
+
+    Returns:
+        far: [N], ray parameter of the hit.
+        hit: bool [N].
+        normal: [N, 3] in the object's axes.
+        face: [N], axis of the face that is hit.
+    """
     with np.errstate(divide="ignore"):
         walls = np.stack([(-1 - start) / ways, (1 - start) / ways])
     enter, leave = walls.min(0), walls.max(0)
@@ -138,7 +183,7 @@ def _cube(ways: np.ndarray, start: np.ndarray, half: np.ndarray):
 
 
 def _ball(ways: np.ndarray, start: np.ndarray, half: np.ndarray):
-    """Like `_cube`, for the unit ball, which has one face."""
+    """Intersect N rays with the ball of radius 1, as `_cube` does for the cube. The ball has one face, 0."""
     a, b, c = (ways * ways).sum(1), (ways * start).sum(1), (start * start).sum() - 1
     root = b * b - a * c
     far = (-b - np.sqrt(np.maximum(root, 0))) / a
@@ -148,7 +193,10 @@ def _ball(ways: np.ndarray, start: np.ndarray, half: np.ndarray):
 
 
 def shadow_factor(view: PixelRays, camera: np.ndarray, thing: placement.PlacedObject, strength: float) -> np.ndarray:
-    """[H, W]: light that the object's soft shadow leaves on the surface; 1 outside the shadow."""
+    """Return the factor [H, W] by which the object's soft shadow multiplies the light on the surface.
+
+    The factor is in [1 - strength, 1], and 1 outside the shadow.
+    """
     ways = view.coarse @ camera[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
         far = ((thing.foot - camera[:3, 3]) @ thing.normal) / (ways @ thing.normal)
@@ -160,7 +208,7 @@ def shadow_factor(view: PixelRays, camera: np.ndarray, thing: placement.PlacedOb
 
 
 def perturb_mask(mask: np.ndarray, most: int, random: np.random.Generator) -> np.ndarray:
-    """A uint8 mask [H, W] dilated or eroded by up to `most` px, then shifted by up to `most` px along each axis."""
+    """Dilate or erode a mask, uint8 [H, W], by up to `most` px, then shift it by up to `most` px along each axis."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * random.integers(1, most + 1) + 1,) * 2)
     mask = cv2.dilate(mask, disc) if random.random() < 0.5 else cv2.erode(mask, disc)
     down, right = (int(step) for step in random.integers(-most, most + 1, 2))
@@ -168,10 +216,17 @@ def perturb_mask(mask: np.ndarray, most: int, random: np.random.Generator) -> np
 
 
 def write_scene(place: placement.Place, capture: placement.Photographs, options: Options, out: Path) -> None:
-    """Write the scene of a place to a new folder `out`: images, masks, test_masks, truth, transforms.json, scene.yaml.
+    """Write the scene of a place: images, masks, test_masks, truth, transforms.json, points and scene.yaml.
+
+    Args:
+        place: the place.
+        capture: the capture.
+        options: options of the scene.
+        out: folder to write to; emptied first.
 
     Raises:
-        ValueError: the object cannot be placed, too few photographs show it, or one has another size.
+        ValueError: the object cannot be placed, too few photographs show it, or a photograph has another size than
+            transforms.json says.
     """
     thing = placement.place_object(capture, place)
     views = placement.select_views(capture, place, thing)
@@ -200,9 +255,13 @@ def write_scene(place: placement.Place, capture: placement.Photographs, options:
 
 
 def write_untouched(place: placement.Place, capture: placement.Photographs, scene: Path, out: Path) -> None:
-    """Write the same views without the object and with nothing to remove; a fit to them is the ceiling.
+    """Write the scene of a place without the object and with nothing to remove; a fit to it is the ceiling.
 
-    `scene` is the place's folder as `write_scene` made it.
+    Args:
+        place: the place.
+        capture: the capture.
+        scene: folder of the scene with the object, from `write_scene`.
+        out: folder to write to; emptied first.
     """
     views = placement.select_views(capture, place, placement.place_object(capture, place))
     shutil.rmtree(out, ignore_errors=True)
@@ -213,14 +272,18 @@ def write_untouched(place: placement.Place, capture: placement.Photographs, scen
 
 
 def write_cameras(capture: placement.Photographs, views: placement.Views, out: Path) -> None:
-    """Write transforms.json and the points of the capture."""
+    """Write transforms.json for the selected views and copy the file of the capture's points."""
     placement.save_transforms(capture, views.all, out / "transforms.json")
     (out / capture.cloud).parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(capture.folder / capture.cloud, out / capture.cloud)
 
 
 def load_photograph(capture: placement.Photographs, name: str) -> np.ndarray:
-    """uint8 [H, W, 3]. ValueError if its size differs from that in transforms.json."""
+    """Load a photograph of a capture, uint8 [H, W, 3].
+
+    Raises:
+        ValueError: its size differs from the size in transforms.json.
+    """
     path = capture.folder / capture.frames[name]["file_path"]
     photo = load_image(path)
     if photo.shape[:2] != (capture.height, capture.width):
@@ -230,5 +293,5 @@ def load_photograph(capture: placement.Photographs, name: str) -> np.ndarray:
 
 
 def yaml_list(names: list[str]) -> str:
-    """A YAML list of quoted names."""
+    """Return a YAML list of quoted names."""
     return "[" + ", ".join(f'"{name}"' for name in names) + "]"

@@ -1,8 +1,9 @@
 """Effect of preconditioning and scaling of linear systems: `python -m benchmarks.studies.conditioning`.
 
-Work-precision diagrams of the three systems of depth estimation: alignment (plain normal equations against centred and
-scaled ones), the bilateral solver (conjugate gradients with and without Jacobi preconditioning), and completion
-(disparity itself against the correction to a plane). Prints the errors and condition numbers.
+The study measures the three linear systems of depth estimation in two forms each. Alignment: plain normal equations
+against centred and scaled ones. Bilateral solver: conjugate gradients with and without Jacobi preconditioning.
+Completion: the system for disparity itself against the system for the correction to a plane. It prints errors and
+condition numbers, and draws them to --out.
 """
 
 from __future__ import annotations
@@ -19,14 +20,16 @@ from scipy.sparse.linalg import cg, spsolve
 from reffusion.depth import alignment, bilateral, completion
 
 HEIGHT, WIDTH = 48, 64
-SPREADS = 10.0 ** np.arange(0, 12)  # offsets, in units of the data's spread
-STEPS = 400
+SPREADS = 10.0 ** np.arange(0, 12)  # offsets of the data from zero, in units of the data's spread
+STEPS = 400  # largest number of steps of conjugate gradients
 
 
 def alignment_errors() -> list[tuple[float, float, float, float]]:
-    """Rows (offset in spreads, condition number of the plain equations, error of the plain line, of the library's).
+    """Fit a line to exact data with a growing offset, by plain normal equations and by the library.
 
-    The data are exact. Errors are maxima over the data, relative to the target's spread.
+    Returns:
+        Rows of (offset in units of the data's spread, condition number of the plain equations, error of the plain fit,
+        error of the library's fit). Errors are maxima over the data, relative to the target's spread.
     """
     random, rows = np.random.default_rng(0), []
     base = random.uniform(-1.0, 1.0, 1000)
@@ -40,7 +43,13 @@ def alignment_errors() -> list[tuple[float, float, float, float]]:
 
 
 def make_maps() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(misfit, confidence, guide) with edges, texture and noise; confidence is 1e-2 to 1e2, and 0 in a hole."""
+    """Make the input of the bilateral solver, with edges, texture and noise.
+
+    Returns:
+        misfit: [H, W], the values to smooth.
+        confidence: [H, W], from 1e-2 to 1e2, and 0 in a hole.
+        guide: uint8 [H, W, 3].
+    """
     random = np.random.default_rng(0)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(float)
     bright = np.where(columns + 0.4 * rows < 40, 80, 170)[..., None] + 12 * np.sin(columns / 3)[..., None]
@@ -51,7 +60,12 @@ def make_maps() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def solver_errors() -> dict[str, tuple[float, list[tuple[float, float]]]]:
-    """Form -> (condition number, [seconds, relative L2 error after each step of conjugate gradients])."""
+    """Solve the bilateral solver's system by conjugate gradients with and without preconditioning.
+
+    Returns:
+        Kind of preconditioning ("none", "Jacobi") -> (condition number, list of (seconds, relative L2 error) after each
+        step).
+    """
     misfit, confidence, guide = make_maps()
     system, cell = bilateral.build_system(confidence, guide)
     right = np.bincount(cell, (confidence * misfit).ravel(), minlength=system.shape[0])
@@ -69,10 +83,12 @@ def solver_errors() -> dict[str, tuple[float, list[tuple[float, float]]]]:
 
 
 def completion_errors() -> tuple[float, list[tuple[float, float, float]]]:
-    """(condition number, [offset in spreads, error of the absolute system, error of the library's completion]).
+    """Complete a plane with a hole and a growing offset, by the system for disparity itself and by the library.
 
-    The data are a plane with a hole, solved with the same factorisation; errors are taken in the hole, relative to the
-    plane's spread.
+    Returns:
+        Condition number of the system, and a list of (offset in units of the plane's spread, error of the system for
+        disparity itself, error of the library's completion). Errors are maxima in the hole, relative to the plane's
+        spread.
     """
     _, confidence, _ = make_maps()
     known = confidence > 0
@@ -92,7 +108,12 @@ def completion_errors() -> tuple[float, list[tuple[float, float, float]]]:
 
 
 def measure(say: Callable[[str], None]) -> tuple:
-    """Measure all three systems and print the numbers."""
+    """Measure all three systems and print the numbers with `say`.
+
+    Returns:
+        The arguments of `draw` except the path: results of `alignment_errors` and `solver_errors`, then the condition
+        number and the list from `completion_errors`.
+    """
     lines, systems, (number, maps) = alignment_errors(), solver_errors(), completion_errors()
     say("alignment: offset / spread, condition (plain), error plain, error centred and scaled (condition 1)")
     for row in lines:
@@ -108,6 +129,7 @@ def measure(say: Callable[[str], None]) -> tuple:
 
 
 def draw(lines, systems, number, maps, path: Path) -> None:
+    """Draw the errors of all three systems; the first arguments are the results of `measure`."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 3.6), layout="constrained")

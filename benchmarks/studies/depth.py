@@ -1,10 +1,11 @@
 """Completed depth in the hole against ray-cast truth: `python -m benchmarks.studies.depth --scene data/demo-table`.
 
-For each reference whose depth `initialize` completed: the share of its hole's pixels within 1, 2 and 5 % of the true
-camera z of the room without the object, and the median error; for all pixels, those near a step of the true depth, and
-those away from one. Writes a picture per reference: reference, true depth, completed depth, and the error, red where
-too far, blue where too near. The scene must be made by the generator, which alone knows the truth. Depth outside the
-masks must agree with the truth, else poses and truth differ in their frame.
+The stage `initialize` completes the depth behind the object in the hole of each reference. The study compares this
+depth with the true camera z of the room without the object. It prints the share of pixels whose error is within 1, 2
+and 5 %, and the median error: for all pixels of the hole, for those near a step of the true depth, and for those away
+from steps. It writes a picture per reference: reference, true depth, completed depth, and the error, red where the
+depth is too far, blue where it is too near. The scene must be made by the generator, which alone knows the truth. The
+depth outside the masks must agree with the truth; otherwise the poses are not in the frame of the truth.
 """
 
 from __future__ import annotations
@@ -36,27 +37,43 @@ KINDS = (
     "corner",
     "grass",
     "mini",
-)  # in a scene's name; without one of these the kind is demo
-WITHIN = (0.01, 0.02, 0.05)  # relative to the true depth
-EDGE, NEAR = 0.02, 4  # change of disparity's slope over a pixel that counts as a step, relative to disparity; px
-MAX_OUTSIDE_ERROR = 0.02  # largest median error outside the masks that a fit's inaccuracy explains
-CLIP, MARGIN, SIDE = 0.05, 12, 480  # largest drawn error; margin around the hole, px; least width of a panel, px
+)  # kinds that a scene's name may contain; a scene whose name contains none is of the kind demo
+WITHIN = (0.01, 0.02, 0.05)  # limits of the error relative to the true depth
+# A pixel is at a step of the depth if the slope of disparity changes there by more than 2 % of the disparity. Pixels
+# within 4 px of such a pixel are near an edge.
+EDGE, NEAR = 0.02, 4
+MAX_OUTSIDE_ERROR = 0.02  # largest median error outside the masks that an inaccurate fit can explain
+CLIP, MARGIN, SIDE = 0.05, 12, 480  # relative error of full colour; margin around the hole, px; least panel width, px
 
 
 def scene_kind(name: str) -> str:
-    """The kind of a scene, from its name: `demo-table-21` is a table."""
+    """Return the kind of a made scene from its name, e.g. "table" for `demo-table-21`."""
     return next((part for part in name.split("-") if part in KINDS), "demo")
 
 
 def scene_pose(camera: Camera, similarity: Similarity) -> np.ndarray:
-    """[4, 4] world-to-camera in the scene's own frame and unit."""
+    """Return a camera's world-to-camera pose [4, 4] in the scene's own frame and unit.
+
+    Args:
+        camera: camera in the normalised frame.
+        similarity: transform from the scene's own frame to the normalised frame.
+    """
     pose = camera.world_to_camera.copy()
     pose[:3, 3] = pose[:3, 3] / similarity.scale - pose[:3, :3] @ similarity.offset
     return pose
 
 
 def true_depth(seed: int, kind: str, camera: Camera, similarity: Similarity) -> np.ndarray:
-    """[H, W] camera z in the normalised frame without the object, by the generator in a separate process."""
+    """Compute the true depth without the object, [H, W] camera z in the unit of the normalised frame.
+
+    The generator does this in a separate process.
+
+    Args:
+        seed: seed of the scene.
+        kind: kind of the scene.
+        camera: camera in the normalised frame.
+        similarity: transform from the scene's own frame to the normalised frame.
+    """
     with tempfile.TemporaryDirectory() as folder:
         view, output = Path(folder) / "view.npz", Path(folder) / "depth.npy"
         np.savez(view, world_to_camera=scene_pose(camera, similarity), rays=pixel_rays(camera)[..., :2])
@@ -66,7 +83,10 @@ def true_depth(seed: int, kind: str, camera: Camera, similarity: Similarity) -> 
 
 
 def near_edges(depth: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels within NEAR px of a depth step. Disparity is linear over a plane at any slant."""
+    """Return bool [H, W], True for pixels within `NEAR` px of a step of the depth.
+
+    Steps are found in disparity, which is linear over a plane of any slant.
+    """
     padded = np.pad(1 / depth, 1, mode="edge")
     middle = padded[1:-1, 1:-1]
     across = np.abs(padded[1:-1, :-2] - 2 * middle + padded[1:-1, 2:])
@@ -77,12 +97,17 @@ def near_edges(depth: np.ndarray) -> np.ndarray:
 
 
 def relative_errors(depth: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """[H, W]: error relative to the true depth, positive if too far, infinite if there is no depth."""
+    """Return the error relative to the true depth, [H, W]: positive if too far, infinite where there is no depth."""
     return np.where(np.isfinite(depth) & (depth > 0), depth / true - 1, np.inf)
 
 
 def scores(error: np.ndarray) -> dict[str, float]:
-    """Scores of errors [P]: count, shares within WITHIN, median absolute error, median error."""
+    """Return the scores of relative errors [P].
+
+    Returns:
+        "pixels": P; "within 1%" etc.: shares of pixels; "median": median absolute error; "bias": median error. Only
+        "pixels" if P is 0.
+    """
     if not error.size:
         return {"pixels": 0}
     shares = {f"within {limit:.0%}": float((np.abs(error) <= limit).mean()) for limit in WITHIN}
@@ -90,7 +115,16 @@ def scores(error: np.ndarray) -> dict[str, float]:
 
 
 def error_sheet(reference: Reference, true: np.ndarray, depth: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """[h, w, 3] uint8: reference, true depth, completed depth and error around the hole, whose border is drawn."""
+    """Return a picture, uint8 [h, w, 3], of reference, true depth, completed depth and error, side by side.
+
+    The panels show the surroundings of the hole, with the hole outlined.
+
+    Args:
+        reference: the reference with its hole.
+        true: [H, W], true depth.
+        depth: [H, W], completed depth.
+        error: [H, W], result of `relative_errors`.
+    """
     mask = reference.mask
     near, far = np.percentile(1 / true[mask], (99.5, 0.5))
     far, near = min(far, near / 1.02) / 1.02, near * 1.02
@@ -112,13 +146,24 @@ def error_sheet(reference: Reference, true: np.ndarray, depth: np.ndarray, error
 
 
 def measure(scene_folder: Path, run: Path, out: Path, kind: str) -> dict[str, dict[str, dict[str, float]]]:
-    """View -> part -> scores; pictures are written to `out`.
+    """Score the completed depth of all references of a run, and write a picture of each to `out`.
 
-    Parts: the hole, near and away from edges; the rest of the consistent mask, which other views should show; pixels
-    that truly no training view shows; and what this view shows, away from edges.
+    The parts of a view are the "hole"; its pixels "near edges" of the true depth and those "elsewhere"; the "rest of
+    C", the pixels of the consistent mask (those that show the object) outside the hole, whose background other views
+    should show; "never seen", the pixels whose background truly no training view shows; and "outside", the pixels
+    outside all masks, away from edges.
+
+    Args:
+        scene_folder: folder of a scene made by the generator.
+        run: runs/<scene>.
+        out: folder for the pictures.
+        kind: kind of the scene.
+
+    Returns:
+        View -> part -> scores.
 
     Raises:
-        ValueError: no reference's depth was completed, or the truth does not agree outside the masks.
+        ValueError: no reference's depth was completed, or depth and truth differ outside the masks.
     """
     seed, scene = load_json(scene_folder / "truth/facts.json")["seed"], load_scene(run / "poses")
     results = {}

@@ -1,12 +1,12 @@
 """Upper bound of the gain of one SDS step: `python -m benchmarks.studies.distillation --run runs/demo`.
 
-In holes of test views, whole and in windows, a picture x with known error e = x - truth is given to the prior, and the
-SDS gradient g = E[z - x0(z_t)] over the noise is measured in pixels. If c is the cosine of g and e, a step of the best
-length along -g leaves |e|^2 (1 - c^2), a gain of at most -10 log10(1 - c^2) dB (none for c <= 0).
-The pictures are the hole filled by Telea's method, mixed with the truth in steps, and the renders of the run's
-initialization and result. So the chart shows up to which quality a prior can improve a picture, before the noise of
-single draws counts. Truth only measures; no setting is chosen by it.
-Writes distillation.json and distillation.png to --out.
+The prior gets a picture x whose error e = x - truth in a hole is known. The holes are those of test views, in whole
+views and in windows. The study measures the SDS gradient g = E[z - x0(z_t)], the mean over the noise, in pixels. If c
+is the cosine of g and e, a step of the best length along -g leaves the squared error |e|^2 (1 - c^2). So the gain is at
+most -10 log10(1 - c^2) dB (none for c <= 0). The pictures are holes filled by Telea's method and mixed with the truth
+in several ratios, and the renders of the run's initialization and result. The chart shows up to which quality of the
+picture a prior can improve the picture, if the noise of single draws is left out. The truth only measures; no setting
+is chosen by it. The study writes distillation.json and distillation.png to --out.
 """
 
 from __future__ import annotations
@@ -33,14 +33,25 @@ from reffusion.prior.model import Prior, load_prior
 ROOT = Path(__file__).resolve().parents[2]
 
 TIMESTEPS = (20, 100, 300, 600, 850)
-NOISES = 4  # draws, half of them for each of two estimates of g, so that their noise is independent
+NOISES = 4  # draws of the noise; two estimates of g use half of the draws each, so that their noise is independent
 MIXES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2)  # share of Telea's filling in the picture
 RENDERS = {"initialization": "renders_initialize", "result": "renders"}
 SCALES = {"whole": "A photo of sks", "window": "A photo of sks, cropped"}
 
 
 def degraded_pictures(run: Path, cases: dict[str, list[Case]], renders: dict[str, dict[str, list[Case]]]):
-    """Name -> scale -> [B, 3, H, W] in [-1, 1]: the mixes, then the run's renders."""
+    """Return the pictures to measure: Telea's fillings mixed with the truth, then the run's renders.
+
+    Outside the holes all pictures equal the truth.
+
+    Args:
+        run: runs/<scene>.
+        cases: scale -> views with the truth, see `scene_cases`.
+        renders: "initialization" or "result" -> scale -> views with renders in place of the truth.
+
+    Returns:
+        Name of the picture -> scale -> [B, 3, H, W] in [-1, 1].
+    """
     pictures: dict[str, dict[str, Tensor]] = {}
     for scale in SCALES:
         truth, hole = to_tensors(cases[scale])
@@ -55,7 +66,19 @@ def degraded_pictures(run: Path, cases: dict[str, list[Case]], renders: dict[str
 
 @torch.no_grad()
 def sds_gradient(prior, pictures: Tensor, holes: Tensor, timestep: int, text: Tensor) -> tuple[Tensor, Tensor]:
-    """E[z - x0(z_t)] over two disjoint halves of the noises, each [B, 3, H, W], the difference of decoded latents."""
+    """Estimate the SDS gradient E[z - x0(z_t)] in pixels twice, from two disjoint halves of the draws of the noise.
+
+    The gradient in pixels is the difference of the decoded latents z and x0.
+
+    Args:
+        pictures: [B, 3, H, W] in [-1, 1].
+        holes: [B, 1, H, W], 1 = repaint.
+        timestep: t.
+        text: [B, L, D], embedded prompt.
+
+    Returns:
+        Two estimates, [B, 3, H, W] each.
+    """
     latents, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
     t, halves = torch.full((len(pictures),), timestep), []
     for half in range(2):
@@ -69,9 +92,15 @@ def sds_gradient(prior, pictures: Tensor, holes: Tensor, timestep: int, text: Te
 
 
 def possible_gain(halves: tuple[Tensor, Tensor], error: Tensor, holes: Tensor) -> dict[str, float]:
-    """Cosine of g and e in the holes, over all pictures together, and the largest gain in dB.
+    """Return the cosine of gradient g and error e in the holes, over all pictures together, and the largest gain in dB.
 
-    |g|^2 is the product of the two halves, which their independent noise does not enlarge.
+    |g|^2 is estimated by the inner product of the two estimates. The square of a single estimate would be too large by
+    the noise of the estimate; the noises of the two estimates are independent.
+
+    Args:
+        halves: two estimates of g, [B, 3, H, W] each.
+        error: e, [B, 3, H, W].
+        holes: [B, 1, H, W], 1 in the holes.
     """
     first, second = (half * holes for half in halves)
     along = float(((first + second) / 2 * error).sum())
@@ -81,7 +110,15 @@ def possible_gain(halves: tuple[Tensor, Tensor], error: Tensor, holes: Tensor) -
 
 
 def measure(models: dict[str, Prior], run: Path) -> list[dict]:
-    """A row for each model, scale, picture and timestep."""
+    """Measure cosine and largest gain for each prior, scale, picture and timestep.
+
+    Args:
+        models: name -> prior, e.g. before and after personalization.
+        run: runs/<scene>.
+
+    Returns:
+        One row each, with "model", "scale", "picture", "psnr" (in the hole, dB), "timestep", "cosine" and "gain" (dB).
+    """
     first = next(iter(models.values()))
     cases = scene_cases(run, first.native_size)
     renders = {name: rendered_cases(run, folder, first.native_size) for name, folder in RENDERS.items()}
@@ -103,7 +140,15 @@ def measure(models: dict[str, Prior], run: Path) -> list[dict]:
 
 
 def rendered_cases(run: Path, folder: str, size: int) -> dict[str, list[Case]]:
-    """`scene_cases` with evaluate's renders instead of the truth."""
+    """Return the same views as `scene_cases`, with renders of the stage `evaluate` instead of the truth.
+
+    Args:
+        folder: folder of the renders, in `evaluate`.
+        size: side to which views are reduced, px.
+
+    Raises:
+        ValueError: the renders are missing.
+    """
     scene = load_scene(run / "poses")
     source = run / "evaluate" / folder
     if not source.is_dir():
@@ -113,7 +158,7 @@ def rendered_cases(run: Path, folder: str, size: int) -> dict[str, list[Case]]:
 
 
 def draw(rows: list[dict], path: Path) -> None:
-    """Chart the largest gain over all timesteps against the picture's quality, for each model and scale."""
+    """Draw the largest gain over all timesteps against the picture's PSNR before, for each prior and scale."""
     from matplotlib.figure import Figure
 
     figure = Figure((9, 3.8), layout="constrained")

@@ -1,8 +1,9 @@
 """PSNR of held-out views against seconds of fitting: `python -m benchmarks.studies.fit --run runs/demo`.
 
-Fits the scene of a finished `poses` stage with the laptop profile's parameters and variants of them. Every 8th training
-view is held out and only measured, with the clock stopped; making the initial points counts. Writes fit.png (curves),
-fit.csv and fit.md (final values). Variants that --out already holds are not run again; an interrupted one continues.
+The study fits the scene of a finished `poses` stage with the laptop profile's parameters and variants of them. Every
+8th training view is held out and only measured. The seconds do not include the measurements, but include making the
+initial points. The study writes fit.png (curves), fit.csv and fit.md (final values) to --out. Variants whose results
+are already in --out are not run again; an interrupted fit continues.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from reffusion import trace
 from stages import fit
 
 ROOT = Path(__file__).parents[2]
-VARIANTS = {
+VARIANTS = {  # name -> differences from the profile's parameters of `fit`
     "laptop": {},
     "laptop, half the steps": {"iterations": 1000},
     "laptop, twice the steps": {"iterations": 4000},
@@ -36,13 +37,26 @@ VARIANTS = {
 
 
 def fit_params(profile: str, overrides: dict[str, object], every: int) -> fit.Params:
-    """The profile's parameters of `fit` with overrides. ValueError names an unknown one."""
+    """Return a profile's parameters of `fit` with overrides.
+
+    Args:
+        profile: name of the profile.
+        overrides: dotted name of a parameter -> value.
+        every: every n-th training view is held out.
+
+    Raises:
+        ValueError: a parameter is unknown; the message names it.
+    """
     params = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"][profile].get("fit", {})
     return fit.Params(**params).changed({**overrides, "holdout": every})
 
 
 def run_fit(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]]:
-    """Trace of a fit with these parameters, kept in `out`."""
+    """Run a fit in the folder `out`, unless it is finished there, and return its trace.
+
+    Raises:
+        ValueError: `out` has a fit with other parameters.
+    """
     saved = out / "params.json"
     if saved.exists() and json.loads(saved.read_text()) != params.model_dump():
         raise ValueError(f"{out} holds a fit with other parameters; remove it, or name another --out")
@@ -54,6 +68,13 @@ def run_fit(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]
 
 
 def draw(curves: dict[str, list[dict[str, float]]], title: str, path: Path) -> None:
+    """Draw the PSNR of held-out views against seconds, one curve per variant.
+
+    Args:
+        curves: variant -> lines of its trace.
+        title: title of the chart.
+        path: PNG to write.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4.2), layout="constrained")

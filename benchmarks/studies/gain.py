@@ -1,9 +1,11 @@
 """Gain of distillation over initialization: `python -m benchmarks.studies.gain runs/demo-wide runs/demo-wide@no_sds`.
 
-For each run, over its test views: evaluate's box scores of result and initialization, and the gradient energy of both
-in the box and in the mask, in units of the truth's. Energy below 1 is too smooth; above 1 is grain or doubled edges.
-The shares of the masks that no training view saw come from `masks` and, with --scene, from the generator's rays.
-Writes pictures of some views to --out: photograph with the object, initialization, result, truth.
+For each run the study prints, as means over the test views, the box scores of result and initialization from the stage
+`evaluate`, and the gradient energy of both in the box and in the mask, relative to that of the truth. An energy below 1
+means too smooth, above 1 means grain or doubled edges. It also prints the shares of the masks whose background no
+training view saw, from the stage `masks` and, with --scene, from the generator's truth.
+The study writes gain.json, gain.md and pictures of some views to --out: fit with the object, initialization, result,
+truth.
 """
 
 from __future__ import annotations
@@ -31,7 +33,11 @@ ENLARGE = 2  # whole factor
 
 
 def evaluate_run(run: Path) -> dict:
-    """{"initialization", "result"}: box scores, "energy_box" and "energy_mask" in units of the truth's.
+    """Score the initialization and the result of a run.
+
+    Returns:
+        "initialization" or "result" -> box scores `SCORES`, and "energy_box" and "energy_mask": gradient energies in
+        the box and in the mask, relative to that of the truth.
 
     Raises:
         ValueError: the run has not been evaluated, or has no ground truth.
@@ -60,12 +66,19 @@ def evaluate_run(run: Path) -> dict:
 
 
 def table(runs: dict[str, dict], shares: dict[str, dict[str, float]]) -> str:
-    """Markdown table; the initialization appears once per run whose initialization is its own."""
+    """Return a Markdown table with a row for the initialization and one for the result of each run.
+
+    The initialization of a variant is omitted if the scene's own run is in the table.
+
+    Args:
+        runs: name of a run -> result of `evaluate_run`.
+        shares: name of a run -> result of `unseen_shares`.
+    """
     lines = ["| | PSNR box, dB | SSIM | FLIP | energy, box | energy, mask |", "|---" * 6 + "|"]
     for name, ways in runs.items():
         for way, row in ways.items():
             if way == "initialization" and "@" in name and name.split("@")[0] in runs:
-                continue  # the scene's own
+                continue  # the table has the initialization of the scene's own run
             cells = [f"{row[column]:.{digits}f}" for column, digits in SCORES.items()]
             cells += [f"{row[column]:.2f}" for column in ("energy_box", "energy_mask")]
             lines.append(f"| {name}, {way} | {' | '.join(cells)} |")
@@ -75,9 +88,15 @@ def table(runs: dict[str, dict], shares: dict[str, dict[str, float]]) -> str:
 
 
 def unseen_shares(run: Path, scene: Path | None) -> dict[str, float]:
-    """Shares of the masks that no training view saw.
+    """Return the shares of the masks whose background no training view saw.
 
-    By `masks` over the training views and, with `scene`, by the generator's rays over training and test views.
+    Args:
+        run: the run.
+        scene: folder of the scene made by the generator; None if unknown.
+
+    Returns:
+        "by masks": share in the training views, from the stage `masks`. With `scene` also the shares from the
+        generator's truth, for training and for test views.
     """
     share = {"by masks": round(load_json(stage_folder(run, "masks") / "facts.json")["unobserved_share"], 3)}
     facts = load_json(scene / "truth/facts.json")["unobserved_share"] if scene else {}
@@ -85,7 +104,10 @@ def unseen_shares(run: Path, scene: Path | None) -> dict[str, float]:
 
 
 def save_sheet(run: Path, path: Path) -> None:
-    """Save `VIEWS` test views as rows: fit with the object, initialization, result, truth, around the mask's box."""
+    """Save a picture of `VIEWS` test views, a row each, cropped around the mask's box.
+
+    The columns are the fit with the object, the initialization, the result and the truth.
+    """
     scene = load_scene(stage_folder(run, "poses"))
     names, rows = pick_evenly(list(scene.test), VIEWS), []
     for name in names:

@@ -1,9 +1,10 @@
 """Seconds and memory of every stage against views and pixels: `python -m benchmarks.studies.growth` (takes hours).
 
-Made rooms of 30 to 300 training views of 0.3 megapixels, and of 30 views of 0.3 to 2 megapixels; --largest adds the
-largest of both. Settings are the profile's with a tenth of its steps (their number depends neither on views nor on
-pixels) and no limit on picture size. Writes growth.json and growth.png to --out: CPU seconds and memory of each stage,
-and the exponent, the slope of a line through them in log-log axes; 1 is linear. Finished jobs are not run again.
+The scenes are made rooms of 30 to 300 training views of 0.3 megapixels, and of 30 views of 0.3 to 2 megapixels.
+--largest adds a scene with the most views and the most pixels. Settings are the profile's, with a tenth of its steps
+(the number of steps depends neither on views nor on pixels) and no limit on picture size. The study writes growth.json
+and growth.png to --out: CPU seconds and memory of each stage, and the exponent, the slope of a line fitted to them in
+log-log axes; 1 means linear growth. Finished jobs are not run again.
 """
 
 from __future__ import annotations
@@ -36,12 +37,13 @@ STAGES = (
     "evaluate",
 )
 VIEWS, PIXELS = (30, 60, 120, 300), (0.3, 0.6, 1.2, 2.0)  # megapixels
-WIDE, HIGH = 4, 3
+WIDE, HIGH = 4, 3  # aspect ratio of the pictures
 SHORT_JOB = (
     "fit.iterations=190 personalize.steps=15 distill.iterations=15 initialize.refit_steps=30 poses.longest=4000 "
 )
 SHORT_JOB += "distill.sds.run=always"
-SAMPLES, TEST = 1, 4  # rays per side of a pixel (1 makes large scenes in minutes); test views
+SAMPLES, TEST = 1, 4  # rays per side of a pixel (with 1, large scenes are made in minutes); number of test views
+# Script that makes a scene in a process of its own; arguments: folder data/, folder to write, numbers of `names`.
 MAKE = """
 import sys; from dataclasses import replace; from pathlib import Path
 sys.path.insert(0, sys.argv[1])
@@ -53,7 +55,7 @@ generate(Path(sys.argv[2]), 0, replace(KINDS["demo"], **dict(zip(names, size))))
 
 
 def make_room(views: int, megapixels: float, folder: Path) -> Path:
-    """Make a room with that many training views of that size, in a folder named after both."""
+    """Make a room with the given number and size of training views, unless it exists, and return its folder."""
     unit = (megapixels * 1e6 / (WIDE * HIGH)) ** 0.5
     scene = folder / f"{views}-views-{megapixels}-mp"
     if not (scene / "truth/facts.json").exists():
@@ -64,10 +66,20 @@ def make_room(views: int, megapixels: float, folder: Path) -> Path:
 
 
 def run_stages(scene: Path, runs: Path, profile: str, last: str) -> dict[str, dict[str, float]]:
-    """Stage -> "cpu" seconds of all its processes, "seconds" and peak "mb", up to `last`; stages left out are missing.
+    """Run the stages of a scene one by one up to the stage `last`, and measure their costs.
+
+    Args:
+        scene: folder of the scene.
+        runs: folder of runs, which also keeps the measured costs.
+        profile: name of the profile.
+        last: last stage to run.
+
+    Returns:
+        Stage -> "cpu" (CPU seconds of all its processes), "seconds" (wall time) and "mb" (peak memory). Skipped stages
+        are missing.
 
     Raises:
-        RuntimeError: a stage fails.
+        RuntimeError: a stage failed.
     """
     record, costs = runs / f"{scene.name}.json", {}
     if record.exists():
@@ -88,12 +100,17 @@ def run_stages(scene: Path, runs: Path, profile: str, last: str) -> dict[str, di
 
 
 def growth_exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
-    """Power of the size with which the values grow."""
+    """Return the exponent p with which the values grow, as size^p, by a least-squares fit to the logarithms."""
     return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
 
 
 def draw(costs: dict[str, dict[str, dict[str, list[float]]]], path: Path) -> None:
-    """For views and for pixels, a panel of CPU seconds and one of memory, one line per stage."""
+    """Draw CPU seconds and memory against the number of views and against the number of pixels, one line per stage.
+
+    Args:
+        costs: what grows, in words -> stage -> {"size", "cpu", "mb"}, a list of one value per scene each.
+        path: PNG to write.
+    """
     figure, grid = charts.new_figure(5.6, 2, 2)
     for row, (of, stages) in zip(grid, costs.items(), strict=True):
         for axes, what in zip(row, ("cpu", "mb"), strict=True):

@@ -1,6 +1,7 @@
-"""Holes to fill and scores of their filling, shared by `benchmarks/studies/prior.py` and related studies.
+"""Pictures with holes and scores of their fillings, shared by `benchmarks/studies/prior.py` and related studies.
 
-Held-out pictures come from the prior's own generators with seeds that no training uses. Every draw is seeded.
+*Held-out* pictures are pictures that the prior was not trained on. They come from the generators of the embedded
+prior's training data, with seeds that no training uses. Every random draw is seeded.
 """
 
 from __future__ import annotations
@@ -23,16 +24,22 @@ from reffusion.prior.model import Prior
 ROOT = Path(__file__).resolve().parents[2]
 
 SIDE = 64  # side of the held-out pictures, px
-SEED = 20  # of the held-out set; training and its validation use others
+SEED = 20  # seed of the held-out set; training and validation of the prior use other seeds
 COVER = (0.05, 0.4)  # share of a held-out picture that its hole covers
-SAMPLER_STEPS = 12  # the laptop profile's number for its reference
-BATCH = 16
+SAMPLER_STEPS = 12  # default number of sampler steps: that of the laptop profile for its reference
+BATCH = 16  # holes filled at once
 COLUMNS = ("psnr", "ssim", "flip", "energy")
 
 
 @dataclass(frozen=True)
 class Case:
-    """A picture to fill: uint8 [H, W, 3] truth, bool [H, W] hole; kind: "photograph", "procedural" or a name."""
+    """Picture with a hole to fill.
+
+    Attributes:
+        truth: uint8 [H, W, 3], the whole picture.
+        hole: bool [H, W], True for the pixels to fill.
+        kind: "photograph" or "procedural" for held-out pictures, else the name of a view.
+    """
 
     truth: np.ndarray
     hole: np.ndarray
@@ -40,7 +47,7 @@ class Case:
 
 
 def make_cases(count: int, seed: int = SEED) -> list[Case]:
-    """`count` pictures that no training has seen, each with a silhouette that covers `COVER` of it."""
+    """Make held-out pictures of `SIDE` px, each with a random silhouette as its hole, whose size is within `COVER`."""
     cases = []
     for index in range(count):
         picture, caption = images.image(seed, index, held_out=True)
@@ -55,11 +62,19 @@ def make_cases(count: int, seed: int = SEED) -> list[Case]:
 
 
 def hole_scores(picture: np.ndarray, truth: np.ndarray, hole: np.ndarray) -> dict[str, float]:
-    """PSNR (dB), SSIM and FLIP as means of their maps over the hole, and the gradient energy in units of the truth's.
+    """Score a filling inside its hole.
 
     Args:
-        picture, truth: uint8 [H, W, 3]; outside the hole the picture is replaced by the truth.
-        hole: bool [H, W], not empty.
+        picture: uint8 [H, W, 3]; outside the hole its pixels are replaced by the truth.
+        truth: uint8 [H, W, 3].
+        hole: bool [H, W], True for the filled pixels.
+
+    Returns:
+        "psnr" in dB; "ssim" and "flip" as means of their maps over the hole; "energy", the gradient energy in the hole
+        relative to that of the truth (below 1 is too smooth).
+
+    Raises:
+        ValueError: the hole is empty.
     """
     if not hole.any():
         raise ValueError("the hole is empty: there is nothing to score")
@@ -74,7 +89,7 @@ def hole_scores(picture: np.ndarray, truth: np.ndarray, hole: np.ndarray) -> dic
 
 
 def ssim_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """[H, W]: SSIM, mean over RGB, with the window of `metrics.ssim`."""
+    """Return the map [H, W] of SSIM, averaged over RGB, with the Gaussian window of `image_metrics.ssim`."""
     from skimage.metrics import structural_similarity
 
     _, values = structural_similarity(
@@ -91,12 +106,12 @@ def ssim_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def flip_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """[H, W]: LDR-FLIP, with the viewing distance of `metrics.flip`."""
+    """Return the map [H, W] of LDR-FLIP, with the viewing distance of `image_metrics.flip`."""
     return image_metrics.flip_map(picture, truth)
 
 
 def gradient_energy(picture: np.ndarray, hole: np.ndarray) -> float:
-    """Mean squared difference of brightness between neighbouring pixels that both lie in the hole."""
+    """Return the mean squared difference of brightness between neighbouring pixels that are both in the hole."""
     light, total, count = picture.mean(2) / 255, 0.0, 0
     for axis in (0, 1):
         both = np.logical_and(*(hole.take(range(k, hole.shape[axis] - 1 + k), axis) for k in (0, 1)))
@@ -106,14 +121,14 @@ def gradient_energy(picture: np.ndarray, hole: np.ndarray) -> float:
 
 
 def mean_scores(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Mean of each column, and the standard error of PSNR."""
+    """Return the mean of each score, "psnr_error" (the standard error of PSNR) and "pictures" (their number)."""
     values = {column: float(np.mean([row[column] for row in rows])) for column in COLUMNS}
     spread = np.std([row["psnr"] for row in rows], ddof=1) / len(rows) ** 0.5 if len(rows) > 1 else 0.0
     return values | {"psnr_error": float(spread), "pictures": len(rows)}
 
 
 def to_tensors(cases: list[Case]) -> tuple[Tensor, Tensor]:
-    """Pictures [B, 3, H, W] in [-1, 1] and holes [B, 1, H, W], 1 = repaint."""
+    """Convert cases to pictures [B, 3, H, W] in [-1, 1] and holes [B, 1, H, W], 1 = repaint."""
     pictures = torch.from_numpy(np.stack([case.truth for case in cases])).permute(0, 3, 1, 2).float() / 127.5 - 1
     return pictures, torch.from_numpy(np.stack([case.hole for case in cases]))[:, None].float()
 
@@ -121,7 +136,10 @@ def to_tensors(cases: list[Case]) -> tuple[Tensor, Tensor]:
 def fill_holes(
     prior: Prior, cases: list[Case], seed: int, prompt: str = "", steps: int = SAMPLER_STEPS
 ) -> list[np.ndarray]:
-    """The holes filled from pure noise in `steps` sampler steps: uint8 [H, W, 3] each."""
+    """Fill the holes with the prior, from pure noise in `steps` sampler steps; return uint8 [H, W, 3] for each case.
+
+    Outside the holes the pictures stay. All priors get the same noise for the same seed.
+    """
     done = []
     for first in range(0, len(cases), BATCH):
         pictures, holes = to_tensors(cases[first : first + BATCH])
@@ -134,7 +152,7 @@ def fill_holes(
 
 
 def save_row(path: Path, case: Case, pictures: list[np.ndarray]) -> None:
-    """Save hole, pictures and truth side by side."""
+    """Save the picture with its hole in grey, the fillings and the truth side by side."""
     path.parent.mkdir(parents=True, exist_ok=True)
     hollow = np.where(case.hole[..., None], np.uint8(128), case.truth)
     save_image(path, np.concatenate([hollow, *pictures, case.truth], 1))

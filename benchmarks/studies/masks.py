@@ -1,10 +1,12 @@
 """Consistent and unobserved masks against ray-cast truth: `python -m benchmarks.studies.masks --scene data/demo`.
 
-Runs the stage `masks` with the parameters of the scene's own run and on its own fit, twice: with the exact masks, and
-with masks that are each dilated, eroded or shifted at random by up to 2 % of the image width, a tenth of them missing.
-Prints the intersection over union over all training views together (missing masks included), of the median and of the
-worst view; pixels within 2 px of the true border do not count. The scene must be made by the generator, which alone
-knows the truth.
+*Consistent* masks are the pixels that show the object, the same in all views. *Unobserved* pixels are those of them
+whose background no other photograph shows. The study runs the stage `masks` twice, with the parameters and the fit of
+the scene's own run: with the exact input masks, and with perturbed ones. These are each dilated, eroded or shifted at
+random by up to 2 % of the image width, and a tenth of them is missing.
+The study prints the intersection over union (IoU) over all training views together (including views whose mask is
+missing), of the median view and of the worst view. Pixels within 2 px of the true border do not count. The scene must
+be made by the generator, which alone knows the truth.
 """
 
 from __future__ import annotations
@@ -27,12 +29,20 @@ from reffusion.types import Camera, Scene
 from stages import masks as masks_stage
 
 REQUIRED_IOU = {"exact": {"consistent": 0.95, "unobserved": 0.9}, "perturbed": {"consistent": 0.90, "unobserved": 0.85}}
-BORDER = 2  # px
-LARGEST, MISSING = 0.02, 0.1  # of the image width; share of the views
+BORDER = 2  # pixels within this distance of the true border do not count, px
+LARGEST, MISSING = 0.02, 0.1  # largest perturbation, relative to the image width; share of views without a mask
 
 
 def true_never_seen(scene_folder: Path, cameras: list[Camera]) -> dict[str, np.ndarray]:
-    """View name -> bool [H, W]: the generator's never-seen pixels, undistorted as `poses` undistorts pictures."""
+    """Load the generator's never-seen pixels, undistorted in the same way as the stage `poses` undistorts pictures.
+
+    Args:
+        scene_folder: folder of a scene made by the generator.
+        cameras: undistorted cameras of the views.
+
+    Returns:
+        View name -> bool [H, W], True for pixels of the object whose background no training view shows.
+    """
     truth = load_json(scene_folder / "truth/cameras.json")
     size = (truth["width"], truth["height"])
     photo = lens.Lens(*size, truth["f"], truth["f"], truth["cx"], truth["cy"], radial=(truth["k1"],))
@@ -45,20 +55,20 @@ def true_never_seen(scene_folder: Path, cameras: list[Camera]) -> dict[str, np.n
 
 
 def perturb_mask(mask: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """bool [H, W]: the mask dilated, eroded or shifted, with equal probability, by a random distance up to LARGEST."""
+    """Dilate, erode or shift a mask, bool [H, W], with equal probability, by a random distance up to `LARGEST`."""
     distance = random.uniform(0, LARGEST * mask.shape[1])
     way = random.choice(["dilate", "erode", "shift"])
     if way == "shift":
         angle = random.uniform(0, 2 * np.pi)
         move = np.float32([[1, 0, distance * np.cos(angle)], [0, 1, distance * np.sin(angle)]])
         return cv2.warpAffine(mask.astype(np.float32), move, mask.shape[::-1]) > 0.5
-    # Distance to the nearest pixel of the mask or, for an erosion, to the nearest one outside it.
+    # Distance to the nearest pixel of the mask; for an erosion, to the nearest pixel outside the mask.
     border_distance = cv2.distanceTransform((~mask if way == "dilate" else mask).astype(np.uint8), cv2.DIST_L2, 5)
     return border_distance <= distance if way == "dilate" else border_distance > distance
 
 
 def save_raw_masks(raw: dict[str, np.ndarray], folder: Path) -> Path:
-    """Write a folder like that of the stage `raw_masks`, with exactly these masks; return it."""
+    """Write a folder in the layout of the stage `raw_masks`, with exactly the given masks; return the folder."""
     shutil.rmtree(folder, ignore_errors=True)
     for name, mask in raw.items():
         save_mask(folder / "masks" / f"{name}.png", mask)
@@ -66,7 +76,12 @@ def save_raw_masks(raw: dict[str, np.ndarray], folder: Path) -> Path:
 
 
 def iou(estimates: list[np.ndarray], truth: list[np.ndarray]) -> float:
-    """Intersection over union of all views together, without the surroundings of the true border."""
+    """Return the intersection over union of all views together, without pixels near the true border.
+
+    Args:
+        estimates: bool [H, W], one per view.
+        truth: bool [H, W], one per view.
+    """
     square = np.ones((2 * BORDER + 1,) * 2, np.uint8)
     both = either = 0
     for mask, true in zip(estimates, truth, strict=True):
@@ -78,7 +93,13 @@ def iou(estimates: list[np.ndarray], truth: list[np.ndarray]) -> float:
 
 
 def scores(artifact: Path, scene: Scene, truth: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, float]]:
-    """Kind of mask -> IoU of the training views together, of the median and of the worst view."""
+    """Return {kind of mask: {"together", "median", "worst"}}, the IoU of all training views, the median and the worst.
+
+    Args:
+        artifact: folder of the stage `masks`.
+        scene: the scene of the stage `poses`.
+        truth: kind of mask ("consistent", "unobserved") -> view -> bool [H, W].
+    """
     sets, results = load_mask_sets(artifact, scene.train), {}
     for kind, true in truth.items():
         masks, truths = [getattr(sets[name], kind) for name in scene.train], [true[name] for name in scene.train]
@@ -88,7 +109,17 @@ def scores(artifact: Path, scene: Scene, truth: dict[str, dict[str, np.ndarray]]
 
 
 def measure(scene_folder: Path, run: Path, out: Path, seed: int) -> dict[str, dict[str, dict[str, float]]]:
-    """Kind of input -> kind of mask -> IoU; the masks made are kept in `out`."""
+    """Run the stage `masks` with exact and with perturbed input masks, and measure the results.
+
+    Args:
+        scene_folder: folder of a scene made by the generator.
+        run: runs/<scene>, with the stages up to `masks`.
+        out: folder for the resulting masks.
+        seed: seed of the perturbations.
+
+    Returns:
+        "exact" or "perturbed" -> kind of mask -> IoU, see `scores`. The kind "input" is the perturbed input masks.
+    """
     scene = load_scene(run / "poses")
     exact = load_raw_masks(run / "raw_masks", scene.train)
     cameras = [scene.cameras[name] for name in scene.train]

@@ -1,10 +1,12 @@
 """An object of a real capture moved to another place: `python -m benchmarks.studies.moving`.
 
-The training photographs show the object at its first place, with masks. The references are as many pictures of it at
-the second place as are needed to show all of it, each with depth: the object's own, elsewhere interpolated between
-sparse points. The object drawn there into all photographs is the truth, and a fit to these is the ceiling. Cameras stay
-as given, since the object was drawn with them.
-Writes moving.json and a sheet of all test views (truth, as photographed, ours, ceiling, difference) to --out.
+The object is synthetic and drawn into the photographs of a capture. The training photographs show the object at a first
+place, with masks; it is to be removed there and inserted at a second place. The references show the object at the
+second place, in as many views as are needed to show all of its surface. Each reference has a depth map: the object's
+depth, and elsewhere depth interpolated between sparse points. The truth is the photographs with the object drawn at the
+second place; the *ceiling* is a fit to them. Cameras stay as given, because the object was drawn with them. The study
+writes moving.json and a sheet of all test views (truth, with the object at the first place, our result, ceiling,
+difference) to --out.
 """
 
 from __future__ import annotations
@@ -19,16 +21,21 @@ from benchmarks.studies import composites, compositing, placement, scoring
 from reffusion.io.arrays import save_json
 from reffusion.io.images import save_image
 
-REGION_FACTOR = 1.08  # radius of the region, over that of the object
-COVERED = 0.995  # least part of the object's visible surface that the references must show
+REGION_FACTOR = 1.08  # radius of the region to fill, over the object's radius
+COVERED = 0.995  # least share of the object's visible surface that the references must show
 GRID = 12  # points along each edge of a face, by which the visibility of the object is measured
 
 
 def select_references(capture: placement.Photographs, thing: placement.PlacedObject, names: list[str]) -> list[str]:
-    """Photographs that together show `COVERED` of the object's visible surface, selected greedily.
+    """Select photographs greedily until they show `COVERED` of the object's visible surface.
 
-    Each next one adds most to the resolution at which the surface is seen, every point taken in its best picture,
-    relative to the best of all photographs.
+    Each step adds the photograph that improves the resolution of the surface most. The resolution of a point is that of
+    the best selected photograph, relative to the best of all photographs.
+
+    Args:
+        capture: the capture.
+        thing: the object at its second place.
+        names: names of the photographs to choose from.
     """
     ticks = (np.arange(GRID) + 0.5) / GRID * 2 - 1
     sides = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)
@@ -47,7 +54,14 @@ def select_references(capture: placement.Photographs, thing: placement.PlacedObj
 
 
 def _fineness(capture: placement.Photographs, name: str, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """[P]: how finely a photograph shows points with normals, [P, 3] both; 0 for points that it does not show."""
+    """Return the resolution [P] at which a photograph shows surface points: the larger, the finer; 0 if not shown.
+
+    It is sqrt(cosine of the viewing angle) / depth.
+
+    Args:
+        points: [P, 3].
+        normals: [P, 3].
+    """
     camera = capture.cameras[name]
     image, z = capture.project(camera, points)
     framed = ((image >= 0) & (image < (capture.width, capture.height))).all(1) & (z > 0)
@@ -62,7 +76,14 @@ def write_scenes(
     capture: placement.Photographs,
     out: Path,
 ) -> Path:
-    """Write the scene to out/<start>-to-<goal> and the ceiling's beside it; return the scene's folder."""
+    """Write the scene to out/<start>-to-<goal>, and the ceiling's scene beside it; return the scene's folder.
+
+    Args:
+        start: first place of the object.
+        goal: second place of the object, in the same capture.
+        capture: the capture.
+        out: folder to write to.
+    """
     before, after = placement.place_object(capture, start), placement.place_object(capture, goal)
     after = placement.PlacedObject(after.foot, before.height, after.axes, before.half, before.shape)
     views, pictured = placement.select_views(capture, goal, after), compositing.PixelRays(capture)

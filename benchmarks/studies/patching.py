@@ -1,12 +1,13 @@
-"""A hole left by deleting splats, patched: `python -m benchmarks.studies.patching write`.
+"""Filling of a hole from which splats were deleted: `python -m benchmarks.studies.patching write`.
 
-Simulates an artist: opens the fit of a finished scene, deletes a box around the object, and saves the rest as an editor
-does, in another order, quantised, without spherical harmonics. `write` makes three scenes of it in --out: with the
-photographs, with the capture's cameras only, and with neither. `make scene=... patch` patches each. `score` renders the
-patched files from the test views, beside the run's own result: PSNR in the box, and a sheet of pictures.
+The study imitates a user of an editor, who opens the fit of a finished scene, deletes all splats in a box around the
+object, and saves the rest in another order, quantised and without spherical harmonics. The action `write` makes three
+scenes from the two files in --out: with the photographs, with the capture's cameras only, and with neither.
+`make scene=... patch` fills the hole of each scene. The action `score` then renders the filled scenes from the test
+views, beside the run's own result, and writes the PSNR in the box and a sheet of pictures.
 
-`command` measures `reffusion patch before.ply after.ply`: splat-transform, an npm package, cuts what `export` wrote,
-opens the filled scene again, and the result is included in `score`.
+The action `command` measures `reffusion patch before.ply after.ply`: splat-transform, an npm package, deletes the
+object from the file that `export` wrote, and opens the filled scene. `score` includes this result.
 """
 
 from __future__ import annotations
@@ -34,14 +35,19 @@ from reffusion.splat import rasterizer
 from reffusion.types import Scene, Similarity
 from report import patch_files
 
-KINDS = ("photographs", "cameras", "neither")
-COMMANDS = ("command, cameras", "command, two files alone")
-TRIMMED = 0.2  # percent of the object's splats on each side that the box ignores, as floaters
+KINDS = ("photographs", "cameras", "neither")  # what a scene has beside the two files of splats
+COMMANDS = ("command, cameras", "command, two files alone")  # runs of the command with and without cameras
+TRIMMED = 0.2  # percent of the object's splats on each side that the box leaves out, because they may be floaters
 SHOWN = 4  # test views on the sheet
 
 
 def in_box(means: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """bool [N]: splats in the smallest rotated box around the object, as a person would fit it."""
+    """Return bool [N], True for the splats in the smallest rotated box around the object.
+
+    Args:
+        means: [N, 3].
+        labels: bool [N], True for splats of the object.
+    """
     thing, draws, box = means[labels], np.random.default_rng(0), Rotation.identity()
     bounds = lambda turn: np.percentile(turn.apply(thing), (TRIMMED, 100 - TRIMMED), axis=0)
     volume = lambda turn: float(np.prod(np.diff(bounds(turn), axis=0)))
@@ -53,7 +59,16 @@ def in_box(means: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def write_scenes(run: Path, scene: Path, out: Path) -> None:
-    """Write the three scenes' folders to `out`."""
+    """Write the folders of the three scenes to `out`.
+
+    Each folder has scene.yaml and both files of splats. The first also has the photographs, the first two have cameras
+    and the reference.
+
+    Args:
+        run: finished run of the scene.
+        scene: folder of the scene with its photographs.
+        out: folder to write to.
+    """
     placed, gaussians = load_scene(run / "poses"), load_ply(run / "fit" / "gaussians.ply")
     deleted = torch.from_numpy(in_box(gaussians.means.double().numpy(), load_object_labels(run / "masks").numpy()))
     rest = gaussians.map(lambda p: p[~deleted])
@@ -83,9 +98,15 @@ def write_scenes(run: Path, scene: Path, out: Path) -> None:
 
 
 def delete_object(run: Path, folder: Path, tool: list[str]) -> None:
-    """Write before.ply, after.ply and cameras/ (training views and photographs) in the scene's own frame.
+    """Write before.ply, after.ply and cameras/ (training views with photographs) in the scene's own frame.
 
-    splat-transform deletes the splats in a box around the object, which are marked in a column of the file it reads.
+    splat-transform deletes the splats in a box around the object. It selects them by a column `selected` of the file
+    that it reads.
+
+    Args:
+        run: run of the scene, with its export.
+        folder: folder to write to.
+        tool: command that runs splat-transform.
     """
     exported, placed = run / "export", load_scene(run / "poses")
     shutil.rmtree(folder, ignore_errors=True)
@@ -113,7 +134,15 @@ def delete_object(run: Path, folder: Path, tool: list[str]) -> None:
 
 
 def run_patch_command(run: Path, out: Path, runs: Path, tool: list[str], set_: str) -> None:
-    """Run the command with cameras, photographs and the run's reference, and with the two files only."""
+    """Run `reffusion patch` twice: with cameras, photographs and the run's reference, and with the two files only.
+
+    Args:
+        run: run of the scene, with its export.
+        out: folder of the study.
+        runs: folder of runs.
+        tool: command that runs splat-transform.
+        set_: parameters of the stages, as for `--set`.
+    """
     folder = out / "command"
     delete_object(run, folder, tool)
     reference = next((run / "reference" / "references").glob("*.png"))
@@ -135,12 +164,12 @@ def run_patch_command(run: Path, out: Path, runs: Path, tool: list[str], set_: s
 
 
 def output_file(out: Path, kind: str) -> Path:
-    """The file that the command writes."""
+    """Return the path of the filled scene that the command writes, for an entry of `COMMANDS`."""
     return out / "command" / ("cameras.ply" if kind == COMMANDS[0] else "alone.ply")
 
 
 def score(run: Path, out: Path, runs: Path) -> None:
-    """Write patching.json and patching.png to `out`."""
+    """Score all filled scenes that exist: write patching.json (PSNR in the box) and patching.png to `out`."""
     placed = load_scene(run / "poses")
     files = {"own result": run / "evaluate" / "scene.ply", "as given": out / "patch-photographs" / "scene.ply"}
     files |= {kind: runs / f"patch-{kind}" / "patch" / "patched.ply" for kind in KINDS}
@@ -161,7 +190,13 @@ def score(run: Path, out: Path, runs: Path) -> None:
 
 
 def render_test_views(parts: tuple[Path, ...], placed: Scene, similarity: Similarity) -> dict[str, np.ndarray]:
-    """Test view -> uint8 [H, W, 3], rendered from the splats of several files together."""
+    """Render the test views from the splats of several files together, as {view: uint8 [H, W, 3]}.
+
+    Args:
+        parts: files of splats in the scene's own frame.
+        placed: the scene with its cameras.
+        similarity: transform from the scene's own frame to the normalised frame.
+    """
     first, *others = (load_ply(path, similarity) for path in parts)
     for other in others:
         most = max(first.sh.shape[1], other.sh.shape[1])
@@ -173,7 +208,7 @@ def render_test_views(parts: tuple[Path, ...], placed: Scene, similarity: Simila
 
 
 def box_psnr(pictures: dict[str, np.ndarray], run: Path, placed: Scene) -> float:
-    """Mean PSNR in the mask's box over the test views."""
+    """Return the mean PSNR in dB over the test views, in the box of each view's mask."""
     values = []
     for name, picture in pictures.items():
         box = image_metrics.mask_box(load_mask(run / "raw_masks" / "test_masks" / f"{name}.png"))

@@ -1,7 +1,7 @@
-"""Placement of a synthetic object in a real capture, and the photographs that show it.
+"""Placement of a synthetic object in a real capture, and selection of the photographs that show the object.
 
-A capture is a nerfstudio folder: `transforms.json` and a point cloud. Its frame is kept; a camera here is a
-camera-to-world matrix [4, 4] that looks along +z, x right, y down.
+A capture is a nerfstudio folder: `transforms.json` and a point cloud. All coordinates are in the capture's own frame. A
+camera in this module is a camera-to-world matrix [4, 4]; it looks along +z, with x right and y down.
 """
 
 from __future__ import annotations
@@ -17,24 +17,28 @@ from reffusion.io.arrays import load_json
 from reffusion.io.ply import load_points
 
 MARGIN = 20  # least distance of the object's axis to the picture's border, px
-FRONT_TOLERANCE = 1.06  # points up to this factor of the nearest points' depth belong to the front surface
+FRONT_TOLERANCE = 1.06  # points belong to the front surface up to this factor of the nearest points' depth
 MIN_POINTS = 8  # least number of points that define a surface
 YAW = 25.0  # degrees by which the object is turned away from the view in which it is placed
 HALF_EXTENTS = (0.55, 0.4, 0.5)  # half extents of the object, relative to its height
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from this module's camera axes to those of transforms.json
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where to put an object.
+    """Place in a capture at which an object is put, and options of the scene made there.
 
     Attributes:
-        name: of the place; capture: name of its folder.
-        view: photograph in which the place is marked; pixel: where in it, px.
-        size: height of the object over its distance from that view.
-        arc: photographs are taken within this many degrees about the surface's normal on either side of `view`.
-        train, test: largest numbers of photographs.
-        near: points within this many px of the pixel define the surface.
+        name: name of the place.
+        capture: name of the capture's folder.
+        view: name of the photograph in which the place is marked.
+        pixel: the place in this photograph, (column, row) in px.
+        size: height of the object over its distance from the camera of `view`.
+        arc: photographs are used whose azimuth about the object differs from that of `view` by at most this angle,
+            degrees.
+        train: number of training photographs.
+        test: number of test photographs; at most `train` + `test` photographs are used.
+        near: radius around the pixel within which sparse points define the surface, px.
         shape: "box" or "ellipsoid".
     """
 
@@ -52,13 +56,18 @@ class Place:
 
 @dataclass(frozen=True)
 class Photographs:
-    """A capture.
+    """Capture with its cameras and sparse points. Views whose photograph is missing are omitted.
 
     Attributes:
-        folder: of the capture; meta: transforms.json without its frames.
-        intrinsics: [3, 3]; distortion: [4], OpenCV's k1, k2, p1, p2; width, height: px.
-        frames: view -> its entry in transforms.json; cameras: view -> camera [4, 4]; views without a file are omitted.
-        points: [P, 3].
+        folder: folder of the capture.
+        meta: content of transforms.json without its frames.
+        intrinsics: [3, 3], the same for all views.
+        distortion: [4], OpenCV's k1, k2, p1, p2.
+        width: px.
+        height: px.
+        frames: view -> entry in transforms.json.
+        cameras: view -> camera-to-world matrix [4, 4].
+        points: [P, 3], sparse points.
     """
 
     folder: Path
@@ -73,11 +82,11 @@ class Photographs:
 
     @property
     def cloud(self) -> str:
-        """Name of the points' file."""
+        """Name of the file with the sparse points."""
         return self.meta.get("ply_file_path", "sparse_pc.ply")
 
     def project(self, camera: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Image points [P, 2] without lens distortion, and depths [P], of points [P, 3]."""
+        """Project points [P, 3]; return image points [P, 2] without lens distortion, and depths [P]."""
         seen = (points - camera[:3, 3]) @ camera[:3, :3]
         depth = seen[:, 2]
         image = seen[:, :2] / depth[:, None]
@@ -86,11 +95,13 @@ class Photographs:
 
 @dataclass(frozen=True)
 class PlacedObject:
-    """The object in the capture's frame.
+    """Synthetic object in the capture's frame.
 
     Attributes:
-        foot: [3], the point on the surface on which it stands; height: in the capture's unit.
-        axes: [3, 3], its side, front and up (the surface's normal) in rows; half: [3] half extents along them.
+        foot: [3], the point of the surface on which the object stands.
+        height: height in the capture's unit; `half` is a multiple of it.
+        axes: [3, 3], the object's side, front and up directions in rows; up is the surface's normal.
+        half: [3], half extents along the axes.
         shape: "box" or "ellipsoid".
     """
 
@@ -102,26 +113,38 @@ class PlacedObject:
 
     @property
     def normal(self) -> np.ndarray:
+        """Normal [3] of the surface on which the object stands."""
         return self.axes[2]
 
     @property
     def middle(self) -> np.ndarray:
+        """Centre [3] of the object."""
         return self.foot + self.normal * self.half[2]
 
 
 class Views(NamedTuple):
-    """Names of photographs by azimuth about the object: all, and the test views among them."""
+    """Names of the selected photographs, in the order of their azimuth about the object.
+
+    Attributes:
+        all: all selected photographs.
+        test: the test views among them.
+    """
 
     all: list[str]
     test: list[str]
 
     @property
     def train(self) -> list[str]:
+        """The training views."""
         return [name for name in self.all if name not in self.test]
 
 
 def load_photographs(folder: Path) -> Photographs:
-    """Load a capture. ValueError if transforms.json or the points are missing."""
+    """Load a capture.
+
+    Raises:
+        ValueError: transforms.json or the file of the points is missing.
+    """
     if not (folder / "transforms.json").exists():
         raise ValueError(f"{folder} holds no transforms.json: it is no nerfstudio capture")
     meta = load_json(folder / "transforms.json")
@@ -138,16 +161,16 @@ def load_photographs(folder: Path) -> Photographs:
 
 
 def save_transforms(capture: Photographs, names: list[str], path: Path) -> None:
-    """Save transforms.json for some views, whose pictures are images/<view>.png."""
+    """Write transforms.json for the named views, with images/<view>.png as their photographs."""
     frames = [capture.frames[name] | {"file_path": f"images/{name}.png"} for name in names]
     path.write_text(json.dumps(capture.meta | {"frames": frames}, indent=1))
 
 
 def place_object(capture: Photographs, place: Place) -> PlacedObject:
-    """The object on the plane through the points around the place's pixel.
+    """Put an object on the plane through the sparse points around the place's pixel.
 
     Raises:
-        ValueError: unknown view, or too few points near the pixel.
+        ValueError: the view is unknown, or there are too few points near the pixel.
     """
     if place.view not in capture.cameras:
         raise ValueError(f"{place.name}: {capture.folder} has no photograph {place.view}")
@@ -168,7 +191,7 @@ def place_object(capture: Photographs, place: Place) -> PlacedObject:
 
 
 def _surface(capture: Photographs, place: Place) -> np.ndarray:
-    """Points [P, 3] of the front surface around the place's pixel."""
+    """Return the sparse points [P, 3] of the front surface around the place's pixel."""
     image, depth = capture.project(capture.cameras[place.view], capture.points)
     close = (depth > 0) & (np.linalg.norm(image - place.pixel, axis=1) < place.near)
     if close.sum() < MIN_POINTS:
@@ -178,7 +201,10 @@ def _surface(capture: Photographs, place: Place) -> np.ndarray:
 
 
 def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(a point [3] on it, normal [3]) of the plane through most of the points [P, 3], with the farthest trimmed."""
+    """Fit a plane to points [P, 3] and return (a point [3] on the plane, normal [3]).
+
+    The fit is repeated five times; each time the points farthest from the plane are removed.
+    """
     for _ in range(5):
         normal = np.linalg.svd(points - points.mean(0))[2][2]
         off = np.abs((points - np.median(points, 0)) @ normal)
@@ -187,20 +213,21 @@ def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def azimuth(thing: PlacedObject, base: np.ndarray, camera: np.ndarray) -> float:
-    """Degrees from camera `base` to another one about the surface's normal."""
+    """Return the angle about the surface's normal from the camera `base` to another camera, degrees in (-180, 180]."""
     one, other = (_along(thing, at[:3, 3] - thing.foot) for at in (base, camera))
     return float(np.degrees(np.arctan2(np.cross(one, other) @ thing.normal, one @ other)))
 
 
 def _along(thing: PlacedObject, vector: np.ndarray) -> np.ndarray:
+    """Return the component of a vector along the surface."""
     return vector - thing.normal * (vector @ thing.normal)
 
 
 def select_views(capture: Photographs, place: Place, thing: PlacedObject) -> Views:
-    """Evenly selected photographs that show the object, with test views evenly among them.
+    """Select photographs that show the object, evenly in azimuth, and evenly spread test views among them.
 
     Raises:
-        ValueError: too few photographs show the object.
+        ValueError: fewer than 4 photographs show the object.
     """
     axis = np.stack([thing.foot, thing.middle, thing.foot + 2 * thing.normal * thing.half[2]])
     base, angles = capture.cameras[place.view], {}

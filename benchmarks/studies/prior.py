@@ -1,19 +1,25 @@
 """Quality of a prior in figures and pictures: `python -m benchmarks.studies.prior --run runs/demo`.
 
-  inpainting    held-out pictures of 64 px, a silhouette cut out of each, against OpenCV's Telea and Navier-Stokes:
-                PSNR, SSIM, FLIP and gradient energy inside the hole; all priors start from the same noise
+Measurements and options:
+
+  inpainting    held-out pictures of 64 px (not in the training set) with a silhouette as a hole, filled by the priors
+                and by OpenCV's methods Telea and Navier-Stokes: PSNR, SSIM, FLIP and gradient energy inside the hole.
+                All priors start from the same noise
   --steps       the first prior with other numbers of sampler steps. Few steps give nearly the mean of all fillings,
                 which is blurred and best by PSNR and SSIM; many steps give one of the fillings
-  personalize   the first prior on a scene's reference with the laptop profile: error against steps; then, before and
-                after, by timestep: error of the clean latent in holes of unseen views, and variance of the SDS gradient
-                over the noise; the same views, and the reference's own hole, filled from pure noise
-  --sampler     steps for that filling; the default of 50 is that of the stock pipeline. More steps are sharper and
-                further from the truth
-  --seeds       repeat with these seeds, each with its own draws in training and in sampling
-  --wrong-reference   repeat with another reference, which must not help: a picture to learn instead, at the same place,
-                or another scene's run, whose personalization is taken as it is
-Writes prior.json and rows of pictures to --out; `python -m report.prior` draws them (`make prior-report` does both).
-Every draw is seeded. LPIPS is left out: its network's weights are not in the repository.
+  personalize   the first prior, personalized to a scene's reference with the laptop profile. Measured are the error
+                against steps; before and after, by timestep, the error of the clean latent in holes of unseen views and
+                the variance of the SDS gradient over the noise; and scores of these views and of the reference's own
+                hole, filled from pure noise
+  --sampler     number of sampler steps for these fillings; the default of 50 is that of the stock pipeline. More steps
+                give fillings that are sharper and further from the truth
+  --seeds       repeat the personalization with these seeds, each with draws of its own in training and in sampling
+  --wrong-reference   repeat with a wrong reference, which must not help: a picture in place of the reference, or
+                another scene's run, whose personalized prior is used as it is
+
+The study writes prior.json and rows of pictures to --out; `python -m report.prior` makes a page of them
+(`make prior-report` does both). Every draw is seeded. LPIPS is left out, because the weights of its network are not in
+the repository.
 """
 
 from __future__ import annotations
@@ -53,7 +59,7 @@ from stages import personalize as stage
 
 ROOT = Path(__file__).resolve().parents[2]
 
-TELEA_RADIUS = 5  # of both OpenCV methods, px
+TELEA_RADIUS = 5  # radius of both OpenCV methods, px
 TIMESTEPS = (20, 100, 250, 400, 550, 700, 850, 980)
 NOISES = 4  # draws for the variance of the SDS gradient
 VIEWS = 6  # number of unseen views
@@ -65,18 +71,30 @@ LEARNS = ("poses", "reference")  # stages that personalization needs of a run
 
 
 def score_cases(pictures: list[np.ndarray], cases: list[Case]) -> dict[str, float]:
-    """Means of the scores inside the holes."""
+    """Return the mean scores of filled pictures inside their holes."""
     return mean_scores([hole_scores(p, c.truth, c.hole) for p, c in zip(pictures, cases, strict=True)])
 
 
 def time_cpu(work) -> tuple:
-    """(result of `work`, CPU seconds of this process over all its threads); other processes do not count."""
+    """Call `work`; return its result and the CPU seconds of this process, summed over all its threads."""
     began = time.process_time()
     return work(), time.process_time() - began
 
 
 def measure_inpainting(priors: list[str], cases: list[Case], out: Path) -> dict:
-    """Method -> kind -> means, and seconds per picture; saves the first `SHOWN` cases as rows of pictures."""
+    """Fill held-out pictures by OpenCV's methods and by priors, and score them.
+
+    The first `SHOWN` cases are saved as rows of pictures.
+
+    Args:
+        priors: diffusers folders.
+        cases: pictures with holes.
+        out: folder of the study.
+
+    Returns:
+        "columns": titles of the columns of pictures; "scores": method -> kind of picture ("all" too) -> mean scores.
+        The kind "all" also has "seconds" of CPU per picture.
+    """
     rivals = {"Telea": cv2.INPAINT_TELEA, "Navier-Stokes": cv2.INPAINT_NS}
     ways, seconds = {}, {}
     for name, flag in rivals.items():
@@ -97,7 +115,11 @@ def measure_inpainting(priors: list[str], cases: list[Case], out: Path) -> dict:
 
 
 def measure_steps(prior: Prior, cases: list[Case], steps: list[int], prompt: str = "") -> dict[str, dict]:
-    """Number of sampler steps -> means, and CPU seconds per picture."""
+    """Fill the holes with several numbers of sampler steps.
+
+    Returns:
+        Number of steps, as text -> mean scores and "seconds" of CPU per picture.
+    """
     result = {}
     for count in steps:
         pictures, seconds = time_cpu(lambda count=count: fill_holes(prior, cases, SEED, prompt, count))
@@ -109,10 +131,17 @@ def measure_steps(prior: Prior, cases: list[Case], steps: list[int], prompt: str
 
 
 def scene_cases(run: Path, size: int, pictures: dict[str, np.ndarray] | None = None) -> dict[str, list[Case]]:
-    """The first reference and its hole, `NOISES` times, and unseen views with ground truth and their test masks.
+    """Load the holes of a run at three scales, as pictures of `size` px.
 
-    Views come whole, reduced to `size`, and as a window of each. `pictures`, view name -> uint8 [H, W, 3], replace the
-    truth.
+    Args:
+        run: runs/<scene>.
+        size: side of the pictures, px.
+        pictures: view name -> uint8 [H, W, 3], to be used instead of the ground truth; None for the ground truth.
+
+    Returns:
+        "reference": the first reference with its hole, `NOISES` times; "whole": up to `VIEWS` test views with ground
+        truth and their masks as holes, reduced to `size`; "window": a window of `size` px around the hole of each of
+        these views.
 
     Raises:
         ValueError: no test view has ground truth and a mask.
@@ -152,7 +181,12 @@ def _reduced(case: Case, size: int) -> Case:
 
 
 def profile_params(prior: str, settings: dict) -> stage.Params:
-    """The laptop profile's parameters of `personalize` for a prior; `settings`, by dotted names, override them."""
+    """Return the laptop profile's parameters of `personalize` for a prior.
+
+    Args:
+        prior: diffusers folder.
+        settings: dotted name of a parameter -> value that overrides the profile's.
+    """
     values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["personalize"]
     for name, value in {"prior": prior, **settings}.items():
         *groups, last = name.split(".")
@@ -165,10 +199,11 @@ def profile_params(prior: str, settings: dict) -> stage.Params:
 
 @torch.no_grad()
 def measure_timesteps(prior: Prior, cases: list[Case], prompt: str) -> dict[str, list[float]]:
-    """Error and variance of the predicted clean latent in the holes, for each of `TIMESTEPS`.
+    """Measure the clean latent x0 that the prior predicts in the holes from the noised truth.
 
-    "error" is the mean squared error of the clean latent predicted from the noised truth; "variance" that of the
-    prediction (and so of z - x0, the SDS gradient) over `NOISES` draws of the noise.
+    Returns:
+        Lists over `TIMESTEPS`. "error": mean squared error of x0. "variance": variance of x0 over `NOISES` draws of the
+        noise, which is also the variance of the SDS gradient z - x0.
     """
     pictures, holes = to_tensors(cases)
     clean, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
@@ -190,7 +225,10 @@ def measure_timesteps(prior: Prior, cases: list[Case], prompt: str) -> dict[str,
 
 
 def replace_references(reference: Path, picture: Path, folder: Path) -> Path:
-    """Copy the stage's folder with `picture`, resized, in place of every reference; masks stay."""
+    """Copy the folder of the stage `reference` to `folder`, with a picture, resized, in place of every reference.
+
+    The masks are copied unchanged. The result is `folder`.
+    """
     shutil.copytree(reference, folder)
     for path in (folder / "references").glob("*.png"):
         height, width = load_image(path).shape[:2]
@@ -199,7 +237,14 @@ def replace_references(reference: Path, picture: Path, folder: Path) -> Path:
 
 
 def personalize_prior(params: stage.Params, needs: dict[str, Path], folder: Path) -> tuple[Prior, list[dict]]:
-    """The prior personalized in `folder`, and the trace; an earlier attempt with these parameters continues."""
+    """Personalize a prior in `folder`; return the personalized prior and the trace.
+
+    An earlier, interrupted attempt with the same parameters continues.
+
+    Args:
+        params: parameters of the stage `personalize`.
+        needs: stage -> folder, for the stages that `personalize` needs.
+    """
     settings, record = params.model_dump(mode="json"), folder / "settings.json"
     if not record.exists() or load_json(record) != settings:
         shutil.rmtree(folder, ignore_errors=True)
@@ -211,7 +256,14 @@ def personalize_prior(params: stage.Params, needs: dict[str, Path], folder: Path
 
 
 def personalize_wrongly(params: stage.Params, needs: dict[str, Path], wrong: Path, folder: Path) -> Prior:
-    """The prior personalized on a wrong reference: a picture, or another scene's finished run."""
+    """Return the prior personalized to a wrong reference.
+
+    Args:
+        params: parameters of the stage `personalize`.
+        needs: stage -> folder, for the stages that `personalize` needs.
+        wrong: a picture to learn instead of the reference, or the run of another scene whose LoRA is used.
+        folder: folder for the personalization.
+    """
     if wrong.is_dir():
         return lora.merge(load_prior(params.prior), wrong / "personalize")
     other = replace_references(needs["reference"], wrong, folder / "other")
@@ -221,22 +273,35 @@ def personalize_wrongly(params: stage.Params, needs: dict[str, Path], wrong: Pat
 
 
 def fill_scales(model: Prior, cases: dict[str, list[Case]], seed: int, sampler: int) -> dict[str, list[np.ndarray]]:
-    """Scale -> its holes filled from pure noise in `sampler` steps."""
+    """Fill the holes of all scales from pure noise in `sampler` steps; return {scale: pictures}."""
     return {scale: fill_holes(model, some, SEED + seed, PROMPTS[scale], sampler) for scale, some in cases.items()}
 
 
 def score_scales(pictures: dict[str, list[np.ndarray]], cases: dict[str, list[Case]]) -> dict[str, dict[str, float]]:
-    """Scale -> means of the scores."""
+    """Return {scale: mean scores}."""
     return {scale: score_cases(pictures[scale], some) for scale, some in cases.items()}
 
 
 def measure_personalization(
     params: stage.Params, run: Path, seeds: list[int], wrong: Path | None, steps: list[int], sampler: int, out: Path
 ) -> dict:
-    """Personalize on the run's reference, once per seed, and measure before and after on unseen views.
+    """Personalize a prior to a run's reference, once per seed, and measure it before and after on unseen views.
 
-    Returns the first seed's measurements, and in "seeds" the sample scores of every seed: "before", "after" and, with a
-    `wrong` reference, "wrong".
+    Args:
+        params: parameters of the stage `personalize`.
+        run: runs/<scene>, with the stages in `LEARNS`.
+        seeds: seeds of the personalization.
+        wrong: wrong reference, see `personalize_wrongly`; None for none.
+        steps: numbers of sampler steps to compare with the first seed.
+        sampler: number of sampler steps of all other fillings.
+        out: folder of the study.
+
+    Returns:
+        The settings, the measurements of the first seed, and in "seeds" the scores of the fillings for every seed:
+        "before", "after" and, if `wrong` is given, "wrong".
+
+    Raises:
+        ValueError: a stage of the run is missing.
     """
     needs = {need: run / need for need in LEARNS}
     for folder in needs.values():
@@ -262,6 +327,7 @@ def measure_personalization(
 
 
 def print_seed(seed: int, scores: dict) -> None:
+    """Print the scores of one seed."""
     print(f"seed {seed}, {scores['seconds']:.0f} s", flush=True)
     for when in ("before", "after", "wrong"):
         for scale, row in scores.get(when, {}).items():
@@ -276,7 +342,16 @@ def measure_first_seed(
     steps: list[int],
     out: Path,
 ) -> dict:
-    """Measurements made once: errors by timestep, the effect of sampler steps, rows of pictures."""
+    """Make the measurements of the first seed: errors by timestep, effect of sampler steps, rows of pictures.
+
+    Args:
+        models: "before", "after" and perhaps "wrong" -> prior.
+        cases: scale -> holes.
+        pictures: key of `models` -> scale -> filled pictures.
+        log: trace of the personalization.
+        steps: numbers of sampler steps to compare.
+        out: folder of the study.
+    """
     result: dict = {"trace": log, "timesteps": TIMESTEPS, "columns": ["hole", *models, "truth"]}
     for scale, some in cases.items():
         result[scale] = {
@@ -290,7 +365,7 @@ def measure_first_seed(
 
 
 def parse_setting(text: str) -> tuple[str, object]:
-    """("steps", 500) from "steps=500"."""
+    """Parse a command-line setting, e.g. "steps=500" to ("steps", 500)."""
     name, separator, value = text.partition("=")
     if not separator:
         raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE")

@@ -1,9 +1,12 @@
 """Acceptance of redrawn and of wrong references: `python -m benchmarks.studies.redrawn --captures ../shared/data`.
 
-For some views of each capture: ten pictures that an autoencoder and other tools could make of the photograph, which
-must be accepted; photographs of the nearest views and of another capture, as they are and redrawn, which must be
-refused. Prints the shares of patches that lie in place, the wrong decisions and, with --seconds, the time of a
-registration.
+A reference is accepted if it shows the same scene from the same view as the view's photograph; the module
+`reffusion.references.registration` decides this. The study tests these decisions. For some views of each capture it
+makes ten pictures that an autoencoder and other tools could make of the photograph; they must be accepted. The
+photographs of the nearest views, one of them redrawn, and a photograph of another capture must be refused. *Redrawn*
+means: with other high frequencies, as an autoencoder writes them.
+The study prints the inlier ratios (shares of compared points that are at the same place as in the photograph), the
+numbers of wrong decisions and, with --seconds, the time of a registration.
 """
 
 from __future__ import annotations
@@ -25,13 +28,20 @@ from reffusion.io.images import load_image
 from reffusion.references import registration
 
 LONGER_SIDE = 640  # px to which photographs are reduced
-NEAREST = 2  # neighbouring views whose photographs are given as pictures of each view
-COMPARED = 4  # neighbouring photographs with which the stage `reference` compares
-CHOSEN_ON = ("bear", "garden", "statue", "fox")  # captures on which thresholds were chosen; the others only report
+NEAREST = 2  # number of neighbouring views whose photographs are given as wrong references of each view
+COMPARED = 4  # number of neighbouring photographs with which a reference is compared
+CHOSEN_ON = ("bear", "garden", "statue", "fox")  # captures on which thresholds were chosen; other captures only report
 
 
 def redraw(photo: np.ndarray, seed: int = 0) -> np.ndarray:
-    """A picture with the photograph's low frequencies and other high ones, as an autoencoder writes it."""
+    """Return a picture with the low frequencies of a photograph and other high frequencies, like an autoencoder's.
+
+    The high frequencies have the photograph's amplitudes and random phases.
+
+    Args:
+        photo: uint8 [H, W, 3].
+        seed: seed of the phases.
+    """
     height, width = photo.shape[:2]
     half = cv2.resize(photo, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
     low = cv2.resize(half, (width, height), interpolation=cv2.INTER_CUBIC).astype(np.float32)
@@ -42,36 +52,36 @@ def redraw(photo: np.ndarray, seed: int = 0) -> np.ndarray:
 
 
 def resize_to_multiple(image: np.ndarray, of: int) -> np.ndarray:
-    """The picture at the nearest size whose sides are both multiples of `of`."""
+    """Resize a picture to the nearest size whose sides are both multiples of `of`."""
     size = [max(of, round(side / of) * of) for side in image.shape[1::-1]]
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def compress(image: np.ndarray, quality: int = 60) -> np.ndarray:
-    """The picture saved as JPEG and read again."""
+    """Save a picture as JPEG with the given quality and read it again."""
     file = io.BytesIO()
     Image.fromarray(image).save(file, "JPEG", quality=quality)
     return np.array(Image.open(file).convert("RGB"))
 
 
 def shift(image: np.ndarray, across: float, down: float) -> np.ndarray:
-    """The picture shifted by this many px."""
+    """Shift a picture to the right by `across` px and down by `down` px."""
     size = (image.shape[1], image.shape[0])
     return cv2.warpAffine(image, np.array([[1.0, 0, across], [0, 1, down]]), size, borderMode=cv2.BORDER_REPLICATE)
 
 
 def sharpen(image: np.ndarray) -> np.ndarray:
-    """The picture with unsharp masking, 100 % of 1.5 px."""
+    """Sharpen a picture by unsharp masking, with 100 % of a radius of 1.5 px."""
     return _to_picture(2 * image.astype(np.float32) - cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.5))
 
 
 def tint(image: np.ndarray) -> np.ndarray:
-    """The picture with a warm cast."""
+    """Give a picture a warm colour cast."""
     return _to_picture(image * np.array([1.08, 1.0, 0.88]) + np.array([0, 4, 8]))
 
 
 def darken(image: np.ndarray) -> np.ndarray:
-    """The picture at nine tenths of its brightness."""
+    """Reduce the brightness of a picture to nine tenths."""
     return _to_picture(image * 0.9)
 
 
@@ -79,7 +89,7 @@ def _to_picture(values: np.ndarray) -> np.ndarray:
     return np.clip(np.round(values), 0, 255).astype(np.uint8)
 
 
-# Edits by common tools after an autoencoder has redrawn a picture.
+# Name -> edit that a common tool could make after an autoencoder has redrawn the picture.
 VARIANTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "redrawn": lambda picture: picture,
     "sides multiples of 8": lambda picture: resize_to_multiple(picture, 8),
@@ -96,7 +106,14 @@ VARIANTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 @dataclass
 class Photographs:
-    """A capture's reduced photographs, read on demand, and the poses of its views."""
+    """Photographs of a capture, reduced and read on demand, and the poses of its views.
+
+    Attributes:
+        files: view -> file of the photograph.
+        upright: True if photographs are turned upright when they are read.
+        world_to_camera: view -> pose [4, 4].
+        pictures: view -> uint8 [H, W, 3], the photographs read so far.
+    """
 
     files: dict[str, Path]
     upright: bool
@@ -104,14 +121,18 @@ class Photographs:
     pictures: dict[str, np.ndarray] = field(default_factory=dict)
 
     def picture(self, view: str) -> np.ndarray:
-        """uint8 [H, W, 3]."""
+        """Return the reduced photograph of a view, uint8 [H, W, 3]."""
         if view not in self.pictures:
             image = load_image(self.files[view], self.upright)
             self.pictures[view] = reduce(image, LONGER_SIDE)
         return self.pictures[view]
 
     def nearest(self, view: str) -> list[str]:
-        """The other views by distance: between centres, relative to the median, plus twice the radians between axes."""
+        """Return the names of all other views, nearest first.
+
+        The distance of two views is the distance of their centres, relative to its median, plus twice the angle between
+        their optical axes in radians.
+        """
         centre = {name: -pose[:3, :3].T @ pose[:3, 3] for name, pose in self.world_to_camera.items()}
         others = [name for name in self.files if name != view]
         distance = {name: float(np.linalg.norm(centre[name] - centre[view])) for name in others}
@@ -122,7 +143,11 @@ class Photographs:
 
 
 def load_photographs(folder: Path) -> Photographs:
-    """Load a capture. ValueError if it has no poses."""
+    """Load the photographs and poses of a capture.
+
+    Raises:
+        ValueError: the capture has no poses.
+    """
     capture = load_capture(folder)
     if capture.poses is None:
         raise ValueError(f"{folder} brings no poses: neighbouring views are not known")
@@ -131,13 +156,13 @@ def load_photographs(folder: Path) -> Photographs:
 
 
 def reduce(image: np.ndarray, longer: int) -> np.ndarray:
-    """The picture with its longer side reduced to `longer` px; smaller pictures stay."""
+    """Reduce the longer side of a picture to `longer` px; smaller pictures stay as they are."""
     size = [round(side * min(1, longer / max(image.shape[:2]))) for side in image.shape[1::-1]]
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def make_hole(shape: Sequence[int], seed: int) -> np.ndarray:
-    """bool [H, W]: a random rectangle of 15 to 35 % of each side."""
+    """Return a random rectangular hole, bool [H, W], whose sides are 15 to 35 % of the picture's sides."""
     random, (height, width) = np.random.default_rng(seed), shape[:2]
     high, wide = (int(side * random.uniform(0.15, 0.35)) for side in (height, width))
     top, left = random.integers(0, height - high), random.integers(0, width - wide)
@@ -148,17 +173,27 @@ def make_hole(shape: Sequence[int], seed: int) -> np.ndarray:
 
 @dataclass
 class Rates:
-    """Shares of patches in place, and counts of wrong decisions."""
+    """Inlier ratios of the registrations, and numbers of wrong decisions.
 
-    own: list[float] = field(default_factory=list)  # of accepted kinds
-    other: list[float] = field(default_factory=list)  # of neighbouring views
-    foreign: list[float] = field(default_factory=list)  # of another capture
+    Attributes:
+        own: inlier ratios of pictures that must be accepted.
+        other: inlier ratios of photographs of neighbouring views.
+        foreign: inlier ratios of the photograph of another capture.
+        refused: number of right pictures that were refused.
+        accepted_by_place: number of photographs of neighbouring views that would be accepted by the inlier ratio alone,
+            without comparison with other photographs.
+        accepted: number of wrong pictures that were accepted.
+    """
+
+    own: list[float] = field(default_factory=list)
+    other: list[float] = field(default_factory=list)
+    foreign: list[float] = field(default_factory=list)
     refused: int = 0
-    accepted_by_place: int = 0  # wrongly, without comparison with other photographs
-    accepted: int = 0  # wrongly
+    accepted_by_place: int = 0
+    accepted: int = 0
 
     def row(self, name: str) -> str:
-        """Row of the Markdown table."""
+        """Return the row of a capture in the Markdown table whose head is `HEADER`."""
         own, other, foreign = (np.array(each) for each in (self.own, self.other, self.foreign))
         quantiles = lambda values, at: " / ".join(f"{100 * q:.1f}" for q in np.quantile(values, at))
         return (
@@ -175,7 +210,13 @@ HEADER = (
 
 
 def measure(capture: Photographs, foreign: np.ndarray, every: int) -> Rates:
-    """Rates over every n-th view of a capture; `foreign` is a photograph of another capture."""
+    """Register right and wrong references for every n-th view of a capture, and count wrong decisions.
+
+    Args:
+        capture: the capture.
+        foreign: uint8 [H, W, 3], a photograph of another capture.
+        every: n.
+    """
     rates = Rates()
     for index, view in enumerate(list(capture.files)[::every]):
         photo, nearest = capture.picture(view), capture.nearest(view)
@@ -185,7 +226,8 @@ def measure(capture: Photographs, foreign: np.ndarray, every: int) -> Rates:
         for number, make in enumerate(VARIANTS.values()):
             image = fit_size(make(redrawn), photo)
             registered = registration.register(image, photo, hole)
-            compare = number == index % len(VARIANTS)  # one variant per view is compared with neighbours, to save time
+            # To save time, only one variant per view is also compared with the photographs of neighbouring views.
+            compare = number == index % len(VARIANTS)
             wrong = not registered.fits or (compare and registration.find_better_view(image, registered, others))
             rates.own.append(registered.inlier_ratio)
             rates.refused += bool(wrong)
@@ -202,12 +244,12 @@ def measure(capture: Photographs, foreign: np.ndarray, every: int) -> Rates:
 
 
 def fit_size(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
-    """The picture resized to the photograph, as the stage does it."""
+    """Resize a picture to the size of the photograph, in the same way as the stage `reference`."""
     return cv2.resize(image, (photo.shape[1], photo.shape[0]), interpolation=cv2.INTER_CUBIC)
 
 
 def measure_seconds(photo: np.ndarray) -> str:
-    """CPU seconds of a registration at 640 and 1600 px, as text."""
+    """Return a text with the CPU seconds of registrations at 640 and 1600 px, of a right and of a wrong picture."""
     parts = []
     for longer in (640, 1600):
         scale = longer / max(photo.shape[:2])

@@ -1,4 +1,4 @@
-"""A scene's prior before and after personalization, and the command line of studies that compare the two."""
+"""Loading of a scene's prior before and after personalization, and the command line of studies that compare the two."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ DTYPES = ("float32", "float16", "bfloat16")
 
 
 def study_parser(about: str, needs: str, folder: str) -> argparse.ArgumentParser:
-    """Command-line parser of such a study.
+    """Return the command-line parser of a study that compares a prior before and after personalization.
 
     Args:
-        about: the help text.
-        needs: stages that the run must have finished.
-        folder: default folder of the results inside the run.
+        about: help text.
+        needs: stages that the run must have finished, in words.
+        folder: name of the default folder for results, inside the run's folder.
     """
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", type=Path, required=True, help=f"runs/<scene>, with {needs}")
@@ -36,7 +36,7 @@ def study_parser(about: str, needs: str, folder: str) -> argparse.ArgumentParser
 
 
 def run_study(study: Callable[[], None]) -> None:
-    """Run a study as a command; a ValueError becomes one line."""
+    """Run a study as a command; a ValueError ends the command with its message in one line."""
     try:
         study()
     except ValueError as error:
@@ -44,10 +44,17 @@ def run_study(study: Callable[[], None]) -> None:
 
 
 def load_priors(arguments: argparse.Namespace) -> tuple[dict[str, Prior], str]:
-    """{"before", "after"} personalization, and the prior's name.
+    """Load the prior of a run before and after personalization.
+
+    Args:
+        arguments: result of the parser of `study_parser`.
+
+    Returns:
+        {"before": prior, "after": prior}, and the prior's name.
 
     Raises:
-        ValueError: the run has no personalized prior, or the device is not available.
+        ValueError: the run has no personalized prior, the device is not available, or the dtype does not fit the
+        device.
     """
     adapted: Path = arguments.run / "personalize"
     if not adapted.is_dir():
@@ -63,14 +70,18 @@ def load_priors(arguments: argparse.Namespace) -> tuple[dict[str, Prior], str]:
 
 
 def peak_mb(device: str) -> int:
-    """Peak memory of this process in MB, weights included: of the GPU by torch's count, else of the process."""
+    """Return the peak memory so far in MB, weights included.
+
+    Args:
+        device: "cuda" for the GPU memory that torch allocated, "cpu" for the memory of this process.
+    """
     if device == "cuda":
         return round(torch.cuda.max_memory_allocated() / 1e6)
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6)
 
 
 def save_results(arguments: argparse.Namespace, folder: Path, name: str, results: dict[str, Any]) -> None:
-    """Save the study's results with the device and peak memory, which are also printed."""
+    """Save a study's results as JSON in `folder`/`name`, with device, dtype and peak memory, which are also printed."""
     peak = peak_mb(arguments.device)
     save_json(folder / name, results | {"device": arguments.device, "dtype": arguments.dtype, "peak_mb": peak})
     print(f"on {arguments.device} in {arguments.dtype}, both priors loaded: at most {peak:,} MB")

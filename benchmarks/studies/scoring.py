@@ -1,4 +1,9 @@
-"""Scores of a composite's result beside its ceiling and Telea's method, uncovered pixels, and a sheet of pictures."""
+"""Scores of a composite's result beside those of its ceiling and of Telea's method, and a sheet of pictures.
+
+A *composite* is a real capture into whose photographs a synthetic object is drawn, see `composites.py`. Its *ceiling*
+is a fit to the photographs without the object. Scores are measured in the *box*, the bounding box of a view's mask, 10
+% wider on each side. A pixel is *uncovered* if no Gaussian covers it well.
+"""
 
 from __future__ import annotations
 
@@ -21,17 +26,24 @@ from reffusion.metrics import image_metrics, lpips
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
 
-MIN_ALPHA = 0.9  # a pixel is uncovered below this alpha
-BLACK, LIT = 0.06, 0.15  # or if its brightest channel is below BLACK where the truth's is above LIT
+MIN_ALPHA = 0.9  # a pixel is uncovered if its alpha is lower
+BLACK, LIT = 0.06, 0.15  # a pixel is uncovered too if its brightest channel is below BLACK and the truth's above LIT
 SHEET_MARGIN = 0.6  # margin of a sheet's crop on each side, relative to the box
 ROW = 200  # height of a sheet's rows, px
 COLUMNS = {"lpips_vgg": 3, "psnr": 2, "ssim": 3, "flip": 3}  # column -> digits
-PICTURES = ("result", "initialize", "ceiling", "telea")
+PICTURES = ("result", "initialize", "ceiling", "telea")  # methods that each row of the table scores
 
 
 @dataclass(frozen=True)
 class Run:
-    """A finished job: its folder, its scene, and the metrics of evaluate."""
+    """Finished run of a scene, or of a variant of a scene.
+
+    Attributes:
+        folder: runs/<scene> or runs/<scene>@<variant>.
+        scene: scene of the stage `poses`.
+        metrics: content of metrics.json of the stage `evaluate`.
+        base: folder of the scene's own run, if this is a variant; else None.
+    """
 
     folder: Path
     scene: Scene
@@ -40,46 +52,57 @@ class Run:
 
     @classmethod
     def load(cls, folder: Path) -> Run:
+        """Load a scene's own run."""
         return cls(folder, load_scene(folder / "poses"), load_json(folder / "evaluate/metrics.json"))
 
     @classmethod
     def load_variant(cls, base: Run, folder: Path) -> Run:
-        """Load a variant's run, which shares with `base` the stages for which it has no folder."""
+        """Load the run of a variant; `base` is the scene's own run, whose stages the variant shares in part."""
         return cls(folder, base.scene, load_json(folder / "evaluate/metrics.json"), base.folder)
 
     def stage(self, name: str) -> Path:
-        """Folder of a stage; the base run's if a variant has none."""
+        """Return the folder of a stage; for a stage that a variant shares, the folder in the scene's own run."""
         own = self.folder / name
         return own if own.exists() or self.base is None else self.base / name
 
     def picture(self, name: str, kind: str = "renders") -> np.ndarray:
-        """uint8 [H, W, 3]: a test view as evaluate rendered it."""
+        """Load a render of a test view by the stage `evaluate`, uint8 [H, W, 3]; `kind` is the folder of renders."""
         return load_image(self.folder / "evaluate" / kind / f"{name}.png")
 
     def truth(self, name: str) -> np.ndarray:
-        """uint8 [H, W, 3]: a test view's photograph."""
+        """Load a view's photograph, uint8 [H, W, 3]; for test views it is the ground truth."""
         return load_image(self.stage("poses") / f"images/{name}.png")
 
     def mask(self, name: str) -> np.ndarray:
-        """bool [H, W]: pixels of the object, from the test mask of a test view, else the consistent mask."""
+        """Load the pixels of the object in a view, bool [H, W], from its test mask if it has one.
+
+        Other views have a consistent mask, computed by the stage `masks`.
+        """
         masks = self.stage("masks")
         return load_object_mask(self.scene.cameras[name], self.stage("raw_masks"), masks if masks.exists() else None)
 
     def seconds(self) -> float:
-        """Of all stages but evaluate, by their receipts."""
+        """Return the seconds of all stages except `evaluate`, from the receipts in the run's folder."""
         receipts = [load_json(path) for path in sorted(self.folder.glob("*/receipt.json"))]
         return sum(receipt["seconds"] for receipt in receipts if receipt["stage"] != "evaluate")
 
     def gaussians(self) -> Gaussians:
-        """The result's Gaussians."""
+        """Load the Gaussians of the result."""
         return load_ply(self.stage(self.metrics["result"]) / "gaussians.ply")
 
 
 def score_place(run: Run, ceiling: Run, variants: Mapping[str, Run]) -> dict[str, Any]:
-    """A place's row of the table.
+    """Score a place: return its row of the table as a dictionary.
 
-    PICTURES -> means of COLUMNS over the test views' boxes (+ 10 %); "sharpness" of result and ceiling; "uncovered",
-    the worst view's share, of "train" and "test"; "seconds" of the job; "variants", COLUMNS of each.
+    Args:
+        run: run of the place.
+        ceiling: run on the same views without the object.
+        variants: name -> run of a variant.
+
+    Returns:
+        For each of `PICTURES` the mean scores `COLUMNS` over the boxes of the test views. "sharpness": gradient energy
+        of "result" and "ceiling" relative to the truth. "uncovered": largest uncovered share of a view's mask among the
+        views of "train" and of "test". "seconds" of the run. "variants": name -> scores.
     """
     row: dict[str, Any] = {
         "result": _means(run.metrics["mean"]),
@@ -102,7 +125,10 @@ def _means(of: dict[str, float | None]) -> dict[str, float | None]:
 
 
 def _telea(run: Run) -> dict[str, float | None]:
-    """Scores of Telea's filling of the test masks in our own renders: our surroundings, no method in the mask."""
+    """Score the run's own renders of the test views with their masks filled by Telea's method.
+
+    This is a baseline without any 3D method inside the mask; the pixels outside are the same as in the run's result.
+    """
     rows, (vgg, _) = [], lpips.load("vgg")
     models = {"vgg": vgg} if vgg else {}
     for name in run.scene.test:
@@ -116,7 +142,10 @@ def _telea(run: Run) -> dict[str, float | None]:
 
 
 def _sharpness(run: Run) -> float | None:
-    """Mean over the test views of the gradient energy in the box over that of the truth; 1 is as sharp."""
+    """Return the gradient energy of the renders in the box relative to that of the truth, averaged over test views.
+
+    1 means as sharp as the truth, below 1 too smooth.
+    """
     shares = []
     for name in run.scene.test:
         box = image_metrics.mask_box(run.mask(name))
@@ -128,13 +157,17 @@ def _sharpness(run: Run) -> float | None:
 
 
 def _untouched(run: Run, ceiling: Run, name: str) -> np.ndarray | None:
-    """A training view's photograph without the object, from the ceiling's fit; None if its size differs."""
+    """Load a training view's photograph without the object, from the ceiling's run; None if its size differs."""
     picture, camera = ceiling.truth(name), run.scene.cameras[name]
     return picture if picture.shape[:2] == (camera.height, camera.width) else None
 
 
 def _worst(run: Run, truths: dict[str, np.ndarray | None]) -> float | None:
-    """Largest uncovered share over the named views."""
+    """Return the largest uncovered share of a view's mask over the named views; None if all their masks are empty.
+
+    Args:
+        truths: view -> photograph without the object, or None if unknown.
+    """
     gaussians = run.gaussians()
     worst = [
         uncovered_share(gaussians, run.scene.cameras[name], run.mask(name), truth) for name, truth in truths.items()
@@ -143,9 +176,15 @@ def _worst(run: Run, truths: dict[str, np.ndarray | None]) -> float | None:
 
 
 def uncovered_share(gaussians: Gaussians, camera: Camera, mask: np.ndarray, truth: np.ndarray | None) -> float | None:
-    """Share of a mask's pixels, bool [H, W], that nothing covers; None for an empty mask.
+    """Return the share in [0, 1] of a mask's pixels that no Gaussian covers; None for an empty mask.
 
-    A pixel is uncovered if alpha is below MIN_ALPHA, or if it is near black and the truth, uint8 [H, W, 3], is not.
+    A pixel is uncovered if its alpha is below `MIN_ALPHA`, or if it is nearly black where the truth is not.
+
+    Args:
+        gaussians: the result.
+        camera: camera of the view.
+        mask: bool [H, W].
+        truth: uint8 [H, W, 3]; None if unknown.
     """
     import torch
 
@@ -160,9 +199,10 @@ def uncovered_share(gaussians: Gaussians, camera: Camera, mask: np.ndarray, trut
 
 
 def comparison_sheet(run: Run, ceiling: Run) -> np.ndarray:
-    """uint8 [H, W, 3], a row per test view around its box.
+    """Return a picture, uint8 [H, W, 3], with a row per test view, cropped around the mask's box.
 
-    Columns: truth, with the object (the fit's render), ours, ceiling, absolute difference between ours and the truth.
+    The columns are the truth, the fit's render with the object, our result, the ceiling, and the absolute difference
+    between our result and the truth.
     """
     rows = []
     for name in run.scene.test:
@@ -178,16 +218,19 @@ def comparison_sheet(run: Run, ceiling: Run) -> np.ndarray:
 
 
 def _row(panels: list[np.ndarray]) -> np.ndarray:
-    """Panels side by side, scaled to a height of ROW px, with 4 px of black between them."""
+    """Join panels side by side, scaled to a height of `ROW` px, with 4 px of black between them."""
     scaled = [cv2.resize(p, (round(p.shape[1] * ROW / p.shape[0]), ROW), interpolation=cv2.INTER_AREA) for p in panels]
     return np.concatenate([np.pad(p, ((0, 0), (0, 4), (0, 0))) for p in scaled], 1)
 
 
 def table(rows: list[dict]) -> str:
-    """Markdown table with a row per place.
+    """Return a Markdown table with a row per place.
 
-    Scores are LPIPS (vgg) / PSNR / SSIM / FLIP, shares in percent; each variant has its scores and the ratio of our
-    LPIPS to its.
+    Scores are LPIPS (vgg) / PSNR / SSIM / FLIP; uncovered shares are in percent. Each variant has a column of its
+    scores, and a column of the full method's LPIPS divided by the variant's.
+
+    Args:
+        rows: results of `score_place`, with the place's name in "place".
     """
     variants = list(rows[0]["variants"]) if rows else []
     heads = [*PICTURES, "sharpness", "its ceiling", "uncovered, train %", "test %", "seconds"]

@@ -1,18 +1,20 @@
 """Variance of a scene's SDS gradient over noise and timesteps, before and after personalization.
 
-`python -m benchmarks.studies.sds_variance`, or `make scene=X sds-variance`: for any scene, with or without ground
-truth, after `initialize` and `personalize`. Training views with something to invent are rendered from the
-initialization and given to the prior as in distillation: whole, and in a window around the hole. The gradient is
-g = z - x0(z_t), that of `weighting: x0`; any other weighting multiplies it by a function of t alone. In the latents of
-the hole, averaged over them and over the views:
+`python -m benchmarks.studies.sds_variance`, or `make scene=X sds-variance`, works for any scene, with or without ground
+truth, after the stages `initialize` and `personalize`. Training views with pixels to invent are rendered from the
+initialization and given to the prior as in distillation: whole views, and windows around the hole. The gradient is
+g = z - x0(z_t), that of `weighting: x0`; any other weighting multiplies g by a function of t alone. The quantities are
+means over the latents of the hole and over the views:
 
-  noise       variance of g over draws of the noise, at each timestep
-  pull        squared mean over these draws, the part that remains in the long run (corrected for the draws' own noise)
-  over noise, over timesteps, together: mean of `noise` over the timesteps, variance of the mean gradient over the
-              timesteps, and their sum: the variance of what one step of distillation draws
+  noise            variance of g over draws of the noise, at each timestep
+  pull             square of the mean of g over these draws, the part that remains after many steps (corrected for the
+                   noise of the mean)
+  over noise       mean of `noise` over the timesteps
+  over timesteps   variance over the timesteps of the mean of g
+  together         sum of the last two: the variance of the gradient of one step of distillation
 
-Every draw is seeded and the same before and after, on any device. Prints tables and the memory used, and writes
-sds_variance.json to --out.
+Every draw is seeded and the same before and after, on any device. The study prints tables and the memory used, and
+writes sds_variance.json to --out.
 """
 
 from __future__ import annotations
@@ -34,16 +36,20 @@ from reffusion.splat import rasterizer
 
 ROOT = Path(__file__).resolve().parents[2]
 
-VIEWS = 6
-NOISES = 8
-TIMESTEPS = (0.02, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9)  # parts of the schedule
+VIEWS = 6  # largest number of training views
+NOISES = 8  # draws of the noise per timestep
+TIMESTEPS = (0.02, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9)  # as fractions of the schedule
 SCALES = ("whole", "window")
 SEED = 0
 
 
 @torch.no_grad()
 def load_inputs(run: Path, prior: Prior) -> dict[str, tuple[Tensor, Tensor]]:
-    """Scale -> (pictures [B, 3, S, S] in [-1, 1], holes [B, 1, S, S], 1 = repaint) of up to `VIEWS` training views.
+    """Render up to `VIEWS` training views with pixels to invent from the initialization, as input of the prior.
+
+    Returns:
+        Scale ("whole" or "window") -> (pictures [B, 3, S, S] in [-1, 1], holes [B, 1, S, S], 1 = repaint). S is the
+        prior's native size.
 
     Raises:
         ValueError: a stage is missing, or nothing is to be invented.
@@ -71,7 +77,7 @@ def load_inputs(run: Path, prior: Prior) -> dict[str, tuple[Tensor, Tensor]]:
 
 @torch.no_grad()
 def sds_gradients(prior: Prior, pictures: Tensor, holes: Tensor, prompt: str) -> Tensor:
-    """[T, K, M]: z - x0(z_t) at `TIMESTEPS`, for each of `NOISES` draws, in the M latent values of the holes."""
+    """Return SDS gradients z - x0(z_t), [T, K, M]: T `TIMESTEPS`, K = `NOISES` draws, M latent values in the holes."""
     latents, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
     text = diffusion.embed_text(prior, [prompt]).expand(len(latents), -1, -1)
     inside, gradients = condition[:, :1].expand_as(latents) > 0.5, []
@@ -86,10 +92,14 @@ def sds_gradients(prior: Prior, pictures: Tensor, holes: Tensor, prompt: str) ->
 
 
 def variances(samples: Tensor) -> dict:
-    """Variances of gradients [T, K, M], T and K at least 2; see the module docstring."""
+    """Return the quantities of the module docstring for gradients [T, K, M], T and K at least 2.
+
+    Returns:
+        "noise" and "pull" are lists over the T timesteps; "over_noise", "over_timesteps" and "together" are numbers.
+    """
     noise = samples.var(1)  # [T, M], unbiased
     mean = samples.mean(1)
-    residual = noise / samples.shape[1]  # part of the noise that remains in the mean of K draws
+    residual = noise / samples.shape[1]  # variance of the mean of K draws
     over_noise = noise.mean()
     over_timesteps = (mean.var(0) - residual.mean(0)).mean().clamp(min=0)
     return {
@@ -102,7 +112,7 @@ def variances(samples: Tensor) -> dict:
 
 
 def measure(models: dict[str, Prior], run: Path) -> dict[str, dict[str, dict]]:
-    """Scale -> "before" or "after" -> `variances`."""
+    """Return {scale: {"before" or "after": variances}} for the priors before and after personalization."""
     inputs = load_inputs(run, next(iter(models.values())))
     return {
         scale: {when: variances(sds_gradients(model, *inputs[scale], prompt)) for when, model in models.items()}
@@ -111,7 +121,10 @@ def measure(models: dict[str, Prior], run: Path) -> dict[str, dict[str, dict]]:
 
 
 def table(results: dict[str, dict[str, dict]]) -> str:
-    """Markdown: per scale a row for each timestep, then the three sums; variance before and after, and their ratio."""
+    """Return Markdown tables, one per scale, with the variances before and after personalization and their ratio.
+
+    A table has a row for each timestep, then the rows `over noise`, `over timesteps` and `together`.
+    """
     lines = []
     for scale, by_time in results.items():
         before, after = by_time["before"], by_time["after"]

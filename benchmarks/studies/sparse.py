@@ -1,14 +1,15 @@
 """Scores against the number of photographs: `make scene=demo-sparse sparse`.
 
-A made scene lists its views in the order in which they become photographs; its scene.yaml names the first. Here 1, 2, 4
-and 8 of them are photographs, and every other training view is a camera only. Three methods for each number:
+A made scene of the kind `sparse` lists training views that are far apart from each other. The study takes the first 1,
+2, 4 and 8 of them as photographs; all other training views are cameras without pixels. Three methods are run for each
+number of photographs:
 
   personalization   the photographs only personalize the prior; Gaussians start at the sparse points
-  both              they are also reconstructed: the method as it is
-  plain 3DGS        only a fit to them, from points: the variant `remove_only`
+  both              the photographs personalize the prior and are reconstructed: the method as it is
+  plain 3DGS        only a fit to the photographs, from sparse points: the variant `remove_only`
 
-Whole test views are scored. Writes sparse.json and sparse.png to --out; finished jobs are not run again. With several
-scenes, of several seeds, a curve is their mean.
+Whole test views are scored. The study writes sparse.json and sparse.png to --out. Finished jobs are not run again. With
+several scenes, made from several seeds, a curve is their mean.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ ROOT = Path(__file__).resolve().parents[2]
 COUNTS = (1, 2, 4, 8)
 SCORES = {"psnr_full": "PSNR (dB)", "flip_full": "FLIP"}
 BOTH, PLAIN, TAUGHT = "both", "plain 3DGS", "personalization"
-POINTS = "fit.few_views=fewer_harmonics"  # a fit starts from sparse points
-METHODS = {
+POINTS = "fit.few_views=fewer_harmonics"  # with this parameter the fit starts from the sparse points
+METHODS = {  # method -> options of the runner
     TAUGHT: (
         f"--set={POINTS} fit.iterations=1 initialize.refit_steps=0 distill.reconstruction.every=0 "
         "distill.reference.weight=0",
@@ -43,10 +44,15 @@ COLOURS = {TAUGHT: charts.GREEN, BOTH: charts.BLUE, PLAIN: charts.ORANGE}
 
 
 def make_scene(scene: Path, count: int, folder: Path) -> Path:
-    """The scene with that many photographs; its files are hard links.
+    """Make a copy of a scene in which only `count` training views are photographs; its files are hard links.
+
+    Args:
+        scene: folder of a made scene.
+        count: number of photographs, the first views of the list "shown" in truth/facts.json.
+        folder: folder to put the copy in; an existing copy is reused.
 
     Raises:
-        ValueError: the scene does not say in which order its views become photographs.
+        ValueError: the scene lists fewer than `count` views.
     """
     order = load_json(scene / "truth/facts.json").get("shown", [])
     if len(order) < count:
@@ -63,7 +69,16 @@ def make_scene(scene: Path, count: int, folder: Path) -> Path:
 
 
 def run_method(scene: Path, way: str, runs: Path) -> dict[str, float]:
-    """Run one method on a scene and return its scores. ValueError if it fails."""
+    """Run one method on a scene and return its mean scores over the test views.
+
+    Args:
+        scene: folder of the scene.
+        way: the method, a key of `METHODS`.
+        runs: folder in which each method has a folder of runs.
+
+    Raises:
+        ValueError: the run failed.
+    """
     home = runs / way.replace(" ", "-")
     command = [sys.executable, "-m", "runner", "run", "all", f"--scene={scene}", f"--runs={home}", *METHODS[way]]
     if subprocess.run(command, cwd=ROOT).returncode:
@@ -74,7 +89,12 @@ def run_method(scene: Path, way: str, runs: Path) -> dict[str, float]:
 
 
 def draw(scores: dict[str, dict[str, list[dict[str, float]]]], path: Path) -> None:
-    """Draw a panel per score. `scores`: method -> number of views -> scores of each scene."""
+    """Draw the scores against the number of photographs, one panel per score and one curve per method.
+
+    Args:
+        scores: method -> number of photographs -> scores of each scene.
+        path: PNG to write.
+    """
     figure, grid = charts.new_figure(3.2, 1, len(SCORES))
     for axes, (score, title) in zip(grid[0], SCORES.items(), strict=True):
         for way, counts in scores.items():

@@ -1,9 +1,10 @@
 """Cost of tracing: `python -m benchmarks.studies.tracing --run runs/demo`.
 
-Runs `fit`, `personalize` and `distill` with the laptop profile in pairs, with a trace and with one measurement at the
-end only. CPU time is measured, so that other processes count little. Moments are log-spaced, so a short run pays more:
-the pairs take --steps steps (`fit` eight times as many, with every 8th view held out), and the last column extrapolates
-to the profile's full length. Exits with 1 if that is over 3 %.
+A trace measures a stage's errors at logarithmically spaced steps. The study runs `fit`, `personalize` and `distill`
+with the laptop profile in pairs: with a trace, and with one measurement at the end only. It compares CPU times, which
+depend little on other processes. The pairs take --steps steps (`fit` eight times as many, with every 8th view held
+out). In such short runs the measured steps are a larger share, so the last column extrapolates the cost to the
+profile's full length. The exit status is 1 if this cost is over 3 % of the stage's time.
 """
 
 from __future__ import annotations
@@ -23,16 +24,17 @@ from stages import distill, fit, personalize
 
 ROOT = Path(__file__).resolve().parents[2]
 
+# stage -> module, name of its number of steps, the stages that it needs, (measurements per octave, first measured step)
 STAGES = {
     "fit": (fit, "iterations", ("poses",), (2, FIRST_TRACED_STEP)),
     "personalize": (personalize, "steps", ("poses", "raw_masks", "reference"), (1, 1)),
     "distill": (distill, "iterations", ("poses", "fit", "masks", "reference", "personalize", "initialize"), (4, 1)),
 }
-ALLOWED = 0.03  # largest share
+ALLOWED = 0.03  # largest allowed share of a stage's time
 
 
 def cpu_seconds(stage: ModuleType, params: object, needs: dict[str, Path | None]) -> tuple[float, int]:
-    """CPU seconds of a whole run, and the number of lines of its trace."""
+    """Run a stage in a temporary folder; return its CPU seconds and the number of lines of its trace."""
     with tempfile.TemporaryDirectory() as folder:
         began = time.process_time()
         stage.run(params, Path(folder), **needs)
@@ -40,7 +42,18 @@ def cpu_seconds(stage: ModuleType, params: object, needs: dict[str, Path | None]
 
 
 def measure_pairs(name: str, run: Path, steps: int, repeats: int) -> tuple[float, float, int, float]:
-    """Median seconds without and with a trace, the additional moments, and seconds per step without a trace."""
+    """Run a stage several times with and without a trace.
+
+    Args:
+        name: name of the stage.
+        run: runs/<scene>.
+        steps: number of steps of each run.
+        repeats: number of pairs.
+
+    Returns:
+        Median CPU seconds without a trace, median CPU seconds with a trace, the number of additional lines of the
+        trace, and CPU seconds per step without a trace.
+    """
     stage, count, needs, _ = STAGES[name]
     settings = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
     settings |= {count: steps, "checkpoint_seconds": 1e9} | ({"holdout": 8} if name == "fit" else {})

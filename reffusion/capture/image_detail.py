@@ -93,7 +93,7 @@ def sample_visible(camera: Camera, points: np.ndarray, picture: np.ndarray, cell
     uv, depth = geometry.project(points, camera)
     values, inside = geometry.sample_nearest(picture, uv)
     cell = max(1.0, camera.width / cells)
-    index = np.zeros(len(points), int)
+    index = np.full(len(points), -1)  # one cell for all points outside the picture
     index[inside] = (uv[inside] // cell).astype(int) @ (10_000, 1)
     visible = inside & (depth < NEARLY * np.maximum(nearest_depths(index, depth), 0))
     return np.where(visible[:, None], values, np.nan)

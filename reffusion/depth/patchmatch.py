@@ -40,7 +40,7 @@ CHANGE_DECAY, SMALL_CHANGE = (
 _SAMPLES = (2 * WINDOW_HALF // WINDOW_STRIDE + 1) ** 2
 _NEIGHBORS = np.array(
     [(0, 1), (0, -1), (1, 0), (-1, 0), (0, 5), (0, -5), (5, 0), (-5, 0)]
-)  # (row, column) offsets: each is odd, which leads to the other colour of a chessboard, see `_spread`
+)  # (row, column) offsets in units of `spacing`: each is odd, so it leads to the other colour, see `_spread`
 _CANDIDATES = len(_NEIGHBORS) + 2  # planes tried at a pixel: those of its neighbours, and two random changes of its own
 
 
@@ -273,18 +273,19 @@ def _spread(
     change_size,
     spacing,
 ):
-    """Update the planes of every second pixel, in a chessboard pattern, to planes of lower cost.
+    """Update the planes of half of the pixels, in a chessboard pattern, to planes of lower cost.
 
-    The candidates are the pixel's own plane, the planes of eight neighbours and two random changes of the own plane. If
-    `spacing` is odd, the neighbours have the other colour of the chessboard, so their planes do not change during the
-    update.
+    The candidates are the pixel's own plane, the planes of eight neighbours and two random changes of the own plane.
+    The squares of the chessboard have sides of `spacing` pixels. So the neighbours are in squares of the other colour,
+    and their planes do not change during the update. The result does not depend on the order in which threads take
+    rows.
 
     Args:
         tickets: Counter from which each thread takes the next row.
         planes: [H, W, 3], updated in place.
         cost: [H, W], the costs of `planes`, updated in place.
         noise: [H, W, 3] standard normal, of the random changes.
-        parity: 0 or 1, the colour of the chessboard: pixels whose row + column has this parity are updated.
+        parity: 0 or 1, the colour of the squares whose pixels are updated.
         first: True in the first iteration, in which the costs of the initial planes are computed.
         change_size: Factor on the random changes in this iteration.
         spacing: See `_bilateral_weights`; also the factor on the distances of the neighbours.
@@ -296,7 +297,9 @@ def _spread(
         row = take_ticket(tickets)
         if row >= height:
             return
-        for column in range((row + parity) % 2, width, 2):
+        for column in range(width):
+            if (row // spacing + column // spacing + parity) % 2:
+                continue
             total = _bilateral_weights(colour, row, column, spacing, weights)
             if first:
                 plane[:] = planes[row, column]

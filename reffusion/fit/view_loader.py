@@ -84,13 +84,15 @@ def downsample(
 ) -> tuple[Camera, np.ndarray, np.ndarray | None]:
     """Return the view (camera, image and weights) at half its size, rounded up.
 
-    A pixel of the small view gets the lowest weight among 3 x 3 pixels around the upper left corner of its area. So a
-    colour to which a pixel of weight 0 contributes has weight 0 (in views of even size).
+    A pixel of the small view gets the lowest weight around the upper left pixel of its area: among 3 x 3 pixels, or
+    5 x 5 in views of odd size, whose areas overlap three pixels. So a colour to which a pixel of weight 0 contributes
+    has weight 0.
     """
     size = (camera.width + 1) // 2, (camera.height + 1) // 2
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     if weights is not None:
-        lowest = cv2.erode(np.asarray(weights, np.float32), np.ones((3, 3), np.uint8))
+        side = 5 if camera.width % 2 or camera.height % 2 else 3
+        lowest = cv2.erode(np.asarray(weights, np.float32), np.ones((side, side), np.uint8))
         weights = cv2.resize(lowest, size, interpolation=cv2.INTER_NEAREST)
     return camera.resized(*size), small, weights
 

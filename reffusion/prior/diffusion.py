@@ -30,7 +30,7 @@ def embed_text(prior: Prior, prompts: list[str]) -> Tensor:
         ValueError: The text encoder was dropped (`model.drop_text_encoders`).
     """
     if prior.text_encoder is None:
-        raise ValueError("this prior's text encoder was dropped; embed every prompt before `without_text`")
+        raise ValueError("this prior's text encoder was dropped; embed every prompt before `drop_text_encoders`")
     if prior.text_encoder_2 is None:
         return prior.text_encoder(
             _token_ids(prior.tokenizer, prior.text_encoder, prompts, prior.device)
