@@ -78,7 +78,7 @@ def srgb(color):
 
 
 def cell(t):
-    """Return (index of the unit cell, position within the cell in [0, 1)) of each coordinate t."""
+    """Return the cell of each coordinate t, in units of cells: (floor(t) as int, position t - floor(t) in the cell)."""
     number = np.floor(t).astype(int)
     return number, t - number
 

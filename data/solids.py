@@ -58,7 +58,8 @@ class Faces(NamedTuple):
         swap: [f] bool, True if u and v are exchanged before the mapping.
         tint: [f, 3] factor on the linear colour of the texture.
         size: [f, 2] extent along u and v, metres.
-        grid: [f, 3] first node, number of columns and number of rows of the face's light map.
+        grid: [f, 3] the face's light map: index of its first node among the nodes of all faces, number of columns, and
+            number of rows.
     """
 
     texture: np.ndarray

@@ -69,7 +69,10 @@ def relative(value: torch.Tensor, truth: torch.Tensor) -> float:
 
 
 def errors(gaussians: Gaussians) -> tuple[float, float]:
-    """Return the relative L2 errors of the float32 rasterizer: of the image, and of its worst gradient."""
+    """Return relative L2 errors of the float32 rasterizer: of the image, and the largest of all parameters' gradients.
+
+    The truth is the pure-torch rasterizer in float64.
+    """
     (picture, slopes), (color, gradients) = step(gaussians.map(torch.Tensor.float), "cpu"), step(gaussians, "torch")
     return relative(picture, color), max(relative(a, b) for a, b in zip(slopes, gradients, strict=True))
 

@@ -99,7 +99,7 @@ def unseen_shares(run: Path, scene: Path | None) -> dict[str, float]:
         generator's truth, for training and for test views.
     """
     share = {"by masks": round(load_json(stage_folder(run, "masks") / "facts.json")["unobserved_share"], 3)}
-    facts = load_json(scene / "truth/facts.json")["unobserved_share"] if scene else {}
+    facts = load_json(scene / "truth/facts.json")["never_seen_share"] if scene else {}
     return share | {f"by rays, {kind} views": round(value, 3) for kind, value in facts.items() if value is not None}
 
 

@@ -22,6 +22,7 @@ from reffusion.clicks.all_views import remove_rim
 from reffusion.clicks.marks import UNKNOWN, Clicks
 from reffusion.clicks.segmenter import Candidate, Prompt
 from reffusion.clicks.single_view import ViewEvidence, bounding_box, erode, refine_edges
+from reffusion.clicks.supports import on_supports
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
@@ -38,6 +39,7 @@ MIN_AGAINST, MAX_FOR = 0.5, 0.2
 MIN_DEPTH = 0.3
 MIN_DEPTH_PX = 1.5
 WHOLE_BONUS = 0.03  # added to the merit of the network's mask of the largest object: early votes cover only parts
+MAX_OTHER_SHARE = 0.2  # a Gaussian with a smaller share of votes for the object is surely not the object
 MIN_AGREEMENT = 0.8  # `agreement` with the votes so far that a network's mask must exceed to vote itself
 
 
@@ -93,12 +95,13 @@ def propagate_masks(
     order = order_by_distance(cameras, masks)
     for k in trace.progress(len(order), "masks from view to view"):
         name = order[k]
-        view, projection = evidence_of(name), project_votes(gaussians, cameras[name], votes)
+        view, projection = evidence_of(name), project_votes(gaussians, cameras[name], assume_supports(gaussians, votes))
         if view.ask is None or projection.silhouette.sum() < MIN_PIXELS:
             continue
         drawn[name] = mask = draw_mask(view, projection)
         if agreement(mask, projection) > MIN_AGREEMENT:
             votes = votes.plus(count_votes(gaussians, cameras[name], mask))
+    votes = assume_supports(gaussians, votes)
     return dict(masks) | {
         name: combine(evidence_of(name).image, project_votes(gaussians, cameras[name], votes), drawn.get(name))
         for name in order
@@ -128,6 +131,15 @@ def count_votes(gaussians: Gaussians, camera: Camera, mask: np.ndarray) -> np.nd
     """
     ballots = torch.as_tensor(np.stack([remove_rim(mask), remove_rim(~mask)], -1), dtype=gaussians.means.dtype)
     return rasterizer.accumulate(gaussians, camera, ballots.to(gaussians.means.device)).cpu().numpy()
+
+
+def assume_supports(gaussians: Gaussians, votes: Votes) -> Votes:
+    """Add votes against the object for Gaussians without a label on the planes that it stands on."""
+    weight = votes.counts.sum(1)
+    known, share = weight > votes.least, votes.counts[:, 0] / np.maximum(weight, 1e-9)
+    is_object, is_other = known & (share > 0.5), known & (share < MAX_OTHER_SHARE)
+    assumed = on_supports(gaussians.means.detach().double().cpu().numpy(), is_object, is_other) & ~known
+    return Votes(np.where(assumed[:, None], (0.0, 1.01 * votes.least), votes.counts), votes.least)
 
 
 @torch.no_grad()

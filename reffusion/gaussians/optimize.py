@@ -252,10 +252,10 @@ class GaussianOptimizer:
             setattr(self, name, getattr(self, name)[keep])
 
     def append(self, gaussians: Gaussians, masked: Tensor) -> None:
-        """Append M Gaussians with zero moments; the running mean is discarded.
+        """Append M Gaussians, whose Adam moments start at zero. The mean over steps (`remember`) is discarded.
 
         Args:
-            masked: [M] bool, their labels.
+            masked: [M] bool, the labels of the new Gaussians, see `masked` of the class.
         """
         self._mean, self._meant = None, 0
         self.gaussians = self.gaussians.zip_map(gaussians, lambda a, b: _leaf(torch.cat([a, b])))

@@ -58,7 +58,7 @@ def detect() -> Machine:
 def find_missing(here: Machine, memory_gb: float = 0.0, splats: bool = True, memory_param: str = "") -> list[str]:
     """Return what prevents this machine from running a stage on CUDA, one line each with the remedy.
 
-    The NVIDIA driver must be present; its absence is reported elsewhere (`plan`).
+    The function assumes that an NVIDIA driver is present. The command `plan` reports a missing driver before.
 
     Args:
         here: this machine, from `detect`.

@@ -210,8 +210,8 @@ def load_references(reference_dir: Path, scene: Scene) -> list[Reference]:
     """Read the references that `save_references` wrote, sorted by view name.
 
     Raises:
-        ValueError: a reference belongs to no view of the scene, has no mask, or is not of its view's size. The message
-            names the file.
+        ValueError: a reference belongs to no view of the scene or has no mask, or its picture, mask or depth is not of
+            the view's size. The message names the picture's file.
     """
     from reffusion.types import Reference
 

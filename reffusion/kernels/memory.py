@@ -82,7 +82,9 @@ def _element(context, builder, kinds, values, lane: int):
 
 @intrinsic
 def load_column(typing, array, width, column, row, last):
-    """Load one column of LANES consecutive rows of a float32 array [R, width] (flat).
+    """Return a vector of LANES numbers: the elements of one column, in consecutive rows, of a float32 array.
+
+    The array is [R, width], stored flat.
 
     Args:
         row: the first of these rows.

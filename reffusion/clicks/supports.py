@@ -1,0 +1,55 @@
+"""Planes beside the object, such as the floor, a table or the top of a plinth, as evidence for what is not the object.
+
+The first masks label only the Gaussians that their views show. Elsewhere a segmentation network may take the object
+and what it stands on for one thing, such as a statue and its plinth of the same stone. The labelled part of the plinth
+lies on planes. Gaussians without a label on the same planes belong to the plinth, too, until masks of further views
+label them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from reffusion import seeding
+from reffusion.background.plane_fit import ransac_plane
+
+# Lengths are shares of the object's radius: the 95 % quantile of the distance of its Gaussians from their median.
+REACH = 2.0  # Gaussians farther from the object's median are not considered
+INLIER_DISTANCE = 0.02
+PLANES = 3  # largest number of planes
+MIN_SHARE = 0.1  # share of the Gaussians around the object with the label "not the object" that a plane must hold
+MAX_OBJECT_SHARE = 0.1  # a plane that holds a larger share of the object's Gaussians is none of its supports
+MIN_GAUSSIANS = 20  # least number of the object's Gaussians, and of those of a plane
+SAMPLES = 4000  # largest number of Gaussians in which planes are searched
+
+
+def on_supports(means: np.ndarray, is_object: np.ndarray, is_other: np.ndarray) -> np.ndarray:
+    """Return bool [N], True for Gaussians on planes that hold many Gaussians of the rest of the scene, but few of the
+    object.
+
+    Args:
+        means: [N, 3] positions of the Gaussians.
+        is_object: bool [N], Gaussians labelled as the object.
+        is_other: bool [N], Gaussians labelled as not the object. The others have no label.
+    """
+    found = np.zeros(len(means), bool)
+    if is_object.sum() < MIN_GAUSSIANS:
+        return found
+    center = np.median(means[is_object], 0)
+    distance = np.linalg.norm(means - center, axis=1)
+    radius = np.quantile(distance[is_object], 0.95)
+    near, generator = distance < REACH * radius, np.random.default_rng(seeding.seed_for(0, "supports"))
+    points = means[near & is_other]
+    points = points[generator.permutation(len(points))[:SAMPLES]]
+    least, inlier_distance = max(MIN_GAUSSIANS, MIN_SHARE * len(points)), INLIER_DISTANCE * radius
+    for _ in range(PLANES):
+        if len(points) < least:
+            break
+        normal, offset, count = ransac_plane(points, inlier_distance, generator)
+        if count < least:
+            break
+        on_plane = np.abs(means @ normal - offset) < inlier_distance
+        if on_plane[is_object].mean() < MAX_OBJECT_SHARE:
+            found |= on_plane & near
+        points = points[np.abs(points @ normal - offset) >= inlier_distance]
+    return found
