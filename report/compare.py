@@ -167,8 +167,9 @@ def _cell(row: dict[str, Any], name: str) -> str:
 def difference_table(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]] | None:
     """Return header and rows of the table of differences: each method's score minus the full method's score.
 
-    A cell has the mean difference, half its 95% confidence interval over views and, in brackets, half its interval over
-    scenes if there are several. The result is None if no differences are known.
+    There is a row for each method except the full one and those whose job equals another method's. A cell has the mean
+    difference, half the width of its 95% confidence interval over views and, in brackets, half the width of its interval
+    over scenes if there are several. The result is None if no differences are known.
     """
     metrics = [metric for metric in SCORES if any(row[f"{metric}_minus_full"] is not None for row in table)]
     others = [row for row in table if row["method"] != FULL and not row["same_as"]]

@@ -72,7 +72,7 @@ def read_json(path: Path) -> Any:
 
 
 def read_receipt(artifact: Path) -> dict[str, Any] | None:
-    """Read the receipt in the folder of an artifact; None if it is missing or lacks one of `RECEIPT_KEYS`."""
+    """Read the receipt in the folder of an artifact; None if it is missing, is not valid JSON, or lacks one of `RECEIPT_KEYS`."""
     found = read_json(artifact / RECEIPT)
     return found if isinstance(found, dict) and found.keys() >= RECEIPT_KEYS else None
 

@@ -120,9 +120,10 @@ def stack_layers(
 
 
 def copy_scene_keys(pipeline: Pipeline, overrides: Overrides) -> Overrides:
-    """Copy each key of scene.yaml that `overrides` sets for one stage to all other stages that read this key.
+    """Return new overrides in which a key of scene.yaml has one value for all stages that read this key.
 
-    A stage for which the key is already set keeps its value.
+    A key that `overrides` sets for one stage is also set for the other stages that read the key, wherever the value
+    comes from: scene.yaml, a variant or `set=`. A stage for which the key is already set keeps its value.
     """
     found = {stage: dict(params) for stage, params in overrides.items()}
     for stage, params in overrides.items():

@@ -110,7 +110,10 @@ def strong_guidance_error() -> float:
 
 
 def equal_prompts_error() -> float:
-    """Return the change of eps by guidance 100 between equal prompts, relative to eps; it must change nothing."""
+    """Return the largest change of eps by guidance 100 if the empty prompt equals the prompt, over the largest |eps|.
+
+    Only rounding may change eps.
+    """
     _, eps, _ = predict(500)
     return ((predict(500, 100.0, prompts()[:1])[1] - eps).abs().max() / eps.abs().max()).item()
 
@@ -176,9 +179,9 @@ def full_mask_leak() -> float:
 
 
 def empty_mask_error() -> float:
-    """Return the difference of the conditioning from the picture's latents if the mask is empty.
+    """Return the largest deviation of the conditioning from (0, the picture's latents) if the mask is empty.
 
-    They must be equal bit for bit.
+    The first channel of the conditioning is the mask. The deviation must be 0.
     """
     with torch.no_grad():
         condition = diffusion.conditioning(model(), images(), torch.zeros(1, 1, SIZE, SIZE))

@@ -63,8 +63,8 @@ def solver_errors() -> dict[str, tuple[float, list[tuple[float, float]]]]:
     """Solve the bilateral solver's system by conjugate gradients with and without preconditioning.
 
     Returns:
-        Kind of preconditioning ("none", "Jacobi") -> (condition number, list of (seconds, relative L2 error) after each
-        step).
+        Kind of preconditioning ("none", "Jacobi") -> (condition number, list with an entry for each step: seconds
+        since the start, L2 error relative to the direct solution).
     """
     misfit, confidence, guide = make_maps()
     system, cell = bilateral.build_system(confidence, guide)
