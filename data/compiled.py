@@ -32,7 +32,8 @@ def _folder() -> Path:
 def kernel(parallel: bool = False, inline: str = "never") -> Callable:
     """Return a decorator that compiles a function with numba at its first call and caches the machine code on disk.
 
-    Later processes load the machine code from the cache. If this folder is not writable, numba uses the user's cache.
+    Later processes load the machine code from the cache. The cache is in the __pycache__ of this module's folder, or in
+    the user's cache of numba if that is not writable.
 
     Args:
         parallel: True runs `prange` loops in several threads.

@@ -22,7 +22,9 @@ from room import furnish
 
 
 def camera_row(world_to_camera: np.ndarray, frame: Frame) -> np.ndarray:
-    """Return a camera of the ray caster, [16], with focal length 1 and without distortion.
+    """Return a camera of the ray caster, [16], of a given pose, with focal length 1 and without distortion.
+
+    So its image points are the points (x, y) on the plane at camera z = 1.
 
     Args:
         world_to_camera: pose [4, 4] in the scene frame.

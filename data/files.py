@@ -75,7 +75,8 @@ def write_poses_bounds(path: Path, kind: Kind, cameras: np.ndarray, frame: Frame
 
     Each row has a 3 x 5 matrix, row by row, and the near and far depth. The columns of the matrix are the directions
     down, right and backwards, the camera centre, and (height, width, focal length). Near and far are the 0.1 and 99.9
-    percentiles of the sparse points' depths.
+    percentiles of the depths of all sparse points in front of the camera, also of those that the camera does not show.
+    Centres and depths are in the scene frame.
     """
     rows = []
     positions = frame.points(points.positions)
@@ -99,7 +100,8 @@ def write_image(path: Path, image: np.ndarray) -> None:
 def write_truth_cameras(path: Path, kind: Kind, names: list[str], cameras: np.ndarray, frame: Frame) -> None:
     """Write a JSON file with the true cameras.
 
-    It has the SIMPLE_RADIAL intrinsics at the size of the written images, and each view's pose in the scene frame.
+    It has the SIMPLE_RADIAL intrinsics at the size of the written images, which all views share, and each view's
+    world-to-camera pose in the scene frame.
     """
     f, cx, cy, k1 = cameras[0, :4].tolist()
     views = {name: frame.world_to_camera(c).tolist() for name, c in zip(names, cameras, strict=True)}

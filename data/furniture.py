@@ -54,7 +54,13 @@ class Furniture:
         self.materials += materials
 
     def room(self, center, half, right, left, ceiling, floor, front, back):
-        """Add the room, which must come first. The other arguments are a centre, half extents and six materials."""
+        """Add the room, which must come first.
+
+        Args:
+            center: (x, y, z), metres.
+            half: half extents (x, y, z), metres.
+            right, left, ceiling, floor, front, back: materials. The front wall is at +z, behind the cameras.
+        """
         self._add(ROOM, center, half, 0.0, [right, left, ceiling, floor, front, back], False)
 
     def box(self, x, bottom, z, size, sides, front=None, top=None, yaw=0.0, removable=False):
@@ -74,16 +80,26 @@ class Furniture:
         self._add(BOX, (x, bottom + half[1], z), half, yaw, faces, removable)
 
     def sphere(self, x, bottom, z, radius, material, yaw=0.0, removable=False):
-        """Add a sphere whose lowest point is at the height `bottom`, metres."""
+        """Add a sphere whose lowest point is at the height `bottom`; x and z are its centre (all in metres)."""
         self._add(SPHERE, (x, bottom + radius, z), (radius,) * 3, yaw, [material], removable)
 
     def cylinder(self, x, bottom, z, radius, high, side, top=None, removable=False):
-        """Add an upright cylinder whose lower face is at the height `bottom`, metres, with the material `side`."""
+        """Add an upright cylinder.
+
+        Args:
+            x: centre, metres.
+            bottom: height of its lower face, metres.
+            z: centre, metres.
+            radius: metres.
+            high: metres.
+            side: material of the side and of the lower face.
+            top: material of the upper face; None for `side`.
+        """
         half = (radius, high / 2, radius)
         self._add(CYLINDER, (x, bottom + high / 2, z), half, 0.0, [side, top or side, side], removable)
 
     def thicket(self, x, bottom, z, size, cell, leaf, material, seed, yaw=0.0):
-        """Add a box full of leaves, see `thicket.py`.
+        """Add a box full of leaves, see `thicket.py`, that is not removable. Its position is given as in `box`.
 
         Args:
             size: (wide, high, deep) of the box, metres.
@@ -102,7 +118,8 @@ class Furniture:
 
         Args:
             index: name of a texture -> its index.
-            node: distance between nodes of the light map, metres.
+            node: approximate distance between nodes of the light map, metres; four times as much on the ceiling and the
+                front wall. A face has 5 to 256 nodes along each side.
         """
         return self._solid_arrays(), self._face_arrays(index, node)
 
@@ -188,7 +205,10 @@ def shelf(f: Furniture, draw, x: float, z: float, wide: float, yaw: float = 0.0)
 
 
 def cabinet(f: Furniture, draw, x: float, z: float, wide: float, high: float, deep: float) -> None:
-    """Add the removable object of the kind "demo": a cabinet with a ball and a jar on it; z is the cabinet's back."""
+    """Add the removable object of "demo" and most other kinds: a cabinet with a ball and a jar on it.
+
+    x is the cabinet's centre, and z its back.
+    """
     body = Material("paint", 1.3)
     f.box(x, 0, z + deep / 2, (wide, high, deep), body, Material("front"), removable=True)
     f.box(x, high, z + deep / 2, (wide + 0.04, 0.025, deep + 0.02), WOOD, removable=True)
@@ -248,7 +268,7 @@ def chest(f: Furniture, draw, x: float, bottom: float, z: float) -> None:
 def keepsake(f: Furniture, draw, x: float, z: float) -> None:
     """Add an object that is not removed: a large ball, or a stool with a globe.
 
-    In the kind "behind" it stands before the removable object.
+    In the kind "behind" it stands before the removable object. In the kind "sparse" it takes the place of this object.
     """
     if draw.random() < 0.5:
         f.sphere(x, 0, z, draw.uniform(0.24, 0.28), Material("globe"), draw.uniform(0, 360))

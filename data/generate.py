@@ -54,8 +54,10 @@ def generate(out: Path, seed: int, kind: Kind) -> dict:
         The facts as in truth/facts.json, see `_facts`.
 
     Raises:
-        ValueError: `out` has files that this script did not write or that have changed since; or the share of the masks
-            whose background no training view shows is below the kind's `least` (for a hanging object: too large).
+        ValueError: `out` has files that this script did not write or that have changed since; or, if the task is to
+            remove an object, the mean share of the masks whose background no training view shows is below the kind's
+            `least` for training or test views (for a hanging object: above `MOST_NEVER_SEEN`). An earlier scene stays
+            as it is.
     """
     if out.exists() and any(out.iterdir()) and not (out / "truth/facts.json").exists():
         raise ValueError(f"{out} holds files that data/generate.py did not write; name another folder, or empty it")

@@ -13,6 +13,6 @@ GREENS = (
 
 
 def foliage(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Return a tileable texture of greens, [size, size, 3] float32 sRGB in [0, 1], with fine and coarse variations."""
+    """Return a tileable texture of greens, [size, size, 3] float sRGB in [0, 1], with fine and coarse variations."""
     tone = 0.5 + 0.2 * fbm(rng, size, 64, 64, 2) + 0.1 * fbm(rng, size, 4, 4, 3)
     return ramp(np.clip(tone, 0, 1), *GREENS[rng.integers(len(GREENS))])

@@ -25,7 +25,7 @@ class Kind:
         texture: pixels along a side of the largest textures.
         node: distance between nodes of the light map, metres.
         bend: largest distortion coefficient k1 of COLMAP's SIMPLE_RADIAL.
-        points: number of sparse points.
+        points: largest number of sparse points.
         hangs: True if the object hangs in mid-air, so that other views show everything that it hides.
         place: where the object is: "room" (against a wall), "behind" (another object, which stays, is in front),
             "table" (on the edge of a table), "corner" (in front of the corner of a wall), "grass" (on a lawn), "floor"
@@ -33,10 +33,12 @@ class Kind:
         task: what the scene asks for. "remove": remove the object. "insert": insert the object, which only the test
             views and the references show. "outpaint": continue the scene beyond a sphere. "sparse": no object is
             removed or inserted, but few views have pixels.
-        references: number of completed views in the scene's folder. For outpainting it has no effect: there are as many
-            references as are needed to show everything.
-        shown: number of training views with pixels; the other training views are cameras only. 0: all have pixels.
-        least: smallest allowed share of the masks whose background no training view shows, in [0, 1].
+        references: number of references in the scene's folder for the tasks "remove" (none if the object hangs) and
+            "insert". For "outpaint" there are as many as are needed to show everything, for "sparse" there are `shown`.
+        shown: for the task "sparse" the number of training views with pixels; the other training views are cameras
+            only. 0 for all other tasks, in which all training views have pixels.
+        least: smallest allowed mean share of the masks whose background no training view shows, in [0, 1]. It is
+            checked for the task "remove" only, unless the object hangs.
         low: height of the lowest cameras above the floor, metres; None for cameras at eye level.
     """
 

@@ -15,7 +15,13 @@ from solids import is_blocked, nearest, on_face, surface
 
 @kernel()
 def irradiance(faces, light, face, u, v, out):
-    """Interpolate the face's light map bilinearly at (u, v), in metres, and write the result to `out` [3]."""
+    """Interpolate the light map of a face bilinearly, and write the result, irradiance / pi, to `out` [3].
+
+    Args:
+        light: [M, 3] light map of all faces.
+        face: number of the face among the faces of all solids.
+        u, v: point on the face, metres; clamped to the face.
+    """
     start, columns, rows = faces.grid[face, 0], faces.grid[face, 1], faces.grid[face, 2]
     x = min(max(u / faces.size[face, 0], 0.0), 1.0) * (columns - 1)
     y = min(max(v / faces.size[face, 1], 0.0), 1.0) * (rows - 1)
@@ -109,14 +115,15 @@ def _lamp_sum(solids, with_object, point, normal, lamp, side):
 
 @kernel(parallel=True)
 def bounced_light(solids, faces, textures, points, normals, owner, light, ambient, rays):
-    """Compute the light [M, 3] at the nodes that surfaces reflect, after one bounce.
+    """Compute the light [M, 3], as irradiance / pi, that reaches the nodes from other surfaces after one bounce.
 
-    This is the mean radiance of the surfaces in a cosine-weighted hemisphere about the normal. All nodes use the same
-    low-discrepancy directions, so that neighbouring nodes do not differ by noise.
+    This is the mean radiance of the surfaces in a cosine-weighted hemisphere about the normal, without the light that
+    reaches the nodes directly from lamps. All nodes use the same low-discrepancy directions, so that neighbouring nodes
+    do not differ by noise. As in `direct_light`, the object has an effect on its own nodes only.
 
     Args:
-        light: [M, 3] light at the nodes before this bounce.
-        ambient: constant that is added to the light of all surfaces.
+        light: [M, 3] light at the nodes before this bounce; the surfaces reflect this light.
+        ambient: constant that is added to the light of all surfaces before they reflect it.
         rays: number of directions.
     """
     bounce = np.zeros((points.shape[0], 3))

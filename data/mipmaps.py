@@ -12,7 +12,8 @@ from compiled import kernel
 class Textures(NamedTuple):
     """K square tileable textures with all their mip levels, in one array of texels.
 
-    Level 0 is the full texture; each further level has half the side.
+    Level 0 is the full texture; each further level has half the side, at least 1 px. All textures have the same number
+    of levels.
 
     Attributes:
         texels: [total, 3] uint8 sRGB, all levels of all textures.
@@ -33,10 +34,10 @@ def build_mipmaps(pictures: dict[str, np.ndarray]) -> tuple[Textures, dict[str, 
     """Build the mip levels of all textures, averaged in linear light.
 
     Args:
-        pictures: name -> [N, N, 3] sRGB in [0, 1], N a power of two.
+        pictures: name -> [N, N, 3] sRGB, clipped to [0, 1], N a power of two.
 
     Returns:
-        The textures, and {name: index of the texture}.
+        The textures in the order of `pictures`, and {name: index of the texture}.
     """
     linear = (np.arange(256) / 255.0) ** 2.2
     levels = max(int(np.log2(p.shape[0])) for p in pictures.values()) + 1
@@ -82,7 +83,8 @@ def _texel(textures, k, level, a, b, out, weight):
 def albedo(faces, textures, face, u, v, footprint, out):
     """Write the linear colour of a face at the point (u, v) to `out` [3], averaged over about `footprint` metres.
 
-    u and v are metres on the face. The two mip levels around the footprint are interpolated.
+    The colour is that of the texture times the face's tint, without light. u and v are metres on the face. The two mip
+    levels around the footprint are interpolated.
     """
     if faces.swap[face]:
         u, v = v, u

@@ -1,7 +1,8 @@
 """Components of textures: tileable noise, coordinates, colour ramps.
 
-Pictures are [N, N] or [N, N, 3] float32. A *tile* is the whole picture; coordinates in tiles run from 0 to 1. A *cell*
-is one of the equal parts into which a pattern divides the tile, e.g. the place of a brick.
+Pictures are [N, N] or [N, N, 3] arrays of floats, float32 or float64. A *tile* is the whole picture; coordinates in
+tiles run from 0 to 1. A *cell* is one of the equal parts into which a pattern divides the tile, e.g. the place of a
+brick.
 """
 
 from __future__ import annotations
@@ -11,7 +12,10 @@ import numpy as np
 
 
 def noise(rng, size, rows, columns):
-    """Return smooth tileable noise [size, size] in about [-1, 1], interpolated from rows x columns random values."""
+    """Return smooth tileable noise [size, size] in about [-1, 1], interpolated from rows x columns random values.
+
+    `rows` and `columns` must divide `size`; otherwise the noise is not tileable.
+    """
     nodes = np.pad(rng.random((rows, columns), dtype=np.float32) * 2 - 1, 2, mode="wrap")
     high, wide = size // rows, size // columns
     big = cv2.resize(nodes, (nodes.shape[1] * wide, nodes.shape[0] * high), interpolation=cv2.INTER_CUBIC)
@@ -50,7 +54,12 @@ def step(edge0, edge1, x):
 
 
 def ramp(t, *colors):
-    """Return colours [N, N, 3] in [0, 1], interpolated along a palette of byte colours at t [N, N] in [0, 1]."""
+    """Return colours [N, N, 3] in [0, 1], interpolated along a palette at t [N, N].
+
+    Args:
+        t: place in the palette: 0 is its first colour, 1 its last; values outside [0, 1] get these colours.
+        colors: the palette, evenly spaced colours in bytes.
+    """
     palette = np.asarray(colors, np.float32) / 255
     return np.stack([np.interp(t, np.linspace(0, 1, len(palette)), palette[:, c]) for c in range(3)], -1)
 
@@ -61,7 +70,12 @@ def blend(a, b, t):
 
 
 def shift(image, x, y):
-    """Return a tileable picture [N, N] sampled bilinearly at the coordinates (x, y), [N, N] each, in tiles."""
+    """Return the values [N, N] of a tileable picture [N, N] at the coordinates (x, y), by bilinear interpolation.
+
+    Args:
+        x: [N, N] horizontal coordinates in tiles; any number, as the picture repeats.
+        y: [N, N] vertical coordinates, likewise.
+    """
     size = np.float32(image.shape[0])
     return cv2.remap(
         image,

@@ -26,11 +26,12 @@ class Session:
         photos: uint8 [V, H, W, 3].
         masks: bool [V, H, W], True for pixels that the object touches, or would touch in a view without the object.
         hidden: bool [V, H, W], True for masked pixels whose background no training view shows.
-        middle: index of the training view nearest to the middle of the walk.
+        middle: index, among all V views, of the training view nearest to the mean position of the training cameras (if
+            the kind has low cameras: to the mean position at the height of the highest camera).
         completions: view index -> uint8 [H, W, 3], the picture that the task asks for (without the object where it is
             to be removed). The first `Kind.references` views of `spread` have one.
-        spread: indices of training views that are far apart: the middle view, then each time the view farthest from
-            all views before.
+        spread: indices, among all V views, of at most `SPREAD` training views that are far apart: the middle view, then
+            each time the view whose distance to the nearest view chosen before is largest.
         object_masks: name of an object -> bool [V, H, W], the object's mask; only objects with masks of their own.
     """
 
@@ -73,7 +74,7 @@ def take_photographs(seed: int, kind: Kind, world: World, target: np.ndarray) ->
 
 
 def _spread(cameras: np.ndarray, first: int, count: int) -> list[int]:
-    """Return the indices of `count` cameras: `first`, then each time the camera farthest from all chosen ones."""
+    """Return the indices of `count` cameras: `first`, then each time the one farthest from its nearest chosen one."""
     chosen, distance = [first], np.full(len(cameras), np.inf)
     while len(chosen) < count:
         distance = np.minimum(distance, np.linalg.norm(cameras[:, 13:] - cameras[chosen[-1], 13:], axis=1))
@@ -105,7 +106,7 @@ def path(seed: int, kind: Kind, target: np.ndarray, count: int, label: str) -> n
     Args:
         seed: seed of the scene.
         kind: kind of the scene.
-        target: [3], the point that the cameras look at, metres.
+        target: [3], the point at which the cameras look approximately, metres.
         count: number of cameras.
         label: "train" or "test"; each has a walk of its own, and the test cameras reach less far to the sides.
     """
@@ -196,7 +197,7 @@ def _radiance(world: World, camera, kind: Kind, with_object: bool, samples: int)
 
 
 def set_exposure(world: World, camera: np.ndarray, kind: Kind) -> World:
-    """Return the world with the exposure at which the mean of a view is 128 of 255, without the object.
+    """Return the world with the exposure at which the mean byte of a view without the object is 128.
 
     Args:
         camera: [16], camera of the view.

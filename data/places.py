@@ -1,8 +1,8 @@
 """Places where the removal of an object is harder than before a wall: a table's edge, a wall's corner, a garden.
 
-`table_room`, `wall_corner` and `garden` furnish an empty room and return the point [3] that the cameras look at, in
-metres. Their arguments are the furniture to fill, a random generator, and the material of the floor. Room frame: x
-right, y up, z towards the cameras; the back wall is z = 0.
+`table_room`, `wall_corner` and `garden` add a room, everything in it and the removable object to an empty `Furniture`,
+and return the point [3] that the cameras look at, in metres. Their other arguments are a random generator and the
+material of the floor. Room frame: x right, y up, z towards the cameras; the back wall is z = 0.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ RUG = Material("rug")
 
 
 def shell(f: Furniture, draw, planks: Material, side: int, corner: float) -> None:
-    """Add an empty room with skirting boards.
+    """Add a room with skirting boards and nothing else.
 
     Args:
-        f: furniture to add to.
+        f: furniture to add to; it must be empty.
         draw: random generator.
         planks: material of the floor.
         side: 1 if the near side wall is on the right, -1 if on the left.
-        corner: distance of the near side wall from the middle, metres.
+        corner: distance of the near side wall from x = 0, metres; that of the other side wall is 4 m.
     """
     left, right = (-corner, 4.0) if side < 0 else (-4.0, corner)
     middle = (left + right) / 2

@@ -198,8 +198,14 @@ def _reaches(solids, camera, with_object, px, py, pz):
 def observations(solids, cameras, width, height, points):
     """Project room points [P, 3] into V views with the object.
 
+    Args:
+        cameras: [V, 16].
+        width: image width, px.
+        height: image height, px.
+        points: [P, 3], room points on surfaces.
+
     Returns:
-        Image points [P, V, 2], NaN where the point is occluded or outside the frame.
+        Image points [P, V, 2], NaN where the point is occluded, also by the object, or outside the image.
     """
     pixels = np.full((points.shape[0], cameras.shape[0], 2), np.nan)
     for n in prange(points.shape[0]):
@@ -215,6 +221,8 @@ def observations(solids, cameras, width, height, points):
 @kernel(parallel=True)
 def never_seen(solids, cameras, masks, points):
     """Return bool [P], True for the background points that no training view shows outside the view's own mask.
+
+    The object and all other solids occlude points in the training views.
 
     Args:
         cameras: [V, 16], cameras of the training views.

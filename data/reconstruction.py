@@ -59,7 +59,7 @@ class SparsePoints:
 
 
 def sparse_points(seed: int, kind: Kind, world: World, cameras: np.ndarray, photos: np.ndarray) -> SparsePoints:
-    """Make sparse points on textured surfaces that are matched in at least 3 training views.
+    """Make at most `kind.points` sparse points on textured surfaces, each matched in at least 3 training views.
 
     Args:
         seed: seed of the scene.

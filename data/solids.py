@@ -48,9 +48,9 @@ class Solids(NamedTuple):
 
 
 class Faces(NamedTuple):
-    """Arrays of f faces of solids, with the materials. A point of a face has coordinates (u, v) in metres.
+    """Arrays of f faces of solids, with the materials.
 
-    On upright faces v points down.
+    A point of a face has coordinates (u, v) in metres, from 0 to `size`. On upright faces v points down.
 
     Attributes:
         texture: [f] index of the texture.
@@ -108,7 +108,8 @@ def _in_cylinder(ox, oy, oz, dx, dy, dz, radius, half):
 def distance(solids, i, ox, oy, oz, dx, dy, dz):
     """Return the distance to solid i along the ray from o in the unit direction d, or 1e30 if the ray misses it.
 
-    For a ray that starts inside the solid, this is the distance to the solid's far side.
+    For a ray that starts inside the solid, this is the distance to the solid's far side. For a thicket, it is the
+    distance to the first leaf. Surfaces nearer than `EPSILON` are ignored.
     """
     if solids.kind[i] == THICKET:  # a separate function, because in one function all solids would take twice the time
         return _to_thicket(solids, i, ox, oy, oz, dx, dy, dz)
@@ -183,7 +184,11 @@ def is_blocked(solids, with_object, ox, oy, oz, dx, dy, dz, limit):
 
 @kernel()
 def surface(solids, i, px, py, pz):
-    """Return (face, u, v, normal x, normal y, normal z) of a room point on the surface of solid i; u, v in metres."""
+    """Return (face, u, v, normal x, normal y, normal z) of a room point on the surface of solid i; u, v in metres.
+
+    `face` is the number of the face among the faces of all solids. The unit normal points outward; that of the room
+    points into the room, and that of a thicket is the normal of the leaf.
+    """
     ax, ay, az = px - solids.center[i, 0], py - solids.center[i, 1], pz - solids.center[i, 2]
     c, s = solids.turn[i, 0], solids.turn[i, 1]
     x, y, z = c * ax - s * az, ay, s * ax + c * az
@@ -213,7 +218,7 @@ def surface(solids, i, px, py, pz):
 
 @kernel()
 def on_face(solids, i, local, u, v):
-    """Return the room point and the outward normal at (u, v) of a face of solid i, as six numbers.
+    """Return the room point and the unit outward normal at (u, v) of a face of solid i, as six numbers.
 
     This is the inverse of `surface`, except that the point of a thicket is on the face of its box, not on a leaf. The
     normal of the room points into the room.

@@ -25,7 +25,7 @@ def without_object(solids: Solids) -> Solids:
 
 
 def bounding_region(solids: Solids) -> tuple[np.ndarray, float]:
-    """Return a sphere around the removable solids as (centre [3], radius), in metres."""
+    """Return a sphere around the removable solids, with a margin, as (centre [3], radius), metres in the room frame."""
     center, reach = solids.center[solids.removable], solids.reach[solids.removable]
     half = solids.half[solids.removable]
     middle = ((center - half).min(0) + (center + half).max(0)) / 2
@@ -60,9 +60,11 @@ def outside_sphere(camera: np.ndarray, kind: Kind, world: World, center: np.ndar
 def choose_covering_views(cameras: np.ndarray, kind: Kind, world: World, center: np.ndarray, first: int) -> list[int]:
     """Choose cameras greedily until they show `COVERED` of the points beyond the sphere that any camera shows.
 
+    The points are samples of the surfaces at the pixels whose rays miss the sphere, see `outside_sphere`.
+
     Args:
         cameras: [V, 16].
-        center: [3], centre of the sphere.
+        center: [3], centre of the sphere with the radius `SPHERE`.
         first: index of the camera to begin with.
 
     Returns:

@@ -1,7 +1,8 @@
-"""Procedural textures: square, tileable (or fitted to one face), [N, N, 3] float32 sRGB in [0, 1], N a power of two.
+"""Procedural textures: square, tileable (or fitted to one face), [N, N, 3] floats, sRGB from 0 to about 1.
 
-Each function makes one kind of texture. Its arguments are a numpy random generator `rng` and N, called `size`. Colours
-are in bytes. A texture *fitted to its face* is stretched over one whole face instead of repeated.
+Each function makes one kind of texture. Its arguments are a numpy random generator `rng` and N, called `size`, which is
+a power of two. `mipmaps.build_mipmaps` clips values above 1. Arguments that are colours are in bytes. A texture *fitted
+to its face* is stretched over one whole face instead of repeated.
 """
 
 from __future__ import annotations
@@ -176,7 +177,7 @@ def rug(rng, size):
 
 
 def books(rng, size, thick=1.0):
-    """Make a row of book spines, fitted to its face; `thick` is a factor on their width."""
+    """Make a row of book spines, fitted to its face; `thick` is a factor on the width of the spines."""
     color = np.full((size, size, 3), 0.05, np.float32)
     x = 0
     while x < size:
@@ -273,7 +274,10 @@ def plain_paint(rng, size, color=(30, 120, 120)):
 
 
 def ball(rng, size, first=(214, 66, 48), second=(240, 226, 196)):
-    """Make the wedges of a beach ball about a tilted axis; x is the longitude and y the latitude of a sphere."""
+    """Make a beach ball, fitted to a sphere: x is the longitude and y the latitude.
+
+    Its wedges about a tilted axis alternate between the colours `first` and `second`; its caps are yellow.
+    """
     x, y = grid(size)
     longitude, latitude = x * 6.2832, y * 3.1416
     p = np.stack([np.sin(latitude) * np.cos(longitude), np.cos(latitude), np.sin(latitude) * np.sin(longitude)], -1)
@@ -289,7 +293,10 @@ def ball(rng, size, first=(214, 66, 48), second=(240, 226, 196)):
 
 
 def quilt(rng, size, first=(214, 66, 48), second=(240, 226, 196), cells=8):
-    """Make a patchwork of triangles in shades of two hues, stitched along the seams; cells x cells squares of two."""
+    """Make a patchwork of triangles, stitched along the seams: cells x cells squares, each of two triangles.
+
+    One triangle of a square has a shade of `first`, the other one a shade of `second`.
+    """
     x, y = grid(size)
     (i, fx), (j, fy) = cell(x * cells), cell(y * cells)
     flip = rng.integers(0, 2, (cells, cells))[j, i] > 0

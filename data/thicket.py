@@ -125,6 +125,8 @@ def _crossings(solids, n, axis, cell, wide, o, d):
 def first_leaf(solids, n, ox, oy, oz, dx, dy, dz, near, far, min_distance):
     """Return the distance along a ray to the first leaf of solid n, or 1e30 if the ray hits no leaf.
 
+    The ray's origin o and unit direction d are in the coordinates of the box.
+
     Args:
         near: distance at which the ray enters the box.
         far: distance at which the ray leaves the box.
@@ -160,14 +162,15 @@ def first_leaf(solids, n, ox, oy, oz, dx, dy, dz, near, far, min_distance):
 def leaf_light(nx, ny, nz):
     """Return the share of the light that a leaf with the given normal receives, in [`SHADE`, 1].
 
-    The sign of the normal has no effect, because light shines through leaves.
+    The normal is a unit vector in the room frame. The sign of the normal has no effect, because light shines through
+    leaves.
     """
     return SHADE + (1.0 - SHADE) * abs(nx * SKY[0] + ny * SKY[1] + nz * SKY[2])
 
 
 @kernel()
 def leaf_normal(solids, n, x, y, z):
-    """Return the unit outward normal (x, y, z) of the leaf on whose surface the point (x, y, z) lies.
+    """Return the unit outward normal of the leaf on whose surface the point (x, y, z) lies, in the box's coordinates.
 
     If there is no leaf in the point's cell, the result is (0, 1, 0).
     """

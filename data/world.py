@@ -36,9 +36,10 @@ class World:
 
 
 def paint_textures(seed: int, size: int) -> dict[str, np.ndarray]:
-    """Return all textures of a scene, {name: [N, N, 3] float32 sRGB in [0, 1]}, in styles drawn from the seed.
+    """Return all textures of a scene, {name: [N, N, 3] floats, sRGB from 0 to about 1}, in styles drawn from the seed.
 
-    Textures of floor, walls and rug have N = `size`; all other textures have half of `size`, at least 128.
+    Textures of floor, walls and rug have N = `size`; all other textures have half of `size`, at least 128. `size` is a
+    power of two.
     """
     small = max(size // 2, 128)
     draw = randomness(seed, "styles")
@@ -82,9 +83,10 @@ def paint_textures(seed: int, size: int) -> dict[str, np.ndarray]:
 
 
 def bake(furniture: Furniture, seed: int, kind: Kind) -> World:
-    """Add textures and light to the furniture of a room, and return the room ready to be rendered.
+    """Return the room with the given furniture, with textures and baked light, ready to be rendered.
 
-    The light comes from a ceiling lamp and a window, and includes two bounces between surfaces. The exposure is 1.
+    The light comes from a ceiling lamp and a window, and includes two bounces between surfaces. The exposure is 1. The
+    furniture is not changed.
     """
     pictures, index = build_mipmaps(paint_textures(seed, kind.texture))
     solids, faces = furniture.arrays(index, kind.node)

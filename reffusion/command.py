@@ -85,7 +85,10 @@ def installed_version() -> str:
 
 
 def main() -> None:
-    """Run the command that the command line names; exit with status 2 if there is no command of this name."""
+    """Run the command that the command line names; without a name, print the text of `--help`.
+
+    The process exits with status 2 if there is no command of this name, or if the command ends with an error message.
+    """
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name in ("--help", "-h", "help", "--version"):
         with suppress(BrokenPipeError):  # as in `reffusion --help | head`

@@ -67,7 +67,7 @@ def unproject(depth: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def reciprocal(values: np.ndarray) -> np.ndarray:
-    """Return 1 / values where the values are positive, else 0.
+    """Return a new array with 1 / values where the values are positive, else 0.
 
     This converts depth to disparity, and disparity to depth.
 
@@ -97,14 +97,15 @@ def sample_nearest(image: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def angle_between_views(point: np.ndarray, camera: Camera, others: Sequence[Camera]) -> float:
-    """Return the smallest angle at a point between the direction to `camera` and the direction to any other camera.
+    """Return the smallest of the angles at a point between the direction to `camera` and those to the other cameras.
 
     Args:
         point: [3], world coordinates of the vertex of the angle.
         others: at least one camera.
 
     Returns:
-        Degrees in [0, 180]. A camera whose centre is the point has no direction; its angle counts as 180.
+        Degrees in [0, 180]. An angle counts as 180 if the centre of one of its two cameras is the point, because this
+        camera has no direction.
     """
     towards = np.stack([view.center - point for view in (camera, *others)])
     lengths = np.linalg.norm(towards, axis=1)

@@ -13,7 +13,9 @@ HARD = 1e4  # cost that forbids a label, because no sum of the costs of pairs ex
 def min_cut(true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray) -> np.ndarray:
     """Return bool [N], the labelling of N nodes with the smallest total cost, found by a minimum cut.
 
-    The total cost is the sum of the costs of the nodes' labels and of the pairs whose nodes have different labels.
+    The total cost is the sum of the costs of the nodes' labels and of the pairs whose nodes have different labels. It
+    is smallest up to rounding: costs are rounded to multiples of 1 / `UNIT`, and a strength above `HARD` counts as
+    `HARD`.
 
     Args:
         true_cost, false_cost: [N], cost of labelling a node True or False. Only the difference of both matters, and a
@@ -41,14 +43,14 @@ def alpha_expansion(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, s
     """Return int [N] in [0, K), a labelling of N nodes with a low total cost, by expansion moves (Boykov et al. 2001).
 
     The total cost is that of `min_cut`, with K labels. An expansion move gives one label to the set of nodes for which
-    this lowers the total cost most. The moves of all labels are repeated until none lowers the cost. The result is a
-    local minimum.
+    this lowers the total cost most. The moves of all labels are repeated until none lowers the cost by more than
+    1 / `UNIT`. The result is a local minimum.
 
     Args:
         cost: [K, N] >= 0, cost of each label at each node.
         pairs: [E, 2] int, indices of neighbouring nodes, each pair once.
         strength: [E] >= 0, cost of a pair whose nodes have different labels.
-        start: int [N], initial labels.
+        start: int [N], initial labels. They are not modified.
     """
     labels, changed = start.copy(), True
     first, second = pairs.T

@@ -43,7 +43,8 @@ def dilate_by_distance(mask: np.ndarray, fraction: float) -> np.ndarray:
     Unlike `dilate`, this function takes the same time for any radius, so it suits large radii.
 
     Args:
-        fraction: the distance as a fraction of the image's width.
+        fraction: the distance as a fraction of the image's width. It is not rounded to whole pixels: below one pixel
+            the mask stays the same.
     """
     if not mask.any():
         return mask
@@ -79,11 +80,11 @@ def close_mask(mask: np.ndarray, fraction: float) -> np.ndarray:
 def remove_slivers(mask: np.ndarray, fraction: float) -> np.ndarray:
     """Remove slivers from a mask, bool [H, W]: smooth it by a majority vote in a square window, then open it.
 
-    Slivers arise along depth edges.
+    Slivers arise along depth edges. The vote also adds pixels, e.g. in narrow gaps of the mask.
 
     Args:
-        fraction: half of the least width of the parts that remain, as a fraction of the image's width. This is half of
-            the window's side, and the radius of the disk of the opening.
+        fraction: half of the least width of the parts that remain, as a fraction of the image's width, at least one
+            pixel. This is half of the window's side, and the radius of the disk of the opening.
     """
     side = 2 * to_pixels(fraction, mask.shape[1]) + 1
     majority = cv2.blur(mask.astype(np.float32), (side, side), borderType=cv2.BORDER_REPLICATE) > 0.5

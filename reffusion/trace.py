@@ -70,11 +70,12 @@ def clear_checkpoint(folder: Path) -> None:
 class Checkpoints:
     """A schedule of checkpoints that decides when the next one is due, and writes it.
 
-    A checkpoint is due `seconds` after the last one was written. If writing took long, as with a million Gaussians or
-    a slow disk, it is due later: `WORK_PER_CHECKPOINT` times the duration of writing after the last one.
+    A checkpoint is due `seconds` after the last one was written, and the first one `seconds` after this object was
+    made. If writing took long, as with a million Gaussians or a slow disk, the next checkpoint is due later:
+    `WORK_PER_CHECKPOINT` times the duration of writing after the last one.
 
     Args:
-        folder: the folder of the checkpoint.
+        folder: the folder of the checkpoint. Each checkpoint replaces the one before.
         seconds: least time between two checkpoints.
     """
 
@@ -106,9 +107,10 @@ class Trace:
     excludes the time spent inside `with trace.paused():` and between an interruption and the resumed run.
 
     Args:
-        folder: the folder of the file. Lines of an earlier run are kept up to `start_iteration`.
+        folder: the folder of the file.
         start_seconds: seconds of work before this run, above 0 if the run is resumed.
-        start_iteration: iteration at which this run starts. Existing lines from this iteration on are dropped.
+        start_iteration: iteration at which this run starts. Of an existing file only the lines of earlier iterations
+            are kept, so none with 0.
     """
 
     def __init__(self, folder: Path, start_seconds: float = 0.0, start_iteration: int = 0):
@@ -122,7 +124,7 @@ class Trace:
 
     @property
     def seconds(self) -> float:
-        """Seconds of work so far, without pauses, earlier runs of a resumed stage included."""
+        """Seconds of work since the stage began, without pauses, with the earlier runs of a resumed stage."""
         return self._offset + (0.0 if self._is_paused else time.perf_counter() - self._since)
 
     @contextmanager
@@ -136,14 +138,16 @@ class Trace:
             self._since, self._is_paused = time.perf_counter(), was_standing
 
     def log(self, iteration: int, **errors: float | str) -> None:
-        """Append one line of values to the trace. The time spent in this call is not counted in "seconds".
+        """Append one line to the trace: "seconds" (see the property `seconds`), "iteration", and the given values.
+
+        The time spent in this call is not counted in "seconds".
 
         Args:
             iteration: number of finished steps.
             errors: key of the line -> value, e.g. `psnr=20.1`.
 
         Raises:
-            FloatingPointError: a value is not finite; the message names it.
+            FloatingPointError: a value is not finite; the message names it, and no line is written.
         """
         for name, value in errors.items():
             if not isinstance(value, str) and not isfinite(value):
@@ -179,17 +183,17 @@ def steps_within_budget(
 ) -> int:
     """Return the number of steps that a stage can do in a time budget, from a twentieth of `max_steps` to `max_steps`.
 
-    The speed is measured by a trial of `TRIAL_STEPS` steps, so the result depends on the machine and its load. It is
-    written to `folder/length.json`. A resumed stage reads it from this file.
+    The speed is measured by a trial of `TRIAL_STEPS` steps, so the result depends on the machine and its load. The
+    result is written to `folder/length.json`. A resumed stage reads the result from this file, without a trial.
 
     Args:
         folder: the stage's folder.
         max_steps: number of steps without a limit.
         seconds: time budget of the whole stage. With 0 there is no limit: the result is `max_steps`, and nothing is
             measured or written.
-        elapsed: returns the seconds that the stage has used so far. It is called after the trial.
-        trial: is called as `trial(folder, count)`. It runs `count` steps, writes their trace to the given folder, and
-            changes nothing else.
+        elapsed: returns the seconds of the budget that the stage has used so far. It is called after the trial.
+        trial: is called as `trial(path, count)` with a temporary folder. It runs `count` steps, writes their trace to
+            this folder, and changes nothing else.
     """
     if not seconds:
         return max_steps

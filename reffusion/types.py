@@ -50,7 +50,10 @@ class Camera:
         return -rotation.T @ translation
 
     def resized(self, width: int, height: int) -> Camera:
-        """Return the same view at another resolution, with an image of the given size in pixels."""
+        """Return the same view at another resolution: the whole field of view on an image of the given size in pixels.
+
+        Width and height are scaled independently of each other.
+        """
         sx, sy = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
@@ -214,11 +217,14 @@ class MaskSet:
     Attributes:
         raw: True at the pixels of the object in the given 2D mask; all False if the view has no mask.
         consistent: C, True at pixels that show the object, rendered from the Gaussians that are labelled as the object.
-            The photograph must not supervise these pixels.
+            The photograph must not supervise these pixels, unless the view is clean (`Scene.clean`): its photograph
+            does not show the object there. In a view without a photograph, C also holds the pixels that no photograph
+            of another view shows.
         unobserved: U, True at those pixels of C where no other photograph shows the background, i.e. what is visible
             there once the object is removed.
         invent: I, True at the pixels whose content is invented by reference and prior. These are the pixels of U (of C
-            with `masks.invent: consistent`), and the pixels that the scene asks to fill.
+            with `masks.invent: consistent`), and the pixels that the scene asks to fill. All are False if U is
+            negligible in all views together (`masks.consolidation.drop_negligible`).
     """
 
     raw: np.ndarray

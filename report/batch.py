@@ -28,6 +28,9 @@ MAX_PICTURES = 200  # more pictures would make a page of tens of MB
 def make(record: Path) -> Path:
     """Write the page of a batch beside the batch's record, and return the page's path.
 
+    The page has the name of the record with the ending .html. Pictures are embedded in the page, and each scene's name
+    links to the scene's report.html if this file exists.
+
     Args:
         record: runs/results.json, or runs/results@<variant>.json.
 
@@ -57,11 +60,11 @@ def make(record: Path) -> Path:
 def _line(run: dict[str, Any], names: list[str], runs: Path, with_picture: bool) -> str:
     """Return a row of the table: the scene's name, scores, seconds and picture.
 
-    A run that is not done shows its state, or the reason of its failure, instead of scores and picture.
+    A run that is not done shows its state, or the reason of its failure, instead of scores, seconds and picture.
 
     Args:
         run: the scene's entry in the batch's record.
-        names: the scores to show.
+        names: names of the scores to show, in the order of the columns.
         runs: folder of the runs.
         with_picture: True if the row may have a picture.
     """
@@ -80,7 +83,12 @@ def _line(run: dict[str, Any], names: list[str], runs: Path, with_picture: bool)
 
 
 def _picture(home: Path, scene: str) -> str:
-    """Return the first rendered view, resized to `WIDTH` px, as an `img` element; empty if no view was rendered."""
+    """Return the result's first rendered view by name, `WIDTH` px wide, as an `img` element; "" if there is none.
+
+    Args:
+        home: runs/<scene> or runs/<scene>@<variant>.
+        scene: name of the scene, the alternative text of the picture.
+    """
     first = next(iter(sorted((home / "evaluate" / "renders").glob("*.png"))), None)
     if first is None:
         return ""

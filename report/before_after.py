@@ -119,7 +119,12 @@ def rendered_views(job: JobFiles) -> list[str]:
 def find_pictures(job: JobFiles, name: str) -> dict[str, Path]:
     """Return the existing pictures of a view as {kind of picture, a key of `TITLES`: file}.
 
-    The photograph of a test view without a mask is ground truth, since it shows the scene without the object.
+    The view's photograph has the key "truth" if the view is a test view without an input mask, since the photograph
+    then shows the scene without the object. Otherwise it has the key "photograph".
+
+    Args:
+        job: a job whose stage `evaluate` is done.
+        name: name of the view.
     """
     evaluate = job.folders["evaluate"]
     poses, raw_masks = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))

@@ -14,12 +14,13 @@ POINT_WEIGHT = 1e-2  # weight of the points' median in the focus point; the opti
 def ellipse_path(cameras: Sequence[Camera], points: np.ndarray, frames: int) -> list[Camera]:
     """Return cameras on an ellipse that fits the positions of a capture's cameras, all looking at the same point.
 
-    The ellipse lies in the principal plane of the camera positions and has their extent. Cameras on a circle give this
-    circle. Cameras side by side give a small loop in front of the scene. The point looked at is `focus_point`.
+    The centre of the ellipse is the mean camera position. Its axes are the first two principal axes of the positions,
+    and each semi-axis is sqrt(2) times the standard deviation along the axis. So cameras on a circle give this circle,
+    and cameras side by side give a flat loop in front of the scene. The point looked at is `focus_point`.
 
     Args:
         cameras: cameras of the capture, at least one; the middle one of the sequence provides image size and focal
-            lengths.
+            lengths. The principal point of the returned cameras is the image centre.
         points: [P, 3] sparse points of the scene. Their median determines the distance of the focus point if the
             optical axes are parallel. May be empty.
         frames: number of cameras to return; the path is closed, and the last camera is one step before the first.
@@ -48,8 +49,8 @@ def ellipse_path(cameras: Sequence[Camera], points: np.ndarray, frames: int) -> 
 def focus_point(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
     """Return the point [3] nearest to all optical axes in the least-squares sense, drawn slightly to the sparse points.
 
-    The attracting point is the median of `points` [P, 3]. If there are none, it is the mean of the points at distance 1
-    in front of the cameras.
+    The optical axes count as infinite lines. The attracting point is the coordinate-wise median of `points` [P, 3]. If
+    `points` is empty, it is the mean of the points at distance 1 in front of the cameras.
     """
     matrix, right = np.zeros((3, 3)), np.zeros(3)
     anchor = np.median(points, 0) if len(points) else np.mean([c.center + c.world_to_camera[2, :3] for c in cameras], 0)
@@ -65,7 +66,8 @@ def look_at(center: np.ndarray, target: np.ndarray, down: np.ndarray) -> np.ndar
     """Return the world-to-camera pose [4, 4] of a camera at `center` [3] that looks at `target` [3].
 
     Args:
-        down: [3], the direction in the world that points down in the image, as far as the viewing direction allows.
+        down: [3], the direction in the world that points down in the image, as far as the viewing direction allows. The
+            roll is arbitrary if `down` is parallel to the viewing direction.
     """
     forward = target - center
     length = np.linalg.norm(forward)

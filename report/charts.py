@@ -76,7 +76,10 @@ def needs_log_axis(values: Iterable[float], factor: float = 12) -> bool:
 
 
 def use_plain_log_ticks(axes: Axes, which: str = "x") -> None:
-    """Label a logarithmic axis, "x" or "y", with numbers such as 10, 20, 50 and 100 instead of powers of ten."""
+    """Label a logarithmic axis, "x" or "y", with plain numbers (10, 100) instead of powers (10^1, 10^2).
+
+    Numbers in between (20, 50) are labelled too if the axis's current upper limit is less than 300 times the lower one.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis = axes.xaxis if which == "x" else axes.yaxis
@@ -127,9 +130,10 @@ def draw_tradeoff(
 
 
 def label_points(axes: Axes, points: np.ndarray, names: Sequence[str], strong: np.ndarray) -> None:
-    """Write the name of each point beside the point, where it covers other points and names least.
+    """Write the name of each point beside the point, where it covers other points, other names and the front least.
 
-    A thin line connects a name to its point if the two are far apart.
+    A thin line connects a name to its point if the two are far apart. The layout and the limits of the axes must be
+    final, because the overlap is measured in px.
 
     Args:
         points: [n, 2] in data units.
@@ -210,10 +214,10 @@ def draw_forest(
 
     The left side of a panel is always worse than the full method. A difference is blue (better) or orange (worse) if
     its interval over views excludes zero, else grey. A thick line is the interval over views, a thin line the interval
-    over scenes.
+    over scenes. A difference that is more than three times as large as the panel's median is an arrow with the number.
 
     Args:
-        differences: metric -> method -> its difference to the full method.
+        differences: metric -> method -> the method's score minus the full method's score.
         titles: metric -> title of its axis.
         more: metrics of which more is better.
         path: PNG to write.
@@ -244,7 +248,7 @@ def _interval(axes: Axes, difference: Difference, row: int, sign: int, far: floa
     Args:
         row: index of the row.
         sign: 1 if more of the metric is better, else -1.
-        far: largest difference that fits the panel. A larger one is drawn as an arrow with the number.
+        far: largest absolute difference that fits the panel. A larger one is drawn as an arrow with the number.
     """
     mean, views = difference.mean, difference.views or 0
     colour = GREY if abs(mean) <= views else BLUE if sign * mean > 0 else ORANGE
@@ -262,7 +266,9 @@ def _interval(axes: Axes, difference: Difference, row: int, sign: int, far: floa
 
 
 def _far(differences: Sequence[Difference]) -> float:
-    """Return the largest absolute difference to draw to scale: three times the median, or infinity if none is larger.
+    """Return the largest absolute mean difference to draw to scale, or infinity if all are drawn to scale.
+
+    This limit is three times the median of the absolute mean differences.
 
     Without this limit a few failing methods would make the differences of all other methods indistinguishable.
     """

@@ -62,7 +62,10 @@ def view_role(name: str, views: dict[str, list[str]]) -> str:
 
 
 def overlay_masks(poses: Path, raw_masks: Path, name: str) -> np.ndarray:
-    """Return a reduced photograph with its masks tinted, uint8 [h, w, 3], at most `WIDTH` x `HEIGHT`.
+    """Return a photograph with its masks tinted, uint8 [h, w, 3], resized to fit into `WIDTH` x `HEIGHT`.
+
+    A small photograph is enlarged. The tint of a test mask is the complement of `TINT`. If several objects have masks
+    of their own (masks/<object>/), these masks are not drawn.
 
     Args:
         poses: folder of the stage `poses`, which has the photographs.
@@ -84,7 +87,8 @@ def contact_sheet(cells: list[tuple[str, np.ndarray, str]]) -> np.ndarray:
     """Return one image, uint8 [H, W, 3], with all pictures in rows on white and a caption below each picture.
 
     Args:
-        cells: (view name, picture uint8 [h, w, 3], role); the caption has the name and the role.
+        cells: (view name, picture uint8 [h, w, 3] of at most `WIDTH` x `HEIGHT` px, role); the caption has the first 28
+            characters of the name, and the role.
     """
     font, line = ImageFont.load_default(13), 20
     columns = min(COLUMNS, len(cells))

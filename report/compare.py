@@ -95,8 +95,9 @@ def make(home: Path) -> dict[str, Path]:
 def save_tradeoff(table: list[dict[str, Any]], path: Path) -> Path | None:
     """Draw the methods' errors against their run times; return the chart's path, or None if there is nothing to draw.
 
-    The errors are those in the box. Without ground truth the chart shows the inconsistency between views instead. Only
-    methods that have all drawn errors appear.
+    The errors are LPIPS (vgg), FLIP and 1 - SSIM in the box, as far as any method has them. If no method has any of
+    them, the chart shows the inconsistency between views instead. Only methods that have all drawn errors appear. A run
+    time is that of all stages of a scene, evaluation included.
     """
     errors = {}
     for name, title in {**ERRORS, "consistency": "inconsistency between views"}.items():
@@ -114,7 +115,7 @@ def save_tradeoff(table: list[dict[str, Any]], path: Path) -> Path | None:
 def save_forest(comparison: Comparison, path: Path) -> Path | None:
     """Draw each method's score minus the full method's score, with confidence intervals, as a forest chart.
 
-    The chart shows the scores in the box, or the scores outside the masks if no box scores are known.
+    The chart shows the scores in the box, or the scores outside the masks if no differences in the box are known.
 
     Returns:
         The chart's path, or None if there is nothing to draw.
@@ -139,7 +140,9 @@ def method_table(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]
     Returns:
         header: titles of the columns. Columns of `OPTIONAL_COLUMNS` are omitted if no method has a value.
         cells: text [rows][columns], one row per method; a dash marks a missing value.
-        bold: [rows][columns], True for the best values of a column, after rounding.
+        bold: [rows][columns], True for the values of a score that equal the best one after rounding. The best value is
+            that of the methods with the most finished scenes. Columns that are no scores, such as "seconds" and
+            "consistency", have no best value, nor has a score that a single one of these methods has.
     """
     names = [name for name in TITLES if name not in OPTIONAL_COLUMNS or any(row[name] is not None for row in table)]
     best = {}
@@ -167,9 +170,10 @@ def _cell(row: dict[str, Any], name: str) -> str:
 def difference_table(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]] | None:
     """Return header and rows of the table of differences: each method's score minus the full method's score.
 
-    There is a row for each method except the full one and those whose job equals another method's. A cell has the mean
-    difference, half the width of its 95% confidence interval over views and, in brackets, half the width of its interval
-    over scenes if there are several. The result is None if no differences are known.
+    There is a row for each method, without the full one and duplicates of earlier methods, and a column for each metric
+    in which a difference is known. A cell has the mean difference, half the width of its 95% confidence interval over
+    views and, in brackets, half the width of its interval over scenes if there are several. The result is None if no
+    differences are known.
     """
     metrics = [metric for metric in SCORES if any(row[f"{metric}_minus_full"] is not None for row in table)]
     others = [row for row in table if row["method"] != FULL and not row["same_as"]]
@@ -212,7 +216,8 @@ def extra_tables(comparison: Comparison, table: list[dict[str, Any]]) -> dict[st
 def summary(comparison: Comparison, table: list[dict[str, Any]]) -> str:
     """Return a sentence with the numbers of methods and scenes, and the best method in each metric.
 
-    The metrics are those in the box, or those outside the masks if no method has box scores.
+    The metrics are those in the box, or those outside the masks if no method has a PSNR in the box. All methods that
+    are best after rounding are named, also if their mean is over fewer scenes than that of other methods.
     """
     done = sum(run.state == "done" for run in comparison.runs.values())
     place = f"{len(comparison.scenes)} scenes ({', '.join(comparison.scenes)})"
@@ -263,9 +268,10 @@ def table_notes(comparison: Comparison, table: list[dict[str, Any]]) -> list[str
 
 
 def method_facts(run: Run) -> list[str]:
-    """Return a sentence with the 2D inpainter and the perceptual distance that a run used; empty if none is recorded.
+    """Return a list of one sentence with the 2D inpainter and the perceptual distance that a run used.
 
-    The names are recorded in metrics.json, or in facts.json of one of the run's stages.
+    The list is empty if neither is recorded. The names are recorded in metrics.json, or in facts.json of one of the
+    run's stages.
     """
     paths = [folder / "facts.json" for folder in run.folders.values()]
     records = [run.metrics, *(load_json(path) for path in paths if path.is_file())]

@@ -21,8 +21,13 @@ BOX = ("left", "top", "right", "bottom")  # columns of per_view.csv
 def save_sheets(comparison: Comparison, out: Path, count: int = 3) -> dict[str, Path]:
     """Write a picture for a few views with the photograph and every method's render; return {view: PNG}.
 
-    One scene gets pictures of `count` evenly spread views. Of several scenes, `count` evenly spread ones get a picture
-    of one view each, whose key begins with the scene's name.
+    Methods that are not finished, and duplicates of earlier methods, are left out. One scene gets pictures of `count`
+    evenly spread views. Of several scenes, `count` evenly spread ones get a picture of one view each, whose key begins
+    with the scene's name. Views without a box are used only if no view has one.
+
+    Args:
+        out: existing folder for the pictures.
+        count: largest number of pictures.
     """
     if len(comparison.scenes) == 1:
         return _sheets_of(comparison, comparison.scenes[0], out, "", count)
@@ -73,7 +78,9 @@ def _title(run: Run, view: str) -> str:
 
 
 def crop_to_box(picture: np.ndarray, row: dict[str, float]) -> np.ndarray:
-    """Return a picture, [H, W, 3], cropped to a view's box plus the margin `CONTEXT`.
+    """Return a picture, [H, W, 3], cropped to a view's box with a margin on each side.
+
+    The margin is `CONTEXT` times the box's width or height. The crop ends at the picture's border.
 
     Args:
         row: the view's row of per_view.csv. The picture stays whole if the row has no box.

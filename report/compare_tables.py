@@ -19,6 +19,8 @@ Table = tuple[list[str], list[list[str]]]  # header, rows
 def scene_table(comparison: Comparison, table: list[dict], metric: str, digits: int) -> Table | None:
     """Return a table of one metric with a row per method: the score in each scene, then the mean as in `table`.
 
+    Duplicates of earlier methods get no row. A score in a scene is the mean over the scene's test views.
+
     Args:
         digits: decimals of the scores.
 
@@ -38,7 +40,7 @@ def scene_table(comparison: Comparison, table: list[dict], metric: str, digits: 
 
 
 def describe_protocol(done: list[Run]) -> list[str]:
-    """Return which views were rendered, and at which size, in which scenes.
+    """Return a phrase that says which views were rendered, and at which size, in which scenes.
 
     Args:
         done: finished runs.
@@ -65,7 +67,7 @@ def load_published(data: Path | None) -> list[dict[str, str]]:
         Empty if there is no such file.
 
     Raises:
-        ValueError: the file has other columns, a metric that is not compared, or a value that is not a number.
+        ValueError: the file has other columns, a metric that is none of `BOX_SCORES`, or a value that is not a number.
     """
     path = data / PUBLISHED if data else None
     if path is None or not path.is_file():
@@ -111,6 +113,8 @@ def published_table(
 
 def format_spread(row: dict, metric: str, digits: int) -> str:
     """Return a method's mean score as text, with ± half its 95 % interval over scenes if there are several scenes.
+
+    A dash stands for a missing score.
 
     Args:
         row: the method's row of the table.

@@ -44,11 +44,12 @@ def coverage_section(job: JobFiles) -> list[str]:
 
 
 def view_shares(job: JobFiles) -> dict[str, tuple[float, float, float | None]]:
-    """Return three shares in [0, 1] for each training view that shows the object, from the masks on disk.
+    """Return three shares in [0, 1] for each view with a non-empty consistent mask, sorted by name.
 
     Returns:
         View name -> (the mask's share of the picture, the made-up share of the mask, the uncovered share of the mask).
-        The last share is None before the stage `initialize`. The dictionary is empty before the stage `masks`.
+        The first two are computed from the masks on disk, the last one is read from the facts of the stage `initialize`
+        and None before this stage. The dictionary is empty before the stage `masks`.
     """
     masks, folder = job.folders.get("masks", Path()), job.folders.get("initialize", Path())
     facts = folder / "facts.json"
@@ -82,7 +83,7 @@ def _bar(share: float | None) -> str:
 
 
 def _unseen(job: JobFiles) -> list[str]:
-    """Return a paragraph on the test views in which more than 1 % of the pixels outside the mask were never seen.
+    """Return a paragraph on test views with more than 1 % of the pixels outside the mask that no training view saw.
 
     The paragraph names at most twelve test views, those with the largest unseen shares first. The list is empty if
     there is no such view or the stage `evaluate` has not run.

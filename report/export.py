@@ -20,13 +20,16 @@ LORA_FILE = "pytorch_lora_weights.safetensors"
 
 
 def make(home: Path) -> list[str]:
-    """Write runs/<scene>/export/: the Gaussians, cameras, photographs and the LoRA in common formats.
+    """Write the Gaussians, cameras, photographs and the LoRA in common formats to `home`/export/.
+
+    Gaussians and cameras are in the scene's own frame. Photographs, the Gaussians of the fit (the scene with the
+    object) and the LoRA are written if they exist.
 
     Args:
         home: runs/<scene> or runs/<scene>@<variant>, with a finished stage `evaluate`.
 
     Returns:
-        One line for each written file or folder, with its path and a description.
+        Lines of text, one for each written file or folder with its path and a description.
 
     Raises:
         ValueError: the stage `evaluate` has not run, or gsply is not installed.
@@ -67,6 +70,8 @@ def make(home: Path) -> list[str]:
 
 def viewer_caveats(path: Path, antialiased: bool) -> str:
     """Return a text with the properties of a .ply file that some viewers do not support; empty if there are none.
+
+    The text is to be appended to a sentence: each property begins with "; ".
 
     Args:
         path: the .ply file.

@@ -1,8 +1,9 @@
 """Gaussians of a finished scene in three layers: kept, added and removed.
 
 *Kept* Gaussians belong to the fit and remain in the result. *Added* Gaussians fill the hole. *Removed* Gaussians are
-those that the stage `masks` labelled: the object. The *states* of a scene are the initialization, snapshots during the
-distillation, and the result.
+those that the stage `masks` labelled: the object, and debris that the object had hidden. The *states* of a scene are
+the initialization, snapshots during the distillation, and the result. Without distillation the result is the only
+state.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ class GaussianLayers:
 
     Attributes:
         states: title of a state -> (kept Gaussians, added Gaussians), in order from the initialization to the result.
+            Snapshots have the kept Gaussians of the result.
         removed: Gaussians of the object; may be empty.
     """
 
@@ -36,7 +38,7 @@ class GaussianLayers:
     removed: Gaussians
 
     def select(self, state: str, kept: bool, added: bool, removed: bool) -> Gaussians:
-        """Return the chosen layers of a state as one set of Gaussians.
+        """Return the chosen layers of a state as one set of Gaussians, in the order kept, added, removed.
 
         Args:
             state: title of the state, a key of `states`.
@@ -81,7 +83,11 @@ def list_snapshots(distill: Path) -> list[Path]:
 
 
 def split_new(folder: Path) -> tuple[Gaussians, Gaussians]:
-    """Load a stage's Gaussians and split them by their labels into (kept Gaussians, new Gaussians)."""
+    """Load a stage's Gaussians and split them by their labels into (kept Gaussians, new Gaussians).
+
+    Args:
+        folder: folder of the stage `initialize` or `distill`, where True labels mean new Gaussians.
+    """
     gaussians, new = load_ply(folder / "gaussians.ply"), load_labels(folder / "labels.npy")
     return gaussians.map(lambda p: p[~new]), gaussians.map(lambda p: p[new])
 
@@ -89,11 +95,11 @@ def split_new(folder: Path) -> tuple[Gaussians, Gaussians]:
 def find_added(result: Gaussians, folder: Path) -> Tensor:
     """Return bool [N], True for the Gaussians of the finished scene that a stage labelled as new.
 
-    Gaussians are matched by position, because the stage `finish` removes and adds Gaussians. Those that `finish` adds
-    around the capture (the backdrop) count as kept.
+    Gaussians are matched by position, up to `SAME_DISTANCE`, because the stage `finish` removes and adds Gaussians.
+    Those that `finish` adds around the capture (the backdrop) count as kept, i.e. are False.
 
     Args:
-        result: the N Gaussians of the finished scene.
+        result: the N Gaussians of the finished scene, in the normalised frame.
         folder: folder of the stage `distill` or `initialize`.
     """
     from scipy.spatial import cKDTree

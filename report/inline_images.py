@@ -18,7 +18,10 @@ COLOURS = 64  # palette size of a chart
 
 
 def photo_address(array: np.ndarray, longest: int) -> str:
-    """Return the data URL of a picture, uint8 [H, W, 3], as WebP. Its longer side is reduced to `longest` px."""
+    """Return the data URL of a picture, uint8 [H, W, 3], as WebP.
+
+    A picture whose longer side exceeds `longest` px is reduced to this size; no picture is enlarged.
+    """
     factor = min(1.0, longest / max(array.shape[:2]))
     small = resize_image(array, (max(1, round(array.shape[1] * factor)), max(1, round(array.shape[0] * factor))))
     return _address(Image.fromarray(small), "webp", quality=QUALITY)
@@ -48,7 +51,11 @@ def affordable_side(count: int, megabytes: float, least: int, most: int, aspect:
 
 
 def picture_grid(cells: list[tuple[str, str]]) -> str:
-    """Return an HTML grid of pictures that adapts to the width of the screen; cells are (address, caption)."""
+    """Return an HTML grid of pictures that adapts to the width of the screen.
+
+    Args:
+        cells: (address of the picture, e.g. a data URL; caption in plain text).
+    """
     lines = [
         f'<figure><img src="{address}" alt="{escape(words)}"><figcaption>{escape(words)}</figcaption></figure>'
         for address, words in cells

@@ -93,7 +93,10 @@ def make(home: Path) -> Path:
 
 
 def summarize_result(job: JobFiles) -> str:
-    """Return one sentence on the result: its number of Gaussians and its mean scores, as far as known."""
+    """Return one sentence on the result: number of Gaussians, mean PSNR and FLIP in the box, as far as known.
+
+    The sentence also names views that are scored although their photographs contradict their poses.
+    """
     mean, counts = job.metrics.get("mean", {}), job.metrics.get("gaussians", {})
     if not job.metrics:
         return "It is not evaluated yet."
@@ -112,7 +115,10 @@ def summarize_result(job: JobFiles) -> str:
 
 
 def unfinished_note(job: JobFiles) -> list[str]:
-    """Return a paragraph with the names of the stages that still have to run; empty if there are none."""
+    """Return a paragraph with the names of the stages that still have to run; empty if there are none.
+
+    Without a recorded plan only the stages `poses`, `fit` and `evaluate` are considered.
+    """
     due = [stage for stage, entry in job.plan.items() if entry["word"] not in ("cached", "skip", "provided")]
     if not job.plan:
         due = [stage for stage in ("poses", "fit", "evaluate") if stage not in job.folders]
@@ -120,7 +126,7 @@ def unfinished_note(job: JobFiles) -> list[str]:
 
 
 def capture_notes(job: JobFiles) -> list[str]:
-    """Return a list of notes on the capture; empty if there are none.
+    """Return HTML parts with a list of notes on the capture; empty if there are none.
 
     The notes are on the frames selected from a video, on structure from motion, and the warnings of the stages
     `poses`, `raw_masks` and `masks`.
@@ -169,7 +175,10 @@ def draw_job(job: JobFiles, path: Path, ceiling: float | None = None) -> None:
 
 
 def score_table(job: JobFiles) -> list[str]:
-    """Return a table of mean scores with a row for the initialization and one for the result; empty without scores."""
+    """Return HTML parts with a table of mean scores over the test views; empty without scores.
+
+    The rows are the initialization, if it was scored, and the result.
+    """
     after, initial = job.metrics.get("mean", {}), job.metrics.get("initialize", {})
     names = [name for name, value in after.items() if value is not None]
     if not names:
@@ -201,7 +210,11 @@ def stage_sections(job: JobFiles, out: Path) -> list[str]:
 
 
 def skipped_section(job: JobFiles) -> list[str]:
-    """Return a table of the stages that were skipped, provided by the scene, or still have to run, with the reasons."""
+    """Return the section with a table of stages and reasons; empty if no plan was recorded.
+
+    The stages are those that were skipped, are provided by the scene, or still have to run or cannot run, and finished
+    stages with a remark.
+    """
     if not job.plan:
         return []
     rows = [
@@ -214,7 +227,10 @@ def skipped_section(job: JobFiles) -> list[str]:
 
 
 def receipts_section(job: JobFiles) -> list[str]:
-    """Return a table of seconds, memory and machine of each stage, and the versions of libraries."""
+    """Return the section with a table of seconds, memory and machine of each stage, and the versions of libraries.
+
+    The seconds of a stage that was resumed are those of its last try only; the table says so.
+    """
     total = sum(receipt["seconds"] for receipt in job.receipts.values())
     rows = []
     for stage, r in job.receipts.items():
@@ -234,7 +250,7 @@ def receipts_section(job: JobFiles) -> list[str]:
 
 
 def files_section(job: JobFiles) -> list[str]:
-    """Return a list of links to the result files that exist."""
+    """Return the section with links to the result files that exist, relative to `job.home`."""
     targets = {"turntable.webm: video around the capture": "turntable.webm"}
     targets = targets if (job.home / "turntable.webm").is_file() else {}
     for name, words in RESULTS.items():

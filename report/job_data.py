@@ -27,14 +27,16 @@ class JobFiles:
 
     Attributes:
         home: runs/<scene>, or runs/<scene>@<variant>.
-        plan: stage -> {"word": status such as "cached", "skip" or "run", "reason", "notes", "folder"}, from plan.json;
-            may be empty, see `load_plan`.
+        plan: stage -> {"word": status such as "cached", "skip" or "run", "reason": text, "notes": texts, "folder": the
+            stage's folder relative to the folder of all runs, or empty}, from plan.json; may be empty, see `load_plan`.
         unset: stage -> all parameters as they would be without `set=` and `budget=` on the command line; empty if no
             plan was recorded.
         folders: stage -> folder that the stage wrote, in the order of the stages, for stages that are done and not
             skipped. A variant shares folders with the scene's own run.
-        receipts: stage -> content of receipt.json.
-        traces: stage -> series -> lines of the trace.
+        receipts: stage -> content of receipt.json, for the stages in `folders`, except those that scene.yaml replaces
+            by another stage's result.
+        traces: stage -> series ("" for the one without a name) -> lines of the trace, for stages with a readable trace,
+            with the same exception.
         unread: reasons why traces could not be read, one per trace.
         metrics: content of metrics.json; empty if the job is not evaluated.
     """

@@ -36,9 +36,9 @@ def default_parameters(stage: str) -> dict[str, Any]:
 
 
 def command_line_parameters(job: JobFiles) -> dict[str, Any]:
-    """Return {"stage.parameter": value} for the parameters that `set=` or `budget=` changed on the command line.
+    """Return {"stage.parameter": value used} for the parameters that `set=` or `budget=` changed on the command line.
 
-    The result is empty if no plan was recorded.
+    Only stages that are done are considered. The result is empty if no plan was recorded.
     """
     unset = {stage: dict(flatten_parameters(values)) for stage, values in job.unset.items()}
     return {
@@ -101,7 +101,7 @@ def load_scene_argument(path: Path, name: str) -> str:
     This is the name of a folder in data/, the path of another folder, or the path of a video.
 
     Args:
-        path: file that records the path of the scene's folder.
+        path: file that records the path of the scene's folder; if it does not exist, the result is `name`.
         name: name of the scene.
     """
     source = path.read_text(encoding="utf-8").strip() if path.is_file() else name

@@ -33,8 +33,9 @@ RESULTS = ("distill", "initialize", "fit")  # stages with Gaussians, latest firs
 def masks_section(job: JobFiles) -> list[str]:
     """Return the section on masks: photographs with tinted input masks and the outlines of the pixel classes.
 
-    The outlined classes are the consistent mask (pixels that show the object, the same in all views) and the invent
-    mask (pixels that are made up). Both come from the stage `masks`.
+    The photographs are at most `MAX_MASK_VIEWS` training views, evenly chosen. The outlined classes are the consistent
+    mask (pixels that show the object, made consistent over all views) and the invent mask (pixels that are made up).
+    Both come from the stage `masks`; before this stage no outline is drawn.
     """
     poses, raw_masks = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))
     top = page.heading("Masks")
@@ -77,7 +78,9 @@ def remnant_pictures(job: JobFiles) -> list[str]:
 
 
 def draw_mask_classes(job: JobFiles, poses: Path, name: str) -> np.ndarray:
-    """Return a reduced photograph, uint8 [h, w, 3], with its input mask tinted and its pixel classes outlined.
+    """Return a photograph, uint8 [h, w, 3], with its input mask tinted and its pixel classes outlined.
+
+    The size is that of `check.overlay_masks`. Masks and classes that do not exist are left out.
 
     Args:
         poses: folder of the stage `poses`, which has the photographs.
@@ -180,7 +183,10 @@ def extra_views_section(job: JobFiles) -> list[str]:
 
 
 def depth_section(job: JobFiles) -> list[str]:
-    """Return the section on depth: a few views of the fit and of the latest Gaussians, coloured on the same scale."""
+    """Return the section on depth: a few views of the fit and of the latest Gaussians, coloured by disparity.
+
+    The two pictures of a view have the same scale of colours; different views have different scales.
+    """
     stages = [s for s in RESULTS if s in job.folders and (job.folders[s] / "gaussians.ply").is_file()]
     top = page.heading("Depth, before and after")
     if not stages or "fit" not in stages or "poses" not in job.folders:
@@ -207,7 +213,8 @@ def render_depth(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 def color_disparity(depths: list[np.ndarray]) -> list[np.ndarray]:
     """Return a picture of each depth map, uint8 [H, W, 3], with disparity (1 / depth) in colours.
 
-    Bright means near, grey means unknown. The first map determines the scale of colours for all maps.
+    Bright means near, grey means unknown. The scale of colours, which is the same for all maps, extends from the 1st to
+    the 99th percentile of the first map's disparities.
 
     Args:
         depths: [H, W] each, camera z, 0 where unknown.

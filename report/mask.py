@@ -66,7 +66,11 @@ class Server(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_address[1]}/"
 
     def state(self) -> dict:
-        """Return the JSON state of the page: the session's state, whether the fit runs, and the progress of the fit."""
+        """Return the JSON state of the page: that of `Session.state`, and three more keys.
+
+        They are "fitting": True while the process of the fit runs; "fit_progress": result of `read_progress`, or None;
+        "next": command that the page suggests after saving.
+        """
         running = self.fit is not None and self.fit.poll() is None
         log = self.session.capture.fit.with_suffix(".log")
         progress = read_progress(log) if running and log.is_file() else None
@@ -186,6 +190,9 @@ def stage_command(stage: str, arguments: argparse.Namespace) -> list[str]:
 
     The option `poses.clicks={}` announces that masks will come from clicks, so that the stages accept a scene without
     masks.
+
+    Args:
+        arguments: has the scene, `runs`, `profile`, `budget` and `set`. Its variant is ignored.
     """
     options = {"--profile": arguments.profile, "--budget": arguments.budget}
     flags = [word for name, value in options.items() if value for word in (name, value)]

@@ -115,7 +115,10 @@ class Session:
 
     A background thread computes the masks. Until the scene is fitted, a mark changes only the mask of its own view.
     After the fit, marks determine the masks of all views, see `reffusion.clicks.scene_segmentation`. The masks after
-    each mark stay in memory, so that adding a mark, or removing the last one, takes little computation.
+    each mark stay in memory, so that adding a mark, or removing the last one, takes little computation. The methods
+    that change marks return before the masks are computed; `state` says when the masks are up to date.
+
+    The views are the training views that show the object. The session begins with the marks saved in clicks.json.
 
     Args:
         capture: folders and given masks of the scene.
@@ -175,7 +178,9 @@ class Session:
         self._change(lambda events: [*events, event])
 
     def remove(self, index: int) -> None:
-        """Remove a mark by its index in the order in which all marks were made; -1 is the last one.
+        """Remove a mark by its index among all current marks, in the order in which they were made; -1 is the last one.
+
+        The indices of later marks decrease by one.
 
         Raises:
             IndexError: there is no such mark.
@@ -191,7 +196,8 @@ class Session:
     def save(self) -> dict[str, int]:
         """Wait for the masks of the latest marks, then write all masks, and the marks to clicks.json.
 
-        Masks are written in the pixels of the original, distorted photographs.
+        Masks are written in the pixels of the original, distorted photographs. The masks of an earlier call are
+        overwritten, but not deleted for views that have no mask any more.
 
         Returns:
             {"written": number of masks written, "kept": number of given masks, which stay as they are}.
@@ -227,10 +233,12 @@ class Session:
         """Return the state that the page shows, as plain JSON values.
 
         Returns:
-            "views": name, size, marks, mask (a number that grows when the mask changes; None without a mask) and
-            whether the mask is given; "fit": True once the fit is loaded; "busy": True while masks are computed;
-            "error": reason why the masks could not be computed, or ""; "unsaved": True if marks have changed since the
-            last save; "folder": folder of the masks.
+            "views": for each view "name", "width" and "height" (undistorted, px), "marks", "mask" (a number that grows
+            when the mask changes; None without a mask) and "given" (True if the mask is given); "fit": True once the
+            fit is loaded; "busy": True while the masks do not yet follow the latest marks; "error": reason why the
+            masks could not be computed, or ""; "unsaved": True if marks have changed since the last save; "folder":
+            folder of the masks. A mark has "index" (for `remove`), "points", "sign" ("+" on the object, "-" on the
+            background) and "radius".
         """
         with self.lock:
             views = [

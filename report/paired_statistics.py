@@ -12,15 +12,16 @@ LEVEL = 0.95  # of confidence
 
 @dataclass(frozen=True)
 class Difference:
-    """Difference of one method to another in a metric, on pairs of renders of the same view.
+    """Difference of a first method to a second one (first minus second) in a metric, on pairs of renders of one view.
 
     Attributes:
         mean: mean difference over all pairs, in units of the metric.
         pairs: number of pairs.
         views: half the width of the 95% confidence interval of the mean, from a paired t-test over the views of all
             scenes. This interval is valid for these scenes only. None for fewer than two pairs.
-        scenes: half the width of the 95% confidence interval of the mean, from a paired t-test over one mean per scene.
-            This interval is valid for other scenes of the same kind too. None for fewer than two scenes.
+        scenes: half the width of the 95% confidence interval of the mean of the scenes' means, from a paired t-test
+            over one mean per scene. This interval is valid for other scenes of the same kind too. None for fewer than
+            two scenes. The mean of the scenes' means equals `mean` if all scenes have equally many pairs.
     """
 
     mean: float
@@ -34,7 +35,7 @@ def paired_difference(differences: Sequence[np.ndarray]) -> Difference | None:
 
     Args:
         differences: one array [views] per scene: the metric of the first method minus the metric of the second method,
-            for each view.
+            for each view. Empty arrays are ignored.
     """
     scenes = [np.asarray(d, np.float64) for d in differences if len(d)]
     if not scenes:

@@ -18,7 +18,7 @@ WHOLE, NEW = "patched.ply", "new.ply"
 
 
 def make(home: Path) -> str:
-    """Write patch/patched.ply (the whole scene) and patch/new.ply (the new Gaussians); return a text to print.
+    """Write patched.ply (the whole scene) and new.ply (the new Gaussians) to `home`/patch/; return a text to print.
 
     Both files are in the scene's own frame, with properties in the order of the .ply file that the user gave.
 

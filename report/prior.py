@@ -102,6 +102,9 @@ def personalization_table(personal: dict[str, Any]) -> str:
     """Return a Markdown table of errors and scores at each scale, before and after personalization.
 
     The clean-latent error and the variance of the SDS gradient are means over all measured timesteps.
+
+    Args:
+        personal: the entry "personalization" of prior.json.
     """
     titles = ("clean-latent error", "variance of the SDS gradient")
     lines = [
@@ -136,7 +139,8 @@ def sampler_table(by_name: dict[str, dict[str, dict[str, float]]]) -> str:
 def seeds_table(seeds: dict[str, dict[str, Any]]) -> str:
     """Return a Markdown table with the mean and the range of scores over seeds, with a row for each scale and state.
 
-    The states are before personalization, after, and after personalization to a wrong reference, if it was measured.
+    The states are before personalization, after, and after personalization to a wrong reference. A state that was not
+    measured with every seed is left out.
 
     Args:
         seeds: seed -> state ("before", "after", "wrong") -> scale -> scores.
@@ -161,7 +165,14 @@ def format_range(values: list[float], digits: int) -> str:
 
 
 def save_charts(personal: dict[str, Any], path: Path) -> None:
-    """Draw the error against personalization steps, and error and SDS variance against the diffusion timestep."""
+    """Draw the clean-latent error against personalization steps, and error and SDS variance against the timestep.
+
+    The first chart is for the reference's own hole, the others are for unseen views before and after personalization.
+
+    Args:
+        personal: the entry "personalization" of prior.json.
+        path: PNG to write.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

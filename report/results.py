@@ -55,9 +55,9 @@ class Run:
         scene: name of the scene.
         state: "done", "failed" or "not run yet".
         error: reason of the failure, in one line; empty if the run did not fail.
-        folders: stage -> folder that the stage wrote, for stages that were not skipped. Methods share folders of stages
-            in which they do not differ.
-        receipts: stage -> content of the stage's receipt.json.
+        folders: stage -> folder that the stage wrote, for stages that were not skipped; empty if the run is not done.
+            Methods share folders of stages in which they do not differ.
+        receipts: stage -> content of the stage's receipt.json, see `load_receipts`.
         metrics: content of metrics.json; empty if the run is not evaluated.
         views: view -> the numbers of the view's row in per_view.csv.
     """
@@ -177,9 +177,10 @@ def load_receipts(folders: dict[str, Path]) -> dict[str, dict[str, Any]]:
 
 
 def load_views(path: Path) -> dict[str, dict[str, float]]:
-    """Load per_view.csv as {view: {column: number}}, without empty cells; empty if the file does not exist.
+    """Load per_view.csv as {view: {column: number}}, in the file's order; empty if the file does not exist.
 
-    A PSNR is at most `PSNR_CAP`, also where a view equals the ground truth.
+    Cells that are empty or no numbers are left out. A PSNR is at most `PSNR_CAP`, also where a view equals the ground
+    truth.
     """
     if not path.is_file():
         return {}
@@ -205,9 +206,13 @@ def _number(column: str, text: str | None) -> float | None:
 def summarize_methods(comparison: Comparison) -> list[dict[str, Any]]:
     """Return the table of all methods: one dictionary per method with the keys `COLUMNS`.
 
-    Values are means over the method's finished scenes, None where unknown. Of a method that computes the same as an
-    earlier method, only "method", "state", "scenes" and "same_as" are filled. The method with the best score `MAIN`
-    comes first. Methods without this score come next in their order, then the duplicates of earlier methods.
+    Scores, "consistency", seconds and number of Gaussians are means over the method's finished scenes, None where
+    unknown; a scene's score is its mean over test views. "peak_memory_mb" is the maximum over stages and scenes, and
+    "scenes" the number of finished scenes. Differences to the full method are means over views, see `Difference`.
+
+    Of a method that computes the same as an earlier method, only "method", "state", "scenes" and "same_as" are filled.
+    The methods are sorted by the score `MAIN`, the best first. Methods without this score come next in their order,
+    then the duplicates of earlier methods.
     """
     table = [_row(comparison, method) for method in comparison.methods]
     table.sort(key=lambda row: (row["same_as"] is not None, row[MAIN] is None, row[MAIN] or 0.0))
@@ -249,15 +254,15 @@ def finite_mean(values: list[float | None]) -> float | None:
 
 
 def mean_interval(values: list[float | None]) -> float | None:
-    """Return half the width of the 95 % confidence interval of the mean of the finite values.
+    """Return half the width of Student's 95 % confidence interval of the mean of the values that are finite numbers.
 
-    None if fewer than two values are finite numbers.
+    None if fewer than two values are.
     """
     return confidence_half_width(np.array([value for value in values if value is not None and math.isfinite(value)]))
 
 
 def total_seconds(run: Run) -> float:
-    """Return the seconds of all stages of a run, evaluation included."""
+    """Return the seconds of all stages of a run, evaluation and stages shared with other methods included."""
     return round(sum(receipt["seconds"] for receipt in run.receipts.values()), 2)
 
 
@@ -278,9 +283,10 @@ def own_seconds(run: Run, full: Run) -> float | None:
 
 
 def view_consistency(run: Run) -> float | None:
-    """Return the inconsistency between views: the mean colour difference in [0, 1] of the same points in two views.
+    """Return the inconsistency between views: the mean absolute colour difference of the same points in two views.
 
-    Each view is compared with the next view by name. None if metrics.json does not have the value.
+    The value is in [0, 1]; less is better. The points are those in the masks, and each view is compared with the next
+    view by name. None if metrics.json does not have the value.
     """
     value = (run.metrics.get("consistency") or {}).get("consistency")
     return None if value is None else float(value)
@@ -300,7 +306,7 @@ def save_csv(path: Path, rows: list[dict[str, Any]]) -> None:
 def differences_to_full(comparison: Comparison, metric: str) -> dict[str, Difference]:
     """Return {method: its score minus the full method's score}, paired over the test views that both methods have.
 
-    Methods without common views, and methods that compute the same as an earlier one, are omitted.
+    The full method, methods without common views, and methods that compute the same as an earlier one are omitted.
     """
     differences = {}
     for method in comparison.distinct_methods:

@@ -83,7 +83,8 @@ def format_quartiles(values: tuple, digits: int | None = None) -> str:
 def main_error_curves(jobs: list[JobFiles]) -> dict[str, tuple[str, list[np.ndarray]]]:
     """Return the main error of each stage with its curve in each scene, from the stages' traces.
 
-    The main error of a stage is the quantity that is the main one in most scenes.
+    The main error of a stage is the quantity that `trace_charts.pick_errors` names first in most scenes. Only the
+    series without a name is read.
 
     Returns:
         Stage -> (name of the quantity, curves [moments, 2] of seconds and value, one for each scene that has it).
@@ -104,8 +105,9 @@ def main_error_curves(jobs: list[JobFiles]) -> dict[str, tuple[str, list[np.ndar
 def summarize_stages(jobs: list[JobFiles]) -> list[tuple]:
     """Return the rows of stages.csv, with the columns `COLUMNS`.
 
-    Each stage has rows for seconds, peak memory and the last value of its main error. The rows of the whole job have
-    the sum of seconds and the scores of the result.
+    Each row has the quartiles of one quantity over the scenes that have it. A stage has rows for seconds, peak memory
+    in MB and the last value of its main error. The whole job, which comes last, has rows for the sum of its stages'
+    seconds and for the scores of the result (means over the test views).
     """
     errors = main_error_curves(jobs)
     rows = []
@@ -126,7 +128,7 @@ def summarize_stages(jobs: list[JobFiles]) -> list[tuple]:
 
 
 def quartiles(values: list[float]) -> tuple[int, float, float, float]:
-    """Return (number of values, first quartile, median, third quartile)."""
+    """Return (number of values, first quartile, median, third quartile) of at least one value."""
     low, middle, high = (float(v) for v in np.percentile(values, [25, 50, 75]))
     return len(values), low, middle, high
 

@@ -62,13 +62,14 @@ def make(home: Path, methods: list[str], seed: int = 0, frames: int = FRAMES) ->
 
     Args:
         home: folder of the comparison: runs/<scene>, or runs/compare for a folder of scenes.
-        methods: methods to compare with the full method; if empty, all methods of the comparison.
+        methods: methods to compare with the full method; if empty, all methods of the comparison without duplicates.
         seed: seed of the clips' random names. The page combines the seed with each participant's name into the seed of
             the order of trials.
         frames: number of frames of a clip along a camera path.
 
     Raises:
-        ValueError: nothing was compared, an unknown method is named, or no pair of clips can be made.
+        ValueError: nothing was compared, a named method was not compared or is a duplicate of an earlier one, or no
+            pair of clips can be made.
     """
     comparison = load_comparison(home)
     others = [method for method in comparison.distinct_methods if method != FULL]
@@ -134,7 +135,10 @@ def _pairs(comparison: Comparison, methods: list[str], frames: int) -> Iterator[
 
 
 def _render_path(run: Run, frames: int) -> Clip | None:
-    """Render a clip along an elliptical path through the capture; None if the result is pictures, not Gaussians."""
+    """Render a clip along an elliptical path through the capture.
+
+    None if the run has no finished result, or the result is inpainted pictures instead of Gaussians.
+    """
     evaluate, poses = run.folders.get("evaluate"), run.folders.get("poses")
     if not evaluate or not poses or not (evaluate / "scene.ply").exists() or "inpainter" in run.metrics:
         return None

@@ -19,11 +19,11 @@ from typing import Any
 def write_table(record: Path) -> None:
     """Write the table of a record beside the record.
 
-    The files are results.csv and results.md for a batch, compare-runs.csv and compare-runs.md for a comparison. The .md
-    of a batch begins with the scenes that failed and the reasons.
+    The files are compare-runs.csv and compare-runs.md for a comparison; for a batch they have the name of the record,
+    e.g. results.csv and results.md. The .md of a batch begins with the scenes that failed and the reasons.
 
     Args:
-        record: results.json of a batch, or compare.json of a comparison.
+        record: results.json or results@<variant>.json of a batch, or compare.json of a comparison.
     """
     content = json.loads(record.read_text(encoding="utf-8"))
     is_comparison, runs = "methods" in content, content["runs"]
@@ -41,7 +41,7 @@ def write_table(record: Path) -> None:
 def table_rows(runs: list[dict[str, Any]], keys: tuple[str, ...]) -> tuple[list[str], list[list[str]]]:
     """Return the header and the rows of the table: one row per run, then one row of means per method.
 
-    A mean is over the scenes that are done and have a value.
+    All cells are text. A mean is over the scenes that are done and have a value.
 
     Args:
         runs: entries of the record.

@@ -39,7 +39,8 @@ NO_ERRORS = ("sds_gradient_mean", "sds_gradient_max", "gaussians", "masked_gauss
 def pick_errors(stage: str, lines: Lines) -> list[str]:
     """Return the names of at most `MAX_PANELS` error quantities that the lines of a trace contain, for a chart.
 
-    The stage's main quantity comes first. If the lines contain no known error, all unknown numbers are returned.
+    The stage's main quantity comes first. If the lines contain no known error, the names of unknown numbers are
+    returned instead, in alphabetical order.
     """
     present = {name for line in lines for name, value in line.items() if isinstance(value, int | float)}
     main = [name for name in MAIN.get(stage, ()) if name in present][:1]
@@ -49,7 +50,11 @@ def pick_errors(stage: str, lines: Lines) -> list[str]:
 
 
 def axis_title(name: str) -> str:
-    """Return the title of an axis: the quantity, its unit if it is dB, and an arrow up if more is better, else down."""
+    """Return the title of an axis: the quantity's label, "dB" if this is its unit, and an arrow.
+
+    The arrow points up if more is better, and down if less is better; there is none if neither is. An unknown name is
+    returned unchanged.
+    """
     if name not in QUANTITIES:
         return name
     quantity = QUANTITIES[name]
@@ -58,7 +63,10 @@ def axis_title(name: str) -> str:
 
 
 def best_index(name: str, values: Sequence[float] | np.ndarray) -> int:
-    """Return the index of the best value of a quantity: of the largest if more is better, else of the smallest."""
+    """Return the index of the best value of a quantity: of the largest if more is better, else of the smallest.
+
+    For a quantity that `QUANTITIES` does not list, less counts as better.
+    """
     more = name in QUANTITIES and QUANTITIES[name].better == "more"
     return int((np.argmax if more else np.argmin)(values))
 
@@ -124,9 +132,12 @@ def clamp_first_seconds(points: np.ndarray) -> np.ndarray:
 
 
 def set_time_axis(axes: Axes, seconds: np.ndarray) -> None:
-    """Use a logarithmic time axis if the latest moment is more than ten times the earliest.
+    """Use a logarithmic time axis if the latest moment is more than ten times the earliest positive one.
 
     Traces are written at logarithmically spaced moments. The axis leaves room on the right for a number.
+
+    Args:
+        seconds: moments of all curves in the chart.
     """
     if needs_log_axis(seconds, 10):
         axes.set_xscale("log")
@@ -150,8 +161,9 @@ def draw_job_chart(
 
     Args:
         seconds: stage -> seconds in its receipt, in the order of the stages.
-        traces: stage -> lines of its trace; drawn if the stage's main quantity is in dB.
-        box: stage -> mean PSNR in dB of the stage's result in the box of the test views; None if unknown.
+        traces: stage -> lines of its trace; drawn from the stage's beginning if its main quantity is in dB.
+        box: stage -> mean PSNR in dB of the stage's result in the box of the test views, drawn as a point at the
+            stage's end; None if unknown.
         path: PNG to write.
         ceiling: mean PSNR in the box of a fit to photographs without the object, drawn as a dashed line; None for no
             line.

@@ -20,7 +20,7 @@ WORDS = "hatched: no photograph shows it"
 
 
 def load_seen_views(home: Path, scene: Scene) -> list[training_coverage.CoverageView]:
-    """Render from the fit what each training view saw: depth, and pixels that the object hides.
+    """Render from the fit what each training view saw: its depth, and the pixels that show the object.
 
     Args:
         home: runs/<scene> or runs/<scene>@<variant>.

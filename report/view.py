@@ -61,13 +61,14 @@ def scene_home(home: Path) -> Path:
 
 
 def move_to_view(place: Any, camera: Camera, target: np.ndarray) -> None:
-    """Move a visitor's camera to the pose of a training view.
+    """Give a visitor's camera the position, the viewing direction and the vertical field of view of another camera.
 
-    The camera then turns about the point on the optical axis at the distance of `target` [3].
+    The roll is not copied; it follows the visitor's up direction. The visitor's camera then turns about the point on
+    the optical axis at the distance of `target` [3] from the camera.
 
     Args:
         place: the visitor's camera in viser, or the initial camera of new visitors; changed in place.
-        camera: the training view's camera.
+        camera: the camera of a training view or a reference.
         target: a point in the scene.
     """
     place.position = camera.center
@@ -82,6 +83,9 @@ def vertical_fov(camera: Camera) -> float:
 
 class Viewer:
     """Viewer of one scene: a web server, and a thread per visitor that renders the visitor's latest camera.
+
+    The server listens on the loopback interface only, and runs in the background from the construction of the viewer
+    until `close`.
 
     Args:
         home: runs/<scene> or runs/<scene>@<variant>, finished.

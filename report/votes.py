@@ -55,10 +55,11 @@ def count_votes(answers: list[dict[str, Any]], key: dict[str, Any]) -> tuple[lis
         key: content of study-key.json, which says which method made which clip.
 
     Returns:
-        The preferences for each method and question, and a sentence for each excluded participant with the reason.
+        The preferences for each method and question that somebody answered, and a sentence for each excluded
+        participant with the reason.
 
     Raises:
-        ValueError: answers belong to another study, to a participant who has already answered, or to an unknown pair.
+        ValueError: answers belong to another study or to an unknown pair, or two files are of one participant.
     """
     accepted, excluded, names = [], [], set()
     for entry in answers:

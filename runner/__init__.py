@@ -4,7 +4,8 @@ It knows files, hashes and YAML, and nothing about 3D. Terms:
 
 - A *request* is what a user asks for on the command line. A *job* is a request with everything resolved and checked.
 - The *artifact* of a stage is the folder runs/<scene>/<stage>/ with its result. Its *receipt*, receipt.json, records
-  all inputs and the hashes of all files. The *key* of an artifact is a hash of its inputs.
+  all inputs and the hashes of all files. The *key* of an artifact is a hash of its inputs, without parameters that do
+  not change the result.
 - A *profile* is a set of parameters in pipeline.yaml. A *variant* (baseline or ablation) overrides some of them, and
   its folder is runs/<scene>@<variant>/.
 - A *need* of a stage is an earlier stage whose artifact it reads, or `scene`, the folder of the scene.

@@ -23,9 +23,10 @@ class ArtifactDiff:
 
     Attributes:
         missing: files that are in the receipt only.
-        changed: files whose content differs.
+        changed: files whose content differs from the receipt.
         added: files that are not in the receipt.
-        by_hand: files that people had changed or added, and that were accepted (`keep`). They agree with the receipt.
+        by_hand: files that people had changed or added, and that were then accepted into the receipt (`keep`). If such
+            a file was changed or removed later, `changed` or `missing` has it, too.
     """
 
     missing: tuple[str, ...] = ()
@@ -34,13 +35,16 @@ class ArtifactDiff:
     by_hand: tuple[str, ...] = ()
 
     def describe(self) -> list[str]:
-        """Return a phrase for each kind of difference that occurs; empty if there is none."""
+        """Return a phrase such as "a.png, b.png changed" for each attribute that is not empty, `by_hand` included."""
         parts = (self.missing, "missing"), (self.changed, "changed"), (self.added, "added"), (self.by_hand, "by hand")
         return [f"{join_names(names)} {word}" for names, word in parts if names]
 
 
 def diff_artifact(folder: Path, hashes: Hashes) -> ArtifactDiff:
-    """Compare the artifact in a folder with its receipt. Without a receipt all its files count as added."""
+    """Compare the artifact in a folder with its receipt. Hidden files are not compared.
+
+    If the receipt is missing or cannot be read, all files count as added.
+    """
     receipt, now = read_receipt(folder), hash_contents(folder, hashes)["files"]
     if not receipt:
         return ArtifactDiff(added=tuple(now))
@@ -57,14 +61,19 @@ def hash_contents(folder: Path, hashes: Hashes) -> dict[str, Any]:
     """Return the part of a receipt that describes the contents of an artifact.
 
     Returns:
-        "files": name -> hash of each file; "output": one hash of all files that other stages may read.
+        "files": name relative to the folder -> hash, for all files but the receipt and hidden ones; "output": one hash
+        of the files on which other stages may depend, i.e. without traces, warnings and checkpoints.
     """
     files = {name: file for name, file in hashes.listing(folder).items() if name != RECEIPT}
     return {"files": files, "output": hash_listing(files)}
 
 
 def accept_changes(folder: Path, hashes: Hashes) -> None:
-    """Accept the files that people changed or added in an artifact: its receipt then lists them as `by_hand`."""
+    """Accept the files that people changed or added in an artifact, so that it counts as undamaged.
+
+    The receipt is rewritten with the present hashes of all files, and lists the accepted ones as `by_hand`. The key of
+    the artifact stays as it is. Without changed or added files nothing is written.
+    """
     diff = diff_artifact(folder, hashes)
     if diff.changed or diff.added:
         by_hand = sorted({*diff.by_hand, *diff.changed, *diff.added})
@@ -73,10 +82,11 @@ def accept_changes(folder: Path, hashes: Hashes) -> None:
 
 
 def replace_artifact(partial: Path, place: Path, hashes: Hashes) -> None:
-    """Replace the artifact at `place` by the finished folder `partial`.
+    """Replace the artifact at `place`, if there is one, by the finished folder `partial`, which is moved there.
 
-    The old artifact is renamed first. If the runner is killed between the two renames, `recover_swap` restores the old
-    artifact.
+    Files that people added to the old artifact are moved to the new one. Files that people changed are moved to
+    kept/<stage>/ beside the artifacts. The rest of the old artifact is deleted. If the runner is killed meanwhile,
+    `recover_swap` restores the old artifact or finishes the replacement.
     """
     old = place.with_name(f".old-{place.name}")
     if place.exists():
@@ -86,7 +96,14 @@ def replace_artifact(partial: Path, place: Path, hashes: Hashes) -> None:
 
 
 def recover_swap(home: Path, hashes: Hashes) -> None:
-    """Undo or finish a replacement of an artifact during which a runner was killed, in the folder of a scene."""
+    """Undo or finish the replacements of artifacts (`replace_artifact`) during which a runner was killed.
+
+    If the new artifact is in place, the replacement is finished; else the old artifact is restored.
+
+    Args:
+        home: folder of a scene or variant in runs/.
+        hashes: the cache of hashes.
+    """
     for gone in home.glob(".gone-*"):
         shutil.rmtree(gone)
     for old in home.glob(".old-*"):
@@ -100,8 +117,8 @@ def recover_swap(home: Path, hashes: Hashes) -> None:
 def _retire(old: Path, place: Path, hashes: Hashes) -> None:
     """Delete an old artifact, but keep what people did in it.
 
-    Files that people added are moved to the new artifact, or to kept/ if it has a file of this name. Files that people
-    changed are moved to kept/<stage>/.
+    Files that people added are moved to the new artifact, or to kept/<stage>/ if it has a file of this name. Files that
+    people changed, and files that were accepted by `keep`, are moved to kept/<stage>/.
 
     Args:
         old: folder of the old artifact; nothing is done if it does not exist.
@@ -124,7 +141,7 @@ def _retire(old: Path, place: Path, hashes: Hashes) -> None:
 
 
 def delete_folder(folder: Path) -> None:
-    """Delete a folder, or a link to one.
+    """Delete a folder with its contents, or a symbolic link without its target. A missing folder is no error.
 
     The folder is renamed first. So the remains that a killed runner may leave are never taken for an artifact.
     """

@@ -1,6 +1,8 @@
 """The commands `compare`, which runs the full method and its variants, and `batch`, which runs all scenes of a folder.
 
-A variant is a baseline or an ablation of pipeline.yaml. A method is a variant or the full method.
+A variant is a baseline or an ablation of pipeline.yaml. A method is a variant, the full method, or the scene's own run,
+i.e. the run without a variant. The full method is the variant "full"; if pipeline.yaml has no such variant, it is the
+scene's own run.
 """
 
 import os
@@ -31,24 +33,27 @@ WAITING, DONE, FAILED = "not run yet", "done", "failed"
 def compare(
     request: Request, only: str = "", seeds: int = 1, data: Path | None = None, execution: Execution | None = None
 ) -> int:
-    """Run the full method and its variants on one or more scenes.
+    """Run the full method, the scene's own run and the variants on one or more scenes.
 
-    The profile is the one that `comparisons` of pipeline.yaml names. After each run, compare.json and a table of all
-    runs are written to runs/<scene>/, or to runs/compare/ for a folder of scenes. Artifacts that are up to date are
+    The scene's own run uses the profile of the scene. All other methods use the profile that `comparisons` of
+    pipeline.yaml names for that profile, if any. After each run, compare.json and a table of all runs are written to
+    runs/<scene>/ of the first scene, or to runs/compare/ for a folder of scenes. Artifacts that are up to date are
     used, so the same command resumes after a kill. If a run fails, the other runs go on.
 
     Args:
         request: the scene and its options, without a variant.
-        only: names of variants, separated by commas or blanks; empty for all.
-        seeds: number of scenes; for the scene X they are X, X-1, X-2 ...
-        data: a folder whose scenes are compared; the request must then name no scene.
+        only: names of the methods to run besides the full method, separated by commas or blanks; "default" is the
+            scene's own run. Empty for all methods.
+        seeds: number of scenes; for the scene X they are X, X-1, X-2 ..., which must exist.
+        data: a folder whose scenes are compared; the request must then name no scene, and `seeds` must be 1.
         execution: settings; None for this machine.
 
     Returns:
         Number of failed runs.
 
     Raises:
-        Refused: a variant, a scene or a parameter is wrong; nothing has run.
+        Refused: a variant, a scene or a parameter is wrong; nothing has run. Parameters are only checked on the first
+            scene that can be read. A scene that cannot be read makes its runs fail.
     """
     if request.variant:
         raise Refused(f"variant={request.variant}: compare runs all variants; variants={request.variant} picks some")
@@ -99,7 +104,7 @@ def _check_requests(scenes: list[str], requests: dict[tuple[str, str], Request],
 
     Args:
         scenes: the scenes, as requests name them.
-        requests: (scene, method) -> request.
+        requests: (scene as requests name it, method) -> request.
         hashes: the cache of hashes.
 
     Raises:
@@ -159,7 +164,11 @@ def _scenes(request: Request, seeds: int, data: Path | None) -> dict[str, str]:
 
 
 def _scene_folders(data: Path) -> list[Path]:
-    """Return the scenes in a folder: its subfolders, sorted, but hidden ones. Raises Refused if there are none."""
+    """Return the scenes in a folder: its subfolders, sorted, except those whose names begin with "." or "_".
+
+    Raises:
+        Refused: there are none.
+    """
     data = data.expanduser()
     found = sorted(p for p in data.iterdir() if p.is_dir() and p.name[0] not in "._") if data.is_dir() else []
     if not found:

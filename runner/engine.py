@@ -30,7 +30,7 @@ class Resources:
     """The resources of one stage.
 
     Attributes:
-        cores: number of CPU cores; None for all.
+        cores: number of CPU cores. None for all cores of this machine, or for one core on a cluster.
         gpus: number of GPUs.
         memory_mb: CPU memory to reserve, MB.
     """
@@ -46,7 +46,8 @@ class Task:
 
     Attributes:
         root: folder with pipeline.yaml and stages/.
-        line: the job description that `worker.run` reads, without the fields that `run_process` adds; paths are text.
+        line: the job description that `worker.run` reads; paths are text. `run_process` adds "result" and "lock", and
+            an engine adds the cores and GPUs.
         output: the file to which everything that the stage prints is appended; None for the runner's own output.
     """
 
@@ -76,7 +77,7 @@ class Engine(Protocol):
     Attributes:
         cuda: whether its machines have a GPU; None if it is this machine, see `resolve.has_cuda`.
         cores: total number of CPU cores.
-        is_remote: True if stages run on other machines, which write to the folder of results.
+        is_remote: True if stages may run on other machines, which write to the folder of results.
     """
 
     cuda: bool | None
@@ -86,20 +87,26 @@ class Engine(Protocol):
     def run(self, task: Task, resources: Resources, lock: int, on_start: Callable[[], None]) -> StageResult:
         """Wait for the resources, run a task in a process, and wait for its end.
 
+        A failure of the stage is no exception; it is in the result. A process that is lost may be started again.
+
         Args:
             task: the work.
             resources: the resources that the process gets.
             lock: open file descriptor of the lock of the scene's folder in runs/. A local process keeps it open, so
                 that the lock is held until the process ends.
-            on_start: called when the task has its resources.
+            on_start: called when the task has its resources, or on a cluster when it is submitted. If the task is
+                started again, it may be called again.
 
         Raises:
-            KeyboardInterrupt: the engine was stopped.
+            KeyboardInterrupt: the engine was stopped before the task succeeded.
         """
         ...
 
     def stop(self) -> None:
-        """Interrupt the running tasks, and start no further ones. May be called from any thread."""
+        """Interrupt the running tasks, and start no further ones. Does not wait for their end.
+
+        May be called from any thread.
+        """
         ...
 
 
@@ -117,7 +124,8 @@ class LocalEngine:
 
         Args:
             cores: numbers of the CPU cores.
-            memory_mb: CPU memory in MB. With None, free memory is also checked before each stage.
+            memory_mb: CPU memory in MB that stages may reserve together. None for the memory that is free now; then the
+                free memory is also checked before each stage.
             gpus: numbers of the GPUs.
         """
         self._cores = sorted(os.sched_getaffinity(0)) if cores is None else list(cores)
@@ -130,7 +138,10 @@ class LocalEngine:
         self._change, self._stopped, self._number = threading.Condition(), False, 0
 
     def run(self, task: Task, resources: Resources, lock: int, on_start: Callable[[], None]) -> StageResult:
-        """See `Engine.run`."""
+        """See `Engine.run`. A stage that is killed (SIGKILL) beside other stages runs once more, alone.
+
+        The usual reason for such a kill is a lack of memory.
+        """
         result, others = self._run_once(task, resources, lock, on_start)
         if result.code == -signal.SIGKILL and others:  # probably out of memory: resume the stage while no other runs
             result, _ = self._run_once(task, replace(resources, memory_mb=ALL_MEMORY_MB), lock, on_start)
@@ -225,7 +236,7 @@ def free_memory_mb() -> int:
 
 
 def visible_gpus() -> list[str]:
-    """Return the numbers of the GPUs that this process may use, as text."""
+    """Return the GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them, or else their numbers as text."""
     listed = os.environ.get("CUDA_VISIBLE_DEVICES")
     if listed is not None:
         return [number for number in listed.split(",") if number not in ("", "-1")]
@@ -247,7 +258,8 @@ def run_process(
         task: the work.
         lock: file descriptor of a lock that the process keeps open, too; None for no lock.
         follow: makes a context from the process, which is entered while the process runs.
-        should_stop: called every second; if it returns True, the process is interrupted. None: never.
+        should_stop: called every second; if it returns True, the process is interrupted, and killed if it has not
+            ended after GRACE seconds. None: never.
     """
     reader, writer = os.pipe()  # a pipe and not a file, because the answer may be that the disk is full
     line = json.dumps(task.line | {"result": writer, "lock": lock})
@@ -308,7 +320,8 @@ def make_engine(name: str | None, address: str | None, root: Path, runs: Path) -
         runs: folder of all results.
 
     Raises:
-        Refused: the engine is unknown, its package is not installed, or the cluster cannot be reached.
+        Refused: the engine is unknown, its package is not installed, or the cluster cannot be reached; or an address is
+            given for the local engine.
     """
     if name in (None, "", "local"):
         if address:

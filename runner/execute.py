@@ -60,10 +60,11 @@ class Execution:
 
     Attributes:
         engine: the engine that runs them.
-        cores: number of cores of each stage. None for all cores, or for an equal part of them if several scenes run.
+        cores: number of cores of each stage. None for an equal part of the engine's cores if several scenes run; else
+            for all cores of this machine, or for one core on a cluster.
         output: the file to which stages append what they print; None for the runner's own output.
-        on_change: called with the name of a stage and its new state: "waits", "runs" or "done". A stage that need not
-            run is done at once.
+        on_change: called with the name of a stage and its new state: "waits" (for cores, GPUs or memory), "runs" or
+            "done". A stage that need not run is done at once.
     """
 
     engine: Engine
@@ -183,9 +184,9 @@ def _run_in_engine(
 def expected_memory_mb(job: ResolvedJob, stage: str, needs: dict[str, Path | None]) -> int:
     """Estimate the CPU memory in MB to reserve for a stage.
 
-    It is 10 % above the largest peak in the receipts of this scene and its variants. Before the first run it follows
-    from the size of the files that the stage reads, by the table `memory` of pipeline.yaml; 0 if the stage is not in
-    the table.
+    It is 10 % above the largest peak of this stage in the receipts of the scene and its variants, whatever their
+    profile. Before the first run it follows from the size of all files in the folders of `needs`, by the table `memory`
+    of pipeline.yaml; 0 if the stage is not in the table.
 
     Args:
         job: the job.
@@ -230,7 +231,7 @@ def _installed() -> dict[str, str]:
 def run_scene(
     request: Request, target: str, hashes: Hashes | None = None, execution: Execution | None = None
 ) -> dict[str, Path | None]:
-    """Run a stage of a scene and everything that it needs, as far as artifacts are not up to date.
+    """Run a stage of a scene and everything that it needs, as far as artifacts are not up to date. Prints the plan.
 
     Args:
         request: the scene and its options.
@@ -239,7 +240,8 @@ def run_scene(
         execution: settings; None for this machine with all its cores.
 
     Returns:
-        Stage -> folder of its artifact; None if it is skipped.
+        Stage -> folder of its artifact, or None if it is skipped; for the stages that it needs, in the order of
+        pipeline.yaml, and last the stage itself. A variant's folder may be that of the scene's own run.
 
     Raises:
         Refused: something that the user can correct is wrong or missing. Mostly this is raised before any stage runs.

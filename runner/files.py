@@ -20,7 +20,10 @@ MACHINE = platform.node()
 
 
 def list_files(folder: Path) -> Iterator[Path]:
-    """List all files below a folder, sorted. Links are followed; hidden names and __pycache__ are left out.
+    """Yield the paths of all files below a folder, each beginning with `folder`; nothing if there is no such folder.
+
+    The files of a folder come first, sorted by name, and then those of its subfolders. Links are followed. Hidden files
+    and folders, __pycache__ and broken links are left out.
 
     Raises:
         Refused: there is a pipe or a device.
@@ -72,7 +75,10 @@ def read_json(path: Path) -> Any:
 
 
 def read_receipt(artifact: Path) -> dict[str, Any] | None:
-    """Read the receipt in the folder of an artifact; None if it is missing, is not valid JSON, or lacks one of `RECEIPT_KEYS`."""
+    """Read the receipt in the folder of an artifact.
+
+    Returns None if the receipt is missing, is not valid JSON, or lacks one of `RECEIPT_KEYS`.
+    """
     found = read_json(artifact / RECEIPT)
     return found if isinstance(found, dict) and found.keys() >= RECEIPT_KEYS else None
 
@@ -158,14 +164,15 @@ def check_lock(lock: int) -> None:
 def export_folders(new: Path, old: Path, home: Path, names: tuple[str, ...]) -> Iterator[str]:
     """Copy folders of a new artifact to `home`, where people work with them.
 
-    Earlier exported files that nobody changed are replaced, or removed if the new artifact does not have them. Files
-    that a person changed or added are kept.
+    This is a generator: it copies while the caller iterates over the messages. Earlier exported files that nobody
+    changed are replaced, or removed if the new artifact does not have them. Files that a person changed or added are
+    kept, and the new files of the same names are not copied.
 
     Args:
         new: folder of the new artifact.
         old: folder of the artifact that `new` will replace.
         home: folder of the results of the scene, to which the folders are copied.
-        names: the folders to copy.
+        names: names of the folders to copy, in `new` and in `home`.
 
     Yields:
         A message for each file that is kept.

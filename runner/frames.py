@@ -15,7 +15,7 @@ FRAME_FILES = ("frames.json", "frames.csv")  # files that the extraction writes 
 
 
 def update_frames(video: Path, folder: Path, root: Path, hashes: Hashes) -> None:
-    """Extract a video's frames into the folder of a scene, unless the folder already has the frames of this video.
+    """Extract a video's frames into the folder of a scene, unless the folder has frames of a video of this content.
 
     Args:
         video: the video.

@@ -19,7 +19,13 @@ from runner.text import display_path, format_bytes
 
 @dataclass(frozen=True)
 class Unused:
-    """An artifact that no plan uses: its folder, its size in bytes, and the reason why no plan uses it."""
+    """An artifact that no plan uses.
+
+    Attributes:
+        folder: its folder.
+        size: size in bytes of the files that may be removed, i.e. without those that people changed or added.
+        why: the reason why no plan uses it.
+    """
 
     folder: Path
     size: int
@@ -32,11 +38,15 @@ def collect_garbage(request: Request, yes: bool) -> None:
     The plans are those of all scenes and variants in runs/ (or of one scene and its variants, if the request names it)
     with the current scene.yaml, pipeline.yaml and options. An artifact that only differs by its code counts as used.
     Only files that agree with receipts are removed, so files that people added or changed are kept. Artifacts of a
-    scene whose folder does not exist are kept too.
+    scene whose folder does not exist, or that cannot be planned, are kept too.
 
     Args:
         request: the options.
-        yes: True removes the artifacts without asking. Otherwise the user is asked if the input is a terminal.
+        yes: True removes the artifacts without asking. False asks the user if the input is a terminal, and else removes
+            nothing.
+
+    Raises:
+        Refused: the request names a scene for which nothing was computed.
     """
     hashes = Hashes(request.runs / HASHES)
     found = list(_unused(request, hashes))

@@ -13,11 +13,14 @@ def cost_table(job: ResolvedJob, decisions: dict[str, Decision], gpu: str | None
     """Return a table with the expected time and memory of each stage of a plan that would run on CUDA.
 
     Args:
+        job: the job.
         decisions: the plan, stage -> decision. Stages that need not run are left out.
         gpu: name of the GPU; None for this machine's.
 
     Returns:
-        The lines of the table; "" if no estimate is known.
+        The lines of the table, with the sum of the times in the last one. "" if there is no estimate: the machine has
+        no GPU and `gpu` is None, or no stage can be estimated. If `gpu` is named and no stage would run on CUDA, a
+        line that says so.
 
     Raises:
         Refused: the GPU is unknown.

@@ -33,7 +33,7 @@ def digest(*parts: str) -> str:
 
 
 def hash_listing(listing: dict[str, str], exclude: tuple[str, ...] = NOT_CONTENT) -> str:
-    """Hash a listing of files to one hash.
+    """Hash a listing of files to one hash, which depends on the order of the listing, too.
 
     Args:
         listing: name of each file, relative to a folder -> hash of its content.
@@ -91,7 +91,9 @@ class Hashes:
         return self._remember("file", path, content)
 
     def module(self, path: Path, root: Path) -> tuple[str, list[Path]]:
-        """Return the fingerprint of a Python file, and the files of CODE_PACKAGES that it imports.
+        """Return the fingerprint of a Python file, and the files of CODE_PACKAGES that it imports itself.
+
+        The fingerprint is a hash of the code without comments and docstrings, see `fingerprint`.
 
         Args:
             path: the Python file.
@@ -106,7 +108,7 @@ class Hashes:
         return fingerprint, self._imports[path, fingerprint]
 
     def folder(self, folder: Path, exclude: tuple[str, ...] = NOT_CONTENT) -> str:
-        """Return one hash of all files below a folder. Hidden files are left out.
+        """Return one hash of the names and contents of all files below a folder. Hidden files are left out.
 
         Args:
             folder: the folder.
@@ -120,7 +122,7 @@ class Hashes:
         return {str(path)[len(top) :]: self.file(path) for path in list_files(folder)}
 
     def files(self, folder: Path, files: Iterable[Path]) -> str:
-        """Return one hash of the contents of some files, and of their names relative to `folder`, in this order."""
+        """Return one hash of the contents of `files` and of their names relative to `folder`, in the given order."""
         top = os.path.join(folder, "")
         name = lambda path: path[len(top) :] if path.startswith(top) else os.path.relpath(path, folder)
         return digest(*(part for path in files for part in (name(str(path)), self.file(path))))
@@ -149,7 +151,9 @@ class Hashes:
 
 
 def paths_outside(value: Any, folder: Path) -> Iterator[Path]:
-    """Yield the existing files and folders outside the scene's folder that parameters name.
+    """Yield the existing files and folders outside the scene's folder that parameters name, as resolved paths.
+
+    Only texts with a slash, and "..", can name such a path. A path may be yielded more than once.
 
     Args:
         value: a parameter or nested parameters; texts in it are tried as paths relative to `folder`.
@@ -165,7 +169,12 @@ def paths_outside(value: Any, folder: Path) -> Iterator[Path]:
 
 
 def files_outside(files: Iterable[str], folder: Path) -> list[Path]:
-    """Return the files whose path, relative to `folder`, leads out of this folder. Links are not resolved."""
+    """Return the normalised paths of those files that lie outside a folder. Links are not resolved.
+
+    Args:
+        files: paths, absolute or relative to `folder`.
+        folder: the folder.
+    """
     paths = (Path(os.path.normpath(os.path.join(folder, file))) for file in files)
     return [path for path in paths if not path.is_relative_to(folder)]
 
@@ -261,14 +270,23 @@ def code_fingerprints(root: Path, stage: str, hashes: Hashes, folder: str = "sta
 
 @dataclass(frozen=True)
 class Inputs:
-    """Everything that an artifact depends on. The receipt stores it, so that a plan can say what changed."""
+    """Everything that an artifact depends on. The receipt stores it, so that a plan can say what changed.
 
-    params: dict[str, Any]  # every parameter of the stage, resolved
-    needs: dict[str, str | None]  # need -> hash of its content; None if the need was skipped
-    weights: dict[str, str]  # parameter -> hash of the folder or file that it names, or the name if it is not local
-    code: dict[str, str]  # file -> fingerprint
-    unkeyed: tuple[str, ...] = ()  # parameters that do not change the artifact
-    # optional features, such as LPIPS, that the machine lacked; the stage runs again once one is available
+    Attributes:
+        params: every parameter of the stage, defaults included; groups are nested dicts.
+        needs: need -> hash of its content; None if the need was skipped.
+        weights: parameter -> hash of the folder or file that it names, or the name if it is not local.
+        code: file -> fingerprint.
+        unkeyed: dotted names of the parameters that do not change the artifact.
+        unavailable: optional features, such as LPIPS, that the machine lacked. The stage runs again once one is
+            available.
+    """
+
+    params: dict[str, Any]
+    needs: dict[str, str | None]
+    weights: dict[str, str]
+    code: dict[str, str]
+    unkeyed: tuple[str, ...] = ()
     unavailable: tuple[str, ...] = ()
 
     @property
@@ -277,7 +295,7 @@ class Inputs:
         return digest(json.dumps([self.keyed(self.params), self.needs, self.weights, self.code], sort_keys=True))
 
     def keyed(self, params: dict[str, Any]) -> dict[str, Any]:
-        """Return the parameters that are part of the key, as dotted name -> value."""
+        """Flatten `params` to a dict dotted name -> value, without `unkeyed`, which are not part of the key."""
         inside = tuple(f"{name}." for name in self.unkeyed)
         return {n: v for n, v in flatten_params(params).items() if n not in self.unkeyed and not n.startswith(inside)}
 
@@ -297,7 +315,11 @@ def flatten_params(params: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def list_changes(old: dict[str, Any], new: Inputs) -> list[str]:
-    """Describe the differences between a receipt, `old`, and the current inputs, a phrase each; code comes last."""
+    """Describe the differences between a receipt, `old`, and the current inputs, a phrase each; code comes last.
+
+    Parameters that do not change the artifact are not compared. An optional feature counts as a difference if the
+    machine lacked it at the time of the receipt and has it now. The list is empty if the artifact is up to date.
+    """
     found, before, after = [], new.keyed(old["params"]), new.keyed(new.params)
     for name in sorted({*before, *after}):
         if name not in after:

@@ -33,13 +33,17 @@ TEMPORARY = (".partial-*", ".copying-*", ".gone-*")
 
 
 def verify(request: Request) -> int:
-    """Hash all files of a scene, of its artifacts and of its variants' artifacts, and compare them with the receipts.
+    """Hash the files of a scene and of all its artifacts, and compare the artifacts with their receipts.
 
-    The hashes are cached, so that the next run repeats the stages whose artifacts are damaged.
+    The artifacts are those of the scene's own run and of all variants, or of one variant if the request names it. The
+    result is printed. The hashes are cached, so that the next run repeats the stages whose artifacts are damaged.
 
     Returns:
-        Number of damaged artifacts, plus number of files of the scene whose content changed while size and time did
-        not.
+        Number of damaged artifacts (files are missing or changed, or the receipt cannot be read; added files are no
+        damage), plus number of files of the scene whose content changed while size and time did not.
+
+    Raises:
+        Refused: the scene or the variant is unknown, or another process uses one of the folders.
     """
     hashes, homes, damaged = Hashes(request.runs / HASHES, recompute=True), _homes(request), 0
     for home in homes:
@@ -63,7 +67,10 @@ def verify(request: Request) -> int:
 def clean(request: Request) -> None:
     """Remove everything that was computed for a scene and its variants, or for one variant if the request names it.
 
-    Files that people added or changed are kept.
+    Files that people added or changed are kept. The user is not asked.
+
+    Raises:
+        Refused: the scene or the variant is unknown, or another process uses one of the folders; nothing was removed.
     """
     homes, pipeline, hashes = _homes(request), load_pipeline(request.root), Hashes(request.runs / HASHES)
     with ExitStack() as locks:
@@ -142,7 +149,10 @@ def _find_artifact_files(home: Path, pipeline: Pipeline, hashes: Hashes) -> Iter
 
 
 def artifact_files(folder: Path, hashes: Hashes) -> Iterator[Path]:
-    """Yield the files of an artifact that agree with its receipt and nobody changed, and then the receipt."""
+    """Yield the files of an artifact that its stage wrote and nobody changed, and last the receipt.
+
+    Files that people changed or added are left out even if they were accepted into the receipt (`keep`).
+    """
     diff = diff_artifact(folder, hashes)
     by_people = {*diff.changed, *diff.added, *diff.by_hand}
     yield from (folder / name for name in hashes.listing(folder) if name not in by_people and name != RECEIPT)
@@ -150,7 +160,7 @@ def artifact_files(folder: Path, hashes: Hashes) -> Iterator[Path]:
 
 
 def remove_empty(home: Path) -> None:
-    """Remove all empty folders in `home`, and `home` itself if it is empty then."""
+    """Remove all folders at any depth in `home` that are empty or become so, and `home` itself if it is empty then."""
     for place, _, _ in os.walk(home, topdown=False):
         if not any(os.scandir(place)):
             os.rmdir(place)

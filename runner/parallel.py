@@ -68,12 +68,19 @@ def run_all(
     By default each group gets an equal part of the engine's cores, at least one. The number of cores of a stage does
     not change when other runs end, so that no result depends on the order in which runs end.
 
+    If runs are parallel or on a cluster, each run's output goes to output.log in its home, and a table of the progress
+    is displayed instead.
+
     Args:
         runs: the runs; those of a group must be neighbours.
-        execution: engine, and number of cores of each stage.
+        execution: engine, and number of cores of each stage; its other settings are not used.
         hashes: the cache of hashes.
         stages: names of all stages, for the display of progress.
-        on_end: called after each run with its index in `runs` and its outcome, never by two threads at once.
+        on_end: called after each run, failed or not, with its index in `runs` and its outcome, never by two threads at
+            once. An error that it raises is raised here.
+
+    Raises:
+        KeyboardInterrupt: the user interrupted the runs (Ctrl-C).
     """
     engine, cores = execution.engine, execution.cores
     groups = [list(places) for _, places in groupby(range(len(runs)), key=lambda place: runs[place].group)]

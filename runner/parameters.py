@@ -19,10 +19,10 @@ SECONDS = "seconds"  # name of the parameter that is set to the stage's share of
 
 
 def merge_params(below: dict[str, Any], above: dict[str, Any], atomic: Collection[str] = ()) -> dict[str, Any]:
-    """Return `below` overridden by `above`.
+    """Return a new dict: `below` overridden by `above`. Both stay unchanged.
 
-    A value that is a mapping in both is merged recursively, unless its key is in `atomic`. All other values of `above`
-    replace those of `below`.
+    A value that is a mapping in both is merged recursively, unless it is at the top level and its key is in `atomic`.
+    All other values of `above` replace those of `below`.
     """
     both = {k for k, v in above.items() if isinstance(v, dict) and isinstance(below.get(k), dict)}.difference(atomic)
     return below | {k: merge_params(below[k], v) if k in both else v for k, v in above.items()}
@@ -30,6 +30,9 @@ def merge_params(below: dict[str, Any], above: dict[str, Any], atomic: Collectio
 
 def parse_set(text: str, pipeline: Pipeline) -> Overrides:
     """Parse the text of `set=`, such as `fit.iterations=500 distill.sds.weight=1`, whose values are YAML.
+
+    Values of keys of scene.yaml stay text as written, as in scene.yaml. If a parameter occurs twice, the last one
+    counts. Whether parameters exist is not checked.
 
     Returns:
         Overrides: stage -> parameter, or group of parameters -> value.
@@ -72,7 +75,7 @@ class Layers:
     layers: tuple[tuple[str, Overrides], ...]
 
     def origin(self, stage: str, name: str) -> str:
-        """Return the name of the last layer that sets a parameter, for error messages.
+        """Return the name of the last layer that sets a parameter, for error messages; "pipeline.yaml" if none does.
 
         A layer also counts if it sets a group that contains the parameter, or a part of the parameter.
 
@@ -153,16 +156,18 @@ def parse_duration(text: object, origin: str) -> float:
 
 
 def split_budget(pipeline: Pipeline, values: Overrides, seconds: float) -> Overrides:
-    """Split a time budget over the stages, in the proportions of the table `budget` in pipeline.yaml.
+    """Give the stages of the table `budget` in pipeline.yaml their fractions of a time budget.
 
-    Stages that are skipped because of their parameters get nothing, and the other stages get correspondingly more.
+    The fractions may add up to less than 1; the rest of the time is for the other stages. A stage that is skipped
+    because of its parameters gets nothing. Its fraction is divided among the other stages of the table in proportion to
+    their fractions.
 
     Args:
         values: stage -> its merged parameters.
-        seconds: the budget.
+        seconds: the budget for all stages together.
 
     Returns:
-        Overrides: stage -> {"seconds": its share}.
+        Overrides: stage -> {"seconds": its share}, without the skipped stages.
 
     Raises:
         Refused: pipeline.yaml has no table `budget`.

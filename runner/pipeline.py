@@ -29,16 +29,25 @@ class Strict(BaseModel, extra="forbid", frozen=True):
 
 
 class Condition(Strict):
-    """A condition under which a stage is skipped. It tests exactly one of `fact`, `param` and `empty`."""
+    """A condition under which a stage is skipped. It tests exactly one of `fact`, `param` and `empty`.
 
-    reason: str  # why the stage is skipped, for the user; may name facts of the tested stage in braces
-    fact: str | None = None  # <stage>.<name>: true if this value of an earlier stage's facts.json equals `equals`
-    # <stage>.<name>, or a list of such names: true if all these parameters, of any stages, equal `equals`
+    Attributes:
+        reason: why the stage is skipped, for the user; may name facts of the tested stage in braces.
+        fact: <stage>.<name>; true if this value of an earlier stage's facts.json equals `equals`.
+        param: <stage>.<name>, or several such names; true if all these parameters, of any stages, equal `equals`.
+        equals: see `fact` and `param`.
+        empty: <stage>/<folder>; true if this folder of an earlier stage's artifact has no files.
+        unless: the condition is false if scene.yaml has one of these keys.
+        only: <stage>.<name> -> value; the condition is false unless each of these parameters has its value.
+    """
+
+    reason: str
+    fact: str | None = None
     param: Annotated[tuple[str, ...], BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)] = ()
     equals: Any = None
-    empty: str | None = None  # <stage>/<folder>: true if this folder of an earlier artifact has no files
-    unless: tuple[str, ...] = ()  # the condition is false if scene.yaml has one of these keys
-    only: dict[str, Any] = {}  # <stage>.<name> -> value: false unless each of these parameters has its value
+    empty: str | None = None
+    unless: tuple[str, ...] = ()
+    only: dict[str, Any] = {}
 
     @model_validator(mode="after")
     def _has_one_test(self) -> Self:
@@ -117,7 +126,7 @@ class Stage(Strict):
 
 
 class Memory(Strict):
-    """The expected CPU memory of a stage: `mb` MB, and `each` MB more per MB of files that the stage reads."""
+    """The expected CPU memory of a stage: `mb` MB, and `each` MB more per MB of files in the folders of its needs."""
 
     mb: Annotated[float, Field(gt=0)]
     each: Annotated[float, Field(ge=0)] = 0
@@ -130,8 +139,9 @@ class Pipeline(Strict):
         stages: name -> stage, in the order in which they run.
         scene_keys: stage -> keys of scene.yaml that are parameters of this stage.
         profiles, variants: name -> parameters by stage.
-        comparisons: profile of a scene -> profile in which `compare` runs its methods.
-        budget: stage -> its part of a time budget, as a fraction of 1.
+        comparisons: profile of a scene -> profile in which `compare` runs all methods but the scene's own run. Without
+            an entry this is the scene's profile, too.
+        budget: stage -> its part of a time budget, as a fraction; the sum is at most 1.
         memory: stage -> expected memory, used while no earlier run has measured it.
     """
 
@@ -172,7 +182,7 @@ class Pipeline(Strict):
         return self
 
     def closure(self, target: str) -> list[str]:
-        """Return a stage and all stages that it needs directly or indirectly, in order.
+        """Return a stage and all stages that it, or its conditions, need directly or indirectly, in order.
 
         Args:
             target: name of the stage; "all" for all stages.
@@ -206,7 +216,11 @@ def unknown_name(kind: str, name: object, known: Any) -> str:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML file of the project as a dict. Raises Refused if it is not valid YAML or not a mapping."""
+    """Read a YAML file of the project as a dict, which is empty for an empty file.
+
+    Raises:
+        Refused: the file is not valid YAML, or not a mapping.
+    """
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), LOADER)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -235,13 +249,22 @@ def load_pipeline(root: Path) -> Pipeline:
 
 @dataclass(frozen=True)
 class SceneFile:
-    """The content of a scene's optional scene.yaml."""
+    """The content of a scene's optional scene.yaml.
 
-    path: Path  # path of the file, which need not exist
+    Attributes:
+        path: path of the file, which need not exist.
+        profile: name of the profile; None if the file names none.
+        brings: the keys that describe the scene, such as `reference`, with their values; keys without a value are left
+            out.
+        stages: parameters by stage, the content of the key `stages`.
+        budget: time budget, as written; None without one.
+    """
+
+    path: Path
     profile: str | None
-    brings: dict[str, Any]  # the keys that describe the scene, such as `reference`, with their values
-    stages: Overrides  # parameters by stage
-    budget: Any = None  # time budget, as written
+    brings: dict[str, Any]
+    stages: Overrides
+    budget: Any = None
 
 
 def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
@@ -273,10 +296,10 @@ def scene_name(scene: Path) -> str:
 
 
 def find_scene(text: str, root: Path) -> Path:
-    """Find the folder or video that `scene=` means.
+    """Find the folder or video that `scene=` means, as an absolute path.
 
     Args:
-        text: a name under data/, or a path.
+        text: a name under data/, or else a path.
         root: folder with pipeline.yaml.
 
     Raises:

@@ -45,22 +45,32 @@ class Decision:
     - `skip`: the stage is not needed.
     - `missing`: the stage cannot run, because something that it needs is not there.
     - `stale`: the artifact is up to date so far, but some of its needs run first. The stage runs if their contents
-    change.
+      change.
     - `pending`: whether the stage runs is only known after an earlier stage has run.
+
+    Attributes:
+        status: see above.
+        reason: the reason for the status, in words.
+        path: folder of the current artifact, which may be out of date; None if there is none or the stage is skipped.
+        is_final: True if this artifact, or its absence, will not change in this run.
+        inputs: everything that the artifact depends on; None if not yet known.
+        notes: notes of the stage's preview.
+        needed: the weights that the stage will use, as fields of reffusion.weights.local.Need.
+        lacks: what this machine lacks for CUDA, a line each with the remedy.
     """
 
     status: str
     reason: str
-    path: Path | None = None  # the current artifact; None if there is none or the stage is skipped
-    is_final: bool = False  # this artifact, or its absence, will not change in this run
-    inputs: Inputs | None = None  # everything that the artifact depends on; None if not yet known
-    notes: tuple[str, ...] = ()  # notes of the stage's preview
-    needed: tuple[dict[str, Any], ...] = ()  # the weights that it will use: fields of reffusion.weights.local.Need
-    lacks: tuple[str, ...] = ()  # what this machine lacks for CUDA, a line each with the remedy
+    path: Path | None = None
+    is_final: bool = False
+    inputs: Inputs | None = None
+    notes: tuple[str, ...] = ()
+    needed: tuple[dict[str, Any], ...] = ()
+    lacks: tuple[str, ...] = ()
 
 
 def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decision:
-    """Decide about one stage, without asking the stage itself.
+    """Decide about one stage, without asking the stage itself and without a check for a GPU (see `plan`).
 
     Args:
         job: the job.
@@ -111,7 +121,10 @@ def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decisi
 
 
 def used_needs(job: ResolvedJob, stage: str) -> list[str]:
-    """Return the needs of a stage, without one that it ignores with its parameters (`pipeline.IgnoredNeed`)."""
+    """Return the names of the needs of a stage, also `scene`, but not one that it ignores with its parameters.
+
+    See `pipeline.IgnoredNeed`.
+    """
     spec = job.pipeline.stages[stage]
     ignored = spec.ignore and _has_value(job, spec.ignore.param, spec.ignore.equals) and spec.ignore.need
     return [need for need in spec.all_needs if need != ignored]
@@ -271,13 +284,13 @@ def plan(job: ResolvedJob, stages: list[str], done: dict[str, Decision] | None =
     Args:
         job: the job.
         stages: the stages, in order.
-        done: decisions that are already made, while the job runs.
+        done: decisions that are already made, while the job runs; they are returned unchanged. None before it runs.
 
     Returns:
         Stage -> decision, in the order of `stages`.
 
     Raises:
-        Refused: a stage is broken or a condition cannot be evaluated.
+        Refused: a stage is broken or a condition cannot be evaluated. Other problems give the status `missing`.
     """
     decisions = dict(done or {})
     for stage in stages:
@@ -380,13 +393,14 @@ def _paths_outside_scene(job: ResolvedJob, stages: list[str]) -> list[Path]:
 def plan_record(job: ResolvedJob, decisions: dict[str, Decision], unset: ResolvedJob) -> dict[str, Any]:
     """Return the content of plan.json, which the report reads.
 
-    It has the profile; for each stage its status, reason, notes and folder relative to runs/; and the parameters
-    without the user's options.
-
     Args:
         job: the job.
         decisions: the plan, stage -> decision.
         unset: the same job without `set=` and `budget=`, whose parameters are recorded.
+
+    Returns:
+        "profile": its name; "stages": stage -> {"word": status, "reason", "notes", "folder": relative to runs/, or
+        None}; "params": stage -> all parameters of `unset`.
     """
     folder = lambda path: path and os.path.relpath(path, job.runs)
     entry = lambda d: {"word": d.status, "reason": d.reason, "notes": list(d.notes), "folder": folder(d.path)}
@@ -395,7 +409,7 @@ def plan_record(job: ResolvedJob, decisions: dict[str, Decision], unset: Resolve
 
 
 def earlier_receipts(job: ResolvedJob, stage: str) -> list[dict[str, Any]]:
-    """Return the receipts of a stage in the scene's own run and in its variants."""
+    """Return the receipts of a stage in the scene's own run and in its variants, as far as there are any."""
     places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
     return [receipt for place in places if (receipt := read_receipt(place / stage))]
 
@@ -403,7 +417,8 @@ def earlier_receipts(job: ResolvedJob, stage: str) -> list[dict[str, Any]]:
 def expected_seconds(job: ResolvedJob, stage: str) -> float | None:
     """Return how many seconds the stage took in its last run on this scene or a variant of it; None if unknown.
 
-    Only runs on this machine and with this profile count.
+    Only runs on this machine and with this profile count. Of a run that was interrupted and resumed, the time is that
+    of the last attempt alone.
     """
     here = [r for r in earlier_receipts(job, stage) if r.get("machine") == MACHINE and r.get("profile") == job.profile]
     return max(here, key=lambda r: r["date"])["seconds"] if here else None

@@ -13,7 +13,7 @@ PROJECT = Path(__file__).resolve().parent.parent  # the folder with runner/ and 
 
 
 def start_worker(root: Path, *arguments: str, **options: Any) -> subprocess.Popen[str]:
-    """Start the process `python -m runner.worker <arguments>`.
+    """Start the process `python -m runner.worker <arguments>`, with a pipe for text as its standard input.
 
     Args:
         root: folder with pipeline.yaml and stages/; it is the working directory and comes first on the import path.

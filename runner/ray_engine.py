@@ -25,8 +25,8 @@ RETRIES = 3  # number of times that a stage is started again after its machine w
 class RayEngine:
     """The engine for Ray, see `engine.Engine`.
 
-    Its `address` is that of a running cluster, as ray.init takes it; None for $RAY_ADDRESS, or a cluster on this
-    machine.
+    Its `address` is that of a running cluster, as ray.init takes it; None for $RAY_ADDRESS, or else a cluster that runs
+    on this machine.
     """
 
     is_remote = True

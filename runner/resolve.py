@@ -34,7 +34,21 @@ CACHED = "answer "  # prefix of the keys in the cache of hashes under which answ
 
 @dataclass(frozen=True)
 class Request:
-    """The options of a command line, as typed; None if an option is not given."""
+    """The options of a command line.
+
+    Attributes:
+        root: folder with pipeline.yaml and stages/.
+        runs: folder of all results.
+        scene: name or path of the scene; "" for none.
+        profile: name of the profile, or "auto"; None if not given.
+        variant: name of the variant; None for the scene's own run.
+        trust: True accepts artifacts that only differ by their code.
+        set: parameters, see `parameters.parse_set`.
+        budget: time budget as text; None if not given.
+        keep: True accepts artifacts that people changed, and records this in their receipts.
+        cuda: whether the cluster has GPUs; None if stages run on this machine, see `has_cuda`.
+        compared: True uses the profile that `comparisons` of pipeline.yaml names for the scene's profile, if any.
+    """
 
     root: Path
     runs: Path
@@ -45,43 +59,68 @@ class Request:
     set: str = ""
     budget: str | None = None
     keep: bool = False
-    cuda: bool | None = None  # whether the cluster has GPUs; None if stages run on this machine, see `has_cuda`
-    compared: bool = False  # True uses the profile that `comparisons` of pipeline.yaml names
+    cuda: bool | None = None
+    compared: bool = False
 
 
 @dataclass(frozen=True)
 class StageInfo:
-    """The description of a stage with given parameters, as the stage's own code gives it."""
+    """The description of a stage with given parameters, as the stage's own code gives it.
 
-    params: dict[str, Any]  # all parameters, groups nested
-    weights: tuple[str, ...] = ()  # dotted names of the parameters that name weights
-    unkeyed: tuple[str, ...] = ()  # dotted names of the parameters that do not change the artifact
-    reads: tuple[str, ...] | None = None  # the files of the scene that it reads; None for all
-    facts: dict[str, Any] = field(default_factory=dict)  # facts about files that it does not read, e.g. their names
-    machine: dict[str, str] = field(default_factory=dict)  # facts about this machine on which the artifact depends
-    unavailable: tuple[str, ...] = ()  # optional features, such as LPIPS, that this machine does not have
+    Attributes:
+        params: all parameters, defaults included; groups are nested dicts.
+        weights: dotted names of the parameters that name weights.
+        unkeyed: dotted names of the parameters that do not change the artifact.
+        reads: paths of the files of the scene that the stage reads; None for all.
+        facts: facts about the scene on which the artifact depends besides the files in `reads`, e.g. names of files.
+        machine: facts about this machine on which the artifact depends.
+        unavailable: optional features, such as LPIPS, that this machine does not have.
+    """
+
+    params: dict[str, Any]
+    weights: tuple[str, ...] = ()
+    unkeyed: tuple[str, ...] = ()
+    reads: tuple[str, ...] | None = None
+    facts: dict[str, Any] = field(default_factory=dict)
+    machine: dict[str, str] = field(default_factory=dict)
+    unavailable: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class ResolvedJob:
-    """A job: one scene, or a variant of it, with all its settings, resolved and checked."""
+    """A job: one scene, or a variant of it, with all its settings, resolved and checked.
+
+    Attributes:
+        root, runs, trust, keep, cuda: as in `Request`.
+        folder: the scene's folder; the root for a job without a scene.
+        home: folder of this run, runs/<scene> or runs/<scene>@<variant>.
+        base: folder of the scene's own run, runs/<scene>, whose artifacts variants share.
+        pipeline: the content of pipeline.yaml.
+        layers: the parameters as the user and the files ask for them, without the defaults in the stages' code.
+        profile: name of the profile.
+        why: the reason for this profile, in words.
+        brings: the keys of scene.yaml that describe the scene and have values.
+        hashes: the cache of hashes.
+        stages: stage -> its description, for the stages that are not broken.
+        broken: stage that cannot be imported -> the error.
+    """
 
     root: Path
     runs: Path
-    folder: Path  # the scene's folder; the root for a job without a scene
-    home: Path  # runs/<scene>, or runs/<scene>@<variant>
-    base: Path  # runs/<scene>: artifacts that variants share
+    folder: Path
+    home: Path
+    base: Path
     pipeline: Pipeline
-    layers: Layers  # the parameters as the user and the files ask for them, without defaults of stages
+    layers: Layers
     profile: str
-    why: str  # the reason for this profile
+    why: str
     trust: bool
-    brings: frozenset[str]  # the keys of scene.yaml that have values
+    brings: frozenset[str]
     hashes: Hashes
-    keep: bool = False  # True accepts artifacts that people changed
-    cuda: bool | None = None  # as in Request
+    keep: bool = False
+    cuda: bool | None = None
     stages: dict[str, StageInfo] = field(default_factory=dict)
-    broken: dict[str, str] = field(default_factory=dict)  # stages that cannot be imported -> the error
+    broken: dict[str, str] = field(default_factory=dict)
 
     @property
     def params(self) -> dict[str, dict[str, Any]]:
@@ -100,7 +139,7 @@ class ResolvedJob:
 
 
 def resolve(request: Request, hashes: Hashes | None = None, scene: bool = True) -> ResolvedJob:
-    """Read and check everything that a request names.
+    """Read and check everything that a request names. If the scene is a video, its frames are extracted.
 
     Args:
         request: the request.
@@ -114,7 +153,7 @@ def resolve(request: Request, hashes: Hashes | None = None, scene: bool = True) 
 
 
 def resolve_all(requests: list[Request], hashes: Hashes, scene: bool = True) -> list[ResolvedJob]:
-    """Resolve several requests, which must have the same root.
+    """Resolve several requests, which must have the same root, and return the jobs in the same order.
 
     All questions to stages whose answers are not in the cache are sent to one process. For the arguments and errors see
     `resolve`.
@@ -164,8 +203,11 @@ def choose_profile(
 ) -> tuple[str, str]:
     """Choose the profile: the one asked for, else that of scene.yaml, else that of the last run, else by the machine.
 
+    The name "auto", asked for or in scene.yaml, stands for the last two. By the machine the profile is "paper" with a
+    GPU, else "laptop".
+
     Args:
-        asked: the option `profile`; None if not given.
+        asked: the option `profile`, which precedes that of scene.yaml; None if not given.
         scene: the content of scene.yaml.
         pinned: files that record the profile of the last run; the first one with a text counts.
         cuda: as in `Request`.

@@ -16,11 +16,11 @@ from runner.engine import StageResult, Task, run_process
 def run_attempt(task: Task, should_stop: Callable[[], bool] | None = None) -> StageResult:
     """Run a task on this machine, from the state that an earlier attempt left.
 
-    The attempt works in a folder that no other attempt writes to. At the end this folder is renamed to the task's own
-    folder.
+    The attempt works in a folder that no other attempt writes to. At the end, also after a failure, this folder is
+    renamed to the task's own folder, unless another attempt has begun.
 
     Args:
-        task: the work.
+        task: the work; its own folder is `task.line["out"]`.
         should_stop: see `engine.run_process`.
     """
     out = Path(task.line["out"])
@@ -36,10 +36,10 @@ def run_attempt(task: Task, should_stop: Callable[[], bool] | None = None) -> St
 
 
 def take_over(folder: Path) -> None:
-    """Restore `folder` from the newest attempt whose runner or machine was lost, if there is one.
+    """Restore `folder` from the newest attempt whose runner or machine was lost, if `folder` does not exist.
 
-    The attempt's folder is copied and then removed, because the lost attempt may still write to it. Nothing is copied
-    if `folder` exists.
+    The attempt's folder, <folder>.<suffix>, is copied and not renamed, because the lost attempt may still write to it.
+    The folders of all attempts are removed, even if `folder` exists.
     """
     attempts = sorted(folder.parent.glob(f"{folder.name}.*"), key=lambda path: path.stat().st_mtime)
     for attempt in reversed(attempts):

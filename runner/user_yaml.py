@@ -31,12 +31,12 @@ def read_user_yaml(path: Path, typed: tuple[str, ...]) -> dict[str, Any]:
     """Read a YAML file of `key: value` lines as a dict; empty if the file does not exist or is empty.
 
     YAML would read the names of views in `view: 20220819_104425` and `test: [2022-08-19, 007, on]` as numbers, dates
-        and
-    booleans. So values stay text as written, or None, except for some keys.
+    and booleans. So scalars stay text as written, or None, except below the keys in `typed`. Lists and mappings are
+    read as such everywhere, and keys are text.
 
     Args:
         path: the file.
-        typed: the keys below which values are read with YAML's types.
+        typed: the top-level keys below which scalars are read with YAML's types.
 
     Raises:
         Refused: the path is no regular file; the file is not UTF-8 text, valid YAML or a mapping; a key occurs twice;
@@ -60,7 +60,7 @@ def read_user_yaml(path: Path, typed: tuple[str, ...]) -> dict[str, Any]:
 
 
 def parse_value(text: str, is_text: bool) -> Any:
-    """Parse a value of the command line as YAML.
+    """Parse a value of the command line as YAML; None for an empty text.
 
     Args:
         text: the value.

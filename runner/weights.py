@@ -10,7 +10,7 @@ from runner.text import format_bytes
 
 
 def fetch_weights(request: Request, offline: bool) -> int:
-    """List the weights that all stages need, and download missing ones.
+    """List the weights that all stages need or could use, and download the missing ones, optional ones too.
 
     Args:
         request: the options. If they name a scene, its scene.yaml counts too.

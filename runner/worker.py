@@ -258,7 +258,8 @@ def run() -> int:
     - "lock": file descriptor of a lock, which stays open until this process ends, or null;
     - optionally the arguments of `_limit_resources`.
 
-    The answer is {"seconds", "peak_memory_mb", "machine"}, or {"error": one line}.
+    The answer is {"seconds", "peak_memory_mb", "machine"}, or {"error": one line}. The seconds are wall-clock time of
+    this process, from the import of the stage, and not of earlier attempts that it resumes.
     """
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # Ray blocks this signal in its processes
     signal.signal(signal.SIGINT, signal.default_int_handler)

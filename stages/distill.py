@@ -39,7 +39,8 @@ def run(
     """Run the stage: optimise the initialized Gaussians.
 
     Writes gaussians.ply, labels.npy (bool [N], True for the masked Gaussians, which `initialize` added), facts.json,
-    trace.jsonl and snapshots/ (the masked Gaussians at some steps).
+    trace.jsonl and snapshots/ (the masked Gaussians at some steps). An interrupted run resumes from the checkpoint in
+    `out`.
 
     Args:
         out: folder of this stage.

@@ -44,10 +44,11 @@ def run(
     initialize: Path | None = None,
     distill: Path | None = None,
 ) -> None:
-    """Run the stage: render and score the test views.
+    """Run the stage: render and score the test views. A scene without test views gets renders of training views.
 
-    Writes renders*/<view>.png, side_by_side/<view>.png, metrics.json (means), per_view.csv and a copy of scene.ply. The
-    result and the initialization are rendered with the backdrop that the stage `finish` added.
+    Writes renders/<view>.png (the result), renders_fit/ and renders_initialize/ (the Gaussians of these stages),
+    side_by_side/<view>.png, metrics.json (means), per_view.csv and a copy of scene.ply. The result and the
+    initialization are rendered with the backdrop, if the stage `finish` added one.
 
     A test view without a picture, and a training view, is rendered but not scored. If the scene keeps one of several
     objects, nothing is scored, because the test photographs show no object at all.
@@ -110,7 +111,7 @@ def run(
 
 
 def views_to_render(scene: Scene) -> tuple[tuple[str, ...], str]:
-    """Return the names of the views to render, and what kind of views they are, in words.
+    """Return the names of the views to render, and their kind: "test", "training" or "training, every 8th".
 
     They are the test views. Without test views they are every 8th training view, or all training views if that would
     give fewer than 8.
@@ -149,7 +150,7 @@ def unseen_by_training(
         fit, raw_masks, masks: folders of the stages of these names; `masks` is None if the stage was skipped.
 
     Returns:
-        Test view -> bool [H, W], True = unseen.
+        Test view -> bool [H, W], True = unseen; empty without test views.
     """
     if not scene.test:
         return {}
@@ -163,6 +164,8 @@ def unseen_by_training(
 
 def save_renders(out: Path, renders: ViewRenders, truth: np.ndarray | None) -> None:
     """Write the renders of a view to the folder of each stage, and fit, ground truth and result side by side.
+
+    The result goes to renders/ whichever stage made it. The box of the object is drawn into the joined picture.
 
     Args:
         out: folder of this stage.
@@ -180,7 +183,7 @@ def save_renders(out: Path, renders: ViewRenders, truth: np.ndarray | None) -> N
 def reduced_side(params: Params, raw_masks: Path) -> int:
     """Return the larger side in px to which pictures are reduced for a second set of scores; 0 for no second set.
 
-    It is `params.longest`, or else the size of the test masks' files.
+    It is `params.longest`, or if that is None the larger side of the test masks' files, or 0 without test masks.
 
     Args:
         raw_masks: folder of the stage `raw_masks`.

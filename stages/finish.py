@@ -23,9 +23,10 @@ def run(
 ) -> None:
     """Run the stage: write scene.ply, in the scene's own frame, and facts.json.
 
-    The result is that of `distill`; if this stage was skipped, that of `initialize`; and if nothing was removed, that
-    of `fit`. Gaussians that the scene brings get no backdrop, because they may cover places that its views do not show.
-    If a backdrop is added, completed/<stage>.ply holds the result in the normalised frame, and also the initialization
+    The result is that of `distill`; if this stage was skipped, that of `initialize`; and if both were skipped, that of
+    `fit`. With `params.backdrop`, scene.ply is the result with a backdrop. Gaussians that the scene brings get no
+    backdrop, because they may cover places that its views do not show. If a backdrop is added, completed/<stage>.ply
+    holds the same result in the normalised frame (<stage> made it), and completed/initialize.ply the initialization
     with the same backdrop.
 
     Args:

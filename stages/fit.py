@@ -1,6 +1,6 @@
 """The stage `fit`: 3D Gaussians are fitted to the photographs, object included.
 
-If the scene brings Gaussians, these are used as they are instead.
+If the scene brings Gaussians, these are used as they are instead, except in the baseline that fits unmasked pixels.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from reffusion.types import Scene
 
 
 def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None) -> None:
-    """Run the stage: fit Gaussians to the training views.
+    """Run the stage: fit Gaussians to the training views, without those that `params.holdout` reserves for evaluation.
 
     Writes gaussians.ply (normalised frame), trace.jsonl and, if exposures are fitted, exposures.json. An interrupted
     fit resumes from the checkpoint in `out`.

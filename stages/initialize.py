@@ -47,8 +47,9 @@ def run(
     - facts.json;
     - depth/<view>.exr: the depth at which each reference and each extra view was unprojected;
     - extra_views/<view>.png: views that were completed besides the references, because gaps were left;
-    - shadows/<view>.png: masks of the object's shadow;
-    - invent/<view>.png: invent masks I, of views in which the references drew less than was asked for;
+    - shadows/<view>.png: masks of the object's shadow in all views, if a reference shows the scene without it;
+    - invent/<view>.png: the invent masks I that reach beyond C (where the scene asks to fill a region), restricted
+      there to pixels that show new Gaussians;
     - trace.jsonl: the convergence of the depth solvers.
 
     Args:
@@ -118,7 +119,8 @@ def summarize(
 ) -> dict[str, Any]:
     """Compute the contents of facts.json: counts of Gaussians, uncovered pixels, and whether SDS may help.
 
-    A pixel of C is uncovered if the initialization shows no surface there. Views with many such pixels are printed.
+    A pixel of C is uncovered if the initialization shows no surface there. The names of views with many such pixels,
+    and the prediction about SDS, are printed.
 
     Args:
         space: results of the stages `poses`, `fit` and `masks`.
@@ -127,8 +129,8 @@ def summarize(
         sets: view name -> pixel classes.
         extra: the extra views that were completed.
         trusted: all completed views that supervise: references and extra views.
-        photos: view name -> uint8 [H, W, 3], photographs from which the object's shadow was removed; None for a
-            baseline.
+        photos: view name -> uint8 [H, W, 3], the photographs, without the object's shadow if one was found; None for a
+            baseline, or if there is no reference.
     """
     train = [space.scene.cameras[name] for name in space.scene.train]
     uncovered = {
@@ -178,7 +180,7 @@ def load_completed(params: Params, space: Workspace, reference: Path | None, lif
 
 
 def trusted_references(reference: Path, references: list[Reference], background: Background) -> list[Reference]:
-    """Extend the masks of the references to all pixels that they show better than the Gaussians do.
+    """Return the references with masks extended to all pixels that they show better than the Gaussians do.
 
     A reference that the scene brings is trusted in all of the consistent mask C. One that was completed here is trusted
     only where it was invented, its own mask.
@@ -194,6 +196,6 @@ def trusted_references(reference: Path, references: list[Reference], background:
 
 
 def save_depths(out: Path, depths: dict[str, np.ndarray]) -> None:
-    """Write depth maps, view name -> [H, W], as depth/<view>.exr."""
+    """Write depth maps, view name -> [H, W] camera z, as out/depth/<view>.exr in float32."""
     for name, depth in depths.items():
         save_exr(out / "depth" / f"{name}.exr", depth.astype("float32"))

@@ -1,4 +1,4 @@
-"""The stage `lift`: the hole of each training view is inpainted in 2D, independently, as NeRF-In and SPIn-NeRF do.
+"""The stage `lift`: the hole of each view is inpainted in 2D, independently, as NeRF-In and SPIn-NeRF do.
 
 Only baselines use this stage; it is not part of the method.
 """
@@ -28,10 +28,11 @@ DTYPE = torch.float32
 
 
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> None:
-    """Run the stage: inpaint the invent mask I of each training view that has one.
+    """Run the stage: inpaint the invent mask I of each view in which it is not empty.
 
-    Writes images/<view>.png, the best view also as a reference (as the stage `reference` does), and facts.json. Views
-    that an interrupted run finished are not inpainted again.
+    The views are the training views, without clean ones (photographed without the object), and views without a
+    photograph. Writes images/<view>.png, the best view also as a reference (as the stage `reference` does), and
+    facts.json. Views that an interrupted run finished are not inpainted again.
 
     Args:
         out: folder of this stage.

@@ -51,7 +51,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     Writes:
 
     - labels.npy, bool [N]: the Gaussians to remove, which are the object's and debris;
-    - debris.npy, bool [N], if debris is searched: Gaussians that the object had hidden and that photographs contradict;
+    - debris.npy, bool [N], if debris is searched: Gaussians that the object had hidden and that no photograph supports;
     - background.npz: planes and mirror planes around the object;
     - raw/, consistent/, unobserved/ and invent/<view>.png: the pixel classes;
     - facts.json;
@@ -131,7 +131,8 @@ def report_remnants(remnants: Sequence[Remnant], out: Path, photo_of: Callable[[
     The warnings are also written to warnings.json.
 
     Args:
-        remnants: the parts; those that would float in the air are removed, and the text says so.
+        remnants: the parts. Of those that would float in the air, the text says that they are removed; the caller
+            removes them.
         out: folder of this stage.
         photo_of: view name -> uint8 [H, W, 3].
     """
@@ -178,8 +179,10 @@ def collect_raw_masks(
 ) -> dict[str, np.ndarray]:
     """Return the raw masks of the views, as a dict view name -> bool [H, W], True = the object.
 
-    They are the masks that the scene brings, redrawn by the segmentation network if `params.refine`, and masks that are
-    made from clicks.
+    They are the masks that the scene brings for training views, united over the objects to remove (`params.remove`;
+    None: all). If `params.refine`, the segmentation network redraws them and makes masks for the other training views
+    that show the object. Clicks, if there are any, give masks to the views without one, test views included. The dict
+    is empty if the scene has neither masks nor clicks.
 
     Args:
         poses, raw_masks: folders of the stages of these names.

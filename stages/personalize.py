@@ -21,7 +21,8 @@ MEMORY_PARAM = "personalize.memory_gb"  # the parameter that out-of-memory error
 def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, reference: Path) -> None:
     """Run the stage: train the LoRA, and write pytorch_lora_weights.safetensors (for diffusers) and trace.jsonl.
 
-    Some photographs that are no references are used to measure the progress; the LoRA is not trained on them.
+    Some photographs that are no references are used to measure the progress; the LoRA is not trained on them. An
+    interrupted run resumes from the checkpoint in `out`.
 
     Args:
         out: folder of this stage.

@@ -48,10 +48,12 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
 
     Writes:
 
-    - images/<view>.png, sparse/0/, lenses.json, transform.json and views.json;
+    - images/<view>.png, the undistorted pictures, for each view that has one;
+    - sparse/0/ (cameras and points, COLMAP), transform.json (normalised frame), views.json (roles) and lenses.json;
     - sfm.json, if poses are estimated by structure from motion;
     - refine.json, if cameras are compared with optical flow and adjusted to it where needed;
-    - gaussians.ply and deleted.npy, if the scene brings Gaussians, and a file from which some were deleted;
+    - gaussians.ply (normalised frame), if the scene brings Gaussians;
+    - deleted.npy, bool [N], if it also brings a file from which a user deleted some of them: True for the deleted ones;
     - warnings.json, if something looks wrong.
 
     Args:

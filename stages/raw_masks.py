@@ -33,7 +33,8 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
 
     - masks/<view>.png, or masks/<object>/<view>.png if several objects have masks of their own;
     - test_masks/<view>.png and fill/<view>.png (pixels to fill), if the scene has such masks;
-    - region.json, if the scene names a region in space that holds the object or is to be filled;
+    - region.json, if the scene names a region in space that holds the object or is to be filled. If everything outside
+      a sphere is to be changed, it is drawn into the masks of the training views instead;
     - facts.json with the larger side of the test masks' files in px, if there are test masks;
     - warnings.json, if masks look wrong.
 

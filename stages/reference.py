@@ -31,9 +31,9 @@ TO_PAINT, VIEWS_TO_PAINT = "to_paint", 4  # folder of templates for painting by 
 def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks: Path) -> None:
     """Run the stage: align the references that the scene brings, or inpaint one view.
 
-    Writes references/<view>.png, masks/<view>.png, depth/<view>.exr (for references with a depth map) and facts.json.
-    Writes also to_paint/ unless scene.yaml names references, and candidates.png and candidates.json if a view is
-    inpainted.
+    Writes references/<view>.png, masks/<view>.png (the pixels that the reference fills), depth/<view>.exr (for
+    references with a depth map) and facts.json. Writes also to_paint/ (`save_views_to_paint`) unless scene.yaml names
+    references, and candidates.png and candidates.json if a view is inpainted.
 
     Args:
         out: folder of this stage.
@@ -53,14 +53,16 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks
 
 
 def save_views_to_paint(folder: Path, painted: list[str], space: Workspace) -> None:
-    """Write templates over which people can paint a reference, for the views that cover most of the hole.
+    """Write templates over which people can paint a reference.
 
-    A view's template is <view>.png, the view without the object and grey where it has to be invented, and
-    <view>_mask.png, these pixels (its invent mask I). ranked.txt lists the views and how much of the hole each adds.
+    There is one for each training view in `painted` with something to invent, and for up to `VIEWS_TO_PAINT` others
+    that show most of what earlier views do not show of the hole. A view's template is <view>.png, the view without the
+    object and grey where it has to be invented, and <view>_mask.png, these pixels (its invent mask I). ranked.txt lists
+    the views and how much of the hole each adds to those before it.
 
     Args:
         folder: where the files are written.
-        painted: names of the views that have a reference already; they come first.
+        painted: names of the views that have a reference already; they come first in the ranking.
         space: results of the stages `poses`, `fit` and `masks`.
     """
     train = space.scene.train
@@ -82,7 +84,8 @@ def inpaint_reference(params: Params, out: Path, space: Workspace) -> Reference:
     """Inpaint the view that the stage `masks` selected as the best one, and return it as a reference.
 
     Outside the consistent mask C the reference is the photograph. In C it is a rendering of the remaining Gaussians
-    (those without the object). In the invent mask I it is the inpainter's picture.
+    (those without the object). In the invent mask I it is the inpainter's picture. Except with the diffusion prior,
+    this is also the case in narrow parts of C and along the edge of C next to I. The mask of the reference is I.
 
     Args:
         out: folder of this stage, for the candidates.
@@ -109,7 +112,9 @@ def inpaint_reference(params: Params, out: Path, space: Workspace) -> Reference:
 def inpaint_by_patches(params: Params, out: Path, base: np.ndarray, name: str, space: Workspace) -> np.ndarray:
     """Fill the hole of a view from patches of the photographs, once per seed, and return the chosen candidate.
 
-    The candidate of least misfit is chosen, unless `params.choose` names another one. All candidates are written.
+    The hole is the invent mask I, with narrow parts of the consistent mask C and the edge of C next to it. The
+    candidate of least misfit is chosen, unless `params.choose` is the number of another one. All candidates are
+    written.
 
     Args:
         out: folder of this stage, for the candidates.
@@ -133,8 +138,8 @@ def inpaint_by_patches(params: Params, out: Path, base: np.ndarray, name: str, s
 def inpaint_by_prior(params: Params, out: Path, base: np.ndarray, name: str, masks: MaskSet) -> np.ndarray:
     """Inpaint the invent mask I of a view by the diffusion prior, once per seed, and return the chosen candidate.
 
-    The candidate with the least visible seam is chosen, unless `params.choose` names another one. All candidates are
-    written.
+    The candidate with the least visible seam is chosen, unless `params.choose` is the number of another one. All
+    candidates are written.
 
     Args:
         out: folder of this stage, for the candidates.

@@ -11,9 +11,11 @@ A work-precision diagram shows the error of a method against its time, for sever
   personalization     (--slow) LoRA by steps, rank and learning rate; needs runs/demo with its stage `reference`
 
 The command prints the recommended setting of each diagram. It writes a PNG for each diagram, and precision.json with
-the error and the CPU seconds (of one thread) of every point. --gate compares the points with baselines.json beside this
-file. The exit status is then 1 if a point is worse: if its error is larger by more than rounding, or its time is more
-than twice the baseline after both are divided by the machine's speed.
+the error and the seconds of every point: CPU seconds with one thread, except for `cutoff` (a count of the work times a
+time per pair) and `personalization` (wall time). --gate compares the points with baselines.json beside this file. The
+exit status is then 1 if a point has no baseline, was not measured, or is worse: if its error exceeds the diagram's
+tolerance (2 to 50 % above the baseline), or its time, relative to a fixed computation on the same machine, is more than
+twice the baseline's. Diagrams with such points are measured up to two more times, and the shortest times count.
 """
 
 from __future__ import annotations

@@ -17,7 +17,8 @@ SEEDS = 5  # number of maps for each share
 def make_maps(share: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Make a disparity map and its noisy target with outliers.
 
-    Outliers are larger than the truth by up to the whole range, like the disparity of objects in front of a wall.
+    Outliers are larger than the truth by a tenth of its range to its whole range, like the disparity of objects in
+    front of a wall.
 
     Args:
         share: share of outliers.
@@ -38,7 +39,11 @@ def make_maps(share: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def diagram() -> Diagram:
-    """Measure error and time of plain and robust alignment by the share of outliers."""
+    """Measure plain and robust alignment by the share of outliers.
+
+    The error is the RMS difference of the aligned estimate from the truth over the truth's standard deviation, averaged
+    over `SEEDS` maps. The time is that of `align`.
+    """
     points = []
     for curve, robust in (("plain", False), ("robust", True)):
         for share in SHARES:

@@ -8,9 +8,10 @@ from benchmarks.bench.points import Diagram
 
 
 def draw(diagram: Diagram, path: Path) -> None:
-    """Draw the error against CPU time, one line per curve, with each setting beside its point and the default ringed.
+    """Draw the error against the time, one line per curve; write a PNG.
 
-    If `diagram.over` names a condition instead of "seconds", two panels show error and CPU time against this condition.
+    Settings that can be recommended are named beside their points, and the default is ringed. If `diagram.over` names a
+    condition instead of "seconds", two panels show the error and the time against this condition, without names.
 
     Args:
         diagram: what to draw.

@@ -57,8 +57,9 @@ def regressions(diagrams: list[Diagram], unit: float, baselines: dict[str, Any])
         baselines: result of `load`.
 
     Returns:
-        One line of text for each point that is worse than its baseline, that has no baseline, or that is in the
-        baselines and was not measured. Empty if all is well.
+        Lines of text, empty if all is well. There is one for each error above `tolerance` times its baseline, for each
+        time above `SLOWER` times its baseline (in machine units), and for each point of a measured diagram that has no
+        baseline or that only the baselines have. Diagrams that were not measured are not compared.
     """
     lines, pace = [], unit / baselines["machine_unit"]
     for diagram in diagrams:

@@ -5,14 +5,15 @@ all sizes measured in turn; the scaling with threads is measured in wall time. C
 
   pairs      millions of pixel-Gaussian pairs that are blended, by the oracle's rule
   lanes      millions of pixel-Gaussian slots that the kernel visits, including those that do not blend
-  fwd, bwd   milliseconds of the forward and of the backward pass
+  fwd, bwd   milliseconds of the forward and of the backward pass of a step
   step/aim   time of a step over its target time. The target is 0.28 us per Gaussian + 4.2 ns per pair + 8 ns per pixel,
              for a core with a measured peak of 214 GF/s
   scaled     the same, with the target multiplied by 214 / (peak measured in this run)
   Glane/s    visited lanes per second, in the forward and in the backward pass, in 1e9
   FMA share  necessary floating-point operations over what the peak allows in the time: 31 per pair forward, 49 backward
              (a fused multiply-add is two; work per Gaussian or per pixel is not counted)
-  threads    speedup by --threads threads: median and upper quartile over pairs of consecutive steps, in wall time
+  threads    speedup of a step by --threads threads over one thread: median and upper quartile over pairs of
+             consecutive measurements, in wall time
   ceiling    the same speedup for independent arithmetic, measured between these steps. It is the largest speedup that
              the machine allowed at the time
 """
@@ -61,9 +62,9 @@ class Case:
         gaussians: the scene.
         camera: the view.
         pairs: number of pixel-Gaussian pairs that are blended.
-        lanes: number of pixel-Gaussian slots that the kernel visits.
-        forward: measured times of the forward pass, ms.
-        backward: measured times of the backward pass, ms.
+        lanes: number of pixel-Gaussian slots that the kernel visits, including those that do not blend.
+        forward: measured times of the forward pass, one per step, ms.
+        backward: measured times of the backward pass, one per step, ms.
     """
 
     gaussians: Gaussians
@@ -84,8 +85,8 @@ class Scaling(NamedTuple):
     """Speedup by several threads over one thread, in wall time.
 
     Attributes:
-        median: median over steps.
-        upper: upper quartile over steps.
+        median: median over pairs of measurements.
+        upper: upper quartile over pairs of measurements.
         ceiling: median speedup of independent arithmetic, the largest that the machine allows.
     """
 
@@ -131,7 +132,7 @@ def prepare(size: str) -> Case:
 
 
 def visited_lanes(gaussians: Gaussians, camera: Camera) -> int:
-    """Return the number of pixel-Gaussian slots that the kernel visits."""
+    """Return the number of pixel-Gaussian slots that the forward kernel visits, including those that do not blend."""
     parameters = [getattr(gaussians, name).numpy() for name in PARAMETERS]
     view = cpu.project_and_bin(parameters, gaussians.antialiased, np.empty((0, 2), np.float32), camera, 0)
     nothing, black = np.empty((len(gaussians), 0), np.float32), np.zeros(3, np.float32)
@@ -179,7 +180,7 @@ def fma_peak(rounds: int = 3_000_000, tries: int = 10) -> float:
 def time_first_image() -> tuple[float, float]:
     """Return the CPU seconds from the start of Python to the first small image, and those of torch's import alone.
 
-    The caches of compiled kernels are warm.
+    Each is the least of three runs, in a process of its own. The caches of compiled kernels are warm.
     """
     image = (
         "import benchmarks.bench.large as b; import numpy as np; "
@@ -199,7 +200,13 @@ def time_first_image() -> tuple[float, float]:
 
 
 def measure_scaling(case: Case, threads: int, repeats: int) -> Scaling:
-    """Measure the speedup by several threads over one thread in wall time, from pairs of consecutive steps."""
+    """Measure the speedup of a step by several threads over one thread in wall time.
+
+    Args:
+        case: scene and view.
+        threads: number of threads.
+        repeats: number of pairs of consecutive measurements, one with one thread and one with several.
+    """
     steps, ceilings = [], []
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(time.sleep, threads * [0.01]))  # starts the threads

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-NEAR_BEST = 1.1  # a setting counts as good as the best one if its error is at most this factor larger
+NEAR_BEST = 1.1  # a setting counts as good as the best one if its error is at most this factor times the best
 
 
 @dataclass(frozen=True)
@@ -16,9 +16,10 @@ class Point:
     Attributes:
         curve: name of the curve to which the point belongs.
         setting: name of the setting; curve and setting together are unique within a diagram.
-        x: the setting as a number, if the setting is a number.
+        x: position on the x axis if `Diagram.over` names a condition; without meaning otherwise.
         error: error in the diagram's unit; less is better.
-        seconds: CPU time of one call.
+        seconds: time that the diagram assigns to the setting: usually the CPU time of one call, for an iterate the CPU
+            time from the start of the solver.
         stands: True if the setting can be recommended; False for points that are no choice, such as an earlier
             iterate.
     """
@@ -41,7 +42,7 @@ class Diagram:
         error: description of the error, with its unit.
         default: (curve, setting) that the project uses; None if there is nothing to choose.
         points: measured points.
-        tolerance: an error up to this factor larger than its baseline is not a regression.
+        tolerance: an error of at most this factor times its baseline is not a regression.
         over: quantity on the x axis: "seconds", or the name of the varied condition if it is not a choice (such as a
             share of outliers).
         why: reasons for the default that errors and times do not show.
@@ -68,7 +69,8 @@ class Diagram:
 def recommendation(diagram: Diagram) -> str:
     """Return a text with the fastest setting that is about as good as the best one, and a comparison with the default.
 
-    About as good means: its error is at most `NEAR_BEST` times the smallest error.
+    About as good means: its error is at most `NEAR_BEST` times the smallest error. Only points that can be recommended
+    (`stands`) take part. Without a default the text says that there is nothing to choose.
     """
     if diagram.default is None:
         return f"{diagram.name}: nothing to choose. {diagram.why}".strip()
@@ -89,7 +91,10 @@ def recommendation(diagram: Diagram) -> str:
 
 
 def cpu_seconds(work: Callable[[], object], repeats: int = 3) -> float:
-    """Return the least CPU time of a few calls, which other processes influence least."""
+    """Return the least CPU seconds of `repeats` calls, summed over this process's threads.
+
+    Other processes influence the least time least.
+    """
     least = float("inf")
     for _ in range(repeats):
         began = time.process_time()

@@ -45,7 +45,8 @@ def bilateral_diagram() -> Diagram:
     """Measure the bilateral solver along its iterations, for several cell sizes.
 
     The solver gets an estimate with a different error on each surface, like monocular depth. It corrects the estimate
-    in the hole by the misfit around the hole.
+    in the hole by the misfit around the hole. The error is the RMS error in the hole over the standard deviation of the
+    truth. Only the converged points can be recommended.
     """
     truth, target, confidence, guide, part = picture()
     hole = confidence == 0
@@ -72,12 +73,13 @@ def along(work: Callable, error: Callable, repeats: int = 3) -> dict[int, tuple[
     """Measure an iterative solver along its iterations, at logarithmically spaced iterations.
 
     Args:
-        work: called with a function that it must call after each iteration.
+        work: runs the solver. It gets a function that it must call after each iteration with the iteration's number and
+            a function whose result begins with the iterate (`bilateral.Watch`).
         error: returns the error of an iterate.
         repeats: number of repetitions, of which the least time counts.
 
     Returns:
-        Iteration -> (CPU seconds until then without the measurements, error).
+        Iteration -> (CPU seconds since the start of `work` without the measurements, error).
     """
     seconds: dict[int, float] = {}
     errors: dict[int, float] = {}
@@ -97,7 +99,7 @@ def along(work: Callable, error: Callable, repeats: int = 3) -> dict[int, tuple[
 
 
 def completion_diagram() -> Diagram:
-    """Measure the error in the hole and the CPU time of depth completion.
+    """Measure depth completion: the RMS error in the hole over the truth's standard deviation, and the CPU time.
 
     There is a curve with the picture as guide and one without, and a point for each limit on the number of unknowns.
     """

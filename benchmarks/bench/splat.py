@@ -53,7 +53,8 @@ def step(gaussians: Gaussians, impl: str) -> tuple[torch.Tensor, list[torch.Tens
     """Render the Gaussians with an implementation of the rasterizer, forward and backward.
 
     Returns:
-        The colours [H, W, 3], and the gradients of a fixed function of the colours with respect to all parameters.
+        The colours [H, W, 3], and the gradients of a fixed linear function of the colours with respect to each of
+        `PARAMETERS`.
     """
     leaves = gaussians.map(lambda p: p.detach().clone().requires_grad_())
     color = rasterizer.render(leaves, VIEW, impl=impl).color
@@ -64,7 +65,7 @@ def step(gaussians: Gaussians, impl: str) -> tuple[torch.Tensor, list[torch.Tens
 
 
 def relative(value: torch.Tensor, truth: torch.Tensor) -> float:
-    """Return the relative L2 error of a tensor."""
+    """Return the L2 norm of a tensor's difference from the truth, relative to the norm of the truth."""
     return float((value.double() - truth).norm() / truth.norm())
 
 
@@ -78,7 +79,7 @@ def errors(gaussians: Gaussians) -> tuple[float, float]:
 
 
 def footprint_diagram() -> Diagram:
-    """Measure the rasterizer's error and time by the size of footprints."""
+    """Measure the rasterizer by the size of footprints: the errors of `errors`, and the CPU time of a `step`."""
     points = []
     for sigma in FOOTPRINTS:
         single = scene(sigma).map(torch.Tensor.float)
@@ -102,7 +103,8 @@ def footprint_diagram() -> Diagram:
 def cutoff_diagram() -> Diagram:
     """Measure the effect of skipping faint contributions, in the oracle.
 
-    The error is that against skipping none. The work is counted: the number of blended pairs times a time per pair.
+    The errors are the relative L2 errors of the image and of the worst gradient against practically no cut-off. The
+    seconds are not measured: they are the number of blended pixel-Gaussian pairs times a time per pair.
     """
     gaussians, original = scene(3.0), pure_torch.MIN_ALPHA
     draw = lambda: step(gaussians, "torch")
@@ -136,7 +138,7 @@ def cutoff_diagram() -> Diagram:
 
 
 def tile_diagram() -> Diagram:
-    """Measure the rasterizer by the height of tiles.
+    """Measure the rasterizer by the height of tiles: the error of the worst gradient, and the CPU time of a `step`.
 
     Each height is compiled in a process of its own, which takes about a minute.
     """
@@ -162,7 +164,7 @@ def measured() -> dict[str, tuple[float, float]]:
     """Measure the rasterizer with the present tile height, for three sizes of footprints.
 
     Returns:
-        Name of a curve -> (relative L2 error of the worst gradient, CPU seconds).
+        Name of a curve -> (relative L2 error of the worst gradient, CPU seconds of a `step`).
     """
     torch.set_num_threads(1)
     diagrams = {}

@@ -99,11 +99,12 @@ class Bench:
         return gaussians, masked.to(self.device)
 
     def measure(self, work: Callable[[], dict[str, float] | None]) -> dict[str, Any]:
-        """Measure the time and memory of `work`, after a warm-up call.
+        """Measure the time and memory of `work`, after a warm-up call. `work` is called `sizes.repeats` + 2 times.
 
         Returns:
-            "seconds": median; "peak_gb": peak memory of the GPU, on the CPU that of live tensors; on a GPU
-            "reserved_gb"; and the values that `work` returns in its first call.
+            "seconds": median wall time of a call. "peak_gb": on a GPU, peak of all allocated memory; on the CPU, peak
+            of the live tensors that a call creates. On a GPU, "reserved_gb": peak of the memory that torch reserved.
+            And the values that `work` returns in its first call.
         """
         values, seconds = work() or {}, []
         for _ in range(self.sizes.repeats):

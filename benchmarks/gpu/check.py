@@ -1,7 +1,7 @@
-"""Check of the method at the paper's sizes on this GPU: correctness, speed and memory. Takes up to 8 minutes.
+"""Check of the method at the paper's sizes on this GPU: correctness, speed and memory. No part starts after 8 minutes.
 
-- gsplat against the float64 oracle (plain torch): colour, depth, alpha, features, weights and their gradients; the same
-  antialiased, and in a crop; SSIM's gradient.
+- gsplat against the float64 oracle (plain torch): colour, depth, alpha, features and their gradients, and the sums of
+  blending weights; the same antialiased, and in a crop; SSIM and its gradient.
 - One step of each loss at the paper's sizes with the full-size SD2-inpainting: seconds per step (median of three),
   memory allocated and reserved. The weights are the published ones if they are on this machine, else random ones of the
   same shapes.
@@ -62,6 +62,10 @@ def check(device: str, out: Path) -> dict[str, Any]:
     Args:
         device: "cuda", or "cpu" for the same parts at small sizes.
         out: folder to write to.
+
+    Returns:
+        "machine": facts; "parts": name of a part -> result; "projected_hours": see `project_hours`; "seconds": wall
+        time of all parts.
     """
     out.mkdir(parents=True, exist_ok=True)
     bench = Bench(PAPER if device == "cuda" else TOY, device, out)
@@ -82,7 +86,7 @@ def run_part(part: Callable[[Bench], dict[str, Any]], bench: Bench, seconds: flo
     Args:
         part: the part.
         bench: device and sizes.
-        seconds: seconds since the beginning of the check; a part is skipped after `SECONDS_LIMIT`.
+        seconds: seconds since the first part began; above `SECONDS_LIMIT` the part is skipped.
     """
     if seconds > SECONDS_LIMIT:
         return {"skipped": f"{SECONDS_LIMIT:.0f} s are over"}
@@ -128,10 +132,10 @@ def project_hours(parts: dict[str, dict[str, Any]]) -> dict[str, float]:
 
 
 def describe_machine(device: str) -> dict[str, Any]:
-    """Return facts on the machine: GPU, driver, versions and settings.
+    """Return facts on the machine: GPU, driver, versions and settings; for device "cpu" only torch's version.
 
-    This also loads gsplat's extension before all parts, so that no part's time includes it. If `make gpu` has not built
-    the extension, it is built now.
+    On a GPU this also loads gsplat's extension before all parts, so that no part's time includes it. If `make gpu` has
+    not built the extension, it is built now.
     """
     facts: dict[str, Any] = {"device": device, "torch": torch.__version__}
     if device == "cpu":

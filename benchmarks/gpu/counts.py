@@ -1,8 +1,8 @@
-"""Table of the cost model: operations and bytes of the parts of a step at full size, counted without computing.
+"""Table of the cost model: operations and bytes of the parts of a step at full size, mostly counted without computing.
 
-The script runs the parts on torch's meta device. It counts the floating-point operations of matrix products and
-convolutions, and the bytes that all operations read and write. Attention matrices are left out, because GPU kernels do
-not write them.
+The script runs the networks on torch's meta device, and the reconstruction loss and Adam on the CPU at a small size,
+scaled up. It counts the floating-point operations of matrix products and convolutions, and the bytes that all
+operations read and write. Large attention matrices are left out, because GPU kernels do not write them.
 
     python -m benchmarks.gpu.counts > reffusion/cost/counts.py
 """
@@ -31,7 +31,10 @@ PATCHES, SIDE = 64, 64  # number and side in px of the critic's patches, as in t
 
 
 class _TrafficCounter(TorchDispatchMode):
-    """Counter of the bytes of all operations' inputs and outputs. Views of tensors count nothing."""
+    """Counter of the bytes of all operations' inputs and outputs.
+
+    Views of tensors and operations on attention matrices count nothing.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -50,7 +53,7 @@ class _TrafficCounter(TorchDispatchMode):
 
 
 def _attention(tensor: Tensor) -> bool:
-    """Return True for an attention matrix, which has a row and a column for each pixel of a latent."""
+    """Return True for a tensor that looks like a large attention matrix: its last two sides are at least 1024."""
     return tensor.ndim >= 3 and min(tensor.shape[-2:]) >= 1024
 
 
@@ -70,6 +73,9 @@ def count_prior(shape: full_size.Shape, name: str) -> dict[str, dict[str, float]
     Args:
         shape: configuration of the prior.
         name: name of the prior, which begins the names of the counts.
+
+    Returns:
+        Name of a computation -> counts as from `count_work`.
     """
     with torch.device("meta"):
         models = full_size.networks(shape, torch.float16)
@@ -112,7 +118,7 @@ def run_unet(prior: Prior, latents: Tensor) -> None:
 def count_critic_step(width: int) -> dict[str, float]:
     """Count one adversarial step: the critic's loss with R1 and its backward pass, then the generator's.
 
-    These are the computations of `Adversary.learn` and `Adversary.loss`.
+    These are the computations of `Adversary.train_step`, without the optimizer, and of `Adversary.generator_loss`.
 
     Args:
         width: channels of the critic.

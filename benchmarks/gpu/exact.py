@@ -1,6 +1,7 @@
 """Comparison of the rasterizer and SSIM on a device with float64 on the CPU: all outputs and all gradients.
 
-The rasterizer is gsplat on a GPU. The *oracle* is the plain torch implementation in float64.
+The rasterizer is gsplat on a GPU, and the compiled one on the CPU. The *oracle* is the plain torch implementation in
+float64.
 """
 
 from __future__ import annotations
@@ -43,8 +44,9 @@ def render_with_gradients(
 
     Returns:
         Tensors on the CPU in float64: the images "color", "depth", "alpha" and "features"; "gradient of <input>", the
-        gradients of a fixed random linear function of the images; "weights", for each Gaussian the sums of random
-        values of pixels times blending weights; and "counts", for each Gaussian the number of blended pixels.
+        gradients of a fixed random linear function of the images; "weights" [N, 2], for each Gaussian the sums of
+        random values of pixels times blending weights; and "counts" [N, 2], for each Gaussian the number of blended
+        pixels, twice.
     """
     device = "cpu" if impl == "torch" else bench.device
     place = lambda tensor: tensor.detach().to(device, dtype).clone().requires_grad_()
@@ -70,8 +72,9 @@ def render_with_gradients(
 def compare_blocks(results: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Any]:
     """Compare results with the truth and return their relative errors.
 
-    The error of an image is the difference that only the share `FLIPPED` of the values exceeds, relative to the image's
-    maximum. The error of any other result is an L2 norm, relative to that of the truth.
+    The error of an image is the absolute difference that only the share `FLIPPED` of the values exceeds, relative to
+    the largest absolute value of the true image. The error of any other result is the L2 norm of its difference,
+    relative to the norm of the truth.
 
     Returns:
         "errors": name -> relative error; "ok": True if all errors are within their bounds; "beyond": names of those
@@ -97,6 +100,9 @@ def check_splatting(bench: Bench, antialiased: bool = False, crop: bool = False)
         bench: device and sizes.
         antialiased: True renders with the 2D filter of Mip-Splatting.
         crop: True renders a part of the image only.
+
+    Returns:
+        As `compare_blocks`.
     """
     count, width = bench.sizes.oracle
     height = width * 4 // 5
@@ -109,7 +115,10 @@ def check_splatting(bench: Bench, antialiased: bool = False, crop: bool = False)
 
 
 def check_similarity(bench: Bench) -> dict[str, Any]:
-    """Compare D-SSIM and its gradient in float32 on the device with float64; with TF32 the error would be a tenth."""
+    """Compare D-SSIM and its gradient in float32 on the device with float64 on the CPU, as `compare_blocks` does.
+
+    With TF32 the error would be a tenth.
+    """
     draw, size = generator(0, "ssim"), bench.sizes.oracle[1]
     image, other = (torch.rand(size, size, 3, generator=draw, dtype=torch.float64) for _ in range(2))
     image, other = 0.5 + 0.1 * image, 0.5 + 0.1 * other  # with low contrast, subtractions lose most digits

@@ -1,7 +1,8 @@
 """One personalization step and one SDS step of the full-size SD2-inpainting on this machine, with random weights.
 
-The configurations below are the published ones; the steps are those of the library. The script also checks the LoRA:
-saved and merged into a fresh model of the same weights, it must predict the same noise (epsilon) as the trained model.
+The configurations below are the published ones; the steps are those of the library. The script also compares the noise
+(epsilon) that the trained model predicts with that of a fresh model of the same weights, into which the saved LoRA is
+merged. It reports the largest difference, which should be rounding only.
 
     python -m benchmarks.gpu.full_size --dtype bfloat16 --out runs/full-size      (--toy: the same at a small size)
 """
@@ -227,6 +228,8 @@ def reference(size: int) -> crops.Picture:
 def trainer(prior: Prior, batch: int) -> tuple[dict[str, list], torch.optim.Optimizer, Params]:
     """Attach the paper's LoRA to a prior (rank 8, alpha 16, dropout 0.1, attention layers), and make AdamW for it.
 
+    The prior is changed in place.
+
     Returns:
         The trained parameters of "unet" and "text", the optimizer, and the parameters of the stage `personalize`.
     """
@@ -238,10 +241,10 @@ def trainer(prior: Prior, batch: int) -> tuple[dict[str, list], torch.optim.Opti
 
 
 def personalization_step(prior: Prior, picture: crops.Picture, batch: int, folder: Path) -> dict[str, float]:
-    """Make one personalization step and save the LoRA to `folder`.
+    """Attach a LoRA to the prior in place, make one personalization step, and save the LoRA to `folder`.
 
     Returns:
-        "loss", and "lora_unet" and "lora_text", the sums of absolute values of the LoRA's weights.
+        "loss" of the step, and "lora_unet" and "lora_text", the sums of absolute values of the LoRA's weights after it.
     """
     trained, optimizer, training = trainer(prior, batch)
     loss = train_step(prior, optimizer, [picture], training, 0)
@@ -315,10 +318,11 @@ def sds_step(
 
 
 def record_time(report: dict[str, Any], name: str, work: Any) -> Any:
-    """Call `work`, record its seconds and the process's peak memory so far in the report, and return its result.
+    """Call `work`, record and print its time and the process's peak memory so far, and return its result.
 
     Args:
-        report: receives the measurements under `name`, with the result if it is a dictionary.
+        report: receives under `name` "seconds" (wall time), "cpu_seconds" and "peak_gb", and the entries of the result
+            if it is a dictionary.
         name: name of the measured work.
         work: function to call.
     """
@@ -333,7 +337,18 @@ def record_time(report: dict[str, Any], name: str, work: Any) -> Any:
 
 
 def run(shape: Shape, dtype: torch.dtype, options: argparse.Namespace) -> dict[str, Any]:
-    """Run one personalization step and one SDS step, check the saved LoRA, and return the measurements."""
+    """Run one personalization step and one SDS step on the CPU, test the saved LoRA, and return the measurements.
+
+    Args:
+        shape: configuration of the prior.
+        dtype: dtype of UNet and text encoders.
+        options: the parsed command line.
+
+    Returns:
+        "parameters", "dtype", "size" (px), the measurements of `record_time`, and "epsilon difference": the largest
+        absolute difference of the noise predicted with the saved LoRA from that of the trained model; "epsilon size":
+        the largest absolute value of the latter.
+    """
     options.out.mkdir(parents=True, exist_ok=True)
     report: dict[str, Any] = {
         "parameters": count_parameters(shape),

@@ -1,6 +1,8 @@
 """Parts of gpu-check that measure seconds and memory: one step of each loss at the paper's sizes, and a fit.
 
-Each part takes the `Bench` with device and sizes, and returns its measurements.
+A step of a loss term is its evaluation on one view, with all renderings, and the backward pass into the Gaussians,
+without the step of their optimizer. Each part takes the `Bench` with device and sizes. It returns the measurements of
+`Bench.measure` and facts on the step.
 """
 
 from __future__ import annotations
@@ -59,7 +61,10 @@ def reference(bench: Bench) -> dict[str, Any]:
 
 
 def personalization(bench: Bench) -> dict[str, Any]:
-    """Measure a personalization step with the paper's LoRA; as many samples run at once as fit into 20 GB."""
+    """Measure a personalization step with the paper's LoRA, with the optimizer's step.
+
+    As many samples of the batch run at once as fit into 20 GB.
+    """
     prior, source = bench.prior("bfloat16")
     picture = full_size.reference(prior.native_size)
     trained, optimizer, training = full_size.trainer(prior, bench.sizes.batch)
@@ -109,7 +114,7 @@ def depth(bench: Bench) -> dict[str, Any]:
 
 
 def adversarial(bench: Bench) -> dict[str, Any]:
-    """Measure a step of the adversarial term, with the critic's own step."""
+    """Measure a step of the adversarial term, with the critic's own optimizer step."""
     bench.forget_prior()
     (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
     critic = Adversary(bench.sizes.critic, 0, bench.device)
@@ -167,7 +172,8 @@ def fit_scene(bench: Bench) -> dict[str, Any]:
     """Fit Gaussians to renders of known Gaussians, starting from shifted Gaussians with weaker colours.
 
     Returns:
-        Image size, images per second, PSNR before and after in dB, and "ok": True if the PSNR has increased.
+        "size" of the images, "images_per_second" (steps per second of the fit), "psnr_before" and "psnr_after" of the
+        first view in dB, and "ok": True if the PSNR has increased.
     """
     sizes, device, out = bench.sizes, bench.device, bench.out
     truth = full_size.gaussians(sizes.gaussians, device, degree=1).map(Tensor.detach)

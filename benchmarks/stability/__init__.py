@@ -52,7 +52,8 @@ def all_cases() -> list[Case]:
 def run(case: Case) -> Row:
     """Measure a case and compare the value with its bound.
 
-    A case that raises an exception or gives no finite number fails, with None as the measured value.
+    A case that raises an exception or gives no finite number fails, with None as the measured value. The traceback is
+    printed.
     """
     try:
         measured = float(case.measure())

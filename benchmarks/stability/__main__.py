@@ -1,6 +1,6 @@
-"""Run all cases, print a table and write a JSON file. The exit status is 1 if a case is out of its bound.
+"""Run all cases, print a table and write a JSON file. The exit status is 1 if a case is out of its bound or raises.
 
-python -m benchmarks.stability [--out runs/stability.json] [--only WORDS]
+python -m benchmarks.stability [--out runs/stability.json] [--only TEXT]    (TEXT: a part of the names of cases)
 """
 
 from __future__ import annotations

@@ -17,17 +17,17 @@ PIXELS = 2000
 
 
 def make_samples(outliers: float, pixels: int = PIXELS, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw samples with outliers.
+    """Draw samples with outliers, which come first.
 
     Args:
-        outliers: share of the samples whose target is uniform over a range, in [0, 1].
+        outliers: share of outliers, 0 to 1. An outlier's target is uniform over the range from 2 to 8.
         pixels: number of samples.
         seed: seed.
 
     Returns:
         estimate: [pixels].
         target: [pixels], the truth with noise, or an outlier.
-        truth: [pixels], 2 estimate + 1.
+        truth: [pixels], 2 estimate + 1, of outliers too.
     """
     random = np.random.default_rng(seed)
     x = random.uniform(1.0, 3.0, pixels)
@@ -38,7 +38,10 @@ def make_samples(outliers: float, pixels: int = PIXELS, seed: int = 0) -> tuple[
 
 
 def robust_error(outliers: float) -> float:
-    """Return the largest error of the robust fit over all samples of ten draws, in standard deviations of the noise."""
+    """Return the largest error of the robustly aligned estimate over all samples of ten draws.
+
+    The unit is the standard deviation of the noise.
+    """
     worst = 0.0
     for seed in range(10):
         x, y, truth = make_samples(outliers, seed=seed)
@@ -49,9 +52,9 @@ def robust_error(outliers: float) -> float:
 
 
 def robust_difference() -> float:
-    """Return the largest difference of the robust fit from plain least squares if there are no outliers.
+    """Return the largest difference between the robustly and the plainly aligned estimate if there are no outliers.
 
-    The unit is the standard error of least squares at the ends of the range.
+    The unit is the standard error of plain least squares at the ends of the estimate's range.
     """
     x, y, _ = make_samples(0.0)
     difference = alignment.align(x, y, robust=True).apply(x) - alignment.align(x, y).apply(x)
@@ -59,9 +62,9 @@ def robust_difference() -> float:
 
 
 def two_lines_error() -> float:
-    """Return the largest error of the robust fit, in standard deviations of the noise, with samples of two lines.
+    """Return the largest error of the robustly aligned estimate, in standard deviations of the noise, for two lines.
 
-    A third of the samples is on another line; the fit must follow the larger group.
+    A third of the samples is on another line. The fit must follow the larger group, whose line is the truth.
     """
     x, y, truth = make_samples(0.0)
     y = np.where(np.arange(len(x)) % 3 == 0, y - truth + 4.0 - 0.5 * x, y)
@@ -83,16 +86,16 @@ def unit_error(x_unit: float, y_unit: float, robust: bool) -> float:
 
 
 def offset_error() -> float:
-    """Return the largest error of the aligned values, relative to their spread, for an estimate with a large offset.
+    """Return the largest error of the aligned values, relative to the truth's range, for an estimate with an offset.
 
-    The offset is about 1e5 times the spread of the estimate.
+    The offset is about 1e5 times the standard deviation of the estimate.
     """
     x, _, truth = make_samples(0.0)
     return float(np.abs(alignment.align(x + 5e4, truth).apply(x + 5e4) - truth).max() / np.ptp(truth))
 
 
 def refuse_too_far_offset() -> float:
-    """Return 0 if an estimate with an offset of about 1e8 times its spread is refused as constant, else 1.
+    """Return 0 if an estimate with an offset of 1e8 standard deviations is refused as constant, else 1.
 
     In float32 such an estimate would contain nothing but the offset.
     """
@@ -101,7 +104,10 @@ def refuse_too_far_offset() -> float:
 
 
 def constant_depth_error() -> float:
-    """Return the relative error of the aligned depth if the scene's depth is constant (a wall), the estimate not."""
+    """Return the largest relative error of the aligned depth if the scene's depth is constant (a wall).
+
+    The estimate is not constant. It is aligned as depth and as disparity, by the plain and by the robust fit.
+    """
     estimate = np.random.default_rng(0).uniform(1.0, 3.0, (12, 10))
     aligned = [
         alignment.align_depth(estimate, np.full((12, 10), 2.5), np.ones((12, 10)), space=space, robust=robust)
@@ -111,7 +117,7 @@ def constant_depth_error() -> float:
 
 
 def refuse_constant_estimate() -> float:
-    """Count the refusals of a constant estimate, plain and robust, that do not name the cause and the value."""
+    """Count the fits to a constant estimate, plain and robust, that are not refused with the cause and the value."""
     flat, depth = np.full((12, 10), 0.7), np.random.default_rng(0).uniform(1.0, 3.0, (12, 10))
     calls = [partial(alignment.align_depth, flat, depth, np.ones((12, 10)), robust=robust) for robust in (False, True)]
     return sum(count_unclear_refusal(call, "constant", "0.7") for call in calls)
@@ -154,7 +160,7 @@ def count_invalid_depths() -> float:
 
 
 def plain_condition() -> float:
-    """Return the condition number of the system that `align` solves if the estimate's offset is 1e4 spreads."""
+    """Return the condition number of the system that `align` solves if the offset is 1e4 standard deviations."""
     return alignment.condition_numbers(1e4 + np.random.default_rng(0).normal(size=1000))[1]
 
 

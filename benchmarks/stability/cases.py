@@ -25,7 +25,10 @@ class Case:
 
 
 def count_unclear_refusal(call: Callable[[], object], *words: str, error: type[Exception] = ValueError) -> float:
-    """Return 0 if `call` raises the exception `error` with all of `words` in its message, else 1."""
+    """Return 0 if `call` raises the exception `error` with all of `words` in its message, else 1.
+
+    Exceptions of other types are not caught.
+    """
     try:
         call()
     except error as refusal:

@@ -56,9 +56,11 @@ def images(label: str = "") -> Tensor:
 def predict(t: int, guidance: float | None = None, empty: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
     """Predict with the prior at one timestep; a square in the middle of the picture is repainted.
 
+    Equal arguments give the same z_t and the same picture.
+
     Args:
         t: timestep.
-        guidance: strength of guidance, 0 = none; None predicts without guidance.
+        guidance: γ of (1 + γ) eps(prompt) - γ eps(empty prompt). None makes a single prediction with the prompt.
         empty: hidden states that replace those of the empty prompt.
 
     Returns:
@@ -75,7 +77,9 @@ def predict(t: int, guidance: float | None = None, empty: Tensor | None = None) 
 
 
 def reconstruction_error(t: int, guidance: float | None = None) -> float:
-    """Return the error of a z_0 + s eps = z_t for the predicted z_0 and eps, relative to the largest term.
+    """Return the largest error of a z_0 + s eps = z_t for the predicted z_0 and eps.
+
+    The error is relative to the largest absolute value of z_t, eps and a z_0.
 
     Args:
         t: timestep; -1 is the last one.
@@ -88,13 +92,16 @@ def reconstruction_error(t: int, guidance: float | None = None) -> float:
 
 
 def no_guidance_error() -> float:
-    """Return the largest difference of guidance 0 from the conditional prediction; they must be equal bit for bit."""
+    """Return the largest difference of eps and z_0 with guidance 0 from those without guidance.
+
+    They must be equal bit for bit.
+    """
     pairs = zip(predict(500, 0.0), predict(500), strict=True)
     return nan_safe_max(*((a - b).abs().max().item() for a, b in pairs))
 
 
 def strong_guidance_error() -> float:
-    """Return the error of guidance 100, relative to eps.
+    """Return the largest error of eps with guidance 100, relative to the largest |eps| without guidance.
 
     The exact value is the weighted sum, in float64, of two separate predictions with prompt and empty prompt.
     """
@@ -110,9 +117,9 @@ def strong_guidance_error() -> float:
 
 
 def equal_prompts_error() -> float:
-    """Return the largest change of eps by guidance 100 if the empty prompt equals the prompt, over the largest |eps|.
+    """Return the largest change of eps by guidance 100 if the empty prompt equals the prompt.
 
-    Only rounding may change eps.
+    It is relative to the largest |eps| without guidance. Only rounding may change eps.
     """
     _, eps, _ = predict(500)
     return ((predict(500, 100.0, prompts()[:1])[1] - eps).abs().max() / eps.abs().max()).item()
@@ -161,7 +168,7 @@ def sds_error(t: int, dtype: torch.dtype) -> float:
 
 
 def empty_mask_gradient() -> float:
-    """Return the largest SDS gradient if the mask is empty."""
+    """Return the largest absolute value of the SDS gradient with `keep_contrast` if the mask is empty. It must be 0."""
     latents, noise, abar = normal(2, 4, 8, 8), normal(2, 4, 8, 8, label="noise"), model().alphas_cumprod
     times, nothing = torch.tensor([3, 700]), torch.zeros(2, 1, 8, 8)
     gradient = sds.sds_gradient(latents, lambda z, _: (z, z), times, noise, abar, keep_contrast=True, mask=nothing)
@@ -169,7 +176,7 @@ def empty_mask_gradient() -> float:
 
 
 def full_mask_leak() -> float:
-    """Return the difference between the prior's conditioning on two pictures if all pixels are masked.
+    """Return the largest difference between the prior's conditioning on two pictures if all pixels are masked.
 
     The conditioning must not depend on masked pixels.
     """
@@ -196,7 +203,7 @@ def refuse_empty_window() -> float:
 
 
 def count_bad_gradients(low: float, high: float, guidance: float) -> float:
-    """Count non-finite numbers in the SDS gradients of Gaussians, for a view that is repainted as a whole.
+    """Count non-finite numbers in the SDS gradients of all Gaussians' parameters, for a view repainted as a whole.
 
     Args:
         low: smallest timestep, as a fraction of the schedule.
@@ -214,7 +221,7 @@ def count_bad_gradients(low: float, high: float, guidance: float) -> float:
 
 
 def count_out_of_range() -> float:
-    """Count pixels that are outside [-1, 1] or NaN after inpainting in one sampler step with a full mask."""
+    """Count values outside [-1, 1] or NaN after inpainting in one sampler step with guidance 100 and a full mask."""
     full, draws = torch.ones(1, 1, SIZE, SIZE), seeding.generator(0)
     sample = diffusion.sample(model(), images(), full, prompts()[:1], 1, draws, 100.0, prompts()[2:])
     return float((~(sample.abs() <= 1)).sum())
@@ -268,7 +275,7 @@ def critic() -> discriminator.Critic:
 def flat_critic_penalty() -> float:
     """Return the largest of the gradient penalty and its gradients for a critic whose weights are all zero.
 
-    Such a critic has no slope, so all of them must be 0.
+    Gradients are those with respect to the weights. Such a critic has no slope, so all of them must be 0.
     """
     flat = discriminator.Critic(16, 8, seeding.generator(0))
     for weight in flat.parameters():

@@ -56,7 +56,7 @@ def fold_filter_naively(log_scales: np.ndarray, logits: np.ndarray, sizes: np.nd
 
 
 def change_result(change: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return a function that maps a correct function to one whose result is changed by `change`."""
+    """Return a value for `Fault.wrong`: it maps a function to one that returns `change` of the function's result."""
     return lambda right: lambda *arguments: change(right(*arguments))
 
 

@@ -48,8 +48,8 @@ def poses(extent: float, offset: np.ndarray) -> dict[str, np.ndarray]:
     """Return world-to-camera poses [4, 4] of five views of the box, from 1.6 extents away, in the scene's own frame.
 
     Args:
-        extent: extent of the scene.
-        offset: [3], position of the box.
+        extent: extent of the scene in its own frame.
+        offset: [3], position of the box's centre in the scene's own frame.
     """
     found = {}
     for k in range(VIEWS):
@@ -66,7 +66,8 @@ def normalized_scene(extent: float, offset: float) -> Scene:
 
     Args:
         extent: extent of the scene in its own frame.
-        offset: distance of the scene from the origin along x, in extents.
+        offset: x coordinate of the scene's centre in its own frame, in extents. The centre lies in the direction
+            `OFFSET_DIRECTION`.
     """
     place = extent * offset * OFFSET_DIRECTION
     world, lens = poses(extent, place), Lens(WIDTH, HEIGHT, 26.0, 26.0, WIDTH / 2, HEIGHT / 2)
@@ -87,8 +88,7 @@ def fit_scene(extent: float, offset: float, rate: float = 1.0) -> tuple[Scene, G
     """Make a scene, fit it in 60 steps, and return scene, Gaussians and the PSNR over its views in dB.
 
     Args:
-        extent: extent of the scene in its own frame.
-        offset: distance of the scene from the origin along x, in extents.
+        extent, offset: as for `normalized_scene`.
         rate: factor on the learning rates.
     """
     scene = normalized_scene(extent, offset)
@@ -120,12 +120,12 @@ def render_photographs() -> dict[str, np.ndarray]:
 
 
 def psnr_difference(extent: float, offset: float) -> float:
-    """Return the difference in PSNR (dB) between the fit and that of the same scene with extent 1 at the origin."""
+    """Return the absolute difference in PSNR (dB) from the fit of the same scene with extent 1 at the origin."""
     return abs(fit_scene(extent, offset)[2] - fit_scene(1.0, 0.0)[2])
 
 
 def camera_difference(extent: float, offset: float) -> float:
-    """Return the largest difference of normalised poses and points from those with extent 1 at the origin."""
+    """Return the largest difference, by entry, of normalised poses and points from those of extent 1 at the origin."""
     scene, reference = normalized_scene(extent, offset), normalized_scene(1.0, 0.0)
     poses_apart = [
         np.abs(scene.cameras[n].world_to_camera - reference.cameras[n].world_to_camera).max() for n in reference.cameras
@@ -134,7 +134,7 @@ def camera_difference(extent: float, offset: float) -> float:
 
 
 def export_vertices(extent: float, offset: float) -> np.ndarray:
-    """Export the fit to a .ply in the scene's own frame, and return its vertices."""
+    """Export the fit to a .ply in the scene's own frame, and return its vertices as a structured array."""
     scene, gaussians, _ = fit_scene(extent, offset)
     with tempfile.TemporaryDirectory() as folder:
         save_ply(Path(folder) / "scene.ply", gaussians, similarity=scene.similarity)
@@ -142,7 +142,7 @@ def export_vertices(extent: float, offset: float) -> np.ndarray:
 
 
 def position_error(extent: float, offset: float) -> float:
-    """Return the largest error of the exported positions, in extents."""
+    """Return the largest error of the exported positions against the fit's in the scene's own frame, in extents."""
     scene, gaussians, _ = fit_scene(extent, offset)
     table = export_vertices(extent, offset)
     positions = np.stack([table[axis] for axis in "xyz"], 1).astype(np.float64)
@@ -150,7 +150,7 @@ def position_error(extent: float, offset: float) -> float:
 
 
 def scale_error(extent: float, offset: float) -> float:
-    """Return the largest error of the exported log-scales."""
+    """Return the largest error of the exported log-scales against the fit's in the scene's own frame."""
     scene, gaussians, _ = fit_scene(extent, offset)
     table = export_vertices(extent, offset)
     scales = np.stack([table[f"scale_{k}"] for k in range(3)], 1).astype(np.float64)
@@ -158,7 +158,10 @@ def scale_error(extent: float, offset: float) -> float:
 
 
 def export_picture_error(extent: float, offset: float) -> float:
-    """Return the largest difference between renders of the fit and of its export, loaded into the normalised frame."""
+    """Return the largest colour difference between one view of the fit and of its export.
+
+    The export is loaded into the normalised frame. Colours are in [0, 1].
+    """
     scene, gaussians, _ = fit_scene(extent, offset)
     with tempfile.TemporaryDirectory() as folder:
         save_ply(Path(folder) / "scene.ply", gaussians, similarity=scene.similarity)
@@ -191,7 +194,10 @@ def refuse_one_place() -> float:
 
 
 def similarity_error() -> float:
-    """Return the error, in extents, of a similarity after its inverse, at an extent of 1e-3 and an offset of 1e6."""
+    """Return the largest error, in extents, of points after a similarity's inverse and the similarity.
+
+    The scene has an extent of 1e-3 and an offset of 1e6, both in units of its own frame.
+    """
     similarity = Similarity(1e3, 1e6 * OFFSET_DIRECTION)
     points = np.random.default_rng(0).uniform(-1, 1, (100, 3))
     return float(np.abs(similarity.apply(similarity.invert(points)) - points).max())

@@ -66,7 +66,7 @@ def constant_psnr() -> float:
 
 
 def constant_flip() -> float:
-    """Return by how much FLIP is outside its range for constant images.
+    """Return by how much FLIP is outside its range for constant images; at most 0 if it is inside.
 
     FLIP must be 0 for an image and itself, and in [0.9, 1] for black and white.
     """
@@ -122,7 +122,10 @@ def count_lpips_faults(first: float, second: float, kind: torch.dtype) -> float:
 
 
 def loss_of_constant_images() -> float:
-    """Return the largest value or gradient of the reconstruction loss for equal constant images, whole and masked."""
+    """Return the largest absolute value or gradient of the reconstruction loss for equal constant images.
+
+    The loss is taken without weights, with weights of 1 and with weights of 0.
+    """
     wrong = 0.0
     for value in (0.0, 0.5, 1.0):
         for weights in (None, torch.ones(9, 8), torch.zeros(9, 8)):
@@ -155,7 +158,7 @@ def count_labelled(masks: dict[str, np.ndarray]) -> float:
 
 
 def count_seen() -> int:
-    """Return the number of Gaussians that contribute to a view."""
+    """Return the number of Gaussians that contribute to at least one of the views."""
     votes = voting.cast_votes(cloud(), NAMED, {view.name: FULL for view in NAMED})
     return int((votes.masked > 0).sum())
 
@@ -195,7 +198,7 @@ def refuse_no_mask() -> float:
 def empty_scene_errors() -> float:
     """Count the violations if all Gaussians were removed as the object.
 
-    All pixels must then be unobserved, no plane may continue into the hole, and no view may see a point.
+    All pixels must then be unobserved, no plane may continue into the hole, and no view may see a point or past it.
     """
     nobody = cloud().map(lambda p: p[:0])
     views = visibility.render_depth_views(nobody, NAMED, {view.name: FULL for view in NAMED})

@@ -80,7 +80,8 @@ def fast_fit_fails(factor: float) -> float:
 def fast_distillation_fails(factor: float) -> float:
     """Return 0 if a distillation with too large learning rates improves the PSNR or stops with a clear error, else 1.
 
-    The terms are reconstruction and reference, and about half of the Gaussians are masked.
+    A clear error names the step and the term that failed. All values and the trace must be finite. The terms are
+    reconstruction and reference. About half of the Gaussians are masked and start in grey.
 
     Args:
         factor: factor on the usual learning rates.
@@ -142,7 +143,7 @@ def refuse_empty_fit() -> float:
 def count_unpruned() -> float:
     """Count the Gaussians with log-scales of 100 and more that pruning does not remove as too large.
 
-    The exponentials of such log-scales overflow.
+    The exponentials of such log-scales overflow. The number is negative if pruning removes other Gaussians, too.
     """
     gaussians = cloud()
     gaussians.log_scales[:4] = torch.tensor([100.0, 1e3, 1e4, 1e30])[:, None]
@@ -152,9 +153,9 @@ def count_unpruned() -> float:
 
 
 def first_step_excess() -> float:
-    """Return by how much Adam's first step exceeds the step size, relative to it, over gradients of 1e-25 to 1e18.
+    """Return by how much Adam's first step exceeds the step size, relative to it: the most over gradients of any size.
 
-    The first step has the length of the step size for a gradient of any size.
+    Gradients are 1e-25 to 1e18. The first step should move no coordinate by more than the step size.
     """
     worst = 0.0
     for size in (1e-25, 1e-15, 1e-8, 1.0, 1e8, 1e18):

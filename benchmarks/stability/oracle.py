@@ -47,6 +47,9 @@ def render_with_gradients(gaussians: Gaussians, camera: Camera, impl: str, seed:
         impl: "cpu" for the compiled rasterizer in float32, "torch" for the oracle in float64.
         seed: seed of features, background and linear function.
         far: unit of depth in the linear function.
+
+    Returns:
+        Images and gradients in the dtype of the implementation.
     """
     dtype = torch.float32 if impl == "cpu" else torch.float64
     random = torch.Generator().manual_seed(seed)

@@ -1,7 +1,7 @@
 """Random small scenes, ordinary and extreme, on which the compiled rasterizer must agree with the oracle.
 
 A seeded generator makes the same scenes for every version of the code. It often draws the ends of a range. Each scene
-has up to eight Gaussians and 12 x 10 pixels, because the oracle evaluates all pairs.
+has up to eight Gaussians and up to 12 x 10 pixels, because the oracle evaluates all pairs.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def _integer(random: np.random.Generator, low: int, high: int) -> int:
 def ordinary(random: np.random.Generator) -> tuple[Gaussians, Camera]:
     """Draw an ordinary scene: Gaussians of about a tenth of the extent, at most 30 times longer than thick.
 
-    The camera is 1 to 2 extents away.
+    The camera is 1 to 2 extents away from the origin.
     """
     count, degree = _integer(random, 1, MAX_GAUSSIANS), _integer(random, 0, 3)
     view = _camera(random, _between(random, 1.0, 2.0), _between(random, 0.5, 3.0))
@@ -125,7 +125,9 @@ def _gaussians(arrays, antialiased: bool) -> Gaussians:
 
 
 def find_worst(scenes: Callable, relative: float, count: int) -> Worst:
-    """Draw `count` scenes, the same ones in each call, compare each with the oracle, and return the largest error.
+    """Draw scenes, the same ones in each call, compare the rasterizer with the oracle, and return the largest error.
+
+    An error that is NaN counts as infinite.
 
     Args:
         scenes: `ordinary` or `extreme`.

@@ -66,13 +66,19 @@ def refuse_completion_of_one_pixel() -> float:
 
 
 def one_pixel_error() -> float:
-    """Return the relative error of the bilateral solver with one known pixel, whose value must result everywhere."""
+    """Return the largest relative error of the bilateral solver with one known pixel.
+
+    The value of this pixel must result everywhere. The guide is constant, then noise.
+    """
     solved = [bilateral.solve(PLANE, confidence_at((3, 3)), guide) for guide in (FLAT, noise_guide())]
     return float(nan_safe_max(*(np.abs(s / PLANE[3, 3] - 1.0).max() for s in solved)))
 
 
 def two_pixels_error() -> float:
-    """Return how far the bilateral solver's result leaves the range of two known pixels, relative to this range."""
+    """Return how far the bilateral solver's result leaves the range of two known pixels, relative to this range.
+
+    The guide is constant, then noise. The number is at most 0 if the result stays inside the range.
+    """
     known = confidence_at((3, 3), (30, 50))
     low, high = sorted((PLANE[3, 3], PLANE[30, 50]))
     solved = np.concatenate([bilateral.solve(PLANE, known, guide).ravel() for guide in (FLAT, noise_guide())])
@@ -80,7 +86,7 @@ def two_pixels_error() -> float:
 
 
 def faint_confidence_error() -> float:
-    """Return the relative error of a constant map after the bilateral solver with a confidence of 1e-8 everywhere."""
+    """Return the largest relative error of a constant map after the bilateral solver with a confidence of 1e-8."""
     solved = bilateral.solve(np.full(PLANE.shape, 3.25), np.full(PLANE.shape, 1e-8), noise_guide())
     return float(np.abs(solved / 3.25 - 1.0).max())
 
@@ -97,15 +103,15 @@ def unequal_confidence_error() -> float:
 
 
 def one_row_error() -> float:
-    """Return the relative error of a constant map, one pixel high, after the bilateral solver."""
+    """Return the largest relative error of a constant map, one pixel high, after the bilateral solver."""
     solved = bilateral.solve(np.full((1, 56), 3.25), np.ones((1, 56)), noise_guide()[:1])
     return float(np.abs(solved / 3.25 - 1.0).max())
 
 
 def border_hole_error() -> float:
-    """Return the relative error of an exact estimate after a refinement with a hole at the border.
+    """Return the largest relative error of an exact estimate after a refinement with a hole at the border.
 
-    The estimate has no misfit to the known data, so it must be kept.
+    The estimate has no misfit to the known data, so it must not change.
     """
     refined = bilateral.refine(PLANE, np.where(CORNER, 9.0, PLANE), (~CORNER).astype(float), FLAT)
     return float(np.abs(refined / PLANE - 1.0).max())
@@ -120,7 +126,7 @@ def refuse_one_known_line() -> float:
 
 
 def constant_plane_error() -> float:
-    """Return the relative error of the planes that are found among samples of a constant disparity."""
+    """Return the largest relative error of the planes that are found among samples of a constant disparity."""
     rows, columns = np.nonzero(~HOLE)
     pixels = np.stack([columns, rows], 1) + 0.5
     model = planar_model(pixels, np.full(len(rows), 0.7), PLANE.shape, generator(0, "stability"))

@@ -92,8 +92,8 @@ def clamping_error(gradients: bool) -> float:
     infinite.
 
     Args:
-        gradients: False compares the pictures and returns the largest difference. True compares the gradients and
-            returns the largest relative L2 difference.
+        gradients: False compares the pictures and returns the largest difference of a colour. True compares the
+            gradients of each parameter and returns the largest L2 difference, relative to the gradient's norm.
 
     Returns:
         Infinity if a value is NaN.

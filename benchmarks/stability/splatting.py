@@ -52,12 +52,12 @@ def world_from_camera(points: list[list[float]], view: Camera) -> torch.Tensor:
 
 
 def oracle_error(change: Callable[[Gaussians], Gaussians], view: Camera | None = None) -> float:
-    """Return the largest relative error of the rasterizer's images and gradients on changed Gaussians.
+    """Return the largest relative L2 error of the rasterizer's images and gradients (`oracle.worst_error`).
 
     The result is infinite if nothing is visible, because the case would then test nothing.
 
     Args:
-        change: function that makes the Gaussians of `cloud` extreme.
+        change: function that returns an extreme version of the Gaussians of `cloud`.
         view: camera; None for `camera()`.
     """
     gaussians, view = change(cloud()), view or camera()
@@ -66,30 +66,33 @@ def oracle_error(change: Callable[[Gaussians], Gaussians], view: Camera | None =
 
 
 def scale_all(scale: float, gaussians: Gaussians) -> Gaussians:
-    """Set the standard deviations to about `scale` extents, and raise the opacities so that tiny ones are visible."""
+    """Return the Gaussians with standard deviations of about `scale` extents.
+
+    Their opacities are raised, so that tiny Gaussians are visible.
+    """
     log_scales = gaussians.log_scales - math.log(0.1) + math.log(scale)
     return replace(gaussians, log_scales=log_scales, opacity_logits=gaussians.opacity_logits + 3)
 
 
 def make_needles(ratio: float, longest: float, gaussians: Gaussians) -> Gaussians:
-    """Make all Gaussians needles of standard deviation `longest`, `ratio` times longer than thick."""
+    """Return the Gaussians as needles with the standard deviation `longest` along, and `longest` / `ratio` across."""
     sizes = torch.tensor([longest, longest / ratio, longest / ratio]).log()
     return replace(gaussians, log_scales=sizes.repeat(len(gaussians), 1))
 
 
 def make_sheets(ratio: float, longest: float, gaussians: Gaussians) -> Gaussians:
-    """Make all Gaussians sheets of standard deviation `longest`, `ratio` times wider than thick."""
+    """Return the Gaussians as sheets with the standard deviation `longest` along, and `longest` / `ratio` across."""
     sizes = torch.tensor([longest, longest, longest / ratio]).log()
     return replace(gaussians, log_scales=sizes.repeat(len(gaussians), 1))
 
 
 def set_opacity(logit: float, gaussians: Gaussians) -> Gaussians:
-    """Set all opacity logits."""
+    """Return the Gaussians with all opacity logits set to `logit`."""
     return replace(gaussians, opacity_logits=torch.full_like(gaussians.opacity_logits, logit))
 
 
 def faint_contribution() -> float:
-    """Return the largest value of alpha and of the gradients for opacities of e^-30.
+    """Return the largest absolute value of alpha and of the gradients for opacities of e^-30.
 
     Such opacities are below the cut-off 1/255, so all values must be 0.
     """
@@ -99,14 +102,15 @@ def faint_contribution() -> float:
 
 
 def set_quaternion_length(length: float, gaussians: Gaussians) -> Gaussians:
-    """Set the lengths of all quaternions."""
+    """Return the Gaussians with all quaternions scaled to `length`."""
     return replace(gaussians, quaternions=torch.nn.functional.normalize(gaussians.quaternions) * length)
 
 
 def zero_quaternion_error() -> float:
-    """Return the largest difference between images with zero quaternions and with identity ones, or gradient.
+    """Return the larger of two numbers that must be 0, for Gaussians whose quaternions are zero.
 
-    A zero quaternion must give the same image as the identity, bit for bit, and have a zero gradient.
+    The first is the largest difference of their images from those with identity quaternions, the second the largest
+    gradient of the zero quaternions.
     """
     zero = replace(cloud(), quaternions=torch.zeros(8, 4))
     one = replace(zero, quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(8, 1))
@@ -131,7 +135,8 @@ def short_quaternion_error() -> float:
 def near_plane_errors() -> float:
     """Count Gaussians near the near plane that are wrongly kept or dropped.
 
-    Their depths are just below, on and just above 0.01; those with z >= 0.01 in float64 must be kept.
+    Their depths are just below, on and just above 0.01, and 0 and less. Those with z >= 0.01 in float64 must be kept,
+    all others dropped.
     """
     view = replace(camera(), world_to_camera=np.eye(4))
     below, above = np.nextafter(np.float32(NEAR), np.float32(0)), np.nextafter(np.float32(NEAR), np.float32(1))
@@ -142,21 +147,21 @@ def near_plane_errors() -> float:
 
 
 def move_to_near_plane(gaussians: Gaussians) -> Gaussians:
-    """Move the Gaussians to depths from just behind the near plane to 0.05, and make them small."""
+    """Return the Gaussians, made small, at depths from 0.0101, just beyond the near plane of 0.01, to 0.05."""
     z = [0.0101, 0.0105, 0.011, 0.012, 0.015, 0.02, 0.03, 0.05]
     means = world_from_camera([[0.001 * k, -0.001 * k, depth] for k, depth in enumerate(z)], camera())
     return replace(scale_all(2e-3, gaussians), means=means)
 
 
 def move_behind_camera(gaussians: Gaussians) -> Gaussians:
-    """Move half of the Gaussians behind the camera, by distances of 1e-6 to 1e6."""
+    """Return the Gaussians with half of them behind the camera, by distances of 1e-6 to 1e6."""
     means = gaussians.means.clone()
     means[::2] = world_from_camera([[0.1, 0.1, -1e-6], [0, 0, -1e-2], [0, 0.5, -1], [1, 1, -1e6]], camera())
     return replace(gaussians, means=means)
 
 
 def move_to_camera_center(gaussians: Gaussians) -> Gaussians:
-    """Move two Gaussians to the camera's centre, and one to 1e-30 in front of the centre."""
+    """Return the Gaussians with two at the camera's centre, and one 1e-30 in front of it."""
     means = gaussians.means.clone()
     means[:3] = world_from_camera([[0, 0, 0], [0, 0, 0], [0, 0, 1e-30]], camera())
     return replace(gaussians, means=means)
@@ -171,7 +176,7 @@ def unrotated_camera() -> Camera:
 
 
 def make_far_needles(gaussians: Gaussians) -> Gaussians:
-    """Make needles whose centres are 1e4 extents away and that nevertheless cross the image.
+    """Return the Gaussians as needles whose centres are 1e4 extents away and that nevertheless cross the image.
 
     Their standard deviations are 2e4 along the needle and 1e-2 across it.
     """
@@ -183,7 +188,10 @@ def make_far_needles(gaussians: Gaussians) -> Gaussians:
 
 
 def equal_depth_differences() -> float:
-    """Count numbers that differ between renderings of Gaussians of equal depth, repeated with one and three threads."""
+    """Count the numbers in images and gradients that differ from the first of three renderings.
+
+    The Gaussians have equal depths. The renderings use one, three and one threads.
+    """
     place = replace(cloud(40), means=torch.zeros(40, 3), opacity_logits=torch.full((40,), 2.0))
     before, renderings = torch.get_num_threads(), []
     try:
@@ -197,14 +205,14 @@ def equal_depth_differences() -> float:
 
 
 def move_to_origin(gaussians: Gaussians) -> Gaussians:
-    """Move all Gaussians to the origin, so that their depths are equal."""
+    """Return the Gaussians with all means at the origin, so that their depths are equal."""
     return replace(gaussians, means=torch.zeros_like(gaussians.means))
 
 
 def wide_image_error() -> float:
     """Return the relative L2 error of the colour of an image of 8192 x 2 px.
 
-    Footprints span a thousand tiles, and pixel coordinates have 11 fewer fractional bits than usual. The image has too
+    Footprints span a thousand tiles, and pixel coordinates have only 11 fractional bits in float32. The image has too
     many pixels for `oracle.blended_pixels`, so only values are compared, and the float64 reference decides on its own
     which contributions are skipped.
     """

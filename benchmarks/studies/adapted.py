@@ -41,7 +41,7 @@ COLUMNS = {  # column -> prior ("before" or "after" personalization), prompt
 
 
 def load_holes(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Load up to `count` training views with pixels to invent, except the views of the references.
+    """Load up to `count` evenly spread training views with pixels to invent, except the views of the references.
 
     Returns:
         View -> (picture, hole). The picture, uint8 [H, W, 3], has the object replaced by the remaining Gaussians (those
@@ -70,7 +70,7 @@ def load_holes(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray]
 
 @torch.no_grad()
 def paint_hole(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str, steps: int) -> np.ndarray:
-    """Inpaint the hole of a picture from pure noise of the seed `SEED`; return uint8 [H, W, 3].
+    """Inpaint the hole of a picture from pure noise of the seed `SEED`; return the whole new picture, uint8 [H, W, 3].
 
     Args:
         picture: uint8 [H, W, 3].
@@ -95,7 +95,15 @@ def paint_hole(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str,
 
 
 def save_sheet(models: dict[str, Prior], run: Path, count: int, steps: int, out: Path) -> list[str]:
-    """Inpaint the holes with all priors and prompts, write the pictures and sheet.png; return the views' names."""
+    """Inpaint the holes with all priors and prompts, write the pictures and sheet.png; return the views' names.
+
+    Args:
+        models: "before" and "after" personalization -> prior.
+        run: runs/<scene>.
+        count: largest number of views.
+        steps: number of sampler steps.
+        out: folder to write to.
+    """
     views, rows = load_holes(run, count), []
     for name, (picture, hole) in views.items():
         row = {"to paint": view_ranking.painting_template(picture, hole)}

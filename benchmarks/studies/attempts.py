@@ -63,7 +63,10 @@ ATTEMPTS: dict[str, dict] = {
 
 
 def profile_params(overrides: dict) -> Params:
-    """Return the laptop profile's parameters of `distill`, changed by the overrides of an attempt."""
+    """Return the laptop profile's parameters of `distill`, changed by the overrides of an attempt.
+
+    An override that is a dictionary changes only the entries that it names. The key `BASE` is no parameter and ignored.
+    """
     values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["distill"]
     for name, value in overrides.items():
         if name != BASE:
@@ -109,7 +112,8 @@ def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> 
         views: result of `load_test_views`.
 
     Returns:
-        {"seconds", "iteration", scores...} after each of `MEASURED_STEPS`; the seconds exclude the measurements.
+        {"seconds", "iteration", scores...} after each of `MEASURED_STEPS`. The seconds are the wall time since the
+        first step began, without the measurements.
     """
     params = profile_params(overrides)
     space = Workspace(run / "poses", run / "fit", run / "masks")
@@ -136,7 +140,7 @@ def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> 
 
 
 def draw(curves: dict[str, list[dict]], path: Path, title: str) -> None:
-    """Draw PSNR and FLIP against seconds, one line per setting.
+    """Draw PSNR and FLIP in the mask's box against seconds, one line per setting.
 
     Args:
         curves: setting -> result of `run_attempt`.

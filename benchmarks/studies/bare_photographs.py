@@ -42,15 +42,15 @@ COLUMNS = (
 
 
 def pose_errors(estimate: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Compare poses after the similarity transform that aligns the camera centres best in the least-squares sense.
+    """Compare poses after the similarity transform of the estimate that aligns the camera centres best (least squares).
 
     Args:
         estimate: view -> world-to-camera pose [4, 4].
         truth: view -> world-to-camera pose [4, 4].
 
     Returns:
-        For the V views that both have: distances of centres [V] in % of the extent of the true centres, and rotation
-        errors [V] in degrees.
+        For the V views that both have, sorted by name: distances of centres [V] in % of the extent of the true centres
+        (the largest distance between two of these), and rotation errors [V] in degrees.
     """
     names = sorted(set(estimate) & set(truth))
     poses_a, poses_b = (np.stack([poses[name] for name in names]) for poses in (estimate, truth))
@@ -68,11 +68,14 @@ def pose_errors(estimate: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarr
 def evaluate_capture(folder: Path, images: str | None, every: int, longest: int) -> list[dict]:
     """Find poses of a capture's photographs and return two rows of the table: as solved, and as adjusted to flow.
 
+    If the adjustment is not accepted, the second row has the solved poses ("left by flow"). A row maps `COLUMNS` to
+    values.
+
     Args:
         folder: folder of the capture.
         images: folder of pictures inside the capture; None for the default.
         every: every n-th photograph by name is taken.
-        longest: longer side of the photographs, px.
+        longest: longest side to which the photographs are reduced, px.
     """
     capture = load_capture(folder, images=images)
     names = sorted(capture.pictures)[::every]

@@ -2,11 +2,11 @@
 
 Each run needs the stages `poses`, `raw_masks` with true masks, and `fit`. --outlines takes true masks of some views
 from a file instead, such as benchmarks/studies/bear_outlines.json: the stone bear of instruct-nerf2nerf's `bear`, drawn
-by hand. The study clicks on the middle view as a person would: each click is in the middle of the largest error of this
-view's current mask, until the mask is good or there are --clicks clicks. Masks of all views are then made from these
-clicks. The study prints the IoU of the clicked view after each click, then the mean and the worst IoU over all views
-with true masks. With --segmenter none, no segmentation network is used. --sheets writes pictures of the masks over
-three views and the worst view.
+by hand. The study clicks on the middle view that has a true mask, as a person would: each click is in the middle of the
+largest error of this view's current mask, until the mask is good or there are --clicks clicks. Masks of all training
+views are then made from these clicks. The study prints the IoU of the clicked view after each click, then the mean and
+the worst IoU over all views with true masks. With --segmenter none, no segmentation network is used. --sheets writes
+pictures of the masks over three views and the worst view.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ TINT = (255, 0, 160)
 def next_click(mask: np.ndarray, true: np.ndarray) -> tuple[float, float, bool]:
     """Return the next click as (x, y, on the object), where the mask is most wrong.
 
-    The click is the pixel deepest inside the missing or the superfluous regions of the mask. It is on the object (True)
-    if the region is missing.
+    The click is the centre, in px, of the pixel deepest inside the missing or the superfluous regions of the mask. It
+    is on the object (True) if the region is missing.
 
     Args:
         mask: bool [H, W], current mask.
@@ -55,7 +55,13 @@ def next_click(mask: np.ndarray, true: np.ndarray) -> tuple[float, float, bool]:
 
 
 def simulate_clicks(view: ViewEvidence, true: np.ndarray, most: int) -> list[Mark]:
-    """Simulate the clicks of a person on a view, at most `most`, and print the IoU after each click."""
+    """Simulate the clicks of a person on a view, starting without a mask; return them and print the IoU after each.
+
+    Args:
+        view: the view.
+        true: bool [H, W], true mask.
+        most: largest number of clicks. Fewer suffice if the IoU reaches `GOOD_IOU`.
+    """
     marks: list[Mark] = []
     mask = np.zeros_like(true)
     while len(marks) < most and iou(mask, true) < GOOD_IOU:
@@ -85,7 +91,10 @@ def load_outlines(path: Path, scene: Scene) -> dict[str, np.ndarray]:
 def evaluate_run(
     run: Path, most: int, segmenter: Segmenter | None, outlines: Path | None = None, sheet: Path | None = None
 ) -> str:
-    """Simulate clicks on the middle view of a run, make masks of all views, and return a line of text with the scores.
+    """Simulate clicks on the middle view with a true mask, make masks of all views, and return a line of text.
+
+    The line has the number of clicks, the mean and the worst IoU over the views with true masks, and the wall seconds
+    of making all masks.
 
     Args:
         run: runs/<scene>.
@@ -95,7 +104,7 @@ def evaluate_run(
         sheet: picture of some masks to write; None for none.
 
     Raises:
-        ValueError: the run has no true masks.
+        ValueError: there are no true masks.
     """
     scene = load_scene(run / "poses")
     true = load_outlines(outlines, scene) if outlines else load_raw_masks(run / "raw_masks", scene.train)

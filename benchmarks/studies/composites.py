@@ -66,7 +66,7 @@ NAMED_PLACES = (
 def make_scenes(place: Place, captures: Path, options: compositing.Options, out: Path) -> tuple[Path, Path]:
     """Make the scene of a place and the same scene without the object, in out/scenes.
 
-    Scenes are made anew only if the place or the options have changed.
+    Scenes are made anew only if the place or the options have changed. All options share the scene without the object.
 
     Args:
         place: the place.
@@ -120,7 +120,7 @@ def evaluate_place(
         variants: names of variants to run and score as well.
 
     Returns:
-        Row of the table, see `scoring.score_place`.
+        Row of the table: the result of `scoring.score_place`, and "place", the name of the scene.
     """
     scene, untouched = make_scenes(place, captures, options, out)
     run, ceiling = (scoring.Run.load(run_job(folder, out / "runs", profile)) for folder in (scene, untouched))
@@ -152,7 +152,7 @@ def select_places(names: str, report: bool) -> tuple[Place, ...]:
 
 
 def run_benchmark(arguments: argparse.Namespace) -> int:
-    """Run the benchmark with parsed arguments and return the exit status."""
+    """Run the benchmark with parsed arguments and return the exit status. Places without a capture are skipped."""
     options = compositing.Options(not arguments.alone, arguments.shadow, arguments.rough, arguments.seed)
     out, rows = arguments.out.resolve(), []
     for place in select_places(arguments.places, arguments.report):

@@ -122,10 +122,12 @@ def composite_object(
     """Draw the object into a photograph.
 
     Args:
-        photo: [H, W, 3] in [0, 1].
+        photo: [H, W, 3] in [0, 1]; it is not changed.
+        view, camera, thing, tints: as for `render_object`.
 
     Returns:
-        Photograph with the object, uint8 [H, W, 3], and the object's mask, uint8 [H, W] in {0, 255}.
+        Photograph with the object, uint8 [H, W, 3], and the object's mask, uint8 [H, W] in {0, 255}: 255 where the
+        object covers a part of the pixel.
     """
     color, cover = render_object(view, camera, thing, tints)
     both = photo * (1 - cover[..., None]) + color
@@ -208,7 +210,7 @@ def shadow_factor(view: PixelRays, camera: np.ndarray, thing: placement.PlacedOb
 
 
 def perturb_mask(mask: np.ndarray, most: int, random: np.random.Generator) -> np.ndarray:
-    """Dilate or erode a mask, uint8 [H, W], by up to `most` px, then shift it by up to `most` px along each axis."""
+    """Return a mask, uint8 [H, W], dilated or eroded by 1 to `most` px, then shifted by up to `most` px per axis."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * random.integers(1, most + 1) + 1,) * 2)
     mask = cv2.dilate(mask, disc) if random.random() < 0.5 else cv2.erode(mask, disc)
     down, right = (int(step) for step in random.integers(-most, most + 1, 2))
@@ -217,6 +219,8 @@ def perturb_mask(mask: np.ndarray, most: int, random: np.random.Generator) -> np
 
 def write_scene(place: placement.Place, capture: placement.Photographs, options: Options, out: Path) -> None:
     """Write the scene of a place: images, masks, test_masks, truth, transforms.json, points and scene.yaml.
+
+    The object is in the images of the training views only; the images of the test views are the untouched photographs.
 
     Args:
         place: the place.

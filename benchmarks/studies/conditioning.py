@@ -28,8 +28,8 @@ def alignment_errors() -> list[tuple[float, float, float, float]]:
     """Fit a line to exact data with a growing offset, by plain normal equations and by the library.
 
     Returns:
-        Rows of (offset in units of the data's spread, condition number of the plain equations, error of the plain fit,
-        error of the library's fit). Errors are maxima over the data, relative to the target's spread.
+        Rows of (offset in units of half the data's range, condition number of the plain equations, error of the plain
+        fit, error of the library's fit). Errors are maxima over the data, relative to the target's range.
     """
     random, rows = np.random.default_rng(0), []
     base = random.uniform(-1.0, 1.0, 1000)
@@ -63,8 +63,8 @@ def solver_errors() -> dict[str, tuple[float, list[tuple[float, float]]]]:
     """Solve the bilateral solver's system by conjugate gradients with and without preconditioning.
 
     Returns:
-        Kind of preconditioning ("none", "Jacobi") -> (condition number, list with an entry for each step: seconds
-        since the start, L2 error relative to the direct solution).
+        Kind of preconditioning ("none", "Jacobi") -> (condition number, list with an entry for each step: wall seconds
+        since the first step began, L2 error relative to the norm of the direct solution).
     """
     misfit, confidence, guide = make_maps()
     system, cell = bilateral.build_system(confidence, guide)
@@ -86,9 +86,9 @@ def completion_errors() -> tuple[float, list[tuple[float, float, float]]]:
     """Complete a plane with a hole and a growing offset, by the system for disparity itself and by the library.
 
     Returns:
-        Condition number of the system, and a list of (offset in units of the plane's spread, error of the system for
+        Condition number of the system, and a list of (offset in units of the plane's range, error of the system for
         disparity itself, error of the library's completion). Errors are maxima in the hole, relative to the plane's
-        spread.
+        range.
     """
     _, confidence, _ = make_maps()
     known = confidence > 0

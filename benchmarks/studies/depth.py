@@ -2,10 +2,11 @@
 
 The stage `initialize` completes the depth behind the object in the hole of each reference. The study compares this
 depth with the true camera z of the room without the object. It prints the share of pixels whose error is within 1, 2
-and 5 %, and the median error: for all pixels of the hole, for those near a step of the true depth, and for those away
-from steps. It writes a picture per reference: reference, true depth, completed depth, and the error, red where the
-depth is too far, blue where it is too near. The scene must be made by the generator, which alone knows the truth. The
-depth outside the masks must agree with the truth; otherwise the poses are not in the frame of the truth.
+and 5 % of the true depth, and the median error: for all pixels of the hole, for those near a step of the true depth,
+for those away from steps, and for other parts of the view (see `measure`). It writes a picture per reference:
+reference, true depth, completed depth, and the error, red where the depth is too far, blue where it is too near. The
+scene must be made by the generator, which alone knows the truth. The depth outside the masks must agree with the truth;
+otherwise the poses are not in the frame of the truth.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ CLIP, MARGIN, SIDE = 0.05, 12, 480  # relative error of full colour; margin arou
 
 
 def scene_kind(name: str) -> str:
-    """Return the kind of a made scene from its name, e.g. "table" for `demo-table-21`."""
+    """Return the kind of a made scene from its name, e.g. "table" for `demo-table-21`; "demo" if the name has none."""
     return next((part for part in name.split("-") if part in KINDS), "demo")
 
 
@@ -105,8 +106,8 @@ def scores(error: np.ndarray) -> dict[str, float]:
     """Return the scores of relative errors [P].
 
     Returns:
-        "pixels": P; "within 1%" etc.: shares of pixels; "median": median absolute error; "bias": median error. Only
-        "pixels" if P is 0.
+        "pixels": P; "within 1%" etc.: shares of pixels in [0, 1]; "median": median absolute error; "bias": median of
+        the signed error. Only "pixels" if P is 0.
     """
     if not error.size:
         return {"pixels": 0}

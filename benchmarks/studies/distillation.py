@@ -47,7 +47,7 @@ def degraded_pictures(run: Path, cases: dict[str, list[Case]], renders: dict[str
     Args:
         run: runs/<scene>.
         cases: scale -> views with the truth, see `scene_cases`.
-        renders: "initialization" or "result" -> scale -> views with renders in place of the truth.
+        renders: "initialization" or "result" -> result of `rendered_cases`.
 
     Returns:
         Name of the picture -> scale -> [B, 3, H, W] in [-1, 1].
@@ -77,7 +77,7 @@ def sds_gradient(prior, pictures: Tensor, holes: Tensor, timestep: int, text: Te
         text: [B, L, D], embedded prompt.
 
     Returns:
-        Two estimates, [B, 3, H, W] each.
+        Two estimates, [B, 3, H, W] each. A step against the gradient moves a picture towards the prior's prediction.
     """
     latents, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
     t, halves = torch.full((len(pictures),), timestep), []
@@ -117,7 +117,8 @@ def measure(models: dict[str, Prior], run: Path) -> list[dict]:
         run: runs/<scene>.
 
     Returns:
-        One row each, with "model", "scale", "picture", "psnr" (in the hole, dB), "timestep", "cosine" and "gain" (dB).
+        One row each, with "model", "scale", "picture", "psnr" (of the picture in the holes, dB), "timestep", "cosine"
+        and "gain" (dB, from `possible_gain`).
     """
     first = next(iter(models.values()))
     cases = scene_cases(run, first.native_size)
@@ -143,6 +144,7 @@ def rendered_cases(run: Path, folder: str, size: int) -> dict[str, list[Case]]:
     """Return the same views as `scene_cases`, with renders of the stage `evaluate` instead of the truth.
 
     Args:
+        run: runs/<scene>.
         folder: folder of the renders, in `evaluate`.
         size: side to which views are reduced, px.
 
@@ -158,7 +160,12 @@ def rendered_cases(run: Path, folder: str, size: int) -> dict[str, list[Case]]:
 
 
 def draw(rows: list[dict], path: Path) -> None:
-    """Draw the largest gain over all timesteps against the picture's PSNR before, for each prior and scale."""
+    """Draw the largest gain over all timesteps against the picture's PSNR before, for each prior and scale.
+
+    Args:
+        rows: result of `measure` for priors named "unadapted" and "personalized"; others are not drawn.
+        path: PNG to write.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure((9, 3.8), layout="constrained")

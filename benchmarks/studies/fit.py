@@ -2,8 +2,8 @@
 
 The study fits the scene of a finished `poses` stage with the laptop profile's parameters and variants of them. Every
 8th training view is held out and only measured. The seconds do not include the measurements, but include making the
-initial points. The study writes fit.png (curves), fit.csv and fit.md (final values) to --out. Variants whose results
-are already in --out are not run again; an interrupted fit continues.
+initial points. The study writes fit.png (curves), fit.csv (all measurements) and fit.md (final values) to --out.
+Variants whose results are already in --out are not run again; an interrupted fit continues.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def run_fit(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]
 
 
 def draw(curves: dict[str, list[dict[str, float]]], title: str, path: Path) -> None:
-    """Draw the PSNR of held-out views against seconds, one curve per variant.
+    """Draw the PSNR of held-out views against seconds from the first second on, one curve per variant.
 
     Args:
         curves: variant -> lines of its trace.

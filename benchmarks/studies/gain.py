@@ -36,8 +36,8 @@ def evaluate_run(run: Path) -> dict:
     """Score the initialization and the result of a run.
 
     Returns:
-        "initialization" or "result" -> box scores `SCORES`, and "energy_box" and "energy_mask": gradient energies in
-        the box and in the mask, relative to that of the truth.
+        "initialization" or "result" -> box scores `SCORES`, as means over the test views, and "energy_box" and
+        "energy_mask": mean gradient energy of the test views in the box and in the mask, divided by that of the truth.
 
     Raises:
         ValueError: the run has not been evaluated, or has no ground truth.
@@ -68,7 +68,8 @@ def evaluate_run(run: Path) -> dict:
 def table(runs: dict[str, dict], shares: dict[str, dict[str, float]]) -> str:
     """Return a Markdown table with a row for the initialization and one for the result of each run.
 
-    The initialization of a variant is omitted if the scene's own run is in the table.
+    The initialization of a variant is omitted if the scene's own run is in the table. Lines below the table state the
+    shares.
 
     Args:
         runs: name of a run -> result of `evaluate_run`.
@@ -95,8 +96,8 @@ def unseen_shares(run: Path, scene: Path | None) -> dict[str, float]:
         scene: folder of the scene made by the generator; None if unknown.
 
     Returns:
-        "by masks": share in the training views, from the stage `masks`. With `scene` also the shares from the
-        generator's truth, for training and for test views.
+        "by masks": share in the training views, from the stage `masks`. With `scene` also "by rays, <kind> views", the
+        shares from the generator's truth in training and in test views.
     """
     share = {"by masks": round(load_json(stage_folder(run, "masks") / "facts.json")["unobserved_share"], 3)}
     facts = load_json(scene / "truth/facts.json")["never_seen_share"] if scene else {}
@@ -104,7 +105,7 @@ def unseen_shares(run: Path, scene: Path | None) -> dict[str, float]:
 
 
 def save_sheet(run: Path, path: Path) -> None:
-    """Save a picture of `VIEWS` test views, a row each, cropped around the mask's box.
+    """Save a picture of up to `VIEWS` evenly spread test views, a row each, cropped around the mask's box.
 
     The columns are the fit with the object, the initialization, the result and the truth.
     """

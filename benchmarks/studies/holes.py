@@ -70,8 +70,8 @@ def hole_scores(picture: np.ndarray, truth: np.ndarray, hole: np.ndarray) -> dic
         hole: bool [H, W], True for the filled pixels.
 
     Returns:
-        "psnr" in dB; "ssim" and "flip" as means of their maps over the hole; "energy", the gradient energy in the hole
-        relative to that of the truth (below 1 is too smooth).
+        "psnr" over the hole's pixels in dB, at most `PSNR_CAP`; "ssim" and "flip" as means of their maps over the hole;
+        "energy", the gradient energy in the hole relative to that of the truth (below 1 is too smooth).
 
     Raises:
         ValueError: the hole is empty.
@@ -138,7 +138,7 @@ def fill_holes(
 ) -> list[np.ndarray]:
     """Fill the holes with the prior, from pure noise in `steps` sampler steps; return uint8 [H, W, 3] for each case.
 
-    Outside the holes the pictures stay. All priors get the same noise for the same seed.
+    Outside the holes the new pictures equal the cases'. All priors get the same noise for the same seed.
     """
     done = []
     for first in range(0, len(cases), BATCH):

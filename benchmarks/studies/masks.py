@@ -55,7 +55,10 @@ def true_never_seen(scene_folder: Path, cameras: list[Camera]) -> dict[str, np.n
 
 
 def perturb_mask(mask: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Dilate, erode or shift a mask, bool [H, W], with equal probability, by a random distance up to `LARGEST`."""
+    """Return a mask, bool [H, W], dilated, eroded or shifted, with equal probability, by a random distance.
+
+    The distance is at most `LARGEST` times the image width.
+    """
     distance = random.uniform(0, LARGEST * mask.shape[1])
     way = random.choice(["dilate", "erode", "shift"])
     if way == "shift":
@@ -68,7 +71,10 @@ def perturb_mask(mask: np.ndarray, random: np.random.Generator) -> np.ndarray:
 
 
 def save_raw_masks(raw: dict[str, np.ndarray], folder: Path) -> Path:
-    """Write a folder in the layout of the stage `raw_masks`, with exactly the given masks; return the folder."""
+    """Write a folder in the layout of the stage `raw_masks`, with exactly the given masks; return the folder.
+
+    An existing folder is removed first.
+    """
     shutil.rmtree(folder, ignore_errors=True)
     for name, mask in raw.items():
         save_mask(folder / "masks" / f"{name}.png", mask)
@@ -77,6 +83,8 @@ def save_raw_masks(raw: dict[str, np.ndarray], folder: Path) -> Path:
 
 def iou(estimates: list[np.ndarray], truth: list[np.ndarray]) -> float:
     """Return the intersection over union of all views together, without pixels near the true border.
+
+    It is 1 if all masks are empty.
 
     Args:
         estimates: bool [H, W], one per view.
@@ -93,7 +101,7 @@ def iou(estimates: list[np.ndarray], truth: list[np.ndarray]) -> float:
 
 
 def scores(artifact: Path, scene: Scene, truth: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, float]]:
-    """Return {kind of mask: {"together", "median", "worst"}}, the IoU of all training views, the median and the worst.
+    """Return {kind of mask: {"together", "median", "worst"}}: IoUs of all training views together and of single views.
 
     Args:
         artifact: folder of the stage `masks`.
@@ -118,7 +126,8 @@ def measure(scene_folder: Path, run: Path, out: Path, seed: int) -> dict[str, di
         seed: seed of the perturbations.
 
     Returns:
-        "exact" or "perturbed" -> kind of mask -> IoU, see `scores`. The kind "input" is the perturbed input masks.
+        "exact" or "perturbed" -> kind of mask -> IoU, see `scores`. "perturbed" has also the kind "input", with only
+        "together": the perturbed input masks that are not missing, against the exact ones.
     """
     scene = load_scene(run / "poses")
     exact = load_raw_masks(run / "raw_masks", scene.train)

@@ -27,7 +27,7 @@ GRID = 12  # points along each edge of a face, by which the visibility of the ob
 
 
 def select_references(capture: placement.Photographs, thing: placement.PlacedObject, names: list[str]) -> list[str]:
-    """Select photographs greedily until they show `COVERED` of the object's visible surface.
+    """Select photographs greedily until they show the share `COVERED` of the surface that any of the photographs shows.
 
     Each step adds the photograph that improves the resolution of the surface most. The resolution of a point is that of
     the best selected photograph, relative to the best of all photographs.
@@ -36,6 +36,9 @@ def select_references(capture: placement.Photographs, thing: placement.PlacedObj
         capture: the capture.
         thing: the object at its second place.
         names: names of the photographs to choose from.
+
+    Returns:
+        Names in the order of selection.
     """
     ticks = (np.arange(GRID) + 0.5) / GRID * 2 - 1
     sides = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)
@@ -76,7 +79,9 @@ def write_scenes(
     capture: placement.Photographs,
     out: Path,
 ) -> Path:
-    """Write the scene to out/<start>-to-<goal>, and the ceiling's scene beside it; return the scene's folder.
+    """Write the scene to out/<start>-to-<goal>, and the ceiling's to the same name with -untouched; return the former.
+
+    Existing folders are replaced. Views are selected about the second place.
 
     Args:
         start: first place of the object.

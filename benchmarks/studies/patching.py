@@ -44,6 +44,8 @@ SHOWN = 4  # test views on the sheet
 def in_box(means: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """Return bool [N], True for the splats in the smallest rotated box around the object.
 
+    The box leaves out `TRIMMED` percent of the object's splats at each end of each axis.
+
     Args:
         means: [N, 3].
         labels: bool [N], True for splats of the object.
@@ -169,7 +171,10 @@ def output_file(out: Path, kind: str) -> Path:
 
 
 def score(run: Path, out: Path, runs: Path) -> None:
-    """Score all filled scenes that exist: write patching.json (PSNR in the box) and patching.png to `out`."""
+    """Score the filled scenes that exist, the run's own result and the scene with the object.
+
+    Writes patching.json (title -> mean PSNR in the box, dB) and patching.png (a row of test views each) to `out`.
+    """
     placed = load_scene(run / "poses")
     files = {"own result": run / "evaluate" / "scene.ply", "as given": out / "patch-photographs" / "scene.ply"}
     files |= {kind: runs / f"patch-{kind}" / "patch" / "patched.ply" for kind in KINDS}

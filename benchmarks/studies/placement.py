@@ -32,12 +32,12 @@ class Place:
         name: name of the place.
         capture: name of the capture's folder.
         view: name of the photograph in which the place is marked.
-        pixel: the place in this photograph, (column, row) in px.
+        pixel: the place in this photograph, (column, row) in px; lens distortion is ignored.
         size: height of the object over its distance from the camera of `view`.
         arc: photographs are used whose azimuth about the object differs from that of `view` by at most this angle,
             degrees.
-        train: number of training photographs.
-        test: number of test photographs; at most `train` + `test` photographs are used.
+        train: wanted number of training photographs; at most `train` + `test` photographs are used.
+        test: wanted number of test photographs; the number is approximate, and at most half of all.
         near: radius around the pixel within which sparse points define the surface, px.
         shape: "box" or "ellipsoid".
     """
@@ -167,7 +167,7 @@ def save_transforms(capture: Photographs, names: list[str], path: Path) -> None:
 
 
 def place_object(capture: Photographs, place: Place) -> PlacedObject:
-    """Put an object on the plane through the sparse points around the place's pixel.
+    """Return an object on the plane through the sparse points around the place's pixel.
 
     Raises:
         ValueError: the view is unknown, or there are too few points near the pixel.
@@ -213,7 +213,10 @@ def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def azimuth(thing: PlacedObject, base: np.ndarray, camera: np.ndarray) -> float:
-    """Return the angle about the surface's normal from the camera `base` to another camera, degrees in (-180, 180]."""
+    """Return the angle about the surface's normal from the camera `base` to another camera, degrees in (-180, 180].
+
+    It is positive counterclockwise, seen from above the surface.
+    """
     one, other = (_along(thing, at[:3, 3] - thing.foot) for at in (base, camera))
     return float(np.degrees(np.arctan2(np.cross(one, other) @ thing.normal, one @ other)))
 
@@ -225,6 +228,8 @@ def _along(thing: PlacedObject, vector: np.ndarray) -> np.ndarray:
 
 def select_views(capture: Photographs, place: Place, thing: PlacedObject) -> Views:
     """Select photographs that show the object, evenly in azimuth, and evenly spread test views among them.
+
+    A photograph shows the object if the object's axis is in the picture and the azimuth is within `place.arc`.
 
     Raises:
         ValueError: fewer than 4 photographs show the object.

@@ -71,7 +71,7 @@ LEARNS = ("poses", "reference")  # stages that personalization needs of a run
 
 
 def score_cases(pictures: list[np.ndarray], cases: list[Case]) -> dict[str, float]:
-    """Return the mean scores of filled pictures inside their holes."""
+    """Return the mean scores of filled pictures inside their holes, see `mean_scores`."""
     return mean_scores([hole_scores(p, c.truth, c.hole) for p, c in zip(pictures, cases, strict=True)])
 
 
@@ -139,9 +139,9 @@ def scene_cases(run: Path, size: int, pictures: dict[str, np.ndarray] | None = N
         pictures: view name -> uint8 [H, W, 3], to be used instead of the ground truth; None for the ground truth.
 
     Returns:
-        "reference": the first reference with its hole, `NOISES` times; "whole": up to `VIEWS` test views with ground
-        truth and their masks as holes, reduced to `size`; "window": a window of `size` px around the hole of each of
-        these views.
+        "reference": the first reference with its hole, reduced to `size`, `NOISES` times; "whole": up to `VIEWS` test
+        views with ground truth and their masks as holes, reduced to `size`; "window": an unreduced window of `size` px
+        that contains a random pixel of the hole, of each of these views.
 
     Raises:
         ValueError: no test view has ground truth and a mask.
@@ -202,8 +202,8 @@ def measure_timesteps(prior: Prior, cases: list[Case], prompt: str) -> dict[str,
     """Measure the clean latent x0 that the prior predicts in the holes from the noised truth.
 
     Returns:
-        Lists over `TIMESTEPS`. "error": mean squared error of x0. "variance": variance of x0 over `NOISES` draws of the
-        noise, which is also the variance of the SDS gradient z - x0.
+        Lists over `TIMESTEPS`, of means over the latent values in the holes. "error": squared error of x0. "variance":
+        variance of x0 over `NOISES` draws of the noise, which is also the variance of the SDS gradient z - x0.
     """
     pictures, holes = to_tensors(cases)
     clean, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
@@ -227,7 +227,7 @@ def measure_timesteps(prior: Prior, cases: list[Case], prompt: str) -> dict[str,
 def replace_references(reference: Path, picture: Path, folder: Path) -> Path:
     """Copy the folder of the stage `reference` to `folder`, with a picture, resized, in place of every reference.
 
-    The masks are copied unchanged. The result is `folder`.
+    The masks are copied unchanged. The result is `folder`, which must not exist before.
     """
     shutil.copytree(reference, folder)
     for path in (folder / "references").glob("*.png"):
@@ -239,7 +239,8 @@ def replace_references(reference: Path, picture: Path, folder: Path) -> Path:
 def personalize_prior(params: stage.Params, needs: dict[str, Path], folder: Path) -> tuple[Prior, list[dict]]:
     """Personalize a prior in `folder`; return the personalized prior and the trace.
 
-    An earlier, interrupted attempt with the same parameters continues.
+    An earlier attempt with the same parameters continues, or is taken as it is if it is finished. One with other
+    parameters is removed.
 
     Args:
         params: parameters of the stage `personalize`.
@@ -278,7 +279,7 @@ def fill_scales(model: Prior, cases: dict[str, list[Case]], seed: int, sampler: 
 
 
 def score_scales(pictures: dict[str, list[np.ndarray]], cases: dict[str, list[Case]]) -> dict[str, dict[str, float]]:
-    """Return {scale: mean scores}."""
+    """Return {scale: mean scores of the filled pictures inside their holes}."""
     return {scale: score_cases(pictures[scale], some) for scale, some in cases.items()}
 
 
@@ -289,16 +290,17 @@ def measure_personalization(
 
     Args:
         params: parameters of the stage `personalize`.
-        run: runs/<scene>, with the stages in `LEARNS`.
+        run: runs/<scene>, with the stages in `LEARNS` and the object's masks in test views.
         seeds: seeds of the personalization.
         wrong: wrong reference, see `personalize_wrongly`; None for none.
-        steps: numbers of sampler steps to compare with the first seed.
+        steps: numbers of sampler steps to compare, for the prior personalized with the first seed.
         sampler: number of sampler steps of all other fillings.
         out: folder of the study.
 
     Returns:
-        The settings, the measurements of the first seed, and in "seeds" the scores of the fillings for every seed:
-        "before", "after" and, if `wrong` is given, "wrong".
+        The settings, the measurements of the first seed (see `measure_first_seed`), and in "seeds" for every seed the
+        scores of the fillings by scale ("before", "after" and, if `wrong` is given, "wrong") and "seconds", the wall
+        time of the personalization without measurements.
 
     Raises:
         ValueError: a stage of the run is missing.
@@ -351,6 +353,11 @@ def measure_first_seed(
         log: trace of the personalization.
         steps: numbers of sampler steps to compare.
         out: folder of the study.
+
+    Returns:
+        "trace", "timesteps", "columns" (titles of the columns of pictures); scale -> key of `models` -> result of
+        `measure_timesteps`, with "samples", the mean scores of the filled pictures; and "sampler": scale -> result of
+        `measure_steps` of the prior "after".
     """
     result: dict = {"trace": log, "timesteps": TIMESTEPS, "columns": ["hole", *models, "truth"]}
     for scale, some in cases.items():
@@ -365,7 +372,7 @@ def measure_first_seed(
 
 
 def parse_setting(text: str) -> tuple[str, object]:
-    """Parse a command-line setting, e.g. "steps=500" to ("steps", 500)."""
+    """Parse a command-line setting, e.g. "steps=500" to ("steps", 500). The value is read as YAML."""
     name, separator, value = text.partition("=")
     if not separator:
         raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE")

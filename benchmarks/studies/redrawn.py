@@ -65,7 +65,7 @@ def compress(image: np.ndarray, quality: int = 60) -> np.ndarray:
 
 
 def shift(image: np.ndarray, across: float, down: float) -> np.ndarray:
-    """Shift a picture to the right by `across` px and down by `down` px."""
+    """Return a picture shifted to the right by `across` px and down by `down` px, which may be fractions."""
     size = (image.shape[1], image.shape[0])
     return cv2.warpAffine(image, np.array([[1.0, 0, across], [0, 1, down]]), size, borderMode=cv2.BORDER_REPLICATE)
 
@@ -182,7 +182,7 @@ class Rates:
         refused: number of right pictures that were refused.
         accepted_by_place: number of photographs of neighbouring views that would be accepted by the inlier ratio alone,
             without comparison with other photographs.
-        accepted: number of wrong pictures that were accepted.
+        accepted: number of wrong pictures, of neighbouring views and of another capture, that were accepted.
     """
 
     own: list[float] = field(default_factory=list)

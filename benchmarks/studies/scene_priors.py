@@ -81,7 +81,10 @@ def peak_mb(device: str) -> int:
 
 
 def save_results(arguments: argparse.Namespace, folder: Path, name: str, results: dict[str, Any]) -> None:
-    """Save a study's results as JSON in `folder`/`name`, with device, dtype and peak memory, which are also printed."""
+    """Save a study's results as JSON in `folder`/`name`, with device, dtype and peak memory so far.
+
+    These three are also printed.
+    """
     peak = peak_mb(arguments.device)
     save_json(folder / name, results | {"device": arguments.device, "dtype": arguments.dtype, "peak_mb": peak})
     print(f"on {arguments.device} in {arguments.dtype}, both priors loaded: at most {peak:,} MB")

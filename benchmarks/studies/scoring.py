@@ -82,7 +82,10 @@ class Run:
         return load_object_mask(self.scene.cameras[name], self.stage("raw_masks"), masks if masks.exists() else None)
 
     def seconds(self) -> float:
-        """Return the seconds of all stages except `evaluate`, from the receipts in the run's folder."""
+        """Return the sum of the seconds of all stages except `evaluate`, from the receipts in the run's folder.
+
+        For a variant this leaves out the stages that it shares.
+        """
         receipts = [load_json(path) for path in sorted(self.folder.glob("*/receipt.json"))]
         return sum(receipt["seconds"] for receipt in receipts if receipt["stage"] != "evaluate")
 
@@ -101,8 +104,9 @@ def score_place(run: Run, ceiling: Run, variants: Mapping[str, Run]) -> dict[str
 
     Returns:
         For each of `PICTURES` the mean scores `COLUMNS` over the boxes of the test views. "sharpness": gradient energy
-        of "result" and "ceiling" relative to the truth. "uncovered": largest uncovered share of a view's mask among the
-        views of "train" and of "test". "seconds" of the run. "variants": name -> scores.
+        of "result" and "ceiling" in the box, relative to the truth's. "uncovered": in the result, the largest uncovered
+        share of a view's mask among the views of "train" and of "test". "seconds" of the run. "variants": name -> mean
+        scores `COLUMNS` of the variant's result.
     """
     row: dict[str, Any] = {
         "result": _means(run.metrics["mean"]),
@@ -176,7 +180,7 @@ def _worst(run: Run, truths: dict[str, np.ndarray | None]) -> float | None:
 
 
 def uncovered_share(gaussians: Gaussians, camera: Camera, mask: np.ndarray, truth: np.ndarray | None) -> float | None:
-    """Return the share in [0, 1] of a mask's pixels that no Gaussian covers; None for an empty mask.
+    """Return the share in [0, 1] of a mask's pixels that are uncovered; None for an empty mask.
 
     A pixel is uncovered if its alpha is below `MIN_ALPHA`, or if it is nearly black where the truth is not.
 
@@ -199,7 +203,7 @@ def uncovered_share(gaussians: Gaussians, camera: Camera, mask: np.ndarray, trut
 
 
 def comparison_sheet(run: Run, ceiling: Run) -> np.ndarray:
-    """Return a picture, uint8 [H, W, 3], with a row per test view, cropped around the mask's box.
+    """Return a picture, uint8 [H, W, 3], with a row per test view that has a mask, cropped around the mask's box.
 
     The columns are the truth, the fit's render with the object, our result, the ceiling, and the absolute difference
     between our result and the truth.

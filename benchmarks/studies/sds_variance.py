@@ -10,7 +10,7 @@ means over the latents of the hole and over the views:
   pull             square of the mean of g over these draws, the part that remains after many steps (corrected for the
                    noise of the mean)
   over noise       mean of `noise` over the timesteps
-  over timesteps   variance over the timesteps of the mean of g
+  over timesteps   variance over the timesteps of the mean of g (corrected likewise)
   together         sum of the last two: the variance of the gradient of one step of distillation
 
 Every draw is seeded and the same before and after, on any device. The study prints tables and the memory used, and
@@ -112,7 +112,12 @@ def variances(samples: Tensor) -> dict:
 
 
 def measure(models: dict[str, Prior], run: Path) -> dict[str, dict[str, dict]]:
-    """Return {scale: {"before" or "after": variances}} for the priors before and after personalization."""
+    """Return {scale: {name of a prior: result of `variances`}}, with the same inputs for all priors.
+
+    Args:
+        models: "before" and "after" personalization -> prior.
+        run: runs/<scene>.
+    """
     inputs = load_inputs(run, next(iter(models.values())))
     return {
         scale: {when: variances(sds_gradients(model, *inputs[scale], prompt)) for when, model in models.items()}

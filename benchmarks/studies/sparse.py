@@ -49,7 +49,10 @@ def make_scene(scene: Path, count: int, folder: Path) -> Path:
     Args:
         scene: folder of a made scene.
         count: number of photographs, the first views of the list "shown" in truth/facts.json.
-        folder: folder to put the copy in; an existing copy is reused.
+        folder: folder to put the copy in. An existing copy is reused, with a new scene.yaml.
+
+    Returns:
+        Folder of the copy.
 
     Raises:
         ValueError: the scene lists fewer than `count` views.

@@ -51,8 +51,8 @@ def measure_pairs(name: str, run: Path, steps: int, repeats: int) -> tuple[float
         repeats: number of pairs.
 
     Returns:
-        Median CPU seconds without a trace, median CPU seconds with a trace, the number of additional lines of the
-        trace, and CPU seconds per step without a trace.
+        Median CPU seconds of a run without a trace, median CPU seconds of a run with a trace, the number of additional
+        lines of the trace in a run, and CPU seconds per step without a trace (without the time of starting the stage).
     """
     stage, count, needs, _ = STAGES[name]
     settings = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]

@@ -52,9 +52,9 @@ class Patches(NamedTuple):
 def complete_scene(scenes: Sequence[Gaussians], cameras: Sequence[Camera]) -> list[Gaussians]:
     """Return each scene with its unsupported Gaussians removed and the backdrop of the first scene appended.
 
-    A Gaussian is supported if its blending weight, summed over all pixels of the training views, exceeds `SUPPORT`. The
-    training views look the same as before: the removed Gaussians hardly contribute to them, and the backdrop lies
-    behind everything.
+    A Gaussian is supported if its blending weight, summed over all pixels of the training views, exceeds `SUPPORT`. For
+    each scene this is the weight in its own renderings. The training views look the same as before: the removed
+    Gaussians hardly contribute to them, and the backdrop lies behind everything.
 
     Args:
         scenes: states of one scene (e.g. after `distill` and after `initialize`), the final state first.
@@ -95,13 +95,17 @@ def blending_weights(gaussians: Gaussians, cameras: Sequence[Camera], pixels: Se
 
 @torch.no_grad()
 def patches_of_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> Patches:
-    """Render the views, and return their blocks of `BLOCK` x `BLOCK` pixels as patches."""
+    """Render the views, and return their blocks of `BLOCK` x `BLOCK` pixels as patches.
+
+    The colour of a patch is the block's mean colour, divided by its mean alpha. Blocks with a mean alpha up to 0.5 are
+    left out.
+    """
     renders = ((camera, rasterizer.render(gaussians, camera)) for camera in cameras)
     return concatenate([_blocks(c, r.color.double().cpu().numpy(), r.alpha.double().cpu().numpy()) for c, r in renders])
 
 
 def patches_outside_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> Patches:
-    """Return the Gaussians that project into no view as patches, seen from the middle of the cameras.
+    """Return the Gaussians whose centres project into the image of no view as patches, seen from the cameras' middle.
 
     These Gaussians come from the scene's sparse points, whose colours are those of photographs that are not among the
     training views. They look like blobs when rendered, because no training view supervised them, but their colours are

@@ -49,10 +49,10 @@ def find_planes(
 ) -> list[Plane]:
     """Find the planes around the removed object, with the cells into which they continue.
 
-    Planes are fitted by RANSAC to samples, i.e. points of the surfaces that several views show around their masks. One
+    Planes are fitted by RANSAC to samples, i.e. points of the surfaces around the masks, taken from several views. One
     view would not suffice, because its depth is rough, and a plane that is oblique in one view is frontal in another.
-    Sparse points refine a plane's position if enough of them lie sharply on it (`plane_fit.refine_by_points`). Third
-    faces of corners are added (`corners.find_third_faces`).
+    Sparse points refine a plane if enough of them lie sharply on it (`plane_fit.refine_by_points`). Third faces of
+    corners are added (`corners.find_third_faces`).
 
     Args:
         center: [3], the middle of the removed object.
@@ -63,7 +63,7 @@ def find_planes(
 
     Returns:
         Up to `MAX_PLANES` planes in the order in which RANSAC found them, about by decreasing number of samples; then
-        the third faces.
+        the third faces. None are returned if there are too few samples.
     """
     samples = sample_surfaces(center, REACH * radius, views, seed)
     points = points[np.linalg.norm(points - center, axis=1) < REACH * radius]
@@ -129,19 +129,19 @@ def _crossing(plane: Plane, others: Sequence[Plane]) -> list[Plane]:
 
 
 def align_plane(plane: Plane, depth: np.ndarray, camera: Camera, hole: np.ndarray) -> Plane:
-    """Move a plane onto the depth of one view around a hole.
+    """Return a plane, moved onto the depth of one view around a hole.
 
     The disparity of a plane is an affine function of the pixel. The function is fitted to the pixels around the hole
     that are inliers, with the plane's old position inside the hole as a weak prior.
 
     Args:
-        depth: [H, W], accurate camera z of the pixels around the hole; 0 where unknown.
+        depth: [H, W], accurate camera z of the pixels around the hole; 0 where unknown. All pixels above 0 count.
         camera: the view.
         hole: bool [H, W], True where the plane may continue.
 
     Returns:
         The moved plane with the same cells; the given plane if fewer than `ALIGN_PIXELS` pixels are inliers, or if the
-        depth in the hole would change by `ALIGN_LIMIT` or more.
+        depth anywhere in the hole would change by `ALIGN_LIMIT` of its value or more.
     """
     plane_depth = plane.depth(camera)
     known = (depth > 0) & np.isfinite(plane_depth)

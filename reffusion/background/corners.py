@@ -32,10 +32,11 @@ def find_third_faces(
     radius: float,
     inlier_distance: float,
 ) -> list[tuple[np.ndarray, float]]:
-    """Find the planes at right angles to two of the given planes on which many of the remaining samples lie sharply.
+    """Find the planes at right angles to two of the given planes on which many of the unexplained samples lie sharply.
 
-    The normal of such a plane is known, so few samples suffice to determine its offset. RANSAC, which draws three
-    samples per plane, would find a hundred planes with as many inliers.
+    The two given planes must be about at right angles to each other. The normal of a third plane is then known, so few
+    samples suffice to determine its offset. RANSAC, which draws three samples per plane, would find a hundred planes
+    with as many inliers.
 
     Args:
         samples: [S, 3], points of the visible surfaces around the object.
@@ -46,7 +47,8 @@ def find_third_faces(
         inlier_distance: distance within which a sample belongs to a plane, in world units.
 
     Returns:
-        (normal, offset) of each plane found.
+        (normal, offset) of each plane found. None of them is about parallel to another, and each passes within
+        about `REACH` radii of the center.
     """
     enough, faces = max(MIN_SAMPLES, MIN_SHARE * len(samples)), []
     for (one, _), (other, _) in combinations(planes, 2):

@@ -111,7 +111,7 @@ def reflect_points(points: np.ndarray, normal: np.ndarray, offset: float) -> np.
 def render_mirrors(
     mirrors: Sequence[Mirror], camera: Camera, pixels: np.ndarray, views: Sequence[DepthView]
 ) -> MirrorImage:
-    """Render all mirror images into one view; at each pixel the nearest plausible one, else the nearest one.
+    """Render all mirror images into one view: each pixel shows the nearest plausible image, else the nearest image.
 
     The arguments are those of `Mirror.render`. A mirror image is plausible where `plausible_depth` is finite.
     """

@@ -71,8 +71,8 @@ class Background:
     def photographed_depth(self, camera: Camera) -> np.ndarray:
         """Return the depth that a view shows outside its mask, [H, W] float64.
 
-        Where the view looks into a mirror, e.g. a polished table, this is the depth of the mirror's plane. Inside the
-        mask, and where nothing is visible, the depth is 0.
+        Where the view shows a reflection, e.g. in a polished table, this is the depth of the reflecting plane
+        (`plane.remove_reflected_depth`). Inside the mask and its margin, and where nothing is visible, the depth is 0.
 
         Args:
             camera: one of `cameras`; for another view the depth is 0 everywhere.
@@ -94,7 +94,7 @@ class Background:
         return count_views(points, self.views).is_empty.reshape(depth.shape)
 
     def with_planes(self, gaussians: Gaussians, labels: Tensor, seed: int = 0) -> Background:
-        """Return the background with the planes around the object, and its center and radius.
+        """Return the background with newly found planes around the object, and the center and radius of the object.
 
         Args:
             gaussians: the N Gaussians of the whole scene.
@@ -108,7 +108,9 @@ class Background:
         return replace(self, planes=planes, center=center, radius=radius)
 
     def with_mirrors(self, remaining: Gaussians) -> Background:
-        """Return the background with the planes of mirror symmetry of the things around the object.
+        """Return the background with newly found mirrors: symmetric things around the object, and their mirror planes.
+
+        The planes, center and radius must be known (`with_planes`); else no mirror is found.
 
         Args:
             remaining: the Gaussians of the scene without the removed ones.

@@ -25,10 +25,11 @@ class Plane:
         origin: [3], the point on the plane at the middle of the map.
         axes: [2, 3], unit vectors of the map's rows (the direction in which the row index grows) and columns.
         cell_size: side of a cell, in world units.
-        seen: bool [CELLS, CELLS], True where views show the plane.
-        free: bool [CELLS, CELLS], True where views see through the plane, so that the plane does not exist there.
+        seen: bool [CELLS, CELLS], True where views show the plane, and not a surface of another plane that crosses it.
+        free: bool [CELLS, CELLS], True where views see through the plane, so that the plane does not exist there unless
+            the cell is `reflective`.
         reflective: bool [CELLS, CELLS], True for cells through which views see and which seen cells surround. The plane
-            has a mirror or a window there.
+            has a mirror or a window there. Most of these cells are also `free`.
         continued: bool [CELLS, CELLS], True for cells that no view shows and into which the plane continues.
         enclosed: bool [CELLS, CELLS], True for the cells of `continued`, and for further cells behind the object that
             the cells of `continued` and `seen` surround. Views may see through these further cells, because reflections
@@ -57,10 +58,10 @@ class Plane:
         return np.where(np.isfinite(depth) & (depth > 0), depth, np.inf)
 
     def pixels_on(self, cells: np.ndarray, depth: np.ndarray, camera: Camera, pixels: np.ndarray) -> np.ndarray:
-        """Return bool [H, W], the pixels of a view whose rays meet the plane in some of its cells.
+        """Return bool [H, W], the pixels of a view whose rays meet the plane in a True cell of `cells`.
 
         Args:
-            cells: bool [CELLS, CELLS], the cells in question.
+            cells: bool [CELLS, CELLS].
             depth: [H, W], the plane's depth in the view, see `Plane.depth`.
             camera: the view.
             pixels: bool [H, W], the pixels to test; all others are False in the result.
@@ -97,12 +98,12 @@ class Plane:
 
 
 def remove_reflected_depth(depth: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
-    """Replace the depth of reflections by the depth of the plane that reflects.
+    """Return a depth map in which pixels that show a reflection have the depth of the plane that reflects.
 
     A pixel that shows a reflection in a polished surface has the depth of the reflected scene, which lies behind the
     plane of the surface. The surface itself, and its texture, continue along the plane. So a pixel gets the plane's
-    depth if its depth lies behind a reflective cell of the plane. A pixel whose depth lies behind a seen cell of a
-    large plane also gets the plane's depth, because most views show the plane there.
+    depth if its depth lies behind a reflective cell of the plane. A pixel whose depth lies clearly behind a seen cell
+    of a large plane also gets the plane's depth, because most views show the plane there.
 
     Args:
         depth: [H, W], the depth that the view shows; 0 where unknown.
@@ -110,7 +111,7 @@ def remove_reflected_depth(depth: np.ndarray, camera: Camera, planes: Sequence[P
         planes: the planes around the object.
 
     Returns:
-        [H, W] float64.
+        [H, W] float64, a new array.
     """
     depth, most = depth.astype(np.float64), max((plane.seen.sum() for plane in planes), default=0)
     for plane in planes:

@@ -56,7 +56,8 @@ def ransac_plane(
         inlier_distance: distance from the plane below which a point is an inlier.
 
     Returns:
-        Normal [3], offset, and the number of inliers. The number is 0 if all drawn triples of points are collinear.
+        Unit normal [3] of either sign and offset of the refitted plane, and the number of its inliers. The number is 0
+        if all drawn triples of points are collinear; the plane then means nothing.
     """
     first, second, third = (points[generator.integers(len(points), size=TRIALS)] for _ in range(3))
     normals = np.cross(second - first, third - first)
@@ -74,14 +75,14 @@ def ransac_plane(
 def refine_by_points(
     normal: np.ndarray, offset: float, points: np.ndarray, inlier_distance: float, min_spread: float
 ) -> tuple[np.ndarray, float] | None:
-    """Refit a plane, which was fitted to rendered depth, to the sparse points near it.
+    """Return a plane, which was fitted to rendered depth, after a refit to the sparse points near it.
 
     Rendered depth is biased towards the camera wherever faint Gaussians float before a plain surface, the more so the
     more oblique the view. This may turn a plane by a degree or more.
 
     Args:
         normal, offset: the plane.
-        points: [P, 3], sparse points.
+        points: [P, 3], sparse points, also far from the plane.
         inlier_distance: distance within which a sample of the rendered surface belongs to the plane.
         min_spread: least standard deviation of the points within the plane, in the direction in which they spread
             least.

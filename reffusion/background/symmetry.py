@@ -56,8 +56,9 @@ def find_mirrors(
     """Find the upright mirrors of the things that stand on the largest plane around the removed object.
 
     Things that may continue beyond the search region are left out. A mirror is accepted if the mirror image of the
-    thing's visible part lies on the thing or where no view looks, but not in free space; if the colours of the mirror
-    image agree with the thing's colours; and if the mirror image shows something that no photograph shows.
+    thing's visible part overlaps the thing and lies otherwise where no view looks, hardly in free space; if the colours
+    of the mirror image agree with the thing's colours; and if the mirror image shows something behind the removed
+    object that no photograph shows.
 
     Args:
         gaussians: the Gaussians of the scene without the removed ones.

@@ -44,10 +44,10 @@ class HoleGeometry:
 
     Attributes:
         unobserved: bool [H, W], True at the pixels of C whose background no photograph shows.
-        continued_depth: [H, W], at unobserved pixels the camera z of the plane that continues there, or of the mirror
-            image of a symmetric thing; inf where there is neither, and at all other pixels.
-        depth: [H, W] float64, rendered from the remaining Gaussians (those without the object). Outside the mask it is
-            the depth that the view shows with the object.
+        continued_depth: [H, W], at unobserved pixels the camera z of the nearest plane that continues there, or of the
+            plausible mirror image of a symmetric thing; inf where there is neither, and at all other pixels.
+        depth: [H, W] float64 camera z, rendered from the remaining Gaussians (those without the object). Outside the
+            mask it is the depth that the view shows with the object, if the view is among the training views.
         alpha: [H, W] float64, rendered from the remaining Gaussians.
         plane_depths: [H, W] each, for every plane that continues in this view its depth at all pixels, inf where a ray
             does not meet it. If there are mirrors, the last entry is the depth of their mirror images, inf elsewhere.

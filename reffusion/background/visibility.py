@@ -114,7 +114,9 @@ def depth_range(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_photographed_depth(depth: np.ndarray, camera: Camera, views: Sequence[DepthView]) -> np.ndarray:
-    """Replace a depth map that was rendered without the object by the depth with the object, outside the mask.
+    """Return a depth map that holds `depth` in the object's mask, and the depth with the object outside the mask.
+
+    The mask is that of the view, with its margin (`DepthView.masked`).
 
     Outside the mask the photograph supervised the depth. The object's Gaussians extend a little beyond the mask, so
     without them the pixels beside the mask would have the depth of the surface behind these Gaussians.
@@ -125,7 +127,8 @@ def with_photographed_depth(depth: np.ndarray, camera: Camera, views: Sequence[D
         views: depth of the training views, rendered with the object.
 
     Returns:
-        [H, W] float64. At pixels outside the mask where the view shows nothing opaque, `depth` stays.
+        [H, W], float64 if the view is among `views`. At pixels outside the mask where the view shows nothing opaque,
+        `depth` stays.
     """
     for view in views:
         if view.camera.name == camera.name:
@@ -170,8 +173,8 @@ class Visibility:
 def count_views(points: np.ndarray, views: Sequence[DepthView], normals: np.ndarray | None = None) -> Visibility:
     """Classify points in every view by comparing their depth with the depth that the view shows.
 
-    A point is seen only if it lies on the view's surface. A point in front of the surface is free, and a point behind
-    the surface is occluded.
+    A point is seen only if it lies on the view's surface, up to a tolerance (`SURFACE`). A point clearly in front of
+    the surface is free, and a point behind the surface is occluded. A point in the mask of the object is only masked.
 
     Args:
         points: [P, 3], world coordinates.
@@ -187,7 +190,7 @@ def count_views(points: np.ndarray, views: Sequence[DepthView], normals: np.ndar
 
 
 def is_seen(view: DepthView, points: np.ndarray) -> np.ndarray:
-    """Return bool [P], True for those of the world points [P, 3] at which the view shows a surface."""
+    """Return bool [P], True for those of the world points [P, 3] at which the view shows a surface outside its mask."""
     counts = np.zeros((4, len(points)), np.int64)
     _count_view(view, points, None, counts)
     return counts[SEEN] > 0

@@ -59,7 +59,8 @@ def undistort_clicks(poses: Path, clicks: Clicked) -> dict[str, tuple[np.ndarray
         clicks: view -> clicks, in pixels of its photograph.
 
     Returns:
-        View -> points [K, 2], pixels of its undistorted picture; and bool [K], True if the click is on the object.
+        View -> points [K, 2], pixels of its undistorted picture; and bool [K], True if the click is on the object. K is
+        0 for a view all of whose clicks are left out.
     """
     lenses, _ = load_lenses(poses)
     sizes, found = load_photograph_sizes(poses), {}
@@ -73,6 +74,8 @@ def undistort_clicks(poses: Path, clicks: Clicked) -> dict[str, tuple[np.ndarray
 
 def undistort_points(points: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
     """Map pixels [K, 2] of a photograph to pixels [K, 2] of its undistorted picture.
+
+    The results may lie outside the undistorted picture. They are NaN where the distortion cannot be inverted.
 
     Args:
         lens: lens of the photograph, at the size of the undistorted picture.

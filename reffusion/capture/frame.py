@@ -188,7 +188,7 @@ def add_random_points(
     Each point has the colour of the pixel for which it was drawn.
 
     Args:
-        ranges: [V, 3] near, typical and far depth of each view, in the normalised frame, in the order of the cameras.
+        ranges: [V, 3] near, typical and far depth of each view in `scene.cameras`, in the normalised frame.
         image_of: function from a view's name to its picture, uint8 [H, W, 3].
     """
     names = list(scene.cameras)
@@ -211,7 +211,7 @@ def sample_frustum_points(
     points float in front of a single camera.
 
     Args:
-        ranges: [V, 3] near, typical and far depth of each view.
+        ranges: [V, 3] near, typical and far depth of each of the V cameras.
 
     Returns:
         points [count, 3]; int [count], the index of the view for which each point was drawn; int [count, 2], the

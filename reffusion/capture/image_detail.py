@@ -48,7 +48,7 @@ def _octave_ratio(image: np.ndarray) -> float:
 def typical_view_count(points: np.ndarray, cameras: Sequence[Camera]) -> int:
     """Return the median over points [P, 3] of the number of views whose pictures contain the point, occluded or not.
 
-    Without points, it is the number of cameras.
+    The median is rounded down. Without points, it is the number of cameras.
     """
     seen = np.zeros(len(points), int)
     for camera in cameras:

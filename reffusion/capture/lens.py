@@ -184,9 +184,10 @@ def _border(lens: Lens) -> tuple[np.ndarray, ...]:
 
 @lru_cache(maxsize=4096)
 def largest_shift(lens: Lens) -> float:
-    """Return the largest displacement, in pixels, of a point on the picture's border by the distortion.
+    """Return the largest distance, in pixels, by which undistortion moves a point on the distorted picture's border.
 
-    It is 0 for a pinhole, and infinite if the distortion cannot be inverted at the border.
+    Undistortion moves a point to the pixel at which `lens.pinhole` shows the same direction. The distance is 0 for a
+    pinhole, and infinite if the distortion cannot be inverted at the border.
     """
     border = np.concatenate(_border(lens))
     seen = to_directions(border, lens)
@@ -236,7 +237,8 @@ def sampling_map(lens: Lens, pinhole: Lens) -> np.ndarray:
 def undistortion_map(lens: Lens) -> tuple[Lens, np.ndarray | None]:
     """Return how to undistort pictures of a lens: the pinhole that replaces the lens, and the `sampling_map`.
 
-    The map is None if the distortion is so small that pictures need no resampling.
+    The map is None if the distortion is so small that pictures need no resampling. Raises BadInput as
+    `undistorted_pinhole` does.
     """
     pinhole = undistorted_pinhole(lens)
     return pinhole, None if pinhole == lens.pinhole else sampling_map(lens, pinhole)

@@ -22,7 +22,8 @@ def save_lenses(
         poses_dir: the folder that the stage `poses` writes.
         lenses: view name -> lens of its photograph with distortion, at the size of its undistorted picture.
         upright: True if the EXIF orientation tags of photographs are obeyed.
-        photographs: view name -> (width, height) of its photograph in the scene's folder.
+        photographs: view name -> (width, height) of its photograph in the scene's folder, after orientation if
+            `upright`.
     """
     views = {name: asdict(lens) for name, lens in lenses.items()}
     save_json(Path(poses_dir) / LENSES, {"upright": upright, "photographs": dict(photographs), "views": views})
@@ -51,5 +52,8 @@ def load_lenses(poses_dir: Path) -> tuple[dict[str, Lens], bool]:
 
 
 def load_photograph_sizes(poses_dir: Path) -> dict[str, tuple[int, int]]:
-    """Return view name -> (width, height) of its photograph in the scene's folder, from lenses.json."""
+    """Return view name -> (width, height) of its photograph in the scene's folder, from lenses.json.
+
+    The size is that after orientation, if EXIF orientation tags are obeyed (`load_lenses`).
+    """
     return {name: tuple(size) for name, size in load_json(Path(poses_dir) / LENSES)["photographs"].items()}

@@ -31,7 +31,7 @@ def load_capture(
         layout: one of LAYOUTS; None to detect the layout.
         images: folder of pictures, relative to the scene; None for the layout's usual folders.
         longest: requested longer side of the pictures in pixels. The layout "llff" may hold the same pictures in
-            several sizes; the smallest size that is large enough is taken.
+            several sizes; the smallest size that is large enough is taken, else the largest size.
         references: files of references (inpainted views). They may lie among the photographs, but are not views.
 
     Raises:

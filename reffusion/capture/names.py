@@ -154,8 +154,8 @@ def pair_pictures(wanted: Mapping[K, str], files: Collection[str]) -> dict[K, st
 def pair_masks(masks: Collection[str], views: Mapping[V, Iterable[str]]) -> dict[str, V]:
     """Return mask file -> key of the view to which the mask belongs. Masks that fit no single view are left out.
 
-    The mask of the picture `A.jpg` may be called `A.png`, `A.jpg.png` (as COLMAP does), or `A` with one of
-    `MASK_SUFFIXES`, such as `A_mask.png`.
+    Several masks may get the same view, if they are called differently. The mask of the picture `A.jpg` may be
+    called `A.png`, `A.jpg.png` (as COLMAP does), or `A` with one of `MASK_SUFFIXES`, such as `A_mask.png`.
 
     Args:
         masks: paths of mask files.

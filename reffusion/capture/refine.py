@@ -47,8 +47,10 @@ class Refinement:
 
     Attributes:
         cameras: view name -> camera, adjusted or as given.
-        before: `flow_residual` of the given cameras in pixels; NaN if no views match.
-        after: `flow_residual` of the adjusted cameras in pixels; None if the cameras are as given.
+        before: `flow_residual` of the given cameras in pixels; NaN if no views match. It is that of the quick test if
+            the quick test decided, else that at the half of the matches which is not used for adjustment.
+        after: `flow_residual` of the adjusted cameras at the same matches; None if the cameras are as given, also if
+            adjusted cameras were rejected.
     """
 
     cameras: dict[str, Camera]
@@ -59,9 +61,10 @@ class Refinement:
 def refine_cameras(cameras: Sequence[Camera], images: Mapping[str, np.ndarray]) -> Refinement:
     """Adjust cameras to optical flow, if the flow contradicts the given cameras and the adjustment reduces the error.
 
-    Cameras stay as given if their residual (`flow_residual`) is at most `GOOD_RESIDUAL`, first in a quick test of a few
-    views, then over all views. Otherwise half of the matches are used for bundle adjustment. The adjusted cameras are
-    accepted if they reduce the residual of the other half to less than `LARGEST_RATIO` times its value.
+    Cameras stay as given if their residual (`flow_residual`) is at most `GOOD_RESIDUAL` or unknown, first in a quick
+    test of a few views, then at one half of the matches of all views. Otherwise the other half is used for bundle
+    adjustment, and the result is aligned with the given cameras by a similarity. The adjusted cameras are accepted if
+    their residual at the former half is less than `LARGEST_RATIO` times that of the given cameras.
 
     Args:
         cameras: cameras of undistorted views in the normalised frame.

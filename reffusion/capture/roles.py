@@ -99,10 +99,10 @@ def load_roles(
 
     Test views are the first of these that exist:
     - the views that `test` names;
-    - the views of the test masks (usually in `<pictures>/test_label`). If the test masks are named like views, their
-      names decide. Otherwise they belong, in order, to the views without a training mask; or, if some training masks
-      are missing too, to the first views of the capture;
-    - the views that the layout itself holds out (`Capture.test`).
+    - the views of the test masks (usually in `<pictures>/test_label`), except those that `train` names. If the test
+      masks are named like views, their names decide. Otherwise they belong, in order, to the views without a training
+      mask; or, if some training masks are missing too, to the first views of the capture;
+    - the views that the layout itself holds out (`Capture.test`), except those that `train` names.
 
     Training views are the views that `train` names, else all views that are neither test nor camera-only views. All
     other views are left out of the scene, unless they are camera-only views.
@@ -125,8 +125,9 @@ def load_roles(
 
     Raises:
         BadInput: a mask belongs to no picture, or its aspect ratio differs from that of its view by more than 10%;
-            there is no mask at all; a view is unknown, or is both a training and a test view; there are fewer than 3
-            training views. The message names the file and the remedy.
+            there is no mask at all, and masks are not optional; a view is unknown, or is named as both a training and a
+            test view; there are fewer than 3 training views (with `cameras_only`: none). The message names the file and
+            the remedy.
     """
     folder = Path(folder)
     found = find_masks(folder, capture, masks, optional=region or cameras_only is not None)

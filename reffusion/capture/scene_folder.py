@@ -23,6 +23,8 @@ from reffusion.params.reference import reference_list
 def read_scene(params: SceneKeys, scene: Path, longest: int = LONGEST) -> tuple[Capture, Roles]:
     """Read a scene folder: return the capture (pictures and cameras) and the roles of its views.
 
+    Views that scene.yaml names under `exclude` are neither in `Capture.pictures` nor in the roles.
+
     Args:
         params: the keys of scene.yaml.
         scene: the scene's folder.
@@ -79,8 +81,8 @@ def check_gaussian_files(params: SceneKeys, scene: Path) -> list[str]:
         A sentence for each thing that will be changed when the files are read.
 
     Raises:
-        BadInput: a file is missing or holds no Gaussians; `cleaned` is given without `gaussians`, or has as many
-            Gaussians as `gaussians`, so that nothing was deleted.
+        BadInput: a file is missing or holds no Gaussians; `cleaned` is given without `gaussians`, or does not have
+            fewer Gaussians than `gaussians`, so that nothing was deleted.
     """
     counts, notes = {}, []
     for key, name in (("gaussians", params.gaussians), ("cleaned", params.cleaned)):

@@ -40,7 +40,7 @@ class Reconstruction:
         photographs: number of photographs that were given, placed or not.
         lenses: number of different lenses of the placed views.
         track_length: mean number of views in which a point is observed.
-        residual: mean reprojection error in pixels of the reduced pictures.
+        residual: reprojection error in pixels of the reduced pictures: the mean over the points of each point's mean.
     """
 
     poses: Poses
@@ -68,9 +68,10 @@ class Reconstruction:
 def reconstruct(photographs: Mapping[str, Path], longest: int, work: Path, seed: int = 0) -> Reconstruction:
     """Estimate lenses, poses and sparse points of photographs. Their EXIF orientation tags are obeyed.
 
-    Photographs of equal size and equal EXIF focal length share one SIMPLE_RADIAL lens. So that portrait and landscape
-    pictures can share a lens, portrait pictures are turned by 90 degrees; the results are turned back. The result is
-    reproducible: the order of pictures and the random seeds are fixed, and the mapping uses a single thread.
+    Photographs of equal size and about equal EXIF focal length share one SIMPLE_RADIAL lens (`group_by_lens`). So that
+    portrait and landscape pictures can share a lens, portrait pictures are turned by 90 degrees; the results are turned
+    back. The result is reproducible: the order of pictures and the random seeds are fixed, and the mapping uses a
+    single thread.
 
     Args:
         photographs: view name -> file; sizes may differ.
@@ -79,8 +80,8 @@ def reconstruct(photographs: Mapping[str, Path], longest: int, work: Path, seed:
         seed: random seed of COLMAP.
 
     Returns:
-        The reconstruction, with lenses for the reduced pictures. Photographs for which COLMAP finds no pose are not in
-        `poses`.
+        The reconstruction, with lenses for the reduced, upright pictures. Photographs for which COLMAP finds no pose
+        are not in `poses`.
 
     Raises:
         BadInput: COLMAP finds poses for fewer than 3 views; the message names the views without a pose.
@@ -211,8 +212,8 @@ def group_by_lens(photographs: Mapping[str, Path], work: Path) -> list[tuple[lis
         work: an existing folder for a temporary file, see `relative_focal_length`.
 
     Returns:
-        For each group the names of its views, and the focal length divided by the picture's longer side; None if
-        EXIF does not tell.
+        For each group the names of its views, and the smallest focal length in the group divided by the picture's
+        longer side; None if EXIF does not tell.
     """
     groups: list[tuple[list[str], float | None]] = []
     last: tuple[list[int], float] | None = None
@@ -266,21 +267,21 @@ def bundle_adjust(
     points: Sequence[tuple[np.ndarray, Sequence[tuple[str, int]]]],
     fixed: Collection[str] = (),
 ) -> dict[str, Camera]:
-    """Adjust the poses and principal points of cameras by bundle adjustment. Focal lengths stay fixed.
+    """Return cameras with poses and principal points adjusted by bundle adjustment. Focal lengths stay fixed.
 
     The sum of a robust loss (soft L1) of the reprojection errors is minimised over poses, principal points and points.
 
     Args:
         cameras: view name -> camera to start from. A view with fewer than `LEAST_SIGHTINGS` observations keeps its
             pose and principal point.
-        sightings: view name -> the observed pixels [2] of this view.
-        points: position [3] and track of each point. A track is a list of observations: pairs of a view name and
-            the index of the pixel in `sightings` of this view.
+        sightings: name of each view in `cameras` -> the pixels [2] in which it observes points.
+        points: initial position [3] and track of each point. A track is a list of observations: pairs of a view name
+            and the index of the pixel in `sightings` of this view.
         fixed: names of views whose principal points stay fixed.
 
     Returns:
-        The adjusted cameras by view name. Their frame agrees only roughly with the given one, since reprojection errors
-        do not change under a similarity.
+        View name -> camera, for all views in `cameras`. The adjusted points are not returned. The frame agrees
+        only roughly with the given one, since reprojection errors do not change under a similarity.
     """
     import pycolmap
 

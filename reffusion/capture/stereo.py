@@ -44,6 +44,7 @@ class Matches:
         others: names of the K neighbours.
         places: [K, P, 2], coordinates (x, y) of the matching pixels in the neighbours.
         seen: [K, P] bool, True if the match is valid: forward and backward flow agree, and the pixel has contrast.
+            `places` is meaningless elsewhere.
     """
 
     view: str
@@ -58,7 +59,8 @@ def triangulate_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Triangulate points from the optical flow between views, about one point per cell of the pictures.
 
-    A cell of a view gets no point if its match is unreliable, or if points of earlier views already cover it.
+    A cell of a view gets no point if its match is unreliable, or if points of earlier views already cover it. Points
+    with a depth above `FARTHEST` are moved to this depth.
 
     Args:
         cameras: cameras of undistorted views in the normalised frame. Fewer than two give no points.
@@ -91,7 +93,7 @@ def match_views(
     """Yield the matches of each of the `chosen` views with its neighbours among `cameras`, one pixel per cell.
 
     Args:
-        images: view name -> uint8 [H, W, 3].
+        images: view name -> uint8 [H, W, 3], for all `cameras`.
         cell: side of a cell in pixels.
     """
     gray = {camera.name: cv2.cvtColor(images[camera.name], cv2.COLOR_RGB2GRAY) for camera in cameras}
@@ -220,7 +222,8 @@ def triangulate(matches: Matches, cameras: Mapping[str, Camera]) -> tuple[np.nda
     Let R and t be the rotation and translation from this view to a neighbour, and let a pixel's ray have z = 1. The
     point of inverse depth r on the ray is R ray + r t in the neighbour, up to scale. Its reprojection error times its
     depth in the neighbour is linear in r. So each neighbour proposes an r. The proposal with which most neighbours
-    agree (reprojection error below `RESIDUAL` px) is refined by least squares over the neighbours that agree.
+    agree (reprojection error in x and in y below `RESIDUAL` px) is refined by least squares over the neighbours that
+    agree.
 
     Args:
         cameras: view name -> camera, of the view and its neighbours.
@@ -251,8 +254,8 @@ def triangulate(matches: Matches, cameras: Mapping[str, Camera]) -> tuple[np.nda
 def flow_residuals(matches: Matches, cameras: Mapping[str, Camera], depth: np.ndarray) -> np.ndarray:
     """Return the residual vectors [K, P, 2] in pixels of a view's points in its K neighbours.
 
-    A vector leads from the pixel that flow found in the neighbour to the projection of the point there. It is NaN if
-    the point is behind the neighbour.
+    A vector leads from the pixel that flow found in the neighbour to the projection of the point there, also where the
+    match is not valid (`Matches.seen`). It is NaN if the point is behind the neighbour.
 
     Args:
         depth: [P], depths of the pixels of `matches`; the points lie there on their rays.

@@ -141,7 +141,7 @@ def check_proportions(
         path: file of the picture.
         name: name of the view.
         of_size: (width, height) of the view.
-        tolerance: largest allowed relative difference of the aspect ratios.
+        tolerance: largest allowed difference of the aspect ratios, relative to that of the picture.
         what: the kind of picture, such as "mask", for the message.
         upright: True to obey the picture's EXIF orientation tag.
 

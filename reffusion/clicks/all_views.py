@@ -61,9 +61,10 @@ def label_gaussians(
     """Return bool [N], True = the Gaussian belongs to the object.
 
     Votes of the masks label the Gaussians that the views with masks show. Gaussians whose centres project beside a mask
-    count as background. A minimum cut labels all other Gaussians. The cut uses the distances to labelled Gaussians, the
-    colours of the photographs without masks, and the similarity of neighbours. The result contains only Gaussians that
-    a chain of object neighbours connects with a Gaussian that votes label as the object.
+    count as background, unless the masks vote for them. A minimum cut labels all other Gaussians. The cut uses the
+    distances to labelled Gaussians, the colours of the photographs without masks, and the similarity of neighbours. The
+    result contains only Gaussians that a chain of object neighbours connects with a Gaussian that votes label as the
+    object.
 
     Args:
         near: the graph of neighbouring Gaussians, from `find_neighbours`.

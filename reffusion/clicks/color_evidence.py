@@ -83,9 +83,10 @@ def color_votes(
         image_of: view -> photograph, uint8 [H, W, 3].
 
     Returns:
-        Column 0: the mean of `color_log_ratio` over all views, weighted by the Gaussian's blending weights, within
-        +-`LARGEST_LOG_RATIO`; positive = like the object. Column 1: blending weight summed over the pixels (px), mean
-        over the compared views; a view that shows too little of the object counts as 0.
+        Column 0: the mean of `color_log_ratio` over the pixels of all compared views, weighted by the Gaussian's
+        blending weights, within +-`LARGEST_LOG_RATIO`; positive = like the object, 0 if no view shows the Gaussian.
+        Column 1: blending weight summed over the pixels (px), mean over the compared views; a view that shows too
+        little of the object counts as 0.
     """
     names = sorted(cameras)
     sums, means = np.zeros((len(gaussians), 2)), gaussians.means

@@ -18,8 +18,8 @@ def load_local_segmenter(source: str = AUTO) -> Segmenter | None:
         The network. None for "none", and for "auto" if the network is not on this machine.
 
     Raises:
-        ValueError: a named source holds no network, its files are damaged, or onnxruntime is missing. The message has
-            one line.
+        ValueError: a named source holds no network or is not on this machine, the network's files are damaged, or
+            onnxruntime is missing. The message has one line.
     """
     if source == NONE:
         return None

@@ -57,6 +57,8 @@ def load_sam(source: str | Path = SOURCE) -> Segmenter | None:
 def wrap_model(model: nn.Module, name: str = SOURCE) -> Segmenter:
     """Return a Segmenter that runs a SamModel of transformers which is already in memory.
 
+    The model itself is put into evaluation mode, and its parameters need no gradient from then on.
+
     Args:
         name: name of the network for messages.
     """

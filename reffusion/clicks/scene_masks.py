@@ -35,12 +35,13 @@ def masks_from_clicks(
     """Make the object's masks from clicks: view name -> bool [H, W], True = the object.
 
     The result holds all training views except `scene.clean` (views without the object, unless they have a mask), and
-    the test views whose photographs show the object. The view with most clicks on the object is segmented first.
+    the test views whose photographs show the object. Without given masks, the view with most clicks on the object is
+    segmented first, and its mask is propagated. With given masks, all clicks are corrections.
 
     Args:
         poses: folder of the stage `poses`, which holds the undistorted photographs.
         clicks: the key `clicks` of scene.yaml: view -> clicks in pixels of the photograph before undistortion.
-        masks: view name -> bool [H, W], masks that the scene provides. They are returned unchanged.
+        masks: view name -> bool [H, W], masks that the scene provides. Only clicks in its own view change a mask.
         segmenter: the segmentation network; None to segment by colours and surfaces alone.
 
     Raises:

@@ -68,16 +68,18 @@ def compute_always(_: Hashable, compute: Callable[[], Masks]) -> Masks:
 def segment_scene(
     views: FittedViews, events: Sequence[Event], given: Masks, recall: Recall = compute_always
 ) -> dict[str, np.ndarray]:
-    """Return the object's mask in every view, view -> bool [H, W]; all False if no mark is on the object.
+    """Return the object's mask in every view, view -> bool [H, W].
 
-    Without given masks, the first clicks select the object in their own view (see `count_first`), and this mask is
-    propagated. With given masks, these are propagated, and all events are corrections.
+    Without given masks, the first clicks select the object in their own view (see `count_first`), this mask is
+    propagated, and later events are corrections. All masks are False if no mark is on the object. With given masks,
+    these are propagated, and all events are corrections.
 
     Args:
         events: the marks, in the order in which they were made.
         given: view -> bool [H, W], masks that the scene provides. Only an event in the same view changes such a mask.
         recall: cache of the results after each event, so that a further event does not repeat the work for the earlier
-            events. It maps (key, compute) to the stored masks for this key, or else to the result of compute().
+            events. It maps (key, compute) to the stored masks for this key, or else to the result of compute(). The key
+            holds the events only, so different scenes or given masks must not share a cache.
     """
     count = 0 if given else count_first(events)
     masks = given
@@ -118,7 +120,8 @@ def _apply_last_mark(
 def count_first(events: Sequence[Event]) -> int:
     """Return how many of the first events select the object in its own view before masks are propagated.
 
-    These are the first event and the clicks after it, up to the first event that is a stroke or lies in another view.
+    These are the first event, of either kind, and the clicks that follow in the same view, until a stroke or an event
+    in another view, which do not count.
     """
     apart = lambda event: event.view != events[0].view or event.mark.radius > 0
     return next((k for k, event in enumerate(events) if k and apart(event)), len(events))
@@ -175,7 +178,8 @@ def correct_view(views: FittedViews, events: Sequence[Event], before: np.ndarray
 def transfer_marks(views: FittedViews, events: Sequence[Event], name: str) -> list[Mark]:
     """Return the marks of other views as clicks in one view, where this view shows the marked surface points.
 
-    A correction of this view leaves pixels unchanged that these clicks confirm.
+    Each point of a stroke's path becomes a click. A correction of this view leaves pixels unchanged that these clicks
+    confirm.
 
     Args:
         events: all marks so far; those in the view `name` itself are not used.
@@ -221,7 +225,7 @@ def spread_change(
     before: np.ndarray,
     given: Masks,
 ) -> dict[str, np.ndarray]:
-    """Apply the change that the last event made in its own view to all other views: view -> bool [H, W].
+    """Return the masks of all views, view -> bool [H, W], after the last event's change is made in all other views.
 
     If a click on the object added a region that does not touch the mask before, the region is another object. Its mask
     is propagated to all views. Otherwise the changed region is transferred by depth. Pixels that marks of a view

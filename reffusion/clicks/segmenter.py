@@ -29,8 +29,8 @@ class Segmenter:
         side: side of the square input, px.
         encode: normalised picture float32 [1, 3, side, side] -> features of the picture.
         decode: (features, points float32 [K, 2] in pixels of the input, labels int [K]: NEGATIVE, POSITIVE, UPPER_LEFT
-            or LOWER_RIGHT) -> (logits float32 [M, h, w] of M masks of the whole square, expected IoU [M]). The masks
-            go from a part to the whole; the last one is that of the largest object.
+            or LOWER_RIGHT) -> (logits float32 [M, h, w] of M masks of the whole square, > 0 on the object, expected IoU
+            [M]). The masks go from a part to the whole; the last one is that of the largest object.
     """
 
     name: str
@@ -104,7 +104,7 @@ def predict_masks(segmenter: Segmenter, features: ImageFeatures, prompt: Prompt)
 
     Raises:
         ValueError: the prompt has neither clicks nor a box.
-        FloatingPointError: the network's answer is not finite.
+        FloatingPointError: the logits of the network's masks are not finite.
     """
     points = [prompt.clicks.points]
     labels = [np.where(prompt.clicks.positive, POSITIVE, NEGATIVE)]

@@ -27,6 +27,9 @@ def on_supports(means: np.ndarray, is_object: np.ndarray, is_other: np.ndarray) 
     """Return bool [N], True for Gaussians on planes that hold many Gaussians of the rest of the scene, but few of the
     object.
 
+    The result is True for Gaussians of any label, also of the object. It is False far from the object (`REACH`), and
+    everywhere if the object has fewer than `MIN_GAUSSIANS` Gaussians.
+
     Args:
         means: [N, 3] positions of the Gaussians.
         is_object: bool [N], Gaussians labelled as the object.

@@ -1,10 +1,10 @@
 """Estimate of the time and the memory that a stage needs on a GPU.
 
 The time is the number of operations and bytes of a stage, counted at full size (counts.py), over the GPU's peak rates.
-The estimate assumes two fifths of each peak rate, and no overlap of computation and memory traffic. On the only kind of
-GPU that was timed, an H200, the estimate is within a tenth to a fifth of the measured time (docs/gpu.md). A plan does
-not know the size of the scene yet, so an example scene is assumed, which `BASIS` states. The CPU time of a stage is not
-included.
+The work of a stage is that of all its steps, without regard to a time budget. The estimate assumes two fifths of each
+peak rate, and no overlap of computation and memory traffic. On the only kind of GPU that was timed, an H200, the
+estimate differs from the measured time by at most a fifth (docs/gpu.md). A plan does not know the size of the scene
+yet, so an example scene is assumed, which `BASIS` states. The CPU time of a stage is not included.
 """
 
 from __future__ import annotations
@@ -267,8 +267,11 @@ def format_estimate(name: str, device: str, found: tuple[Work, float] | None) ->
         found: the stage's work and GPU memory in GB; None if they are unknown.
 
     Returns:
-        "gpu": key in `GPUS`; "seconds"; "gb"; "basis": the assumptions. None if the stage does not run on "cuda", its
-        work is unknown, or there is no known GPU.
+        "gpu": key in `GPUS`; "seconds": time of the whole stage; "gb": GPU memory that the stage needs, GB; "basis":
+        the assumptions. None if the stage does not run on "cuda", its work is unknown, or there is no known GPU.
+
+    Raises:
+        ValueError: `name` is not in the table `GPUS`, on whatever device the stage runs.
     """
     gpu = find_gpu(name)
     if gpu is None or device != "cuda" or found is None:

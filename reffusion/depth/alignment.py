@@ -34,7 +34,8 @@ class Alignment:
 
     Attributes:
         scale, offset: The fitted coefficients.
-        residual: Weighted root mean square of target - fit, in the unit of the target.
+        residual: Weighted root mean square of target - fit, in the unit of the target. The weights are those of the
+            fit, so for a robust fit outliers hardly count.
     """
 
     scale: float
@@ -82,7 +83,7 @@ def align(
 
 
 def condition_numbers(estimate: np.ndarray, weights: np.ndarray | None = None) -> tuple[float, float]:
-    """Return two condition numbers of the normal equations: in plain form, and in the form that `align` solves.
+    """Return two condition numbers of the normal equations: first in plain form, then in the form that `align` solves.
 
     `align` works about the weighted mean and in units of the weighted spread, which decouples the two equations. Only
     the rounding of the mean relative to the spread remains.
@@ -216,8 +217,9 @@ def align_depth(
         robust: See `align`.
 
     Returns:
-        Depth at all pixels. Where the aligned disparity is not positive or is close to 0, the depth is the largest
-            known depth. With `space` "depth", the smallest known depth replaces aligned depths that are not positive.
+        The aligned estimate as depth, also at known pixels. Where the aligned disparity is not positive or is close to
+            0, the depth is the largest known depth. With `space` "depth", the smallest known depth replaces aligned
+            depths that are not positive.
 
     Raises:
         Degenerate: As `align`.

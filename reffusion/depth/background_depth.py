@@ -184,8 +184,9 @@ def continue_depth(
 
     Intersecting planes are fitted to the sparse points around the hole, or to the rendered depth if there are few
     points. (Sparse points are unbiased, while the expected depth of splats is too small wherever haze floats in front
-    of a plain surface.) If the planes do not explain the surroundings, or if other views see past the planes, each
-    surface around the hole is continued smoothly instead, with creases at edges of the guide.
+    of a plain surface.) If the planes do not explain the surroundings, if other views see past the planes, or if the
+    planes would hide a plane that is known to continue there (`Hints.plane_depth`), each surface around the hole is
+    continued smoothly instead, with creases at edges of the guide.
 
     Args:
         view: The depth around the hole.
@@ -198,7 +199,8 @@ def continue_depth(
             through which the view looks at the background.
 
     Returns:
-        disparity: [H, W] float64, also outside the hole.
+        disparity: [H, W] float64, at all pixels. At known pixels it is that of the fit, which may differ from the
+            view's. It may be 0 or negative where a surface is continued beyond infinite depth.
         description: The method, and the share of the samples that planes explain, in words.
 
     Raises:
@@ -317,7 +319,10 @@ def _in_free_space(view: ViewDepth, disparity: np.ndarray) -> np.ndarray:
 
 
 def points_around(view: ViewDepth, points: np.ndarray, settings: CompletionSettings) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sparse points that are visible around the hole: image points [S, 2] in pixels, and disparities [S]."""
+    """Return the sparse points that are visible around the hole: image points [S, 2] in pixels, and disparities [S].
+
+    They lie in a ring (`settings.ring`) around the pixels of the hole and of the removed object.
+    """
     return visible_points(points, view.camera, _surroundings(view, settings), view.disparity)
 
 

@@ -59,7 +59,7 @@ def refine(
         confidence: [H, W] >= 0.
         guide: [H, W, 3] image, uint8 or in [0, 1].
         solver: Parameters of the solver.
-        watch: Called after each iteration of the solver, with the corrected estimate.
+        watch: Called after each iteration of the solver (see `Watch`); its function returns the corrected estimate.
 
     Returns:
         [H, W] float64. An estimate without residuals is returned unchanged.
@@ -91,7 +91,7 @@ def solve(
         confidence: [H, W] >= 0.
         guide: [H, W, 3] image, uint8 or in [0, 1].
         solver: Parameters of the solver.
-        watch: Called after each iteration.
+        watch: Called after each iteration, see `Watch`.
 
     Returns:
         [H, W] float64. Cells that no confidence reaches have the confidence-weighted mean of the target.
@@ -155,8 +155,8 @@ def build_system(
 def condition_numbers(confidence: np.ndarray, guide: np.ndarray) -> tuple[float, float]:
     """Return two condition numbers of the solver's system: without preconditioner, and with the Jacobi preconditioner.
 
-    The condition number is the largest eigenvalue over the smallest. Its square root is about the number of iterations
-    of conjugate gradients. `solve` uses the preconditioner.
+    The system is that of the default `Solver`. The condition number is the largest eigenvalue over the smallest. Its
+    square root is about the number of iterations of conjugate gradients. `solve` uses the preconditioner.
 
     Args:
         confidence, guide: As in `solve`.

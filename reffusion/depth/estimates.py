@@ -29,8 +29,9 @@ def align_estimate(
         log: Records the result of the solver.
 
     Returns:
-        disparity: [H, W] float64.
-        description: The error of the alignment, in words.
+        disparity: [H, W] float64, at all pixels; at known pixels it is about that of the view.
+        description: The root mean square error of the alignment at known pixels, before the solver, relative to their
+            mean disparity, in words.
 
     Raises:
         Degenerate: There are fewer than 4 known pixels, the estimate is constant there, or it falls where the disparity
@@ -69,7 +70,8 @@ def align_depth_map(
         log: Records the results of its solvers.
 
     Returns:
-        disparity: [H, W] float64.
+        disparity: [H, W] float64, the aligned map where it is known. If it is unknown in the hole, the continuation
+            fills all unknown pixels; else unknown pixels, which all lie outside the hole, have the meaningless value 1.
         description: The method, in words.
 
     Raises:

@@ -9,7 +9,7 @@ import numpy as np
 def inpaint_depth(depth: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Return [H, W], the depth map with its unknown pixels filled by Telea's method, which acts on disparity here.
 
-    A filled pixel is 0 where its disparity is about 0, i.e. its depth about infinite.
+    The result is 0, also at known pixels, where the depth is more than 1000 times the smallest known depth.
 
     Args:
         depth: [H, W] > 0, read where `known`.

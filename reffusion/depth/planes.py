@@ -76,9 +76,9 @@ def planar_model(
 
     Planes are found by sequential RANSAC: the plane through three samples with the most inliers is refitted to its
     inliers, and these are removed before the next plane is searched. The model starts with the plane that explains most
-    samples. Another plane joins it as maximum or minimum if the result explains more samples. This excludes, for
-    example, the plane of an object in front of a wall: as a maximum it would occlude samples of the wall beside the
-    object.
+    samples. Another plane joins it as maximum or minimum if the result explains clearly more samples (by `MIN_GAIN` of
+    all samples). This excludes, for example, the plane of an object in front of a wall: as a maximum it would occlude
+    samples of the wall beside the object.
 
     PAPER leaves open: the completion. This is the hypothesis for rooms; the smooth one is `completion.complete`.
 

@@ -12,9 +12,9 @@ from reffusion import geometry, trace
 class SolverLog:
     """Logger of the errors of the depth solvers in one view.
 
-    The error is the root mean square of the relative difference between a solver's disparity and the disparities of the
-    sparse points around the hole. Only the planes are fitted to these points. The other solvers do not read the points,
-    so for the other solvers these points are held-out data.
+    The error ("disparity_error") is the root mean square of (a solver's disparity / the point's disparity - 1) over the
+    sparse points around the hole. Without points no error is logged. Only the planes are fitted to these points. The
+    other solvers do not read the points, so for the other solvers these points are held-out data.
 
     Args:
         log: The trace to write to, with one series for each solver. If None, nothing is written.
@@ -29,7 +29,8 @@ class SolverLog:
     def log_iteration(self, iteration: int, get_result: Callable[[], tuple[np.ndarray, float]]) -> None:
         """Log the error and the residual of the bilateral solver after an iteration.
 
-        This method is a `bilateral.Watch`. Only iterations that are evenly spaced in the logarithm are logged.
+        This method is a `bilateral.Watch`. Only iterations that are evenly spaced in the logarithm are logged. The
+        attribute `iterations` becomes the number of this iteration in any case.
 
         Args:
             iteration: The number of iterations so far.

@@ -39,8 +39,9 @@ class Adversary:
             fake: Patches of a rendered view, as many as `real`.
 
         Returns:
-            Values for the trace: "critic_loss", and, if the penalty is on, "critic_slope", which is the R1 penalty
-                before its weight, i.e. the mean of ||dD / d patch||^2.
+            Values for the trace, of the critic before the step: "critic_loss", without the penalty, and, if the penalty
+                is on, "critic_slope", which is the R1 penalty before its weight, i.e. the mean of ||dD / d patch||^2
+                over the real or the fake patches, as `choices.penalized` says.
 
         Raises:
             FloatingPointError: The loss or its gradient is not finite. The critic's weights are unchanged.
@@ -65,7 +66,7 @@ class Adversary:
         return log
 
     def generator_loss(self, fake: Tensor) -> Tensor:
-        """Return the loss that rewards fake patches which the critic takes for real.
+        """Return the generator's loss, a scalar that is lower the more the critic takes the fake patches for real.
 
         The loss is differentiable in the patches. The critic's weights get no gradient.
         """

@@ -16,12 +16,14 @@ PRUNE_OPA = 0.005  # opacity below which Gaussians are pruned after each densifi
 def densify_masked(optimizer: GaussianOptimizer, generator: torch.Generator) -> None:
     """Clone or split the masked Gaussians with the largest screen-space gradients, then prune faint Gaussians.
 
-    The share `DENSIFIED_SHARE` of the masked Gaussians is cloned or split. All Gaussians, masked or not, whose opacity
-    is below `PRUNE_OPA` are pruned. Unmasked Gaussians are never cloned or split, because the optimizer accumulates
-    screen-space gradients of masked Gaussians only.
+    The share `DENSIFIED_SHARE` of the masked Gaussians is cloned or split, or fewer if fewer have a gradient. All
+    Gaussians, masked or not, whose opacity is below `PRUNE_OPA` are pruned. Without masked Gaussians nothing is done,
+    not even pruning. Unmasked Gaussians are never cloned or split, because the optimizer accumulates screen-space
+    gradients of masked Gaussians only.
 
     Args:
-        optimizer: Holds the Gaussians, which are changed in place, and their accumulated gradients.
+        optimizer: Holds the Gaussians, which are replaced, and their accumulated screen-space gradients, which are
+            reset.
         generator: Draws the positions of split Gaussians.
     """
     if not optimizer.masked.any():

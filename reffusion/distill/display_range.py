@@ -8,7 +8,7 @@ from torch.autograd.function import once_differentiable
 
 
 def clamp_to_display(color: Tensor) -> Tensor:
-    """Clamp colours to [0, 1]. The gradient passes, unless it would move a colour further out of this range.
+    """Clamp colours to [0, 1]. The gradient passes unless a step against it would move a colour further out of [0, 1].
 
     PAPER leaves open: colours above 1. Spherical harmonics can produce them, and neither the prior nor the critic was
     trained on such colours. A plain clamp has no gradient there, so such colours would never return. If every gradient

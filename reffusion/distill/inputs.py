@@ -25,7 +25,8 @@ from reffusion.workspace import Workspace
 def resolve_sds(params: Params, initialize: Path) -> tuple[Params, str]:
     """Decide whether SDS runs, and return the resulting parameters and the decision in words.
 
-    With `distill.sds.run: auto`, the decision is that of the stage `initialize`, read from its facts.json.
+    SDS with weight 0 does not run. Otherwise `distill.sds.run` decides: "always", "never", or "auto", which takes the
+    decision of the stage `initialize` from its facts.json.
 
     Args:
         params: Parameters of the stage `distill`.
@@ -76,8 +77,8 @@ def load_adapted_prior(params: Params, personalize: Path | None) -> tuple[Prior 
             not adapted.
 
     Returns:
-        The prior, and [3, L, D], the embeddings of the global, the local and the empty prompt. (None, None) if no term
-            uses the prior.
+        The prior, and [3, L, D], the embeddings of the global, the local and the empty prompt. With `params.prompts` =
+            "empty" all three are embeddings of the empty prompt. (None, None) if no term uses the prior.
     """
     if not params.needs_prior:
         return None, None
@@ -92,10 +93,11 @@ def load_adapted_prior(params: Params, personalize: Path | None) -> tuple[Prior 
 def load_train_views(
     params: Params, space: Workspace, initialize: Path | None = None, lift: Path | None = None
 ) -> list[TrainView]:
-    """Load the training views: photographs, the pixels that may supervise, the pixels to repaint, and lifted images.
+    """Load the training views, and after them the blank views, which have no photograph and supervise nothing.
 
-    Pixels that `initialize` found to be in the object's shadow do not supervise. If `initialize` reduced the invent
-    mask of a view, the reduced mask is used.
+    A view holds its photograph, the pixels that may supervise, the pixels to repaint, and its lifted image. The photo
+    of a blank view is black. Pixels that `initialize` found to be in the object's shadow do not supervise. If
+    `initialize` reduced the invent mask of a view, the reduced mask is used.
 
     Args:
         params: Parameters of the stage `distill`.

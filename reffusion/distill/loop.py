@@ -87,13 +87,14 @@ def build_objective(inputs: TermInputs, settings: Params) -> Objective:
 def distill(
     initial: Gaussians, masked: Tensor, inputs: TermInputs, settings: Params, folder: Path, rates: Rates | None = None
 ) -> tuple[Gaussians, Tensor]:
-    """Optimise an initialization, from the start or from the checkpoint in `folder` (bit for bit on the CPU).
+    """Optimise an initialization, from the start or from the checkpoint in `folder`.
 
-    A line of the trace contains: reconstruction and lift (the values of these terms), reference_psnr (in the holes of
-    the references), sds_gradient_mean and sds_gradient_max (norm of the weighted SDS gradient per masked Gaussian;
-    absent if the view is too far from every reference), depth (the last value of the depth term),
-    depth_skipped_<reason> (number of views skipped so far), adversarial (the generator's loss), critic_loss,
-    critic_slope (R1 without its weight), gaussians and masked_gaussians (numbers of Gaussians).
+    On the CPU a resumed run ends with the same bits as an unbroken one. A line of the trace contains: reconstruction
+    and lift (the values of these terms), reference_psnr (in the holes of the references), sds_gradient_mean and
+    sds_gradient_max (norm of the weighted SDS gradient per masked Gaussian; absent if the view is too far from every
+    reference), depth (the last value of the depth term), depth_skipped_<reason> (number of views skipped so far),
+    adversarial (the generator's loss), critic_loss, critic_slope (R1 without its weight), gaussians and
+    masked_gaussians (numbers of Gaussians).
 
     Args:
         initial: The Gaussians of the initialization. All tensors of the inputs are on their device.
@@ -104,7 +105,8 @@ def distill(
         rates: Step sizes of Adam. None: those of 3DGS, in the unit that `settings.lr.means_unit` names.
 
     Returns:
-        The optimised Gaussians, detached, and their labels, bool [M].
+        The optimised Gaussians, detached, and their labels, bool [M]. M differs from N if Gaussians were densified or
+            pruned.
 
     Raises:
         FloatingPointError: A value or a gradient is not finite. The message names step, term and view.
@@ -138,12 +140,12 @@ def distill(
 
 
 def take_step(optimizer: GaussianOptimizer, step: int, objective: Objective) -> dict[str, float]:
-    """Take one step of Adam along the gradient of the weighted sum, and return the values that the terms log.
+    """Take one step of Adam against the gradient of the weighted sum, and return the values that the terms log.
 
     Args:
-        optimizer: Holds the Gaussians, which are changed.
+        optimizer: Holds the Gaussians, which are changed, and their accumulated screen-space gradients.
         step: Number of the step, from 0.
-        objective: The weighted sum.
+        objective: The weighted sum. Its `latest` is updated.
     """
     background, foreground = [], []
     for term in objective.terms:
@@ -263,9 +265,10 @@ def _densifies_after(settings: Params, done: int) -> bool:
 
 
 def average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
-    """Average the Gaussians over the last steps of a run, and replace them by this mean after the last step.
+    """Average the Gaussians over the steps after the share `AVERAGED_FROM` of a run.
 
-    A run with densification is not averaged.
+    This is called after each step, and adds its Gaussians to the running mean. After the last step the mean replaces
+    the Gaussians. A run with densification is not averaged.
 
     Args:
         optimizer: Holds the Gaussians and their running mean.
@@ -287,7 +290,7 @@ def rates_of(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:
 
 
 def masked_factors(lr: LearningRates) -> dict[str, float]:
-    """Return the factor on the step size of masked Gaussians, by the name of the parameter."""
+    """Return parameter name -> factor on the step size of masked Gaussians; unmasked Gaussians have the factor 1."""
     shape = lr.masked * lr.shape
     factors = {"means": shape, "quaternions": shape, "log_scales": shape, "sh": lr.masked}
     return factors | {"opacity_logits": lr.masked * lr.opacities}

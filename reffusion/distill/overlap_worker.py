@@ -33,8 +33,9 @@ class OverlapWorker:
     def overlap(self, work: Callable[[], T]) -> Iterator[Callable[[], T]]:
         """Run `work` while the body of the `with` statement runs; with one thread, run it before the body.
 
-        The context manager gives a function that returns the result of `work` or raises its exception. At its end it
-        waits for `work`, even if the body raises.
+        The context manager gives a function that waits for the result of `work`, and returns it or raises the exception
+        of `work`. With one thread this exception is raised before the body. At its end the context manager waits for
+        `work`, even if the body raises.
         """
         if self._executor is None:
             result = work()

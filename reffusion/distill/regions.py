@@ -16,11 +16,13 @@ from torch import Tensor
 class VoxelRegion:
     """The part of space to which the masked Gaussians belong, as voxels of a grid around them.
 
+    `foreign` is a part of `home`. In the other voxels of `home` masked and unmasked Gaussians may be.
+
     Attributes:
         origin: [3], the lowest corner of the grid.
         voxel: Side of a voxel.
-        home: bool [X, Y, Z], True at voxels in which a masked Gaussian may be: those near a masked Gaussian of the
-            initialization.
+        home: bool [X, Y, Z], True at voxels in which a masked Gaussian may be: those within `reach` voxels of a masked
+            Gaussian of the initialization (see `build_region`).
         foreign: bool [X, Y, Z], True at voxels in which no unmasked Gaussian may be: those that held a masked Gaussian
             of the initialization, while neither they nor their 26 neighbours held an unmasked one.
     """
@@ -41,7 +43,8 @@ def build_region(means: Tensor, masked: Tensor, resolution: int = 32, reach: int
         means: [N, 3], the centres of all Gaussians of the initialization.
         masked: bool [N], True for masked Gaussians, of which there is at least one.
         resolution: Number of voxels along the diagonal of the bounding box of the masked Gaussians.
-        reach: Number of voxels by which a Gaussian may be away from the masked Gaussians of the initialization.
+        reach: Number of voxels along each axis by which a masked Gaussian may be away from the masked Gaussians of the
+            initialization.
     """
     masked_means = means[masked]
     low, high = masked_means.amin(0), masked_means.amax(0)
@@ -63,7 +66,7 @@ def build_region(means: Tensor, masked: Tensor, resolution: int = 32, reach: int
 
 
 def has_changed_region(region: VoxelRegion, means: Tensor, masked: Tensor) -> Tensor:
-    """Return bool [N], the Gaussians to prune: masked ones that left the region, and unmasked ones that entered it.
+    """Return bool [N], the Gaussians to prune: masked ones outside `region.home`, unmasked ones in `region.foreign`.
 
     Args:
         region: The region of the initialization.

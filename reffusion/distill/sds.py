@@ -23,7 +23,7 @@ def draw_timesteps(count: int, steps: int, low: float, high: float, generator: t
     Args:
         count: Number of timesteps to draw.
         steps: Number of timesteps of the prior's schedule.
-        low, high: First and last timestep, as fractions of the schedule: 0 <= low < high <= 1.
+        low, high: First and last timestep, both included, as fractions of the schedule: 0 <= low < high <= 1.
         generator: The source of randomness, on the CPU.
 
     Raises:
@@ -42,7 +42,8 @@ def match_contrast(x0: Tensor, latents: Tensor, mask: Tensor) -> Tensor:
     towards this mean remove contrast from a rendering that was correct. So for each sample and channel, the deviations
     x0' from the mean inside the mask are multiplied by b = <z', x0'> / <x0', x0'>. This factor minimises the squared
     difference from the deviations z' of the latents. A factor below 1 is replaced by 1, so that x0 may add contrast.
-    With a factor above 1, |b x0'| <= |z'|, so the contrast never exceeds that of the latents.
+    With a factor above 1, |b x0'| <= |z'|, so the contrast never exceeds that of the latents. The elements outside the
+    mask are multiplied by the same factor.
 
     Args:
         x0: [B, C, h, w], the clean latents predicted by the denoiser.
@@ -84,7 +85,8 @@ def sds_gradient(
         noise: [B, C, h, w], standard normal, one for each latent.
         alphas_cumprod: [T], alpha_bar of every timestep.
         weighting: The choice of w(t), see above.
-        keep_contrast: Whether the prediction x0_theta is replaced by `match_contrast` of x0_theta. Not in the paper.
+        keep_contrast: Whether the prediction x0_theta is replaced by `match_contrast` of x0_theta, inside `mask` or,
+            with None, everywhere; eps_theta changes accordingly. Not in the paper.
         mask: [B, 1, h, w], 1 where the gradient is kept and 0 where the gradient is set to zero. None keeps all of it.
             PAPER leaves open: whether the gradient is masked. The paper distils the whole view, and only masked
             Gaussians receive the gradient in any case.
@@ -117,9 +119,9 @@ def sds_gradient(
 
 
 def sds_loss(latents: Tensor, gradient: Tensor, reduction: Literal["sum", "mean"] = "sum") -> Tensor:
-    """Return a scalar whose gradient with respect to `latents` is the SDS gradient. Its value has no meaning.
+    """Return a scalar whose gradient with respect to `latents` is the weighted SDS gradient. Its value has no meaning.
 
-    Sample 0 is the whole view and has weight 1. The other samples are patches, which are averaged: L_global +
+    Sample 0 is the whole view and has weight 1. The other samples are P patches, each with weight 1 / P: L_global +
     mean(L_local).
 
     PAPER leaves open: "sum" (threestudio) or "mean" over a latent's elements.

@@ -83,6 +83,8 @@ class Exposures:
     def step(self, progress: float) -> None:
         """Do one Adam step for the exposures that have a gradient, then shift all so that their mean is the identity.
 
+        The gradients are cleared.
+
         Args:
             progress: share of the run in [0, 1] that is done; the learning rate decays exponentially with it, from
                 `LEARNING_RATE` to `FINAL_LEARNING_RATE`.
@@ -115,9 +117,9 @@ class Exposures:
 def view_exposures(fit: Path, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
     """Return the exposure of every view: as fitted, or for a view without a fit interpolated from nearby photographs.
 
-    The interpolation averages the fitted exposures with Gaussian kernel weights of the distances between poses. The
-    bandwidth is the one of `BANDWIDTHS` that predicts each fitted exposure best from all other fitted exposures (the
-    smallest one if fewer than three exposures were fitted).
+    The interpolation averages the fitted exposures with Gaussian kernel weights of the distances between poses. All
+    views have one bandwidth: the one of `BANDWIDTHS` with the least sum of squared errors when each fitted exposure is
+    predicted from all other fitted exposures (the smallest one if fewer than three exposures were fitted).
 
     Args:
         fit: folder of the stage `fit`, which holds exposures.json if exposures were fitted.
@@ -177,7 +179,7 @@ def apply_exposure(color: Tensor, matrix: np.ndarray | None) -> Tensor:
 
 
 def match_exposure(matrix: np.ndarray, color: np.ndarray, photo: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return an exposure adjusted to a photograph by a gain and an offset per channel.
+    """Return an exposure adjusted to a photograph: `matrix`, followed by a fitted gain and offset per channel.
 
     Both pictures are blurred before the comparison, because in a less sharp rendering contrast would seem lower, and
     the gain would compensate for sharpness instead of exposure. Pixels that are too dark or clipped in the photograph
@@ -185,7 +187,7 @@ def match_exposure(matrix: np.ndarray, color: np.ndarray, photo: np.ndarray, pix
 
     Args:
         matrix: [3, 4], the exposure to adjust.
-        color: [H, W, 3] in [0, 1], the rendering with this exposure.
+        color: [H, W, 3] in [0, 1], the rendering, to which `matrix` is already applied.
         photo: uint8 [H, W, 3], the photograph of the same view.
         pixels: bool [H, W], True for the pixels to compare.
 
@@ -229,9 +231,10 @@ def _fit_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 
 def load_normalized_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Load the photographs of the named views, all with one exposure (see `normalize_exposure`).
+    """Load the photographs of the named views, with the exposure of the Gaussians (see `normalize_exposure`).
 
-    A view without a photograph is replaced by a rendering of the fitted Gaussians, object included.
+    A photograph without a fitted exposure, as a test view's, is loaded as it is. A view without a photograph gets a
+    rendering of the fitted Gaussians, object included.
 
     Args:
         poses, fit: folders of the stages of these names.
@@ -249,7 +252,9 @@ def load_normalized_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[
 
 @torch.no_grad()
 def render_views(poses: Path, fit: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Render the named views from the Gaussians that the stage `fit` wrote, object included.
+    """Render the named views from the Gaussians that the stage `fit` wrote, object included, on the CPU.
+
+    The exposures of the views are not applied.
 
     Args:
         poses, fit: folders of the stages of these names.
@@ -289,6 +294,8 @@ def normalize_exposure(image: np.ndarray, fit: Path, name: str) -> np.ndarray:
 
 def undo_exposure(color: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
     """Return the colours of the Gaussians for the colours [H, W, 3] of a photograph; the inverse of `apply_exposure`.
+
+    The result is not clamped.
 
     Args:
         color: [H, W, 3] in [0, 1].

@@ -55,7 +55,8 @@ def gaussians_on_surfaces(
         params: sets the seed, the degree of spherical harmonics, the device and antialiasing.
 
     Returns:
-        Two sheets of Gaussians (see `gaussians.sheets`), or None if there are too few sparse points.
+        Gaussians in two sheets (see `gaussians.sheets`), or None if there are too few sparse points in the scene or in
+        every view.
     """
     if len(points) <= NORMAL_NEIGHBORS:
         return None

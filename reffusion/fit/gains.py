@@ -21,8 +21,9 @@ PRIOR_WEIGHT = 1e-3  # pull of a view towards the mean, in points; it decides on
 def estimate_gains(points: np.ndarray, cameras: Sequence[Camera], photos: Mapping[str, np.ndarray]) -> np.ndarray:
     """Estimate the brightness of each view's red, green and blue relative to the geometric mean of all views.
 
-    The estimate is a robust least-squares fit to the logarithms of colours, with one unknown per view (its brightness)
-    and one per point (its colour). Colours that are too dark or clipped are left out.
+    Brightness is measured in sRGB values, which are not linearised. The estimate is a robust least-squares fit to the
+    logarithms of colours, with one unknown per view (its brightness) and one per point (its colour). Colours that are
+    too dark or clipped are left out.
 
     Args:
         points: [P, 3] points on the scene's surfaces.
@@ -44,7 +45,10 @@ def estimate_gains(points: np.ndarray, cameras: Sequence[Camera], photos: Mappin
 
 
 def brightness_deviation(gains: np.ndarray) -> float:
-    """Return the standard deviation of the views' log brightness, from their gains [V, 3]; 0 without views."""
+    """Return the standard deviation over the views of their log brightness, from gains [V, 3]; 0 without views.
+
+    The log brightness of a view is the mean of the natural logarithms of its three gains.
+    """
     return float(np.log(gains).mean(1).std()) if len(gains) else 0.0
 
 

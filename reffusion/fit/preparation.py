@@ -43,15 +43,18 @@ def estimate_exposures(
 ) -> np.ndarray | None:
     """Decide whether exposures are fitted, and estimate the brightness of the views as their initial values.
 
-    With `exposure` = "auto" exposures are fitted if the brightness of shared points varies by at least
-    `BRIGHTNESS_DEVIATION` between views. The decision to fit is printed.
+    `params.exposure` decides: "never", "always" or "auto". With "auto" exposures are fitted if the standard deviation
+    of the views' log brightness (`brightness_deviation`) is at least `BRIGHTNESS_DEVIATION`. The decision to fit is
+    printed.
 
     Args:
+        scene: the scene, at whose sparse points brightness is compared.
         cameras: the V views.
         images: view name -> uint8 [H, W, 3].
 
     Returns:
-        [V, 3], relative brightness of each view's red, green and blue; None if exposures are not fitted.
+        [V, 3], brightness of each view's red, green and blue relative to the geometric mean of all views; None if
+        exposures are not fitted.
     """
     if params.exposure == "never":
         return None
@@ -68,15 +71,15 @@ def estimate_exposures(
 def equalize_exposure(
     images: Mapping[str, np.ndarray], cameras: list[Camera], gains: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Divide each picture by the gains of its view, so that all pictures have equal brightness.
+    """Return copies of the pictures, divided by the gains of their views, so that all have equal brightness.
 
     Args:
-        images: view name -> uint8 [H, W, 3]; a picture whose view is not among `cameras` stays unchanged.
+        images: view name -> uint8 [H, W, 3]; the copy of a picture whose view is not among `cameras` is unchanged.
         cameras: the V views.
         gains: [V, 3], from `estimate_exposures`.
 
     Returns:
-        View name -> uint8 [H, W, 3].
+        View name -> uint8 [H, W, 3], clipped to [0, 255].
     """
     gain_of = {camera.name: gain for camera, gain in zip(cameras, gains, strict=True)}
     return {name: to_uint8(image / 255.0 / gain_of.get(name, 1.0)) for name, image in images.items()}
@@ -111,8 +114,9 @@ def collect_points(
 ):
     """Collect the points from which a fit starts: the sparse points, and points triangulated from optical flow.
 
-    Points from flow are added if `params.init.flow_cell` is not 0. Points that lie inside `hidden` in more than half
-    of the views with such a mask are left out, because no supervising pixel would ever move Gaussians there.
+    Points from flow are added if `params.init.flow_cell` is not 0. A point is left out if it projects into `hidden` in
+    more than half of those views that have such a mask and contain the point, because no supervising pixel would ever
+    move Gaussians there.
 
     Args:
         cameras: the views between which flow is computed.
@@ -120,7 +124,7 @@ def collect_points(
         hidden: view name -> bool [H, W], True for pixels that do not supervise.
 
     Returns:
-        Positions [P, 3] float64 and colours [P, 3] uint8.
+        Positions [P, 3] float64 and colours [P, 3] uint8, sparse points first.
     """
 
     points, colors = scene.points, scene.point_colors
@@ -134,6 +138,8 @@ def collect_points(
 
 def make_gaussians(params: Params, points: np.ndarray, colors: np.ndarray) -> Gaussians:
     """Return an initial Gaussian at each point (see `initial_gaussians`), on the device `params.device`.
+
+    If there are more points than `params.densify.cap_max`, a random subset of this size is used.
 
     Args:
         points: [P, 3] positions.

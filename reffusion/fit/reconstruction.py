@@ -60,8 +60,9 @@ def fit(
             Gaussians take their place, and only their device and `antialiased` matter.
         settings: the parameters of the stage `fit`.
         folder: receives trace.jsonl, checkpoints and, if exposures are fitted, exposures.json. A line of the trace
-            holds "loss" and "psnr" (over the steps since the last line), "gaussians" (their number) and
-            "psnr_held_out".
+            holds "loss" (mean of the steps since the last line), "psnr" in dB (of the mean squared error of these
+            steps), "gaussians" (their number) and "psnr_held_out" in dB (mean PSNR of the held-out views, rendered
+            without exposures).
         weights: view name -> [H, W], weight of each pixel. Pixels of weight 0, and only these, influence nothing. A
             view without an entry has weight 1 everywhere.
         held_out: views that are evaluated for the trace, and do not supervise.
@@ -69,15 +70,16 @@ def fit(
         gains: [V, 3], initial brightness of `cameras` from which exposures are fitted; None fits no exposures.
         placed: [N] bool, True for the Gaussians of `initial` whose positions are known. Their positions move with
             `PLACED_RATE_FACTOR` times the learning rate. None: none is.
-        spent: seconds already spent on making `initial`; "seconds" in the trace starts from this value.
+        spent: seconds already spent on making `initial`; "seconds" in the trace, which is cumulative, starts from this
+            value.
         impl: implementation of the renderer.
 
     Returns:
         The Gaussians, detached. Their number differs from that of `initial` if the schedule densifies or prunes.
 
     Raises:
-        ValueError: there is no view, or an image or the weights differ in size from their camera (both are checked
-            before any computation); or pruning removed all Gaussians.
+        ValueError: there is no view, an image is missing, or an image or the weights differ in size from their camera
+            (all are checked before any computation); or pruning removed all Gaussians.
         FloatingPointError: a loss, gradient or parameter is infinite or NaN. The message names the step and the view.
     """
     weights = weights or {}

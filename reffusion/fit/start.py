@@ -31,7 +31,7 @@ def initial_gaussians(
         generator: random generator for this subset.
         opacity: opacity of each Gaussian, in (0, 1).
         size: standard deviation of a Gaussian, divided by the root mean square of the distances from its point to the
-            3 nearest other points.
+            3 nearest other points (of the random subset, if one is used).
 
     Returns:
         min(P, budget) Gaussians, float32 on the CPU.

@@ -36,8 +36,9 @@ GROW_SCALE3D = 0.01  # standard deviation / distance to the camera above which a
 def learning_rates(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:
     """Return Adam's learning rates for a fit to these views.
 
-    The learning rate of positions decays to a hundredth. With `lr.means_unit` = "cameras" it is in units of
-    `cameras_extent(cameras)`, the unit of 3DGS, else in units of the normalised frame.
+    The learning rate of positions decays to a hundredth of `lr.means` by the end of the fit. With `lr.means_unit` =
+    "cameras" it is in units of `cameras_extent(cameras)`, the unit of 3DGS, else in units of the normalised frame. The
+    views matter only for this unit.
     """
     rates = Rates(
         means=lr.means,
@@ -66,15 +67,18 @@ def step(
     As long as the schedule densifies, the screen-space gradients of the step are accumulated in `optimizer`.
 
     Args:
+        optimizer: holds the Gaussians, which are updated in place.
         exposures: exposures of the views, which are updated, too; None leaves colours as they are rendered.
         camera: the view.
         target: [H, W, 3] in [0, 1], its photograph.
         counts: [H, W], weights of its pixels; None: all 1.
+        settings: parameters of the stage `fit`.
         i: number of the step, from 0.
         impl: implementation of the renderer.
 
     Returns:
-        The reconstruction loss, and the mean squared error of the pixels of positive weight, both before the update.
+        The reconstruction loss with the weights `counts`, and the unweighted mean squared error of the pixels of
+        positive weight. Both compare the rendering before the update, with the view's exposure applied.
 
     Raises:
         FloatingPointError: the loss or a gradient is infinite or NaN. The message names the step and the view.
@@ -111,7 +115,8 @@ def squared_error(image: Tensor, target: Tensor, counts: Tensor | None) -> float
 
     Args:
         image, target: [H, W, 3].
-        counts: [H, W], weights of the pixels; None includes all pixels. If no weight is positive, the error is 0.
+        counts: [H, W], weights of the pixels, which only select pixels: all positive weights count the same. None
+            includes all pixels. If no weight is positive, the error is 0.
     """
     if counts is None:
         error = (image - target).flatten()
@@ -165,9 +170,10 @@ def is_averaged(settings: Params, done: int) -> bool:
 
 
 def degree_at(settings: Params, i: int) -> int:
-    """Return the degree of spherical harmonics rendered in step `i`: from 0, one more every `sh.every` of the fit.
+    """Return the degree of spherical harmonics that step `i` renders.
 
-    With `sh.every` = 0 it is the highest degree, `sh.degree`, from the first step on.
+    It is 0 at first, and grows by one each time another share `sh.every` of the fit's steps is done, up to `sh.degree`.
+    With `sh.every` = 0 it is `sh.degree` from the first step on.
     """
     if settings.sh.every == 0:
         return settings.sh.degree
@@ -177,9 +183,10 @@ def degree_at(settings: Params, i: int) -> int:
 def control_density(
     optimizer: GaussianOptimizer, centers: Tensor, started_with: int, settings: Params, done: int
 ) -> None:
-    """Densify, prune and reset opacities, if the schedule `settings.densify` asks for it after `done` steps.
+    """Densify, prune and reset opacities (cap them at 0.01), if `settings.densify` schedules it after `done` steps.
 
     Args:
+        optimizer: holds the Gaussians, which are changed.
         centers: [V, 3], the camera centres; a Gaussian's size is measured relative to the distance to the nearest one.
         started_with: number of Gaussians at the start of the fit.
         done: number of steps done.

@@ -28,7 +28,8 @@ def iterate_views(
 ) -> Iterator[tuple[Camera, Tensor, Tensor | None]]:
     """Yield the view of each step, as camera, image and weights; a thread prepares it while the previous step runs.
 
-    In each epoch every view appears once, in a new random order.
+    In each epoch every view appears once, in a new random order. The view of a step depends only on its number and the
+    seed, so that a resumed fit continues the same sequence.
 
     Args:
         cameras: the views.

@@ -25,11 +25,14 @@ def densify(
 ) -> int:
     """Clone small and split large Gaussians whose mean screen-space gradient is at least `grow_grad2d`.
 
-    The gradients are those that `GaussianOptimizer.observe` accumulated; they are reset. A clone is a copy at the same
-    position. It moves away from the original, because its Adam moments start at zero. A split replaces a Gaussian by
-    two smaller children at positions sampled from it. Clones and children inherit the label.
+    The mean screen-space gradient is the mean of the gradient's norm over the views that `GaussianOptimizer.observe`
+    accumulated. The accumulated gradients are reset. A clone is a copy at the same position. It moves away from the
+    original, because its Adam moments start at zero. A split replaces a Gaussian by two smaller children at positions
+    sampled from it. Clones and children inherit the label.
 
     Args:
+        optimizer: holds the Gaussians, which are replaced. The survivors come first, in their order, then clones, then
+            children.
         grow_grad2d: in units of normalised device coordinates (see `GaussianOptimizer.observe`); 3DGS: 2e-4.
         grow_scale3d: Gaussians whose largest standard deviation is above this value are split, all other ones cloned.
             One value for all Gaussians, or [N]. 3DGS: 0.01.
@@ -96,7 +99,7 @@ def unit(quaternions: Tensor) -> Tensor:
 
 
 def prune(optimizer: GaussianOptimizer, prune_opa: float, prune_scale3d: float | Tensor) -> int:
-    """Remove the Gaussians that are too faint or too large.
+    """Remove the Gaussians of the optimizer that are too faint or too large.
 
     PAPER leaves open: 3DGS also removes Gaussians that cover more than 20 pixels of a view. This limit depends on the
     image size, and would remove whole walls in small images, so it is left out here.

@@ -21,9 +21,9 @@ class NeighbourGraph:
     """The graph whose E edges join neighbouring Gaussians, with the similarity of their colours.
 
     Attributes:
-        pairs: [E, 2] int, indices of the two Gaussians of each edge; each pair occurs once.
-        likeness: [E] in [0, 1], similarity of the two colours: exp(-d / 2), where d is the squared difference of the
-            colours over its mean of all edges.
+        pairs: [E, 2] int, indices of the two Gaussians of each edge, the smaller one first; each pair occurs once.
+        likeness: [E] in [0, 1], similarity of the two colours: exp(-d / 2), where d is the squared distance of the two
+            RGB colours, divided by its mean over all edges.
         way: [E], positive, length of the edge: the distance of the two means times 1 + `UNLIKE` sqrt(d).
     """
 
@@ -35,7 +35,8 @@ class NeighbourGraph:
 def find_neighbours(gaussians: Gaussians) -> NeighbourGraph:
     """Build the graph that joins each Gaussian to its `NEIGHBOURS` nearest ones, by the distance of means.
 
-    Colours are compared without their view-dependent part.
+    A Gaussian has more edges if it is among the nearest ones of further Gaussians. Colours are compared without their
+    view-dependent part.
     """
     means, color = (each.detach().cpu().double().numpy() for each in (gaussians.means, gaussians.sh[:, 0] * SH0))
     near = cKDTree(means).query(means, min(NEIGHBOURS + 1, len(means)))[1].reshape(len(means), -1)[:, 1:]

@@ -48,7 +48,7 @@ def _l1(image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
 
 
 def confine(gaussians: Gaussians, select: Tensor) -> Gaussians:
-    """Return the same Gaussians, through which gradients reach only the selected ones.
+    """Return Gaussians of the same values, through which gradients reach only the selected ones of `gaussians`.
 
     Args:
         select: bool [N], True for the Gaussians whose parameters receive gradients. The gradients of all other
@@ -110,19 +110,21 @@ class Rates:
 
 
 class GaussianOptimizer:
-    """Adam over Gaussians that can be added, removed and relabelled.
+    """Adam over Gaussians that can be added and removed.
 
     Each Gaussian counts its own steps, so that one added later starts Adam anew, bias correction included. A step
     updates only visible Gaussians and their moments (as in Taming 3DGS), because a Gaussian that no pixel sees has no
     gradient to average.
 
     Attributes:
-        gaussians: the N Gaussians; their parameters are leaf tensors that require gradients. After each change of their
-            number this is a new object.
+        gaussians: the N Gaussians; their parameters are leaf tensors that require gradients. `select` and `append`
+            replace this object by a new one without gradients.
         masked: [N] bool, labels of the Gaussians; `select` and `append` update them.
         masked_factors: parameter name -> factor on the learning rates of masked Gaussians; 1 without an entry.
-        grad2d_sum: [N], sum of the screen-space gradients that `observe` was given since `forget_grad2d`.
-        grad2d_count: [N], number of views in this sum. `select` and `append` update both.
+        grad2d_sum: [N], sum over views of the norm of each Gaussian's screen-space gradient (see `observe`), since the
+            last `forget_grad2d`.
+        grad2d_count: [N], number of views in this sum, those that rendered the Gaussian. `select` and `append` update
+            both.
     """
 
     _COUNTERS = ("masked", "_steps", "grad2d_sum", "grad2d_count")
@@ -158,7 +160,7 @@ class GaussianOptimizer:
         self.forget_grad2d()
 
     def observe(self, probe_gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
-        """Accumulate the screen-space gradients of one view, which `densify` uses.
+        """Add the norms of the screen-space gradients of one view to `grad2d_sum`, from which `densify` takes means.
 
         3DGS measures in normalised device coordinates, where the image spans [-1, 1]: one unit is half the image. So
         gradients with respect to pixels are multiplied by `width / 2` and `height / 2`. Since the loss is a mean over
@@ -180,7 +182,9 @@ class GaussianOptimizer:
         self.grad2d_count = torch.zeros_like(self._steps)
 
     def step(self, progress: float, visible: Tensor | None = None, sh_degree: int | None = None) -> None:
-        """Do one Adam step with the accumulated gradients, and clear them.
+        """Do one Adam step with the gradients in `.grad` of the parameters, and clear these gradients.
+
+        A parameter without a gradient stays unchanged.
 
         Args:
             progress: share of the run in [0, 1] that is done; sets the learning rate of the means.
@@ -241,10 +245,12 @@ class GaussianOptimizer:
                 getattr(self.gaussians, name).copy_(getattr(self._mean, name))
 
     def select(self, keep: Tensor) -> None:
-        """Keep the chosen Gaussians, with their labels, moments and running mean, and remove all other ones.
+        """Keep the chosen Gaussians and remove all other ones.
+
+        Labels, step counts, moments, running mean and accumulated screen-space gradients are kept; `.grad` is not.
 
         Args:
-            keep: [N] bool, True for the Gaussians to keep, or their indices [M].
+            keep: [N] bool, True for the Gaussians to keep, or their indices [M] in the new order.
         """
         self._replace(lambda p: p[keep])
         self._mean = self._mean and self._mean.map(lambda p: p[keep])
@@ -252,7 +258,9 @@ class GaussianOptimizer:
             setattr(self, name, getattr(self, name)[keep])
 
     def append(self, gaussians: Gaussians, masked: Tensor) -> None:
-        """Append M Gaussians, whose Adam moments start at zero. The mean over steps (`remember`) is discarded.
+        """Append M Gaussians, whose moments and step counts start at zero.
+
+        The running mean (`remember`) and `.grad` are discarded.
 
         Args:
             masked: [M] bool, the labels of the new Gaussians, see `masked` of the class.

@@ -54,7 +54,8 @@ def sheet_gaussians(
 ) -> Gaussians:
     """Return the Gaussians of both sheets for the chosen pixels: first the front sheet, then the sheet behind it.
 
-    `color_steps` and `view_dependent` of the settings are not used here.
+    With `offset_px` = 0 there is only the front sheet. `color_steps` and `view_dependent` of the settings are not used
+    here.
 
     Args:
         image, depth, pixels, camera, sh_count: as for `surface_gaussians`.

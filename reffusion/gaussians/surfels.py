@@ -30,7 +30,7 @@ def surface_gaussians(
     slope of a slanted surface; along the normal it is thin. So the surface stays closed in nearer views and from the
     side.
 
-    PAPER leaves open: scale and opacity of the initial Gaussians. These values reproduce the reference.
+    PAPER leaves open: scale and opacity of the initial Gaussians. The defaults reproduce the reference's picture.
 
     Args:
         image: [H, W, 3], the colours, uint8 or floating point in [0, 1].

@@ -37,8 +37,8 @@ def expected_mirror_depth(background: Background) -> dict[str, np.ndarray]:
 
     Returns:
         View name -> float64 [H, W], the camera z of the plausible mirror images inside C, and inf elsewhere. A mirror
-        image is plausible where photographs show the part that is mirrored, and no view sees past the image. The
-        dictionary is empty if the background has no mirrors.
+        image is plausible where photographs show the part that is mirrored, and the views do not see past the image
+        (`Visibility.is_empty`). The dictionary is empty if the background has no mirrors.
     """
     if not background.mirrors:
         return {}
@@ -127,7 +127,8 @@ def completed_views(
     Returns:
         For each reference its depth view and its picture, uint8 [H, W, 3]. The depth is that of `gaussians`, rendered
         in the reference's view, and 0 where alpha is at most `OPAQUE`. The object's mask of the depth view does not
-        contain the pixels that the reference completed.
+        contain the pixels that the reference completed. Its `near_ratio` and `far_ratio` are those of the view with the
+        object.
     """
     views, found = {view.camera.name: view for view in background.views}, []
     for each in references:
@@ -191,7 +192,9 @@ def uncovered_share(gaussians: Gaussians, camera: Camera, mask: np.ndarray, min_
 
 @torch.no_grad()
 def pixels_in_front(gaussians: Gaussians, depth: np.ndarray, reference: Reference, mask: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the reference's pixels outside C whose surface lies in front of all Gaussians.
+    """Return bool [H, W], the reference's pixels outside C whose surface lies clearly in front of the rendered draft.
+
+    Pixels at which the draft has an alpha up to 0.5 count as in front of everything.
 
     Most of these pixels show the inner side of a surface that an earlier reference added.
 

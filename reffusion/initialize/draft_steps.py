@@ -22,7 +22,9 @@ SEED = 0  # seed of the refit and of the random Gaussians
 
 
 def restrict_invent_masks(draft: Draft, sets: Mapping[str, MaskSet], background: Background) -> dict[str, MaskSet]:
-    """Restrict the invent masks I outside C to the pixels that show new Gaussians of the references.
+    """Return pixel classes whose invent mask I is restricted outside C to the pixels that show new Gaussians.
+
+    The new Gaussians are those of the references.
 
     C is the consistent mask (the removed object's pixels). I reaches beyond C where the scene asks to fill a region.
     There the photographs are right wherever the references added nothing. Inside C, I stays as it is.

@@ -44,7 +44,9 @@ def complete_extra_views(
             photographs and the references.
 
     Returns:
-        The draft with the extra views, the extra views, and view name -> [H, W], the depth at which each was added.
+        The draft with the extra views and without the floaters; the extra views in the order of completion, in which a
+        view may occur again, with what it left uncovered as its mask; and view name -> [H, W], the depth at which each
+        was last added.
     """
     extra: list[Reference] = []
     depths: dict[str, np.ndarray] = {}

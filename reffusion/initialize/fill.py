@@ -65,6 +65,9 @@ def fill_references(
 
     Returns:
         The filled draft, and view name -> [H, W], the depth at which the reference was added.
+
+    Raises:
+        ValueError: as `unprojection.estimate_depth`.
     """
     ordered = [each for each in references if each.mask.any()]
     ordered.sort(key=lambda each: (each.camera.name != first, -int(each.mask.sum())))
@@ -89,10 +92,11 @@ def fill_reference(
     farthest: bool = False,
     share: Share | None = None,
 ) -> Filled:
-    """Add one reference to the draft, on the pixels of its mask that are still empty.
+    """Return the draft with one reference added, on the pixels of its mask that earlier references did not fill.
 
-    Inside C (the object's mask) the reference shows the background, whose depth is estimated. Outside C it may draw an
-    inserted object over the remaining scene.
+    Pixels of C (the object's mask) at which the draft is not opaque, or beside which another view would show a gap, are
+    added too. Inside C the reference shows the background, whose depth is estimated. Outside C it may draw an inserted
+    object over the remaining scene.
 
     Args:
         params: parameters of the stage `initialize`.
@@ -103,8 +107,11 @@ def fill_reference(
         log: receives the traces of the depth solvers.
         farthest: True for an extra view (`extra_views`). Through the gap that it fills one sees the farthest of the
             surfaces around the gap, so only this surface is continued into the gap.
-        share: the pixels outside C that this reference adds, and those that it leaves to other references. None if it
-            is the only one with a depth map.
+        share: the pixels outside C that this reference adds, and those that it leaves to other references. None if
+            inserted surfaces are not divided among references (`sharing.share_surfaces`).
+
+    Raises:
+        ValueError: as `unprojection.estimate_depth`.
     """
     camera, mask = reference.camera, background.masks[reference.camera.name]
     over = reference.mask & ~mask  # an inserted object, drawn over the remaining scene

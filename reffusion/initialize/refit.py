@@ -84,7 +84,7 @@ def refit(
 
 
 def crop_to_mask(reference: Reference) -> tuple[Camera, np.ndarray, np.ndarray]:
-    """Crop a completed view to the surroundings of its mask.
+    """Crop a completed view, whose mask must not be empty, to the surroundings of its mask.
 
     The loss is a mean over the pixels of the crop. The weights are therefore scaled by the crop's share of the view, so
     that a pixel counts as much as in the whole view. Gaussians outside the crop are not rendered, and so Adam's
@@ -105,9 +105,9 @@ def crop_to_mask(reference: Reference) -> tuple[Camera, np.ndarray, np.ndarray]:
 def repetitions(supervision: Supervision) -> list[int]:
     """Return how many times each completed view occurs per pass over the photographs, in which each occurs once.
 
-    Together the completed views take about `REFERENCE_SHARE` of the steps. Each takes a part in proportion to the
-    number of its completed pixels, but occurs at least once: an extra view of a few pixels must not take steps from the
-    reference.
+    The numbers are in the order of `supervision.references`. Together the completed views take about `REFERENCE_SHARE`
+    of the steps. Each takes a part in proportion to the number of its completed pixels, but occurs at least once: an
+    extra view of a few pixels must not take steps from the reference.
     """
     sizes = [int(reference.mask.sum()) for reference in supervision.references]
     total = REFERENCE_SHARE / (1 - REFERENCE_SHARE) * len(supervision.cameras)

@@ -28,7 +28,7 @@ def remove_shadows(
     Returns:
         A tuple of three results:
 
-        - the references, with the shadow added to their masks;
+        - the references, each with the shadow that was detected in its own view added to its mask;
         - the background. Its photographs have the references' light where they showed the shadow. Pixels whose light
           is unknown are added to the masks of its views, and so do not supervise;
         - view name -> bool [H, W], the shadow in each view; an empty dictionary if no reference shows a shadow.

@@ -38,7 +38,8 @@ class GainPrediction(NamedTuple):
     Attributes:
         may_gain: whether SDS may improve the initialization.
         reason: the reason, in words.
-        psnr_beside: PSNR in dB of the renders beside the hole; None if there was no photograph to compare with.
+        psnr_beside: PSNR in dB of the renders beside the hole, from the mean squared error over the pixels of all
+            compared views; None if there was no photograph to compare with.
     """
 
     may_gain: bool

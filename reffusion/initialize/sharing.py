@@ -93,6 +93,9 @@ def share_surfaces(
 
     Returns:
         View name -> its share, for the references with a depth map; empty if fewer than two have one.
+
+    Raises:
+        ValueError: as `align_reference_depth`.
     """
     with_depth = [each for each in references if each.depth is not None]
     if len(with_depth) < 2:
@@ -134,8 +137,8 @@ def select_finest(surfaces: Sequence[ReferenceSurface]) -> list[np.ndarray]:
     """Return for each reference bool [H, W], the pixels that it adds to the scene.
 
     Each surface is added by the reference that shows it with the smallest footprint (the length of a pixel on the
-    surface); between equal footprints the earlier reference wins. A surface that another reference sees past is not
-    added at all.
+    surface); between equal footprints the earlier reference wins. A pixel whose surface another reference sees past is
+    not added.
     """
     found = []
     for i, each in enumerate(surfaces):
@@ -167,7 +170,8 @@ def cross_visibility(
 
     Returns:
         Three arrays [P]: bool, True where the other reference would add the same surface; bool, True where the other
-        reference sees past the point; and the other reference's footprint at the pixel that shows the point.
+        reference sees past the point; and the other reference's footprint at the pixel that shows the point, which has
+        a meaning only where the first array is True.
     """
     near, far = cv2.erode(np.where(other.depth > 0, other.depth, np.inf), EDGE), cv2.dilate(other.depth, EDGE)
     uv, z = geometry.project(points, other.camera)

@@ -31,7 +31,7 @@ RING = 0.1  # of the image's width: width of the ring around a hole in which dep
 
 
 def refine_background(background: Background, camera: Camera, hole: np.ndarray) -> tuple[Background, np.ndarray]:
-    """Correct the depth of one view, and all planes, around a hole by plane sweep stereo.
+    """Return the background with the depth of one view, and all planes, corrected around a hole by plane sweep stereo.
 
     Args:
         background: the photographs, depth views and planes around the object.

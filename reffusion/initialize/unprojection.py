@@ -64,8 +64,9 @@ def estimate_depth(
     Returns:
         A tuple of three results:
 
-        - depth, [H, W] float64 camera z: the rendered depth where it is known, and the estimate elsewhere;
-        - the estimate at all pixels, [H, W] float64;
+        - depth, [H, W] float64 camera z: where the scene's depth is known, the rendered depth or the better one of
+          `hints` (see `background_depth.extract_depth`), and the estimate elsewhere;
+        - the estimate at all pixels, [H, W] float64 camera z;
         - a description of the method, in words.
 
     Raises:
@@ -150,7 +151,9 @@ def find_gaps(
 def add_surface(
     draft: Draft, reference: Reference, depth: np.ndarray, pixels: np.ndarray, background: Background, sheets: Sheets
 ) -> Draft:
-    """Add pixels of a reference to the draft, as a surface of new Gaussians.
+    """Return the draft with pixels of a reference added, as a surface of new Gaussians.
+
+    The colours of these Gaussians are corrected so that the rendered view shows the reference (`match_colors`).
 
     Args:
         draft: the scene that is being filled.
@@ -178,7 +181,7 @@ def add_surface(
 def match_colors(
     gaussians: Gaussians, labels: torch.Tensor, image: np.ndarray, pixels: np.ndarray, camera: Camera, steps: int
 ) -> Gaussians:
-    """Correct the colours of the labelled Gaussians so that a rendered view shows a given picture.
+    """Return all Gaussians, the colours of the labelled ones corrected so that a rendered view shows a given picture.
 
     Only the constant spherical harmonic changes. Each step adds to the colour of a Gaussian the mean residual of the
     pixels that it is blended into, weighted by its blending weights. This undoes the blur of the footprints. A Gaussian

@@ -43,12 +43,12 @@ class ColorChange:
     """The change of colour of the surface around a hole, from a completed view to each of V views.
 
     Attributes:
-        material: [H, W, 3] float32 in [0, 1], the completed view after a strong blur (`COLOR_BLUR`). It tells materials
-            apart.
+        material: [H, W, 3] float32 in [0, 1], the completed view inside the hole and its photograph outside, after a
+            strong blur (`COLOR_BLUR`). It tells materials apart.
         points: [R, 3], R samples of the surface, in the world.
         colors: [R, 3], `material` at the samples.
-        change: [R, V, 3], a sample's colour in each view minus its colour in the completed view, both in [0, 1] and
-            blurred by `BLUR`; 0 where the view does not show the sample.
+        change: [R, V, 3], a sample's colour in the photograph of each view minus its colour in the photograph of the
+            completed view, both in [0, 1] and blurred by `BLUR`; 0 where the view does not show the sample.
         visible: bool [R, V], True where a view shows a sample.
     """
 
@@ -67,7 +67,9 @@ def measure_change(
     views: Sequence[DepthView],
     photos: Mapping[str, np.ndarray],
 ) -> ColorChange:
-    """Measure how the colour of the surface around a hole changes from the completed view to all other views.
+    """Measure how the colour of the surface around a hole changes from a completed view to each of V views.
+
+    Photographs are compared with photographs, because a completed view may lack the object's shadow.
 
     Args:
         picture: [H, W, 3] uint8, the completed view.
@@ -114,11 +116,11 @@ def _blur(image: np.ndarray, known: np.ndarray, blur: float) -> np.ndarray:
 def transfer_sh(
     gaussians: Gaussians, is_new: torch.Tensor, camera: Camera, change: ColorChange, views: Sequence[DepthView]
 ) -> Gaussians:
-    """Give new Gaussians spherical harmonics whose colour changes as that of the surface around them does.
+    """Return all Gaussians, the new ones with harmonics whose colour changes as that of the surface around them does.
 
     For every view, each new Gaussian takes the mean change of colour of the neighbouring samples, weighted by distance
-    and similarity of colour. Its harmonics are a least squares fit to these changes. Seen from `camera`, the Gaussian
-    keeps its colour.
+    and similarity of colour, and shrunk towards 0 where the samples disagree. Its harmonics are a least squares fit to
+    these changes. Seen from `camera`, the Gaussian keeps its colour.
 
     Args:
         gaussians: all N Gaussians of the scene.

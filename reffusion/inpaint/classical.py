@@ -118,10 +118,10 @@ def _fsr_works() -> bool:
 
 
 def blank_hole(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """Return the image, uint8 [H, W, 3], with zeros in the hole, bool [H, W]."""
+    """Return a copy of the image, uint8 [H, W, 3], with zeros in the hole, bool [H, W]."""
     return np.where(hole[..., None], np.uint8(0), image)
 
 
 def paste_hole(image: np.ndarray, painted: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """Return [H, W, 3], the colours of `painted` inside the hole, bool [H, W], and of `image` outside."""
+    """Return a new array [H, W, 3], the colours of `painted` inside the hole, bool [H, W], and of `image` outside."""
     return np.where(hole[..., None], painted, image)

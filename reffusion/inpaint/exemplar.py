@@ -52,8 +52,8 @@ MIN_LAYER_SHARE = 0.02  # share of the hole into which a foreground layer must c
 def mask_to_paint(hidden: np.ndarray, unknown: np.ndarray) -> np.ndarray:
     """Return bool [H, W], the pixels of a view to paint.
 
-    These are the unknown pixels, observed parts of C that are too narrow to be kept (`MIN_KEPT_RADIUS`), and the rim of
-    C beside them.
+    These are the unknown pixels, the observed pixels of C in gaps between unknown pixels that are too narrow to be kept
+    (no disk of radius `MIN_KEPT_RADIUS` fits in), and the rim around both (`add_rim`).
 
     Args:
         hidden: bool [H, W], C.
@@ -67,9 +67,10 @@ def mask_to_paint(hidden: np.ndarray, unknown: np.ndarray) -> np.ndarray:
 
 
 def add_rim(hole: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the hole and the rim of C (`hidden`) beside it, on either side of C's border.
+    """Return bool [H, W], the hole and all pixels within `RIM_WIDTH` both of the hole and of C (`hidden`).
 
-    The rim may still show the object's blurred edge, which would be continued into the hole.
+    So the hole grows inside C on all sides, and beyond C's border, where a pixel may still show the object's blurred
+    edge, which would be continued into the hole.
     """
     return hole | dilate(hidden, RIM_WIDTH) & dilate(hole, RIM_WIDTH)
 
@@ -82,13 +83,15 @@ def complete_view(
     Args:
         image: uint8 [H, W, 3], the view; read outside the hole only.
         hole: bool [H, W], the pixels to fill.
-        camera: the camera of the view.
+        camera: the camera of the view. Its name must be that of a view in `around`.
         hidden: bool [H, W], C: the pixels at which the photograph shows the object.
-        around: the photographs and the surfaces around the object.
+        around: the photographs, the view's own among them, the views completed before (`completed`), and the surfaces
+            around the object.
         seeds: seeds of the random searches.
 
     Returns:
-        One completion of the view for each seed.
+        One completion of the view for each seed, in the order of the seeds. Its misfit counts large pieces and patches,
+        each by their share of the pixels that these two steps fill, and serves to compare the completions.
     """
     mirrored = render_mirrors(around.mirrors, camera, hidden, around.views)
     target, sources, smooth, symmetries = _find_surfaces(image, hole, camera, hidden, around, mirrored)

@@ -48,9 +48,9 @@ def load_inpainter(inpainter: Inpainter, device: str = "cpu") -> Painter | None:
 
 
 def run_network(network: Network, image: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """Return the image, uint8 [H, W, 3], with its hole, bool [H, W], filled by the network.
+    """Return a copy of the image, uint8 [H, W, 3], with its hole, bool [H, W], filled by the network.
 
-    Pixels outside the hole are unchanged.
+    Pixels outside the hole are unchanged. Raises ValueError as `Network.paint` does.
     """
     if not hole.any():
         return image.copy()
@@ -71,7 +71,7 @@ def run_network(network: Network, image: np.ndarray, hole: np.ndarray) -> np.nda
 
 
 def crop_around(hole: np.ndarray, side: int) -> tuple[slice, slice]:
-    """Return the rows and columns of a square crop around the hole, bool [H, W].
+    """Return the rows and columns of a square crop around the hole, bool [H, W], which must not be empty.
 
     The side of the square is twice the longer side of the hole's bounding box and at least `side` px, but at most the
     shorter side of the image. If the hole is longer than the shorter side of the image, the crop is a rectangle that

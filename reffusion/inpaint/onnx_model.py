@@ -21,8 +21,9 @@ class Network:
     Attributes:
         side: px, side of the square images that the network takes; None if it takes any size.
         paint: function (picture uint8 [H, W, 3], hole bool [H, W], True = to fill) -> uint8 [H, W, 3]. The result is
-            the network's output for the whole picture, also outside the hole. Raises ValueError if the output has
-            another size, is not finite, or has values in [0, 1] instead of 0..255.
+            the network's output for the whole picture, also outside the hole. Raises ValueError if the
+            network fails on the picture, or if its output has another size, is not finite, or has values in [0, 1]
+            instead of 0..255.
     """
 
     side: int | None
@@ -39,8 +40,8 @@ def load(file: Path, dtype: str) -> Network:
             255 elsewhere.
 
     Raises:
-        ValueError: onnxruntime is missing, the file is no ONNX model, or its inputs and outputs differ. The message is
-            one line that names the file.
+        ValueError: onnxruntime is missing, the file is no ONNX model, or its inputs and outputs are others than
+            these. The message is one line that names the file.
     """
     session = open_session(file, str(file))
     side = _read_side(session, file, dtype)

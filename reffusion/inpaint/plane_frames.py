@@ -16,6 +16,9 @@ MAX_DISTANCE = 0.03  # relative difference of depth within which a pixel lies on
 def label_planes(depth: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
     """Return int [H, W], the index of the plane on which each pixel lies.
 
+    A pixel lies on a plane if its depth is within `MAX_DISTANCE` (relative) of the plane's depth in this view. The
+    whole infinite plane counts, also where its map says that it does not exist.
+
     Args:
         depth: [H, W], camera z of the visible surface; 0 where unknown.
         camera: the view.
@@ -57,9 +60,9 @@ def plane_jacobians(label: np.ndarray, camera: Camera, planes: Sequence[Plane]) 
 
 
 def plane_coordinates(label: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
-    """Return [H, W, 2], the coordinates of each pixel on its plane, in the plane's own axes and in world units.
+    """Return [H, W, 2], the coordinates of each pixel on its plane, along `Plane.axes` from `Plane.origin`.
 
-    They are 0 for pixels on no plane.
+    They are in world units, and 0 for pixels on no plane.
 
     Args:
         label: int [H, W], the plane of each pixel, see `label_planes`.
@@ -76,7 +79,8 @@ def plane_coordinates(label: np.ndarray, camera: Camera, planes: Sequence[Plane]
 
 
 def invert_2x2(matrices: np.ndarray) -> np.ndarray:
-    """Return the inverses of matrices [..., 2, 2]; zeros for a singular matrix, as for a plane seen edge on."""
+    """Return the inverses of matrices [..., 2, 2]; zeros where a matrix is singular or not finite, as for a
+    plane seen edge on."""
     (a, b), (c, d) = (np.moveaxis(matrices[..., row, :], -1, 0) for row in (0, 1))
     with np.errstate(invalid="ignore"):
         determinant = a * d - b * c

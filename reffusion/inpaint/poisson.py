@@ -30,7 +30,8 @@ def blend(
         right, below: [H, W, 3], the desired difference from each pixel to the next one on the right, and below.
         own: [H, W, 3], the desired colours.
         beside: bool [H, W], the pixels outside the hole that the hole must join; None for all.
-        color_weight: weight of the desired colours, if the weight of the desired differences is 1.
+        color_weight: weight of the squared deviation from the desired colours, if that of the squared deviation from
+            the desired differences is 1.
 
     Returns:
         [N, 3] float64, the colours of the hole's pixels in row-major order.
@@ -59,14 +60,15 @@ def blend(
 
 
 def paste(image: np.ndarray, picture: np.ndarray, mask: np.ndarray, both: np.ndarray) -> np.ndarray:
-    """Paste a picture into an image, after its tone is matched to the image's.
+    """Return a copy of an image into which a picture is pasted, after the picture's tone is matched to the image's.
 
-    To match the tone, the median difference between image and picture is added to the picture.
+    To match the tone, the median difference image - picture of each channel is added to the picture.
 
     Args:
         image, picture: uint8 [H, W, 3].
         mask: bool [H, W], the pixels to paste.
         both: bool [H, W], the pixels at which image and picture show the same; the difference is taken there.
+            If there are none, the tone is not changed.
 
     Returns:
         uint8 [H, W, 3].
@@ -80,6 +82,8 @@ def paste(image: np.ndarray, picture: np.ndarray, mask: np.ndarray, both: np.nda
 
 def interpolate(values: np.ndarray, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
     """Interpolate values smoothly across a hole, by the Laplace equation.
+
+    The values are 0 in a part of the hole that touches no pixel of `beside`.
 
     Args:
         values: [H, W, 3].

@@ -26,7 +26,7 @@ TURNED_SH = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], n
 
 
 def save_compressed(path: Path, gaussians: Gaussians, similarity: Similarity) -> None:
-    """Write Gaussians as a compressed .ply in the scene's own frame.
+    """Write Gaussians as a compressed .ply in the scene's own frame. `Gaussians.antialiased` is not stored.
 
     The Gaussians are sorted along a Morton curve, so that chunks have a small extent and quantisation is fine. The x, y
     and z of a position keep 11, 10 and 11 bits of the chunk's extent. Colours, opacity and spherical harmonics keep 8
@@ -102,7 +102,7 @@ def load_spz(path: Path) -> Rows:
 
 
 def save_spz(path: Path, rows: Rows) -> None:
-    """Write rows as a .spz file.
+    """Write rows as a .spz file. Its header does not say that the splats are antialiased.
 
     Positions are fixed-point numbers of 24 bits. As many bits as the largest coordinate allows are fractional.
 

@@ -12,7 +12,7 @@ from reffusion.io.images import load_exr, open_image
 
 
 def load_depth(path: Path) -> np.ndarray:
-    """Read a map of depth or disparity as float32 [h, w], in the unit of the file.
+    """Read a map of depth or disparity as float32 [h, w], in the unit of the file, without any scaling.
 
     A pixel is unknown, and becomes NaN, if its value is not finite. A value of 0 means unknown too if the file holds
     integers.

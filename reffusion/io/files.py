@@ -98,7 +98,7 @@ def shorten(value: object, most: int = 60) -> str:
 class Cursor:
     """A reader of a little-endian binary file, which it holds in memory.
 
-    Every method raises BadInput if the file ends too early.
+    Every method that reads raises BadInput if the file ends too early.
 
     Attributes:
         path: the file.

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def load_ground_truth(camera: Camera, poses: Path) -> np.ndarray | None:
-    """Read a view's own picture as uint8 [H, W, 3]; None if the view has no picture.
+    """Read a view's own undistorted picture as uint8 [H, W, 3]; None if the view has no picture.
 
     Args:
         poses: folder of the stage `poses`.
@@ -38,8 +38,8 @@ def load_object_mask(camera: Camera, raw_masks: Path, masks: Path | None) -> np.
     """Read the object's mask in a view as bool [H, W], True = the object.
 
     The mask is the first of the following that exists: the view's test mask; its consistent mask C (the rendered labels
-    of the object's Gaussians); its raw mask, as a variant may skip the stage `masks`; an empty mask. The test mask
-    comes first, so that all variants of a scene with test masks are scored in the same box.
+    of the object's Gaussians); its raw mask (of all objects together), as a variant may skip the stage `masks`; an
+    empty mask. The test mask comes first, so that all variants of a scene with test masks are scored in the same box.
 
     Args:
         raw_masks, masks: folders of the stages of these names; `masks` is None if that stage was skipped.

@@ -196,8 +196,9 @@ def load_mask(path: Path, size: tuple[int, int] | None = None, values: MaskValue
         values: which pixel values mark the object.
 
     Raises:
-        BadInput: the file is unreadable, has its mask in the alpha channel, or has areas of several values or colours
-            (such as numbers of objects) while `values` has no `ids`. The message names the file.
+        BadInput: the file is unreadable, or has colours while `values` has `ids`. Without `ids`: the file has its mask
+            in the alpha channel, has areas of several values or colours (such as numbers of objects), or has values
+            above 1 that all lie below the threshold. The message names the file.
     """
     with open_image(path, "a readable mask") as image:
         if values.ids:
@@ -281,9 +282,10 @@ def _flat_levels(array: np.ndarray) -> list[int]:
 
 
 def resize_image(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resize a picture, uint8 [h, w, 3], to `size`.
+    """Resize a picture, uint8 [h, w, 3] or [h, w], to `size`.
 
-    The interpolation is area averaging if neither side grows, and bicubic else.
+    The interpolation is area averaging if neither side grows, and bicubic else. A picture that has this size already is
+    returned itself, not as a copy.
 
     Args:
         size: (width, height) in pixels.

@@ -48,7 +48,10 @@ class Machine:
 
 @functools.cache
 def detect() -> Machine:
-    """Detect what this machine has for CUDA. A few files are read, and nvidia-smi is run if it exists."""
+    """Detect what this machine has for CUDA. A few files are read, and nvidia-smi is run if it exists.
+
+    The result of the first call is returned by all later calls of the process.
+    """
     gpu, gigabytes, driver = _query_gpu()
     package = _package("gsplat")
     extension = package is not None and any(package.glob("csrc*.so"))
@@ -58,7 +61,8 @@ def detect() -> Machine:
 def find_missing(here: Machine, memory_gb: float = 0.0, splats: bool = True, memory_param: str = "") -> list[str]:
     """Return what prevents this machine from running a stage on CUDA, one line each with the remedy.
 
-    The function assumes that an NVIDIA driver is present. The command `plan` reports a missing driver before.
+    The list is empty if nothing is known to be missing. The function assumes that an NVIDIA driver is present. The
+    command `plan` reports a missing driver before.
 
     Args:
         here: this machine, from `detect`.

@@ -97,6 +97,8 @@ def check_can_save(path: Path) -> None:
 def save_splats(path: Path, gaussians: Gaussians, similarity: Similarity, properties: Sequence[str] = ()) -> None:
     """Write Gaussians in the scene's own frame, in the format that the file's ending names (see `splats.FORMATS`).
 
+    Only a plain .ply stores `Gaussians.antialiased`.
+
     Args:
         gaussians: in the normalised frame.
         similarity: from the scene's own frame to the normalised frame.

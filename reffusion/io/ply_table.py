@@ -61,8 +61,8 @@ def load_header(path: Path) -> Header:
     """Read the header of a PLY file.
 
     Raises:
-        BadInput: the file cannot be read, has no valid PLY header or no vertices, or is shorter than its header
-            declares.
+        BadInput: the file cannot be read, has no valid PLY header or no element `vertex` (which may have no rows), or
+            is shorter than its header declares.
     """
     with reading(path, "a readable PLY file with vertices"), open(path, "rb") as file:
         if file.readline(8).strip() != b"ply":
@@ -97,6 +97,7 @@ def load_vertices(path: Path, header: Header) -> np.ndarray:
     """Read the N vertices of a PLY file as a structured array [N] with a field per property.
 
     The array of a binary file whose vertices have no list properties is a memory map of the file, and takes no memory.
+    Numbers of a text file may have wider types than the header declares.
 
     Args:
         header: the header of this file, from `load_header`.

@@ -30,7 +30,8 @@ def save_scene(poses_dir: Path, scene: Scene) -> None:
     """Write a scene as sparse/0/*.bin, transform.json and views.json; pictures are not written.
 
     The cameras in sparse/0/ are of COLMAP's model PINHOLE, in the normalised frame. transform.json holds the
-    similarity, and views.json the names of training, test and clean views (clean: without the object).
+    similarity. views.json holds the names of training, test and clean views (clean: without the object), and of
+    camera-only views, suspects and outliers if there are any (`reffusion.types.Scene`).
     """
     poses_dir = Path(poses_dir)
     cameras, images = {}, {}
@@ -89,9 +90,9 @@ def load_views(poses_dir: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
 
 
 def has_photograph(poses_dir: Path, name: str) -> bool:
-    """Return whether the view has a photograph.
+    """Return whether the stage `poses` wrote a picture of the view; camera-only views have none.
 
-    In a scene without photographs, later stages use renders of its Gaussians instead.
+    In a scene without photographs no view has one, and later stages use renders of its Gaussians instead.
     """
     return (Path(poses_dir) / "images" / f"{name}.png").exists()
 
@@ -103,7 +104,10 @@ def load_warnings(folder: Path) -> list[str]:
 
 
 def list_objects(raw_masks_dir: Path) -> list[str]:
-    """Return the sorted names of the objects that have masks of their own, masks/<object>/; empty for one object."""
+    """Return the sorted names of the objects that have masks of their own, masks/<object>/.
+
+    The list is empty if the masks do not distinguish between objects.
+    """
     return sorted(path.name for path in (Path(raw_masks_dir) / "masks").glob("[!.]*") if path.is_dir())
 
 
@@ -116,7 +120,8 @@ def raw_mask_files(raw_masks_dir: Path, name: str, objects: Sequence[str] | None
         objects: names of the objects whose masks are returned, if objects have masks of their own; None: all objects.
 
     Returns:
-        One file per object, or masks/<view>.png if objects have no masks of their own; empty if the view has no mask.
+        One file for each of these objects that has a mask in the view, or masks/<view>.png if objects have no masks of
+        their own; empty if the view has no mask.
     """
     folder = Path(raw_masks_dir) / "masks"
     found_objects = list_objects(raw_masks_dir) if objects is None else objects
@@ -136,7 +141,8 @@ def load_raw_masks(
         objects: names of the objects; None: all.
 
     Returns:
-        Only views that have a mask, or a mask of each object, are keys.
+        Only views that have a mask are keys; if objects have masks of their own, only views that have a mask of each
+        of `objects`.
     """
     objects = list_objects(raw_masks_dir) if objects is None else objects
     files = {name: raw_mask_files(raw_masks_dir, name, objects) for name in names}
@@ -169,7 +175,7 @@ def load_mask_sets(masks_dir: Path, names: Iterable[str]) -> dict[str, MaskSet]:
 
 
 def has_object_mask(raw_masks_dir: Path, masks_dir: Path | None, name: str) -> bool:
-    """Return whether the view has a raw mask that the user gave, or a non-empty one that was made from clicks.
+    """Return whether the view has a raw mask that the user gave, empty or not, or a non-empty one made from clicks.
 
     Args:
         raw_masks_dir: folder of the stage `raw_masks`, which holds the given masks.

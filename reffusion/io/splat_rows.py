@@ -91,7 +91,8 @@ def drop_invalid(rows: Rows) -> tuple[Rows, Repairs]:
     zero quaternion as the identity.
 
     Returns:
-        The remaining rows, and the numbers of dropped rows and clamped values.
+        The remaining rows, and the numbers of dropped rows and of infinite values that were clamped. Finite values that
+        are clamped are not counted.
     """
     logits, scales = rows.opacity_logits, rows.log_scales
     with np.errstate(invalid="ignore", over="ignore"):

@@ -1,7 +1,9 @@
 """The schema of `trace.jsonl`, in which a stage records its error against run time, and reading of such files.
 
-A trace has one JSON object per line, see docs/development.md#traces. Its keys are quantities, such as "psnr". A trace
-may hold several series, e.g. one per solver and view.
+A trace has one JSON object per line, see docs/development.md#traces. Its keys are "seconds" (work time since the stage
+began), "iteration" (number of finished steps), and quantities, such as "psnr". A trace may hold several series, e.g.
+one per solver and view; the key "series" then names the series of a line. The last line of a series may have the key
+"reason".
 """
 
 from __future__ import annotations
@@ -74,6 +76,8 @@ def read_trace(path: Path) -> list[dict[str, Any]]:
 
 def load_trace(path: Path, stage: str) -> dict[str, list[dict[str, Any]]]:
     """Read a stage's trace and check each line against the schema (docs/development.md#traces).
+
+    Lines that are not valid JSON are skipped, as in `read_trace`.
 
     Args:
         stage: name of the stage; `distill` may have quantities that are not in `QUANTITIES` (its loss terms).

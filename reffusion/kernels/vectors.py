@@ -213,7 +213,7 @@ def root(typing, x):
 
 @intrinsic
 def ceiling(typing, x):
-    """Return each lane rounded up to an integer."""
+    """Return each lane rounded up to a whole number, as a vector of the same type."""
 
     def emit(context, builder, sig, args):
         return _call(builder, "ceil", args[0])

@@ -40,6 +40,9 @@ def label_object(
 ) -> Tensor:
     """Label the Gaussians of the object: by votes of the raw masks, or without masks by a region in space.
 
+    Gaussians that hardly any view sees are also labelled by their position: they belong to the object if they project
+    into the masks of more than half of the views (`voting.hidden_inside`).
+
     Args:
         params: parameters of the stage `masks`.
         gaussians: the N Gaussians of the whole scene.
@@ -76,8 +79,10 @@ def render_consistent_masks(
 ) -> dict[str, np.ndarray]:
     """Render the consistent mask C of each view: the pixels where the rendered labels exceed tau'.
 
+    Small islands are then removed, and small holes filled (`clean_mask`).
+
     Args:
-        params: sets the threshold tau' (`tau_rendered`).
+        params: sets the threshold tau' (`tau_rendered`), and whether masks are cleaned (`tidy`).
         gaussians: the N Gaussians of the whole scene.
         labels: bool [N], True for the Gaussians of the object.
         cameras: view name -> camera.
@@ -110,7 +115,8 @@ def classify_pixels(
     """Split the consistent mask of each view into observed and unobserved pixels, and select the pixels to invent.
 
     Unobserved pixels are invented (with `params.invent` "consistent": all of C), as well as the pixels that the scene
-    asks to fill. In a clean view no pixel is unobserved.
+    asks to fill. In a clean view C stays, but no pixel of it is unobserved, and none is invented unless the scene asks
+    to fill it.
 
     Args:
         params: parameters of the stage `masks`.
@@ -167,13 +173,14 @@ def add_uncaptured_pixels(
 def drop_negligible(
     params: Params, sets: Mapping[str, MaskSet], names: Sequence[str], fill: FillRequest
 ) -> dict[str, MaskSet]:
-    """Clear the invent masks of all views if the unobserved share of C is negligible.
+    """Return the pixel classes of all views, with empty invent masks if the unobserved share of C is negligible.
 
     The share is that of `unobserved_share`, and `params.negligible` is its limit. Nothing is cleared if all of C is to
     be invented (`params.invent` "consistent"), or if the scene asks to fill pixels.
 
     Args:
-        names: the views over which the share is computed.
+        sets: view name -> pixel classes.
+        names: the views over which the share is computed. The invent masks of all views in `sets` are cleared.
         fill: the pixels that the scene asks to fill.
     """
     if params.invent == "consistent" or fill or unobserved_share(sets, names) > params.negligible:
@@ -191,8 +198,8 @@ def count_pixels(kind: str, sets: Mapping[str, MaskSet], names: Sequence[str]) -
 
 
 def unobserved_share(sets: Mapping[str, MaskSet], names: Sequence[str]) -> float:
-    """Return the share of the consistent masks' pixels that are unobserved, in [0, 1], over the views `names`.
+    """Return the share of the consistent masks' pixels that are unobserved, in [0, 1], over the views `names` together.
 
-    Behind an unobserved pixel no photograph shows the background.
+    Behind an unobserved pixel no photograph shows the background. The share is 0 if all consistent masks are empty.
     """
     return count_pixels("unobserved", sets, names) / max(count_pixels("consistent", sets, names), 1)

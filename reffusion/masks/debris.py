@@ -40,7 +40,8 @@ def find_debris(
         gaussians: the N Gaussians of the whole scene, with the object.
         labels: bool [N], True for the Gaussians of the object.
         views: depth of the training views, rendered with the object.
-        masks: view name -> bool [H, W], the consistent masks C, True at pixels that show the object.
+        masks: view name -> bool [H, W], True at pixels where the photograph shows the object: C, and nothing in a clean
+            view (photographed without the object).
         photos: view name -> uint8 [H, W, 3], the photographs in the exposure of the Gaussians.
 
     Returns:

@@ -98,7 +98,7 @@ def inside_region(gaussians: Gaussians, region: Region) -> Tensor:
 
 
 def restrict_to_new(invent: np.ndarray, consistent: np.ndarray, new_share: np.ndarray) -> np.ndarray:
-    """Restrict the invent mask I of a view to C and to the pixels that show new Gaussians.
+    """Return the invent mask I of a view, restricted to C and to the pixels that show new Gaussians.
 
     This happens once the references are in the scene as new Gaussians. C are the pixels of the removed object. Outside
     C, a region that the scene asks to fill also covers pixels at which the references inserted nothing.

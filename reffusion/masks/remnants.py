@@ -171,7 +171,7 @@ def surface_sizes(gaussians: Gaussians) -> np.ndarray:
 
 
 def connected_parts(found: np.ndarray, pairs: np.ndarray) -> list[np.ndarray]:
-    """Return the connected parts of a set of nodes that have at least `LEAST_COUNT` nodes.
+    """Return those connected parts of a set of nodes that consist of at least `LEAST_COUNT` nodes.
 
     Args:
         found: bool [N], True for the nodes of the set.
@@ -189,7 +189,7 @@ def connected_parts(found: np.ndarray, pairs: np.ndarray) -> list[np.ndarray]:
 
 @torch.no_grad()
 def render_parts(gaussians: Gaussians, parts: Sequence[np.ndarray], camera: Camera) -> list[np.ndarray]:
-    """Return for each part the pixels, bool [H, W], at which its Gaussians have more than half of the blending weight.
+    """Return for each part the pixels, bool [H, W], at which the blending weights of its Gaussians sum to above 0.5.
 
     Args:
         parts: bool [N] for each part, True for its Gaussians.

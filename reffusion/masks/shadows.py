@@ -35,9 +35,9 @@ ISLAND, NOTCH = 0.015, 0.01  # of the image's width: smaller islands are removed
 def redrawn_difference(reference: np.ndarray, photo: np.ndarray, known: np.ndarray) -> float:
     """Return how much a picture differs from its photograph where both show the same, in levels of 255.
 
-    If an autoencoder redrew the picture, its texture differs from that of the photograph everywhere. The result is a
-    high quantile (`REDRAWN_QUANTILE`) of these differences, so smaller differences do not mean that a pixel was
-    repainted.
+    The difference of a pixel is that of the colour channel that differs most, after a slight blur. If an autoencoder
+    redrew the picture, its texture differs from that of the photograph everywhere. The result is a high quantile
+    (`REDRAWN_QUANTILE`) of these differences, so smaller differences do not mean that a pixel was repainted.
 
     Args:
         reference, photo: [H, W, 3] uint8.
@@ -55,7 +55,8 @@ def changed_pixels(reference: np.ndarray, photo: np.ndarray, within: np.ndarray,
         reference: [H, W, 3] uint8, the completed view.
         photo: [H, W, 3] uint8, its photograph.
         within: bool [H, W], the pixels to compare; all others are False in the result.
-        noise: the result of `redrawn_difference`. Differences up to this many levels of 255 do not count.
+        noise: the result of `redrawn_difference`. Differences up to this many levels of 255 do not count, nor do
+            differences up to `CHANGED` levels.
     """
     differs = within & (_fine_difference(reference, photo) > max(CHANGED, noise))
     # Some of the repainted pixels may look like the photograph, so holes and notches are closed.
@@ -100,9 +101,9 @@ def detect_shadows(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) ->
 
 
 def log_light(reference: np.ndarray, view: np.ndarray) -> np.ndarray:
-    """Return float32 [H, W, 3], the logarithm of the ratio of the completed view's brightness to the photograph's.
+    """Return float32 [H, W, 3], the natural logarithm of the completed view's brightness divided by the photograph's.
 
-    The pictures are blurred first. The arguments are those of `detect_shadows`.
+    Each colour channel has its own ratio. The pictures are blurred first. The arguments are those of `detect_shadows`.
     """
     sigma = morphology.to_pixels(BLUR, view.shape[1])
     blur = lambda image: cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma) + DARK_OFFSET
@@ -119,7 +120,7 @@ def project_shadow(
         light: [H, W, 3], the result of `log_light` for the view `camera`.
         depth: [H, W], camera z of the surfaces in the view `camera`; 0 where unknown.
         camera: the view in which the shadow was detected.
-        views: the views into which the shadow is projected.
+        views: the views into which the shadow is projected. The view `camera` may be among them.
 
     Returns:
         View name -> (bool [H, W], the shadow in this view; [H, W, 3], its log light). The log light is NaN outside the

@@ -89,12 +89,15 @@ def find_floaters(
     Args:
         remaining: the M Gaussians of the scene without the removed ones.
         cameras: the training views.
-        unobserved: view name -> bool [H, W], True at unobserved pixels.
+        unobserved: view name -> bool [H, W], True at unobserved pixels. A view without an entry does not vote.
         tau: a Gaussian is a floater if the ratio of its contributions to unobserved pixels and to all other pixels
             exceeds this.
 
     Returns:
         bool [M], True for floaters.
+
+    Raises:
+        ValueError: as `cast_votes`.
     """
     return label_gaussians(cast_votes(remaining, cameras, unobserved, mode="weight"), tau)
 

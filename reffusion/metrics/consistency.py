@@ -1,4 +1,4 @@
-"""Multi-view consistency: a score for how similar the colours are that a surface has in two rendered views."""
+"""Multi-view consistency: how much the colours of the same surface points differ in two rendered views."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def reprojected_color_difference(first: RenderedView, second: RenderedView) -> t
     The pixels are unprojected by the depth of `first` and projected into `second`. Pixels without a depth, and points
     outside the frame of `second`, are not compared. A point that lies farther behind the surface of `second` than the
     relative depth `TOLERANCE` is occluded in `second` and not compared. A point at which `second` has no depth is
-    compared.
+    compared. The mask of `second` is not used.
 
     Returns:
         The mean absolute difference over pixels and channels (colours in [0, 1], exposures undone), and the share in
@@ -86,7 +86,7 @@ def continue_surrounding_depth(depth: np.ndarray, mask: np.ndarray) -> np.ndarra
     This gives a depth to pictures that were inpainted in 2D, since 2D inpainting makes no depth.
 
     Args:
-        depth: [H, W], camera z; 0 where unknown.
+        depth: [H, W], camera z; 0 where unknown. Outside the mask the disparity of such a pixel counts as 0.
         mask: bool [H, W], True = the pixel was inpainted.
 
     Returns:

@@ -2,7 +2,7 @@
 
 Images are sRGB [H, W, 3], uint8 or float in [0, 1]. The box is cut out first and scored as a separate image, so no
 pixel outside the box affects a score of the box. Nothing is resized. Every function that compares two images raises
-ValueError if their sizes differ or if they are empty.
+ValueError if their sizes differ, if they are empty, or if an image has another dtype or values outside [0, 1].
 """
 
 from __future__ import annotations
@@ -227,7 +227,8 @@ def score_view(
         box: the mask's box; None if the mask is empty, which makes the scores of the box None.
         targets: the result of `lpips_targets` for the part of the ground truth in the box; None to leave LPIPS out.
         mask: bool [H, W], True = the object; None if no pixel is masked.
-        shows_object: True if the ground truth shows the object, so that only pixels outside the mask can be scored.
+        shows_object: True if the ground truth shows the object, so that only pixels outside the mask can be scored, and
+            the scores of the box and of the full image are None.
         unseen: bool [H, W], True = no training view shows the surface of this pixel; None if unknown, which makes
             "psnr_outside_seen" and "unseen_share" None.
 

@@ -41,6 +41,8 @@ def score_row(
 ) -> dict[str, Any]:
     """Return the row of a view in per_view.csv: its size, its mask's box and, if there is a ground truth, its scores.
 
+    The `CONSISTENCY_COLUMNS` are None until `add_consistency` fills them.
+
     Args:
         view: the rendered view; its mask is the object.
         initial: uint8 [H, W, 3], the rendering of the initialization (the scene before `distill`), which is scored in
@@ -48,7 +50,8 @@ def score_row(
         truth: the ground truth.
         models: name of the network ("alex" or "vgg") -> LPIPS network.
         longest: px. If the picture's larger side exceeds this, the box is also scored after all pictures are reduced to
-            this larger side, in the columns `reduced_*`, unless the ground truth shows the object. 0 for never.
+            this larger side, in the columns `reduced_*` and `initialize_reduced_*`, unless the ground truth shows the
+            object. 0 for never.
     """
     camera, box = view.camera, image_metrics.mask_box(view.mask)
     row = {"view": camera.name, "width": camera.width, "height": camera.height} | dict.fromkeys(CONSISTENCY_COLUMNS)
@@ -109,8 +112,9 @@ def summarize(
         infix: text that precedes a column's name in the rows, after `initialize_`; for example "reduced_".
 
     Returns:
-        "mean": column -> mean over the views that have a value. "initialize": column -> mean of the column
-        `initialize_<column>`. "views": column -> number of views that have a value.
+        "mean": column -> mean over the views that have a value (`image_metrics.mean`), None if none has. "initialize":
+        the same for the column `initialize_<column>`. "views": column -> number of views that have a value in the
+        column itself.
     """
     values = lambda prefix, name: [row.get(f"{prefix}{infix}{name}") for row in rows]
     return {
@@ -159,7 +163,8 @@ def summarize_consistency(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Summarise the multi-view consistency over the pairs of consecutive views.
 
     Returns:
-        "consistency" and "consistency_share": means over the pairs that have a value. "pairs": number of pairs that
+        "consistency", the colour difference (0 = consistent), and "consistency_share", the share of the mask's pixels
+        that were compared: means over the pairs that have a value. "pairs": number of pairs that
         could be compared. "protocol": description of the measurement.
     """
     difference, share = ([row[name] for row in rows] for name in CONSISTENCY_COLUMNS)

@@ -23,7 +23,7 @@ class ViewRenders(NamedTuple):
     """The renderings of one view.
 
     Attributes:
-        by_stage: name of a stage -> uint8 [H, W, 3], the rendering of the stage's Gaussians.
+        by_stage: name of a stage -> uint8 [H, W, 3], the rendering of the stage's Gaussians, never inpainted.
         result: the rendering of the resulting scene, inpainted in 2D inside the mask if the renderer has a painter.
     """
 
@@ -53,8 +53,10 @@ class ViewRenderer:
 
         Args:
             mask: bool [H, W], the object.
-            photo: uint8 [H, W, 3], the photograph whose exposure the renderings get (outside the mask); None to use the
-                view's entry in `exposures`, which is interpolated from nearby photographs for a test view.
+            photo: uint8 [H, W, 3], the view's photograph. The view's entry in `exposures` is adjusted so that the
+                rendering of "fit" is as bright as the photograph outside the mask. None to use the entry as it is (for
+                a test view it is interpolated from nearby photographs). A view without an entry is rendered without
+                exposure, also with a photograph.
 
         Raises:
             ValueError: a rendering has values that are not finite.

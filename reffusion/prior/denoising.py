@@ -37,7 +37,7 @@ def denoising_error(
     """Return two mean squared errors of the denoiser for each sample: of its target, and of the clean latent, [B] each.
 
     The target is the quantity that the network was trained to predict: eps, or v = a eps - s z. Both errors are means
-    over the whole image.
+    over all latents of a sample, with the weight `outside_weight` outside the mask.
 
     PAPER leaves open: the target (the paper's prior predicts eps) and whether the loss covers the whole image or the
     mask. As in RealFill, it covers the whole image.
@@ -48,7 +48,8 @@ def denoising_error(
         text: [3, L, D], the embeddings of PROMPTS.
         timesteps: [B] long.
         noise: [B, C, h, w] standard normal, in the shape of the latents.
-        outside_weight: Weight of latents outside the mask in the means. Latents to repaint have weight 1.
+        outside_weight: Weight of latents outside the mask in the means. Latents to repaint have weight 1. With 0 the
+            errors are those in the hole.
     """
     images, masks = samples.images.to(prior.device), samples.masks.to(prior.device)
     timesteps, noise = timesteps.to(prior.device), noise.to(prior.device)
@@ -67,7 +68,7 @@ def denoising_error(
 
 
 def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Batch:
-    """Return two fixed samples of the first reference, the whole view and a crop, with its hole as mask.
+    """Return two fixed samples of the first reference, first the whole view and then a crop, with its hole as mask.
 
     These samples measure the error of the prior. If the reference has no hole, the mask covers everything.
 
@@ -85,7 +86,10 @@ def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Bat
 
 
 def backward_one_sample(prior: Prior, references: Sequence[Picture], seed: int) -> None:
-    """Compute the loss and the gradient of one sample; `memory.fit_to_memory` measures the memory that this takes."""
+    """Compute the loss of one sample, and add its gradient to the `.grad` of the prior's trained parameters.
+
+    `memory.fit_to_memory` measures the memory that this takes.
+    """
     sample = Batch(*(tensor[:1] for tensor in held_out_samples(references, prior.native_size, seed)))
     noise = torch.zeros(1, *latent_shape(prior, prior.native_size))
     text = diffusion.embed_text(prior, list(PROMPTS))

@@ -155,7 +155,10 @@ def training_target(prior: Prior, latents: Tensor, noise: Tensor, t: Tensor) -> 
 
 
 def predict(prior: Prior, noisy: Tensor, t: Tensor, condition: Tensor, text: Tensor) -> tuple[Tensor, Tensor]:
-    """Return eps and z_0 as predicted from the noisy latents z_t, float32 [B, C, h, w] each."""
+    """Return eps and z_0 as predicted from the noisy latents z_t, float32 [B, C, h, w] each, without guidance.
+
+    The arguments are those of `raw_prediction`.
+    """
     output, a = raw_prediction(prior, noisy, t, condition, text), alpha_bar(prior, t)
     if prior.prediction_type == "epsilon":
         return output, (noisy - (1 - a).sqrt() * output) / a.sqrt()

@@ -12,11 +12,11 @@ JACOBI_STEPS = 4
 
 @torch.no_grad()
 def harmonic_extension(images: Tensor, hidden: Tensor) -> Tensor:
-    """Return images whose holes are filled by the harmonic extension of the known pixels.
+    """Return images whose holes are filled by approximately the harmonic extension of the known pixels.
 
-    The method is cascadic multigrid: grids go from one cell to the full size. Cells with known pixels have the mean of
-    these pixels. All other cells start from the coarser grid and take `JACOBI_STEPS` iterations, with Neumann
-    conditions at the borders of the image.
+    Known pixels are unchanged. The method is cascadic multigrid: grids go from one cell to the full size. Cells with
+    known pixels have the mean of these pixels. All other cells start from the coarser grid and take `JACOBI_STEPS`
+    iterations, with Neumann conditions at the borders of the image.
 
     Args:
         images: [B, C, H, W]. Values in the hole are ignored and need not be finite.

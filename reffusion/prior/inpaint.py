@@ -103,7 +103,7 @@ def paint(
     start: float,
     guidance: float,
 ) -> Tensor:
-    """Paint candidates for the pixels of a hole. All other pixels are unchanged.
+    """Return copies of a view, each with another candidate painted into its hole. All other pixels are unchanged.
 
     First the whole view is painted at the prior's native size from pure noise. Each finer level (`level_sizes`) starts
     from the enlarged result of the coarser level, and is repainted window by window from the noise level `start`. A
@@ -120,7 +120,7 @@ def paint(
         guidance: The paper's a, the strength of classifier-free guidance.
 
     Returns:
-        [len(seeds), 3, H, W] in [-1, 1].
+        [len(seeds), 3, H, W] in [-1, 1], in the order of the seeds, on the prior's device.
     """
     size, count, device = prior.native_size, len(seeds), prior.device
     height, width = hole.shape
@@ -233,6 +233,8 @@ def repaint(
 
 def seam_score(candidates: Tensor, hole: Tensor) -> Tensor:
     """Return [B], the mean absolute colour step across the boundary of the hole; a low value means no visible seam.
+
+    The mean is over channels and over all pairs of neighbouring pixels of which one is in the hole.
 
     PAPER leaves open: how the reference is chosen (the paper: by eye). Here by default the candidate with the lowest
     value is chosen.

@@ -132,7 +132,7 @@ def load_state(prior: Prior, state: dict[str, Tensor]) -> None:
 
 
 def set_dropout(prior: Prior, active: bool) -> None:
-    """Switch UNet and text encoder to training mode, with LoRA dropout, or to evaluation mode."""
+    """Switch UNet and text encoder to training mode, with LoRA dropout (True), or to evaluation mode (False)."""
     for part in (prior.unet, prior.text_encoder):
         part.train(active)
 
@@ -189,7 +189,7 @@ def _adapter_config(part: nn.Module) -> dict[str, Any]:
 
 
 def merge(prior: Prior, folder: Path) -> Prior:
-    """Return the prior with the LoRA in `folder`. The networks of the given prior are changed.
+    """Return the prior with the LoRA in `folder`. It shares the given prior's networks, which are changed in place.
 
     The LoRA is merged into the weights of the UNet. The text encoder keeps separate LoRA layers.
 

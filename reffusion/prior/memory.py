@@ -94,12 +94,15 @@ def fit_to_memory(
 ) -> Prior:
     """Return the prior with the number of samples per pass set to the number that fits into the budget.
 
+    The memory of one sample is measured by running the networks.
+
     Args:
         prior: The diffusion prior.
         budget_gb: The budget in GB. With 0 the prior is returned unchanged.
         param: Name of the parameter that sets the budget.
-        backward: Computes the loss and the gradient of one sample, whose memory determines `rows_with_grad`. The
-            gradients in the networks are removed afterwards. None: `rows_with_grad` is not set.
+        backward: Function of the prior that computes the loss and the gradient of one sample, whose memory determines
+            `rows_with_grad`. The gradients in the networks are removed afterwards. None: `rows_with_grad` keeps its
+            value.
 
     Raises:
         ValueError: As `rows_within`.

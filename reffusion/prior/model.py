@@ -244,12 +244,15 @@ def make_prior(
 
 
 def drop_text_encoders(prior: Prior) -> Prior:
-    """Return the prior without text encoders, which frees their memory once all prompts are embedded."""
+    """Return a new Prior without text encoders, for use once all prompts are embedded.
+
+    The given prior keeps its text encoders; their memory is freed when nothing refers to them any more.
+    """
     return replace(prior, text_encoder=None, text_encoder_2=None)
 
 
 def enable_checkpointing(prior: Prior) -> Prior:
-    """Enable gradient checkpointing in UNet and VAE, and return the same prior.
+    """Enable gradient checkpointing in UNet and VAE, in place, and return the same prior.
 
     With checkpointing the activations of each block are recomputed in the backward pass.
     """

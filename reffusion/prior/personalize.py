@@ -61,7 +61,7 @@ def personalize(
         references: The pictures to learn, see `draw_samples`.
         settings: Parameters of the stage `personalize`.
         folder: Receives checkpoints and trace.jsonl with the errors of `validation.measure_errors`. The time of these
-            measurements is not counted.
+            measurements is not counted in "seconds" of the trace.
         photographs: Photographs in which errors are measured, see `validation.make_held_out`. The prior is not trained
             on them.
 
@@ -126,7 +126,9 @@ def train_step(
     step: int,
     threads: Threads | None = None,
 ) -> float:
-    """Take one optimiser step, and return the mean loss. Random draws depend only on the seed and on `step`.
+    """Take one optimiser step, and return the mean loss of the batch before it.
+
+    Random draws depend only on the seed and on `step`.
 
     Args:
         prior: The prior with LoRA layers attached.

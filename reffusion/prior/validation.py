@@ -40,7 +40,7 @@ class HeldOut:
 
 
 def choose_photos(names: Sequence[str], references: Sequence[str]) -> list[str]:
-    """Return the names of up to `PHOTOS` views, evenly spread over `names`, that are no references."""
+    """Return up to `PHOTOS` of the names that are no references, taken at equal steps from the first one on."""
     others = [name for name in names if name not in references]
     return others[:: max(1, len(others) // PHOTOS)][:PHOTOS]
 
@@ -53,7 +53,8 @@ def make_held_out(
     Args:
         references: The references, of which the first is used.
         photographs: Other views, [3, H, W] in [-1, 1], each with the object's mask, bool [H, W]. The hole of the
-            reference is placed in each photograph, shifted to where it overlaps least with the object.
+            reference is placed in each photograph, shifted to where it overlaps least with the object. A photograph in
+            which the object covers all of the hole even there is left out.
         size: Side of a sample in pixels.
         seed: Determines the crop of the reference.
     """
@@ -75,10 +76,14 @@ def make_held_out(
 def measure_errors(
     prior: Prior, held: HeldOut, seed: int, map_parts: Callable[..., Iterable] = map
 ) -> dict[str, float]:
-    """Return the errors listed in docs/development.md#traces, by their key.
+    """Return the errors for the trace of personalization, by their key.
 
-    The noise is fixed, so the errors are comparable during training. With a small model this takes about as long as one
-    training step.
+    "target_mse" and "clean_latent_mse" are the two errors of `denoising_error` in the hole of the whole reference,
+    "crop_latent_mse" is the error of the clean latent in the hole of its crop; each is a mean over `NOISE_LEVELS`.
+    "hole_psnr" and, if there are photographs, "photo_psnr" are in dB, for one denoising step from pure noise: in the
+    hole of the reference, and of the mean over photographs of the squared error in their holes. LoRA's dropout is
+    switched off and stays off. The noise is fixed, so the errors are comparable during training. With a small model
+    this takes about as long as one training step.
 
     Args:
         prior: The prior with LoRA layers attached.

@@ -44,7 +44,11 @@ def windows_around(mask: Tensor, size: int, count: int, generator: torch.Generat
 
 
 def enlarge_to_fit(image: Tensor, size: int) -> Tensor:
-    """Return an image [C, H, W], enlarged bilinearly if a window of `size` pixels does not fit into it."""
+    """Return an image [C, H, W], enlarged bilinearly if a window of `size` pixels does not fit into it.
+
+    The shorter side is then `size`, and the proportions are kept up to rounding. If the window fits, `image` itself is
+    returned.
+    """
     height, width = image.shape[-2:]
     factor = size / min(height, width)
     if factor <= 1:
@@ -55,6 +59,8 @@ def enlarge_to_fit(image: Tensor, size: int) -> Tensor:
 
 def two_scales(image: Tensor, windows: list[tuple[int, int]], size: int) -> Tensor:
     """Return an image at two scales: the whole view resized to a square, and patches at full resolution (section 4.2).
+
+    The proportions of the whole view are not kept.
 
     PAPER leaves open: whether the bilinear reduction is antialiased. It is, so that each rendered pixel receives a part
     of the global gradient; plain bilinear sampling of a large view would skip most pixels.

@@ -35,19 +35,21 @@ def adopt_references(files: Sequence[ReferenceFile], space: Workspace) -> tuple[
 
     A reference is used inside the invent mask I of its view (the pixels to be invented). In a clean view, whose
     photograph shows the scene without the object, it is used inside the consistent mask C instead (the pixels where the
-    object's Gaussians would be).
+    object's Gaussians would be), and is never dropped, because it still teaches the prior.
 
     Args:
         files: the references that come with the scene.
         space: results of earlier stages.
 
     Returns:
-        The references, and view name -> a description of how well the reference fits its photograph.
+        The references that are left, see `adopt_reference`; and for these, view name -> a description of how well the
+        reference fits its photograph.
 
     Raises:
-        BadInput: a reference does not show its view, and scene.yaml does not say that it is trusted.
-        ValueError: no reference is left, a reference covers too little of the hole, or two references contradict each
-            other.
+        BadInput: a reference does not show its view, and scene.yaml does not say that it is trusted; or a file cannot
+            be used.
+        ValueError: no reference is left, a reference covers too little of the hole, two references contradict each
+            other, or a depth map does not fit the scene.
     """
     references, fits = [], {}
     for file in files:
@@ -67,8 +69,8 @@ def adopt_references(files: Sequence[ReferenceFile], space: Workspace) -> tuple[
 def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tuple[Reference, str]:
     """Align one reference with its photograph.
 
-    A picture that equals the photograph outside the object is used as it is. Of any other picture only the hole, the
-    object's shadow and a blended rim are pasted into the photograph.
+    A picture that equals the photograph outside the object (`Registration.is_identical`) is used as it is. Of any other
+    picture only the hole, the object's shadow and a blended rim are pasted into the photograph.
 
     Args:
         file: the reference's files.
@@ -76,10 +78,13 @@ def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tu
         space: results of earlier stages.
 
     Returns:
-        The reference in the scene's common exposure, and a description of how well it fits its photograph.
+        The reference in the scene's common exposure, and a description of how well it fits its photograph. The
+        reference's mask holds those pixels of `masks.invent` that the picture covers and that are in `masks.consistent`
+        or differ from the photograph. The depth, if any, is multiplied by the scale of the normalised frame.
 
     Raises:
-        BadInput: the picture does not show its view, and scene.yaml does not say that it is trusted.
+        BadInput: the picture does not show its view, or shows another view better, and scene.yaml does not say that it
+            is trusted; or a file cannot be used.
         ValueError: the picture covers less than `LEAST_HOLE_SHARE` of the hole.
     """
     lenses, upright = load_lenses(space.poses)
@@ -175,7 +180,7 @@ def load_photo(space: Workspace, name: str) -> np.ndarray:
 
 
 def object_pixels(masks: MaskSet) -> np.ndarray:
-    """Return bool [H, W], the pixels of a view that may show the object."""
+    """Return bool [H, W], the pixels of a view that may show the object or that are to be invented."""
     return masks.raw | masks.consistent | masks.invent
 
 

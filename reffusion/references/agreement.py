@@ -39,17 +39,22 @@ CONTRADICTION = 0.04
 def refine_hole_depth(
     holes: Mapping[str, Hole], references: Sequence[Reference], remaining: Gaussians, hidden: Mapping[str, np.ndarray]
 ) -> dict[str, Hole]:
-    """Replace the depth of holes by the depth maps of their references, and drop holes whose depth is unknown.
+    """Return those holes that have a reference and a known depth, with the depth that the references tell.
 
-    Depth is unknown where a reference without a depth map draws mostly outside the object's pixels. It inserts an
-    object there, which does not lie at the depth of the surroundings. A hole is also dropped if its depth map cannot
-    be aligned, because too little depth is known.
+    If a reference has a depth map, this map, aligned with the rendered depth around the hole, replaces the whole depth
+    of the hole. Otherwise the depth stays as given. A hole is left out if its depth map cannot be aligned, because too
+    little depth is known or the map is constant. A hole is also left out if its reference has no depth map and draws
+    mostly outside the object's pixels. Such a reference inserts an object, which does not lie at the depth of the
+    surroundings.
 
     Args:
         holes: view name -> its hole (`view_ranking.find_holes`).
         references: the completed views.
         remaining: the Gaussians of the scene without the object.
         hidden: view name -> bool [H, W], the object's pixels.
+
+    Raises:
+        ValueError: a depth map does not fit the scene.
     """
     found = {}
     for each in (each for each in references if each.camera.name in holes):
@@ -81,7 +86,8 @@ def _align_depth(hole: Hole, reference: Reference, remaining: Gaussians, hidden:
 def find_contradictions(references: Sequence[Reference], holes: Mapping[str, Hole]) -> list[tuple[str, str, float]]:
     """Return the pairs of views whose references contradict each other, with their `color_difference`.
 
-    Two references contradict each other if the difference exceeds `CONTRADICTION`. The largest difference comes first.
+    An entry is (first view, second view, difference). Two references contradict each other if the difference exceeds
+    `CONTRADICTION`. The largest difference comes first.
 
     Args:
         references: the completed views; those without an entry in `holes` are ignored.
@@ -100,15 +106,16 @@ def color_difference(a: Reference, b: Reference, hole_a: Hole, hole_b: Hole) -> 
     """Return the mean difference in [0, 1] between the colours of two references, where both show the same surface.
 
     At a point in both holes, the difference is how far the smoothed colour of one reference lies outside the range of
-    smoothed colours that the other shows around this point. It is averaged over all such points, and over both
-    directions of comparison.
+    smoothed colours that the other shows around this point, in the channel in which it lies furthest outside. It is
+    averaged over all such points, and over both directions of comparison.
 
     Args:
         a, b: the two references.
         hole_a, hole_b: the hole of each.
 
     Returns:
-        None if the references share fewer than `LEAST_PIXELS` pixels.
+        None if the references share fewer than `LEAST_PIXELS` pixels. A direction of comparison with fewer pixels does
+        not count.
     """
     ways = [_one_way_difference(a, b, hole_a, hole_b), _one_way_difference(b, a, hole_b, hole_a)]
     differences = [way for way in ways if way is not None]

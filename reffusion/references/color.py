@@ -44,7 +44,7 @@ def recolor(picture: np.ndarray, gain: np.ndarray, offset: np.ndarray) -> np.nda
 def paste(
     picture: np.ndarray, photo: np.ndarray, hole: np.ndarray, inside: np.ndarray, margin: float, rim: float
 ) -> np.ndarray:
-    """Paste the hole of the picture into the photograph, uint8 [H, W, 3].
+    """Return the photograph, uint8 [H, W, 3], with the hole of the picture pasted in where the picture covers it.
 
     Args:
         picture: uint8 [H, W, 3], aligned with the photograph and matched to its colours.

@@ -48,7 +48,7 @@ class ReferenceFile:
 
 
 def list_paintings(folder: Path) -> list[Path]:
-    """Return the files in the scene's folder `painted`, sorted; hidden files are left out."""
+    """Return all files in the scene's folder `painted` (pictures, depth maps, masks), sorted, but no hidden files."""
     return sorted(path for path in (Path(folder) / PAINTED).glob("[!.]*") if path.is_file())
 
 
@@ -69,9 +69,10 @@ def load_reference_files(
         The references, sorted by view name.
 
     Raises:
-        BadInput: a view is unknown, is a test view, or is neither a training nor a test view; a view has two
-            references; a file is missing; a picture has other proportions than its view; or a depth map is of an
-            unknown kind. The message names the file and the remedy.
+        BadInput: a view is unknown, or is no training view; scene.yaml names two references for a view, or `painted`
+            holds two paintings or two depth maps of a view; a file is missing; a depth map in `painted` has no
+            painting; a picture has other proportions than its view; or a depth map is of an unknown kind. The message
+            names the file and the remedy.
     """
     folder = Path(folder)
     found: dict[str, ReferenceFile] = {}

@@ -52,15 +52,17 @@ class Registration:
     Attributes:
         affine: [2, 3], the affine map from pixels of the photograph to pixels of the picture; None if the picture is
             aligned without one.
-        max_shift: px, the largest distance by which the map moves a corner of the picture.
+        max_shift: px, the largest distance by which the map moves a corner of the picture. Here and in
+            `median_displacement`, pixels are those of the full-size picture.
         gain, offset: [3] each, so that photograph = gain * picture + offset for colours in [0, 1]; 1 and 0 if the
             colours need no correction.
         point_count: number of points that were compared.
-        inlier_ratio: share in [0, 1] of the points that the aligned picture shows at the same place as the photograph;
-            NaN if there are too few points.
+        inlier_ratio: share in [0, 1] of all compared points, tracked or not, that the aligned picture shows at the same
+            place as the photograph; NaN if there are too few points.
         median_displacement: px, median of the displacements of the tracked points that remain after alignment; NaN if
             no point was tracked.
-        is_identical: True if the picture equals the photograph outside the hole, up to rounding.
+        is_identical: True if the picture fits without a map and equals the photograph outside the hole: the median
+            difference of the values there is at most `IDENTICAL`, so that single areas may differ.
     """
 
     affine: np.ndarray | None
@@ -110,7 +112,8 @@ def register(picture: np.ndarray, photo: np.ndarray, hidden: np.ndarray, working
         picture: uint8 [H, W, 3], the completed view, resized to the photograph's size.
         photo: uint8 [H, W, 3], the photograph of the view.
         hidden: bool [H, W], the object's pixels in the photograph.
-        working: px; larger pictures are reduced to this longer side before they are compared.
+        working: px; larger pictures are reduced to this longer side before they are compared. The result is for the
+            full size in any case.
     """
     known = ~_dilate(hidden, MARGIN)
     untouched = known.any() and np.median(np.abs(picture.astype(np.int16) - photo)[known]) <= IDENTICAL
@@ -134,11 +137,13 @@ def find_better_view(
     Args:
         picture: uint8 [H, W, 3].
         found: the registration of the picture with the photograph of its own view.
-        others: for each other view its name, its photograph, and the object's pixels in the photograph, bool [H, W].
-            Likely views should come first, because the search ends at the first view that surely fits.
+        others: for each other view its name, its photograph (of any size), and the object's pixels in the photograph,
+            bool [H, W]. Likely views should come first, because the search ends at the first better view that surely
+            fits.
 
     Returns:
-        The name of the best such view and its inlier ratio; None if no other view is better.
+        The name of the best such view and its inlier ratio; None if no other view is better. A view is better if its
+        inlier ratio is clearly larger, or about the same with a much smaller shift.
     """
     best: tuple[str, float] | None = None
     own = 0.0 if np.isnan(found.inlier_ratio) else found.inlier_ratio
@@ -165,7 +170,8 @@ def warp(picture: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray
         moved: [2, 3], the affine map from pixels of the photograph to pixels of the picture.
 
     Returns:
-        The resampled picture, uint8 [H, W, 3], and bool [H, W], the pixels that the map takes into the picture.
+        The resampled picture, uint8 [H, W, 3], and bool [H, W], the pixels that the map takes into the picture. At
+        other pixels the border of the picture is repeated.
     """
     height, width = picture.shape[:2]
     linear, shift = moved[:, :2], moved[:, 2] + (moved[:, :2] - np.eye(2)) @ (0.5, 0.5)

@@ -70,9 +70,9 @@ def estimate_affine(source: np.ndarray, target: np.ndarray, inlier: float) -> np
 
 
 def low_pass(grey: np.ndarray) -> np.ndarray:
-    """Return the picture, float32 [H, W], blurred so that details finer than a quarter of its resolution vanish.
+    """Return the picture, float32 [H, W], blurred by a Gaussian.
 
-    The size of the picture stays the same.
+    Its standard deviation is `LOW_PASS` times the longer side of the picture, at least `LEAST_LOW_PASS` px.
     """
     sigma = max(LOW_PASS * max(grey.shape), LEAST_LOW_PASS)
     return cv2.GaussianBlur(grey.astype(np.float32), (0, 0), sigma)

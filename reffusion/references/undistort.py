@@ -27,7 +27,8 @@ def undistort_reference(
             the picture needs no alignment.
 
     Returns:
-        The picture, uint8 [H, W, 3], and bool [H, W], the pixels that the file covers.
+        The picture, uint8 [H, W, 3] of the size of `lens`, and bool [H, W], the pixels that the file covers (without
+        `affine` all).
     """
     image, size = load_image(given.path, upright), (lens.width, lens.height)
     pinhole, where = undistortion_map(lens)
@@ -51,7 +52,8 @@ def undistort_reference_depth(
         given, lens, upright, affine: as of `undistort_reference`.
 
     Returns:
-        float32 [H, W], NaN where unknown; None if the reference has no depth map.
+        float32 [H, W] in the unit of the file, NaN where unknown and outside the file; None if the reference has no
+        depth map.
 
     Raises:
         BadInput: the file is no depth map, or has other proportions than the picture. The message names the file.

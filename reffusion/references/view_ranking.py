@@ -60,6 +60,8 @@ def find_holes(
 ) -> dict[str, Hole]:
     """Return view name -> its hole at a reduced size, for the views that have pixels to be invented.
 
+    Views in which no depth around the hole is known are left out, and so are holes that vanish at the reduced size.
+
     Args:
         remaining: the Gaussians of the scene without the object.
         cameras: the views.
@@ -87,9 +89,9 @@ def find_holes(
 def rank_views(view_holes: Mapping[str, Hole], chosen: Sequence[str], most: int) -> list[RankedView]:
     """Rank views greedily by how many pixels to be invented they cover that the views before them do not cover.
 
-    The views in `chosen` come first, in the given order. Up to `most` other views follow. Of these, views whose hole
-    does not touch the border of the picture precede the rest, because the border cuts off a part of the hole. Other
-    views that newly cover less than `LEAST_GAIN` are left out.
+    The views in `chosen` that have a hole come first, in the given order. Up to `most` other views follow. Of these,
+    views whose hole does not touch the border of the picture precede the rest, because the border cuts off a part of
+    the hole. Other views that newly cover less than `LEAST_GAIN` are left out.
 
     Args:
         view_holes: view name -> its hole.

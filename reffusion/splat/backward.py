@@ -66,7 +66,8 @@ def blend_backward(footprints, features, bins, used, images, transmittance, grad
 
     Returns:
         records [I, columns] float32, ordered by Gaussian, whose first GRAD_FEATURES + C columns are as in `layout`; and
-        written [I] bool, True for the valid records. A pair that no pixel blends writes no record.
+        written [I] bool, True for the valid records. A pair whose footprint reaches no unfinished pixel writes no
+        record, and its row of `records` is undefined.
     """
     columns = record_columns(features.shape[1])
     records, written = empty_aligned(len(bins.entries), columns), np.zeros(len(bins.entries), np.bool_)
@@ -203,8 +204,8 @@ def _rows_backward(member, rows, left, top, footprints, features, state, stride,
         sums: output, gradients of the features, summed per lane.
 
     Returns:
-        Whether any pixel blends the footprint, and a tuple of vectors: the first ten columns of its record, summed per
-        lane.
+        Whether the footprint reaches any unfinished pixel, and a tuple of vectors: the first ten columns of its record,
+        summed per lane.
     """
     zero = splat(0.0)
     base, first_row, end_row = member * FOOTPRINT, rows & 255, rows >> 8

@@ -77,8 +77,8 @@ def blend(footprints, features, background, bins, width, height):
 
     Returns:
         color [H, W, 3], depth [H, W], alpha [H, W], features [H, W, C] and transmittance [H, W], all float32; and used
-        [tiles] int64, the number of entries of each tile's list that were processed before all its pixels were
-        finished.
+        [tiles] int64, the number of entries of each tile's list that were processed: all, or fewer if all pixels of
+        the tile were finished. `depth` is divided by alpha, and `color` includes the background.
     """
     color, blended = empty_aligned(height, width, 3), empty_aligned(height, width, features.shape[1])
     depth = empty_aligned(height, width)

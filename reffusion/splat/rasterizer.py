@@ -26,12 +26,13 @@ def render(
     sh_degree: int | None = None,
     probe: Tensor | None = None,
 ) -> Rendering:
-    """Render Gaussians: colour, depth, alpha and blended features in one pass, all differentiable.
+    """Render Gaussians in one pass: colour, depth (divided by alpha), alpha and blended features, all differentiable.
 
     Args:
         gaussians: N Gaussians; N may be 0. Culled Gaussians (docs/method.md#splatting) get zero gradients.
         camera: the view, of size 1 x 1 or larger.
-        features: [N, C] values that are blended like colours, over a background of zeros; differentiable. None: none.
+        features: [N, C] values that are blended like colours, over a background of zeros, and not divided by alpha;
+            differentiable. None: none.
         background: [3] colour behind everything, black if None; differentiable.
         impl: the implementation. "auto" selects "cuda" for tensors on a GPU, else "cpu". "torch" supports any dtype,
             such as float64, and any device.
@@ -82,6 +83,8 @@ def accumulate(
     gaussians: Gaussians, camera: Camera, values: Tensor, *, impl: Implementation = "auto", count: bool = False
 ) -> Tensor:
     """Sum blending weight x value over the pixels of a view, for each Gaussian. Not differentiable.
+
+    The blending weight of a Gaussian at a pixel is its alpha times the transmittance in front of it.
 
     With 1 - mask and mask as two channels of `values`, the sums are the votes of the paper's mask lifting.
 

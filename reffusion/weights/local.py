@@ -31,10 +31,11 @@ class Need:
     """Weights that a stage needs, and whether they can be used on this machine.
 
     Attributes:
-        name: a hub id, a folder, or the name of a file.
+        name: a hub id, a path, or a text for messages such as `LPIPS_NAME`. It tells `fetch` what to download.
         problem: why the weights cannot be used, in most cases with a remedy; None if they can be used.
         bytes: size of the weights, or of their download; None if unknown.
-        fetched: True if `make weights` can download the weights; False for weights that a user names by a path.
+        fetched: True if `make weights` can download the weights when there is a problem. It has no meaning if there is
+            none.
         optional: True if the stage works without the weights and reports what it leaves out.
         half: True if weights in half precision are sufficient.
         file: the only file of the hub model that is needed; None for all files that diffusers or transformers reads.
@@ -51,7 +52,7 @@ class Need:
     folders: tuple[str, ...] = ()
 
     def fetch(self) -> None:
-        """Download the weights and check them.
+        """Download the weights and check them. May be called only if `fetched` is True and there is a problem.
 
         Raises:
             ValueError: the download failed, or the weights are not the expected ones. The message has one line.
@@ -173,7 +174,8 @@ def abbreviate_home(path: Path) -> str:
 
 
 def hub_cache() -> Path:
-    """Return the folder of the hub's cache: HF_HUB_CACHE, else `hub` below HF_HOME, else ~/.cache/huggingface/hub."""
+    """Return the folder of the hub's cache: HF_HUB_CACHE, else `hub` below HF_HOME, else huggingface/hub below
+    the user's cache folder (XDG_CACHE_HOME, else ~/.cache)."""
     home = Path(os.environ.get("HF_HOME", _cache() / "huggingface"))
     return Path(os.environ.get("HF_HUB_CACHE", home / "hub")).expanduser()
 
@@ -330,7 +332,10 @@ def _check_whole(path: Path) -> None:
 
 
 def find_mismatch(configs: Mapping[str, Mapping[str, Any]]) -> str | None:
-    """Return the reason why the parts of an inpainting model do not fit together; None if they fit.
+    """Return the reason why a diffusion model cannot be used; None if it can.
+
+    Reasons are that it is no inpainting model, that its prediction type is not supported, or that its parts do not fit
+    together.
 
     Args:
         configs: part -> configuration, for "unet", "vae", "text_encoder", "scheduler", and for "text_encoder_2" if the

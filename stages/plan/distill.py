@@ -30,12 +30,17 @@ def lacks(params: Params) -> list[str]:
 
 
 def cost(params: Params, gpu: str) -> Mapping[str, object] | None:
-    """Estimate seconds and GB of GPU memory of the stage; None if it does not run on a GPU or the GPU is unknown.
+    """Estimate the stage's time and memory on a GPU.
 
     Args:
         gpu: name of the GPU; "" for this machine's.
 
+    Returns:
+        "gpu": its name in the table of GPUs; "seconds"; "gb": GPU memory; "basis": the assumptions, as text. None if
+        the stage does not run on CUDA or cannot be estimated, or if `gpu` is "" and this machine has no GPU of the
+        table.
+
     Raises:
-        ValueError: the name is not in the table of GPUs.
+        ValueError: `gpu` is named and not in the table.
     """
     return estimate.format_estimate(gpu, params.device, estimate.distill(params))

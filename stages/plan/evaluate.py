@@ -18,12 +18,18 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """Return what the result depends on besides the parameters: the 2D inpainter, and the hash of its file."""
+    """Return facts about this machine on which the result depends: "inpainter" -> kind and hash of the file.
+
+    The dict is empty if nothing is inpainted in 2D, or by an inpainter without a file that the parameters name.
+    """
     return painters.inpainter_facts(params.inpainter) if params.inpaint else {}
 
 
 def unavailable(params: Params) -> list[str]:
-    """Return the scores that cannot be computed on this machine. The stage runs again once they can be computed."""
+    """Return the names of scores that cannot be computed on this machine, e.g. because weights are missing.
+
+    The stage runs again once they can be computed.
+    """
     return ["LPIPS"] if local.lpips_need().problem else []
 
 

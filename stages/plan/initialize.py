@@ -23,17 +23,20 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
 
 
 def optional_weights(params: Params) -> list[local.Need]:
-    """Return the weights of a depth network that the stage could use, if the parameters name none."""
+    """Return the weights of a depth network that the stage could use; an empty list if the parameters name one."""
     return [] if params.depth.model else [local.model_need(DEPTH_ANYTHING, "float32")]
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """Return what the result depends on besides the parameters: the 2D inpainter, and the hash of its file."""
+    """Return facts about this machine on which the result depends: "inpainter" -> kind and hash of the file.
+
+    The dict is empty if no extra views are completed, or by an inpainter without a file that the parameters name.
+    """
     return painters.inpainter_facts(params.inpainter) if params.extra_views else {}
 
 
 def preview(params: Params, **_: Path | None) -> list[str]:
-    """Describe what the stage will do, a sentence each, as far as it is known before it runs."""
+    """Say how many extra views the stage may complete, and how; an empty list if it completes none."""
     if not (params.extra_views and params.start == "reference"):
         return []
     kind = painters.resolve_inpainter(params.inpainter).kind

@@ -19,7 +19,10 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """Return what the result depends on besides the parameters: the 2D inpainter, and the hash of its file."""
+    """Return facts about this machine on which the result depends: "inpainter" -> kind and hash of the file.
+
+    The dict is empty if the parameters name an inpainter without a file, such as the diffusion prior.
+    """
     return painters.inpainter_facts(params.inpainter)
 
 

@@ -11,7 +11,7 @@ __all__ = ["Params", "lacks", "needed_weights", "optional_weights", "preview"]
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """Return the segmentation network that refines masks, if the parameters ask for it.
+    """Return the segmentation network that refines masks, if the parameters ask for it; else an empty list.
 
     Args:
         brings: the keys of scene.yaml and the names of the scene's folders; not used here.
@@ -20,17 +20,24 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
 
 
 def optional_weights(params: Params) -> list[local.Need]:
-    """Return the segmentation network that makes masks from clicks; without it the stage still works."""
+    """Return the segmentation network that makes masks from clicks; without it the stage still works.
+
+    The list is empty if the parameters name another network, or if the network is among `needed_weights`.
+    """
     return [local.segmenter_need()] if params.segmenter == AUTO and not params.refine else []
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """Return what masks from clicks and refined masks depend on besides the parameters: the network and its files."""
+    """Return facts about this machine on which masks from clicks and refined masks depend.
+
+    They are "segmenter" -> hash of the network's files, or a name if there are none. The dict is empty without such
+    masks.
+    """
     return segmenter_facts(params.segmenter) if params.clicks or params.refine else {}
 
 
 def preview(params: Params, **_: Path | None) -> list[str]:
-    """Describe what the stage will do, a sentence each, as far as it is known before it runs."""
+    """Say if clicks will be segmented without a network; else return an empty list."""
     if not params.clicks or segmenter_facts(params.segmenter)["segmenter"] != NONE:
         return []
     return ["clicks are segmented by colours and surfaces; with the network of `make weights`, fewer clicks suffice"]

@@ -22,7 +22,9 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
     """Return the sorted files of the scene that the stage reads.
 
     They are the photographs and depth maps of the capture, the Gaussians that the scene brings, and all files that are
-    neither pictures nor depth maps. So the stage does not run again when masks or references are added.
+    neither pictures nor depth maps, except scene.yaml, the file of clicks and the folder of painted references. So the
+    stage does not run again when masks, clicks or references are added. If the scene cannot be read, all files but
+    scene.yaml and the clicks are returned.
 
     Args:
         scene: folder of the scene.
@@ -43,12 +45,15 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
-    """Return the names of training, test, clean and cameras-only views.
+    """Return {"views": [names of training, test, clean and cameras-only views]}; {} for a scene without photographs.
 
     The stage depends on these roles, which may depend on the names of masks, while it does not read the masks.
 
     Args:
         scene: folder of the scene.
+
+    Raises:
+        ValueError: the scene cannot be read.
     """
     if is_gaussians_only(params, scene):
         return {}

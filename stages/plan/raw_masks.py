@@ -24,10 +24,13 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
-    """Return which file is the mask of which view, and the region that the scene names.
+    """Return facts on which the stage depends: "masks", the file of each view's mask, and "region", if there is one.
 
     Args:
         scene: folder of the scene.
+
+    Raises:
+        ValueError: the scene cannot be read.
     """
     region: dict[str, object] = {}
     if params.region:

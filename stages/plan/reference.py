@@ -32,12 +32,15 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
 
 
 def optional_weights(params: Params) -> list[local.Need]:
-    """Return the weights of the inpainters from which `inpainter: auto` selects."""
+    """Return the weights of all inpainters from which `inpainter: auto` selects, whatever the parameters are."""
     return [need for kind in PAINTERS for need in painters.weights_needs(Inpainter(kind=kind))]
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """Return what the result depends on besides the parameters: the 2D inpainter, and the hash of its file."""
+    """Return facts about this machine on which the result depends: "inpainter" -> kind and hash of the file.
+
+    The dict is empty if the parameters name an inpainter without a file, such as the diffusion prior.
+    """
     return painters.inpainter_facts(params.inpainter)
 
 
@@ -87,12 +90,17 @@ def lacks(params: Params) -> list[str]:
 
 
 def cost(params: Params, gpu: str) -> Mapping[str, object] | None:
-    """Estimate seconds and GB of GPU memory of the stage; None if it does not run on a GPU or the GPU is unknown.
+    """Estimate the stage's time and memory on a GPU.
 
     Args:
         gpu: name of the GPU; "" for this machine's.
 
+    Returns:
+        "gpu": its name in the table of GPUs; "seconds"; "gb": GPU memory; "basis": the assumptions, as text. None if
+        the stage does not run on CUDA or cannot be estimated, or if `gpu` is "" and this machine has no GPU of the
+        table.
+
     Raises:
-        ValueError: the name is not in the table of GPUs.
+        ValueError: `gpu` is named and not in the table.
     """
     return estimate.format_estimate(gpu, params.device, estimate.reference(params))

@@ -69,8 +69,9 @@ def check_poses(cameras: Sequence[Camera], points: np.ndarray, image_of: Callabl
 
     Each photograph is compared with those of its nearest views at the points that both see. The worst view is set
     aside, and the views that were compared with it are compared again without it. This is repeated until the remaining
-    views agree, or half of the views are set aside. In the first case each view that was set aside is compared with the
-    remaining views once more, and taken back if it agrees with them.
+    views agree, or half of the judged views are set aside. In the first case each view that was set aside is compared
+    with the remaining views once more, and taken back if it agrees with them. The views that are still set aside
+    contradict their poses.
 
     Args:
         cameras: cameras of undistorted views in the normalised frame.
@@ -234,7 +235,8 @@ class Verdict:
     Attributes:
         outliers: names of the training views to leave out of the scene, sorted.
         suspects: names of the views that contradict their poses but stay in the scene. These are test views and clean
-            views; and training views too, if too few would be left, or if at least half of the views contradict.
+            views; and training views too, if too few would be left, or if at least half of the judged views contradict.
+            Views that `keep` of scene.yaml names are neither outliers nor suspects.
         sentences: messages to the user. They suggest lines of scene.yaml that change the decision.
     """
 
@@ -257,7 +259,7 @@ def judge(check: PoseCheck, scene: Scene, keep: Collection[str] = (), exclude: S
     """Decide which of the contradicting views are left out of the scene, and write the messages to the user.
 
     Args:
-        keep: names of views that scene.yaml keeps in any case.
+        keep: names of views that scene.yaml keeps in any case; their contradictions are ignored.
         exclude: names of views that scene.yaml excludes already; the suggested line repeats them.
     """
     wrong = [name for name in check.contradicting if name not in keep]

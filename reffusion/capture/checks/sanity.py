@@ -29,7 +29,8 @@ LEAST_SEEN = 50  # points that must be visible in a view to judge it
 def find_odd_exposures(scene: Scene, image_of: Callable[[str], np.ndarray]) -> list[str]:
     """Return a warning about photographs that are much brighter or darker than the other photographs.
 
-    Brightness is compared at points that several views see.
+    Brightness is compared at points that several views see. The views are training and test views without suspects
+    (views whose photographs contradict their poses).
 
     Args:
         scene: undistorted views in the normalised frame. Its points must be sparse points or points from optical flow,

@@ -16,6 +16,8 @@ LEAST = 3  # smallest number of cameras
 def has_pictures(folder: Path, but: frozenset[str] = frozenset()) -> bool:
     """Return whether a scene folder holds photographs, in the places where a layout looks for them.
 
+    Any file with the ending of a picture counts, masks too.
+
     Args:
         but: names of files in the scene's own folder that are not photographs (references).
     """
@@ -30,8 +32,8 @@ def read(folder: Path) -> tuple[Poses, Path] | None:
     """Read the lenses and poses of a scene folder without photographs.
 
     Returns:
-        The cameras, without points, and the transforms file or COLMAP model from which they were read; None if the
-        folder has neither.
+        The cameras, without points, and the file or folder from which they were read: the first transforms file or,
+        without such files, the folder of the COLMAP model. None if the scene has neither.
 
     Raises:
         BadInput: a file is wrong, as for a capture with pictures; or there are fewer than three cameras.

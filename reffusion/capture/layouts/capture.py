@@ -111,7 +111,8 @@ def find_image_folder(folder: Path, images: str | None, usual: tuple[str, ...]) 
 
     Args:
         folder: the scene's folder.
-        images: folder of pictures that scene.yaml names, relative to the scene; None if not named.
+        images: folder of pictures that scene.yaml names, relative to the scene; it is returned unchecked. None if not
+            named.
         usual: the layout's usual folders, in order of preference.
 
     Raises:
@@ -145,10 +146,10 @@ def resize_lens(lens: Lens, picture: Path) -> Lens:
 
 
 def nearest_rigid(matrix: np.ndarray, name: str, source: Path) -> np.ndarray:
-    """Return a pose [4, 4] with its rotation part replaced by the nearest rotation.
+    """Return a pose [4, 4] with its rotation part replaced by the nearest rotation; the translation stays.
 
     Args:
-        matrix: [4, 4], a pose with rounding errors.
+        matrix: [4, 4], a pose with rounding errors, or with a uniform scale of its rotation part, which is dropped.
         name, source: the view and the file of the pose, for messages.
 
     Raises:

@@ -71,7 +71,7 @@ def read(folder: Path, images: str | None) -> Capture:
         images: folder of pictures, relative to the scene; None for the usual folders.
 
     Raises:
-        BadInput: there is no model; or as for `capture_from_model`.
+        BadInput: there is no model; the usual folders hold no pictures; or as for `capture_from_model`.
     """
     model = find_model(folder)
     if model is None:
@@ -83,9 +83,10 @@ def read(folder: Path, images: str | None) -> Capture:
 def capture_from_model(folder: Path, model: Path, image_folder: Path, layout: str, label_folder: Path) -> Capture:
     """Return the capture of a COLMAP model whose images are paired with picture files.
 
-    Pairs are found by paths (`pair_pictures`). LLFF's renamed copies (`image000.png` and so on) are paired by order,
-    with a warning, if there are as many as images in the model and none has an image's name. Images without a picture
-    and pictures without an image are left out, with a warning.
+    Pairs are found by paths (`pair_pictures`). LLFF's renamed copies (`image000.png` and so on) are paired by order if
+    there are as many as images in the model and none has an image's name. Images without a picture and pictures without
+    an image are left out, and so are the model's points if they are not in the frame of its cameras. `Capture.warnings`
+    tells all of this.
 
     Args:
         folder: the scene's folder.
@@ -200,7 +201,8 @@ def read_cameras(model: Path) -> Poses:
     """Read the lenses and poses of a model without its pictures. The result has no points.
 
     Raises:
-        BadInput: an image's camera is missing in the model.
+        BadInput: a file cannot be read; an image's camera is missing, or its camera model is not supported; or two
+            images have the same name.
     """
     source, camera_file = _files(model)
     images, _ = _images_by_name(source)

@@ -25,8 +25,11 @@ def points_from_depth(
 ) -> PointCloud:
     """Unproject a grid of pixels of up to `FRAMES` depth maps, and colour the points by the views' pictures.
 
+    Pixels whose depth is unknown or not positive give no point.
+
     Args:
-        depths: view name -> file of its depth map; depth is along the camera's axis.
+        depths: view name -> file of its depth map (camera z, not disparity), at any size. Without files there are no
+            points.
         scale: length in the scene's units of the number 1 in a depth map of integers (a picture). Depth maps of floats
             (.npy, .exr) are in the scene's units.
         pictures: view name -> picture file.

@@ -41,13 +41,14 @@ def read(folder: Path, images: str | None, longest: int, references: frozenset[P
 
     Args:
         images: folder of pictures, relative to the scene; None to choose a size of the usual folders.
-        longest: requested longer side of the pictures in pixels, see `_choose_image_folder`.
+        longest: requested longer side of the pictures in pixels. The smallest size with at least as many is chosen,
+            else the largest size.
         references: files of references (inpainted views), which are not views. They are left out if the numbers of
-            pictures and poses differ.
+            pictures and of rows in poses_bounds.npy differ.
 
     Raises:
-        BadInput: there is neither poses_bounds.npy nor a COLMAP model; the numbers of poses and pictures differ; or a
-            pose is wrong.
+        BadInput: there is neither poses_bounds.npy nor a COLMAP model; the numbers of poses and pictures differ; a pose
+            is wrong; or, with a COLMAP model, as for `capture_from_model`.
     """
     source = folder / "poses_bounds.npy"
     label_folder = _label_folder(folder, images)

@@ -36,19 +36,20 @@ class FoundMasks:
 
 
 def find_masks(folder: Path, capture: Capture, spec: str | MaskSpec | None, optional: bool) -> FoundMasks:
-    """Find the masks of a scene, and check that each mask belongs to a picture.
+    """Find the mask files of a scene, and check by their names that each belongs to a picture.
 
     If no folder is named, masks are taken from the first of these places that has some: `label` in the folder of
     pictures, the usual folders, masks beside their pictures (`A_mask.png` beside `A.png`), the files that the layout
-    names (`Capture.ignore_masks`).
+    names (`Capture.ignore_masks`), whose black pixels then mark the object. Masks of left-out pictures are dropped.
 
     Args:
         spec: the key `masks` of scene.yaml (`reffusion.params.capture`): a folder, optionally with the numbers that
             mark the object; "none" for no masks; None to search.
-        optional: True if a scene without masks is no error.
+        optional: True if it is no error that the search finds no masks. A folder that `spec` names must hold masks in
+            any case.
 
     Raises:
-        BadInput: there are no masks, or a mask is wrong; the message names the file or folder and the remedy.
+        BadInput: there are no masks, or as for `group_by_object`; the message names the file or folder and the remedy.
     """
     named = spec if isinstance(spec, MaskSpec) else MaskSpec(folder=spec)
     if named.folder is not None and named.folder.lower() == NONE:
@@ -108,7 +109,7 @@ def _mask_paths(place: Path, capture: Capture) -> list[str]:
 
 
 def group_by_object(place: Path, files: Collection[str], capture: Capture) -> dict[str, dict[str, Path]]:
-    """Return object -> view -> mask file, for the masks in a folder.
+    """Return object -> view -> mask file, for the masks in a folder. Masks of left-out pictures are dropped.
 
     Sub-folders are objects if a view has masks in several of them, or if there is only one sub-folder. All masks are of
     one object, called "", if there are no sub-folders; if each view has a mask in only one of several sub-folders; or
@@ -119,7 +120,8 @@ def group_by_object(place: Path, files: Collection[str], capture: Capture) -> di
         files: paths of the masks, relative to the folder.
 
     Raises:
-        BadInput: a mask belongs to no picture; two masks belong to one picture; or masks lie beside folders of masks.
+        BadInput: a mask belongs to no picture; two masks of one object belong to one picture; or masks lie beside
+            folders of masks.
     """
     folders = {PurePosixPath(path).parts[0] for path in files if "/" in path}
     if not folders or _are_picture_folders(folders, capture):
@@ -147,6 +149,8 @@ def _are_picture_folders(folders: Collection[str], capture: Capture) -> bool:
 
 def match_masks(place: Path, files: Collection[str], capture: Capture, strict: bool = True) -> dict[str, str]:
     """Return mask -> the view to which it belongs, or the path of a left-out picture to which it belongs.
+
+    Several masks may belong to one view.
 
     Args:
         place: the folder of the masks.

@@ -11,6 +11,8 @@ from reffusion.io.images import image_size
 def read(folder: Path, images: str | None, references: frozenset[Path] = frozenset()) -> Capture:
     """Read a scene folder that holds photographs only. Their sizes may differ, as in portrait and landscape.
 
+    Photographs in sub-folders are read only if the folder of pictures itself holds none.
+
     Args:
         images: folder of pictures, relative to the scene; None for the usual folders.
         references: files of references (inpainted views). They may lie among the photographs, but are not views.

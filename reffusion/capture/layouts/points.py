@@ -73,11 +73,10 @@ def keep_points_in_frame(
 def are_tracks_inside(points: ModelPoints, poses: Mapping[int, tuple[Lens, np.ndarray]]) -> bool:
     """Return whether at least 90% of the observations (`TRACKED`) have a point inside the observing image.
 
-    The result is True if the model has no tracks.
-
     Args:
         points: points and tracks of a COLMAP model.
-        poses: image id -> its lens and its world-to-camera pose [4, 4].
+        poses: image id -> its lens and its world-to-camera pose [4, 4]. Observations by other images are ignored. If
+            there are no observations by these images, the result is True.
     """
     inside = seen = 0
     for identity, (lens, pose) in poses.items():
@@ -93,7 +92,8 @@ def contradicts_order(
     """Return whether pictures seem to be in the wrong order: most fit another view's pose better than their own.
 
     A picture fits a pose if it shows the points' colours at their projections (`correlate_colors`). At most `VIEWS`
-    pictures, spread evenly, are tested with the poses of all views. The result is False if no picture can be tested.
+    pictures, spread evenly, are tested with the poses of all views. The result is False if no picture can be tested,
+    for example because the points are too few or all of one brightness.
 
     Args:
         pictures, lenses, poses: view k has pictures[k], lenses[k] and the world-to-camera pose poses[k], [4, 4].
@@ -119,14 +119,15 @@ def correlate_colors(
     """Correlate the brightness of points with that of a picture at the points' projections.
 
     Args:
-        grey: [H, W], brightness of the picture, at any size.
+        grey: [H, W] in [0, 255], brightness of the picture, at any size.
         lens: lens of the view, at any size.
         pose: [4, 4], world-to-camera pose of the view.
         positions: [P, 3].
         colors: uint8 [P, 3].
 
     Returns:
-        The correlation over the visible points, in [-1, 1]; NaN if there are too few points or too little contrast.
+        Pearson's correlation in [-1, 1] over those of about `POINTS` points that lie in the picture and that no clearly
+        nearer point hides; NaN if there are too few of them or too little contrast.
     """
     some = slice(None, None, max(1, len(positions) // POINTS))
     at = positions[some] @ pose[:3, :3].T + pose[:3, 3]
@@ -155,7 +156,7 @@ def _is_nearest(uv: np.ndarray, depth: np.ndarray) -> np.ndarray:
 
 
 def read_grey(path: Path) -> np.ndarray:
-    """Read a picture's brightness as float64 [h, w], reduced so that its longer side has at most `SIDE` px."""
+    """Read a picture's brightness as float64 [h, w] in [0, 255], reduced to at most `SIDE` px on its longer side."""
     return load_thumbnail(path, SIDE) @ GREY
 
 

@@ -85,10 +85,10 @@ def place_cameras(means: np.ndarray, sizes: np.ndarray, opaque: np.ndarray, dele
             needle (a long, thin splat), because no photograph shows needles.
         opaque: bool [N], True for opaque splats.
         deleted: bool [N], True for the splats that were deleted.
-        width: width of the views in pixels.
+        width: width of the views in pixels; their height is 3/4 of it.
 
     Returns:
-        Up to `MOST` cameras without points, called around_00, around_01 and so on.
+        3 to `MOST` cameras without points, called around_00, around_01 and so on.
 
     Raises:
         BadInput: fewer than three positions are found, or hardly any splats remain.

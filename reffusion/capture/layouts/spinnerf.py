@@ -29,13 +29,18 @@ PARTS = {  # file or folder of a scene -> what the scene lacks without it
 
 
 def scene_folders(data: Path) -> list[Path]:
-    """Return the folders of the published scenes in `data`; if there are none, all folders that have an `images_4`."""
+    """Return the folders of the published scenes in `data`, sorted.
+
+    If there are none, the result is all folders in `data` that have an `images_4`.
+    """
     folders = sorted(p for p in data.iterdir() if p.is_dir() and p.name[0] not in "._") if data.is_dir() else []
     return [p for p in folders if p.name in SCENES] or [p for p in folders if (p / "images_4").is_dir()]
 
 
 def summarize_scenes(data: Path) -> list[str]:
-    """Return a line for each published scene: the views it holds and the parts it lacks, or that it is not there.
+    """Return a line for each of the `scene_folders`, with the numbers of its views and the parts that it lacks.
+
+    If some of them are published scenes, a line for each missing published scene says that it is not there.
 
     Raises:
         ValueError: `data` holds no scene at all.

@@ -71,11 +71,12 @@ def read(folder: Path, images: str | None) -> Capture:
     """Read a scene folder with transforms files.
 
     The test views of Blender's files are the frames of transforms_test.json, or without that file those of
-    transforms_val.json.
+    transforms_val.json, which is otherwise not read. Frames without a picture are left out. `Capture.warnings` tells
+    both.
 
     Args:
-        images: folder of pictures, relative to the scene; None to use the paths in the frames, or else the
-            usual folders.
+        images: folder of pictures, relative to the scene. None to use the paths in the frames, or the usual folders if
+            no frame's path leads to a picture.
 
     Raises:
         BadInput: a file or frame is wrong; no frame has a picture; or two frames have the same picture.
@@ -120,10 +121,11 @@ def read(folder: Path, images: str | None) -> Capture:
 
 
 def read_cameras(folder: Path) -> Poses:
-    """Read the lenses and poses of a capture without its pictures. The result has no points.
+    """Read the lenses and poses of all frames of all transforms files, without pictures. The result has no points.
 
     Raises:
-        BadInput: a frame has no w and h, which tell the size of its picture; or two frames have the same file_path.
+        BadInput: a file or frame is wrong; a frame has no w and h, which tell the size of its picture; or two frames
+            have the same file_path.
     """
     frames = [each for split, source in split_files(folder).items() for each in _load_frames(source, split)]
     listed = {normalize_path(each.file_path): each for each in frames}

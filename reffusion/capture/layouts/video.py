@@ -65,8 +65,9 @@ class FrameStats:
 def extract_frames(video: Path, folder: Path, content: str) -> str:
     """Select the sharpest frames of a video and write them as pictures.
 
-    Writes the frames to images/ in `folder`, the measurements of all frames to frames.csv, and at the end frames.json,
-    a summary. The same file gives the same frames. A rotation that the video file declares is applied.
+    Writes the frames as frame_<number>.jpg to images/ in `folder`, the measurements of all measured frames to
+    frames.csv, and at the end frames.json, a summary. An existing images/ is replaced. The same file gives the same
+    frames. A rotation that the video file declares is applied.
 
     Args:
         content: a hash of the video file, which is written to frames.json.
@@ -106,7 +107,10 @@ def extract_frames(video: Path, folder: Path, content: str) -> str:
 
 
 def measure_frames(video: Path) -> list[FrameStats]:
-    """Return the sharpness and distance of each frame, or of every n-th frame if there are more than `LOOKED_AT`."""
+    """Return the sharpness and distance of each frame, or of every n-th frame if there are more than `LOOKED_AT`.
+
+    Frames that cannot be decoded are left out.
+    """
     count = _count(video)
     every, way, seen = max(1, -(-count // LOOKED_AT)), _MotionTracker(), []
     frames = _frames(video, lambda number: number % every == 0)

@@ -23,8 +23,9 @@ from reffusion.types import Gaussians, Rendering
 def build(inputs: TermInputs, settings: Params) -> Term | None:
     """Build the adversarial term with its critic. Return None if its weight is 0 or no view has a hole.
 
-    In each step the real patches come from one reference and the fake ones from one training view. The gradient reaches
-    the spherical harmonics of the masked Gaussians, or with `adversarial.reaches: all` those of all Gaussians.
+    The term begins at the share `adversarial.start` of the run. In each step the real patches come from one reference
+    and the fake ones from one training view. The gradient reaches the spherical harmonics of the masked Gaussians, or
+    with `adversarial.reaches: all` those of all Gaussians.
 
     Raises:
         ValueError: No reference has a hole.
@@ -80,7 +81,8 @@ def evaluate_adversarial(
         generator: Draws the windows, on the CPU.
 
     Returns:
-        The generator's loss, the rendering, and values for the trace.
+        The generator's loss, the rendering, and values for the trace: "adversarial" (this loss) and the values of
+            `Adversary.train_step`.
 
     Raises:
         FloatingPointError: See `Adversary.train_step`.

@@ -82,8 +82,9 @@ def evaluate_depth(
     """Return the depth loss of one view, and its rendering.
 
     The view is rendered, its hole is repainted by the prior from a random timestep, and the depth of the repainted
-    picture is estimated. The loss is the mean of ((rendered depth - estimated depth) / extent)^2 over the pixels of the
-    hole that can be compared (see `depth_target`).
+    picture is estimated. An estimator that does not use the picture estimates without repainting. The loss is the mean
+    of ((rendered depth - estimated depth) / extent)^2 over the pixels of the hole that can be compared (see
+    `depth_target`).
 
     Args:
         gaussians: All Gaussians of the scene.
@@ -95,7 +96,7 @@ def evaluate_depth(
         guidance: The paper's a, the strength of classifier-free guidance.
         generator: Draws timestep and noise, on the CPU.
         estimator: The depth estimator.
-        max_side: Longer side, in pixels, at which a larger view is rendered.
+        max_side: Longer side, in pixels, at which a larger view is rendered. The returned rendering has this size.
         extent: The unit of depth.
 
     Raises:
@@ -126,8 +127,8 @@ def evaluate_depth(
 def depth_target(view: ViewDepth, disparity: np.ndarray, covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the depth that the hole should have, [H, W] float64, and the pixels to compare, bool [H, W].
 
-    Not compared are pixels that no Gaussian covers, and pixels whose estimate is beyond infinity or farther than the
-    limit `ViewDepth.least_disparity`.
+    The pixels to compare are the pixels of the hole that are covered and have a rendered depth, and whose estimate is
+    nearer than the limit `ViewDepth.least_disparity`.
 
     Args:
         view: The rendered depth of the view.

@@ -60,8 +60,10 @@ def evaluate_lift(
 ) -> tuple[Tensor, Rendering]:
     """Return the difference between a rendered view and its image inpainted in 2D, and the rendering.
 
-    NeRF-In takes the squared error of the hole's pixels. Where the images of several views disagree, the minimum of
-    this error is their mean, which is blurred. Therefore SPIn-NeRF compares patches around the hole by LPIPS.
+    With `lift.loss` = "mse" the difference is the mean squared error of the hole's pixels, as in NeRF-In. Otherwise it
+    is the perceptual distance of one random patch that contains a pixel of the hole. Where the images of several views
+    disagree, the minimum of the squared error is their mean, which is blurred. Therefore SPIn-NeRF compares patches
+    around the hole by LPIPS.
 
     Args:
         gaussians: All Gaussians of the scene.

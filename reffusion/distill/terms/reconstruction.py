@@ -45,7 +45,9 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
 
 
 def evaluate_reconstruction(gaussians: Gaussians, reached: Tensor, view: TrainView) -> tuple[Tensor, Rendering]:
-    """Return (1 - 0.2) L1 + 0.2 D-SSIM over the pixels whose photograph may supervise, and the rendering.
+    """Return 0.8 L1 + 0.2 D-SSIM over the pixels whose photograph may supervise, and the rendering.
+
+    The sum over these pixels is divided by the number of all pixels of the view (see `reconstruction_loss`).
 
     Args:
         gaussians: All Gaussians of the scene.

@@ -46,7 +46,7 @@ def evaluate_reference(
     """Return the reconstruction loss over a reference's hole, and the rendering of the part of the view around it.
 
     Only the bounding box of the hole is rendered. The loss is scaled to the value that it would have if the whole view
-    were rendered.
+    were rendered, where the sum over the hole is divided by the number of all pixels.
 
     PAPER leaves open: whether the reference supervises directly. In the paper it only initialises and personalises.
 

@@ -116,11 +116,12 @@ def evaluate_sds(
 ) -> tuple[Tensor, Rendering]:
     """Return the SDS loss L_global + mean(L_local) of one view, and the rendering.
 
-    The whole view and its patches are one batch of the UNet.
+    Only the gradient of this loss has a meaning, not its value (see `sds_loss`). The whole view and its patches are one
+    batch of the UNet.
 
     PAPER leaves open: what conditions the UNet. Here the condition is the photograph where the photograph may
-    supervise, and elsewhere the rendering itself (background that other views see behind the object), with a blank
-    hole. No gradient flows through this condition.
+    supervise, and elsewhere the rendering itself (background that other views see behind the object), with the hole
+    masked as in `diffusion.conditioning`. No gradient flows through this condition.
 
     Args:
         gaussians: All Gaussians of the scene.

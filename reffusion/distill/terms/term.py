@@ -34,7 +34,7 @@ class TermValue(NamedTuple):
 
     Attributes:
         loss: Scalar, before the term's weight.
-        rendering: The rendering from which the loss was computed. Gaussians that it does not contain are not moved.
+        rendering: The rendering from which the loss was computed. The term moves only Gaussians that it contains.
         log: Values that are added to the trace for this step.
         latest: Values that are added to the trace for this step and for all later steps, until the term is computed
             again. For terms that are not computed in every step.

@@ -50,9 +50,10 @@ class Completion:
 
     Attributes:
         image: uint8 [H, W, 3].
-        misfit: how badly the patches fit on the whole: the weighted mean of their misfits (`search.misfit`). Of several
-            completions, the one with the least misfit mostly looks best. It is `NO_MATCH` if there were too few patches
-            and Telea's method filled the hole.
+        misfit: how badly the patches fit on the whole: the mean of their misfits (`search.misfit`), in which pixels
+            near the hole's border weigh most and pixels without a patch are left out. Of several completions of one
+            hole, the one with the least misfit mostly looks best. It is `NO_MATCH` if there were too few patches and
+            Telea's method filled the hole, and 0 if the hole is empty.
     """
 
     image: np.ndarray

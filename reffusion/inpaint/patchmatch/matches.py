@@ -82,7 +82,8 @@ class Matches(NamedTuple):
         row, column: [N] float32, centre of the patch in the source image.
         angle: [N] float32, radians by which the patch is turned in its plane.
         along_plane: [N] bool, True if the patch follows the perspective of its plane.
-        misfit: [N] float32, how badly the patch fits (`search.misfit`); `NO_MATCH` for no patch.
+        misfit: [N] float32, how badly the patch fits (`search.misfit`); `NO_MATCH` if the pixel has no patch, or one
+            that it must not take.
     """
 
     source: np.ndarray

@@ -66,8 +66,8 @@ def misfit(n, along_plane, source, y, x, angle, limit, level):
         level: `Level`.
 
     Returns:
-        The weighted mean squared difference of the features, times the penalty for another surface. `NO_MATCH` if the
-        pixel must not take this patch, or if the misfit exceeds `limit`.
+        The squared Euclidean difference of the features, as a weighted mean over the patch's pixels, times the penalty
+        for another surface. `NO_MATCH` if the pixel must not take this patch, or if the misfit exceeds `limit`.
     """
     hole, sources = level.hole, level.sources
     row, column = math.floor(y + 0.5), math.floor(x + 0.5)
@@ -177,8 +177,8 @@ def _search_anywhere(matches, n, level, positions, state):
 def search(todo, rounds, tries, matches, level, positions, state):
     """Improve the matches of pixels of the hole, in place.
 
-    For each pixel the patches of its neighbours, random places near its present patch, and `tries` random places
-    anywhere are tried.
+    The misfit of a pixel's present patch is computed anew. Then the patches of its neighbours, random places near its
+    present patch, and `tries` random places anywhere are tried, and the best one is kept.
 
     Args:
         todo: [T], indices of the pixels, in row-major order; every second round goes backwards.

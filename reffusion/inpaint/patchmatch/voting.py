@@ -117,7 +117,8 @@ def gather_gradients(matches, hole, sources, right, below, count_right, count_be
         right, below: [H, W, 3] float32, zeros at first; get the sums of the differences from each pixel to the next one
             on the right, and below.
         count_right, count_below: [H, W] float32, zeros at first; get the number of summands.
-        own: [H, W, 3] float32; gets the colour at the centre of each pixel's patch.
+        own: [H, W, 3] float32; gets the colour at the centre of each pixel's patch. Pixels that no patch fills keep
+            their values.
     """
     height, width = own.shape[:2]
     for n in range(len(hole.row)):

@@ -101,8 +101,9 @@ class Options:
     Attributes:
         ring_weight: weight of the difference between a candidate and the known picture in the ring.
         color_weight: weight of the pieces' colours in the Poisson blending; their gradients have weight 1.
-        max_cost: pixels with this cost or a higher one are not filled.
-        max_median_cost: if the median cost of the hole's pixels is higher, no candidate suits and nothing is filled.
+        max_cost: pixels with this cost or a higher one are not filled. The cost of a pixel is that of the candidate
+            chosen for it (`Candidates.costs`), without seams.
+        max_median_cost: if the median of these costs over the hole is higher, no candidate suits and nothing is filled.
     """
 
     ring_weight: float = 1.0
@@ -116,10 +117,11 @@ class Assembly:
     """A picture whose hole is filled from pieces, as far as they suit.
 
     Attributes:
-        image: uint8 [H, W, 3].
+        image: uint8 [H, W, 3], the target's image, changed at the filled pixels only.
         filled: bool [H, W], the pixels of the hole that pieces fill.
         cost: in levels, the total cost divided by the number of the hole's pixels. The total cost consists of the
             differences along seams, the differences from the known picture in the ring, and the candidates' own costs.
+            It is 0 if there were no candidates.
     """
 
     image: np.ndarray
@@ -143,9 +145,13 @@ def split_detail(image: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def erode_readable(source: SourceImage, masked: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the usable pixels of a source that lie at least `MASK_MARGIN` from `masked`, bool [H, W].
+    """Return bool [H, W], the usable pixels of a source, without a margin of `MASK_MARGIN` px around `masked`.
 
-    Pieces may be taken from these pixels.
+    The same margin is left along the image's border. Pieces may be taken from the resulting pixels.
+
+    Args:
+        source: the source.
+        masked: bool [H, W].
     """
     return ndimage.binary_erosion(~masked, iterations=MASK_MARGIN) & source.usable
 
@@ -181,10 +187,10 @@ def assemble(
     Args:
         target: the view; its image is read outside the hole only.
         hole: bool [H, W].
-        pixels: pixels of the hole and of its ring, at least one of each.
+        pixels: the pixels of the hole to fill, and pixels of its ring, at least one of each.
         candidates: the photographs from which pieces are taken.
-        regions: masks, bool [H, W] each, that together cover the hole. Each region is blended by itself, so that no
-            tone spreads from one into another.
+        regions: masks, bool [H, W] each, that together cover the pixels to fill. Each region is blended by itself, so
+            that no tone spreads from one into another.
         options: settings.
     """
     coarse, stride = pixels.subsample()

@@ -49,7 +49,7 @@ def feature_distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def neighbor_pairs(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int], stride: int) -> np.ndarray:
-    """Return [E, 2], all pairs of pixels that lie side by side on a grid, as indices into the N pixels.
+    """Return [E, 2], all pairs of horizontal or vertical neighbours on a grid, as indices into the N pixels.
 
     Args:
         rows, columns: [N], positions of the pixels.

@@ -65,11 +65,15 @@ def fill_from_photo(
     """Fill the hole of a view with shifted pieces of the view's own photograph, as far as suitable pieces exist.
 
     Args:
-        target: the view; its image is read outside the hole only, its geometry everywhere.
+        target: the view. Pieces are copied from its image outside the hole. Its geometry is read everywhere.
         hole: bool [H, W], the pixels to fill.
-        own: the view's own photograph as a source.
+        own: the view as a source of texture. Only its `usable`, `masked` and `layer` are read: pieces come from pixels
+            that are usable and not masked.
         smooth: indices of the smooth planes. A pixel on one of them is not filled from another one.
         seed: seed of the random choice of patches that are compared.
+
+    Returns:
+        The picture, and the pixels that could be filled: none if the photograph shows nothing similar.
     """
     nothing = Assembly(target.image, np.zeros_like(hole), 0.0)
     if not hole.any():
@@ -226,7 +230,8 @@ def frequent_offsets(
         features: [H, W, C], the values by which patches are compared, in levels.
         readable: bool [H, W], the pixels that patches may cover.
         distance: [H, W], the distance of each pixel from the hole, in px.
-        width: px, width of the hole. Patches nearer to each other than `MIN_OFFSET_SHARE` of it are not compared.
+        width: px, width of the hole. Patches nearer to each other than `MIN_OFFSET_SHARE` of it, or than
+            `MIN_OFFSET_PX`, are not compared.
         seed: seed of the random choice of patches near the hole.
 
     Returns:

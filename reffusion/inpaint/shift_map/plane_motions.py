@@ -151,7 +151,10 @@ class PlaneMotions:
         return Samples(_sample(photo.colors, at), _sample(photo.detail, at), _is_set(photo.readable, at))
 
     def covers(self, motion: Motion, pixels: HolePixels) -> np.ndarray:
-        """Return bool [N], True for the pixels that a candidate with this motion could fill."""
+        """Return bool [N], True for the pixels at which the moved photograph shows the plane and may be used.
+
+        The photograph's scale is not considered; see `costs`.
+        """
         return _is_set(self.photos[motion.photo].readable, self._source_pixels(motion, pixels))
 
     def detail_difference(self, motion: Motion, pixels: HolePixels) -> tuple[np.ndarray, np.ndarray]:
@@ -162,8 +165,8 @@ class PlaneMotions:
             pixels: N known pixels.
 
         Returns:
-            The difference in levels, [N], at most `MAX_DIFFERENCE`; and bool [N], True where the moved photograph shows
-            the plane.
+            The Euclidean difference over the three channels, in levels, [N], at most `MAX_DIFFERENCE`; and bool [N],
+            True where the moved photograph shows the plane and may be used.
         """
         at, photo = self._source_pixels(motion, pixels), self.photos[motion.photo]
         difference = np.linalg.norm(_sample(photo.detail, at) - pixels.detail, axis=1)

@@ -48,7 +48,8 @@ class PlaneSymmetry:
 
     Attributes:
         centre: [2], the point on the plane about which the texture turns; None if the motions are shifts.
-        motions: [M, 2], shifts in world units; or [M, 1], turns in radians.
+        motions: [M, 2], shifts in world units, those of the highest correlation first; or [M, 1], turns in radians, in
+            both directions, the smallest first.
         resolution: the accuracy of the motions, in world units: the side of a cell of the map. For turns it is the
             accuracy of the positions of turned points.
     """
