@@ -10,7 +10,7 @@ from pathlib import Path
 
 from reffusion.io.arrays import load_json
 from reffusion.io.images import image_size, load_image
-from reffusion.io.scene import raw_mask_files
+from reffusion.io.scene import has_object_mask
 from report import inline_images, page
 from report.job_data import JobFiles
 from report.results import load_views
@@ -119,8 +119,8 @@ def rendered_views(job: JobFiles) -> list[str]:
 def find_pictures(job: JobFiles, name: str) -> dict[str, Path]:
     """Return the existing pictures of a view as {kind of picture, a key of `TITLES`: file}.
 
-    The view's photograph has the key "truth" if the view is a test view without an input mask, since the photograph
-    then shows the scene without the object. Otherwise it has the key "photograph".
+    The view's photograph has the key "truth" if the view is a test view without an input mask or a mask made from
+    clicks, since the photograph then shows the scene without the object. Otherwise it has the key "photograph".
 
     Args:
         job: a job whose stage `evaluate` is done.
@@ -131,7 +131,8 @@ def find_pictures(job: JobFiles, name: str) -> dict[str, Path]:
     paths = {kind: evaluate / kind / f"{name}.png" for kind in TITLES}
     views = poses / "views.json"
     if views.is_file():
-        clean = name in load_json(views)["test"] and not raw_mask_files(raw_masks, name)
+        shows_object = has_object_mask(raw_masks, job.folders.get("masks"), name)
+        clean = name in load_json(views)["test"] and not shows_object
         paths["truth" if clean else "photograph"] = poses / "images" / f"{name}.png"
     return {kind: path for kind, path in paths.items() if path.is_file()}
 

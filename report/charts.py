@@ -259,7 +259,8 @@ def _interval(axes: Axes, difference: Difference, row: int, sign: int, far: floa
         axes.text(0.01 if worse else 0.99, row, words.replace("-", "−"), fontsize=9, color=colour, **at)
         return
     if difference.scenes:
-        ends = np.clip([mean - difference.scenes, mean + difference.scenes], -far, far)
+        centre = difference.scenes_mean
+        ends = np.clip([centre - difference.scenes, centre + difference.scenes], -far, far)
         axes.plot(ends, [row, row], color=colour, linewidth=1.2, solid_capstyle="butt")
     axes.plot([mean - views, mean + views], [row, row], color=colour, linewidth=4, solid_capstyle="butt")
     axes.plot(mean, row, "o", markersize=6, color=colour)

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, load_mask, resize_image, resize_nearest, save_image
-from reffusion.io.scene import has_photograph, load_warnings
+from reffusion.io.scene import has_photograph, load_warnings, raw_mask_files
 from report import cli, sheet
 
 WIDTH, HEIGHT, GAP = 240, 180, 4  # largest width and height of a picture, and the gap between pictures, px
@@ -65,7 +65,7 @@ def overlay_masks(poses: Path, raw_masks: Path, name: str) -> np.ndarray:
     """Return a photograph with its masks tinted, uint8 [h, w, 3], resized to fit into `WIDTH` x `HEIGHT`.
 
     A small photograph is enlarged. The tint of a test mask is the complement of `TINT`. If several objects have masks
-    of their own (masks/<object>/), these masks are not drawn.
+    of their own (masks/<object>/), all are drawn in the same tint.
 
     Args:
         poses: folder of the stage `poses`, which has the photographs.
@@ -76,8 +76,9 @@ def overlay_masks(poses: Path, raw_masks: Path, name: str) -> np.ndarray:
     factor = min(WIDTH / image.shape[1], HEIGHT / image.shape[0])
     size = max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor))
     small = resize_image(image, size)
-    for folder, tint in (("test_masks", [255 - level for level in TINT]), ("masks", TINT)):
-        if (path := raw_masks / folder / f"{name}.png").is_file():
+    test_mask, complement = raw_masks / "test_masks" / f"{name}.png", [255 - level for level in TINT]
+    for files, tint in (([test_mask], complement), (raw_mask_files(raw_masks, name), TINT)):
+        for path in (path for path in files if path.is_file()):
             mask = resize_nearest(load_mask(path), size[::-1])
             small[mask] = (small[mask] // 2 + np.array(tint, np.uint8) // 2).astype(np.uint8)
     return small

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from reffusion.command import root, workplace
+
 
 def scene_parser(name: str, description: str, needs_scene: bool = True) -> argparse.ArgumentParser:
     """Return an argument parser with the options --scene, --variant and --runs.
@@ -25,9 +27,10 @@ def run_folder(arguments: argparse.Namespace) -> Path:
     """Return the folder of a scene's stages: runs/<scene>, or runs/<scene>@<variant> if a variant is named.
 
     Args:
-        arguments: the result of a parser of `scene_parser`. The scene may be a name, the path of a folder, or the path
-            of a file, whose name without its ending is then the scene's name.
+        arguments: the result of a parser of `scene_parser`. The scene may be a name under data/, the path of a folder,
+            or the name or path of a video, whose name without its ending is then the scene's name.
     """
-    scene = arguments.scene.expanduser().resolve()
+    scene = workplace(root()) / "data" / arguments.scene.expanduser()
+    scene = (scene if scene.exists() else arguments.scene.expanduser()).resolve()
     name = scene.stem if scene.is_file() else scene.name
     return arguments.runs / (f"{name}@{arguments.variant}" if arguments.variant else name)

@@ -217,15 +217,16 @@ def summary(comparison: Comparison, table: list[dict[str, Any]]) -> str:
     """Return a sentence with the numbers of methods and scenes, and the best method in each metric.
 
     The metrics are those in the box, or those outside the masks if no method has a PSNR in the box. All methods that
-    are best after rounding are named, also if their mean is over fewer scenes than that of other methods.
+    are best after rounding are named. Only the methods with the most finished scenes are considered.
     """
     done = sum(run.state == "done" for run in comparison.runs.values())
     place = f"{len(comparison.scenes)} scenes ({', '.join(comparison.scenes)})"
     parts = [f"{len(table)} methods on {place if len(comparison.scenes) > 1 else comparison.scenes[0]}"]
     parts[0] += "" if done == len(comparison.runs) else f", {done} of {len(comparison.runs)} runs done"
     boxed = any(row["psnr_box"] is not None for row in table)
+    most = max(row["scenes"] for row in table)
     for metric, better in (BOX_SCORES if boxed else OUTSIDE_SCORES).items():
-        rows = [row for row in table if row[metric] is not None]
+        rows = [row for row in table if row[metric] is not None and row["scenes"] == most]
         if len(rows) > 1:
             rounded = [round(row[metric], DIGITS[metric]) for row in rows]
             best = (max if better == "more" else min)(rounded)

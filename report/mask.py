@@ -207,6 +207,7 @@ def main() -> None:
     parser.add_argument("--budget", help="as for `run`")
     parser.add_argument("--set", default="", help="as for `run`")
     arguments = parser.parse_args()
+    arguments.variant = ""  # a variant has the masks of its scene
     if status := subprocess.run(stage_command("raw_masks", arguments)).returncode:
         raise SystemExit(status)
     try:

@@ -197,7 +197,7 @@ class Session:
         """Wait for the masks of the latest marks, then write all masks, and the marks to clicks.json.
 
         Masks are written in the pixels of the original, distorted photographs. The masks of an earlier call are
-        overwritten, but not deleted for views that have no mask any more.
+        overwritten, or deleted if the view had marks then and has no mask any more.
 
         Returns:
             {"written": number of masks written, "kept": number of given masks, which stay as they are}.
@@ -213,7 +213,8 @@ class Session:
             masks = {name: mask for name, mask in self.masks.items() if name not in self.capture.given}
             if not any(mask.any() for mask in masks.values()):
                 raise ValueError("nothing to save yet: click on the object first")
-            folder, written = self.capture.folder, dict(_saved_marks(self.capture.folder)["written"])
+            folder, saved = self.capture.folder, _saved_marks(self.capture.folder)
+            written = dict(saved["written"])
             paths = {name: self.capture.masks / f"{name}.png" for name in masks}
             foreign = [
                 p for p in paths.values() if p.exists() and written.get(_relative_path(p, folder)) != file_digest(p)
@@ -223,6 +224,11 @@ class Session:
             for name, path in paths.items():
                 replace_image(path, to_uint8(distort_mask(masks[name], self.lenses[name], self.sizes[name]) * 1.0))
                 written[_relative_path(path, folder)] = file_digest(path)
+            cleared = {mark["view"] for mark in saved["marks"]}.intersection(self.views) - {*self.masks}
+            for path in (self.capture.masks / f"{name}.png" for name in cleared):
+                if path.exists() and written.get(_relative_path(path, folder)) == file_digest(path):
+                    path.unlink()
+                    del written[_relative_path(path, folder)]
             save_json(
                 folder / CLICKS, {"marks": [self._to_photograph(each) for each in self.events], "written": written}
             )

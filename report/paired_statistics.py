@@ -21,13 +21,16 @@ class Difference:
             scenes. This interval is valid for these scenes only. None for fewer than two pairs.
         scenes: half the width of the 95% confidence interval of the mean of the scenes' means, from a paired t-test
             over one mean per scene. This interval is valid for other scenes of the same kind too. None for fewer than
-            two scenes. The mean of the scenes' means equals `mean` if all scenes have equally many pairs.
+            two scenes.
+        scenes_mean: mean of the scenes' means, the centre of the interval over scenes. It equals `mean` if all scenes
+            have equally many pairs.
     """
 
     mean: float
     pairs: int
     views: float | None
     scenes: float | None
+    scenes_mean: float
 
 
 def paired_difference(differences: Sequence[np.ndarray]) -> Difference | None:
@@ -41,7 +44,8 @@ def paired_difference(differences: Sequence[np.ndarray]) -> Difference | None:
     if not scenes:
         return None
     pairs, means = np.concatenate(scenes), np.array([d.mean() for d in scenes])
-    return Difference(float(pairs.mean()), len(pairs), confidence_half_width(pairs), confidence_half_width(means))
+    widths = confidence_half_width(pairs), confidence_half_width(means)
+    return Difference(float(pairs.mean()), len(pairs), *widths, float(means.mean()))
 
 
 def confidence_half_width(values: np.ndarray) -> float | None:

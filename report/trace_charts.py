@@ -72,9 +72,11 @@ def best_index(name: str, values: Sequence[float] | np.ndarray) -> int:
 
 
 def draw_stage_chart(stage: str, series: dict[str, Lines], path: Path) -> list[str]:
-    """Draw a stage's errors against seconds of work, one panel per quantity and one curve per series.
+    """Draw a stage's main quantities, mostly errors, against seconds of work: a panel for each, a curve per series.
 
     Args:
+        stage: name of the stage; its main quantity comes first. At most `MAX_PANELS` quantities are drawn, see
+            `pick_errors`.
         series: name of a series -> lines of the trace.
         path: PNG to write; nothing is written if the lines contain no quantity to draw.
 

@@ -130,7 +130,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--trust", action="store_true", help="accept artifacts made by older code")
     parser.add_argument("--keep", action="store_true", help="accept artifacts that people changed, from now on")
     parser.add_argument("--budget", help="time for the whole job, such as 5m: sets the number of steps")
-    parser.add_argument("--cores", type=int, help="for each stage; default: all, or an equal part for each scene")
+    parser.add_argument(
+        "--cores", type=int, help="for each stage; default: all (on a cluster 1), or an equal part for each scene"
+    )
     parser.add_argument("--engine", help=f"where stages run: local (default), {', '.join(ENGINES)}")
     parser.add_argument("--address", help="of the engine: ray://HOST:10001 or HOST:6379; a partition of Slurm")
     parser.add_argument("--offline", action="store_true", help="weights: only list what is missing")

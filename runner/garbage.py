@@ -8,10 +8,11 @@ from pathlib import Path
 
 from runner import Refused, say
 from runner.artifacts import delete_folder, recover_swap
-from runner.files import RECEIPT, hold_lock, list_files, read_receipt, read_text
+from runner.files import RECEIPT, hold_lock, list_files, read_json, read_receipt, read_text
+from runner.frames import FRAME_FILES, FRAMES
 from runner.keys import HASHES, Hashes
 from runner.maintenance import artifact_files, is_home, remove_empty
-from runner.pipeline import load_pipeline
+from runner.pipeline import find_scene, load_pipeline, scene_name
 from runner.plan import plan
 from runner.resolve import Request, resolve
 from runner.text import display_path, format_bytes
@@ -72,6 +73,8 @@ def _unused(request: Request, hashes: Hashes) -> Iterator[Unused]:
     """
     homes = sorted(path for path in request.runs.glob("*") if is_home(path)) if request.runs.is_dir() else []
     name = Path(request.scene).name
+    with suppress(Refused):  # the scene may have been removed
+        name = scene_name(find_scene(request.scene, request.root))
     scenes = dict.fromkeys(home.name.partition("@")[0] for home in homes)
     if name and name not in scenes:
         raise Refused(
@@ -112,6 +115,8 @@ def _planned(request: Request, home: Path, reasons: dict[Path, str], hashes: Has
         reasons |= dict.fromkeys(receipts, f"there is no variant {variant} any more")
         return set()
     source = request.root / (read_text(home / "source") or read_text(home.with_name(name) / "source"))
+    if source == home.with_name(name) / FRAMES:  # frames of the video that is the scene
+        source = request.root / (read_json(source / FRAME_FILES[0]) or {}).get("video", "")
     if source == request.root or not source.exists():
         raise Refused("its scene is not there")
     planned = replace(request, scene=str(source), variant=variant or None, trust=True)

@@ -113,7 +113,8 @@ def _homes(request: Request) -> list[Path]:
         if name not in scenes:
             raise Refused(f"{display_path(runs)}: {unknown_name('scene', name, scenes)}") from None
     else:
-        base = runs / scene_name(scene)
+        name = scene_name(scene)  # the name of a video in data/ has no ending
+        base = runs / name
         check_unique_name(base, base / FRAMES if scene.is_file() else scene, request.root)
     variants = [each for each in existing if each.startswith(f"{name}@")]
     if request.variant and f"{name}@{request.variant}" not in variants:

@@ -127,7 +127,7 @@ def summarize(
         draft: the initialized scene.
         floaters: number of Gaussians that were removed as floaters.
         sets: view name -> pixel classes.
-        extra: the extra views that were completed.
+        extra: the extra views that were completed. A view may occur more than once, with different masks.
         trusted: all completed views that supervise: references and extra views.
         photos: view name -> uint8 [H, W, 3], the photographs, without the object's shadow if one was found; None for a
             baseline, or if there is no reference.
@@ -136,7 +136,10 @@ def summarize(
     uncovered = {
         each.name: coverage.uncovered_share(draft.gaussians, each, sets[each.name].consistent) for each in train
     }
-    shares = {each.camera.name: float(each.mask.sum() / sets[each.camera.name].consistent.sum()) for each in extra}
+    guessed: dict[str, np.ndarray] = {}
+    for each in extra:  # a view may have been completed more than once
+        guessed[each.camera.name] = guessed.get(each.camera.name, False) | each.mask
+    shares = {name: float(mask.sum() / sets[name].consistent.sum()) for name, mask in guessed.items()}
     gain = GainPrediction(True, f"start is {params.start}", None)
     if photos is not None:
         gain = predict_gain(draft.gaussians, train, sets, photos, max(shares.values(), default=0.0))

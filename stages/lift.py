@@ -30,17 +30,22 @@ DTYPE = torch.float32
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> None:
     """Run the stage: inpaint the invent mask I of each view in which it is not empty.
 
-    The views are the training views, without clean ones (photographed without the object), and views without a
-    photograph. Writes images/<view>.png, the best view also as a reference (as the stage `reference` does), and
-    facts.json. Views that an interrupted run finished are not inpainted again.
+    The views are the training views, without clean ones (photographed without the object), views without a photograph,
+    and the best view, even if it is clean. Writes images/<view>.png, the best view also as a reference (as the stage
+    `reference` does), and facts.json. Views that an interrupted run finished are not inpainted again.
 
     Args:
         out: folder of this stage.
         poses, fit, masks: folders of the stages of these names.
+
+    Raises:
+        ValueError: only views without a photograph have pixels to invent.
     """
     space = Workspace(poses, fit, masks)
     scene, sets, best_view = space.scene, space.mask_sets, space.facts["best_reference"]
-    names = sorted({best_view, *space.facts["invent_views"]} - scene.clean)
+    if best_view is None:
+        raise ValueError("only views without a photograph have pixels to invent; lift needs a photograph that has some")
+    names = sorted({best_view} | ({*space.facts["invent_views"]} - scene.clean))
     painter, paint = load_painter(params)
     print(f"2D inpainter: {painter}", flush=True)
     for k in trace.progress(len(names), "lift"):

@@ -92,9 +92,15 @@ def inpaint_reference(params: Params, out: Path, space: Workspace) -> Reference:
         space: results of the stages `poses`, `fit` and `masks`.
 
     Raises:
-        ValueError: `params.choose` is not the number of a candidate.
+        ValueError: only views without a photograph have pixels to invent, or `params.choose` is not the number of a
+            candidate.
     """
     name = space.facts["best_reference"]
+    if name is None:
+        raise ValueError(
+            "only views without a photograph have pixels to invent, and they cannot be completed here; name a training "
+            "view as `reference` in scene.yaml"
+        )
     if params.choose is not None and params.choose >= params.candidates:
         raise ValueError(f"reference.choose is {params.choose}, but candidates are counted 0..{params.candidates - 1}")
     camera, masks = space.scene.cameras[name], space.mask_sets[name]

@@ -361,6 +361,18 @@ def test_the_page_runs_the_stages_that_it_reads(tmp_path, monkeypatch):
     assert pages[0].masks == folder / "masks" and pages[0].given == {}
 
 
+def test_a_variant_has_the_masks_of_its_scene(tmp_path, monkeypatch):
+    folder = write_small_capture(tmp_path / "scene")
+    old = tmp_path / "runs/scene@masked/fit"  # of other parameters
+    old.mkdir(parents=True)
+    words = ["mask", "--scene", str(folder), "--runs", str(tmp_path / "runs"), "--variant", "masked"]
+    monkeypatch.setattr("sys.argv", words)
+    pages = []
+    monkeypatch.setattr(mask, "serve", lambda session, *_: pages.append(session.capture))
+    mask.main()
+    assert pages[0].fit == tmp_path / "runs/scene/fit", "which this command makes"
+
+
 @pytest.fixture
 def page_server(clicked_scene, tmp_path):
     _, placed, fit = clicked_scene
@@ -418,6 +430,19 @@ def test_clicks_are_restored_the_next_time(page_server, tmp_path):
     (event,) = again.events
     assert event.view == "a2" and event.mark.points.tolist() == [[48.0, 36.0]] and event.mark.positive
     again.save()  # its own files it may write again
+
+
+def test_a_mask_is_gone_after_its_marks_are_cleared(clicked_scene, tmp_path):
+    """Before the fit, when each view has the mask of its own marks."""
+    _, placed, fit = clicked_scene
+    session = Session(Capture(tmp_path, tmp_path / "masks", placed, fit, {}), lambda: False)
+    session.mark("a2", [(48.0, 36.0)], True)
+    session.mark("a3", [(48.0, 36.0)], True)
+    assert session.save()["written"] == 2
+    session = Session(Capture(tmp_path, tmp_path / "masks", placed, fit, {}), lambda: False)
+    session.clear("a3")
+    assert session.save()["written"] == 1
+    assert [path.name for path in (tmp_path / "masks").iterdir()] == ["a2.png"]
 
 
 def test_masks_of_others_are_never_overwritten(page_server, tmp_path):

@@ -19,8 +19,9 @@ from scenes.browser import open_page
 from scenes.processes import run_module
 from scenes.toy_projects import COMPARE_FILES, make_request, write_files, write_project
 
+from reffusion.io.images import save_mask
+from report import before_after, charts, compare_pictures, job, job_data, results, scenes_page, trace_charts
 from report import compare as page
-from report import compare_pictures, job, job_data, results, scenes_page, trace_charts
 from report.paired_statistics import confidence_half_width, paired_difference, pareto_front
 from runner import Refused
 from runner.compare import compare
@@ -296,6 +297,25 @@ def test_without_ground_truth_held_out_views_are_compared_outside_their_masks(jo
     assert (job_folder / "compare/differences.png").exists()
 
 
+def test_the_best_method_is_one_of_those_with_all_scenes(job_folder):
+    comparison = results.load_comparison(job_folder)
+    row = lambda name, scenes, psnr: dict.fromkeys(results.COLUMNS) | {
+        "method": name, "scenes": scenes, "psnr_box": psnr, "state": "done"
+    }  # fmt: skip
+    table = [row("full", 2, 20.0), row("none", 2, 21.0), row("better", 1, 30.0)]
+    assert "best in PSNR: none." in page.summary(comparison, table)
+
+
+def test_a_photograph_with_the_object_is_no_ground_truth(job_folder):
+    """Also if clicks made the mask of this test view."""
+    files = job_data.load_job(job_folder)
+    assert "truth" in before_after.find_pictures(files, "a")
+    save_mask(job_folder / "masks/raw/a.png", np.ones((30, 40), bool))
+    files.folders["masks"] = job_folder / "masks"
+    found = before_after.find_pictures(files, "a")
+    assert "photograph" in found and "truth" not in found
+
+
 def test_several_scenes(job_folder):
     """`better` gains 2.0, 2.2, 2.4 and 2.6 dB in the views of one scene, and 1 dB more in those of the other."""
     for name in ("toy", "toy@better"):
@@ -339,6 +359,16 @@ def test_the_interval_is_students():
     assert paired_difference([values]).scenes is None and paired_difference([values]).views == confidence_half_width(
         values
     )
+
+
+def test_the_interval_over_scenes_is_around_the_mean_of_their_means():
+    """The scenes have one, one and seven views, so the mean of all views is another."""
+    found = paired_difference([np.array([1.0]), np.array([2.0]), np.full(7, 6.0)])
+    assert found.mean == 5 and found.scenes_mean == 3
+    _, grid = charts.new_figure(2)
+    charts._interval(grid[0, 0], found, 0, 1, np.inf)
+    ends = grid[0, 0].lines[0].get_xdata()
+    assert np.mean(ends) == pytest.approx(3) and np.ptp(ends) == pytest.approx(2 * found.scenes)
 
 
 def test_pareto_front_against_all_pairs():

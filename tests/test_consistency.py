@@ -81,3 +81,11 @@ def test_depth_is_continued_through_a_mask():
     broken = np.where(inner_mask(), 0.7, depth)
     assert np.abs(consistency.continue_surrounding_depth(broken, inner_mask()) / depth - 1).max() < 1e-6
     assert (consistency.continue_surrounding_depth(broken, np.ones_like(inner_mask())) == 0).all()
+
+
+def test_pixels_without_depth_beside_a_mask_do_not_bend_the_continuation():
+    depth, _ = render_plane(turned_camera("a"), slope=0.3)
+    is_unknown = np.random.default_rng(0).random(depth.shape) < 0.1
+    is_unknown[:, :18] = True  # empty space, as beside the captured scene
+    found = consistency.continue_surrounding_depth(np.where(is_unknown, 0.0, depth), inner_mask())
+    assert np.abs(found / depth - 1)[inner_mask()].max() < 1e-6

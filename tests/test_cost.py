@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 from scenes.capture import write_four_photos
 from scenes.processes import fake_nvidia_smi
 
@@ -69,6 +70,16 @@ def test_the_table_is_what_is_counted_today():
     for name, each in found.items():
         assert each["tflop"] == pytest.approx(COUNTS[name]["tflop"], rel=0.02), name
         assert each["gb"] == pytest.approx(COUNTS[name]["gb"], rel=0.05), name
+
+
+def test_large_attention_matrices_do_not_count_and_large_feature_maps_do():
+    """On a GPU no kernel writes the former. SDXL decodes pictures of 1024 px, so its feature maps are as large."""
+    queries, features = torch.zeros(1, 2, 1024, 8, device="meta"), torch.zeros(1, 4, 1024, 1024, device="meta")
+    attend = torch.nn.functional.scaled_dot_product_attention
+    assert counts.count_work(lambda: attend(queries, queries, queries))["gb"] < 1024**2 * 4 / 1e9
+    activated = counts.count_work(lambda: torch.nn.functional.silu(features))["gb"]
+    assert activated == pytest.approx(2 * 4 * features.numel() / 1e9, abs=1e-5)
+    assert COUNTS["SDXL encode"]["gb"] == pytest.approx(4 * COUNTS["SD2 encode"]["gb"], rel=0.05)
 
 
 def test_cards_by_any_name():

@@ -5,6 +5,7 @@ import pytest
 
 from reffusion.depth import bilateral, completion, planes
 from reffusion.depth.completion import Plate
+from reffusion.depth.inpaint_depth import inpaint_depth
 from reffusion.seeding import generator
 
 ROWS, COLUMNS = np.mgrid[:48, :64].astype(float)
@@ -140,3 +141,12 @@ def test_too_few_samples_fix_no_plane():
     line = np.stack([np.arange(30.0), 2 * np.arange(30.0)], 1)
     with pytest.raises(ValueError, match="fix no plane"):
         planes.planar_model(line, np.ones(30), (48, 64), generator(0))
+
+
+def test_far_pixels_keep_their_depth_beside_one_very_near():
+    """As with a floater right in front of the camera."""
+    depth, known = np.full((20, 20), 30.0), np.ones((20, 20), bool)
+    depth[0, 0], known[8:12, 8:12] = 0.01, False
+    found = inpaint_depth(depth, known)
+    np.testing.assert_allclose(found[known], depth[known])
+    assert (found[~known] == 0).all()

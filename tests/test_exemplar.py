@@ -103,6 +103,16 @@ def test_masked_pixels_of_a_source_never_show():
     assert (painted[:, 0] - painted[:, 1]).max() < 30
 
 
+def test_a_hole_that_no_patch_suits_is_the_worst_completion():
+    """All the source's pixels show the plane of the hole from a hundred times nearer, too near for its patches."""
+    image, mask = checker_image(), middle_mask()
+    target = replace(without_geometry(image, mask), plane=np.ones((96, 128), np.int64))
+    source = replace(target, to_plane=target.to_plane / 100, pixel_size=target.pixel_size / 100)
+    found = complete(target, mask, [source], smooth=[1])
+    assert found.misfit >= NO_MATCH and (found.image[~mask] == image[~mask]).all()
+    assert complete(target, mask, [target], smooth=[1]).misfit < 1e4
+
+
 # ------------------------------------------------------------------------------------------------ along a plane
 
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
 import pytest
-from scenes.toy_projects import make_request, write_project
+from scenes.toy_projects import make_request, write_files, write_project
 
 from runner import Refused
 from runner.compare import compare
 from runner.execute import run_scene
 from runner.garbage import collect_garbage
+from runner.keys import HASHES, Hashes
+from runner.maintenance import clean, verify
 
 pytestmark = pytest.mark.integration
 
@@ -81,6 +84,24 @@ def test_older_code_counts_as_used_and_a_scene_that_is_gone_is_kept(comparison_c
     assert list_artifacts(comparison_copy) == before
     with pytest.raises(Refused, match="nothing was computed for nobody"):
         collect_garbage(make_request(comparison_copy, "nobody"), yes=True)
+
+
+def test_a_video_is_named_with_or_without_its_ending(tmp_path, capsys):
+    root = write_project(tmp_path)
+    write_files(root, {"data/clip.mp4": "a film"})
+    content = Hashes(root / "runs" / HASHES).file(root / "data/clip.mp4")
+    record = json.dumps({"video": str(root / "data/clip.mp4"), "content": content})
+    write_files(root, {"runs/clip/frames/frames.json": record, "runs/clip/frames/number.txt": "7"})
+    run_scene(make_request(root, "clip.mp4"), "all")
+    before = list_artifacts(root)
+    for name in ("clip.mp4", "clip", ""):
+        capsys.readouterr()
+        collect_garbage(make_request(root, name), yes=True)
+        assert capsys.readouterr().out == "nothing that no plan uses\n" and list_artifacts(root) == before
+    verify(make_request(root, "clip.mp4"))
+    assert "runs/clip/distill: as it was made" in capsys.readouterr().out
+    clean(make_request(root, "clip.mp4"))
+    assert not list_artifacts(root)
 
 
 def test_other_parameters_are_those_of_the_command(comparison_copy, capsys):

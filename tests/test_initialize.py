@@ -13,6 +13,7 @@ from scenes.stage_runs import run_through_masks, write_true_references
 from reffusion import geometry
 from reffusion.background.model import Background
 from reffusion.depth import background_depth
+from reffusion.depth.background_depth import CompletionSettings
 from reffusion.gaussians.optimize import reconstruction_loss
 from reffusion.gaussians.sheets import Sheets, sheet_gaussians
 from reffusion.gaussians.surfels import surface_gaussians, surface_normals
@@ -281,6 +282,18 @@ def test_the_back_of_a_thing_is_drawn_though_its_front_shows_from_behind():
     both = join_gaussians(wall, front)
     assert coverage.pixels_in_front(both, depth, reference, hidden).sum() < 0.2 * mask.sum()  # the square's soft rim
     assert not coverage.pixels_in_front(wall, depth, reference, mask).any()
+
+
+def test_a_depth_map_that_is_unknown_outside_the_hole_adds_nothing_there():
+    view = floor_view(0.0)
+    depth, picture = render_floor(view)
+    hole, unknown, nothing = np.zeros((3, *depth.shape), bool)
+    hole[14:22, 16:30], unknown[:, :8] = True, True
+    floor = sheet_gaussians(picture, depth, ~nothing, view, 1, SHEETS)
+    reference = Reference(view, np.uint8(255 * picture), hole | unknown, np.where(unknown, np.nan, depth))
+    _, estimate, _ = rules.estimate_depth(floor, reference, hole, nothing, np.zeros((0, 3)), CompletionSettings())
+    np.testing.assert_allclose(estimate, depth, rtol=0.02)
+    assert not coverage.pixels_in_front(floor, estimate, reference, nothing).any()
 
 
 def test_pixels_stained_by_an_edge_lie_beside_it_on_what_stays():

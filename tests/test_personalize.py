@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from scenes.networks import small_prior
@@ -35,6 +36,15 @@ def striped_reference(height=70, width=90):
     hole = torch.zeros(height, width, dtype=torch.bool)
     hole[20:50, 30:60] = True
     return crops.make_picture(image.to(torch.uint8), hole, NATIVE)
+
+
+@pytest.mark.parametrize("count", range(12))
+def test_photographs_for_validation_are_spread_over_all(count):
+    names = ["reference", *(f"photo {k:02}" for k in range(count))]
+    chosen = [names.index(name) - 1 for name in validation.choose_photos(names, ["reference"])]
+    assert len(chosen) == min(count, validation.PHOTOS) and chosen == sorted(set(chosen))
+    steps = np.diff([*chosen, count])
+    assert not count or (chosen[0] == 0 and steps.max() - steps.min() <= 1)
 
 
 def test_pictures_are_enlarged_until_a_crop_fits():

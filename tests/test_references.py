@@ -120,6 +120,23 @@ def test_another_picture_fits_badly_and_a_plain_one_cannot_be_told():
     assert found.fits and np.isnan(found.inlier_ratio) and "too plain" in str(found)
 
 
+def test_of_a_picture_like_its_photograph_the_hole_alone_is_taken(wall_folders, tmp_path):
+    """A corner that the user repainted beside the hole stays that of the photograph."""
+    photo = load_image(wall_folders["poses"] / "images/a2.png")
+    picture = wall_scene.photo(wall_scene.CAMERAS["a2"]).copy()
+    picture[:20, :20] = 255 - picture[:20, :20]
+    save_image(wall_folders["scene"] / "ref.png", picture)
+    made = run_reference_stage(wall_folders, tmp_path / "out", **reference_entry("a2"))["a2"]
+    assert (made.image[:20, :20] == photo[:20, :20]).all()
+    assert (made.image == picture)[made.mask].all()
+
+
+def test_where_no_photograph_has_a_hole_a_reference_is_asked_for(wall_folders, tmp_path):
+    save_json(wall_folders["masks"] / "facts.json", {"best_reference": None})
+    with pytest.raises(ValueError, match="name a training view as `reference`"):
+        run_reference_stage(wall_folders, tmp_path / "out")
+
+
 def test_only_the_hole_and_its_rim_are_taken():
     photo, picture, everywhere = (
         np.zeros((20, 20, 3), np.uint8),

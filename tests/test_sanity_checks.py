@@ -16,7 +16,7 @@ from reffusion.capture.checks.sanity import find_odd_exposures, find_odd_masks
 from reffusion.capture.image_detail import sample_visible
 from reffusion.geometry import pixel_rays
 from reffusion.io.arrays import save_json
-from reffusion.io.images import image_size
+from reffusion.io.images import image_size, save_mask
 from reffusion.io.scene import load_raw_masks, load_scene, load_views
 from reffusion.types import Camera
 from report import check
@@ -97,6 +97,18 @@ def test_the_sheet_shows_every_mask_over_its_photograph(tmp_path, wall_capture):
     overlay = check.overlay_masks(poses, tmp_path / "wall/raw_masks", "a3")
     assert overlay.shape[:2] == (180, 240)
     assert (np.abs(overlay.astype(int) - check.TINT).sum(-1) < 300).mean() > 0.5 * masks["a3"].mean()
+
+
+def test_the_sheet_shows_the_masks_of_several_objects(tmp_path, wall_capture):
+    _, masks, _ = wall_capture
+    poses, _, _ = wall_scene.write_poses_and_fit(tmp_path, 1.5, masks={})
+    halves = {"left": masks["a3"].copy(), "right": masks["a3"].copy()}
+    halves["left"][:, 48:], halves["right"][:, :48] = False, False
+    plain = check.overlay_masks(poses, tmp_path / "raw_masks", "a3")
+    for name, mask in halves.items():
+        save_mask(tmp_path / f"raw_masks/masks/{name}/a3.png", mask)
+    tinted = (check.overlay_masks(poses, tmp_path / "raw_masks", "a3") != plain).any(-1)
+    assert tinted.mean() == pytest.approx(masks["a3"].mean(), rel=0.1)
 
 
 def test_check_says_how_structure_from_motion_went(tmp_path, monkeypatch, capsys):

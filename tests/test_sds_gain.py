@@ -1,6 +1,7 @@
 """The prediction whether SDS can improve the initialization, from its error beside the hole."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,11 +10,14 @@ from scenes.settings import with_changes
 from scenes.wall_scene import CAMERAS, TRAIN, true_mask, wall_and_square
 
 from reffusion.distill.inputs import resolve_sds
+from reffusion.initialize.draft import Draft
 from reffusion.initialize.sds_gain import GUESSED_SHARE, HOLE_LOSS, MAX_VIEWS, PRIOR_PSNR, predict_gain
 from reffusion.io.arrays import save_json
+from reffusion.params import initialize
 from reffusion.params.distill import Params
 from reffusion.splat import rasterizer
-from reffusion.types import MaskSet
+from reffusion.types import MaskSet, Reference
+from stages.initialize import summarize
 from stages.plan import distill as plan
 
 AT, TRAINED = 0.8, [CAMERAS[name] for name in TRAIN]
@@ -42,6 +46,20 @@ def test_what_no_reference_covers_may_gain_however_good_the_rest(wall_without_sq
     assert not predict_gain(wall, TRAINED, sets, photos, guessed_share=GUESSED_SHARE).may_gain
     found = predict_gain(wall, TRAINED, sets, photos, guessed_share=0.19)
     assert found.may_gain and "19%" in found.reason and found.psnr_beside > 45
+
+
+def test_a_view_that_was_completed_twice_counts_with_all_its_guessed_pixels(wall_without_square):
+    wall, sets, photos = wall_without_square
+    camera, mask = TRAINED[0], sets[TRAINED[0].name].consistent
+    rows, columns = np.nonzero(mask)
+    first, second = np.zeros_like(mask), np.zeros_like(mask)
+    first[rows[::2], columns[::2]], second[rows[::20], columns[::20]] = True, True
+    extra = [Reference(camera, photos[camera.name], each) for each in (first, second)]
+    scene = SimpleNamespace(train=TRAIN, cameras=CAMERAS)
+    space = SimpleNamespace(scene=scene, labels=torch.zeros(1, dtype=torch.bool))
+    facts = summarize(initialize.Params(), space, Draft.start(wall), 0, sets, extra, extra, photos)
+    assert facts["extra_views"] == {camera.name: pytest.approx(0.5, abs=0.01)}
+    assert facts["sds_may_gain"] and "50%" in facts["sds_reason"]
 
 
 def test_what_is_wrong_in_the_hole_or_far_from_it_does_not_count_and_beside_it_does(wall_without_square):

@@ -94,6 +94,15 @@ def test_stripes_repeat_by_their_period():
     assert beside.max() <= 1
 
 
+def test_patches_that_are_all_too_near_to_each_other_have_no_offsets():
+    readable = np.zeros((HEIGHT, WIDTH), bool)
+    readable[40:70, 40:70] = True
+    noise = np.random.default_rng(0).normal(0, 20, (HEIGHT, WIDTH, 3))
+    offsets = lambda width: frequent_offsets(noise, readable, np.zeros((HEIGHT, WIDTH)), width, seed=0)
+    assert len(offsets(8 * 40)) == 0
+    assert len(offsets(8 * 10)) > 0
+
+
 def test_slopes_are_those_of_the_ground_and_short_among_leaves():
     tilt, pose = np.deg2rad(60.0), np.eye(4)
     pose[:3, :3] = [[1, 0, 0], [0, -np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), -np.cos(tilt)]]

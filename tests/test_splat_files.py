@@ -22,10 +22,10 @@ from scenes.splat_tables import read_rows, replace_columns, write_rows
 from reffusion.io.arrays import load_labels
 from reffusion.io.compressed import load_spz, save_spz
 from reffusion.io.files import BadInput
-from reffusion.io.ply import load_ply, load_points, save_ply
+from reffusion.io.ply import load_ply, load_points, save_ply, save_splats
 from reffusion.io.quantized import save_splat
 from reffusion.io.splats import load_splats, summarize_splats
-from reffusion.types import Gaussians
+from reffusion.types import Gaussians, Similarity
 from stages import poses
 from stages.plan import poses as planned
 
@@ -223,6 +223,14 @@ def test_spz_is_read_in_the_frame_of_a_ply(tmp_path, version):
     path.write_bytes(b"NGSP")
     with pytest.raises(BadInput, match=r"s\.spz: not a \.spz file"):
         summarize_splats(path)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_a_spz_says_how_it_is_meant_to_be_drawn(tmp_path, antialiased):
+    gsply, made = pytest.importorskip("gsply"), replace(random_gaussians(3, 1), antialiased=antialiased)
+    save_splats(tmp_path / "s.spz", made, Similarity(1.0, np.zeros(3)))
+    assert load_ply(tmp_path / "s.spz").antialiased == antialiased
+    assert len(gsply.read_spz(str(tmp_path / "s.spz"))) == 3, "other readers read it, too"
 
 
 def load_rows(folder, gaussians):

@@ -1,6 +1,10 @@
 """The number of threads of a long computation on the CPU."""
 
+import os
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import torch
 
@@ -50,3 +54,22 @@ def test_little_work_and_gpus_are_left_to_torch():
         == [1] * STEPS
         == record_parts({1: 0.0, 2: 0.0}, device="meta")
     )
+
+
+def test_the_benchmark_sets_one_thread_before_numpy_and_torch_are_loaded():
+    """They read the number only once; with two threads, CPU seconds would contain the time of waiting."""
+    probe = """
+import os, sys
+class Watch:
+    def find_spec(self, name, *_):
+        if name in ("numpy", "torch"):
+            print(name, os.environ.get("OMP_NUM_THREADS"), os.environ.get("OPENBLAS_NUM_THREADS"))
+sys.meta_path.insert(0, Watch())
+import benchmarks.bench.__main__
+"""
+    others = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    root = Path(__file__).resolve().parent.parent
+    done = subprocess.run(
+        [sys.executable, "-c", probe], cwd=root, env=others, capture_output=True, text=True, check=True
+    )
+    assert sorted(set(done.stdout.splitlines())) == ["numpy 1 1", "torch 1 1"]

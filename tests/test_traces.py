@@ -52,6 +52,13 @@ def initialized_folders(tmp_path_factory):
     return folders | {"prior": home / "prior"}
 
 
+def test_the_line_of_a_violation_is_that_of_the_file(tmp_path):
+    lines = ['{"seconds": 1, "iteration": 0}', '{"seconds": 2, "iter', '{"seconds": 3, "iteration": 1, "pace": 1}']
+    (tmp_path / "trace.jsonl").write_text("\n".join(lines))
+    with pytest.raises(ValueError, match=r"line 3: unknown quantity 'pace'"):
+        load_trace(tmp_path / "trace.jsonl", "fit")
+
+
 def run_stage(stage: str, initialized_folders, out: Path, **changed) -> Path:
     """Run one of the iterative stages on the small scene; return its folder."""
     out.mkdir(parents=True, exist_ok=True)

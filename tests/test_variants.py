@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from reffusion.distill.terms.lift import evaluate_lift
 from reffusion.distill.terms.term import TermInputs
 from reffusion.distill.train_view import ReferenceHole
 from reffusion.initialize import random_init
-from reffusion.io.arrays import load_json, load_labels
+from reffusion.io.arrays import load_json, load_labels, save_json
 from reffusion.io.ground_truth import load_object_mask
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
@@ -275,6 +276,25 @@ def test_lift_goes_on_where_it_was_killed(masked_scene, lifted_views, tmp_path):
     for name in ("a1", "a4"):
         file = Path("images") / f"{name}.png"
         assert (tmp_path / file).read_bytes() == (lifted_views / file).read_bytes()
+
+
+def test_lift_paints_a_clean_view_if_it_is_the_best(masked_scene, tmp_path):
+    """So it is if scene.yaml asks to fill pixels of it."""
+    best = load_json(masked_scene["masks"] / "facts.json")["best_reference"]
+    shutil.copytree(masked_scene["poses"], tmp_path / "poses")
+    views = load_json(tmp_path / "poses/views.json")
+    save_json(tmp_path / "poses/views.json", views | {"clean": [best]})
+    lift.run(lift.Params(), tmp_path / "lift", **masked_scene | {"poses": tmp_path / "poses"})
+    (made,) = load_references(tmp_path / "lift", load_scene(tmp_path / "poses"))
+    assert made.camera.name == best and made.mask.any()
+
+
+def test_lift_without_a_hole_in_any_photograph_says_so(masked_scene, tmp_path):
+    shutil.copytree(masked_scene["masks"], tmp_path / "masks")
+    facts = load_json(tmp_path / "masks/facts.json")
+    save_json(tmp_path / "masks/facts.json", facts | {"best_reference": None})
+    with pytest.raises(ValueError, match="only views without a photograph have pixels to invent"):
+        lift.run(lift.Params(), tmp_path / "lift", **masked_scene | {"masks": tmp_path / "masks"})
 
 
 def test_lift_by_diffusion(masked_scene, tmp_path):

@@ -16,6 +16,7 @@ from reffusion.capture import sfm
 from reffusion.capture.layouts import video
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, load_image
+from report import cli
 from runner import Refused
 from runner.frames import update_frames
 from runner.maintenance import clean
@@ -142,6 +143,14 @@ def test_a_video_is_a_scene(walk_video, tmp_path, capfd):
     assert [path.name for path in (runs / "walk").rglob("*") if path.is_file()] == ["frame_00002.png"]
     with pytest.raises(Refused, match="not a video that OpenCV reads"):
         again(ROOT / "README.md")
+
+
+def test_pages_find_the_results_of_a_video_by_its_name(walk_video, tmp_path, monkeypatch):
+    monkeypatch.setattr(cli, "workplace", lambda root: tmp_path)
+    walk_video.parent.rename(tmp_path / "data")
+    for name in ("walk.mp4", "walk", str(tmp_path / "data/walk.mp4")):
+        arguments = cli.scene_parser("view", "Show.").parse_args(["--scene", name, "--runs", str(tmp_path / "runs")])
+        assert cli.run_folder(arguments) == tmp_path / "runs/walk"
 
 
 def test_photographs_of_a_phone(tmp_path):

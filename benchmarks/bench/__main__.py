@@ -26,13 +26,14 @@ import os
 import sys
 from pathlib import Path
 
+os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read when numpy and torch are loaded
+
 import torch
 
 from benchmarks.bench import alignment, gate, personalization, solvers, splat
 from benchmarks.bench.draw import draw
 from benchmarks.bench.points import recommendation
 
-os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read when numpy and torch are loaded
 ROOT = Path(__file__).resolve().parents[2]
 
 RETRIES = 2  # additional measurements of diagrams that fail the gate

@@ -83,5 +83,5 @@ def diagram(run: Path, out: Path) -> Diagram:
         ("steps", "steps 400"),
         points,
         tolerance=1.1,
-        why="Wall clock of two threads.",
+        why="Wall clock of one thread.",
     )

@@ -27,13 +27,15 @@ from reffusion.prior import denoising, diffusion
 from reffusion.prior.model import Prior
 
 HEIGHT, WIDTH, GAUSSIANS = 300, 400, 1000  # image size and number of Gaussians of counts per pixel and per Gaussian
+# The operations that read or write attention matrices
+ATTENTION = ("bmm", "_safe_softmax", "_softmax_backward_data", "_to_copy")
 PATCHES, SIDE = 64, 64  # number and side in px of the critic's patches, as in the paper
 
 
 class _TrafficCounter(TorchDispatchMode):
     """Counter of the bytes of all operations' inputs and outputs.
 
-    Views of tensors and operations on attention matrices count nothing.
+    Views of tensors and operations on large attention matrices count nothing.
     """
 
     def __init__(self) -> None:
@@ -45,16 +47,20 @@ class _TrafficCounter(TorchDispatchMode):
         inputs = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
         outputs = [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor)]
         homes = {leaf.untyped_storage()._cdata for leaf in inputs}
-        in_place = func.__name__.split(".")[0].endswith("_")
-        view = outputs and all(leaf.untyped_storage()._cdata in homes for leaf in outputs) and not in_place
-        if not view and not any(map(_attention, inputs + outputs)):
+        name = func.__name__.split(".")[0]
+        view = outputs and all(leaf.untyped_storage()._cdata in homes for leaf in outputs) and not name.endswith("_")
+        attends = name in ATTENTION and any(map(_is_large_square, inputs + outputs))
+        if not view and not attends:
             self.bytes += sum(leaf.numel() * leaf.element_size() for leaf in inputs + outputs)
         return result
 
 
-def _attention(tensor: Tensor) -> bool:
-    """Return True for a tensor that looks like a large attention matrix: its last two sides are at least 1024."""
-    return tensor.ndim >= 3 and min(tensor.shape[-2:]) >= 1024
+def _is_large_square(tensor: Tensor) -> bool:
+    """Return whether the last two sides of a tensor are equal and at least 1024, as those of a large attention matrix.
+
+    A feature map may have this shape, too.
+    """
+    return tensor.ndim >= 3 and tensor.shape[-1] == tensor.shape[-2] >= 1024
 
 
 def count_work(work: Callable[[], object]) -> dict[str, float]:

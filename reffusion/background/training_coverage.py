@@ -48,7 +48,7 @@ class CoverageView(NamedTuple):
 def render_coverage_views(
     gaussians: Gaussians, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray]
 ) -> list[CoverageView]:
-    """Render the depth of the training views, at most `LONGEST` px wide or high.
+    """Return depth and object mask of each training view, reduced to at most `LONGEST` px in width and height.
 
     Args:
         gaussians: the fitted Gaussians with the object, because the object hides the surfaces behind it.

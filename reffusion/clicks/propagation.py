@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from scipy import ndimage
@@ -23,6 +24,7 @@ from reffusion.clicks.marks import UNKNOWN, Clicks
 from reffusion.clicks.segmenter import Candidate, Prompt
 from reffusion.clicks.single_view import ViewEvidence, bounding_box, erode, refine_edges
 from reffusion.clicks.supports import on_supports
+from reffusion.morphology import disk
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
@@ -35,6 +37,7 @@ POINTS = 3  # largest number of points in a prompt
 MIN_REST = 0.01  # share of the visible silhouette; the network gets a further prompt for larger parts that it left out
 # Votes exclude a pixel whose `Projection.outside` is above MIN_AGAINST and whose `Projection.inside` is below MAX_FOR.
 MIN_AGAINST, MAX_FOR = 0.5, 0.2
+MIN_WIDTH = 0.004  # share of the larger image side: radius of the narrowest part that votes take from a network's mask
 # Points of a prompt are at least this far from the mask's border: as a share of the largest such distance, and in px.
 MIN_DEPTH = 0.3
 MIN_DEPTH_PX = 1.5
@@ -186,10 +189,10 @@ def draw_mask(view: ViewEvidence, projection: Projection) -> np.ndarray:
     """Return bool [H, W], the segmentation network's mask of the object in a view, prompted by projected votes.
 
     The network may take the object and its support for one thing, such as a statue and its plinth. So if the network's
-    mask covers pixels that votes exclude, the network is prompted again with negative points at these pixels. The
-    object to remove may consist of several things, such as a table and the dishes on the table. So for each large part
-    of the visible silhouette that the mask leaves out, the network is prompted separately, and its answer is added if
-    this raises the agreement with the votes.
+    mask covers pixels that votes exclude, the network is prompted again with negative points at these pixels. What the
+    mask still covers of them, outside the silhouette, is removed. The object to remove may consist of several things,
+    such as a table and the dishes on the table. So for each large part of the visible silhouette that the mask leaves
+    out, the network is prompted separately, and its answer is added if this raises the agreement with the votes.
 
     Args:
         view: a view with a network (`ask` is not None).
@@ -207,7 +210,7 @@ def draw_mask(view: ViewEvidence, projection: Projection) -> np.ndarray:
     ]
     candidates = _ask(view, prompts)
     mask = _select(candidates, projection)
-    excluded = mask & (projection.outside > MIN_AGAINST) & (projection.inside < MAX_FOR)
+    excluded = mask & _excluded(projection)
     if excluded.sum() > MIN_REST * silhouette.sum():
         others = _deepest_points(excluded)
         points = Clicks(
@@ -219,7 +222,18 @@ def draw_mask(view: ViewEvidence, projection: Projection) -> np.ndarray:
         both = mask | _select(_ask(view, [Prompt(_deepest_points(part), bounding_box(part))]), projection, mask)
         if agreement(both, projection) > agreement(mask, projection):
             mask = both
-    return mask
+    return mask & ~_open(mask & _excluded(projection) & ~projection.silhouette)
+
+
+def _excluded(projection: Projection) -> np.ndarray:
+    """Return bool [H, W], the pixels that votes exclude from the object."""
+    return (projection.outside > MIN_AGAINST) & (projection.inside < MAX_FOR)
+
+
+def _open(mask: np.ndarray) -> np.ndarray:
+    """Return bool [H, W], the mask without parts thinner than the uncertainty of Gaussians at borders."""
+    kernel = disk(max(1, round(MIN_WIDTH * max(mask.shape))))
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
 
 
 def _ask(view: ViewEvidence, prompts: Sequence[Prompt], parts: bool = False) -> list[tuple[Candidate, float]]:

@@ -71,18 +71,18 @@ def align_depth_map(
 
     Returns:
         disparity: [H, W] float64, the aligned map where it is known. If it is unknown in the hole, the continuation
-            fills all unknown pixels; else unknown pixels, which all lie outside the hole, have the meaningless value 1.
+            fills all unknown pixels; else unknown pixels, which all lie outside the hole, have the view's disparity.
         description: The method, in words.
 
     Raises:
         Degenerate, ValueError: As `alignment.align_either`.
     """
     aligned, space = alignment.align_either(depth, view.depth, view.known)
+    missing = ~np.isfinite(aligned)
     result, description = (
-        1.0 / np.where(np.isfinite(aligned), aligned, 1.0),
+        np.where(missing, view.disparity, 1.0 / np.where(missing, 1.0, aligned)),
         f"by the depth map that came along, as {space}",
     )
-    missing = ~np.isfinite(aligned)
     if (missing & view.hole).any():
         rest, rest_description = continue_depth(view, guide, points, settings, log)
         result, description = (

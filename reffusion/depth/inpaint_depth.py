@@ -9,7 +9,8 @@ import numpy as np
 def inpaint_depth(depth: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Return [H, W], the depth map with its unknown pixels filled by Telea's method, which acts on disparity here.
 
-    The result is 0, also at known pixels, where the depth is more than 1000 times the smallest known depth.
+    Known pixels keep their depth. At other pixels the result is 0 where the depth would be more than 1000 times the
+    smallest known depth.
 
     Args:
         depth: [H, W] > 0, read where `known`.
@@ -20,4 +21,4 @@ def inpaint_depth(depth: np.ndarray, known: np.ndarray) -> np.ndarray:
     levels = np.round(disparity / top * 65535).astype(np.uint16)
     filled = cv2.inpaint(levels, (~known).astype(np.uint8), 3, cv2.INPAINT_TELEA) / 65535 * top
     filled = np.where(known, disparity, filled)
-    return np.divide(1.0, filled, out=np.zeros_like(filled), where=filled > 1e-3 * top)
+    return np.divide(1.0, filled, out=np.zeros_like(filled), where=known | (filled > 1e-3 * top))

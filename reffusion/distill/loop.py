@@ -282,9 +282,9 @@ def average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
 
 
 def rates_of(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:
-    """Return the step sizes of 3DGS, in the unit that `lr.means_unit` names.
+    """Return the default step sizes of 3DGS, without the factors in `lr` (`masked_factors` returns these).
 
-    With the unit "cameras", the step sizes of positions are multiplied by the extent of the cameras.
+    If `lr.means_unit` is "cameras", the step sizes of positions are multiplied by the extent of the cameras.
     """
     return Rates().in_units_of(cameras_extent(cameras)) if lr.means_unit == "cameras" else Rates()
 

@@ -27,7 +27,7 @@ def initial_gaussians(
         points: [P, 3] in the normalised frame, P >= 4.
         colors: [P, 3] uint8, the colours of the Gaussians.
         sh_degree: degree of the spherical harmonics; all but the constant one are 0.
-        budget: maximum number of Gaussians; if there are more points, a random subset of them is used.
+        budget: maximum number of Gaussians, at least 4; if there are more points, a random subset of them is used.
         generator: random generator for this subset.
         opacity: opacity of each Gaussian, in (0, 1).
         size: standard deviation of a Gaussian, divided by the root mean square of the distances from its point to the

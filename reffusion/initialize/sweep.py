@@ -36,7 +36,8 @@ def refine_background(background: Background, camera: Camera, hole: np.ndarray) 
     Args:
         background: the photographs, depth views and planes around the object.
         camera: the view.
-        hole: bool [H, W], the pixels to be filled. Depth is searched in a ring around them and the object's pixels.
+        hole: bool [H, W], the pixels to be filled. Depth is searched in a ring around
+            the hole and the object, outside the hole.
 
     Returns:
         The background with corrected depth and planes, and bool [H, W], the pixels at which the sweep found depth.

@@ -323,7 +323,8 @@ def _source_image(
 def _choose_others(own: DepthView, views: Sequence[DepthView]) -> list[DepthView]:
     """Choose up to `OTHER_PHOTOS` other views, evenly spread from near to far.
 
-    So a surface that one of them sees obliquely is seen less obliquely by another one.
+    So a surface that one of them sees obliquely is seen less obliquely by another one. If there are more other views,
+    the nearest one is left out, because it shows nearly the same as the view itself.
     """
     distance = lambda view: float(np.linalg.norm(view.camera.center - own.camera.center))
     others = sorted((view for view in views if view is not own), key=distance)

@@ -5,6 +5,7 @@ A compressed .ply is quantised in chunks of 256 Gaussians. This is the only modu
 
 from __future__ import annotations
 
+import gzip
 import importlib.util
 import struct
 import zlib
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 PACKED = "packed_position"  # a vertex property by which a compressed .ply is recognised
 SPZ_HEADER, SPZ_MAGIC = struct.Struct("<IIIBBBB"), 0x5053474E
+SPZ_FLAGS = 14  # index of the byte of flags in the header; its lowest bit means antialiased
 # Sign of each spherical harmonic when y and z change sign, in the order of 3DGS (degree 1 is y, z, x).
 TURNED_SH = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
@@ -101,13 +103,14 @@ def load_spz(path: Path) -> Rows:
         return _turn_about_x(_to_rows(gsply.read_spz(str(path))))
 
 
-def save_spz(path: Path, rows: Rows) -> None:
-    """Write rows as a .spz file. Its header does not say that the splats are antialiased.
+def save_spz(path: Path, rows: Rows, antialiased: bool = False) -> None:
+    """Write rows as a .spz file of version 3.
 
     Positions are fixed-point numbers of 24 bits. As many bits as the largest coordinate allows are fractional.
 
     Args:
         rows: in the frame of a .ply (y down); they are rotated by 180 degrees about x for the file.
+        antialiased: True if the splats are to be rendered with Mip-Splatting's 2D filter.
 
     Raises:
         BadInput: gsply is not installed.
@@ -126,7 +129,11 @@ def save_spz(path: Path, rows: Rows) -> None:
         format="ply",
     )
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    gsply.write_spz(str(path), data, fractional_bits=int(np.clip(22 - np.ceil(np.log2(extent)), 1, 20)))
+    gsply.write_spz(str(path), data, version=3, fractional_bits=int(np.clip(22 - np.ceil(np.log2(extent)), 1, 20)))
+    if antialiased:  # gsply writes no flags
+        content = bytearray(gzip.decompress(Path(path).read_bytes()))
+        content[SPZ_FLAGS] |= 1
+        Path(path).write_bytes(gzip.compress(content, 6, mtime=0))
 
 
 def _to_rows(data) -> Rows:

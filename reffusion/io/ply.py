@@ -97,7 +97,7 @@ def check_can_save(path: Path) -> None:
 def save_splats(path: Path, gaussians: Gaussians, similarity: Similarity, properties: Sequence[str] = ()) -> None:
     """Write Gaussians in the scene's own frame, in the format that the file's ending names (see `splats.FORMATS`).
 
-    Only a plain .ply stores `Gaussians.antialiased`.
+    A plain .ply and a .spz store `Gaussians.antialiased`, the other formats do not.
 
     Args:
         gaussians: in the normalised frame.
@@ -110,7 +110,10 @@ def save_splats(path: Path, gaussians: Gaussians, similarity: Similarity, proper
         rows = Rows(means.astype(np.float64), *others)
         sizes = (rows.log_scales - np.log(similarity.scale)).astype(np.float32)
         rows = replace(rows, means=similarity.invert(rows.means), log_scales=sizes)
-        (compressed.save_spz if name.endswith(".spz") else save_splat)(path, rows)
+        if name.endswith(".spz"):
+            compressed.save_spz(path, rows, gaussians.antialiased)
+        else:
+            save_splat(path, rows)
     elif name.endswith(".compressed.ply"):
         compressed.save_compressed(path, gaussians, similarity)
     else:

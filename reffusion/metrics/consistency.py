@@ -86,7 +86,7 @@ def continue_surrounding_depth(depth: np.ndarray, mask: np.ndarray) -> np.ndarra
     This gives a depth to pictures that were inpainted in 2D, since 2D inpainting makes no depth.
 
     Args:
-        depth: [H, W], camera z; 0 where unknown. Outside the mask the disparity of such a pixel counts as 0.
+        depth: [H, W], camera z; 0 where unknown. Only known pixels outside the mask determine the continuation.
         mask: bool [H, W], True = the pixel was inpainted.
 
     Returns:
@@ -98,7 +98,7 @@ def continue_surrounding_depth(depth: np.ndarray, mask: np.ndarray) -> np.ndarra
         return np.zeros(depth.shape)
     disparity = np.divide(1.0, depth, out=np.zeros(depth.shape), where=known)
     try:
-        disparity = complete(disparity, ~mask)
+        disparity = complete(disparity, known)
     except ValueError:
         return np.where(mask, 0.0, depth)
     usable = disparity > 0.1 * disparity[known].min()  # at most ten times the farthest known depth

@@ -40,9 +40,10 @@ class HeldOut:
 
 
 def choose_photos(names: Sequence[str], references: Sequence[str]) -> list[str]:
-    """Return up to `PHOTOS` of the names that are no references, taken at equal steps from the first one on."""
+    """Return up to `PHOTOS` of the names that are no references, evenly spread from the first one on."""
     others = [name for name in names if name not in references]
-    return others[:: max(1, len(others) // PHOTOS)][:PHOTOS]
+    count = min(PHOTOS, len(others))
+    return [others[k * len(others) // count] for k in range(count)]
 
 
 def make_held_out(

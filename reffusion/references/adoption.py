@@ -69,8 +69,8 @@ def adopt_references(files: Sequence[ReferenceFile], space: Workspace) -> tuple[
 def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tuple[Reference, str]:
     """Align one reference with its photograph.
 
-    A picture that equals the photograph outside the object (`Registration.is_identical`) is used as it is. Of any other
-    picture only the hole, the object's shadow and a blended rim are pasted into the photograph.
+    Only the hole, the object's shadow and a blended rim are taken from the picture and pasted into the photograph. A
+    picture that equals the photograph outside the object (`Registration.is_identical`) is pasted without alignment.
 
     Args:
         file: the reference's files.
@@ -108,10 +108,10 @@ def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tu
     if not found.is_identical:
         image, inside = undistort_reference(file, lens, upright, found.affine)
         image = color.recolor(image, found.gain, found.offset)
-        margin, blend = (share * camera.width for share in (PASTE_MARGIN, PASTE_BLEND))
         usual = shadows.redrawn_difference(image, photo, inside & ~hidden)
-        hole = hidden | shadows.detect_shadows(image, photo, hidden) & inside
-        image = color.paste(image, photo, hole, inside, margin, blend)
+    margin, blend = (share * camera.width for share in (PASTE_MARGIN, PASTE_BLEND))
+    hole = hidden | shadows.detect_shadows(image, photo, hidden) & inside
+    image = color.paste(image, photo, hole, inside, margin, blend)
     if masks.invent.any() and (share := inside[masks.invent].mean()) < LEAST_HOLE_SHARE:
         raise ValueError(f"{file.path}: shows only {share:.0%} of the hole in '{file.view}'; crop less")
     differs = masks.consistent | shadows.changed_pixels(image, photo, masks.invent, usual)

@@ -53,7 +53,7 @@ class Completion:
         misfit: how badly the patches fit on the whole: the mean of their misfits (`search.misfit`), in which pixels
             near the hole's border weigh most and pixels without a patch are left out. Of several completions of one
             hole, the one with the least misfit mostly looks best. It is `NO_MATCH` if there were too few patches and
-            Telea's method filled the hole, and 0 if the hole is empty.
+            Telea's method filled the hole, or if no pixel has a patch, and 0 if the hole is empty.
     """
 
     image: np.ndarray
@@ -99,7 +99,7 @@ def complete(
         coarser = hole_pixels
     assert matches is not None
     weight = level.weight[hole_pixels.row, hole_pixels.column] * (matches.misfit < NO_MATCH)
-    misfit = float((matches.misfit * weight).sum() / max(weight.sum(), 1e-6))
+    misfit = float((matches.misfit * weight).sum() / weight.sum() if weight.any() else NO_MATCH)
     return Completion(_blend_patches(target.image, hole, level, matches), misfit)
 
 

@@ -235,7 +235,8 @@ def frequent_offsets(
         seed: seed of the random choice of patches near the hole.
 
     Returns:
-        [M, 2] int (rows, columns), the most frequent offset first; M = 0 if there are too few patches.
+        [M, 2] int (rows, columns), the most frequent offset first; M = 0 if there are too few patches, or if
+        all are too near to each other.
     """
     draws = np.random.default_rng(seeding.seed_for(seed, "offsets"))
     rows, columns = np.nonzero(ndimage.binary_erosion(readable, iterations=ARM + 1))
@@ -255,8 +256,9 @@ def frequent_offsets(
         difference = square - 2 * patches[batch] @ patches.T
         too_near = (rows[batch][:, None] - rows) ** 2 + (columns[batch][:, None] - columns) ** 2 < least**2
         difference[too_near] = np.inf
-        nearest = difference.argmin(1)
-        offsets.append(np.stack([rows[nearest] - rows[batch], columns[nearest] - columns[batch]], 1))
+        comparable = ~too_near.all(1)
+        compared, nearest = batch[comparable], difference.argmin(1)[comparable]
+        offsets.append(np.stack([rows[nearest] - rows[compared], columns[nearest] - columns[compared]], 1))
     return _histogram_peaks(np.concatenate(offsets), readable.shape)
 
 

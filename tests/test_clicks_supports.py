@@ -1,0 +1,49 @@
+"""What stands beside the object is kept out of its masks: planes around the object, and pixels that votes exclude."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reffusion.clicks import supports
+from reffusion.clicks.propagation import Projection, draw_mask
+from reffusion.clicks.segmenter import Candidate
+from reffusion.clicks.single_view import ViewEvidence
+
+
+def support_scene(generator, bumps=0.0):
+    """A ball of radius 1 on the plane z = 0: means [N, 3] of Gaussians; bool [N] each, of the ball and of the plane."""
+    ball = generator.normal(size=(400, 3))
+    ball = ball / np.linalg.norm(ball, axis=1, keepdims=True) + (0, 0, 1)
+    plane = np.column_stack([generator.uniform(-3, 3, (1200, 2)), bumps * generator.normal(size=1200)])
+    is_ball = np.arange(1600) < 400
+    return np.concatenate([ball, plane]), is_ball, ~is_ball
+
+
+def test_a_plane_known_on_one_side_of_the_object_goes_on_at_the_other_side():
+    means, ball, plane = support_scene(np.random.default_rng(0))
+    known = means[:, 0] > 0
+    found = supports.on_supports(means, ball & known, plane & known)
+    near = np.linalg.norm(means - np.median(means[ball & known], 0), axis=1) < 1.5
+    assert found[plane & near & ~known].all() and found[ball].mean() < 0.02
+
+
+@pytest.mark.parametrize("case", ["a rug is the object", "rough ground", "nothing labelled"])
+def test_no_plane_speaks_against_the_object_where_none_supports_it(case):
+    means, ball, plane = support_scene(np.random.default_rng(1), bumps=1.0 if case == "rough ground" else 0.0)
+    known, rug = means[:, 0] > 0, plane & (np.linalg.norm(means, axis=1) < 1)
+    is_object = {"a rug is the object": rug & known, "rough ground": ball & known, "nothing labelled": known & False}
+    is_other = known & ~ball & ~rug if case == "a rug is the object" else plane & known
+    assert not supports.on_supports(means, is_object[case], is_other).any()
+
+
+def test_pixels_that_votes_exclude_are_taken_from_the_networks_mask():
+    """The network knows only the statue with its plinth. A thin strip of excluded pixels may be an error."""
+    statue, plinth, strip = (np.zeros((90, 120), bool) for _ in range(3))
+    statue[20:60, 40:70], plinth[60:80, 30:80], strip[20:55, 70:72] = True, True, True
+    answer = [Candidate(statue | plinth | strip, 0.9)] * 3
+    view = ViewEvidence(np.zeros((90, 120, 3), np.uint8), ask=lambda prompt: answer)
+    votes = Projection(statue, statue * 1.0, np.where(statue, 0.0, 1.0))
+    assert np.array_equal(draw_mask(view, votes), statue | strip)
+    unknown = Projection(statue, statue * 1.0, np.zeros((90, 120)))
+    assert np.array_equal(draw_mask(view, unknown), answer[0].mask)
