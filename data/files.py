@@ -21,7 +21,7 @@ def write_model(folder: Path, kind: Kind, names: list[str], cameras: np.ndarray,
     Args:
         folder: folder to write to.
         kind: kind of the scene.
-        names: names of the views; training views come last.
+        names: names of the views, to which ".jpg" is appended in the file; training views come last.
         cameras: [V, 16], one row per view.
         frame: transform from the room to the scene frame.
         points: sparse points with their image points in the training views; test views get no image points.

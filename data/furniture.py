@@ -2,7 +2,8 @@
 
 The functions below the class add one piece each to a `Furniture`, here called `f`, with random details from the
 generator `draw`. Room frame: metres, x right, y up, z towards the cameras; the back wall is z = 0. Angles are in
-degrees. A solid is *removable* if it belongs to an object that the scene asks to remove or to insert.
+degrees. `x` and `z` are the centre of a piece, unless its docstring says otherwise. A solid is *removable* if it
+belongs to an object that the scene asks to remove or to insert.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ class Material:
         texture: name of the texture.
         tile: side of the repeated texture in metres; 0 stretches one texture over the whole face.
         tint: factor on the texture's linear colour.
-        turned: True turns the texture by 90 degrees.
+        turned: True exchanges the axes of the texture, so that its rows run along v of the face.
     """
 
     texture: str

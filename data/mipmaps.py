@@ -34,7 +34,7 @@ def build_mipmaps(pictures: dict[str, np.ndarray]) -> tuple[Textures, dict[str, 
     """Build the mip levels of all textures, averaged in linear light.
 
     Args:
-        pictures: name -> [N, N, 3] sRGB, clipped to [0, 1], N a power of two.
+        pictures: name -> [N, N, 3] sRGB, N a power of two; values outside [0, 1] are clipped.
 
     Returns:
         The textures in the order of `pictures`, and {name: index of the texture}.

@@ -174,7 +174,7 @@ def _look_at(along: np.ndarray, roll: float) -> np.ndarray:
 
 
 def develop(color: np.ndarray, exposure: float) -> np.ndarray:
-    """Convert linear radiance to sRGB bytes with a curve that compresses highlights instead of clipping them."""
+    """Convert linear radiance times `exposure` to sRGB bytes by a curve that compresses highlights without clipping."""
     tone = 1 - np.exp(-exposure * color)
     return np.round(255 * tone ** (1 / 2.2)).astype(np.uint8)
 

@@ -138,8 +138,8 @@ def render(solids, faces, textures, light, camera, width, height, with_object, s
         samples: rays along a side of a pixel; the picture is box-filtered over samples² rays per pixel.
 
     Returns:
-        Linear radiance [H, W, 3], and bool [H, W], True where at least one ray of the pixel hits the object first (if
-        the object were there).
+        Linear radiance [H, W, 3], and the object's mask, bool [H, W], the same for each `with_object`: True where the
+        object is the first thing that at least one ray of the pixel hits, or would hit if the object were there.
     """
     color = np.zeros((height, width, 3))
     mask = np.zeros((height, width), np.bool_)

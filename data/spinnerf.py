@@ -1,4 +1,7 @@
-"""List of SPIn-NeRF's published scenes that are in a folder, one per line: `python data/spinnerf.py --data FOLDER`."""
+"""Print a line for each of SPIn-NeRF's scenes in a folder: `python data/spinnerf.py --data FOLDER`.
+
+A line has the numbers of views and the parts that the scene lacks, or says that a published scene is missing.
+"""
 
 from __future__ import annotations
 

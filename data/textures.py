@@ -45,7 +45,7 @@ def herringbone(rng, size, cells=32, long=4):
     """Make a herringbone floor: narrow blocks at right angles to each other, with the grain along each block.
 
     Args:
-        cells: number of block widths along a side.
+        cells: number of block widths along a side; the texture is tileable only for a multiple of 2 * `long`.
         long: length of a block over its width.
     """
     palette = WOODS[rng.integers(len(WOODS))]

@@ -117,13 +117,16 @@ class Workspace:
     def background(self) -> Background:
         """The surroundings of the object as the photographs show them, with the planes and mirrors that `masks` found.
 
-        A mirror is a plane of mirror symmetry of a thing beside the object (`background/mirrors.py`).
+        It also has the object's center and radius. A mirror is a plane of mirror symmetry of a thing beside the object
+        (`background/mirrors.py`).
         """
         return surfaces_from_arrays(self.background_views, load_arrays(self.masks / SURFACES), self.device)
 
     @cached_property
     def background_views(self) -> Background:
-        """The background without planes and mirrors.
+        """The background before `masks` searches it: without planes and mirrors, the object's extent still unknown.
+
+        `center` and `radius` have their defaults (the origin, and infinity).
 
         For a view without a photograph, a rendering of the Gaussians takes the place of the photograph. The pixels of
         this view that no photograph shows are in its mask C, so they count as hidden.

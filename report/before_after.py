@@ -119,8 +119,8 @@ def rendered_views(job: JobFiles) -> list[str]:
 def find_pictures(job: JobFiles, name: str) -> dict[str, Path]:
     """Return the existing pictures of a view as {kind of picture, a key of `TITLES`: file}.
 
-    The view's photograph has the key "truth" if the view is a test view without an input mask or a mask made from
-    clicks, since the photograph then shows the scene without the object. Otherwise it has the key "photograph".
+    The view's photograph has the key "truth" if it shows the scene without the object: if the view is a test view that
+    has neither an input mask nor a mask made from clicks. Otherwise the photograph has the key "photograph".
 
     Args:
         job: a job whose stage `evaluate` is done.

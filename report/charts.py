@@ -214,7 +214,8 @@ def draw_forest(
 
     The left side of a panel is always worse than the full method. A difference is blue (better) or orange (worse) if
     its interval over views excludes zero, else grey. A thick line is the interval over views, a thin line the interval
-    over scenes. A difference that is more than three times as large as the panel's median is an arrow with the number.
+    over scenes. A difference whose absolute value is more than three times the panel's median absolute difference is
+    drawn as an arrow with the number.
 
     Args:
         differences: metric -> method -> the method's score minus the full method's score.

@@ -141,8 +141,8 @@ def method_table(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]
         header: titles of the columns. Columns of `OPTIONAL_COLUMNS` are omitted if no method has a value.
         cells: text [rows][columns], one row per method; a dash marks a missing value.
         bold: [rows][columns], True for the values of a score that equal the best one after rounding. The best value is
-            that of the methods with the most finished scenes. Columns that are no scores, such as "seconds" and
-            "consistency", have no best value, nor has a score that a single one of these methods has.
+            that of the methods with the most finished scenes. There is no best value in columns that are no scores,
+            such as "seconds" and "consistency", nor in a score that only one of these methods has.
     """
     names = [name for name in TITLES if name not in OPTIONAL_COLUMNS or any(row[name] is not None for row in table)]
     best = {}

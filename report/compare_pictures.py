@@ -19,15 +19,15 @@ BOX = ("left", "top", "right", "bottom")  # columns of per_view.csv
 
 
 def save_sheets(comparison: Comparison, out: Path, count: int = 3) -> dict[str, Path]:
-    """Write a picture for a few views with the photograph and every method's render; return {view: PNG}.
+    """Write a sheet for a few views: the photograph and every method's render, cropped to the box; return {view: PNG}.
 
-    Methods that are not finished, and duplicates of earlier methods, are left out. One scene gets pictures of `count`
-    evenly spread views. Of several scenes, `count` evenly spread ones get a picture of one view each, whose key begins
+    Methods that are not finished, and duplicates of earlier methods, are left out. One scene gets sheets of `count`
+    evenly spread views. Of several scenes, `count` evenly spread ones get a sheet of one view each, whose key begins
     with the scene's name. Views without a box are used only if no view has one.
 
     Args:
-        out: existing folder for the pictures.
-        count: largest number of pictures.
+        out: existing folder for the sheets.
+        count: largest number of sheets.
     """
     if len(comparison.scenes) == 1:
         return _sheets_of(comparison, comparison.scenes[0], out, "", count)

@@ -112,9 +112,9 @@ def published_table(
 
 
 def format_spread(row: dict, metric: str, digits: int) -> str:
-    """Return a method's mean score as text, with ± half its 95 % interval over scenes if there are several scenes.
+    """Return a method's mean score as text; with several scenes, ± half the width of its 95 % confidence interval.
 
-    A dash stands for a missing score.
+    The interval is over scenes. A dash stands for a missing score.
 
     Args:
         row: the method's row of the table.

@@ -69,12 +69,12 @@ def make(home: Path) -> list[str]:
 
 
 def viewer_caveats(path: Path, antialiased: bool) -> str:
-    """Return a text with the properties of a .ply file that some viewers do not support; empty if there are none.
+    """Return text on what viewers may not support in a .ply file: doubles, Mip-Splatting's filter; "" if neither.
 
-    The text is to be appended to a sentence: each property begins with "; ".
+    The text is to be appended to a sentence: each of the two parts begins with "; ".
 
     Args:
-        path: the .ply file.
+        path: the .ply file; its header says whether positions are doubles.
         antialiased: True if its Gaussians were fitted with the 2D filter of Mip-Splatting.
     """
     with open(path, "rb") as file:

@@ -227,6 +227,11 @@ def main() -> None:
 def serve(session: Session, arguments: argparse.Namespace, fit: subprocess.Popen) -> None:
     """Print the page's address and serve the page until Ctrl-C.
 
+    Args:
+        session: marks and masks of the page.
+        arguments: `port` is the first port to try; `scene` and `profile` are for the command that the page suggests.
+        fit: process of the stage `fit`.
+
     Raises:
         ValueError: no port is free.
     """

@@ -95,7 +95,7 @@ class Comparison:
 
     @property
     def distinct_methods(self) -> list[str]:
-        """Methods without the duplicates, i.e. without those that compute exactly the same as an earlier method."""
+        """Names of the methods, without duplicates (methods that compute exactly the same as an earlier method)."""
         return [method for method in self.methods if method not in self.same_as]
 
     @property
@@ -207,8 +207,9 @@ def summarize_methods(comparison: Comparison) -> list[dict[str, Any]]:
     """Return the table of all methods: one dictionary per method with the keys `COLUMNS`.
 
     Scores, "consistency", seconds and number of Gaussians are means over the method's finished scenes, None where
-    unknown; a scene's score is its mean over test views. "peak_memory_mb" is the maximum over stages and scenes, and
-    "scenes" the number of finished scenes. Differences to the full method are means over views, see `Difference`.
+    unknown; a scene's score is its mean over test views. "<score>_interval" is half the width of the score's confidence
+    interval over scenes (`mean_interval`). "peak_memory_mb" is the maximum over stages and scenes, and "scenes" the
+    number of finished scenes. Differences to the full method are means over views, see `Difference`.
 
     Of a method that computes the same as an earlier method, only "method", "state", "scenes" and "same_as" are filled.
     The methods are sorted by the score `MAIN`, the best first. Methods without this score come next in their order,
@@ -256,7 +257,7 @@ def finite_mean(values: list[float | None]) -> float | None:
 def mean_interval(values: list[float | None]) -> float | None:
     """Return half the width of Student's 95 % confidence interval of the mean of the values that are finite numbers.
 
-    None if fewer than two values are.
+    The result is None if fewer than two values are finite numbers.
     """
     return confidence_half_width(np.array([value for value in values if value is not None and math.isfinite(value)]))
 
@@ -304,9 +305,10 @@ def save_csv(path: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def differences_to_full(comparison: Comparison, metric: str) -> dict[str, Difference]:
-    """Return {method: its score minus the full method's score}, paired over the test views that both methods have.
+    """Return {method: `Difference` of its scores to the full method's (method minus full)} in one metric.
 
-    The full method, methods without common views, and methods that compute the same as an earlier one are omitted.
+    Scores are paired over the test views that both methods have. The full method, methods without common views, and
+    methods that compute the same as an earlier one are omitted.
     """
     differences = {}
     for method in comparison.distinct_methods:

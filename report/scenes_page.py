@@ -16,7 +16,7 @@ SCORES = ("lpips_vgg_box", "psnr_box", "ssim_box", "flip_box")
 
 
 def make(jobs: list[JobFiles], out: Path) -> Path:
-    """Write index.html, stages.png and stages.csv into `out`; return the page's path.
+    """Write the page index.html, stages.csv and, if there are traces, stages.png into `out`; return the page's path.
 
     Args:
         jobs: one per scene, at least one.
@@ -134,7 +134,12 @@ def quartiles(values: list[float]) -> tuple[int, float, float, float]:
 
 
 def scene_table(jobs: list[JobFiles], out: Path) -> str:
-    """Return an HTML table with a row per scene: the number of stages done, their seconds, and the scores."""
+    """Return an HTML table with a row per scene: the number of stages done, their seconds, and the scores.
+
+    Args:
+        jobs: one per scene.
+        out: not used; nothing is written.
+    """
     names = [n for n in SCORES if any(job.metrics.get("mean", {}).get(n) is not None for job in jobs)]
     rows = []
     for job in jobs:

@@ -54,7 +54,7 @@ def say(text: str) -> None:
 
 @contextmanager
 def redirect_output(redirect: Callable[[str], None]) -> Iterator[None]:
-    """Pass the messages that this thread gives to `say` to the function `redirect` instead, inside the context."""
+    """Inside the context, call `redirect` with each message of `say` in this thread instead of printing the message."""
     token = _redirect.set(redirect)
     try:
         yield

@@ -31,8 +31,8 @@ def merge_params(below: dict[str, Any], above: dict[str, Any], atomic: Collectio
 def parse_set(text: str, pipeline: Pipeline) -> Overrides:
     """Parse the text of `set=`, such as `fit.iterations=500 distill.sds.weight=1`, whose values are YAML.
 
-    Values of keys of scene.yaml stay text as written, as in scene.yaml. If a parameter occurs twice, the last one
-    counts. Whether parameters exist is not checked.
+    The value of a parameter that is also a key of scene.yaml is not converted to numbers or booleans: it stays text, as
+    in scene.yaml. If a parameter occurs twice, the last one counts. Whether parameters exist is not checked.
 
     Returns:
         Overrides: stage -> parameter, or group of parameters -> value.

@@ -121,9 +121,9 @@ def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decisi
 
 
 def used_needs(job: ResolvedJob, stage: str) -> list[str]:
-    """Return the names of the needs of a stage, also `scene`, but not one that it ignores with its parameters.
+    """Return the names of a stage's needs, `scene` included, without the one that its parameters make it ignore.
 
-    See `pipeline.IgnoredNeed`.
+    For the ignored need see `pipeline.IgnoredNeed`.
     """
     spec = job.pipeline.stages[stage]
     ignored = spec.ignore and _has_value(job, spec.ignore.param, spec.ignore.equals) and spec.ignore.need

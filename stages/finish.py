@@ -25,9 +25,9 @@ def run(
 
     The result is that of `distill`; if this stage was skipped, that of `initialize`; and if both were skipped, that of
     `fit`. With `params.backdrop`, scene.ply is the result with a backdrop. Gaussians that the scene brings get no
-    backdrop, because they may cover places that its views do not show. If a backdrop is added, completed/<stage>.ply
-    holds the same result in the normalised frame (<stage> made it), and completed/initialize.ply the initialization
-    with the same backdrop.
+    backdrop, because they may cover places that its views do not show. If a backdrop is added, the result with backdrop
+    is also written in the normalised frame, as completed/<name of the stage that made it>.ply, and the initialization
+    with the same backdrop as completed/initialize.ply.
 
     Args:
         out: folder of this stage.

@@ -36,7 +36,8 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None
     """Run the stage: fit Gaussians to the training views, without those that `params.holdout` reserves for evaluation.
 
     Writes gaussians.ply (normalised frame), trace.jsonl and, if exposures are fitted, exposures.json. An interrupted
-    fit resumes from the checkpoint in `out`.
+    fit resumes from the checkpoint in `out`. If the scene brings Gaussians and `params.pixels` is "all", these become
+    gaussians.ply and nothing is fitted.
 
     Args:
         out: folder of this stage.

@@ -183,10 +183,10 @@ def load_completed(params: Params, space: Workspace, reference: Path | None, lif
 
 
 def trusted_references(reference: Path, references: list[Reference], background: Background) -> list[Reference]:
-    """Return the references with masks extended to all pixels that they show better than the Gaussians do.
+    """Return all references; the masks of those that the scene brings are extended by the consistent mask C.
 
-    A reference that the scene brings is trusted in all of the consistent mask C. One that was completed here is trusted
-    only where it was invented, its own mask.
+    A reference that the scene brings shows all of C better than the Gaussians do. A reference that the stage
+    `reference` completed is trusted only where it was invented, so its mask stays as it is.
 
     Args:
         reference: folder of the stage `reference`.

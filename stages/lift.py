@@ -30,9 +30,9 @@ DTYPE = torch.float32
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> None:
     """Run the stage: inpaint the invent mask I of each view in which it is not empty.
 
-    The views are the training views, without clean ones (photographed without the object), views without a photograph,
-    and the best view, even if it is clean. Writes images/<view>.png, the best view also as a reference (as the stage
-    `reference` does), and facts.json. Views that an interrupted run finished are not inpainted again.
+    The views are training views and views without a photograph. Clean views (photographed without the object) are left
+    out, except the best view, which is never left out. Writes images/<view>.png, the best view also as a reference (as
+    the stage `reference` does), and facts.json. Views that an interrupted run finished are not inpainted again.
 
     Args:
         out: folder of this stage.

@@ -57,9 +57,10 @@ def regressions(diagrams: list[Diagram], unit: float, baselines: dict[str, Any])
         baselines: result of `load`.
 
     Returns:
-        Lines of text, empty if all is well. There is one for each error above `tolerance` times its baseline, for each
-        time above `SLOWER` times its baseline (in machine units), and for each point of a measured diagram that has no
-        baseline or that only the baselines have. Diagrams that were not measured are not compared.
+        Lines of text, empty if all is well. There is one for each error above `tolerance` times its baseline plus
+        `LEAST_ERROR`, for each time above `SLOWER` times its baseline (in machine units) plus `LEAST_SECONDS`, for each
+        measured point or whole diagram without a baseline, and for each baseline of a measured diagram whose point was
+        not measured. Diagrams that were not measured are not compared.
     """
     lines, pace = [], unit / baselines["machine_unit"]
     for diagram in diagrams:

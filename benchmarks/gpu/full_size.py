@@ -159,8 +159,8 @@ def peak_memory(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
     The memory is counted on the meta device. There, attention computes whole attention matrices; GPU kernels need less.
 
     Returns:
-        "weights", and the peak of "inpainting", "SDS" and "personalization", the last two also with checkpointing of
-        activations.
+        "weights"; and the peak, without the weights, of "inpainting", "SDS", "personalization", "SDS, checkpointing"
+        and "personalization, checkpointing" (of activations).
     """
     with torch.device("meta"):
         models = networks(shape, dtype)
@@ -300,7 +300,7 @@ def sds_step(
         step: number of the step, which seeds the draws.
 
     Returns:
-        "gradient_norm": L2 norm of the gradient of the harmonics.
+        "gradient_norm": L2 norm of the gradient of 0.001 times the term with respect to the harmonics.
 
     Raises:
         FloatingPointError: this norm is 0 or not finite.

@@ -39,7 +39,7 @@ def plane_error(hole: np.ndarray, guide: np.ndarray | None = None, unit: float =
         hole: bool [H, W], True for the unknown pixels.
         guide: guide of the completion; None for none.
         unit: factor on the disparity.
-        offset: number that is added to the disparity, in this unit.
+        offset: number that is added to the disparity before the multiplication by `unit`.
     """
     disparity = unit * (PLANE + offset)
     completed = completion.complete(np.where(hole, 9.0 * unit, disparity), ~hole, guide)

@@ -5,7 +5,7 @@ After some steps, test views are rendered and scored in the mask's box; this tim
 that of the run. --start takes another folder with gaussians.ply and labels.npy, such as
 runs/demo@lift_mse/initialize, whose renders are worse: the value of a prior depends on how much is left to improve.
 Test views only measure; no setting is chosen by them. The study writes attempts.json and attempts.png to --out.
-Settings that are already in the file are not run again.
+Settings that are already in the file are not run again, so another --start needs another --out.
 """
 
 from __future__ import annotations

@@ -97,7 +97,7 @@ def render_object(
         view: rays of the capture.
         camera: camera-to-world matrix [4, 4].
         thing: the object.
-        tints: [3, 3], RGB colours in [0, 1] of the faces of each axis.
+        tints: [3, 3], RGB colours in [0, 1] of the faces of each axis; an ellipsoid has the first one only.
 
     Returns:
         RGB [H, W, 3] multiplied by the coverage, and the coverage [H, W], all in [0, 1].

@@ -48,7 +48,7 @@ CLIP, MARGIN, SIDE = 0.05, 12, 480  # relative error of full colour; margin arou
 
 
 def scene_kind(name: str) -> str:
-    """Return the kind of a made scene from its name, e.g. "table" for `demo-table-21`; "demo" if the name has none."""
+    """Return the kind of a made scene from its name: "table" for `demo-table-21`; "demo" if no part is in `KINDS`."""
     return next((part for part in name.split("-") if part in KINDS), "demo")
 
 

@@ -101,6 +101,9 @@ def possible_gain(halves: tuple[Tensor, Tensor], error: Tensor, holes: Tensor) -
         halves: two estimates of g, [B, 3, H, W] each.
         error: e, [B, 3, H, W].
         holes: [B, 1, H, W], 1 in the holes.
+
+    Returns:
+        "cosine", at most 0.9999, and "gain", dB.
     """
     first, second = (half * holes for half in halves)
     along = float(((first + second) / 2 * error).sum())
@@ -142,6 +145,8 @@ def measure(models: dict[str, Prior], run: Path) -> list[dict]:
 
 def rendered_cases(run: Path, folder: str, size: int) -> dict[str, list[Case]]:
     """Return the same views as `scene_cases`, with renders of the stage `evaluate` instead of the truth.
+
+    The scale "reference" is as in `scene_cases`, without renders.
 
     Args:
         run: runs/<scene>.

@@ -54,6 +54,11 @@ def fit_params(profile: str, overrides: dict[str, object], every: int) -> fit.Pa
 def run_fit(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]]:
     """Run a fit in the folder `out`, unless it is finished there, and return its trace.
 
+    Args:
+        poses: folder of the stage `poses`.
+        out: folder of the fit.
+        params: parameters of the stage `fit`.
+
     Raises:
         ValueError: `out` has a fit with other parameters.
     """

@@ -55,7 +55,10 @@ generate(Path(sys.argv[2]), 0, replace(KINDS["demo"], **dict(zip(names, size))))
 
 
 def make_room(views: int, megapixels: float, folder: Path) -> Path:
-    """Make a room with the given number and size of training views, unless it exists, and return its folder."""
+    """Make a room with the given number and size of training views, unless it exists, and return its folder.
+
+    The room's folder is inside `folder`.
+    """
     unit = (megapixels * 1e6 / (WIDE * HIGH)) ** 0.5
     scene = folder / f"{views}-views-{megapixels}-mp"
     if not (scene / "truth/facts.json").exists():
@@ -70,7 +73,8 @@ def run_stages(scene: Path, runs: Path, profile: str, last: str) -> dict[str, di
 
     Args:
         scene: folder of the scene.
-        runs: folder of runs, which also keeps the measured costs.
+        runs: folder of runs, which also keeps the measured costs. If it has costs of the scene, nothing is run, and
+            these costs are returned, whatever `last` is.
         profile: name of the profile.
         last: last stage to run.
 

@@ -84,7 +84,7 @@ def write_scenes(
     Existing folders are replaced. Views are selected about the second place.
 
     Args:
-        start: first place of the object.
+        start: first place of the object, which also gives the object's size and shape at both places.
         goal: second place of the object, in the same capture.
         capture: the capture.
         out: folder to write to.

@@ -63,8 +63,8 @@ def in_box(means: np.ndarray, labels: np.ndarray) -> np.ndarray:
 def write_scenes(run: Path, scene: Path, out: Path) -> None:
     """Write the folders of the three scenes to `out`.
 
-    Each folder has scene.yaml and both files of splats. The first also has the photographs, the first two have cameras
-    and the reference.
+    Each folder has scene.yaml and two files of splats, before and after the deletion of the object. "photographs" and
+    "cameras" also have the cameras and the reference, and "photographs" has the photographs.
 
     Args:
         run: finished run of the scene.
@@ -100,14 +100,14 @@ def write_scenes(run: Path, scene: Path, out: Path) -> None:
 
 
 def delete_object(run: Path, folder: Path, tool: list[str]) -> None:
-    """Write before.ply, after.ply and cameras/ (training views with photographs) in the scene's own frame.
+    """Delete the object from an exported scene: write before.ply, after.ply and cameras/ in the scene's own frame.
 
     splat-transform deletes the splats in a box around the object. It selects them by a column `selected` of the file
-    that it reads.
+    that it reads. The folder cameras/ has the cameras and photographs of the training views.
 
     Args:
         run: run of the scene, with its export.
-        folder: folder to write to.
+        folder: folder to write to; emptied first.
         tool: command that runs splat-transform.
     """
     exported, placed = run / "export", load_scene(run / "poses")
@@ -137,6 +137,9 @@ def delete_object(run: Path, folder: Path, tool: list[str]) -> None:
 
 def run_patch_command(run: Path, out: Path, runs: Path, tool: list[str], set_: str) -> None:
     """Run `reffusion patch` twice: with cameras, photographs and the run's reference, and with the two files only.
+
+    Before this, `delete_object` makes the two files. Afterwards splat-transform opens both results, as a test, and
+    writes them again.
 
     Args:
         run: run of the scene, with its export.

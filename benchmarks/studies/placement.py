@@ -100,7 +100,7 @@ class PlacedObject:
     Attributes:
         foot: [3], the point of the surface on which the object stands.
         height: height in the capture's unit; `half` is a multiple of it.
-        axes: [3, 3], the object's side, front and up directions in rows; up is the surface's normal.
+        axes: [3, 3], the object's axes in rows: two along the surface, then up, which is the surface's normal.
         half: [3], half extents along the axes.
         shape: "box" or "ellipsoid".
     """

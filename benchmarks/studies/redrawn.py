@@ -1,10 +1,10 @@
 """Acceptance of redrawn and of wrong references: `python -m benchmarks.studies.redrawn --captures ../shared/data`.
 
 A reference is accepted if it shows the same scene from the same view as the view's photograph; the module
-`reffusion.references.registration` decides this. The study tests these decisions. For some views of each capture it
-makes ten pictures that an autoencoder and other tools could make of the photograph; they must be accepted. The
-photographs of the nearest views, one of them redrawn, and a photograph of another capture must be refused. *Redrawn*
-means: with other high frequencies, as an autoencoder writes them.
+`reffusion.references.registration` decides this. The study tests these decisions. For every n-th view of each capture
+(--every) it makes ten pictures that an autoencoder and other tools could make of the photograph; they must be accepted.
+The photographs of the nearest views, one of them redrawn, and a photograph of another capture must be refused.
+*Redrawn* means: with other high frequencies, as an autoencoder writes them.
 The study prints the inlier ratios (shares of compared points that are at the same place as in the photograph), the
 numbers of wrong decisions and, with --seconds, the time of a registration.
 """
@@ -130,8 +130,8 @@ class Photographs:
     def nearest(self, view: str) -> list[str]:
         """Return the names of all other views, nearest first.
 
-        The distance of two views is the distance of their centres, relative to its median, plus twice the angle between
-        their optical axes in radians.
+        The distance of another view is that of its centre, divided by the median of the distances of all other views'
+        centres, plus twice the angle between the optical axes in radians.
         """
         centre = {name: -pose[:3, :3].T @ pose[:3, 3] for name, pose in self.world_to_camera.items()}
         others = [name for name in self.files if name != view]
@@ -249,7 +249,10 @@ def fit_size(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
 
 
 def measure_seconds(photo: np.ndarray) -> str:
-    """Return a text with the CPU seconds of registrations at 640 and 1600 px, of a right and of a wrong picture."""
+    """Return a text with the CPU seconds of four registrations: a right and a wrong picture, each in two sizes.
+
+    The longer side of the photograph is resized to 640 and to 1600 px.
+    """
     parts = []
     for longer in (640, 1600):
         scale = longer / max(photo.shape[:2])

@@ -76,7 +76,7 @@ class Run:
     def mask(self, name: str) -> np.ndarray:
         """Load the pixels of the object in a view, bool [H, W], from its test mask if it has one.
 
-        Other views have a consistent mask, computed by the stage `masks`.
+        Other views have a consistent mask, computed by the stage `masks`, or the raw mask if the run has no such stage.
         """
         masks = self.stage("masks")
         return load_object_mask(self.scene.cameras[name], self.stage("raw_masks"), masks if masks.exists() else None)

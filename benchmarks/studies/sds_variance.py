@@ -128,7 +128,8 @@ def measure(models: dict[str, Prior], run: Path) -> dict[str, dict[str, dict]]:
 def table(results: dict[str, dict[str, dict]]) -> str:
     """Return Markdown tables, one per scale, with the variances before and after personalization and their ratio.
 
-    A table has a row for each timestep, then the rows `over noise`, `over timesteps` and `together`.
+    A table has a row for each timestep, with the pull before and after too, then the rows `over noise`, `over
+    timesteps` and `together`.
     """
     lines = []
     for scale, by_time in results.items():

@@ -34,7 +34,13 @@ ALLOWED = 0.03  # largest allowed share of a stage's time
 
 
 def cpu_seconds(stage: ModuleType, params: object, needs: dict[str, Path | None]) -> tuple[float, int]:
-    """Run a stage in a temporary folder; return its CPU seconds and the number of lines of its trace."""
+    """Run a stage in a temporary folder; return its CPU seconds and the number of lines of its trace.
+
+    Args:
+        stage: module of the stage.
+        params: parameters of the stage.
+        needs: stage -> its folder, for the stages that this stage needs; None for a stage that was skipped.
+    """
     with tempfile.TemporaryDirectory() as folder:
         began = time.process_time()
         stage.run(params, Path(folder), **needs)

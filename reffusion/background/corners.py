@@ -74,11 +74,11 @@ def find_third_faces(
 
 
 def visible_past(plane: Plane, nearer: Sequence[Plane], views: Sequence[DepthView]) -> np.ndarray:
-    """Return the cells of a plane that some view would show if the object were removed.
+    """Return the cells of a plane that the object hides in some view, and that this view would show without the object.
 
-    A cell is True if in some view the object's mask covers the cell, and no `nearer` plane occludes the cell. A plane
-    occludes only with its known cells (seen or continued). So the face of a box does not continue inside the box,
-    because there the box's other faces occlude it.
+    A cell is True if in some view the object's mask covers the cell, and no `nearer` plane occludes the cell. A cell
+    that no mask covers is False, even if views show the cell. A plane occludes only with its known cells (seen or
+    continued). So the face of a box does not continue inside the box, because there the box's other faces occlude it.
 
     Args:
         nearer: the planes that may occlude `plane`, with their cells.

@@ -84,7 +84,8 @@ class Background:
     def is_empty(self, camera: Camera, depth: np.ndarray) -> np.ndarray:
         """Return bool [H, W], the pixels at which a surface of the given depth would contradict the views.
 
-        There at least two views see past the surface, and more than show a surface there (`Visibility.is_empty`).
+        At such a pixel at least two views see past the surface, and more views see past it than show a surface at the
+        same place (`Visibility.is_empty`).
 
         Args:
             camera: the view of the surface.

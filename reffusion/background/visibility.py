@@ -208,7 +208,7 @@ def smooth_surface(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.nd
     The depth map is median-filtered first, because rendered Gaussians make a surface rough.
 
     Args:
-        depth: [H, W], camera z.
+        depth: [H, W], camera z; 0 where unknown. There the result is meaningless.
         camera: the view.
     """
     smooth = cv2.medianBlur(depth.astype(np.float32), 5).astype(np.float64)

@@ -110,10 +110,11 @@ def check_gaussian_files(params: SceneKeys, scene: Path) -> list[str]:
 
 
 def is_gaussians_only(params: SceneKeys, scene: Path) -> bool:
-    """Return whether the scene consists only of Gaussians, without photographs.
+    """Return whether the scene has Gaussians but no photographs. It may have cameras (a transforms file, COLMAP model).
 
     Then scene.yaml names a fitted scene of Gaussians as `gaussians`, and as `cleaned` the same scene after the user
-    deleted the object. Renders of these Gaussians are used in place of photographs.
+    deleted the object. Renders of these Gaussians are used in place of photographs. Only `cleaned` is tested here;
+    `check_gaussian_files` checks that `gaussians` is named too.
 
     Raises:
         BadInput: the scene is of this kind, and scene.yaml has a key about photographs.

@@ -148,6 +148,9 @@ def color_steps(lab: np.ndarray, pairs: np.ndarray, depth_edges: np.ndarray | No
 
     This is the colour difference in 8-bit L*a*b* if `depth_edges` is None. Otherwise it is a weighted sum of the colour
     difference and `depth_edges`, in which edges of surfaces dominate.
+
+    Args:
+        lab, pairs, depth_edges: as for `grow_object`.
     """
     color = np.linalg.norm(lab[pairs[:, 0]] - lab[pairs[:, 1]], axis=1)
     return color if depth_edges is None else COLOR_ON_SURFACE * color + DEPTH_EDGE_COST * depth_edges

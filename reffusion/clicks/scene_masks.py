@@ -73,8 +73,8 @@ def refine_masks(
 
     Args:
         poses: folder of the stage `poses`, which holds the undistorted photographs.
-        masks: view name -> bool [H, W], the rough masks. Views may lack a mask. An empty mask votes, too: nothing in
-            its view is the object.
+        masks: view name -> bool [H, W], the rough masks of training views that show the object (not of
+            `scene.clean`). Views may lack a mask. An empty mask votes, too: nothing in its view is the object.
         segmenter: the segmentation network.
     """
     cameras = {name: scene.cameras[name] for name in scene.train if name not in scene.clean}
@@ -101,9 +101,10 @@ def masks_of_test_views(scene: Scene, views: FittedViews, masks: Mapping[str, np
 
 
 def evidence_loader(scene: Scene, gaussians: Gaussians, poses: Path, segmenter: Segmenter | None):
-    """Return a function from a view's name to its ViewEvidence, which loads a photograph at the first call for a view.
+    """Return a function from a view's name to its ViewEvidence.
 
-    The segmentation network encodes the photograph at the first prompt. The last `KEPT_VIEWS` views stay in memory.
+    The function loads the view's photograph and renders its relief at the first call. The segmentation network encodes
+    the photograph at the first prompt. The last `KEPT_VIEWS` views stay in memory.
 
     Args:
         poses: folder of the stage `poses`, which holds the undistorted photographs.

@@ -118,10 +118,10 @@ def _apply_last_mark(
 
 
 def count_first(events: Sequence[Event]) -> int:
-    """Return how many of the first events select the object in its own view before masks are propagated.
+    """Return how many events, from the first on, make the mask of the first event's view before it is propagated.
 
-    These are the first event, of either kind, and the clicks that follow in the same view, until a stroke or an event
-    in another view, which do not count.
+    These are the first event (a click or a stroke) and the clicks in the same view that directly follow it. The first
+    later stroke, or event in another view, ends the count and is not included.
     """
     apart = lambda event: event.view != events[0].view or event.mark.radius > 0
     return next((k for k, event in enumerate(events) if k and apart(event)), len(events))

@@ -298,8 +298,8 @@ def _upscale(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 def refine_edges(image: np.ndarray, mask: np.ndarray, marks: np.ndarray) -> np.ndarray:
     """Return bool [H, W], the mask with its border moved to changes of colour by GrabCut.
 
-    The border moves by at most `BAND`. The mask is returned unchanged if the mask or its surroundings have fewer than
-    10 pixels.
+    The border moves by at most the share `BAND` of the larger image side. The mask is returned unchanged if the mask or
+    its surroundings have fewer than 10 pixels.
 
     Args:
         image: uint8 [H, W, 3].

@@ -33,7 +33,7 @@ def on_supports(means: np.ndarray, is_object: np.ndarray, is_other: np.ndarray) 
     Args:
         means: [N, 3] positions of the Gaussians.
         is_object: bool [N], Gaussians labelled as the object.
-        is_other: bool [N], Gaussians labelled as not the object. The others have no label.
+        is_other: bool [N], Gaussians labelled as not the object. Gaussians in neither array have no label.
     """
     found = np.zeros(len(means), bool)
     if is_object.sum() < MIN_GAUSSIANS:

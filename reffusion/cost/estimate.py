@@ -141,12 +141,16 @@ def rendering(pixels: float, gaussians: float) -> Work:
 
 
 def reconstruction(gaussians: float) -> Work:
-    """Return the work of one reconstruction step on a view: rendering and loss, without Adam."""
+    """Return the work of one reconstruction step on a view of the assumed size: rendering and loss, without Adam.
+
+    Args:
+        gaussians: number of Gaussians.
+    """
     return rendering(WIDTH * HEIGHT, gaussians) + network("loss, a million pixels").times(WIDTH * HEIGHT / 1e6)
 
 
 def adam(gaussians: float) -> Work:
-    """Return the work of one step of Adam on all parameters of the Gaussians."""
+    """Return the work of one step of Adam on all parameters of `gaussians` Gaussians."""
     return network("Adam, a million Gaussians").times(gaussians / 1e6)
 
 

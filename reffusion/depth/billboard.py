@@ -21,7 +21,8 @@ def billboard_depth(object_pixels: np.ndarray, depth: np.ndarray, camera: Camera
     """Return [H, W] camera z, which is `depth`, and at `object_pixels` the depth of upright billboards.
 
     Each connected component of the object becomes one billboard. It stands upright on the surface below its lowest
-    pixels, and bulges towards the camera inside its outline. The sides and the back of the object remain unknown.
+    pixels, or faces the camera if the camera looks at this surface almost head-on, as at a wall. It bulges towards the
+    camera inside its outline. The sides and the back of the object remain unknown.
     Nowhere is the billboard farther than `depth`.
 
     Args:

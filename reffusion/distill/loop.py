@@ -102,7 +102,8 @@ def distill(
         inputs: What the scene provides for the terms.
         settings: Parameters of the stage `distill`.
         folder: Receives trace.jsonl, checkpoints, and snapshots of the masked Gaussians in snapshots/.
-        rates: Step sizes of Adam. None: those of 3DGS, in the unit that `settings.lr.means_unit` names.
+        rates: Step sizes of Adam; None takes those of 3DGS (`rates_of`). In either case the step sizes of masked
+            Gaussians are multiplied by the factors in `settings.lr` (`masked_factors`).
 
     Returns:
         The optimised Gaussians, detached, and their labels, bool [M]. M differs from N if Gaussians were densified or

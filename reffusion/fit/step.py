@@ -187,7 +187,7 @@ def control_density(
 
     Args:
         optimizer: holds the Gaussians, which are changed.
-        centers: [V, 3], the camera centres; a Gaussian's size is measured relative to the distance to the nearest one.
+        centers: [V, 3], the camera centres. The size of a Gaussian is divided by its distance to the nearest of these.
         started_with: number of Gaussians at the start of the fit.
         done: number of steps done.
     """

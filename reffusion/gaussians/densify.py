@@ -63,7 +63,7 @@ def densify(
 def viewing_distance(means: Tensor, centers: Tensor) -> Tensor:
     """Return the distance [N] of each mean [N, 3] to the nearest camera centre [V, 3].
 
-    Sizes of Gaussians are measured in units of this distance.
+    The stage `fit` measures sizes of Gaussians in units of this distance.
     """
     return torch.cdist(means.detach(), centers.to(means)).amin(dim=1)
 
@@ -106,7 +106,8 @@ def prune(optimizer: GaussianOptimizer, prune_opa: float, prune_scale3d: float |
 
     Args:
         prune_opa: opacity in [0, 1] below which a Gaussian is removed.
-        prune_scale3d: largest standard deviation above which a Gaussian is removed; one for all, or [N].
+        prune_scale3d: a Gaussian whose largest standard deviation is above this value is removed. One value for all
+            Gaussians, or [N].
 
     Returns:
         The number of removed Gaussians.

@@ -35,8 +35,8 @@ class NeighbourGraph:
 def find_neighbours(gaussians: Gaussians) -> NeighbourGraph:
     """Build the graph that joins each Gaussian to its `NEIGHBOURS` nearest ones, by the distance of means.
 
-    A Gaussian has more edges if it is among the nearest ones of further Gaussians. Colours are compared without their
-    view-dependent part.
+    A Gaussian can have more than `NEIGHBOURS` edges, because other Gaussians may have it among their nearest ones.
+    Colours are compared without their view-dependent part.
     """
     means, color = (each.detach().cpu().double().numpy() for each in (gaussians.means, gaussians.sh[:, 0] * SH0))
     near = cKDTree(means).query(means, min(NEIGHBOURS + 1, len(means)))[1].reshape(len(means), -1)[:, 1:]

@@ -25,7 +25,7 @@ class Sheets:
 
     Attributes:
         spread: standard deviation of the first sheet's Gaussians, in pixels of the view whose pixels they show.
-        thickness: standard deviation along the normal, relative to the smaller one within the surface.
+        thickness: standard deviation along the normal, divided by the smaller of the two within the surface.
         grazing: cosine of the angle between normal and viewing direction below which Gaussians are not stretched
             further.
         opacity: opacity of the first sheet's Gaussians, in (0, 1).

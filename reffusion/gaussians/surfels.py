@@ -39,7 +39,7 @@ def surface_gaussians(
         camera: the view.
         sh_count: number of spherical harmonics per Gaussian; all but the constant one are 0.
         spread: standard deviation of a disk in pixels of the view.
-        thickness: standard deviation along the normal, relative to the smaller one within the surface.
+        thickness: standard deviation along the normal, divided by the smaller of the two within the surface.
         grazing: cosine of the angle between normal and viewing direction below which disks are not stretched further.
         opacity: opacity of each disk, in (0, 1).
         offset_px: distance of the disks behind the surface, along its normal, in pixels.
@@ -97,7 +97,7 @@ def surface_normals(depth: np.ndarray, camera: Camera) -> np.ndarray:
     their own surface.
 
     Args:
-        depth: [H, W] camera z; 0 where unknown.
+        depth: [H, W] camera z; 0 where unknown. The normals of unknown pixels have no meaning.
         camera: the view.
     """
     disparity = np.divide(1.0, depth, out=np.zeros(depth.shape), where=np.asarray(depth) > 0)

@@ -103,11 +103,11 @@ def crop_to_mask(reference: Reference) -> tuple[Camera, np.ndarray, np.ndarray]:
 
 
 def repetitions(supervision: Supervision) -> list[int]:
-    """Return how many times each completed view occurs per pass over the photographs, in which each occurs once.
+    """Return how many times each completed view occurs in a pass that shows every photograph once.
 
     The numbers are in the order of `supervision.references`. Together the completed views take about `REFERENCE_SHARE`
-    of the steps. Each takes a part in proportion to the number of its completed pixels, but occurs at least once: an
-    extra view of a few pixels must not take steps from the reference.
+    of the steps. Each completed view takes a part in proportion to the number of its completed pixels, but occurs at
+    least once: an extra view of a few pixels must not take steps from the reference.
     """
     sizes = [int(reference.mask.sum()) for reference in supervision.references]
     total = REFERENCE_SHARE / (1 - REFERENCE_SHARE) * len(supervision.cameras)

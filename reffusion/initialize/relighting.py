@@ -20,6 +20,9 @@ def remove_shadows(
 ) -> tuple[list[Reference], Background, dict[str, np.ndarray]]:
     """Detect the object's cast shadow by comparing references with their photographs, and relight all photographs.
 
+    Of a reference that also fills pixels outside C (the object's mask), only the differences inside C count as shadow:
+    it shows an inserted object, which differs from the photograph, too.
+
     Args:
         references: completed views, without the object and its shadow.
         gaussians: of the filled scene.

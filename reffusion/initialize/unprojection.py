@@ -59,7 +59,7 @@ def estimate_depth(
         disparity: [H, W], the depth model's output for the reference, up to scale and offset; None without a model.
         log: receives a series of values for each solver (docs/development.md#traces).
         hints: further knowledge of the view's depth.
-        farthest: continue only the farthest of several surfaces around the hole.
+        farthest: as of `background_depth.continue_depth`; read only without a depth map and without a model.
 
     Returns:
         A tuple of three results:
@@ -122,7 +122,7 @@ def find_gaps(
     views: Sequence[tuple[Camera, np.ndarray]],
     min_alpha: float,
 ) -> np.ndarray:
-    """Return bool [H, W], the pixels of a view whose surface is missing in another view, so that a gap shows there.
+    """Return bool [H, W], the pixels of a view whose surface is missing in another view, which shows a gap instead.
 
     Only few views, all from about the same side, see the ground beside the hole and behind the object. The Gaussians
     that were fitted there cover the ground from this side. From the other side a black gap shows between these

@@ -166,7 +166,7 @@ def parallel_for(function: Callable, *arguments, gaussians: int = MIN_PARALLEL) 
             threads.
         arguments: its other arguments.
         gaussians: number of Gaussians, if it determines the amount of work. Below `MIN_PARALLEL` only the calling
-            thread is used.
+            thread is used; the default uses all threads.
     """
     helpers = threads() - 1 if gaussians >= MIN_PARALLEL else 0
     tickets = np.array([0, helpers + 1])

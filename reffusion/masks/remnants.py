@@ -97,14 +97,15 @@ def find_remnants(gaussians: Gaussians, labels: Tensor, cameras: Sequence[Camera
 
 
 def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarray, bool]]:
-    """Find the connected parts of the scene that seem to belong to the object, without regard to their visible size.
+    """Find the connected parts of the unlabelled scene that seem to belong to the object, whatever their visible size.
 
     Args:
         gaussians: the N Gaussians of the whole scene.
         labels: bool [N], True for the Gaussians of the object.
 
     Returns:
-        For each part its Gaussians, bool [N], and whether the part would float once the object is removed.
+        For each part its Gaussians, bool [N], none of which is labelled, and whether the part would float once the
+        object is removed.
     """
     means = gaussians.means.detach().cpu().double().numpy()
     if not labels.any():

@@ -54,7 +54,8 @@ def changed_pixels(reference: np.ndarray, photo: np.ndarray, within: np.ndarray,
     Args:
         reference: [H, W, 3] uint8, the completed view.
         photo: [H, W, 3] uint8, its photograph.
-        within: bool [H, W], the pixels to compare; all others are False in the result.
+        within: bool [H, W], the pixels to compare. All others are False in the result, unless changed pixels enclose
+            them: such a hole is filled.
         noise: the result of `redrawn_difference`. Differences up to this many levels of 255 do not count, nor do
             differences up to `CHANGED` levels.
     """

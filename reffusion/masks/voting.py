@@ -107,8 +107,9 @@ def hidden_inside(
 ) -> Tensor:
     """Return bool [N], the Gaussians whose means project into the masks in more than `share` of the views.
 
-    This vote labels Gaussians that no view sees: those inside the object would become visible when it is removed. The
-    arguments are those of `points_inside`.
+    All Gaussians are tested, whether views see them or not. This finds those inside the object, which votes by blending
+    weight cannot label if no view sees them. They would become visible once the object is removed. The arguments are
+    those of `points_inside`.
     """
     means = gaussians.means.detach().cpu().double().numpy()
     return torch.as_tensor(points_inside(means, cameras, masks, share), device=gaussians.means.device)

@@ -226,7 +226,8 @@ def score_view(
         image, truth: [H, W, 3] of one size.
         box: the mask's box; None if the mask is empty, which makes the scores of the box None.
         targets: the result of `lpips_targets` for the part of the ground truth in the box; None to leave LPIPS out.
-        mask: bool [H, W], True = the object; None if no pixel is masked.
+        mask: bool [H, W], True = the object, which the caller may have grown by a margin (`rows.OUTSIDE_MARGIN`). The
+            scores outside count the other pixels. None if no pixel is masked.
         shows_object: True if the ground truth shows the object, so that only pixels outside the mask can be scored, and
             the scores of the box and of the full image are None.
         unseen: bool [H, W], True = no training view shows the surface of this pixel; None if unknown, which makes

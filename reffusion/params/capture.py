@@ -102,5 +102,5 @@ class SceneKeys(Settings):
 
     @property
     def mask_folder(self) -> str | None:
-        """The folder of the masks, or "none", as scene.yaml says; None if it names none: the usual folders."""
+        """The folder of masks that scene.yaml names; "none" if the scene has no masks; None for the usual folders."""
         return self.masks.folder if isinstance(self.masks, MaskSpec) else self.masks

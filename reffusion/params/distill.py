@@ -127,10 +127,11 @@ class LiftTerm(Settings):
 
 
 class LearningRates(Settings):
-    """Factors on the step sizes of Adam in distillation.
+    """Settings of Adam in distillation: factors on the step sizes of 3DGS, the unit of position steps, and epsilon.
 
-    They apply to masked Gaussians (those that `initialize` added). Unmasked Gaussians keep the step sizes of 3DGS,
-    because the reconstruction term has to correct those that the object's blurred rim had tinted.
+    The factors `masked`, `opacities` and `shape` apply to masked Gaussians (those that `initialize` added) only.
+    Unmasked Gaussians keep the step sizes of 3DGS, because the reconstruction term has to correct the Gaussians that
+    the object's blurred rim had tinted. `means_unit` and `epsilon` apply to all Gaussians.
 
     PAPER leaves open: Adam's step sizes in distillation. They are those of 3DGS, times these factors.
     """

@@ -83,7 +83,11 @@ def rectangle_mask(size: int, generator: torch.Generator) -> Tensor:
 
 
 def random_mask(samples: TrainingSamples, size: int, generator: torch.Generator) -> Tensor:
-    """Draw a random mask of the kind `samples.masks`, [1, size, size] float, 1 = repaint."""
+    """Draw a random mask, [1, size, size] float, 1 = repaint.
+
+    With `samples.masks` = "rectangles" it is a `rectangle_mask`. With "realfill" the share `WHOLE_SHARE` of the masks
+    covers the whole image instead.
+    """
     if samples.masks == "realfill" and _uniform(0, 1, generator) < WHOLE_SHARE:
         return torch.ones(1, size, size)
     return rectangle_mask(size, generator)

@@ -18,7 +18,13 @@ from reffusion.seeding import generator as seeded
 def spread_timesteps(count: int, steps: int, generator: torch.Generator) -> Tensor:
     """Draw stratified timesteps in random order, long [count]: one in each of `count` equal parts of [0, steps).
 
-    Stratified timesteps vary less between batches than independent ones.
+    All have the same random position within their part. Stratified timesteps vary less between batches than independent
+    ones.
+
+    Args:
+        count: Number of timesteps to draw, the size of a batch.
+        steps: Number of timesteps of the noise schedule.
+        generator: The source of randomness, on the CPU.
     """
     positions = torch.randperm(count, generator=generator) + torch.rand(1, generator=generator)
     return (positions * (steps / count)).long().clamp(max=steps - 1)

@@ -81,7 +81,7 @@ class Prior:
 
     @property
     def native_size(self) -> int:
-        """Return the side of the training images in pixels."""
+        """Return the side in pixels of the square images on which the model was trained."""
         config: Any = self.unet.config
         size = config.sample_size
         return self.factor * (size if isinstance(size, int) else min(size))

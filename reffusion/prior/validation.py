@@ -79,12 +79,14 @@ def measure_errors(
 ) -> dict[str, float]:
     """Return the errors for the trace of personalization, by their key.
 
-    "target_mse" and "clean_latent_mse" are the two errors of `denoising_error` in the hole of the whole reference,
-    "crop_latent_mse" is the error of the clean latent in the hole of its crop; each is a mean over `NOISE_LEVELS`.
-    "hole_psnr" and, if there are photographs, "photo_psnr" are in dB, for one denoising step from pure noise: in the
-    hole of the reference, and of the mean over photographs of the squared error in their holes. LoRA's dropout is
-    switched off and stays off. The noise is fixed, so the errors are comparable during training. With a small model
-    this takes about as long as one training step.
+    All errors are measured in holes. "target_mse" and "clean_latent_mse" are the two errors of `denoising_error` for
+    the whole reference, and "crop_latent_mse" is the error of the clean latent for its crop; each is a mean over
+    `NOISE_LEVELS`. "hole_psnr" and "photo_psnr" are the PSNR in dB of pictures painted in one denoising step from pure
+    noise: of the reference, and of all photographs together (from the mean of their squared errors). Without
+    photographs "photo_psnr" is left out.
+
+    The noise is fixed, so the errors are comparable during training. LoRA's dropout is switched off and stays off. With
+    a small model this takes about as long as one training step.
 
     Args:
         prior: The prior with LoRA layers attached.

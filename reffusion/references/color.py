@@ -37,7 +37,12 @@ def match_colors(picture: np.ndarray, photo: np.ndarray, known: np.ndarray) -> t
 
 
 def recolor(picture: np.ndarray, gain: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Return gain * picture + offset, uint8 [H, W, 3], where gain and offset, [3] each, are those of `match_colors`."""
+    """Return gain * picture + offset, computed for colours in [0, 1] and clipped there, as uint8 [H, W, 3].
+
+    Args:
+        picture: uint8 [H, W, 3].
+        gain, offset: [3] each, from `match_colors`.
+    """
     return to_uint8(picture / 255.0 * gain + offset)
 
 

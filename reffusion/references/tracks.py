@@ -79,9 +79,9 @@ def low_pass(grey: np.ndarray) -> np.ndarray:
 
 
 def find_points(grey: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return [N, 2], px (x, y), points of a low-passed picture that can be located in both directions.
+    """Return [N, 2], px (x, y), points of a low-passed picture with texture in every direction: corners and blobs.
 
-    These are corners and blobs, which lie at least `SPACING` apart and so spread over the picture.
+    The points lie at least `SPACING` apart and so spread over the picture.
 
     Args:
         grey: float32 [H, W], the low-passed picture.

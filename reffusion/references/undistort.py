@@ -18,6 +18,8 @@ def undistort_reference(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Load the picture of a reference, and undistort it as the photograph of its view was undistorted.
 
+    A picture that is undistorted already (`given.undistorted`) is only resized and aligned.
+
     Args:
         given: the files of the reference.
         lens: the lens of the view's photograph, at the size of the undistorted photograph (`reffusion.capture.lenses`).

@@ -266,12 +266,12 @@ def _moments(footprint, g_0, g_1, g_2):
 
 
 def gather_values(footprints, bins, values, count):
-    """Sum weight x value over the pixels of each pair of a footprint and a tile.
+    """Sum blending weight x value of the pixel over the pixels of each pair of a footprint and a tile.
 
     Args:
         footprints: [>= N, FOOTPRINT] flat.
         bins: the tile lists, see `binning.Bins`.
-        values: [H, W, C].
+        values: [H, W, C], the values of the pixels.
         count: True takes weight 1 at each pixel that blends the footprint, instead of the blending weight.
 
     Returns:

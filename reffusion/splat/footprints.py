@@ -91,10 +91,10 @@ class ScratchArrays(NamedTuple):
 
     Attributes:
         basis: [16, LANES], the spherical harmonics Y_k.
-        along: [16, LANES], their gradients.
-        coefficients: [width, LANES], the coefficients sh_k, and then their gradients.
+        along: [16, LANES], dLoss/dY_k.
+        coefficients: [width, LANES], the coefficients sh_k, which are later overwritten by dLoss/dsh_k.
         sums: [LANES, columns], the sums of each Gaussian's records.
-        moments: [columns, LANES], the same, transposed.
+        moments: [columns, LANES], `sums` transposed.
     """
 
     basis: np.ndarray

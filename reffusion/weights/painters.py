@@ -53,9 +53,10 @@ def find_file(inpainter: Inpainter) -> Path:
 
 
 def weights_needs(inpainter: Inpainter, param: str = "inpainter") -> list[Need]:
-    """Return the need for the inpainter's file; an empty list if this kind of inpainter has no file.
+    """Return the need for an inpainter's file, as a list of one; an empty list for kinds other than "lama" and "migan".
 
-    An ONNX file without onnxruntime is also a problem of the need.
+    The list is empty for the kind "auto" too, which can do without a file. An ONNX file without onnxruntime is also a
+    problem of the need.
 
     Args:
         param: name of the parameter that holds the setting, for messages.

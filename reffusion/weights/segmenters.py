@@ -15,9 +15,10 @@ AUTO, NONE = "auto", "none"
 
 
 def segmenter_folder(source: str) -> Path:
-    """Return the folder that the parameter `segmenter` names; "auto" is the folder of `reffusion weights`.
+    """Return the folder that the parameter `segmenter` names.
 
-    The folder need not exist. Any other text, also a hub id, is taken as a path.
+    "auto" stands for the folder into which `reffusion weights` downloads the default network. Any other text, also a
+    hub id, is taken as a path. The folder need not exist.
     """
     return segmenter_cache() if source == AUTO else Path(source).expanduser()
 

@@ -20,7 +20,8 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
 def machine_facts(params: Params) -> dict[str, str]:
     """Return facts about this machine on which the result depends: "inpainter" -> kind and hash of the file.
 
-    The dict is empty if nothing is inpainted in 2D, or by an inpainter without a file that the parameters name.
+    If `inpainter: auto` selects an inpainter without a file, the value is its kind alone. The dict is empty if nothing
+    is inpainted in 2D, or if the parameters name an inpainter that has no file.
     """
     return painters.inpainter_facts(params.inpainter) if params.inpaint else {}
 

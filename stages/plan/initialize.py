@@ -30,7 +30,8 @@ def optional_weights(params: Params) -> list[local.Need]:
 def machine_facts(params: Params) -> dict[str, str]:
     """Return facts about this machine on which the result depends: "inpainter" -> kind and hash of the file.
 
-    The dict is empty if no extra views are completed, or by an inpainter without a file that the parameters name.
+    If `inpainter: auto` selects an inpainter without a file, the value is its kind alone. The dict is empty if no extra
+    views are completed, or if the parameters name an inpainter that has no file.
     """
     return painters.inpainter_facts(params.inpainter) if params.extra_views else {}
 

@@ -45,7 +45,7 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
-    """Return {"views": [names of training, test, clean and cameras-only views]}; {} for a scene without photographs.
+    """Return {"views": [training, test, clean, cameras-only]}, a list of view names each; {} without photographs.
 
     The stage depends on these roles, which may depend on the names of masks, while it does not read the masks.
 

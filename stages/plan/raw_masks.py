@@ -24,10 +24,15 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
-    """Return facts on which the stage depends: "masks", the file of each view's mask, and "region", if there is one.
+    """Return the facts "masks" and "region", on which the stage depends besides the contents of its files.
 
     Args:
         scene: folder of the scene.
+
+    Returns:
+        "masks": [folder that the stage writes -> view -> file, pixel values that mark the object (empty: white)], left
+        out for a scene without photographs; "region": the region that the scene names and whether the scene has masks,
+        left out without a region.
 
     Raises:
         ValueError: the scene cannot be read.
@@ -43,10 +48,11 @@ def scene_facts(params: Params, scene: Path) -> dict[str, object]:
 
 
 def preview(params: Params, *, scene: Path, poses: Path | None = None) -> list[str]:
-    """Describe what the stage will do, a sentence each, after all masks were read.
+    """Read and check all masks, and describe what the stage will do, a sentence each.
 
     Args:
         scene: folder of the scene.
+        poses: not used.
 
     Raises:
         ValueError: a mask is unreadable, or all masks are empty or all are full.

@@ -39,7 +39,8 @@ def optional_weights(params: Params) -> list[local.Need]:
 def machine_facts(params: Params) -> dict[str, str]:
     """Return facts about this machine on which the result depends: "inpainter" -> kind and hash of the file.
 
-    The dict is empty if the parameters name an inpainter without a file, such as the diffusion prior.
+    If `inpainter: auto` selects an inpainter without a file, the value is its kind alone. The dict is empty if the
+    parameters name an inpainter that has no file, such as the diffusion prior.
     """
     return painters.inpainter_facts(params.inpainter)
 

@@ -79,6 +79,9 @@ class Capture:
 def find_pictures(folder: Path, nested: bool = False) -> dict[str, Path]:
     """Return view name -> picture file in a folder, sorted by path (`list_pictures`); empty if there is no such folder.
 
+    Args:
+        nested: True to include pictures in sub-folders.
+
     Raises:
         BadInput: two pictures have the same view name.
     """
@@ -105,9 +108,9 @@ def relative_paths(folder: Path, pictures: dict[str, Path]) -> dict[str, tuple[s
 def find_image_folder(folder: Path, images: str | None, usual: tuple[str, ...]) -> Path:
     """Return the folder of a scene's pictures.
 
-    Without `images`, it is the first usual folder that holds pictures, or the first of these that has a sub-folder
-    `label` (masks). Pictures in sub-folders count, except in sub-folders of the scene's own folder ("."), which hold
-    masks and other files.
+    Without `images`, this is the first usual folder that holds pictures and has a sub-folder `label` (masks), else the
+    first one that holds pictures. Pictures in sub-folders count, except in sub-folders of the scene's own folder ("."),
+    which hold masks and other files.
 
     Args:
         folder: the scene's folder.
@@ -127,7 +130,14 @@ def find_image_folder(folder: Path, images: str | None, usual: tuple[str, ...]) 
 
 
 def lens_from_model(camera: ModelCamera, source: Path) -> Lens:
-    """Return the lens of a camera in COLMAP's file `source`. Raises BadInput if its camera model is not supported."""
+    """Convert a camera of a COLMAP model to a lens.
+
+    Args:
+        source: the file from which the camera was read, for messages.
+
+    Raises:
+        BadInput: the camera's model (its kind of lens) is not supported.
+    """
     try:
         return from_colmap(camera.model, camera.width, camera.height, camera.params)
     except BadInput as error:

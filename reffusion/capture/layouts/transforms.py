@@ -42,7 +42,7 @@ class Frame:
 
     Attributes:
         values: the keys of the frame, together with the keys of the whole file that the frame does not have.
-        file_path: the frame's key of this name, a path of its picture.
+        file_path: value of the frame's key `file_path`: a path of its picture, which need not exist.
         source: the transforms file.
         split: "" for transforms.json; "train", "test" or "val" for Blender's files.
     """

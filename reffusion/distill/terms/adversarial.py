@@ -25,7 +25,7 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
 
     The term begins at the share `adversarial.start` of the run. In each step the real patches come from one reference
     and the fake ones from one training view. The gradient reaches the spherical harmonics of the masked Gaussians, or
-    with `adversarial.reaches: all` those of all Gaussians.
+    with `adversarial.reaches: all` or `confined: false` those of all Gaussians.
 
     Raises:
         ValueError: No reference has a hole.

@@ -34,7 +34,8 @@ EXTENT = 1.0  # PAPER leaves open: the unit of the loss. Here it is the scene's 
 def build(inputs: TermInputs, settings: Params) -> Term | None:
     """Build the depth term. Return None if its weight is 0 or no view has a hole.
 
-    Its gradient reaches the masked Gaussians, in all parameters except the spherical harmonics.
+    Its gradient reaches the masked Gaussians, or with `confined: false` all, in all parameters except the spherical
+    harmonics.
 
     Raises:
         ValueError: There is no prior, its prompts are not embedded, or there is no depth estimator.

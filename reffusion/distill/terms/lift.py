@@ -19,7 +19,7 @@ from reffusion.types import Gaussians, Rendering
 def build(inputs: TermInputs, settings: Params) -> Term | None:
     """Build the lift term. Return None if its weight is 0 or no inpainted view has a hole.
 
-    Its gradient reaches the masked Gaussians.
+    Its gradient reaches the masked Gaussians, or with `confined: false` all.
 
     Raises:
         ValueError: No view was inpainted, or the perceptual loss has no distance.

@@ -16,8 +16,9 @@ from reffusion.types import Gaussians, Rendering
 def build(inputs: TermInputs, settings: Params) -> Term | None:
     """Build the reconstruction term. Return None if it never runs or no photograph may supervise.
 
-    Its gradient reaches the unmasked Gaussians, or with `reconstruction.reaches: shown` all. In a clean view, from
-    which the object is absent, it reaches all Gaussians, because such a view shows the true background.
+    Its gradient reaches the unmasked Gaussians, or with `reconstruction.reaches: shown` or `confined: false` all. In a
+    clean view, from which the object is absent, it reaches all Gaussians, because such a view shows the true
+    background.
     """
     views = [view for view in inputs.views if view.supervises.any()]
     if not settings.reconstruction.every or not views:

@@ -16,7 +16,8 @@ from reffusion.types import Camera, Gaussians, Rendering
 def build(inputs: TermInputs, settings: Params) -> Term | None:
     """Build the reference term, which takes the references in turn. Return None if its weight is 0.
 
-    Its gradient reaches the masked Gaussians, or with `reference.reaches: all` all that show in the hole.
+    Its gradient reaches the masked Gaussians, or with `reference.reaches: all` or `confined: false` all that show in
+    the hole.
 
     Raises:
         ValueError: There is no reference.

@@ -34,7 +34,8 @@ class TermValue(NamedTuple):
 
     Attributes:
         loss: Scalar, before the term's weight.
-        rendering: The rendering from which the loss was computed. The term moves only Gaussians that it contains.
+        rendering: The rendering from which the loss was computed. The term moves only Gaussians that show in this
+            rendering.
         log: Values that are added to the trace for this step.
         latest: Values that are added to the trace for this step and for all later steps, until the term is computed
             again. For terms that are not computed in every step.
@@ -136,7 +137,7 @@ def cycle_through(views: Sequence[TrainView], seed: int, label: str) -> Callable
 
 
 def reach_hole(settings: Params, everywhere: bool = False) -> Callable[[Tensor, TermView], Tensor]:
-    """Return the `reaches` of a term that fills the hole: the masked Gaussians, or all.
+    """Return the function `Term.reaches` of a term that fills the hole. It selects the masked Gaussians, or all.
 
     Args:
         settings: If `settings.confined` is False, the term reaches all Gaussians.
