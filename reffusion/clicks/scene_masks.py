@@ -73,12 +73,13 @@ def refine_masks(
 
     Args:
         poses: folder of the stage `poses`, which holds the undistorted photographs.
-        masks: view name -> bool [H, W], the rough masks of training views that show the object (not of
-            `scene.clean`). Views may lack a mask. An empty mask votes, too: nothing in its view is the object.
+        masks: view name -> bool [H, W], the rough masks. Views may lack a mask. An empty mask votes, too: nothing in
+            its view is the object. Masks of `scene.clean`, views without the object, are ignored.
         segmenter: the segmentation network.
     """
     cameras = {name: scene.cameras[name] for name in scene.train if name not in scene.clean}
-    return redraw_masks(FittedViews(gaussians, cameras, evidence_loader(scene, gaussians, poses, segmenter)), masks)
+    rough = {name: mask for name, mask in masks.items() if name in cameras}
+    return redraw_masks(FittedViews(gaussians, cameras, evidence_loader(scene, gaussians, poses, segmenter)), rough)
 
 
 def masks_of_test_views(scene: Scene, views: FittedViews, masks: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
