@@ -100,10 +100,11 @@ def write_scenes(run: Path, scene: Path, out: Path) -> None:
 
 
 def delete_object(run: Path, folder: Path, tool: list[str]) -> None:
-    """Delete the object from an exported scene: write before.ply, after.ply and cameras/ in the scene's own frame.
+    """Write a scene with and without its object: before.ply, after.ply and cameras/, in the frame of the capture.
 
-    splat-transform deletes the splats in a box around the object. It selects them by a column `selected` of the file
-    that it reads. The folder cameras/ has the cameras and photographs of the training views.
+    before.ply is the export's with_object.ply. Its copy selected.ply has a further column `selected`, 1 for the splats
+    in a box around the object. splat-transform reads this copy and deletes these splats. The folder cameras/ has the
+    cameras and photographs of the training views.
 
     Args:
         run: run of the scene, with its export.

@@ -246,8 +246,8 @@ def align_either(estimate: np.ndarray, depth: np.ndarray, known: np.ndarray) -> 
 
     The map is aligned robustly both as depth and as disparity. Of the alignments with a positive scale, the one with
     the smaller error in disparity is kept. The map stays unchanged if it is positive and, read as depth in the scene's
-    unit, fits about as well (`SAME_UNIT_RATIO`) or within `SAME_UNIT_ERROR`. Two maps in the scene's unit agree with
-    each other, while separate alignments would add noise to each.
+    unit, fits about as well (`SAME_UNIT_RATIO`) or within `SAME_UNIT_ERROR`, so that the maps
+    of several references stay consistent with each other.
 
     Args:
         estimate: [H, W], depth or disparity of any scale and offset, NaN where unknown.
@@ -255,8 +255,8 @@ def align_either(estimate: np.ndarray, depth: np.ndarray, known: np.ndarray) -> 
         known: bool or weights [H, W]. Pixels with depth <= 0 do not count.
 
     Returns:
-        depth: [H, W] float64 camera z, NaN where the estimate is NaN. The largest known depth replaces depths beyond
-            infinity. The smallest known depth replaces depths behind the camera.
+        depth: [H, W] float64 camera z, NaN where the estimate is NaN. The largest known depth replaces depths of
+            at least 1000 times this depth, or beyond infinity. The smallest known depth replaces depths behind the camera.
         space: The quantity of which the map is an affine function, "depth" or "disparity".
 
     Raises:

@@ -16,7 +16,7 @@ LEAST = 3  # smallest number of cameras
 def has_pictures(folder: Path, but: frozenset[str] = frozenset()) -> bool:
     """Return whether a scene folder holds photographs, in the places where a layout looks for them.
 
-    Any file with the ending of a picture counts, masks too.
+    Any file there with the ending of a picture counts, also a mask.
 
     Args:
         but: names of files in the scene's own folder that are not photographs (references).
