@@ -246,8 +246,8 @@ def align_either(estimate: np.ndarray, depth: np.ndarray, known: np.ndarray) -> 
 
     The map is aligned robustly both as depth and as disparity. Of the alignments with a positive scale, the one with
     the smaller error in disparity is kept. The map stays unchanged if it is positive and, read as depth in the scene's
-    unit, fits about as well (`SAME_UNIT_RATIO`) or within `SAME_UNIT_ERROR`, so that the maps
-    of several references stay consistent with each other.
+    unit, fits about as well (`SAME_UNIT_RATIO`) or within `SAME_UNIT_ERROR`, so that the maps of several references
+    stay consistent with each other.
 
     Args:
         estimate: [H, W], depth or disparity of any scale and offset, NaN where unknown.
