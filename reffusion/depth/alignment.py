@@ -256,7 +256,8 @@ def align_either(estimate: np.ndarray, depth: np.ndarray, known: np.ndarray) -> 
 
     Returns:
         depth: [H, W] float64 camera z, NaN where the estimate is NaN. The largest known depth replaces depths of
-            at least 1000 times this depth, or beyond infinity. The smallest known depth replaces depths behind the camera.
+            at least 1000 times this depth, or beyond infinity. The smallest known depth replaces depths behind the
+            camera.
         space: The quantity of which the map is an affine function, "depth" or "disparity".
 
     Raises:
