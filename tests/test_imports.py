@@ -176,10 +176,11 @@ def test_report_reads_through_io(path):
         if path.stem in draws
         else ()
     )
+    places = ("reffusion.command",) if path.stem == "cli" else ()  # the folder of scenes
     clicked = ("reffusion.clicks", "reffusion.capture", "reffusion.params", "reffusion.command", "reffusion.types")
     making = clicked if path.stem in ("mask", "mask_session") else ()  # masks
     chance = ("reffusion.seeding",) if path.stem in ("study", "votes") else ()  # the order of pairs, intervals
-    assert all(name.startswith(("reffusion.io", *chance, *drawing, *making)) for name in own), own
+    assert all(name.startswith(("reffusion.io", *chance, *drawing, *making, *places)) for name in own), own
 
 
 @pytest.mark.parametrize("path", sources("reffusion"), ids=relative_path)
