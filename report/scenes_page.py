@@ -35,7 +35,7 @@ def make(jobs: list[JobFiles], out: Path) -> Path:
         words = "Blue: median and quartiles over the scenes. Grey: each scene. A stage that has ended keeps its error."
         parts.append(page.paragraph(words, quiet=True))
     parts += [page.heading("Median, and quartiles in brackets"), *statistics_tables(rows)]
-    parts += [page.heading("Scenes"), scene_table(jobs, out)]
+    parts += [page.heading("Scenes"), scene_table(jobs)]
     path = out / "index.html"
     path.write_text(page.document(title, parts), encoding="utf-8")
     return path
@@ -133,12 +133,11 @@ def quartiles(values: list[float]) -> tuple[int, float, float, float]:
     return len(values), low, middle, high
 
 
-def scene_table(jobs: list[JobFiles], out: Path) -> str:
+def scene_table(jobs: list[JobFiles]) -> str:
     """Return an HTML table with a row per scene: the number of stages done, their seconds, and the scores.
 
     Args:
         jobs: one per scene.
-        out: not used; nothing is written.
     """
     names = [n for n in SCORES if any(job.metrics.get("mean", {}).get(n) is not None for job in jobs)]
     rows = []

@@ -62,7 +62,8 @@ class Lens:
 
     def coefficients(self) -> str:
         """Return the model and its coefficients that are not 0, for messages: `SIMPLE_RADIAL k1=0.0124`."""
-        names = [(f"k{i}", k) for i, k in enumerate((*self.radial, *self.denominator), start=1)]
+        names = [(f"k{i}", k) for i, k in enumerate(self.radial, start=1)]
+        names += [(f"k{i}", k) for i, k in enumerate(self.denominator, start=4)]
         names += [("p1", self.tangential[0]), ("p2", self.tangential[1])]
         return " ".join([self.model, *(f"{name}={value:.4g}" for name, value in names if value)])
 
