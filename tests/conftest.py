@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-# No result of a test depends on which weights lie in the cache of whoever runs it.
+# Use an empty cache: no test result may depend on the weights in the cache of the user who runs the tests.
 os.environ["XDG_CACHE_HOME"] = str(Path(tempfile.gettempdir()) / f"reffusion-tests-{os.getuid()}")
 
 DATA = Path(__file__).parents[1] / "data"
@@ -15,7 +15,7 @@ DATA = Path(__file__).parents[1] / "data"
 
 @pytest.fixture(scope="module")
 def generate():
-    """The module data/generate.py, with its neighbours importable."""
+    """The module data/generate.py. While the fixture is active, the other modules in data/ can be imported too."""
     sys.path.insert(0, str(DATA))
     try:
         import generate
@@ -35,7 +35,7 @@ def mini_scene(generate, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def prior():
-    """A small random inpainting prior, one for all tests of a module."""
+    """A small inpainting prior with random weights, shared by all tests of a module."""
     from scenes.networks import small_prior
 
     return small_prior()
@@ -43,7 +43,7 @@ def prior():
 
 @pytest.fixture(scope="module")
 def text(prior):
-    """[3, L, D], hidden states of the global, the local and the empty prompt."""
+    """The text encoder's hidden states [3, L, D] of the global, the local and the empty prompt."""
     import torch
 
     from reffusion.prior.crops import PROMPTS
@@ -55,12 +55,12 @@ def text(prior):
 
 @pytest.fixture
 def wall_folders(tmp_path):
-    """The folders before the stage `reference`, of the wall with a square before it."""
+    """The output folders of all stages before `reference`, for a scene with a square in front of a wall."""
     from scenes.references import write_wall_stages
 
     return write_wall_stages(tmp_path)
 
 
 def pytest_collection_modifyitems(items):
-    """Run the longest file first: with two processes it would otherwise run alone at the end."""
+    """Run test_resume.py, the longest file, first. Two test processes would otherwise end with one idle process."""
     items.sort(key=lambda item: item.path.name != "test_resume.py")

@@ -1,4 +1,4 @@
-"""The study of the personalized prior: it compares both priors on the same views and noise, and paints only holes."""
+"""The study of the personalized prior paints holes before and after personalization, with equal views and noise."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HOLE[10:24, 12:30] = True
 
 
 def write_reference_run(home):
-    """An initialized run with photographs, a fit from which nothing is removed, and a reference for view `a`."""
+    """Write an initialized run with photographs, a fit without masked Gaussians, and a reference of view `a`."""
     run = write_initialized_run(home, HOLE)
     wall = load_ply(run / "initialize" / "gaussians.ply")
     save_ply(run / "fit" / "gaussians.ply", wall)
@@ -36,10 +36,11 @@ def write_reference_run(home):
 def test_same_views_same_noise_and_holes_alone_are_painted(tmp_path):
     prior, run = small_prior(), write_reference_run(tmp_path / "run")
     views = adapted.save_sheet({"before": prior, "after": prior}, run, 3, 2, tmp_path / "out")
-    assert views == ["b"]  # the reference's own view is what was learnt, the third is clean
+    # The prior was trained on the reference of view `a`; view `c` is clean (photographed without the object).
+    assert views == ["b"]
     pictures = {path.stem: load_image(path) for path in (tmp_path / "out/b").glob("*.png")}
     assert sorted(pictures) == ["adapted", "as-it-is", "as-it-is-no-prompt", "to-paint"]
-    assert (pictures["adapted"] == pictures["as-it-is"]).all()  # one prior, so one picture
+    assert (pictures["adapted"] == pictures["as-it-is"]).all()  # both priors are the same here
     assert (pictures["adapted"][~HOLE] == pictures["to-paint"][~HOLE]).all()
     assert (pictures["adapted"][HOLE] != pictures["to-paint"][HOLE]).any()
     assert load_image(tmp_path / "out/sheet.png").shape[1] > 4 * HOLE.shape[1]

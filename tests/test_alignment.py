@@ -1,4 +1,4 @@
-"""Alignment of disparity and depth: exact recovery, outliers and degenerate input."""
+"""Alignment of estimated disparity or depth with known depth: exact recovery, outliers and degenerate input."""
 
 import numpy as np
 import pytest

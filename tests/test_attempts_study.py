@@ -1,4 +1,4 @@
-"""The study of settings of `distill`: each is a setting of the stage, and its curve is the stage's."""
+"""The study of settings of `distill`: each attempt is a valid setting; the scores equal those of the stage's output."""
 
 import os
 from pathlib import Path
@@ -26,7 +26,7 @@ NO_PRIOR = {"sds": {"weight": 0}, "iterations": 4}
 
 @pytest.fixture(scope="module")
 def initialized_run(tmp_path_factory):
-    """A small run up to `initialize`, whose test views have ground truth."""
+    """Return the folder of a small run up to the stage `initialize`; its test views have ground truth."""
     home = tmp_path_factory.mktemp("scene")
     poses = run_through_initialize(home, NEAR)["poses"]
     for name in wall_scene.TEST:

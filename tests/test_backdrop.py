@@ -1,4 +1,4 @@
-"""The backdrop outside all training views: it has no holes or blobs, and is scored separately."""
+"""The backdrop, a sphere of blurred colours behind the scene, and the pixels of a view that no training view saw."""
 
 from dataclasses import replace
 
@@ -29,13 +29,13 @@ def wall_gaussians() -> Gaussians:
 
 
 def panned_camera(degrees: float) -> Camera:
-    """A camera in the middle, turned to the right about its vertical axis."""
+    """Return a camera at the origin, turned to the right about its vertical axis by `degrees`."""
     rotation = yaw(np.radians(degrees))
     return make_camera("t", (wall_scene.WIDTH, wall_scene.HEIGHT), wall_scene.FOCAL, rotation=rotation)
 
 
 def add_gaussian(gaussians: Gaussians, mean, sizes, color) -> Gaussians:
-    """The Gaussians and one opaque Gaussian more."""
+    """Return the Gaussians and one more opaque Gaussian at `mean` [3]; `sizes` [3] are its standard deviations."""
     one = round_gaussians([mean], [color], 1.0, 4.0, gaussians.sh.shape[1])
     return join_gaussians(gaussians, replace(one, log_scales=torch.tensor([sizes]).log()))
 
@@ -74,7 +74,7 @@ def test_unseen_is_what_all_training_views_hide_behind_something_or_under_masks(
     points = wall_scene.wall_points(aside)
     framed = np.any([((uv >= 0) & (uv < (c.width, c.height))).all(-1) & ~wall_scene.is_behind_square(points, c, at)
                      for c in TRAIN for uv in [geometry.project(points, c)[0]]], 0)  # fmt: skip
-    here = ~wall_scene.is_behind_square(points, aside, at)  # the square itself was seen
+    here = ~wall_scene.is_behind_square(points, aside, at)  # without the square's surface, which training views see
     assert (
         wall_scene.iou(training_coverage.unseen_pixels(both, aside, coverage_views(both)) & here, ~framed & here) > 0.85
     )
@@ -82,7 +82,7 @@ def test_unseen_is_what_all_training_views_hide_behind_something_or_under_masks(
     assert training_coverage.unseen_pixels(scene, TRAIN[0], coverage_views(scene, hidden)).all()
 
 
-# --- what is counted
+# --- scores
 
 
 def test_scores_of_seen_pixels_only():

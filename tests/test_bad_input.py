@@ -1,6 +1,6 @@
-"""Bad input is refused at once, in one line that names the file or the key, and nothing is written.
+"""Bad input is refused within seconds, in one line that names the file or the key, and nothing is written.
 
-Most cases call what the command calls after it starts (`first_message`); some run the command itself.
+Most cases call the functions that the command calls (`first_message`), which is faster; some run the command itself.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from stages import poses, raw_masks
 ROOT = Path(__file__).resolve().parent.parent
 PIPELINE = load_pipeline(ROOT)
 SLOW = os.environ.get("REFFUSION_SLOW") == "1"
-LONGEST = 10.0  # seconds
+LONGEST = 10.0  # seconds until the refusal
 
 Change = Callable[[Path], None]
 
 
 @pytest.fixture(scope="session")
 def good_captures(tmp_path_factory) -> Path:
-    """A good capture of each layout, to copy and to corrupt."""
+    """Return a folder with a good capture of each layout; tests corrupt copies of these captures."""
     home = tmp_path_factory.mktemp("good")
     for layout in ("llff", "colmap", "colmap txt", "transforms", "photos"):
         write_capture(home / layout, layout, make_truth())
@@ -52,7 +52,16 @@ def good_captures(tmp_path_factory) -> Path:
 
 
 def first_message(folder: Path, out: Path, set_: str = "") -> str | None:
-    """The message of the command for a scene, or None where `poses` accepts it. Unexpected errors are raised."""
+    """Return the message by which the command refuses a scene, or None if the stages `poses` and `raw_masks` accept it.
+
+    Args:
+        folder: the scene.
+        out: the folder that the stages write to.
+        set_: parameters as typed after `set=`.
+
+    Raises:
+        Exception: any error that is not a refusal.
+    """
     try:
         scene = load_scene_file(folder, PIPELINE)
         profile, _ = choose_profile("laptop" if scene.profile is None else None, scene, [], PIPELINE)
@@ -87,7 +96,19 @@ def first_message(folder: Path, out: Path, set_: str = "") -> str | None:
 def assert_bad_input(
     good_captures: Path, tmp_path: Path, layout: str, change: Change, names: str, set_: str = ""
 ) -> str:
-    """Corrupt a copy of a good capture, and check the message."""
+    """Corrupt a copy of a good capture by `change`, and assert that it is refused by one line that contains `names`.
+
+    Args:
+        good_captures: the fixture.
+        tmp_path: a folder for the copy and the output.
+        layout: the capture in `good_captures`.
+        change: corrupts the copy.
+        names: the file or key that the message must name.
+        set_: parameters as typed after `set=`.
+
+    Returns:
+        The message.
+    """
     folder, out = tmp_path / "s", tmp_path / "out"
     shutil.copytree(good_captures / layout, folder)
     out.mkdir()
@@ -101,7 +122,7 @@ def assert_bad_input(
     return message
 
 
-# ---------------------------------------------------------------------------------------------- what changes a capture
+# -------------------------------------------------------------------------------------- changes that corrupt a capture
 
 
 def write_file(name: str, content: bytes | str) -> Change:
@@ -118,7 +139,7 @@ def write_yaml(text: str) -> Change:
 
 
 def truncate_file(name: str, keep: int) -> Change:
-    """Keep the first bytes of a file; a negative `keep` drops the last ones."""
+    """Return a change that keeps the first `keep` bytes of a file; a negative `keep` drops that many last bytes."""
     return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:keep])
 
 
@@ -132,7 +153,7 @@ def replace_in_file(name: str, old: str, new: str) -> Change:
 
 
 def replace_by(name: str, kind: str) -> Change:
-    """Put a folder, a pipe, or a dangling link in place of a file."""
+    """Return a change that puts a folder, a pipe or a dangling link (`kind`) in place of a file."""
 
     def change(folder: Path) -> None:
         path = folder / name
@@ -182,7 +203,7 @@ def do_all(*changes: Change) -> Change:
 
 
 def png_header(width: int, height: int, kind: int = 2) -> bytes:
-    """A PNG file that declares a size and contains almost no data."""
+    """Return a PNG file that declares a size but has almost no pixel data; `kind` is the PNG colour type."""
     chunk = lambda tag, data: struct.pack(">I", len(data)) + tag + data + struct.pack(">I", zlib.crc32(tag + data))
     header = struct.pack(">IIBBBBB", width, height, 8, kind, 0, 0, 0)
     return (
@@ -323,7 +344,7 @@ def test_scene_yaml(good_captures, tmp_path, text):
     assert_bad_input(good_captures, tmp_path, "transforms", write_yaml(text), "")
 
 
-VALUES = {  # parameter -> values that it cannot have
+VALUES = {  # parameter -> values that must be refused
     "fit.iterations": ("true", "-1", "1.5", "many", ".nan", ".inf", "[1]", "{a: 1}", "null", '"x"'),
     "fit.seed": ("on", "half", "1e400"),
     "fit.lr.means": ("true", "-1", ".nan", ".inf", "fast"),
@@ -463,7 +484,7 @@ def test_transforms_json(good_captures, tmp_path, change):
 # ---------------------------------------------------------------------------------------------- COLMAP, LLFF
 
 MODEL = "sparse/0"
-CAMERA = "1 SIMPLE_PINHOLE 96 72 90"  # begins the line in cameras.txt
+CAMERA = "1 SIMPLE_PINHOLE 96 72 90"  # the beginning of the camera's line in cameras.txt
 COLMAP_TEXT: dict[str, tuple[str, Change]] = {
     **{
         f"camera: {line!r:.40}": ("cameras.txt", write_file(f"{MODEL}/cameras.txt", line + "\n"))
@@ -545,7 +566,7 @@ def test_colmap_text(good_captures, tmp_path, names, change):
 
 
 def overwrite_number(name: str, at: int, layout: str, value: float) -> Change:
-    """Overwrite a number in a binary file."""
+    """Return a change that overwrites the number at byte `at` of a binary file; `layout`: its type for `struct`."""
 
     def change(folder: Path) -> None:
         data = bytearray((folder / name).read_bytes())
@@ -823,7 +844,7 @@ DEPTH: dict[str, tuple[str, Change]] = {
 
 @pytest.mark.parametrize(("name", "change"), DEPTH.values(), ids=DEPTH.keys())
 def test_depth_maps(good_captures, tmp_path, name, change):
-    """Of references: what `poses` lets pass by its header, `reference` refuses."""
+    """Depth maps of references. Either `poses` refuses the file by its header, or loading the file refuses it."""
     folder = tmp_path / "s"
     shutil.copytree(good_captures / "transforms", folder)
     change(folder)
@@ -848,7 +869,7 @@ def test_paintings(good_captures, tmp_path, broken):
         load_image(found[0].path if found else ReferenceFile("v01", folder / "painted/v01.png").path)
 
 
-# ---------------------------------------------------------------------------------------------- what is meant, works
+# ---------------------------------------------------------------------------------- names that look like other types
 
 NAMES = ["20220819_104425", "2022-08-19", "007", "1e3", "on", "null_"]
 
@@ -875,7 +896,7 @@ def test_names_that_look_like_numbers_or_dates_are_names(good_captures, tmp_path
 
 # ---------------------------------------------------------------------------------------------- the command itself
 
-QUICK = [  # refused before a stage is asked
+QUICK = [  # refused before a stage checks its parameters
     ("scene.yaml", write_yaml(YAML["billion laughs"]), ""),
     ("scene.yaml", write_yaml(YAML["python tag"]), ""),
     ("scene.yaml", replace_by("scene.yaml", "pipe"), ""),

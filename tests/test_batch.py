@@ -1,4 +1,4 @@
-"""Several scenes at once on a toy pipeline: cores, memory, progress, and what a second call runs."""
+"""Several scenes at once on a toy pipeline: cores, memory, progress, interruptions, and reuse by a second call."""
 
 from __future__ import annotations
 
@@ -43,7 +43,14 @@ SCENES = ("a", "b", "c", "d")
 
 
 def write_projects(root: Path, pause: float = 0.0, memory: str = "", meet: int = 0) -> Path:
-    """Write scenes a to d; c is unreadable. `distill` waits until `meet` of them run, and takes `pause` s."""
+    """Write a toy project with the scenes a to d; scene c is unreadable.
+
+    Args:
+        root: the folder to write to.
+        pause: seconds that the stage `distill` takes.
+        memory: text to append to pipeline.yaml.
+        meet: `distill` waits until this many scenes have begun `distill`.
+    """
     write_project(root)
     (root / "stages/distill.py").write_text(
         STAGE.replace("pause: float = 0.0", f"pause: float = {pause}\n    meet: int = {meet}")
@@ -66,7 +73,7 @@ def max_concurrent(found: list[list]) -> int:
 
 
 def local_engine(cores: int, memory_mb: int = 10_000) -> LocalEngine:
-    """An engine with this many cores, whatever the machine has."""
+    """Return an engine with this many cores, even if the machine has fewer: a core then appears several times."""
     real = sorted(os.sched_getaffinity(0))
     return LocalEngine([real[n % len(real)] for n in range(cores)], memory_mb, [])
 
@@ -90,7 +97,7 @@ def test_several_at_once_and_a_second_call_runs_what_failed(tmp_path, capsys):
     assert batch(make_request(root, ""), root / "many", Execution(local_engine(4))) == 0
     assert len(read_spans(root)) == 4 and "failed" not in (root / "runs/results.md").read_text()
     (root / "alone").mkdir()
-    for other in "ac":  # it waits for three
+    for other in "ac":  # `distill` waits for three scenes
         (root / f"alone/begun-{other}").touch()
     alone = Request(root, root / "alone", str(root / "many/b"), "laptop")
     run_scene(alone, "all")
@@ -101,14 +108,17 @@ def test_several_at_once_and_a_second_call_runs_what_failed(tmp_path, capsys):
 
 @pytest.mark.parametrize("cores, memory_mb, most", [(2, 10_000, 2), (4, 1300, 2), (4, 100, 1)])
 def test_never_more_than_there_are_cores_or_memory(tmp_path, cores, memory_mb, most):
-    """By pipeline.yaml 500 MB, and 100 for each MB of what poses wrote (next to nothing); then by what it last took."""
+    """pipeline.yaml gives `distill` 600 MB, and 100 MB for each MB of its input, which is almost empty here.
+
+    One stage runs alone if the engine has less than 600 MB.
+    """
     root = write_projects(tmp_path, 0.5, "memory: {distill: {mb: 600, each: 100}}\n")
     batch(make_request(root, ""), root / "many", Execution(local_engine(cores, memory_mb), 1))
     assert len(read_spans(root)) == 3 and max_concurrent(read_spans(root)) <= most
 
 
 def test_a_stage_killed_beside_others_is_retried_alone(tmp_path):
-    """As where memory runs out: the one whose number is highest is killed while others are at it."""
+    """`distill` of scene d is killed once while it runs beside other scenes, as when memory runs out."""
     root = write_projects(tmp_path, meet=3)
     stage = (root / "stages/distill.py").read_text()
     kill = """    if out.parent.name == "d" and not (out.parent.parent / "killed").exists():
@@ -134,7 +144,7 @@ def test_variants_of_several_scenes_at_once(tmp_path):
     root = write_projects(tmp_path, 0.1)
     assert (
         compare(make_request(root, ""), "better,twin", data=root / "many", execution=Execution(local_engine(4))) == 3
-    )  # of scene c
+    )  # scene c fails with each of the three methods
     lines = (root / "runs/ran.txt").read_text().splitlines()
     assert sorted(lines) == sorted(set(lines)), "what is equal is done once"
     record = json.loads((root / "runs/compare/compare.json").read_text())
@@ -162,7 +172,7 @@ def test_stopped_while_several_run(tmp_path):
 
 
 def test_work_finished_at_an_interruption_is_not_repeated(tmp_path):
-    """`distill` takes no notice of Ctrl-C; `evaluate` after it is not begun."""
+    """`distill` ignores Ctrl-C and ends, so its result is kept. The next stage, `evaluate`, is not begun."""
     root = write_projects(tmp_path, 0.0)
     takes = "    import signal\n    signal.signal(2, signal.SIG_IGN)\n    (out / 'begun').touch()\n    time.sleep(2)\n"
     stage = COMPARE_FILES["stages/distill.py"].replace("    time.sleep(params.pause)\n", takes)

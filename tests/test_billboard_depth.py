@@ -1,4 +1,4 @@
-"""An object that a reference adds without a depth map stands on the surface beneath it."""
+"""An object that a reference adds without a depth map stands upright on the surface below the object."""
 
 import numpy as np
 from scenes.cameras import make_camera, world_rays
@@ -7,11 +7,11 @@ from reffusion import geometry
 from reffusion.depth.billboard import billboard_depth
 from reffusion.types import Camera
 
-TILT = np.radians(25)  # the camera looks down on a floor 1 below it
+TILT = np.radians(25)  # radians; the camera looks down by this angle on a floor 1 below the camera
 
 
 def tilted_floor_view() -> tuple[Camera, np.ndarray]:
-    """A camera that looks down on a floor, and camera z [H, W] of the floor and a wall at 4."""
+    """Return a camera that looks down on a floor, and its depth map [H, W] of the floor and of a wall at z = 4."""
     c, s = np.cos(TILT), np.sin(TILT)  # world: x right, y down, z ahead
     camera = make_camera("v", (96, 72), 80.0, rotation=np.array([[1, 0, 0], [0, c, -s], [0, s, c]]))
     rays = world_rays(camera)

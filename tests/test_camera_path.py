@@ -1,4 +1,4 @@
-"""The camera path around a capture and the video along it."""
+"""The camera path around a capture, and the video along this path."""
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from report import camera_path, turntable
 
 
 def ring_cameras(count: int, radius: float, height: float = 0.3) -> list[Camera]:
-    """Cameras on a circle about the y axis, rows downwards along +y, all looking at the origin."""
+    """Return cameras on a circle about the y axis that look at the origin; their image rows go down along +y."""
     turns = 2 * np.pi * np.arange(count) / count
     centers = np.stack([radius * np.cos(turns), np.full(count, -height), radius * np.sin(turns)], 1)
     poses = [camera_path.look_at(center, np.zeros(3), np.array([0.0, 1.0, 0.0])) for center in centers]

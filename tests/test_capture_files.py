@@ -41,11 +41,11 @@ from reffusion.params.poses import Params
 from reffusion.types import Scene
 from stages.plan import poses as plan
 
-SHARE = 1 / 16  # of a picture that `write_masks` masks
+SHARE = 1 / 16  # of a picture's pixels: `write_masks` masks this share
 
 
 def run_with_warnings(folder: Path, **params) -> tuple[Scene, Path, str]:
-    """Run the stages: the scene, its folder, and the warnings."""
+    """Run the stages that read a capture; return the scene, its folder and the warnings, joined by newlines."""
     with warnings.catch_warnings(record=True) as records:
         warnings.simplefilter("always")
         scene, out = run_stages(folder, **params)
@@ -53,7 +53,7 @@ def run_with_warnings(folder: Path, **params) -> tuple[Scene, Path, str]:
 
 
 def assert_view_cameras(scene: Scene, truth: Truth, views: dict[str, str]) -> None:
-    """Assert poses and intrinsics of `views`: our name -> name in the truth."""
+    """Assert the true poses and intrinsics of all views of the scene; `views`: name in the scene -> name in `truth`."""
     assert sorted(scene.cameras) == sorted(views)
     similarity, at = scene.similarity, undistorted_pinhole(truth.lens)
     for view, name in views.items():
@@ -73,7 +73,16 @@ def mask_shares(out: Path) -> dict[str, float]:
 
 
 def write_textured_views(folder: Path, truth: Truth, names: dict[str, str]) -> np.ndarray:
-    """Write pictures of a textured plane (view -> file name); return the colours of the truth's points."""
+    """Write pictures of the textured plane z = 0, and return the plane's colours at the truth's points.
+
+    Args:
+        folder: the folder to write to.
+        truth: cameras and points.
+        names: view -> path of its picture below `folder`.
+
+    Returns:
+        uint8 [P, 3].
+    """
     generator = np.random.default_rng(0)
     waves = generator.normal(size=(12, 3)) * 7
     phases = generator.uniform(0, 2 * np.pi, 12)
@@ -92,12 +101,12 @@ def write_textured_views(folder: Path, truth: Truth, names: dict[str, str]) -> n
 
 
 def flat_truth(views: int = 12, points: int = 400) -> Truth:
-    """The cameras of `make_truth` in front of points on the plane z = 0."""
+    """Return the cameras of `make_truth` and random points on the plane z = 0 in front of them."""
     places = np.random.default_rng(5).uniform(-0.9, 0.9, (points, 3)) * (1, 1, 0)
     return replace(make_truth(views=views), points=places)
 
 
-# ---------------------------------------------------------------------------------------------- A: which model
+# ---------------------------------------------------------------------------------- choice among COLMAP models
 
 
 def test_the_model_with_most_images_is_taken(tmp_path):
@@ -119,7 +128,7 @@ def test_a_lone_model_with_another_number_is_found(tmp_path):
     assert "is taken" not in messages
 
 
-# ---------------------------------------------------------------------------------------------- B, C: names, folders
+# ------------------------------------------------------------------------------------------- names of views, folders
 
 
 @pytest.mark.parametrize("name", ["day1/{}.png", "images/{}.png", "day1\\{}.png", "C:\\scans\\day1\\{}.PNG"])
@@ -153,7 +162,7 @@ def test_equal_names_in_two_folders_are_called_by_their_paths(tmp_path):
         kind = "test_masks" if each == "cam0/0001.png" else "masks"
         write_pictures(folder / "images" / Path(each).parent, [Path(each).stem])
         write_masks(folder / kind / Path(each).parent, [Path(each).stem])
-        (folder / kind / each).rename(folder / kind / f"{each}.png")  # COLMAP's rule
+        (folder / kind / each).rename(folder / kind / f"{each}.png")  # COLMAP names the mask of A.png A.png.png
     write_named_model(folder / "sparse/0", truth, path)
     scene, out, _ = run_with_warnings(folder, test=["cam0/0001.png"], clean=["cam1-0002"], test_masks="test_masks")
     assert_view_cameras(scene, truth, {each[:-4].replace("/", "-"): view for view, each in path.items()})
@@ -174,7 +183,7 @@ def test_folders_of_masks_are_objects_where_a_view_has_several(tmp_path):
     assert list_objects(out) == ["ball", "box"]
 
 
-# ---------------------------------------------------------------------------------------------- D: Blender
+# ----------------------------------------------------------------------------------------- Blender's files
 
 
 @pytest.mark.parametrize("splits", [("train", "test"), ("train", "val"), ("train", "test", "val")])
@@ -200,7 +209,7 @@ def test_blenders_files_with_their_split(tmp_path, splits):
     assert ("transforms_val.json" in messages) == (len(splits) == 3)
 
 
-# ---------------------------------------------------------------------------------------------- F: what masks hold
+# -------------------------------------------------------------------------------------------- values of mask files
 
 
 def test_a_palette_with_white_first(tmp_path):
@@ -237,7 +246,7 @@ def test_soft_edges_and_grey_objects_are_no_object_numbers(tmp_path):
     assert (load_mask(tmp_path / "lossy.jpg") != (soft >= 128)).mean() < 0.01
 
 
-# ---------------------------------------------------------------------------------------------- G, J: beside photos
+# -------------------------------------------------------------------------- references and masks beside photographs
 
 
 def test_a_reference_among_bare_photographs_is_no_view(tmp_path):
@@ -272,7 +281,7 @@ def test_photographs_are_not_their_own_masks(tmp_path):
         plan.preview(Params(masks="images"), folder)
 
 
-# ---------------------------------------------------------------------------------------------- H, I, L: order, points
+# ---------------------------------------------------------------------------------------------- order of names, points
 
 
 def test_names_that_do_not_match_are_not_paired_by_order(tmp_path):
@@ -287,7 +296,11 @@ def test_names_that_do_not_match_are_not_paired_by_order(tmp_path):
 
 @pytest.mark.parametrize("numbered", [False, True])
 def test_renamed_copies_in_another_order_than_the_model_are_refused(tmp_path, numbered):
-    """LLFF sorts names as text; a model whose names sort otherwise gives each copy another view's pose."""
+    """The copies in images_4 have other names than the model's images, so they are paired in the order of names.
+
+    LLFF sorts names as text. The unpadded numbers frame0, frame1, frame10, ... have another order as text than as
+    numbers, so each copy would get the pose of another view.
+    """
     truth, folder = flat_truth(), tmp_path / "s"
     views = sorted(truth.world_to_camera)
     colors = write_textured_views(
@@ -357,7 +370,7 @@ def test_nothing_matched_is_not_zero_pixels(tmp_path, capsys):
     assert load_json(out / "refine.json") == {"before": None, "after": None}
 
 
-# ---------------------------------------------------------------------------------------------- M, N: bytes
+# ----------------------------------------------------------- Unicode names, unreadable files, camera models
 
 
 def test_composed_and_decomposed_accents_are_one_name(tmp_path):
@@ -375,7 +388,7 @@ def test_composed_and_decomposed_accents_are_one_name(tmp_path):
 
 def test_files_that_are_no_pictures_are_named(tmp_path, monkeypatch):
     folder = write_capture(tmp_path / "s", "colmap", make_truth())
-    Image.init()  # every format registers now, not while the table is replaced
+    Image.init()  # registers every format before the table of formats is replaced
     monkeypatch.setattr(Image, "OPEN", {kind: opener for kind, opener in Image.OPEN.items() if kind != "HEIF"})
     (folder / "images/v01.png").write_text("<html>404</html>")
     with pytest.raises(BadInput, match=r"v01\.png: not a readable image \(UnidentifiedImageError"):
@@ -398,7 +411,8 @@ def test_colmaps_fisheyes_without_coefficients(tmp_path, model, params, text):
         (folder / "sparse/0/cameras.bin").unlink()
     scene, _, _ = run_with_warnings(folder)
     assert_view_cameras(scene, truth, {view: view for view in truth.world_to_camera})
-    pinhole = undistorted_pinhole(truth.lens)  # a pixel of it is read where an equidistant fisheye shows its direction
+    # A pixel of the undistorted picture is read where an equidistant fisheye shows the pixel's direction.
+    pinhole = undistorted_pinhole(truth.lens)
     at = sampling_map(truth.lens, pinhole)[10, 20]
     x, y = (20.5 - pinhole.cx) / pinhole.fx, (10.5 - pinhole.cy) / pinhole.fy
     stretch = np.arctan(np.hypot(x, y)) / np.hypot(x, y)
@@ -429,7 +443,7 @@ def test_windows_paths_in_transforms(tmp_path):
     assert len(capture.poses.points) == 60 and not capture.warnings and len(capture.pictures) == 6
 
 
-# ---------------------------------------------------------------------------------------------- O, Q
+# -------------------------------------------------- mask and depth files of transforms.json, 16 bits
 
 
 def test_mask_path_and_depth_file_path(tmp_path):

@@ -42,7 +42,7 @@ from reffusion.io.images import save_image
 from reffusion.io.ply import save_points
 from reffusion.io.scene import load_views
 
-# ---------------------------------------------------------------------------------------------- N: other than its name
+# ----------------------------------------------------------------------- files whose content is not what the name says
 
 POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:" + 64 * "4" + "\nsize 4096\n"
 CONSENT_PAGE = b"\xef\xbb\xbf\r\n<!DOCTYPE html><html><title>Google Drive - Virus scan warning</title></html>"
@@ -75,7 +75,11 @@ def test_phone_picture_called_jpg_without_its_reader(tmp_path, monkeypatch, bran
 
 
 def write_fisheye_capture(folder: Path, params: tuple[float, ...]) -> Truth:
-    """Write speckled photographs of a fisheye without coefficients, in COLMAP's earlier model."""
+    """Write a COLMAP capture with speckled photographs of a fisheye lens without distortion coefficients.
+
+    Its camera model is OPENCV_FISHEYE with four zero coefficients, which COLMAP had before the models FISHEYE and
+    SIMPLE_FISHEYE; `params` are (fx, fy, cx, cy) in px.
+    """
     truth = make_truth(("OPENCV_FISHEYE", (*params, 0.0, 0.0, 0.0, 0.0)))
     write_capture(folder, "colmap", truth)
     for k, view in enumerate(truth.world_to_camera):
@@ -85,7 +89,7 @@ def write_fisheye_capture(folder: Path, params: tuple[float, ...]) -> Truth:
 
 
 def assert_same_undistortion(folder: Path, truth: Truth, earlier: dict[str, np.ndarray]) -> None:
-    """Assert the true cameras, and the pictures that the earlier model gives."""
+    """Assert the true cameras, and the undistorted pictures `earlier` (view -> picture) of the OPENCV_FISHEYE model."""
     scene, out, sentences = run_with_messages(folder)
     assert reprojection_error(scene, truth) < EXACT
     assert_message(sentences, "undistortion", "moves the border")
@@ -94,7 +98,7 @@ def assert_same_undistortion(folder: Path, truth: Truth, earlier: dict[str, np.n
 
 
 def write_camera(folder: Path, number: int, params: tuple[float, ...]) -> None:
-    """Write cameras.bin with one camera of the model with this number."""
+    """Write cameras.bin with one camera; `number` is COLMAP's number of the camera model, `params` its parameters."""
     head = struct.pack("<QIiQQ", 1, 1, number, WIDTH, HEIGHT)
     (folder / "sparse/0/cameras.bin").write_bytes(head + struct.pack(f"<{len(params)}d", *params))
 
@@ -122,7 +126,7 @@ def test_fisheyes_in_binary(tmp_path, number, params):
 
 
 def assert_names_model(message: str, file: str, model: str) -> None:
-    """The message names the file, the model and a remedy."""
+    """Assert that the message names the file, the camera model and a remedy."""
     assert file in message and re.search(rf"\b{model}\b", message), message
     assert any(word in message.lower() for word in ("convert", "undistort")), message
 
@@ -157,7 +161,7 @@ def test_points_in_a_folder_by_a_windows_path(tmp_path):
 
 @pytest.mark.parametrize("coded", [True, False])
 def test_video_without_frames(tmp_path, coded):
-    """Frames of a phone's AV1 that cannot be decoded here; a sound recording in the container of a video."""
+    """Refuse an MP4 file with AV1 frames that cannot be decoded here (`coded`), or with a sound track only."""
     path = tmp_path / "walk.mp4"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 30, (64, 48))
     for k in range(40):
@@ -175,11 +179,11 @@ def test_video_without_frames(tmp_path, coded):
     assert any(word in message for word in way_out), message
 
 
-# ---------------------------------------------------------------------------------------------- O: masks and depth
+# ------------------------------------------------------------------------------ masks and depth of transforms.json
 
 
 def add_to_frames(folder: Path, key: str, path_of) -> None:
-    """Add `key` to every frame of transforms.json; `path_of` maps a view's name to its value."""
+    """Set `key` in every frame of transforms.json; `path_of` maps a view's name to the value."""
     record = json.loads((folder / "transforms.json").read_text())
     for frame in record["frames"]:
         frame[key] = path_of(Path(frame["file_path"]).stem)
@@ -187,7 +191,7 @@ def add_to_frames(folder: Path, key: str, path_of) -> None:
 
 
 def write_inverse_masks(folder: Path, where: str) -> Truth:
-    """Write masks as nerfstudio has them (0 is excluded), named in transforms.json."""
+    """Write a capture with nerfstudio's masks in the folder `where`: mask_path names them, and 0 marks the object."""
     truth = make_truth()
     write_pictures(folder / "images", truth.world_to_camera)
     for view in truth.world_to_camera:
@@ -213,7 +217,10 @@ def test_masks_of_the_scene_win(tmp_path):
 
 
 def test_masks_that_lie_where_ours_are_looked_for(tmp_path):
-    """Nerfstudio's own name of the folder: taken as that file means them, or the sentence says how they are taken."""
+    """nerfstudio's folder of masks is called `masks`, like ours, but its masks have the opposite sign.
+
+    Either mask_path is followed, and the object is masked, or a message names mask_path.
+    """
     write_inverse_masks(tmp_path / "s", "masks")
     try:
         _, out, sentences = run_with_messages(tmp_path / "s")
@@ -243,7 +250,11 @@ def test_mask_of_half_of_the_frames(tmp_path):
 
 @pytest.mark.parametrize("unit", [None, 0.0005])
 def test_depth_of_a_phone_makes_points(tmp_path, unit):
-    """16-bit maps of half the size, in millimetres unless the file says otherwise; 0 is unknown. The scene is z = 0."""
+    """Depth maps become points on the plane z = 0, which the photographs show, or a message names depth_file_path.
+
+    The maps have 16 bits and half the photographs' size. Their unit is a millimetre unless transforms.json gives
+    another `unit` in metres; 0 means unknown.
+    """
     truth = make_truth()
     folder = write_capture(tmp_path / "s", "transforms", truth)
     at = truth.lens.resized(WIDTH // 2, HEIGHT // 2)
@@ -266,7 +277,7 @@ def test_depth_of_a_phone_makes_points(tmp_path, unit):
         assert_message(sentences, "depth_file_path")
 
 
-# ---------------------------------------------------------------------------------------------- Q: 16 bits of grey
+# ------------------------------------------------------------------------------------------------- 16 bits of grey
 
 
 @pytest.mark.parametrize(
@@ -274,7 +285,7 @@ def test_depth_of_a_phone_makes_points(tmp_path, unit):
     [(".tif", "<u2", 0, 4095), (".tiff", ">u2", 300, 64_000), (".png", "<u2", 7_000, 21_000)],
 )
 def test_grey_photographs_of_16_bits(tmp_path, ending, order, low, high):
-    """A camera of 12 bits, a scan in the other order of bytes, a thermal camera: a ramp stays a ramp."""
+    """A ramp of grey stays a ramp, from a 12-bit camera, a big-endian scan, and a thermal camera."""
     folder, truth = tmp_path / "s", make_truth()
     write_masks(folder / "masks", truth.world_to_camera)
     (folder / "images").mkdir()

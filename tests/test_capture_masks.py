@@ -36,11 +36,11 @@ from scenes.room import render_room_corner, room_walk, speckle_texture
 
 from reffusion.io.images import save_image
 
-# ---------------------------------------------------------------------------------------------- F: masks of any kind
+# ------------------------------------------------------------------------------------------- uncommon kinds of masks
 
 
 def write_capture_with_masks(folder: Path, masks: str, draw) -> Truth:
-    """Write a COLMAP capture whose masks are the Pillow images that `draw` returns."""
+    """Write a COLMAP capture with masks in the folder named `masks`; `draw()` returns a mask as a Pillow image."""
     truth = make_truth()
     write_capture(folder, "colmap", truth)
     (folder / "masks").rename(folder / masks)
@@ -59,7 +59,7 @@ def palette_image(numbers: np.ndarray, colors: dict[int, tuple[int, int, int]]) 
 
 
 def test_palette_whose_black_is_the_last_entry(tmp_path):
-    """As an annotation tool writes it whose table begins with the first label, dark red."""
+    """The first entry of the palette is the object's label, dark red; the last is the background, black."""
     draw = lambda: palette_image(np.where(OBJECT, 0, 2), {0: (128, 0, 0), 1: (0, 128, 0), 2: (0, 0, 0)})
     truth = write_capture_with_masks(tmp_path / "s", "masks", draw)
     _, out, _ = run_with_messages(tmp_path / "s")
@@ -67,7 +67,7 @@ def test_palette_whose_black_is_the_last_entry(tmp_path):
 
 
 def test_one_class_of_a_palette_by_its_number(tmp_path):
-    """Pascal VOC: classes by number, the contour is 255 and bright."""
+    """Masks of Pascal VOC: palette numbers are classes; the object has class 15, and its bright contour has 255."""
     numbers = np.where(OBJECT, 15, 0)
     numbers[50:60, 10:90] = 7
     numbers[HEIGHT // 4 - 1, WIDTH // 4 : WIDTH // 2] = 255
@@ -78,7 +78,7 @@ def test_one_class_of_a_palette_by_its_number(tmp_path):
 
 
 def numbered_16_bit() -> Image.Image:
-    """A 16-bit map of object numbers: the object has the parts 3 and 1024 and stands on 40000."""
+    """Return a 16-bit map of object numbers: the object consists of the parts 3 and 1024; another object is 40000."""
     numbers = np.where(OBJECT, 1024, 0).astype(np.uint16)
     numbers[HEIGHT // 4 : HEIGHT // 4 + 5][:, WIDTH // 4 : WIDTH // 2] = 3
     numbers[50:] = 40000
@@ -104,7 +104,7 @@ def test_antialiased_outlines_are_no_object_numbers(tmp_path):
     assert [masked_share(out, v) for v in truth.world_to_camera] == pytest.approx([SHARE] * 6, abs=0.003)
 
 
-# ---------------------------------------------------------------------------------------------- G: references
+# ------------------------------------------------------------------------------------------------- references
 
 
 def test_reference_and_its_depth_among_photographs_of_input(tmp_path):
@@ -130,7 +130,7 @@ def test_two_references_beside_pictures_of_llff(tmp_path):
     assert_masked_views(out, truth.world_to_camera)
 
 
-# ---------------------------------------------------------------------------------------------- H: order
+# ------------------------------------------------------------------- pictures paired with poses by order
 
 
 def test_frames_of_another_tool_are_not_paired_by_order(tmp_path):
@@ -144,8 +144,11 @@ def test_frames_of_another_tool_are_not_paired_by_order(tmp_path):
 
 
 def write_corner_capture(folder: Path, order: list[int]) -> Truth:
-    """A drawn corner of a room, its points coloured as seen, and images IMG_8 to IMG_13 in the model; `image00k.png` is
-    the view number `order[k]`."""
+    """Write a capture of a room's corner whose pictures and COLMAP images have different names; return the truth.
+
+    The model has the images IMG_8.JPG to IMG_13.JPG, and points with the colours of the pictures. The picture
+    images_4/image00k.png shows view number `order[k]`.
+    """
     generator, cameras = np.random.default_rng(5), room_walk(6)
     textures = np.stack([cv2.GaussianBlur(speckle_texture(generator), (0, 0), 5) for _ in range(3)])
     textures = 255 * (textures - textures.min()) / np.ptp(textures)
@@ -177,7 +180,7 @@ def recolor(path: Path, colors: np.ndarray) -> None:
 
 
 def test_renamed_copies_follow_the_order_of_file_names(tmp_path):
-    """IMG_10.JPG comes before IMG_8.JPG."""
+    """Names are sorted as text: IMG_10.JPG comes before IMG_8.JPG."""
     truth = write_corner_capture(tmp_path / "s", [2, 3, 4, 5, 0, 1])
     scene, _, sentences = run_with_messages(tmp_path / "s")
     assert_cameras(scene, truth)

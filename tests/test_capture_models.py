@@ -37,12 +37,12 @@ from reffusion.io.scene import list_objects
 
 
 def truth_in_other_frame(views: int) -> Truth:
-    """A model of the same views by another run: its frame is another."""
+    """Return the truth of `make_truth` in another world frame, as another run of COLMAP would give."""
     return make_truth(views=views, scale=2.5, offset=(7.0, -3.0, 11.0))
 
 
 def write_transforms_with_paths(folder: Path, truth: Truth, paths: dict[str, str]) -> None:
-    """transforms.json with frames of these file paths: view -> file_path."""
+    """Write transforms.json whose frames have the given paths; `paths`: view -> file_path."""
     write_transforms(folder, truth)
     record = json.loads((folder / "transforms.json").read_text())
     for frame in record["frames"]:
@@ -50,7 +50,7 @@ def write_transforms_with_paths(folder: Path, truth: Truth, paths: dict[str, str
     (folder / "transforms.json").write_text(json.dumps(record))
 
 
-# ---------------------------------------------------------------------------------------------- A: several models
+# ------------------------------------------------------------------------------------------------- several models
 
 
 def test_largest_of_three_models_that_nerfstudio_left(tmp_path):
@@ -80,7 +80,7 @@ def test_two_digit_model_beside_masks_of_images_4(tmp_path):
     assert_message(sentences, "sparse", "10", "2")
 
 
-# ---------------------------------------------------------------------------------------------- B: names and folders
+# ------------------------------------------------------------------------------------------------- names and folders
 
 
 def test_rig_of_two_cameras_two_folders_deep(tmp_path):
@@ -116,7 +116,7 @@ def test_absolute_windows_paths_and_other_case(tmp_path):
     stems = {v: f"img_{k:04d}" for k, v in enumerate(sorted(truth.world_to_camera))}
     names = {v: rf"D:\Scans\Garden 2\photos\{stem.upper()}.JPG" for v, stem in stems.items()}
     write_named_model(folder / "sparse/0", truth, names)
-    del stems["v02"]  # a picture that was deleted: order says nothing
+    del stems["v02"]  # one picture is missing, so order cannot pair pictures with poses
     write_pictures(folder / "images", stems.values())
     write_masks(folder / "masks", stems.values())
     scene, _, _ = run_with_messages(folder, test=["img_0003.png"])
@@ -124,7 +124,7 @@ def test_absolute_windows_paths_and_other_case(tmp_path):
     assert_cameras(scene, rename_views(truth, stems))
 
 
-# ---------------------------------------------------------------------------------------------- C: masks in folders
+# ------------------------------------------------------------------------------------------------- masks in folders
 
 
 def test_masks_by_colmaps_rule_for_equal_names(tmp_path):
@@ -163,7 +163,7 @@ def test_folders_of_objects_stay_objects(tmp_path):
     assert list_objects(out) == ["chair", "lamp"]
 
 
-# ---------------------------------------------------------------------------------------------- D: Blender's files
+# ------------------------------------------------------------------------------------------------- Blender's files
 
 
 def blender_frames(truth: Truth, paths: dict[str, str]) -> list[dict]:

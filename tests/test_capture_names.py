@@ -34,7 +34,7 @@ from scenes.capture_checks import (
     write_named_model,
 )
 
-# ---------------------------------------------------------------------------------------------- I: points
+# -------------------------------------------------------------------------------- points in another frame
 
 
 def assert_points_near(scene, sentences: list[str], file: str) -> None:
@@ -65,7 +65,7 @@ def test_points_in_utm_beside_a_complete_model_of_llff(tmp_path):
     assert_points_near(scene, sentences, "points3D")
 
 
-# ---------------------------------------------------------------------------------------------- J: masks beside
+# ------------------------------------------------------------------------------------- masks beside photographs
 
 
 def test_masks_beside_photographs_without_a_key(tmp_path):
@@ -81,7 +81,7 @@ def test_masks_beside_photographs_without_a_key(tmp_path):
 
 
 def test_masks_beside_pictures_of_llff(tmp_path):
-    """Names that end in numbers; one view's photograph is called _mask too, and has no mask."""
+    """The names of five views end in numbers. The sixth, `venetian_mask`, is a photograph although it ends in _mask."""
     folder, truth = tmp_path / "s", make_truth()
     names = {v: f"2024-02-0{k + 1} party" for k, v in enumerate(sorted(truth.world_to_camera))}
     names["v05"] = "venetian_mask"
@@ -95,7 +95,7 @@ def test_masks_beside_pictures_of_llff(tmp_path):
     assert_masked_views(out, list(names.values())[:5])
 
 
-# ---------------------------------------------------------------------------------------------- L: LLFF's order
+# ---------------------------------------------------------------------------------------- LLFF's order of names
 
 
 def test_copies_with_blanks_and_hyphens(tmp_path):
@@ -111,7 +111,7 @@ def test_copies_with_blanks_and_hyphens(tmp_path):
 
 
 def test_test_masks_follow_the_order_of_file_names(tmp_path):
-    """Three views before the masked ones; out_00000 stands for the first by file name, and has the largest mask."""
+    """The first three views in order of file names are test views, and out_0000k.png is the test mask of the k-th."""
     folder, truth = tmp_path / "s", make_truth(views=8)
     files = ["20220811(0).jpg", "20220811(1).jpg", "20220811.jpg", *(f"2022082{k}.jpg" for k in range(5))]
     assert files == sorted(files)
@@ -130,7 +130,7 @@ def test_test_masks_follow_the_order_of_file_names(tmp_path):
         assert mask.mean() == pytest.approx(height / HEIGHT, abs=1e-3), file
 
 
-# ---------------------------------------------------------------------------------------------- M: forms of Unicode
+# ------------------------------------------------------------------------------------------------- forms of Unicode
 
 
 def to_nfd(name: str) -> str:
@@ -142,7 +142,7 @@ def to_nfc(name: str) -> str:
 
 
 def assert_cameras_by_nfc(scene, truth: Truth, names: dict[str, str]) -> None:
-    """Assert the true cameras, whichever Unicode form the names have."""
+    """Assert the true cameras; names are compared in the Unicode form NFC. `names`: view of the truth -> name."""
     found = {to_nfc(name): name for name in scene.cameras}
     assert sorted(found) == sorted(to_nfc(name) for name in names.values())
     assert_cameras(scene, rename_views(truth, {v: found[to_nfc(n)] for v, n in names.items()}))
@@ -182,7 +182,7 @@ def test_folder_of_a_model_written_on_another_system(tmp_path):
 
 
 def test_names_of_two_forms_in_one_folder(tmp_path):
-    """Every second picture was copied through macOS."""
+    """Every second picture has a decomposed (NFD) name, as after a copy through macOS; the others have NFC names."""
     folder, truth = tmp_path / "s", make_truth()
     names = {v: f"Straße à {k}" for k, v in enumerate(sorted(truth.world_to_camera))}
     pictures = {v: (to_nfd, to_nfc)[k % 2](n) for k, (v, n) in enumerate(names.items())}

@@ -18,7 +18,7 @@ ORIENTATION, EXIF_FOLDER, FOCAL_35_MM = 0x0112, 0x8769, 0xA405
 
 
 def exif(orientation: int = 1) -> Image.Exif:
-    """The EXIF data of a phone with the focal length of the rendering, 170 px of 200."""
+    """Return EXIF data with an orientation tag and the renderings' 35 mm focal length (170 px at 200 px width)."""
     result = Image.Exif()
     result[ORIENTATION] = orientation
     result.get_ifd(EXIF_FOLDER)[FOCAL_35_MM] = round(36 * 170 / 200)
@@ -34,7 +34,7 @@ def save_walk(folder: Path, ending: str, **options) -> dict[str, np.ndarray]:
 
 
 def assert_placed(scene, truth: dict[str, np.ndarray]) -> None:
-    """Assert that all views are placed: rotations within 2 degrees, centres within 2 % of their extent."""
+    """Assert that all views have poses: rotations within 2 degrees, centres within 2 % of the extent of all centres."""
     assert sorted(scene.train) == sorted(truth)
     percents, degrees = pose_errors({name: scene.cameras[name].world_to_camera for name in scene.train}, truth)
     assert degrees.max() < 2 and percents.max() < 2
@@ -53,7 +53,10 @@ def test_webp_saved_by_a_browser_as_jpg(tmp_path):
 
 
 def save_two_orientations(folder: Path, portrait: set[int], save) -> dict[str, np.ndarray]:
-    """Save nine views, those in `portrait` upright, with `save(path, picture, is_portrait)`; return the true poses."""
+    """Save nine views by `save(path without ending, picture, is_portrait)`; return view -> world_to_camera [4, 4].
+
+    The views whose numbers are in `portrait` are 150 x 200 px, the others 200 x 150 px (width x height).
+    """
     truth, surfaces = room_walk(9), room_textures(np.random.default_rng(0))
     folder.mkdir(parents=True)
     for k, (name, pose) in enumerate(truth.items()):
@@ -70,7 +73,7 @@ def assert_two_orientations(scene, truth: dict[str, np.ndarray], portrait: set[i
 
 
 def test_turned_by_their_tag(tmp_path):
-    """A phone stores all lying, and says in a tag which to turn."""
+    """All photographs are stored in landscape, and the EXIF orientation says which to turn, as phones store them."""
 
     def save(path: Path, picture: Image.Image, upright: bool) -> None:
         stored = picture.transpose(Image.Transpose.ROTATE_90) if upright else picture

@@ -1,4 +1,4 @@
-"""2D inpainters change only the hole and ignore its content; LaMa gets the input that it expects."""
+"""2D inpainters change only the hole and ignore the hole's content; LaMa gets the input that LaMa expects."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path):
 
 
 def test_a_mask_is_widened_by_a_share_of_the_width():
-    wide = morphology.dilate(HOLE, 0.04)  # 2 px
+    wide = morphology.dilate(HOLE, 0.04)  # the share 0.04 of the width of 50 px is 2 px
     assert (wide[10:26, 25]).all() and not wide[9, 25] and not wide[26, 25] and wide[18, 13] and not wide[18, 12]
     assert (morphology.dilate(HOLE, 0) == HOLE).all() and not morphology.dilate(np.zeros_like(HOLE), 0.1).any()
 

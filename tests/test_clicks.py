@@ -1,4 +1,4 @@
-"""Clicks become masks: in one photograph, in all views through the Gaussians, and in a browser."""
+"""Clicks become masks: in one photograph, in all views by the Gaussians, and on the page in a browser."""
 
 import itertools
 import threading
@@ -42,12 +42,12 @@ NEAR = 1.7
 
 
 def make_clicks(*points):
-    """Clicks at (x, y), one mark each; a third entry False marks a click beside the object."""
+    """Return one mark for each click (x, y); a third entry False says that the click is not on the object."""
     return [Mark(np.array([p[:2]], float), len(p) < 3) for p in points]
 
 
 def click_mask(picture, *points, relief=None, before=None):
-    """The mask after clicks on a picture."""
+    """Return the mask, bool [H, W], after clicks on a picture; `before` is the mask before the clicks."""
     return apply_marks(ViewEvidence(picture, relief), make_clicks(*points), before)
 
 
@@ -68,7 +68,7 @@ def test_the_cut_is_the_cheapest_of_all():
 
 
 def disk_picture(shape=(240, 320)):
-    """A noisy blue slope with a red disk that has a yellow stripe, and the mask of the disk."""
+    """Return a picture of a red disk with a yellow stripe on a noisy blue gradient, and the mask of the disk."""
     rows, columns = np.mgrid[: shape[0], : shape[1]]
     disk = np.hypot(rows - 120, columns - 150) < 60
     noise = np.random.default_rng(1).normal(0, 6, (*shape, 3))
@@ -90,7 +90,8 @@ def test_one_click_finds_what_is_of_one_colour_and_another_the_rest():
 
 def test_where_the_depth_is_known_a_click_goes_as_far_as_the_surface():
     picture, disk = disk_picture()
-    picture[:, 180:] = picture[70:90, 140:160].mean((0, 1))  # what stands behind has the disk's colour, and touches it
+    # The background right of column 180 has the disk's colour and touches the disk.
+    picture[:, 180:] = picture[70:90, 140:160].mean((0, 1))
     relief = np.where(disk, 0.0, 300.0)
     alone, flat = click_mask(picture, (150, 85)), click_mask(picture, (150, 85), relief=0 * relief)
     assert wall_scene.iou(alone, disk) < 0.9 and (alone == flat).all()
@@ -108,7 +109,11 @@ def test_a_click_takes_back_what_it_is_on():
 
 
 def test_a_correction_changes_one_region_and_keeps_what_marks_confirm():
-    """Random clicks and strokes: each changes one connected region below it, and no pixel that others confirm."""
+    """Marks are random clicks and strokes, on the object or beside it.
+
+    A click changes at most one connected region, a stroke at most five. The mask agrees with all pixels that marks
+    confirm.
+    """
     picture, _ = disk_picture((120, 160))
     picture = picture[:120, 70:230]
     draw = np.random.default_rng(0)
@@ -153,7 +158,7 @@ def test_of_the_networks_masks_the_one_with_edges_around_it_is_selected():
 
 @pytest.fixture(scope="module")
 def clicked_scene(tmp_path_factory):
-    """The wall with a square before it, photographed with the square, without masks."""
+    """Write a wall and a square in front of it, photographed without masks; return the folders of run, poses, fit."""
     folder = tmp_path_factory.mktemp("clicked")
     placed, fit, _ = wall_scene.write_poses_and_fit(folder, NEAR, masks={})
     everything, _ = wall_scene.wall_and_square(NEAR)
@@ -191,7 +196,7 @@ def test_clicks_on_nothing_are_refused(clicked_scene, tmp_path):
 
 
 def fitted_views(ask=None):
-    """The wall and the square, photographed; `ask`: view -> network."""
+    """Return the fitted views of the wall and the square; `ask(view)` returns the segmentation network for a view."""
     everything, _ = wall_scene.wall_and_square(NEAR)
     cameras = {name: wall_scene.CAMERAS[name] for name in wall_scene.TRAIN}
 
@@ -212,7 +217,7 @@ def test_a_mask_in_one_view_stays_as_it_was_given():
 
 
 def test_a_network_that_knows_the_object_in_parts_gives_the_whole_in_all_views():
-    """The object is two things to the network: the upper and the lower half of the square."""
+    """The network knows the upper and the lower half of the square as two separate objects."""
 
     def ask(name):
         square = square_mask(name)
@@ -232,7 +237,7 @@ def test_a_network_that_knows_the_object_in_parts_gives_the_whole_in_all_views()
 
 
 def test_rough_masks_are_drawn_anew():
-    """Masks 2 px too large or too small, and one missing; the network knows the square."""
+    """The given masks are 2 px too large or too small, and one view has none. The network knows the square."""
 
     def ask(name):
         square = square_mask(name)
@@ -275,7 +280,11 @@ def test_a_stroke_in_one_view_corrects_the_others():
 
 
 def sheet_points(origin, along, up, color, step=0.04):
-    """Small round Gaussians on a parallelogram: means [n, 3] and colours [n, 3]."""
+    """Place Gaussians on a grid with distance `step` on the parallelogram spanned by `along` and `up` at `origin`.
+
+    Returns:
+        Means [n, 3] and colours [n, 3].
+    """
     origin, along, up = (np.array(each, float) for each in (origin, along, up))
     rows, columns = (np.arange(step / 2, np.linalg.norm(each), step) / np.linalg.norm(each) for each in (up, along))
     means = (origin + rows[:, None, None] * up + columns[None, :, None] * along).reshape(-1, 3)
@@ -287,7 +296,7 @@ def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
         sheet_points((-4, -2, 4), (8, 0, 0), (0, 4, 0), (0.2, 0.3, 0.7)),  # the wall
         sheet_points(
             (-0.5, -0.5, 2.5), (1, 0, 0), (0, 1, 0), (0.8, 0.5, 0.2)
-        ),  # a box: its front, and its sides in shade
+        ),  # the front of a box; its two darker sides follow
         sheet_points((-0.5, -0.5, 2.5), (0, 0, 0.8), (0, 1, 0), (0.5, 0.3, 0.12)),
         sheet_points((0.5, -0.5, 2.5), (0, 0, 0.8), (0, 1, 0), (0.5, 0.3, 0.12)),
     ]
@@ -302,7 +311,7 @@ def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
     assert (found & box).sum() > 0.95 * box.sum() and (found & ~box).sum() < 0.01 * box.sum()
 
 
-# ---------------------------------------------------------------------------------------------- what a scene brings
+# ---------------------------------------------------------------------------------------- clicks that a scene gives
 
 
 def test_clicks_find_their_place_through_the_lens():
@@ -348,11 +357,11 @@ def test_invalid_clicks_are_refused(click):
         masks.Params(clicks={"v00": [click]})
 
 
-# ---------------------------------------------------------------------------------------------- the page
+# ------------------------------------------------------------------------------- the page in the browser
 
 
 def test_the_page_runs_the_stages_that_it_reads(tmp_path, monkeypatch):
-    """On a capture without masks that no stage has seen."""
+    """The capture has no masks, and no stage has run on it."""
     folder = write_small_capture(tmp_path / "scene")
     monkeypatch.setattr("sys.argv", ["mask", "--scene", str(folder), "--runs", str(tmp_path / "runs")])
     pages = []
@@ -363,7 +372,7 @@ def test_the_page_runs_the_stages_that_it_reads(tmp_path, monkeypatch):
 
 def test_a_variant_has_the_masks_of_its_scene(tmp_path, monkeypatch):
     folder = write_small_capture(tmp_path / "scene")
-    old = tmp_path / "runs/scene@masked/fit"  # of other parameters
+    old = tmp_path / "runs/scene@masked/fit"  # a fit with other parameters, which the page must not use
     old.mkdir(parents=True)
     words = ["mask", "--scene", str(folder), "--runs", str(tmp_path / "runs"), "--variant", "masked"]
     monkeypatch.setattr("sys.argv", words)
@@ -429,11 +438,11 @@ def test_clicks_are_restored_the_next_time(page_server, tmp_path):
     again = Session(page_server.session.capture, lambda: True)
     (event,) = again.events
     assert event.view == "a2" and event.mark.points.tolist() == [[48.0, 36.0]] and event.mark.positive
-    again.save()  # its own files it may write again
+    again.save()  # the page may overwrite files that it wrote
 
 
 def test_a_mask_is_gone_after_its_marks_are_cleared(clicked_scene, tmp_path):
-    """Before the fit, when each view has the mask of its own marks."""
+    """Without a fit, a view has a mask only by its own marks, so the mask file is removed with the marks."""
     _, placed, fit = clicked_scene
     session = Session(Capture(tmp_path, tmp_path / "masks", placed, fit, {}), lambda: False)
     session.mark("a2", [(48.0, 36.0)], True)

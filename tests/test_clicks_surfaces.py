@@ -1,4 +1,4 @@
-"""Clicks where the depth is known select the object that stands out, also on rough ground."""
+"""Where depth is known, a click selects the object in front of its surroundings, also on rough ground."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from reffusion.clicks.single_view import ViewEvidence, apply_marks
 
 
 def checkered_disk_on_gravel():
-    """Picture, relief and mask of a checkered disk in front of noisy gravel."""
+    """Return picture, relief (log depth times focal length, px) and mask of a checkered disk before noisy gravel."""
     draw, (rows, columns) = np.random.default_rng(3), np.mgrid[:256, :256]
     disk = np.hypot(rows - 150, columns - 110) < 26
     picture = np.repeat(draw.integers(60, 180, (256, 256, 1)), 3, 2)
@@ -27,7 +27,7 @@ def test_one_click_finds_a_chequered_thing_on_rough_ground():
 
 
 def test_a_further_click_never_loses_what_was_clicked_before():
-    """A second part is no reason to keep of the first only the pixel that was clicked."""
+    """A mark has clicks on two parts. The mask holds both whole parts, not just the second and a pixel of the first."""
     picture, relief, disk = checkered_disk_on_gravel()
     rows, columns = np.mgrid[:256, :256]
     other = np.hypot(rows - 80, columns - 200) < 20

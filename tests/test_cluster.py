@@ -1,4 +1,4 @@
-"""Engines other than this machine: a local Ray cluster of three nodes, submitit's local executor, lost work."""
+"""Engines other than this machine: a local Ray cluster of three nodes, submitit's local executor, lost attempts."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes
 
 
 def artifact_hashes(runs: Path) -> dict[str, str]:
-    """The hash of every file of every artifact, from the receipts."""
+    """Return the hash of each file of each artifact in `runs`, as recorded in the receipts: path -> hash."""
     receipts = {path.parent.relative_to(runs): json.loads(path.read_text()) for path in runs.glob("*/*/receipt.json")}
     return {f"{place}/{name}": file for place, each in receipts.items() for name, file in each["files"].items()}
 
 
 @pytest.fixture(scope="module")
 def ray_cluster():
-    """Three Ray nodes with a core each."""
+    """Start a Ray cluster of three nodes with one core each."""
     pytest.importorskip("ray", reason="ray is not installed")
     from ray.cluster_utils import Cluster
 
@@ -56,7 +56,7 @@ def ray_engine(ray_cluster, tmp_path):
     ray.shutdown()
 
 
-# ------------------------------------------------------------------------------------------------------- what was lost
+# --------------------------------------------------------------------------------------------- attempts that were lost
 
 
 def make_task(root: Path) -> Task:
@@ -80,7 +80,10 @@ def test_an_attempt_works_in_a_folder_of_its_own_and_goes_on_from_the_one_before
 
 
 def test_an_attempt_given_up_as_lost_writes_nothing(tmp_path, monkeypatch):
-    """While it works, another takes over and ends."""
+    """While the attempt works, another attempt takes over and ends.
+
+    The first attempt's later writes fail, and only the second attempt's files are in the result.
+    """
     root = write_project(tmp_path)
     out = root / "runs/toy/.partial-distill-1"
 
@@ -137,7 +140,7 @@ def test_this_machine_goes_on_with_what_a_cluster_left(tmp_path, capsys):
 
 
 def write_twelve_scenes(root: Path) -> Path:
-    """Twelve scenes of the toy pipeline."""
+    """Write a toy project with twelve scenes."""
     write_project(root)
     for number in range(12):
         (root / f"many/s{number:02}").mkdir(parents=True)
@@ -147,7 +150,7 @@ def write_twelve_scenes(root: Path) -> Path:
 
 @slow
 def test_twelve_scenes_with_three_variants_on_ray_are_those_of_one_machine(tmp_path, ray_engine, ray_cluster):
-    """A node is killed while it works."""
+    """Results are equal even though one Ray node is killed while stages run on it."""
     root = write_twelve_scenes(tmp_path)
     runs = root / "runs"
 
@@ -173,14 +176,14 @@ def test_twelve_scenes_with_three_variants_on_ray_are_those_of_one_machine(tmp_p
 
 
 def assert_same_as_one_machine(root: Path, variants: str, least: int) -> None:
-    """Assert that runs/ equals a local run file by file, and that a local run repeats nothing."""
+    """Assert that runs/ has at least `least` files, those of a local run, and that a second run repeats nothing."""
     runs = root / "runs"
     local = type(make_request(root, ""))(root, root / "alone", "", "laptop")
     assert compare(local, variants, data=root / "many", execution=Execution(LocalEngine(), 1)) == 0
     here, away = artifact_hashes(root / "alone"), artifact_hashes(runs)
     different = sorted(name for name in {*here, *away} if here.get(name) != away.get(name))
     assert len(here) >= least and not [name for name in different if not name.endswith("metrics.json")]
-    for name in different:  # it holds the stages' seconds
+    for name in different:  # metrics.json contains the stages' seconds, which differ
         one, other = (json.loads((place / name).read_text()) for place in (root / "alone", runs))
         assert one["mean"] == other["mean"] and one["gaussians"] == other["gaussians"]
     assert_artifacts_complete(runs)
@@ -207,15 +210,15 @@ def test_the_driver_killed_and_started_again(tmp_path, ray_cluster, send):
     environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO}/tests"}
     command = [sys.executable, "-c", DRIVER, str(root), ray_cluster.address]
     process = subprocess.Popen(command, env=environment)
-    while len(list((root / "runs").glob("begun-*"))) < 3:  # `poses` of all three is in place
+    while len(list((root / "runs").glob("begun-*"))) < 3:  # then `poses` of the three readable scenes is done
         assert process.poll() is None
         time.sleep(0.05)
     process.send_signal(send)
     process.wait(60)
     before = (root / "runs/ran.txt").read_text().splitlines()
-    time.sleep(6)  # what was running is ended with its driver
+    time.sleep(6)  # stages that outlived the driver would end within this time
     assert (root / "runs/ran.txt").read_text().splitlines() == before
-    assert subprocess.run(command, env=environment, timeout=300).returncode == 1  # scene c
+    assert subprocess.run(command, env=environment, timeout=300).returncode == 1  # scene c fails
     lines = (root / "runs/ran.txt").read_text().splitlines()
     assert sorted(lines) == sorted(set(lines)) and len(lines) == 9
     assert_artifacts_complete(root / "runs")
@@ -233,7 +236,7 @@ def test_work_finished_when_the_driver_is_interrupted_is_not_repeated(tmp_path, 
         time.sleep(0.002)
     process.send_signal(signal.SIGINT)
     process.wait(60)
-    assert subprocess.run(command, env=environment, timeout=300).returncode == 1  # scene c
+    assert subprocess.run(command, env=environment, timeout=300).returncode == 1  # scene c fails
     lines = ran.read_text().splitlines()
     assert sorted(lines) == sorted(set(lines)) and len(lines) == 9
     assert_artifacts_complete(root / "runs")

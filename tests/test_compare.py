@@ -1,4 +1,4 @@
-"""The commands compare and report on a toy pipeline: resuming, failures, tables, intervals, Pareto front, pages."""
+"""The commands `compare` and `report` on a toy pipeline: resuming, failures, tables, intervals, Pareto front, pages."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def methods_by_name(job_folder: Path) -> dict[str, dict]:
 
 @pytest.fixture(scope="module")
 def compared_project(tmp_path_factory) -> Path:
-    """All variants on the toy scene, one of which fails."""
+    """Return a project after `compare` ran all variants on the toy scene; the variant `bad` fails."""
     root = write_project(tmp_path_factory.mktemp("compared"))
     assert compare(make_request(root)) == 1
     return root
@@ -56,7 +56,7 @@ def pages(compared_project) -> dict[str, Path]:
 
 @pytest.fixture
 def job_folder(compared_project, tmp_path) -> Path:
-    """The scene's folder in a copy of the compared runs."""
+    """Return the toy scene's folder in a copy of the compared runs, which a test may change."""
     shutil.copytree(compared_project / "runs", tmp_path / "runs")
     return tmp_path / "runs/toy"
 
@@ -69,7 +69,7 @@ def test_every_variant_once_and_what_is_equal_is_shared(compared_project):
     assert finished_stages(compared_project) == sorted(
         [*own, "toy@better distill", "toy@better evaluate", "toy@none evaluate"]
     )
-    copy = compared_project / "runs/toy@twin/distill"  # copied from the variant that did the same
+    copy = compared_project / "runs/toy@twin/distill"  # copied from the variant `better`, which has the same parameters
     assert (copy / "gain.txt").read_text() == "3" and (copy / "receipt.json").exists()
     assert not list((compared_project / "runs").glob("*/.copying*")) and not list(
         (compared_project / "runs").glob("toy@twin/.*")
@@ -93,7 +93,7 @@ def test_the_same_job_is_no_row_of_figures(compared_project, pages):
 
 
 def test_methods_are_compared_in_a_profile_of_their_own(tmp_path):
-    """The scene's own run is a method beside the others."""
+    """pipeline.yaml names another profile for comparisons; the scene's own run is one more method, `default`."""
     root = write_project(tmp_path)
     pipeline = COMPARE_FILES["pipeline.yaml"].replace(
         "profiles: {laptop: {}}", "profiles: {laptop: {}, terms: {distill: {gain: 2}}}"
@@ -124,7 +124,7 @@ def test_the_best_in_lpips_comes_first_and_ties_are_ties(job_folder):
 
 
 def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path):
-    """Three scenes, `better` too; the second scene is slow at first."""
+    """Compares `full` and `better` on three scenes, and is killed in the second scene, which is slow at first."""
     root = write_project(tmp_path)
     write_files(root, {"data/toy-2/number.txt": "20", "data/published.csv": PUBLISHED})
     slow = root / "data/toy-1/scene.yaml"
@@ -143,10 +143,10 @@ def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path
     before = [f"toy{end}" for end in (" distill", " evaluate", " poses", "@better distill", "@better evaluate")]
     assert finished_stages(root) == sorted([*before, "toy-1 poses"])
     home = root / "runs/compare"
-    partial = (home / "compare-runs.md").read_text().splitlines()  # written after each run
+    partial = (home / "compare-runs.md").read_text().splitlines()  # the table is written after each run
     assert "| full | toy | done | 23.6500 | 0.6000 |" in partial[2] and "not run yet" in partial[4]
     assert "| full | mean of 1 |  | 23.6500 |" in partial[-2]
-    assert methods_by_name(home)["full"]["state"] == "1 of 3 done"  # the page can be drawn at any moment
+    assert methods_by_name(home)["full"]["state"] == "1 of 3 done"  # a partial comparison can be loaded
     slow.unlink()
     assert compare(make_request(root, ""), "better", data=root / "data") == 0
     ends = (" distill", " evaluate", " poses", "@better distill", "@better evaluate")
@@ -157,7 +157,7 @@ def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path
     made = page.make(home)
     text = made["md"].read_text()
     assert text.startswith("# data, 3 scenes: methods compared") and "| full | 24.65 ± 2.48 |" in text
-    assert "| better | 25.95 | 27.95 | 26.95 | 26.95 |" in text  # in each scene, and their mean
+    assert "| better | 25.95 | 27.95 | 26.95 | 26.95 |" in text  # the three scenes, and their mean
     assert "| somebody | published | PSNR, dB | 19.5 | ten scenes, 1600 px |" in text
     assert "| full | here | PSNR, dB | 24.65 ± 2.48 |" in text
     assert len(list((home / "compare").glob("toy*.png"))) == 3 and "24.65 ± 2.48" in made["html"].read_text()
@@ -169,7 +169,7 @@ def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path
 
 @pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
 def test_three_made_scenes_of_spin_nerfs_layout_by_the_real_stages(tmp_path, generate):
-    """As `make data=FOLDER compare` runs them, at tiny sizes; killed in the second scene, and gone on with."""
+    """Runs the command of `make data=FOLDER compare` at tiny sizes, kills it in the second scene, and runs it again."""
     from reffusion.capture.layouts import spinnerf
 
     for seed, name in enumerate(("1", "2", "book")):
@@ -251,7 +251,7 @@ def test_the_page_needs_no_other_file(pages):
     html = pages["html"].read_text()
     sources = re.findall(r'src="([^"]*)"', html)
     assert len(sources) == 5 and all(source.startswith("data:image/png;base64,") for source in sources)
-    text = re.sub(r'src="[^"]*"', "", html)  # whose letters may hold any word
+    text = re.sub(r'src="[^"]*"', "", html)  # encoded pictures may contain any word
     assert "http" not in text and "<script" not in text and "@import" not in text
     assert html.count("no weights") == 1 and "2D inpainter a brush" in html and "perceptual" not in html
     linked = re.findall(r"\]\((.*?)\)", pages["md"].read_text())
@@ -291,7 +291,7 @@ def test_without_ground_truth_held_out_views_are_compared_outside_their_masks(jo
     title = lambda: compare_pictures._cells([runs.runs["full", "toy"]], runs.runs["full", "toy"], "a")[0][0]
     assert title() == "ground truth"
     (job_folder / "raw_masks/masks").mkdir(parents=True)
-    (job_folder / "raw_masks/masks/a.png").touch()  # of a test view that shows the object
+    (job_folder / "raw_masks/masks/a.png").touch()  # so the test view `a` shows the object
     runs.runs["full", "toy"].folders["raw_masks"] = job_folder / "raw_masks"
     assert title() == "photograph, with the object"
     assert (job_folder / "compare/differences.png").exists()
@@ -307,7 +307,7 @@ def test_the_best_method_is_one_of_those_with_all_scenes(job_folder):
 
 
 def test_a_photograph_with_the_object_is_no_ground_truth(job_folder):
-    """Also if clicks made the mask of this test view."""
+    """The test view has a mask from clicks, so its photograph shows the object."""
     files = job_data.load_job(job_folder)
     assert "truth" in before_after.find_pictures(files, "a")
     save_mask(job_folder / "masks/raw/a.png", np.ones((30, 40), bool))
@@ -346,7 +346,7 @@ def test_several_scenes(job_folder):
 
 
 def test_the_interval_is_students():
-    """Quantiles from the printed table of Student's t: 2.776445 with 4 degrees of freedom, 12.706205 with 1."""
+    """97.5 % quantiles from the printed table of Student's t: 2.776445 at 4 degrees of freedom, 12.706205 at 1."""
     values = np.array([1.0, 2, 3, 4, 5])
     assert confidence_half_width(values) == pytest.approx(2.776445 * np.sqrt(2.5) / np.sqrt(5), rel=1e-6)
     assert confidence_half_width(values[:1]) is None and confidence_half_width(np.full(7, 0.3)) == pytest.approx(
@@ -362,7 +362,7 @@ def test_the_interval_is_students():
 
 
 def test_the_interval_over_scenes_is_around_the_mean_of_their_means():
-    """The scenes have one, one and seven views, so the mean of all views is another."""
+    """The scenes have one, one and seven views, so the mean of all views differs from the mean of scene means."""
     found = paired_difference([np.array([1.0]), np.array([2.0]), np.full(7, 6.0)])
     assert found.mean == 5 and found.scenes_mean == 3
     _, grid = charts.new_figure(2)
@@ -383,8 +383,9 @@ def test_pareto_front_against_all_pairs():
 def test_the_median_of_curves():
     steps = np.array([1.0, 10, 100])
     lines = [np.column_stack([steps[:n], np.full(n, value)]) for n, value in ((3, 1.0), (2, 2.0), (3, 4.0), (3, 9.0))]
+    # The curve that ends at step 10 keeps its last value up to step 100.
     moments, quartiles = trace_charts.quartile_band(lines)
-    assert moments[0] == pytest.approx(1) and moments[-1] == pytest.approx(100)  # the one that ended keeps its value
+    assert moments[0] == pytest.approx(1) and moments[-1] == pytest.approx(100)
     assert np.allclose(quartiles.T, np.percentile([1, 2, 4, 9], [25, 50, 75]))
 
 
@@ -411,7 +412,7 @@ def test_report_of_a_job(compared_project, job_folder):
     assert "http" not in re.sub(r'src="[^"]*"', "", html), "whose letters may hold any word"
     assert "make scene=" in html and "profile=laptop all" in html and "set by hand" not in html
     receipt = json.loads((job_folder / "distill/receipt.json").read_text())
-    receipt["params"]["gain"] = 2  # as set="distill.gain=2" would have left it
+    receipt["params"]["gain"] = 2  # as a run with set="distill.gain=2" writes it
     (job_folder / "distill/receipt.json").write_text(json.dumps(receipt))
     html = job.make(job_folder).read_text()
     assert "set by hand" in html and "profile=laptop set=distill.gain=2 all" in html
@@ -454,7 +455,7 @@ def test_report_of_many_scenes(job_folder):
 
 
 def test_a_job_that_failed_is_still_reported(job_folder):
-    """Without a plan: the stages of the scene's own run are taken for the variant's, as far as they are there."""
+    """No plan is recorded, so the report of the variant uses the stages of the scene's own run that exist."""
     for stage in ("distill", "evaluate"):
         shutil.rmtree(job_folder / stage)
     assert "in 1 stages. It is not evaluated yet." in job.make(job_folder.with_name("toy@bad")).read_text()

@@ -1,4 +1,4 @@
-"""Composites of real captures: where the object stands, which pixels it changes, and the table."""
+"""Composites of a synthetic object and a real capture: the object's place, the changed pixels, and the table."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PLACE = placement.Place("here", "small", "v03", (48.0, 40.0), 0.25, 60.0, train=
 
 
 def arc_pose(angle: float) -> np.ndarray:
-    """[4, 4] camera-to-world, on an arc 3 away from the origin and 2 above the ground y = 0."""
+    """Return camera-to-world [4, 4] on an arc of radius 3 at height 2 above the ground y = 0; `angle` in radians."""
     center = np.array([3 * np.sin(angle), 2.0, 3 * np.cos(angle)])
     camera = np.eye(4)
     camera[:3, :3] = rotation_along(-center, (0.0, 1.0, 0.0)).T
@@ -36,7 +36,7 @@ def arc_pose(angle: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def captures_folder(tmp_path_factory) -> Path:
-    """A folder with one capture: 8 noisy photographs of a flat ground with a bent lens; one has no file."""
+    """Write a capture of a flat ground: 8 noise photographs with lens distortion, and a frame whose file is missing."""
     folder, random = tmp_path_factory.mktemp("captures"), np.random.default_rng(0)
     frames = []
     for k, angle in enumerate(np.radians(np.linspace(-40, 40, 8))):
@@ -64,7 +64,7 @@ def load_masks(scene: Path, folder: str = "masks") -> dict[str, np.ndarray]:
 
 
 def project_through_lens(capture: placement.Photographs, name: str, points: np.ndarray) -> np.ndarray:
-    """Image points [P, 2], projected by the project's own lens."""
+    """Project points [P, 3] to pixels [P, 2] of the view `name` by `reffusion.capture.lens`, with distortion."""
     of = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
     bent = lens.from_colmap("OPENCV", WIDTH, HEIGHT, tuple(LENS[key] for key in of))
     camera = capture.cameras[name]
@@ -86,7 +86,7 @@ def test_the_object_stands_on_the_ground_where_it_was_pointed_at(captures_folder
 
 @pytest.mark.parametrize("shape", ["box", "ellipsoid"])
 def test_masks_are_the_projected_object(captures_folder, tmp_path, shape):
-    """The hull of the object's projected surface covers the mask, and the mask covers it, but for a pixel."""
+    """The mask equals the convex hull of the object's projected surface, up to one pixel at the border."""
     place, capture = replace(PLACE, shape=shape), placement.load_photographs(captures_folder / "small")
     thing, scene = placement.place_object(capture, place), write_composite(captures_folder, tmp_path / "scene", place)
     unit = np.random.default_rng(1).normal(size=(4000, 3))
@@ -131,7 +131,7 @@ def test_a_shadow_darkens_the_ground_outside_the_masks(captures_folder, tmp_path
 
 
 def test_rough_masks_are_wrong_by_no_more_than_they_may(captures_folder, tmp_path):
-    """Grown or shrunk by at most 3 px, and shifted by at most 3: no border is more than 6 px away along an axis."""
+    """Masks grow or shrink by at most 3 px and shift by at most 3 px, so borders move by at most 6 px per axis."""
     plain, rough = (
         write_composite(captures_folder, tmp_path / "plain"),
         write_composite(captures_folder, tmp_path / "rough", rough=3),

@@ -1,4 +1,4 @@
-"""Consistency of neighbouring views, on scenes whose warp is known in closed form."""
+"""Colour differences of neighbouring views after reprojection, on planes whose warp is known in closed form."""
 
 import numpy as np
 import pytest
@@ -12,12 +12,12 @@ WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 
 
 def turned_camera(name, x=0.0, angle=0.0):
-    """At (x, 0, 0), turned about the vertical by `angle` radians."""
+    """Return a camera at (x, 0, 0), turned about the vertical axis by `angle` radians."""
     return make_camera(name, (WIDTH, HEIGHT), FOCAL, (x, 0.0, 0.0), yaw(angle))
 
 
 def render_plane(view, slope=0.0, shift=0.0):
-    """Depth and picture of the plane z = 2 + slope x, whose colours are linear in x and y."""
+    """Return depth [H, W] and picture of the plane z = 2 + slope x; colours are linear in x and y, plus `shift`."""
     rays = world_rays(view)
     start = view.center
     depth = (2 + slope * start[0] - start[2]) / (rays[..., 2] - slope * rays[..., 0])
@@ -51,7 +51,10 @@ def test_a_colour_that_changes_from_view_to_view_is_the_difference():
 
 
 def test_a_wrong_depth_shows_as_the_slope_of_the_picture_times_the_shift():
-    """At half its depth a point lands 6 px off in a view 0.2 to the side; a pixel is worth 0.2 * 2 / 60 of red."""
+    """The difference equals the colour gradient times the shift of the pixels.
+
+    At half its depth, a point lands 6 px off in a view 0.2 to the side. Red changes by 0.2 * 2 / 60 for each pixel.
+    """
     a, b = plane_view(turned_camera("a"), inner_mask()), plane_view(turned_camera("b", 0.2))
     value, _ = consistency.reprojected_color_difference(a._replace(depth=a.depth / 2), b._replace(depth=b.depth / 2))
     assert value == pytest.approx(6 * 0.2 * 2 / 60 / 3, abs=1.2 / 255)
@@ -59,10 +62,10 @@ def test_a_wrong_depth_shows_as_the_slope_of_the_picture_times_the_shift():
 
 def test_what_the_neighbour_does_not_see_is_not_compared():
     a, b = plane_view(turned_camera("a"), inner_mask()), plane_view(turned_camera("b", 0.2))
-    half = np.where(np.arange(WIDTH) < WIDTH // 2, 0.5, b.depth)  # something nearer before its left half
+    half = np.where(np.arange(WIDTH) < WIDTH // 2, 0.5, b.depth)  # a nearer surface occludes the left half of b
     poisoned = np.where((half < 1)[..., None], np.uint8(255), b.picture)
     value, share = consistency.reprojected_color_difference(a, b._replace(depth=half, picture=poisoned))
-    # The plane's pixels land 6 px to the left: those of columns 38 to 43 stay in the right half.
+    # The mask's columns 20 to 43 land 6 px to the left, so only columns 38 to 43 land in the right half.
     assert share == pytest.approx(6 / 24) and value < 1.2 / 255 + 1 / 255
     assert consistency.reprojected_color_difference(a, plane_view(turned_camera("b", 50.0))) == (None, 0.0)
     assert consistency.reprojected_color_difference(a._replace(mask=np.zeros_like(a.mask)), b) == (None, None)
@@ -86,6 +89,6 @@ def test_depth_is_continued_through_a_mask():
 def test_pixels_without_depth_beside_a_mask_do_not_bend_the_continuation():
     depth, _ = render_plane(turned_camera("a"), slope=0.3)
     is_unknown = np.random.default_rng(0).random(depth.shape) < 0.1
-    is_unknown[:, :18] = True  # empty space, as beside the captured scene
+    is_unknown[:, :18] = True  # no depth, as beside the captured scene
     found = consistency.continue_surrounding_depth(np.where(is_unknown, 0.0, depth), inner_mask())
     assert np.abs(found / depth - 1)[inner_mask()].max() < 1e-6

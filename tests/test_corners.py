@@ -1,4 +1,4 @@
-"""A step in a wall continues behind an object, although its side is narrow in all photographs."""
+"""The narrow third face of a corner, here the side of a step in a wall, is found and continued behind an object."""
 
 import numpy as np
 import pytest
@@ -9,18 +9,18 @@ from reffusion.background.corners import find_third_faces
 from reffusion.background.visibility import DepthView, depth_range
 
 NO_POINTS = np.zeros((0, 3))
-SIZE, DEEP = 160, 0.35  # px; how far the wall comes forward of the one behind it
-LOW, HIGH = np.array([-0.25, -0.45, 0.0]), np.array([0.35, -0.15, 0.45])  # what stands before the edge
+SIZE, DEEP = 160, 0.35  # picture size in px; depth of the step between the front wall and the wall behind
+LOW, HIGH = np.array([-0.25, -0.45, 0.0]), np.array([0.35, -0.15, 0.45])  # corners of the box before the edge
 
 
 def edge_camera(turn):
-    """Looks at the edge from before the wall and from the left, where its side is visible."""
+    """Return a camera that looks at the edge, `turn` radians to the left of the wall's normal, where the side shows."""
     center = (-2.2 * np.sin(turn), -2.2 * np.cos(turn), 0.9)
     return look_at_camera(f"v{turn:.2f}", center, (0.0, 0.0, 0.3), (SIZE, SIZE), 170.0)
 
 
 def edge_depth_view(view, step=0.0):
-    """Floor and wall, masked where the box hides them; `step`: height of every second board of the floor."""
+    """Return the depth of floor and walls, masked where the box is; `step`: height of every second floor board."""
     rays = world_rays(view)
     with np.errstate(divide="ignore", invalid="ignore"):
         floor, front, behind, side = (
@@ -70,7 +70,8 @@ def test_sparse_points_tell_where_planes_lie_that_are_drawn_too_near():
     views = []
     for turn in np.linspace(0.1, 0.6, 12):
         true = edge_depth_view(edge_camera(turn))
-        rows = np.linspace(0, 0.02, SIZE)[:, None]  # haze: the farther up, so farther off, the nearer it is drawn
+        # As in haze, the rendered depth is too small, by up to 2 % in the top row.
+        rows = np.linspace(0, 0.02, SIZE)[:, None]
         depth = true.depth * (1 - rows[::-1])
         views.append(DepthView.from_range(true.camera, depth, depth_range(depth.astype(np.float32)), true.masked))
     draws, count = np.random.default_rng(0), 150
@@ -84,10 +85,10 @@ def test_sparse_points_tell_where_planes_lie_that_are_drawn_too_near():
         of_points, of_views = (min(planes, key=off) for planes in (with_points, without_points))
         assert off(of_points) < 0.2 and abs(of_points.offset) < 2e-3
         assert off(of_views) > 2 * off(of_points)
-    line = np.stack([np.linspace(-0.5, 0.5, 200), np.zeros(200), np.zeros(200)], 1)  # tells no direction across
+    line = np.stack([np.linspace(-0.5, 0.5, 200), np.zeros(200), np.zeros(200)], 1)  # does not determine a plane
     few = find_planes((LOW + HIGH) / 2, 0.3, views, line)
     assert all(np.allclose(a.normal, b.normal) for a, b in zip(few, without_points, strict=True))
-    grass = np.stack([*draws.uniform(-0.5, 0.5, (2, 600)), draws.uniform(-0.05, 0.05, 600)], 1)  # lies sharply nowhere
+    grass = np.stack([*draws.uniform(-0.5, 0.5, (2, 600)), draws.uniform(-0.05, 0.05, 600)], 1)  # has no sharp height
     rough = find_planes((LOW + HIGH) / 2, 0.3, views, grass)
     assert all(np.allclose(a.normal, b.normal) for a, b in zip(rough, without_points, strict=True))
 

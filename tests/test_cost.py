@@ -1,4 +1,4 @@
-"""The cost forecast on a GPU: it counts operations, grows with the work, and falls with a faster GPU."""
+"""The forecast of GPU costs counts operations; the time grows with the work and falls with a faster GPU."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_another_prior_was_not_counted():
 
 @pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="slow: a minute")
 def test_the_table_is_what_is_counted_today():
-    """The parts that are our own; `python -m benchmarks.gpu.counts` makes it anew."""
+    """Checks the parts that are this project's code. `python -m benchmarks.gpu.counts` writes the table again."""
     found = {"critic 256": counts.count_critic_step(256), "loss, a million pixels": counts.count_pixel_loss()}
     found["Adam, a million Gaussians"] = counts.count_adam()
     for name, each in found.items():
@@ -73,7 +73,7 @@ def test_the_table_is_what_is_counted_today():
 
 
 def test_large_attention_matrices_do_not_count_and_large_feature_maps_do():
-    """On a GPU no kernel writes the former. SDXL decodes pictures of 1024 px, so its feature maps are as large."""
+    """No GPU kernel writes attention matrices to memory, but large feature maps are written, as SDXL's at 1024 px."""
     queries, features = torch.zeros(1, 2, 1024, 8, device="meta"), torch.zeros(1, 4, 1024, 1024, device="meta")
     attend = torch.nn.functional.scaled_dot_product_attention
     assert counts.count_work(lambda: attend(queries, queries, queries))["gb"] < 1024**2 * 4 / 1e9
@@ -89,7 +89,7 @@ def test_cards_by_any_name():
 
 
 def test_what_a_plan_prints(tmp_path, monkeypatch):
-    """On a machine with a small GPU, an old driver and, as it may be, no gsplat and a torch without CUDA."""
+    """The machine has a small GPU and an old driver; gsplat and CUDA in torch may be missing."""
     write_four_photos(tmp_path / "row")
     monkeypatch.setattr(os, "environ", fake_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 440.10"))
     monkeypatch.setattr("runner.plan.has_cuda", lambda: True)

@@ -1,4 +1,4 @@
-"""Triton kernels agree with the formulas, on a GPU or in Triton's interpreter (TRITON_INTERPRET=1)."""
+"""Triton kernels agree with the PyTorch implementations, on a GPU or in Triton's interpreter (TRITON_INTERPRET=1)."""
 
 from __future__ import annotations
 

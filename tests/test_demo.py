@@ -25,7 +25,7 @@ def read_files(folder: Path) -> dict[str, bytes]:
 
 
 def project_by_truth(truth: dict, view: str, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Image points [P, 2] and camera z of scene points, by truth/cameras.json alone."""
+    """Return the image points [P, 2] and the camera z [P] of scene points, from truth/cameras.json alone."""
     pose = np.array(truth["world_to_camera"][view])
     x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).T
     x, y = x / z, y / z
@@ -93,7 +93,10 @@ def test_poses_bounds_model_and_truth_agree(mini_scene, generate):
 
 
 def test_sparse_points_lie_on_what_the_training_views_show(mini_scene):
-    """Half a pixel away colours agree far better than six pixels away: poses, lens and tracks are one system."""
+    """The sparse points have the colours of the pixels onto which they project.
+
+    The colours of pixels six columns away differ far more. Poses, lens and points are therefore consistent.
+    """
     truth = json.loads((mini_scene / "truth/cameras.json").read_text())
     model = colmap.load_model_points(mini_scene / "sparse/0/points3D.bin")
     errors = {0: [], 6: []}
@@ -117,7 +120,7 @@ def test_only_masked_pixels_change_when_the_object_goes(generate, mini_scene):
 
 
 def test_test_views_are_without_the_object(generate, mini_scene):
-    """Rendering with the object changes the test views inside their masks and nowhere else."""
+    """A test view rendered again with the object differs inside its mask, and only inside its mask."""
     import photographs
 
     kind = generate.KINDS["mini"]
@@ -137,7 +140,10 @@ def test_test_views_are_without_the_object(generate, mini_scene):
 
 
 def test_never_seen_pixels_are_never_seen(generate, mini_scene):
-    """Checked with another projection: every training view hides such a pixel's background, or a mask covers it."""
+    """The background of a pixel in truth/never_seen is masked or occluded in every training view.
+
+    The test projects the background points by truth/cameras.json and not by the generator's own code.
+    """
     import photographs
     import raycast
 
@@ -163,7 +169,7 @@ def test_never_seen_pixels_are_never_seen(generate, mini_scene):
             inside = (column >= 0) & (row >= 0) & (column < kind.width) & (row < kind.height)
             visible[inside] |= ~covered[row[inside], column[inside]]
         assert visible[~never[mask]].all()
-        # The few left over are behind furniture that stays.
+        # Up to a tenth of the points project onto unmasked pixels, but furniture that remains occludes these points.
         assert visible[never[mask]].mean() < 0.1
 
 
@@ -195,7 +201,10 @@ def test_too_small_a_share_is_an_error_and_writes_nothing(generate, tmp_path):
 
 
 def test_insertion_and_outpainting_are_asked_for_by_scene_files(generate, tmp_path):
-    """The references alone of the training views show the object; outpainting keeps the disc of a sphere."""
+    """For insertion, the reference picture shows an object that its photograph does not show.
+
+    For outpainting, the mask covers all pixels outside the disc of a sphere.
+    """
     stamp = {"width": 64, "height": 48, "samples": 1, "train": 8, "test": 3, "texture": 256}
     scenes = {}
     for name in ("insert", "outpaint"):

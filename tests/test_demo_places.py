@@ -1,4 +1,4 @@
-"""The generator's harder scenes: an object in front that stays, the edge of a table, a corner of walls, foliage."""
+"""The generator's harder scenes: an occluder that remains, a table edge, a corner of two walls, and foliage."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def test_harder_places_have_masks_of_the_demos_size(generate, tmp_path, name, ma
 
 
 def shrink_kind(kind):
-    """The kind at a tiny size."""
+    """Return a scene kind with fewer, tiny photographs (48 x 36 px) and coarser textures."""
     return replace(kind, width=48, height=36, samples=1, train=24, test=6, texture=256, node=0.4, points=60)
 
 
 def photograph_scene(generate, kind, seed: int):
-    """Solids, cameras of the training views, and the photographs of a scene."""
+    """Return the solids, the cameras of the training views, and the photographs of a generated scene."""
     import photographs
 
     furniture, target = generate.furnish(seed, kind)
@@ -60,7 +60,7 @@ def test_what_stays_hides_a_part_of_the_hole_from_the_reference_only(generate):
 
 
 def test_the_table_stands_in_free_space(generate):
-    """Under its top low cameras see what high ones do not, and the object reaches beyond its edge."""
+    """Some cameras lie below the table top, the reference camera above; the object overhangs the table's edge."""
     kind = shrink_kind(generate.KINDS["table"])
     solids, cameras, session = photograph_scene(generate, kind, 0)
     top = next(n for n in range(len(solids.kind)) if solids.half[n, 1] == 0.02 and not solids.removable[n])
@@ -73,7 +73,7 @@ def test_the_table_stands_in_free_space(generate):
 
 
 def test_behind_the_object_a_corner_makes_a_step(generate):
-    """Without the object the hole of one view shows the jutting wall and what is far behind its edge."""
+    """Without the object, the hole of the middle view shows a wall that juts out and a surface far behind it."""
     import photographs
     import raycast
 
@@ -88,7 +88,11 @@ def test_behind_the_object_a_corner_makes_a_step(generate):
 
 
 def test_a_pair_has_masks_for_each_object_that_make_up_the_hole(generate, tmp_path):
-    """And two references; what hides the other object is in its own mask only."""
+    """The scene has two objects, a box and a ball, and two reference views.
+
+    Every training view has one mask for each object. A pixel where one object occludes the other is in the mask of the
+    occluding object only.
+    """
     folder = tmp_path / "pair"
     facts = generate.generate(folder, 0, shrink_kind(generate.KINDS["pair"]))
     assert 0.2 <= min(facts["never_seen_share"].values()) and facts["mask_share"]["train"] > 0.05
@@ -102,7 +106,11 @@ def test_a_pair_has_masks_for_each_object_that_make_up_the_hole(generate, tmp_pa
 
 
 def test_leaves_are_where_the_rays_meet_them(generate):
-    """Walking from cell to cell finds the same leaf as looking back along the ray, and none that it skipped."""
+    """A ray through foliage stops at the first leaf.
+
+    A second ray, started just before the hit, meets a leaf at the hit or nearer. No camera sees a point just behind
+    the leaf.
+    """
     import raycast
     import solids as solid
     from furniture import Furniture, Material
@@ -125,7 +133,7 @@ def test_leaves_are_where_the_rays_meet_them(generate):
         face, u, v, *normal = solid.surface(thing, 1, *point)
         assert face == 6 and 0 <= u <= 0.9 and 0 <= v <= 0.8
         assert np.linalg.norm(normal) == pytest.approx(1) and np.dot(normal, way) < 0
-        # A step before it the leaf is still the first thing ahead, or another one nearer; behind it nothing is seen.
+        # From 0.02 before the hit, the ray meets this leaf or a nearer leaf. The leaf hides the point 0.02 behind.
         assert solid.distance(thing, 1, *(point - 0.02 * way), *way) <= 0.02 + 1e-9
         camera = np.array([1, 0, 0, 0, *np.eye(3).ravel(), *center])
         assert not raycast._reaches(thing, camera, True, *(point + 0.02 * way))

@@ -14,7 +14,7 @@ INNER = (ROWS > 14) & (ROWS < 34) & (COLUMNS > 20) & (COLUMNS < 45)
 
 
 def room_corner():
-    """Disparity of a floor below a wall, and a picture in which their colours differ."""
+    """Return the disparity [H, W] of a floor below a wall, and a picture [H, W, 3] in which the two colours differ."""
     floor, wall = 0.5 + 0.02 * (ROWS - 24.0), 0.5 + 0.001 * (COLUMNS - 32)
     picture = np.where((floor > wall)[..., None], (0.8, 0.5, 0.2), (0.3, 0.4, 0.6))
     return np.maximum(floor, wall), picture
@@ -144,7 +144,7 @@ def test_too_few_samples_fix_no_plane():
 
 
 def test_far_pixels_keep_their_depth_beside_one_very_near():
-    """As with a floater right in front of the camera."""
+    """One pixel is 3000 times nearer than all others, like a floater close to the camera."""
     depth, known = np.full((20, 20), 30.0), np.ones((20, 20), bool)
     depth[0, 0], known[8:12, 8:12] = 0.01, False
     found = inpaint_depth(depth, known)

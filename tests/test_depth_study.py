@@ -1,4 +1,4 @@
-"""The true depth of the depth study: it agrees with the generator, and its edges are found."""
+"""The depth study: its true depth maps agree with the generator's sparse points, and depth edges are found."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.integration
 
 
 def test_truth_is_where_sparse_points_are(generate, tmp_path):
-    """Points that a view shows outside its mask lie at the depth of the room without the object."""
+    """Sparse points that project outside a view's mask lie at the depth of the room without the object."""
     import depths
 
     kind, folder = generate.KINDS["mini"], tmp_path / "mini"
@@ -35,7 +35,7 @@ def test_truth_is_where_sparse_points_are(generate, tmp_path):
         visible[inside] = ~mask[row[inside], column[inside]]
         error = depths.background_depth(0, kind, pose, rays[visible]) / z[visible] - 1
         agreeing.append(np.abs(error) < 0.01)
-        hidden.append(error < -0.01)  # something else is before the point
+        hidden.append(error < -0.01)  # another surface occludes the point
     agreeing, hidden = np.concatenate(agreeing), np.concatenate(hidden)
     assert agreeing.mean() > 0.9
     assert (agreeing | hidden).mean() > 0.98

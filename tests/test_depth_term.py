@@ -1,4 +1,4 @@
-"""The depth term: alignment, target, gradients, convergence, degenerate views, resume."""
+"""The depth loss term: alignment of estimates, target depth, gradients, convergence, degenerate views, and resume."""
 
 from dataclasses import replace
 
@@ -40,7 +40,11 @@ DEPTH = DepthTerm(steps=2)
 
 
 def slanted_wall(moved: float = 1.0):
-    """The wall as Gaussians; the masked ones in its middle stand `moved` times as far away as they should."""
+    """Return Gaussians on a slanted wall, and bool [N], True for the masked Gaussians in the middle of the wall.
+
+    Args:
+        moved: Factor on the depth of the masked Gaussians; at 1.0 they lie on the wall.
+    """
     wide = make_camera("sheet", (52, 44), FOCAL)
     rows, columns = np.mgrid[:44, :52] + 0.5
     disparity = 0.5 + 0.004 * (columns - 26) - 0.002 * (rows - 22)
@@ -64,13 +68,13 @@ def evaluate_term(gaussians, masked, estimator, prior=None, text=None, view=None
 
 
 def wall_depth(moved=1.0, how=HOW):
-    """The depth of the wall that the view renders."""
+    """Return the depth that VIEW renders of the wall, with the masked Gaussians moved by the factor `moved`."""
     with torch.no_grad():
         return background_depth.extract_depth(render(slanted_wall(moved)[0], VIEW), VIEW, HOLE, HOLE, how)
 
 
 def constant_estimator(estimate):
-    """The paper's estimator with a network that always returns `estimate`."""
+    """Return the paper's depth estimator, with a network that returns `estimate` for every image."""
     return depth_estimator.network_estimator(lambda image: torch.as_tensor(np.asarray(estimate)), HOW)
 
 
@@ -79,7 +83,7 @@ def constant_estimator(estimate):
 
 @pytest.mark.parametrize("unit", [1e-8, 1.0, 1e8])
 def test_the_target_does_not_depend_on_the_estimates_unit(unit):
-    """An estimate that is right but for scale and offset gives the wall, in whatever unit it comes."""
+    """An estimated disparity that is an affine function of the true disparity gives the wall's depth as target."""
     view = replace(wall_depth(), depth=1 / WALL)
     guide = np.full((HEIGHT, WIDTH, 3), 0.5)
     disparity, _ = estimates.align_estimate(view, guide, unit * (40 * WALL - 7), HOW)
@@ -125,9 +129,11 @@ def test_a_surface_that_is_right_has_no_loss_and_one_that_is_not_is_pulled_the_r
         gaussians = as_leaves(gaussians)
         loss, _ = evaluate_term(gaussians, masked, estimator)
         loss.backward()
-        whole = float((0.1 / WALL[HOLE].mean()) ** 2)  # part of the hole is the wall around the masked ones
+        # The loss is smaller than `whole`: a part of the hole shows unmasked Gaussians, which lie on the wall.
+        whole = float((0.1 / WALL[HOLE].mean()) ** 2)
         assert 0.4 * whole < float(loss.detach()) < whole and right < 1e-3 * whole
-        pull = gaussians.means.grad[masked][:, 2]  # of the loss: down its slope is the way
+        # A positive gradient moves a Gaussian towards the camera, because a step follows the negative gradient.
+        pull = gaussians.means.grad[masked][:, 2]
         assert (sign * pull.sum()) > 0 and (sign * pull > 0).float().mean() > 0.8
 
 
@@ -204,7 +210,7 @@ def test_the_gradient_agrees_with_finite_differences_in_float64():
             assert float((gradient * bump).sum()) == pytest.approx((up - down) / (2 * h), rel=1e-2, abs=3e-3 * scale)
 
 
-# ------------------------------------------------------------------------------------------ views that tell nothing
+# ------------------------------------------------------------------------------------------ degenerate views
 
 
 @pytest.mark.integration
@@ -310,7 +316,7 @@ def run_depth_distill(folder, prior, text, estimator, settings=RUN):
 
 @pytest.mark.integration
 def test_interrupted_distillation_with_the_depth_term_resumes_bit_for_bit(prior, text, tmp_path, monkeypatch):
-    monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
+    monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # write a checkpoint after every step
     whole, _ = run_depth_distill(tmp_path / "whole", prior, text, constant_estimator(WALL))
     real = D.take_step
 

@@ -1,4 +1,8 @@
-"""The patch critic against closed forms, float64 and finite differences, and what it learns."""
+"""The patch critic (the discriminator of the adversarial loss) and its losses.
+
+Values are compared with closed forms in float64, gradients with finite differences. The critic must learn to separate
+two textures.
+"""
 
 import numpy as np
 import pytest
@@ -35,7 +39,7 @@ LOGITS = torch.tensor([-1e4, -100.0, -30.0, -3.0, -1e-3, 0.0, 0.5, 20.5, 90.0, 1
 
 
 def log_sigmoid_loss(x):
-    """f(x) = -log(1 + exp(-x)) and its slope in float64, without overflow."""
+    """Return f(x) = -log(1 + exp(-x)) and its derivative, computed in float64 without overflow."""
     x = np.asarray(x, np.float64)
     return -np.logaddexp(0, -x), np.exp(-np.logaddexp(0, x))
 
@@ -103,7 +107,7 @@ def test_penalty_of_the_critic_and_its_slope_by_finite_differences():
 
 
 def test_scores_at_the_start_are_of_one_size_whatever_the_width():
-    """Equalised learning rate: all weights are unit normal, and what passes keeps its size."""
+    """Equalised learning rate: all weights are unit normal, and activations keep their size from layer to layer."""
     sizes = []
     for width in (4, 16, 64):
         scores = []
@@ -124,7 +128,7 @@ def test_minibatch_deviation_against_numpy():
     out = append_minibatch_std(features, group=4)
     assert (out[:, :5] == features).all() and out.shape == (12, 6, 3, 3)
     for i in range(12):
-        members = features.numpy()[i % 3 :: 3]  # three groups of four
+        members = features.numpy()[i % 3 :: 3]  # patch i belongs to one of three groups of four
         assert len(members) == 4
         assert out[i, 5].numpy() == pytest.approx(np.full((3, 3), members.std(0).mean()), rel=1e-5)
     same = torch.ones(4, 2, 3, 3, requires_grad=True)
@@ -204,7 +208,7 @@ def test_patches_lie_between_black_at_minus_one_and_white_at_one():
 
 
 def checker_patches(count, fine, label):
-    """Checkered patches of equal mean and deviation, with cells of one pixel or of four."""
+    """Return checkered patches of equal mean and deviation, with cells of one pixel or of four pixels."""
     period = 1 if fine else 4
     cells = torch.arange(8) // period
     board = ((cells[:, None] + cells) % 2).float() * 2 - 1

@@ -1,4 +1,8 @@
-"""Distillation: bit-exact confinement, regions, resume, guards, and references by hand and by the prior."""
+"""Distillation, and references painted by hand or by the diffusion prior.
+
+Each loss term changes only the Gaussians and parameters that it may reach, and all others stay bit for bit the same.
+Masked Gaussians stay in their region, runs resume bit for bit, and errors name step, term and view.
+"""
 
 import json
 from dataclasses import replace
@@ -135,7 +139,7 @@ def test_the_critic_reaches_spherical_harmonics_only(reaches):
 def test_the_adversarial_gradient_is_that_of_the_patches_by_finite_differences():
     gaussians, masked = random_wall()
     moved, view = as_leaves(gaussians), train_view()
-    adversary = Adversary(ADVERSARIAL, seed=0, rate=1e-12)  # the critic stands still
+    adversary = Adversary(ADVERSARIAL, seed=0, rate=1e-12)  # the critic stays nearly constant
     term = lambda g: evaluate_adversarial(g, masked, view, view.photo, square_hole(), adversary, generator(1))[0]
     term(moved).backward()
     direction = torch.randn(gaussians.sh.shape, generator=generator(8)) * masked[:, None, None]
@@ -151,9 +155,9 @@ def test_only_gaussians_that_changed_region_are_found():
     assert not has_changed_region(region, gaussians.means, masked).any(), "an initialization is in its regions"
     moved = gaussians.means.clone()
     a, b = torch.nonzero(masked)[0, 0], torch.nonzero(~masked)[0, 0]
-    moved[a] = torch.tensor([0.55, 0.4, 0.05])  # a masked one far out on the wall
+    moved[a] = torch.tensor([0.55, 0.4, 0.05])  # a masked Gaussian, far outside its region
     middle = ((gaussians.means[:, :2].norm(dim=1)) + 10 * ~masked).argmin()
-    moved[b] = gaussians.means[middle]  # an unmasked one in the middle of the invented part
+    moved[b] = gaussians.means[middle]  # an unmasked Gaussian, inside the region of the masked ones
     assert set(torch.nonzero(has_changed_region(region, moved, masked))[:, 0].tolist()) == {int(a), int(b)}
     slightly = gaussians.means + region.voxel * 0.9
     assert not has_changed_region(region, slightly, masked)[masked].any(), "there is room to move in"
@@ -162,7 +166,7 @@ def test_only_gaussians_that_changed_region_are_found():
     assert not has_changed_region(single, gaussians.means[:1], torch.tensor([True])).any()
 
 
-# Neither critic nor reference; no Gaussian is added.
+# ------------------------------------------------------------------------------------------ whole runs
 
 
 def run_distill(folder, prior, text, settings=SETTINGS, views=None, gaussians=None):
@@ -189,7 +193,7 @@ def test_any_number_of_threads_gives_the_same_bits(prior, text, tmp_path, off):
 
 
 def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp_path, monkeypatch):
-    monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
+    monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # write a checkpoint after every step
     monkeypatch.setattr(D, "REGION_EVERY", 2)
     whole, labels = run_distill(tmp_path / "whole", prior, text)
     assert labels.sum() > random_wall()[1].sum(), "densification added no masked Gaussian"
@@ -219,7 +223,7 @@ def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp
 
 
 def test_densification_takes_a_share_whatever_the_weight(prior, text, tmp_path, monkeypatch):
-    """The SDS gradient has no scale of its own."""
+    """A fixed share of the Gaussians is densified, since the SDS gradient has no absolute scale for a threshold."""
     monkeypatch.setattr(densification, "PRUNE_OPA", 0.0)
     monkeypatch.setattr(densification, "DENSIFIED_SHARE", 0.25)
 
@@ -262,7 +266,7 @@ def test_distillation_may_reach_the_background_too_but_not_what_does_not_show(pr
 
 def test_views_far_from_every_reference_are_not_distilled(prior, text, tmp_path):
     start, masked = random_wall()
-    near, far = train_view("a"), train_view("b", 0.5)  # 26 degrees aside
+    near, far = train_view("a"), train_view("b", 0.5)  # `far` is 26 degrees away from the reference
     distilled = lambda degrees: views_near_references([near, far], [wall_camera()], start.means[masked], degrees)
     assert [distilled(x) for x in (1, 20, 35, 180)] == [{"a"}, {"a"}, {"a", "b"}, {"a", "b"}]
     for degrees in (20, 35):
@@ -274,7 +278,7 @@ def test_views_far_from_every_reference_are_not_distilled(prior, text, tmp_path)
 
 
 def test_photographs_may_reach_the_masked_gaussians_that_show_outside_the_hole(tmp_path):
-    """Those that show inside it only lie still."""
+    """With `reaches="shown"`, a Gaussian moves only if it contributes to a pixel outside the hole."""
     start, masked = random_wall()
     view = train_view("a")
     outside = rasterizer.accumulate(start, view.camera, (~square_hole())[..., None].float())[:, 0] > 0
@@ -316,7 +320,8 @@ def test_the_reference_term_is_that_of_the_whole_view():
     expected = reconstruction_loss(render(whole, wall_camera()).color, image, square_hole())
     loss.backward()
     expected.backward()
-    assert float(loss) == pytest.approx(float(expected), rel=1e-3)  # slopes are clamped at another border
+    # Not exactly equal: the term renders a crop, and gradients are clamped at the border of the rendered image.
+    assert float(loss) == pytest.approx(float(expected), rel=1e-3)
     for name in PARAMETERS:
         apart = (getattr(part, name).grad - getattr(whole, name).grad).norm()
         assert apart < 0.01 * getattr(whole, name).grad.norm(), name
@@ -333,9 +338,8 @@ def test_nan_names_step_term_and_view(prior, text, tmp_path):
         run_distill(tmp_path / "y", None, None, with_changes(PLAIN, sds=OFF), [bad])
     alone = with_changes(SETTINGS, sds=OFF, reference=OFF)
     (tmp_path / "z").mkdir()
-    beside = torch.where(
-        square_hole()[..., None], train_view().photo, float("nan")
-    )  # the patches of the critic reach that far
+    # NaN outside the hole: the critic's patches extend over the border of the hole.
+    beside = torch.where(square_hole()[..., None], train_view().photo, float("nan"))
     start, masked = random_wall()
     holes = [ReferenceHole(wall_camera(), beside, each) for each in (square_hole(), torch.zeros_like(square_hole()))]
     full, empty = (TermInputs([train_view()], [each], start.means[masked]) for each in holes)
@@ -400,7 +404,7 @@ def test_the_seam_prefers_the_candidate_that_continues_its_surroundings():
 
 @pytest.fixture
 def stage_folders(tmp_path):
-    """The folders of a small scene: poses, fit, masks, initialize, and a prior."""
+    """The folders of a small scene's stages, filled up to `initialize`, and the folder of a small prior."""
     gaussians, masked = random_wall()
     cameras = {name: wall_camera(name, shift) for name, shift in (("a", 0.0), ("b", 0.1), ("t", 0.05))}
     scene = make_scene(cameras, ("t",), points=np.zeros((4, 3)))

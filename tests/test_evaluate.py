@@ -1,4 +1,4 @@
-"""The stage `evaluate` on written folders: its scores can be recomputed from its own pictures."""
+"""The stage `evaluate` on synthetic stage folders: all scores can be recomputed from the pictures that it saves."""
 
 import csv
 import json
@@ -38,7 +38,10 @@ def random_blobs(count, seed=0):
 
 
 def write_stages(home):
-    """Write the folders of earlier stages: views 0-2 are test views (2 without a mask), 3-7 training views."""
+    """Write the folders of the earlier stages; return stage name -> folder.
+
+    Views 0 to 2 are test views, of which view 2 has no mask; views 3 to 7 are training views.
+    """
     names = [f"view{i}" for i in range(8)]
     cameras = {
         name: make_camera(name, (WIDTH, HEIGHT), 40.0, (0.3 - 0.1 * i, 0.0, 0.0)) for i, name in enumerate(names)
@@ -63,7 +66,7 @@ def write_stages(home):
 
 
 def run_finish_and_evaluate(out, stage_folders, **params):
-    """Run `finish`, in a folder beside `out`, and `evaluate`; return metrics.json."""
+    """Run `finish` (in a folder beside `out`) and then `evaluate` (in `out`); return the content of metrics.json."""
     finished = out.with_name(f"finish-{out.name}")
     for folder in (finished, out):
         folder.mkdir()
@@ -74,7 +77,7 @@ def run_finish_and_evaluate(out, stage_folders, **params):
 
 
 def test_while_an_object_is_kept_nothing_is_scored(tmp_path, stage_folders):
-    """Test photographs show none."""
+    """The test photographs show no object, so the scores of a scene with an object would be meaningless."""
     save_json(stage_folders["masks"] / "facts.json", {"kept": ["ball"]})
     found = run_finish_and_evaluate(tmp_path / "out", stage_folders)
     assert found["mean"].get("psnr_box") is None and (tmp_path / "out/renders/view0.png").exists()
@@ -87,7 +90,11 @@ def test_test_views_that_contradict_their_poses_are_named(tmp_path, stage_folder
 
 
 def test_views_are_drawn_as_bright_as_photographs_are(stage_folders, tmp_path):
-    """As their own outside the mask, or else as those next to them; and they are as consistent as without."""
+    """A test view gets the exposure of its photograph, measured outside the mask.
+
+    A test view without a photograph gets the exposure of the neighbouring training views. The consistency score is the
+    same as without exposures.
+    """
     names = [f"view{k}" for k in range(3, 8)]
     dark = np.diag([0.5, 0.6, 0.7]) @ np.eye(3, 4)
     (stage_folders["poses"] / "images/view2.png").unlink()
@@ -97,7 +104,8 @@ def test_views_are_drawn_as_bright_as_photographs_are(stage_folders, tmp_path):
     for name, gain in (("view0", [0.3, 0.4, 0.8]), ("view1", [1.0, 1.0, 1.0])):
         rendering = render(many, load_scene(stage_folders["poses"]).cameras[name])
         own, visible = 255 * rendering.color.detach().numpy() * gain, rendering.alpha.detach().numpy() > 0.9
-        own[~visible] = 240  # where the fit shows nothing it tells nothing, nor do the mask's pixels
+        # Pixels where the fit is transparent, and masked pixels, must not influence the exposure.
+        own[~visible] = 240
         own[10:30, 5:35] = 255
         assert 0.05 < (~visible).mean() < 0.5
         save_image(stage_folders["poses"] / f"images/{name}.png", own.clip(0, 255).round().astype(np.uint8))
@@ -118,7 +126,7 @@ def stage_folders(tmp_path):
 
 @pytest.fixture(scope="module")
 def finished_job(tmp_path_factory):
-    """The folder of a finished scene without LPIPS weights; tests must not change it."""
+    """The folder of a scene that was evaluated without LPIPS weights; tests must not change it."""
     home = tmp_path_factory.mktemp("scene")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(home / "nothing"))
@@ -173,7 +181,7 @@ def test_the_scene_is_exported_in_its_own_frame(finished_job):
     if (completed := finished_job / "finish-evaluate" / "completed" / "distill.ply").exists():
         result = load_ply(completed)
     back = SIMILARITY.apply(exported.means.double().numpy())
-    # 500 km away a float of the scene's own frame is worth 0.03 units, 6e-4 of the normalised frame.
+    # 500 km from the origin, float32 resolves 0.03 units of the scene's own frame: 6e-4 in the normalised frame.
     assert np.abs(back - result.means.double().numpy()).max() < 1e-3
     sizes = exported.log_scales - result.log_scales
     assert torch.allclose(sizes, torch.full_like(sizes, -np.log(0.02)), atol=1e-5)
@@ -246,7 +254,7 @@ def test_a_held_out_view_that_shows_the_object_is_scored_outside_its_mask_only(t
         row = next(csv.DictReader(file))
     assert row["view"] == "view0" and row["psnr_box"] == "" and row["left"] == "2"
     mask = np.zeros((HEIGHT, WIDTH), bool)
-    mask[8:32, 3:37] = True  # 2 px wider, a disk at its corners
+    mask[8:32, 3:37] = True  # the mask dilated by 2 px; the corners, which dilation rounds, are ignored
     picture, truth = (
         load_image(p / "view0.png") for p in (tmp_path / "out/renders", stage_folders["poses"] / "images")
     )

@@ -1,4 +1,4 @@
-"""Exemplar inpainting: patches of photographs, transported along surfaces and blended without seams."""
+"""Exemplar inpainting: patches of photographs are moved along surfaces into the hole, and blended without seams."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def middle_mask():
 
 
 def test_a_pattern_is_continued_as_sharp_as_it_is():
-    """A hole in a checkerboard with period 16, of which nine tenths of the board's own contrast must come back."""
+    """The mean error in the hole of a checkerboard (period 16 px) is below a tenth of half the board's contrast."""
     wrong = lambda painted: np.abs(painted[middle_mask()].astype(int) - checker_image()[middle_mask()]).mean()
     assert (
         wrong(complete_alone(checker_image(), middle_mask())) < 0.1 * 70 < wrong(telea(checker_image(), middle_mask()))
@@ -104,7 +104,7 @@ def test_masked_pixels_of_a_source_never_show():
 
 
 def test_a_hole_that_no_patch_suits_is_the_worst_completion():
-    """All the source's pixels show the plane of the hole from a hundred times nearer, too near for its patches."""
+    """The only source shows the hole's plane from a distance 100 times smaller, so no patch has a suitable scale."""
     image, mask = checker_image(), middle_mask()
     target = replace(without_geometry(image, mask), plane=np.ones((96, 128), np.int64))
     source = replace(target, to_plane=target.to_plane / 100, pixel_size=target.pixel_size / 100)
@@ -126,7 +126,7 @@ FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0, np.zeros(3), np.eye(3)[:2], 4 / CE
 
 
 def paint_planks(view: Camera) -> np.ndarray:
-    """uint8 [H, W, 3]: a floor of planks 0.12 wide that run away from camera a."""
+    """Return a picture uint8 [H, W, 3] of a floor of planks, 0.12 wide, that run away from camera a."""
     depth = FLOOR.depth(view)
     x, y, _ = np.moveaxis(geometry.unproject(np.where(np.isfinite(depth), depth, 1.0), view), -1, 0)
     joint = np.abs((x + 0.3 * y) / 0.12 % 1 - 0.5) > 0.42
@@ -163,7 +163,7 @@ def test_planks_run_on_in_their_own_perspective():
 
 
 def plane_pixels(picture: np.ndarray, view: Camera) -> PlanePixels:
-    """The pixels of the floor within 1.2 of its middle."""
+    """Return the pixels of `picture` that show the floor within a distance of 1.2 from its centre."""
     places = plane_frames.plane_coordinates(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
     rows, columns = np.nonzero((np.linalg.norm(places, axis=-1) < 1.2) & np.isfinite(FLOOR.depth(view)))
     return PlanePixels(np.stack([columns, rows], 1), places[rows, columns], picture)
@@ -171,13 +171,13 @@ def plane_pixels(picture: np.ndarray, view: Camera) -> PlanePixels:
 
 def test_a_floor_of_planks_repeats_itself_by_their_width():
     found = find_symmetry(plane_pixels(paint_planks(CAMERAS[0]), CAMERAS[0]))
-    across = (found.motions @ (1.0, 0.3)) / 0.12  # planks' widths that each shift goes across them
+    across = (found.motions @ (1.0, 0.3)) / 0.12  # each shift's component across the planks, in plank widths
     assert found.centre is None and len(found.motions) > 5 and np.abs(across - across.round()).max() < 0.25
     assert np.abs(across).max() > 2
 
 
 def paint_tabletop(view: Camera) -> np.ndarray:
-    """uint8 [H, W, 3]: twenty planks that meet in a point, covered by a plate of another colour."""
+    """Return a picture uint8 [H, W, 3] of twenty planks that meet in a point under a round plate."""
     depth = FLOOR.depth(view)
     x, y, _ = np.moveaxis(geometry.unproject(np.where(np.isfinite(depth), depth, 1.0), view), -1, 0)
     away, turn = np.hypot(x - 0.1, y - 0.4), np.arctan2(y - 0.4, x - 0.1) / (np.pi / 10)
@@ -231,7 +231,8 @@ def test_joints_and_round_borders_go_on_where_a_floor_repeats_itself(shown):
     found = fill_plane(target, HOLE, sources, 1, how[1])
     picture, filled = found.image, found.filled
     assert filled[HOLE].mean() > 0.9 and not filled[~HOLE].any() and (picture[~filled] == image[~filled]).all()
-    dark = lambda done: done.mean(-1)[filled] < 90  # joints; and what is bright is the plate
+    # Dark pixels are joints between planks; pixels brighter than 195 are the plate.
+    dark = lambda done: done.mean(-1)[filled] < 90
     kind = lambda done: dark(done).astype(int) + 2 * (done.mean(-1)[filled] > 195)
     wrong = lambda done: (kind(done) != kind(truth)).mean()
     patches = np.mean([wrong(complete(target, HOLE, sources, smooth, k).image) for k in range(3)])
@@ -282,7 +283,7 @@ def test_a_floor_is_smooth_and_grass_is_not():
 
 
 def test_the_misfit_is_the_mean_square_by_weight():
-    """Against NumPy, in float64, for a patch that is turned and carried along the floor."""
+    """A float64 NumPy implementation gives the same misfit for a patch that is rotated and moved along the floor."""
     around = floor_background()
     own, other = (exemplar._source_image(view, around.photos[view.camera.name], around) for view in around.views[:2])
     seen = [(completion._color_features(each.image, each.masked), each.masked) for each in (own, other)]
@@ -335,13 +336,14 @@ def test_blending_its_own_gradients_returns_a_picture():
 def test_what_is_painted_reaches_over_the_rim_and_narrow_rests():
     mask, unknown = np.zeros((100, 200), bool), np.zeros((100, 200), bool)
     mask[20:80, 40:160] = True
-    unknown[20:80, 40:80] = unknown[20:80, 84:100] = True  # a rest of 4 px is left between, and 60 px beside
+    # The mask has two known strips: 4 px wide (to be painted too) and 60 px wide (not to be painted).
+    unknown[20:80, 40:80] = unknown[20:80, 84:100] = True
     hole = exemplar.mask_to_paint(mask, unknown)
     assert hole[50, 82] and hole[50, 39] and not hole[50, 120] and not hole[50, 37] and not hole[10].any()
 
 
 def test_a_nearer_surface_ends_at_the_prolongation_of_its_border():
-    """A bench's end before a hedge: left and right of the object its upper edge is seen, at row 60."""
+    """A near surface (row 60 and below) is visible left and right of the object: its upper edge continues at row 60."""
     depth = np.full((120, 160), 4.0)
     depth[60:] = 1.0
     hidden = np.zeros((120, 160), bool)

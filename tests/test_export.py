@@ -1,4 +1,4 @@
-"""Exported scenes, read back by other libraries."""
+"""Exported scenes: other libraries read the same cameras, points and Gaussians from the files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def random_scene_in_frame():
 
 
 def visible_gaussians(camera: Camera, degree: int = 2):
-    """Gaussians in front of a camera, in the normalised frame."""
+    """Return 300 Gaussians in front of a camera, in the normalised frame."""
     made = random_gaussians(300, degree)
     at = torch.tensor([0.0, 0.0, 4.0]) + made.means
     pose = torch.from_numpy(camera.world_to_camera).float()
@@ -42,7 +42,10 @@ def visible_gaussians(camera: Camera, degree: int = 2):
 
 
 def test_colmap_and_nerfstudio_see_the_scene_as_we_do(tmp_path):
-    """Renders of the exported .ply by the exported cameras, in the scene's own frame, are those of the normalised."""
+    """The exported .ply and cameras, which are in the scene's own frame, give the renderings of the normalised frame.
+
+    The cameras are read from the COLMAP model and from transforms.json.
+    """
     import pycolmap
 
     scene = random_scene_in_frame()

@@ -1,4 +1,4 @@
-"""The relative brightness of photographs, estimated from the points that they share."""
+"""Exposure gains: the relative brightness of photographs, estimated from sparse points that several of them show."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def test_gains_are_robust_to_occluders(wall_photos):
     bright = np.exp(np.random.default_rng(0).normal(0, 0.15, (len(cameras), 3)))
     bright /= bright.max() * 1.05
     pictures = dim_photos({camera.name: photos[camera.name] for camera in cameras}, bright)
-    for photo in list(pictures.values())[::3]:  # a thing before a quarter of the picture
+    for photo in list(pictures.values())[::3]:  # an occluder covers a quarter of every third picture
         photo[: photo.shape[0] // 2, : photo.shape[1] // 2] = 200
     found = estimate_gains(scene.points, cameras, pictures)
     expected = bright / np.exp(np.log(bright).mean(0))

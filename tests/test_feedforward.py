@@ -1,7 +1,7 @@
-"""LaMa and MI-GAN from files: their input, their output, and which files are refused.
+"""LaMa and MI-GAN from files: the networks' input and output, and which files are refused.
 
-The tests build stand-ins with the inputs and outputs of the published files; they fill a hole with the mean of its
-surroundings.
+The tests build stand-in networks with the inputs and outputs of the published files. A stand-in fills the hole with the
+mean of all pixels outside the hole.
 """
 
 import json
@@ -37,7 +37,7 @@ from stages.plan import reference as plan_reference
 pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).resolve().parent.parent
-HEIGHT, WIDTH = 96, 136  # multiples of 8: the means are of these pixels alone
+HEIGHT, WIDTH = 96, 136  # multiples of 8: the picture is not padded, so padding does not change the mean
 SIDE = 32
 PICTURE = gradient_image((HEIGHT, WIDTH), 2, 1)
 
@@ -51,12 +51,14 @@ def two_part_hole() -> np.ndarray:
 
 
 def write_onnx_model(path, kind="lama", side=None, answer=None, **changes):
-    """Write an ONNX file with the inputs and outputs of LaMa ("lama") or MI-GAN.
+    """Write an ONNX file with the inputs and outputs of LaMa or MI-GAN; return its path.
 
     Args:
-        side: fixed size; None: any.
-        answer: factor of the output, if not the kind's own.
-        changes: "names" of the inputs, channels of the "mask", "size" (height, width) of the image, "batch", "outputs".
+        kind: "lama" or "migan".
+        side: Height and width of the only size that the network accepts, in pixels. None if it accepts any size.
+        answer: Factor on the output. None for the factor that this kind of network has.
+        changes: Deviations from the published file: "names" (of image and mask input), "mask" (channels of the mask),
+            "size" (height, width), "batch" (batch dimension), "outputs" (names of the outputs).
     """
     onnx = pytest.importorskip("onnx", reason="needs onnx and onnxruntime")
     pytest.importorskip("onnxruntime", reason="needs onnx and onnxruntime")
@@ -109,7 +111,7 @@ def load_inpainter(kind, weights=None):
     return feedforward.load_inpainter(Inpainter(**inpainter_setting(kind, weights)))
 
 
-# ----------------------------------------------------------------------------------------- what is shown, what is taken
+# ---------------------------------------------------------------------------- the networks' input and output
 
 
 @pytest.mark.parametrize("kind", ["lama", "migan"])
@@ -122,7 +124,8 @@ def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path, kind, si
     assert painted.dtype == np.uint8 and (painted[~inner] == image[~inner]).all()
     place = feedforward.crop_around(inner, side) if side else (slice(None), slice(None))
     known = image[place][~inner[place]].mean(0)
-    middle = cv2.erode(inner.astype(np.uint8), np.ones((9, 9))) > 0  # of scaled answers the border mixes
+    # If the output is resized, interpolation mixes colours at the border of the hole; compare away from the border.
+    middle = cv2.erode(inner.astype(np.uint8), np.ones((9, 9))) > 0
     assert np.abs(painted[middle if side else inner] - known).max() < (1.01 if not side else 4)
     noise = np.random.default_rng(0).integers(0, 256, image.shape, np.uint8)
     assert (painter.paint(np.where(inner[..., None], noise, image), inner) == painted).all()
@@ -137,7 +140,7 @@ def test_a_torchscript_lama_is_read_as_by_the_baselines(tmp_path):
 
 
 def record_network_input(side, inner):
-    """The input (picture, hole) of a network of this size."""
+    """Return the input (picture, hole) that a network with input size `side` gets for the hole `inner`."""
     inputs = []
 
     def paint(image, mask):
@@ -151,9 +154,9 @@ def record_network_input(side, inner):
 def test_a_fixed_size_sees_a_square_around_the_hole_with_as_much_again():
     inner = np.zeros((300, 400), bool)
     inner[100:140, 200:260] = True
-    assert feedforward.crop_around(inner, 64) == (slice(60, 180), slice(170, 290))  # twice the hole
-    assert feedforward.crop_around(inner, 200) == (slice(20, 220), slice(130, 330))  # as large as the model
-    assert feedforward.crop_around(inner, 512) == (slice(0, 300), slice(80, 380))  # as the picture has it
+    assert feedforward.crop_around(inner, 64) == (slice(60, 180), slice(170, 290))  # twice the size of the hole
+    assert feedforward.crop_around(inner, 200) == (slice(20, 220), slice(130, 330))  # the size of the network's input
+    assert feedforward.crop_around(inner, 512) == (slice(0, 300), slice(80, 380))  # at most the height of the picture
     inner[:] = False
     inner[290:, :20] = True
     assert feedforward.crop_around(inner, 64) == (slice(236, 300), slice(0, 64)), "at the picture's border"
@@ -167,7 +170,7 @@ def test_a_fixed_size_sees_a_square_around_the_hole_with_as_much_again():
     assert image.shape == (304, 400, 3) and mask.shape == (304, 400), "any size: multiples of 8"
 
 
-# ----------------------------------------------------------------------------------------------------- what is refused
+# ----------------------------------------------------------------------------------------------------- refused files
 
 
 def test_other_models_are_refused_in_one_line(tmp_path):
@@ -214,7 +217,7 @@ def needed_weights(kind, weights=None):
 
 @pytest.fixture
 def empty_weight_cache(tmp_path, monkeypatch):
-    """An empty cache of weights; its folder of models by owner/name."""
+    """An empty cache of weights. The fixture is the cache's folder, in which models lie under owner/name."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("HF_HOME", str(tmp_path / "hub"))
     monkeypatch.delenv("HF_HUB_CACHE", raising=False)
@@ -222,7 +225,7 @@ def empty_weight_cache(tmp_path, monkeypatch):
 
 
 def write_published_model(empty_weight_cache, kind):
-    """Write the stand-in where `make weights` puts the published file."""
+    """Write a stand-in network to the path where `make weights` stores the published file; return this path."""
     folder = empty_weight_cache / PAINTERS[kind].repo
     folder.mkdir(parents=True)
     return write_onnx_model(folder / PAINTERS[kind].file, kind)

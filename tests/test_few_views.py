@@ -1,4 +1,4 @@
-"""Few photographs: depth between sparse points keeps edges, and a fit on it generalizes to other views."""
+"""Few photographs: dense depth from sparse points keeps edges, and a fit from this depth generalizes to other views."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ from stages import fit as stage
 
 pytestmark = pytest.mark.integration
 
-WALL, NEAR, HALF = 2.0, 1.5, 0.2  # depth of the wall and of a square before it; half its side
+WALL, NEAR, HALF = 2.0, 1.5, 0.2  # z of the wall, z of a square in front of the wall, half the side of the square
 NONE: dict[str, np.ndarray] = {}
 
 
@@ -32,7 +32,7 @@ def interpolate_depth(points, view, picture):
 
 
 def render_wall_and_square(view):
-    """Depth [H, W] and picture uint8 [H, W, 3] of the wall with the square before it."""
+    """Return depth [H, W] and picture uint8 [H, W, 3] of the wall with the square in front of it."""
     rays = (world_rays(view)).reshape(view.height, view.width, 3)
     at = lambda z: view.center + rays * ((z - view.center[2]) / rays[..., 2:])
     square = (np.abs(at(NEAR)[..., :2]) < HALF).all(-1)
@@ -44,7 +44,10 @@ def render_wall_and_square(view):
 
 
 def sample_wall_and_square(count=700, seed=0):
-    """Points of the square and of the whole wall, also behind the square, and their colours."""
+    """Return points [count + 60, 3] and colours uint8 [count + 60, 3]: `count` of the whole wall, 60 of the square.
+
+    Some of the wall's points lie behind the square.
+    """
     draw = np.random.default_rng(seed)
     wall = np.column_stack([draw.uniform(-1.2, 1.2, count), draw.uniform(-0.9, 0.9, count), np.full(count, WALL)])
     square = np.column_stack([draw.uniform(-HALF, HALF, (60, 2)) * 0.97, np.full(60, NEAR)])
@@ -59,7 +62,7 @@ def test_depth_steps_where_the_picture_does_and_hidden_points_are_silent():
     depth, picture = render_wall_and_square(view)
     found = interpolate_depth(points, view, picture)
     wrong = np.abs(found / depth - 1) > 0.01
-    assert wrong.mean() < 0.02  # at the very edge, by the median
+    assert wrong.mean() < 0.02  # the median moves depth edges a little
     assert np.abs(points.normals[:700, 2]).min() > 0.7 and np.allclose(np.linalg.norm(points.normals, axis=1), 1)
 
 
@@ -95,14 +98,14 @@ def test_too_few_points_tell_nothing():
 
 
 def aperiodic_color(points):
-    """uint8 [..., 3]: a pattern in space without period."""
+    """Return uint8 [..., 3], the colours of points [..., 3] in a three-dimensional pattern without period."""
     x, y, z = np.moveaxis(points, -1, 0)
     waves = [np.sin(31 * x + 17 * y + 9 * z), np.sin(23 * y - 29 * x + 5), np.sin(41 * x * y + 37 * y), np.cos(53 * x)]
     return (127 + 30 * np.stack([waves[0] + waves[2], waves[1] + waves[3], waves[2] + waves[3]], -1)).astype(np.uint8)
 
 
 def render_slanted_plane(view):
-    """Depth [H, W] and picture uint8 [H, W, 3] of the plane z = 2 + 0.5 x - 0.3 y."""
+    """Return depth [H, W] and picture uint8 [H, W, 3] of the plane z = 2 + 0.5 x - 0.3 y."""
     rays = world_rays(view)
     normal = np.array([0.5, -0.3, -1.0])
     depth = -(view.center @ normal + 2) / (rays @ normal)
@@ -125,7 +128,7 @@ def test_depth_stays_where_photographs_have_no_texture():
     planes = patchmatch.estimate_planes(views[0], grey, [(views[1], grey)], believed, np.random.default_rng(0))
     depth = 1 / (planes * geometry.pixel_rays(views[0])).sum(-1)
     assert np.abs(depth / believed - 1).max() < 1e-6
-    away = front_camera("away", 50.0)  # shows nothing of it
+    away = front_camera("away", 50.0)  # this view does not show the surface
     planes = patchmatch.estimate_planes(views[0], grey, [(away, grey)], believed, np.random.default_rng(0))
     assert np.abs((planes * geometry.pixel_rays(views[0])).sum(-1) - 0.5).max() < 1e-6
 
@@ -147,11 +150,11 @@ def test_other_photographs_may_be_of_another_size_and_threads_do_not_matter(monk
     torch.set_num_threads(before)
     assert np.array_equal(*found)
     depth = 1 / (found[0] * geometry.pixel_rays(views[0])).sum(-1)
-    assert spacing > 1 or np.median(np.abs(depth / true - 1)) < 1e-3  # larger windows need larger pictures
+    assert spacing > 1 or np.median(np.abs(depth / true - 1)) < 1e-3  # larger spacings need larger pictures
 
 
 def render_aperiodic_square(view):
-    """Depth [H, W] and picture of a wall and a square before it, both with an aperiodic pattern."""
+    """Return depth [H, W] and picture uint8 [H, W, 3] of a square before a wall, with an aperiodic pattern."""
     rays = world_rays(view)
     at = lambda z: view.center + rays * ((z - view.center[2]) / rays[..., 2:])
     square = (np.abs(at(NEAR)[..., :2]) < HALF).all(-1)
@@ -167,7 +170,8 @@ def test_points_behind_the_visible_surface_are_refuted():
     pictures = {view.name: render_aperiodic_square(view)[1] for view in views}
     positions = np.concatenate([wall, square])
     colors = aperiodic_color(positions)
-    uv, _ = geometry.project(wall, views[0])  # of the colour of what hides them, and more than there are before them
+    # Wall points behind the square get the colour of the square, and outnumber the square's own points.
+    uv, _ = geometry.project(wall, views[0])
     behind = (np.abs(wall[:, :2]) < HALF * WALL / NEAR).all(1)
     colors[: len(wall)][behind] = geometry.sample_nearest(pictures["a"], uv)[0][behind]
     points = SparsePoints.of(positions, colors)
@@ -197,7 +201,7 @@ def test_a_further_view_adds_what_those_before_do_not_show():
 
 
 def write_room_poses(folder, train):
-    """Write a `poses` folder with these training views; return all views."""
+    """Write a `poses` folder with the training views `train`; return all views, by name."""
     views = {view.name: view for view in (front_camera(f"v{k}", x) for k, x in enumerate((0.0, -0.12, 0.06)))}
     points, colors = sample_wall_and_square()
     save_scene(folder, Scene(views, train, ("v2",), frozenset(train), points, colors, Similarity(1.0, np.zeros(3))))

@@ -1,4 +1,4 @@
-"""The stage `finish`: which result becomes scene.ply, and its backdrop."""
+"""The stage `finish`: which Gaussians become scene.ply, and when a backdrop (a distant background sphere) is added."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ def fit_folders(tmp_path):
 
 
 def add_stages(folders, tmp_path):
-    """Add `initialize` and `distill`, whose Gaussians differ from the fit's in number."""
+    """Write `initialize` and `distill` with one and two Gaussians fewer than the fit; return all folders."""
     gaussians = load_ply(folders["fit"] / "gaussians.ply")
     for count, stage in enumerate(("initialize", "distill"), start=1):
         folders = folders | {stage: tmp_path / stage}
@@ -60,7 +60,7 @@ def test_result_and_initialization_get_the_same_backdrop(fit_folders, tmp_path):
 
 
 def test_a_scene_with_gaussians_keeps_them(fit_folders, tmp_path):
-    """They may know more than the views do."""
+    """If the capture came with Gaussians, `finish` adds no backdrop: the file may show more than the views."""
     save_ply(fit_folders["poses"] / "gaussians.ply", load_ply(fit_folders["fit"] / "gaussians.ply"))
     facts, scene = run_finish(tmp_path / "out", fit_folders)
     assert facts["backdrop"] is False

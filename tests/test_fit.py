@@ -1,4 +1,4 @@
-"""The fit of a whole scene: it improves, resumes, ignores masked pixels, and names what fails."""
+"""The fit of a whole scene: it improves, resumes, ignores masked pixels, and errors name the view and the value."""
 
 import json
 import re
@@ -36,7 +36,10 @@ SETTINGS = Params(
 
 
 def arc_cameras(count: int = 5, scale: float = 1.0, offset=(0.0, 0.0, 0.0)) -> list[Camera]:
-    """Views of the origin from distance 1, in a frame where the normalised point p is p / scale + offset."""
+    """Return cameras on an arc that look at the origin from distance 1 in normalised units.
+
+    The cameras' frame is the one in which the normalised point p has the coordinates p / scale + offset.
+    """
     cameras = []
     for k in range(count):
         angle = 0.8 * (k / (count - 1) - 0.5)
@@ -95,10 +98,10 @@ class Interruption(Exception):
 
 @pytest.mark.parametrize("gains", [None, np.linspace(0.8, 1.2, 15).reshape(5, 3)], ids=["plain", "exposure"])
 def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, gains):
-    monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
+    monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # write a checkpoint after every step
     unbroken = run_fit(tmp_path / "unbroken", gains=gains)
     adapt, folder = fitting.control_density, tmp_path / "resumed"
-    for moment in (3, 4, 13, 18):  # before the first checkpoint of a run, twice in a row, around densifications
+    for moment in (3, 4, 13, 18):  # twice in a row (before a resumed run writes a checkpoint), around densification
 
         def killing(optimizer, centers, started_with, settings, done, moment=moment):
             adapt(optimizer, centers, started_with, settings, done)
@@ -123,8 +126,11 @@ def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, ga
 
 @pytest.mark.integration
 def test_exposures_are_found_and_taken_out_again(tmp_path):
-    """Photographs of which each has another exposure: where it is fitted the held-out view, exposed as on average, is
-    right; where not, it is not; and the photographs come back as if none had differed."""
+    """Every photograph has a different exposure, and the fit estimates these exposures.
+
+    The held-out view, rendered with the mean exposure, is then more accurate than after a fit without exposures.
+    Photographs with their exposure undone are close to photographs of equal exposure.
+    """
     target, cameras = arc_cameras(9)[4], [c for k, c in enumerate(arc_cameras(9)) if k != 4]
     pictures, gains = render_photos([*cameras, target]), (0.7, 1.2, 0.8, 1.25, 1.1, 0.85, 1.15, 0.95)
     poses = tmp_path / "poses"
@@ -158,7 +164,10 @@ def test_exposures_are_found_and_taken_out_again(tmp_path):
 
 
 def test_a_view_is_exposed_as_the_photographs_next_to_it(tmp_path):
-    """Where neighbours are alike the nearest tell; where they are not, all do."""
+    """If neighbouring photographs have similar exposures, the nearest ones determine the exposure of a view.
+
+    If neighbouring exposures differ, all photographs contribute.
+    """
     cameras = arc_cameras(12)
     seen = [camera for k, camera in enumerate(cameras) if k % 3 != 1]
 
@@ -186,8 +195,8 @@ def test_a_photograph_tells_how_its_view_is_exposed_though_it_is_sharper_and_sho
     smooth = cv2.GaussianBlur(draws.random((60, 80, 3)), (0, 0), 5)
     smooth = 0.2 + 0.5 * (smooth - smooth.min()) / np.ptp(smooth)
     photo = smooth * [0.7, 0.9, 1.1] + [0.1, 0.05, 0.0] + 0.08 * draws.standard_normal((60, 80, 1))
-    photo[:20, :30] = 0.9  # where the mask is
-    photo[50:, 60:] = 0.5  # and somebody has walked into the picture
+    photo[:20, :30] = 0.9  # masked pixels
+    photo[50:, 60:] = 0.5  # an occluder that is not masked
     pixels = np.ones((60, 80), bool)
     pixels[:20, :30] = False
     found = exposure.match_exposure(np.eye(3, 4), smooth, (photo.clip(0, 1) * 255).astype(np.uint8), pixels)
@@ -241,7 +250,7 @@ def test_masked_pixels_do_not_matter_to_the_fit(tmp_path):
 
 
 def test_a_scene_a_thousand_times_larger_and_far_away_fits_alike(tmp_path):
-    """Cameras and points in metres of a national grid, through their similarity, give the fit of the unit scene."""
+    """A scene in metres of a national grid, normalised by its similarity, is fitted like the scene at unit scale."""
     scale, offset = 1e-3, np.array([4.5e5, -3.2e4, 120.0])
     far = Similarity(scale, offset)
     cameras = [normalize_camera(c, far) for c in arc_cameras(scale=scale, offset=offset)]
@@ -308,7 +317,7 @@ def write_arc_poses(folder) -> None:
     colors = np.full((len(points), 3), 128, np.uint8)
     scene = make_scene({c.name: c for c in cameras}, names[:1], points=points, colors=colors)
     save_scene(folder, scene)
-    for name in scene.train:  # the test view has no picture here: reading it would fail
+    for name in scene.train:  # no file for the test view: the stage would fail if it read one
         save_image(folder / "images" / f"{name}.png", pictures[name])
 
 
@@ -390,9 +399,8 @@ def test_sparse_steps_look_at_every_pixel_in_four_turns(monkeypatch):
     image, counts = np.zeros((5, 7, 3), np.uint8), np.arange(35, dtype=np.float32).reshape(5, 7)
     image[..., 0] = counts
     args = [camera], {"v": image}, {"v": counts}, range(5), 0
-    assert all(
-        look[0] == camera for look in view_loader.iterate_views(*args, sparse=range(4))
-    )  # too small to do without
+    # Pictures below MIN_SPARSE_PIXELS are always shown in full.
+    assert all(look[0] == camera for look in view_loader.iterate_views(*args, sparse=range(4)))
     monkeypatch.setattr(view_loader, "MIN_SPARSE_PIXELS", 35)
     looks = list(view_loader.iterate_views(*args, sparse=range(4)))
     assert sorted(np.concatenate([weights.flatten() for _, _, weights in looks[:4]])) == list(range(35))

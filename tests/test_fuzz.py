@@ -1,7 +1,7 @@
-"""All readers of user files, on corrupted files: they raise only their own errors.
+"""All readers of user files, on corrupted files: they raise only the project's own errors (BadInput, Refused).
 
-`REFFUSION_SLOW=1` spends `REFFUSION_FUZZ_SECONDS` (600) on each reader; so does `python -m tests.test_fuzz`, without
-pytest. Files that once broke a reader stay in `FOUND`.
+With `REFFUSION_SLOW=1`, each reader is tested for `REFFUSION_FUZZ_SECONDS` (600 by default).
+`python -m tests.test_fuzz` does the same without pytest. `FOUND` holds files that once caused another error.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ pytestmark = pytest.mark.integration
 
 SLOW = os.environ.get("REFFUSION_SLOW") == "1"
 SECONDS = float(os.environ.get("REFFUSION_FUZZ_SECONDS", "600"))
-QUICK = 40  # files a reader in an ordinary run
-LONGEST = 10.0  # seconds that a file may take
+QUICK = 40  # corrupted files for each reader in an ordinary run
+LONGEST = 10.0  # seconds that a reader may spend on one file
 
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader of files of this name, and good files to corrupt."""
+    """A function that reads files named `name`, and valid files (`seeds`) from which corrupted files are made."""
 
     name: str
     read: Callable[[Path], object]
@@ -59,7 +59,7 @@ class Reader:
 
 
 def good_files() -> dict[str, bytes]:
-    """File name -> content, of every kind of file."""
+    """Return a valid file of every kind: file name -> content."""
     import torch
 
     draw = np.random.default_rng(0)
@@ -126,7 +126,12 @@ stages:
 
 
 def capture_reader(name: str, others: dict[str, bytes]) -> Callable[[Path], object]:
-    """A reader of the file's folder as a capture, with pictures and other files beside it."""
+    """Return a function that adds three pictures beside a file, and reads the file's folder as a capture.
+
+    Args:
+        name: Layout of the capture.
+        others: File name -> content; the pictures are copies of `p.png`.
+    """
 
     def read(path: Path) -> object:
         folder = path.parent
@@ -194,7 +199,7 @@ def readers() -> list[Reader]:
     ]
 
 
-# ---------------------------------------------------------------------------------------------- spoiling
+# ---------------------------------------------------------------------------------------------- corruption
 
 NUMBERS = [struct.pack(f"<{kind}", value) for kind, value in (
     ("B", 0), ("B", 255), ("H", 65535), ("I", 2**31), ("I", 2**32 - 1), ("Q", 2**63), ("Q", 2**64 - 1), ("Q", 10**9),
@@ -211,7 +216,7 @@ WORDS = [word.encode() for word in (
 
 @st.composite
 def corrupted_bytes(draw: st.DrawFn, seeds: tuple[bytes, ...]) -> bytes:
-    """A good file with random changes: cut, overwritten, inserted, repeated and removed parts."""
+    """Draw a valid file with 1 to 6 random changes: parts are cut, overwritten, inserted, repeated or removed."""
     data = bytearray(draw(st.sampled_from(seeds)))
     for _ in range(draw(st.integers(1, 6))):
         at = draw(st.integers(0, max(len(data), 1)))
@@ -241,7 +246,7 @@ def corrupted_bytes(draw: st.DrawFn, seeds: tuple[bytes, ...]) -> bytes:
 
 
 def fix_png_checksums(data: bytes) -> bytes:
-    """A PNG with correct checksums, so that the reader gets past them."""
+    """Return a PNG file with corrected checksums, so that a reader does not reject the file for its checksums."""
     if not data.startswith(b"\x89PNG\r\n\x1a\n"):
         return data
     out, at = bytearray(data[:8]), 8
@@ -267,7 +272,10 @@ def try_read(read: Callable[[Path], object], path: Path) -> None:
 
 
 def try_reader(reader: Reader, data: bytes) -> None:
-    """Only the project's own errors are raised, in one line that names the file."""
+    """Write `data` to a file and read the file.
+
+    Only the project's own errors may be raised. Their message must be one line that names the file or its folder.
+    """
     with tempfile.TemporaryDirectory() as name, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         path = Path(name) / reader.name
@@ -276,7 +284,12 @@ def try_reader(reader: Reader, data: bytes) -> None:
 
 
 def fuzz(reader: Reader, files: int | None, seconds: float = 0.0) -> int:
-    """Try a number of fixed files, or new ones for some seconds; return how many."""
+    """Test a reader on corrupted files; return the number of files.
+
+    Args:
+        files: Number of files, which are the same in every run. None: new random files until `seconds` are over.
+        seconds: Least duration, in seconds.
+    """
     count = 0
 
     def one(data: bytes) -> None:
@@ -319,13 +332,13 @@ def test_spoilt_files_for_long(name):
     fuzz(READERS[name], None, SECONDS)
 
 
-# Reader -> files that once came through as another error, base64.
+# Name of the reader -> files in base64 that once caused an error which is not the project's own.
 FOUND: dict[str, tuple[str, ...]] = {
     "cameras.txt": (base64.b64encode(b"9" * 2000 + b" PINHOLE 0 9 9 9 6 4.5\n").decode(),),
     "p.png": (
         "iVBORw0KGgoAAAANSUhEUgAAAAwAQAAJAQAAAAAHXjIUAAAAJElEQVR4nGOIYmB0lWY8dorRTonp9wWGRwoMPgeYvBgY5D4A"
         "AGRfB+OsiEFuAAAAAElFTkSuQmCC",
-    ),  # 50 MP declared in 93 bytes: over 10 s on a starved machine
+    ),  # 93 bytes that declare 50 megapixels: took over 10 s on a busy machine
 }
 
 

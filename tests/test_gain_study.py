@@ -1,4 +1,4 @@
-"""The study of what distillation gains: energy of gradients against the truth, its table, and runs of variants."""
+"""The study that compares distillation with initialization: gradient energy, the table, and runs of variants."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ def row(**values) -> dict[str, float]:
 def test_a_variants_initialization_is_written_once():
     ways = {"initialization": row(), "result": row(psnr_box=31.5)}
     text = gain.table({"demo": ways, "demo@no_sds": ways, "other@no_sds": ways}, {"demo": {"by masks": 0.7}})
-    assert text.count("initialization |") == 2  # demo's, and that of `other`, whose own run is not there
+    assert text.count("initialization |") == 2  # of demo, and of `other@no_sds`, since there is no run of `other`
     assert "| demo@no_sds, result | 31.50 | 0.9000 | 0.0500 | 0.90 | 0.80 |" in text
     assert "{'by masks': 0.7}" in text
 
@@ -33,6 +33,8 @@ def test_energy_counts_steps_whose_ends_both_lie_in_the_mask():
     picture, mask = np.zeros((4, 6, 3), np.uint8), np.zeros((4, 6), bool)
     picture[:, 3:] = 255  # one edge, between columns 2 and 3
     mask[1:3, 1:3] = True
-    assert holes.gradient_energy(picture, mask) == 0  # the edge is the mask's own border
+    assert holes.gradient_energy(picture, mask) == 0  # the step crosses the border of the mask
     mask[1:3, 3] = True
-    assert holes.gradient_energy(picture, mask) == pytest.approx(2 / 7)  # 2 of 4 horizontal and 3 vertical steps
+    assert holes.gradient_energy(picture, mask) == pytest.approx(
+        2 / 7
+    )  # 2 of the 7 steps (4 horizontal, 3 vertical) in the mask

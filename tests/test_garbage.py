@@ -1,4 +1,7 @@
-"""The command gc lists artifacts that no plan uses, and removes them on request if a receipt names them."""
+"""The command gc lists artifacts that no plan uses.
+
+On request, it removes these artifacts, except files that no receipt names or that were changed.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +56,7 @@ def test_unused_artifacts_are_listed_first_and_removed_on_request(comparison_cop
     (comparison_copy / "pipeline.yaml").write_text(text.replace("  better: {distill: {gain: 3}}\n", ""))
     (comparison_copy / "data/toy/scene.yaml").write_text(
         "stages: {distill: {gain: 0}}"
-    )  # left out now, in every variant
+    )  # a gain of 0 leaves `distill` out, in every variant
     (comparison_copy / "runs/toy/distill/notes.txt").write_text("mine")
     (comparison_copy / "runs/toy/distill/gain.txt").write_text("changed by hand")
     (comparison_copy / "runs/toy/mine").mkdir()

@@ -1,4 +1,4 @@
-"""Files of Gaussians as editors and trainers write them: precisions, byte orders, filters, .splat and .spz."""
+"""Files of Gaussians from editors and other trainers: precisions, byte orders, 3D filters, .splat and .spz."""
 
 from __future__ import annotations
 
@@ -26,7 +26,14 @@ def sigmoid(values):
 
 
 def gaussian_table(count: int, rest: int = 0, scales: int = 3, more: tuple[str, ...] = (), kind: str = "f4"):
-    """A structured array of Gaussians around the origin with the properties of a 3DGS file; those in `more` are 0."""
+    """Return a structured array of random Gaussians around the origin, with the properties of a 3DGS file.
+
+    Args:
+        rest: Number of properties f_rest_*.
+        scales: Number of properties scale_*.
+        more: Names of further properties, all 0.
+        kind: NumPy type of all properties.
+    """
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{k}" for k in range(rest))]
     names += ["opacity", *(f"scale_{k}" for k in range(scales)), "rot_0", "rot_1", "rot_2", "rot_3", *more]
     table, generator = np.zeros(count, [(name, kind) for name in names]), np.random.default_rng(11)
@@ -42,7 +49,7 @@ def write_transforms_capture(folder: Path) -> Path:
 
 
 def load_written_gaussians(folder: Path, name: str, **params) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The columns of the Gaussians that `poses` wrote, in the scene's own frame, and the messages."""
+    """Run the stage `poses` on a file of Gaussians; return the columns in the scene's own frame, and messages."""
     scene, out, sentences = run_with_messages(folder, gaussians=name, **params)
     data = PlyData.read(str(out / "gaussians.ply"), mmap=False)["vertex"].data
     columns = {each: np.array(data[each], np.float64) for each in data.dtype.names}
@@ -58,7 +65,7 @@ def assert_columns_equal(columns: dict[str, np.ndarray], table: np.ndarray, name
 
 
 def covariances(columns) -> np.ndarray:
-    """[N, 3, 3], independent of the sign of quaternions and the order of axes."""
+    """Return the covariances [N, 3, 3], which do not depend on the sign of quaternions and the order of axes."""
     w, x, y, z = (np.asarray(columns[f"rot_{k}"], np.float64) for k in range(4))
     length = np.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w / length, x / length, y / length, z / length
@@ -73,7 +80,7 @@ def covariances(columns) -> np.ndarray:
 PLACE_AND_COLOR = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2")
 SHAPE = ("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 
-# ---------------------------------------------------------------------------------------------- E: not finite, zero
+# ---------------------------------------------------------------------------------------------- edited files
 
 
 def test_not_finite_and_zero_rows_of_big_endian_doubles(tmp_path):
@@ -106,7 +113,7 @@ def test_not_finite_and_zero_rows_of_big_endian_doubles(tmp_path):
 
 
 def test_deleted_splats_are_those_of_the_rows_that_stay(tmp_path):
-    """Before and after an editor deleted 30: bad rows are in both files, in front of what was deleted."""
+    """An editor deleted 30 rows. Both files have 3 invalid rows before these 30; deleted.npy omits invalid rows."""
     folder, before = write_transforms_capture(tmp_path / "s"), gaussian_table(400)
     before["z"][5] = np.nan
     before[[17, 18]] = 0
@@ -131,7 +138,7 @@ def test_text_file_with_words_for_what_is_not_finite(tmp_path):
     assert_message(sentences, "1", "scan.ply")
 
 
-# ---------------------------------------------------------------------------------------------- P: other trainers
+# ---------------------------------------------------------------------------------------------- other trainers
 
 
 def assert_filter_folded(columns: dict[str, np.ndarray], table: np.ndarray, atol: float) -> None:
@@ -159,12 +166,12 @@ def test_filter_of_some_splats_in_doubles(tmp_path):
 
 
 def test_filter_of_opaque_splats(tmp_path):
-    """Infinite opacities become those of the filter."""
+    """An infinite opacity logit becomes the finite one that the 3D filter gives."""
     folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(24, more=("filter_3D",))
     table["filter_3D"], table["opacity"][::3] = 0.05, np.inf
     write_rows(folder / "mip.ply", table, text=True)
     columns, _ = load_written_gaussians(folder, "mip.ply")
-    assert_filter_folded(columns, table, 5e-3)  # infinite ones may be clamped first
+    assert_filter_folded(columns, table, 5e-3)  # infinite logits may be clamped before the filter is applied
 
 
 @pytest.mark.parametrize("rest", [0, 24])
@@ -192,7 +199,7 @@ def test_fourth_degree_is_cut_channel_by_channel(tmp_path, text):
 
 
 def test_splat_file(tmp_path):
-    """32 bytes each: place and sizes as floats, colour and opacity, rotation as bytes around 128."""
+    """A .splat file has 32 bytes a Gaussian: position and sizes as floats; colour, opacity and rotation as bytes."""
     folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(16)
     colors = np.random.default_rng(2).integers(0, 256, (16, 4)).astype(np.uint8)
     colors[:2, 3] = 255, 1
@@ -215,7 +222,12 @@ def test_splat_file(tmp_path):
 
 
 def spz_bytes(table: np.ndarray, turns: np.ndarray, version: int) -> bytes:
-    """A .spz file of degree 0 with rotations `turns` (wxyz); the format flips y and z of the places."""
+    """Return a .spz file of spherical-harmonics degree 0. The format stores positions with negated y and z.
+
+    Args:
+        turns: Unit quaternions wxyz, [N, 4].
+        version: 2 or 3, version of the format; the versions store quaternions differently.
+    """
     count = len(table)
     places = np.stack([table["x"], -table["y"], -table["z"]], 1).astype(np.float64)
     fixed = np.round(places * 4096).astype("<i4")
@@ -242,11 +254,13 @@ def spz_bytes(table: np.ndarray, turns: np.ndarray, version: int) -> bytes:
 
 @pytest.mark.parametrize("version", [2, 3])
 def test_spz_file(tmp_path, version):
-    """Its axes are right, up, back. Taken as such, or turned to those of the PLY file that it was made of: places and
-    rotations go together."""
+    """The axes of a .spz file are right, up, back. A reader may keep these axes or convert them to a PLY file's axes.
+
+    In both cases, positions and rotations must be in the same axes.
+    """
     folder, table = write_transforms_capture(tmp_path / "s"), gaussian_table(32)
     turns = np.random.default_rng(6).normal(size=(32, 4))
-    turns[:, 0] += np.sign(turns[:, 0])  # near 0 version 2 is coarse
+    turns[:, 0] += np.sign(turns[:, 0])  # version 2 does not store w, and is inexact where w is near 0
     turns /= np.linalg.norm(turns, axis=1, keepdims=True)
     (folder / "scan.spz").write_bytes(spz_bytes(table, turns, version))
     columns, _ = load_written_gaussians(folder, "scan.spz")

@@ -1,4 +1,4 @@
-"""Projection and its inverse."""
+"""Projection, unprojection, and angles between views."""
 
 from dataclasses import replace
 
@@ -59,7 +59,7 @@ def test_samples_outside_the_image_are_marked():
 
 
 def off_square_camera(*center):
-    """A camera whose two focal lengths differ."""
+    """Return a camera with fx = 35 px and fy = 33 px at `center`."""
     return replace(make_camera("view", (40, 30), 35.0, center), fy=33.0)
 
 
@@ -67,7 +67,8 @@ def test_the_angle_between_views_is_the_smallest_and_is_taken_at_the_point():
     point, view = np.array([1.0, 0.0, 0.0]), off_square_camera(3.0, 0.0, 0.0)
     for degrees in (0.0, 1e-3, 40.0, 90.0, 179.0, 180.0):
         turned = np.radians(degrees)
-        other = off_square_camera(1 + 5 * np.cos(turned), 5 * np.sin(turned), 0.0)  # further away, which does not count
+        # The second camera is farther from the point: the distance must not change the angle.
+        other = off_square_camera(1 + 5 * np.cos(turned), 5 * np.sin(turned), 0.0)
         assert geometry.angle_between_views(point, view, [other]) == pytest.approx(degrees, abs=1e-4)
     aside = [off_square_camera(1.0, 2.0, 0.0), off_square_camera(3.0, 2.0, 0.0)]
     assert geometry.angle_between_views(point, view, aside) == pytest.approx(45)

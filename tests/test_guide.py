@@ -1,4 +1,4 @@
-"""Every command of docs/guide.md runs as written on a small scene; the longer ones with REFFUSION_SLOW=1."""
+"""Every command of docs/guide.md runs as written on a small scene; long commands run only with REFFUSION_SLOW=1."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def photo_folder(generate, tmp_path_factory) -> Path:
-    """A folder with photographs, and masks of them."""
+    """A folder with photographs and their masks."""
     folder = tmp_path_factory.mktemp("guide") / "my-photos"
     generate.generate(folder, 0, generate.KINDS["mini"])
     return folder
@@ -64,7 +64,7 @@ def test_the_mask_page(photo_folder):
             address = next(found[0] for line in serving.stdout if (found := re.findall(r"http://127\S+", line)))
             assert "What should be removed?" in urllib.request.urlopen(address, timeout=20).read().decode()
         finally:
-            os.killpg(serving.pid, signal.SIGTERM)  # who runs the tests may have it ignore SIGINT
+            os.killpg(serving.pid, signal.SIGTERM)  # not SIGINT, which a test runner may ignore and pass on
 
 
 @pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="a minute; set REFFUSION_SLOW=1")

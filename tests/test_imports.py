@@ -17,7 +17,8 @@ from runner.pipeline import load_pipeline
 
 ROOT = Path(__file__).resolve().parent.parent
 OWN = {"reffusion", "stages", "runner", "report"}
-# A heavy or special dependency enters in one module; transformers in one for each kind of network.
+# Heavy or special dependencies, and the only modules that may import them: one module for each dependency, and for
+# transformers one for each kind of network.
 DOORS = {
     "pycolmap": ("reffusion/capture/sfm.py",),
     "diffusers": ("reffusion/prior/model.py",),
@@ -48,7 +49,7 @@ OWN_FILES = (
     "reffusion/weights/segmenters.py",
     "reffusion/capture/sfm.py",
     COMPILER,
-)  # weights, databases, pipes, kernels
+)  # these modules read or write weights, databases, pipes or compiled kernels
 PURE = (
     "geometry",
     "types",
@@ -59,7 +60,7 @@ PURE = (
     "distill/discriminator",
     "distill/terms/",
     "prior/windows",
-)  # tensors and plain numbers only
+)  # these modules use tensors and plain numbers only
 
 
 def sources(*folders: str) -> list[Path]:
@@ -67,7 +68,11 @@ def sources(*folders: str) -> list[Path]:
 
 
 def imports(path: Path, top_only: bool = False) -> set[str]:
-    """Dotted names a file imports, relative ones made absolute; TYPE_CHECKING blocks left out."""
+    """Return the dotted names that a file imports, as absolute names, without those in TYPE_CHECKING blocks.
+
+    Args:
+        top_only: Leave out imports inside functions.
+    """
     tree = ast.parse(path.read_text(encoding="utf-8"))
     package = path.relative_to(ROOT).parts[:-1]
     found = set()
@@ -92,7 +97,7 @@ def _nodes(tree: ast.AST, top_only: bool) -> Iterator[ast.AST]:
 
 
 def foreign_packages(path: Path, allowed: set[str], top_only: bool = False) -> set[str]:
-    """Top-level packages that `path` imports, other than the standard library and `allowed`."""
+    """Return the top-level packages that `path` imports, without the standard library and the packages `allowed`."""
     return {name.split(".")[0] for name in imports(path, top_only)} - allowed - set(sys.stdlib_module_names)
 
 
@@ -121,7 +126,7 @@ def test_stages_import_the_library_only(path):
 
 @pytest.mark.parametrize("stage", [path.stem for path in sources("stages/plan") if path.stem != "__init__"])
 def test_plan_modules_import_nothing_heavy(stage):
-    """So that `plan` answers at once."""
+    """Heavy imports would make the command `plan` slow to answer."""
     code = f"import sys, stages.plan.{stage}; print(*sorted(set(sys.argv[1:]) & set(sys.modules)))"
     command = [sys.executable, "-c", code, "torch", "scipy", "numba", "cv2", "diffusers", "transformers"]
     assert subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip() == ""
@@ -135,12 +140,12 @@ def test_previews_take_the_needs_of_their_stage(stage, needs):
 
 
 def test_there_are_no_import_cycles():
-    """Neither do the packages of the library: what lies below knows nothing of what lies above."""
+    """Neither modules nor packages of the library import each other in a cycle, so the layers have an order."""
     paths = sources("reffusion", "stages", "runner", "report")
     modules = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in paths}
     owner = lambda name: name if name in modules else name.rpartition(".")[0]
     needs = {name: {owner(other) for other in imports(path)} & set(modules) for name, path in modules.items()}
-    tuple(graphlib.TopologicalSorter(needs).static_order())  # CycleError tells the circle
+    tuple(graphlib.TopologicalSorter(needs).static_order())  # raises CycleError, which names the cycle
     room = lambda name: ".".join(name.split(".")[: 2 if name.count(".") > 1 else 3])
     library = {name: others for name, others in needs.items() if name.startswith("reffusion.")}
     rooms: dict[str, set[str]] = {}
@@ -150,7 +155,7 @@ def test_there_are_no_import_cycles():
 
 
 def test_init_files_are_empty():
-    """What a stage depends on is what it imports."""
+    """A stage depends on the modules that it imports; code in an __init__.py would add hidden dependencies."""
     for folder in {path.parent for path in sources("reffusion")}:
         assert folder.name == "reffusion" or not (folder / "__init__.py").read_text().strip(), folder
 
@@ -176,10 +181,11 @@ def test_report_reads_through_io(path):
         if path.stem in draws
         else ()
     )
-    places = ("reffusion.command",) if path.stem == "cli" else ()  # the folder of scenes
+    places = ("reffusion.command",) if path.stem == "cli" else ()  # for the path of the folder of scenes
     clicked = ("reffusion.clicks", "reffusion.capture", "reffusion.params", "reffusion.command", "reffusion.types")
-    making = clicked if path.stem in ("mask", "mask_session") else ()  # masks
-    chance = ("reffusion.seeding",) if path.stem in ("study", "votes") else ()  # the order of pairs, intervals
+    making = clicked if path.stem in ("mask", "mask_session") else ()  # to make masks
+    # For the random order of pairs, and for confidence intervals.
+    chance = ("reffusion.seeding",) if path.stem in ("study", "votes") else ()
     assert all(name.startswith(("reffusion.io", *chance, *drawing, *making, *places)) for name in own), own
 
 

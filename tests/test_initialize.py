@@ -1,4 +1,4 @@
-"""New Gaussians lie on the hidden surface, reproduce the reference, and leave no holes."""
+"""The stage `initialize`: new Gaussians lie on the hidden surface, reproduce the reference, and leave no holes."""
 
 from dataclasses import replace
 
@@ -41,7 +41,7 @@ def masks_folders(tmp_path_factory):
 
 
 def slanted_disparity(degrees: float):
-    """Disparity of a plane through (0, 0, 2) turned about the vertical, its view, and its normal."""
+    """Return the disparity [H, W] of a plane through (0, 0, 2) turned about the vertical, its view, and its normal."""
     view = wall_scene.front_camera("v", 0.0)
     rays = geometry.pixel_rays(view)
     normal = np.array([np.sin(np.radians(degrees)), 0.0, -np.cos(np.radians(degrees))])
@@ -86,14 +86,18 @@ def test_no_grid_shows_from_four_times_nearer(degrees):
 
 
 def floor_view(turn: float) -> Camera:
-    """The origin of the floor y = 0, seen from 2 away and 30 degrees above it, `turn` degrees around the vertical."""
+    """Return a camera at distance 2 from the origin, 30 degrees above the floor y = 0.
+
+    Args:
+        turn: Angle of the camera around the vertical, in degrees.
+    """
     a, b = np.radians(turn), np.radians(30)
     forward = np.array([np.sin(a) * np.cos(b), np.sin(b), np.cos(a) * np.cos(b)])  # y points down
     return look_at_camera(f"from {turn}", -2 * forward, (0.0, 0.0, 0.0), (48, 36), 60.0, up=(0.0, -1.0, 0.0))
 
 
 def render_floor(view: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Depth of the floor and a smooth checkered picture of it."""
+    """Return the depth [H, W] of the floor and a smooth checkered picture [H, W, 3] of the floor, in [0, 1]."""
     rays, up = geometry.pixel_rays(view), view.world_to_camera[:3, 1]
     depth = (up @ view.world_to_camera[:3, 3]) / (rays @ up)
     points = geometry.unproject(depth, view)
@@ -116,7 +120,10 @@ def test_no_view_is_completed_from_behind_where_nobody_photographed():
 
 
 def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side():
-    """Opaque neighbours hide each other: colours that are right in the reference slide away in the opposite view."""
+    """With opaque Gaussians that occlude each other, colours that fit the reference are displaced in the opposite view.
+
+    The default settings of the new surface must reduce this error.
+    """
     view, opposite = floor_view(0.0), floor_view(180.0)
     depth, picture = render_floor(view)
     reference = Reference(view, (picture * 255).round().astype(np.uint8), np.ones(depth.shape, bool))
@@ -143,7 +150,10 @@ def test_bad_depth_is_refused():
 
 
 def test_holes_left_by_faint_gaussians_are_filled(masks_folders, tmp_path):
-    """The rim of the hole that the mask leaves to the remaining Gaussians, with these taken away."""
+    """After the masked Gaussians are removed, faint remaining Gaussians still cover a part of the hole.
+
+    The hole to fill must contain the unobserved pixels, and stay inside the consistent mask.
+    """
     view = wall_scene.CAMERAS["a2"]
     sets = load_mask_sets(masks_folders["masks"], ["a2"])["a2"]
     gaussians, labels = (
@@ -184,7 +194,10 @@ def test_the_reference_is_reproduced_by_matched_colors():
 
 
 def test_a_hidden_gaussian_does_not_become_a_speck_of_another_colour():
-    """Behind a red sheet it cannot show the picture; from elsewhere it would be seen as what it had been made."""
+    """New Gaussians behind a red sheet cannot reproduce the picture in this view.
+
+    Their colours must stay in the picture's range: an extreme colour would be visible from other views.
+    """
     view = wall_scene.front_camera("v", 0.0)
     picture = np.random.default_rng(0).integers(110, 140, (wall_scene.HEIGHT, wall_scene.WIDTH, 3)).astype(np.uint8)
     far, everything = (
@@ -201,7 +214,10 @@ def test_a_hidden_gaussian_does_not_become_a_speck_of_another_colour():
 
 
 def test_refit_moves_the_gaussians_and_leaves_no_checkpoint(masks_folders, tmp_path):
-    """Twice the same, as many as before, nearer to the photographs; what it needs to resume goes when it is done."""
+    """Refitting is deterministic, keeps the number of Gaussians, and lowers the error against a photograph.
+
+    Checkpoints are deleted when the refit is complete.
+    """
     found = {}
     for name, steps in (("none", 0), ("first", 40), ("again", 40)):
         out = tmp_path / name
@@ -250,7 +266,7 @@ def test_a_gap_is_narrow_and_a_hole_is_not():
 
 
 def test_a_completed_view_pulls_by_its_window_as_by_the_whole():
-    """The same loss and gradient within, whichever is drawn."""
+    """The crop around the mask gives the same loss and gradient as the whole view."""
     view, wall = (
         wall_scene.front_camera("v", 0.0),
         wall_scene.rectangle_gaussians(wall_scene.WALL, 2.0, 1.4, wall_scene.wall_color),
@@ -271,7 +287,10 @@ def test_a_completed_view_pulls_by_its_window_as_by_the_whole():
 
 
 def test_the_back_of_a_thing_is_drawn_though_its_front_shows_from_behind():
-    """What a reference draws before all that the Gaussians show, and not where they show it already."""
+    """pixels_in_front() finds the pixels where a reference shows a surface in front of all Gaussians.
+
+    Pixels where the Gaussians already show this surface are not found.
+    """
     view, near = wall_scene.front_camera("v", 0.0), 1.4
     wall = wall_scene.rectangle_gaussians(wall_scene.WALL, 2.0, 1.4, wall_scene.wall_color)
     mask, hidden = wall_scene.true_mask(view, near), np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
@@ -280,7 +299,9 @@ def test_the_back_of_a_thing_is_drawn_though_its_front_shows_from_behind():
     assert (coverage.pixels_in_front(wall, depth, reference, hidden) == mask).all()
     front = wall_scene.rectangle_gaussians(near, wall_scene.HALF, wall_scene.HALF, wall_scene.wall_color)
     both = join_gaussians(wall, front)
-    assert coverage.pixels_in_front(both, depth, reference, hidden).sum() < 0.2 * mask.sum()  # the square's soft rim
+    assert (
+        coverage.pixels_in_front(both, depth, reference, hidden).sum() < 0.2 * mask.sum()
+    )  # only the soft edge of the square is left
     assert not coverage.pixels_in_front(wall, depth, reference, mask).any()
 
 
@@ -304,4 +325,6 @@ def test_pixels_stained_by_an_edge_lie_beside_it_on_what_stays():
     ring[2:7, 2:7] = True
     ring[3:6, 3:6] = False
     assert (found == ring).all()
-    assert not coverage.beside_depth_edges(depth, stays + 1).any()  # not on what stays: a part of the thing
+    assert not coverage.beside_depth_edges(
+        depth, stays + 1
+    ).any()  # none where the depth is not that of the remaining scene

@@ -1,4 +1,4 @@
-"""The wheel is one package that works from any folder as a checkout does."""
+"""The wheel installs one package, whose commands work in any folder as they do in a checkout."""
 
 from __future__ import annotations
 
@@ -25,14 +25,21 @@ BUILD = "import sys, setuptools.build_meta as build; build.build_wheel(sys.argv[
 
 @pytest.fixture(scope="module")
 def wheel_folder(tmp_path_factory) -> Path:
-    """A folder with the contents of the wheel."""
+    """A folder with the unpacked contents of a wheel that is built from a copy of the project."""
     pytest.importorskip("setuptools", "77", reason="building a wheel needs setuptools 77 or later")
-    copy, out = tmp_path_factory.mktemp("copy"), tmp_path_factory.mktemp("out")  # building leaves folders behind
+    copy, out = (
+        tmp_path_factory.mktemp("copy"),
+        tmp_path_factory.mktemp("out"),
+    )  # a build leaves folders in its source folder
     for name in (*FOLDERS, "priors"):
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "pipeline.yaml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, copy)
-    for name in ("data/mine/photo.py", "tests/test_it.py", "runs/mine/note.json"):  # what must stay out
+    for name in (
+        "data/mine/photo.py",
+        "tests/test_it.py",
+        "runs/mine/note.json",
+    ):  # files that the wheel must not contain
         (copy / name).parent.mkdir(parents=True)
         (copy / name).touch()
     subprocess.run([sys.executable, "-c", BUILD, str(out)], cwd=copy, check=True, capture_output=True)
@@ -45,7 +52,7 @@ def wheel_folder(tmp_path_factory) -> Path:
 
 
 def run_command(wheel_folder: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """`reffusion <arguments>` in a folder outside the project."""
+    """Run `reffusion <arguments>` from the unpacked wheel, in a folder outside the project."""
     return run_module("reffusion.command", *arguments, cwd=folder, env={"PYTHONPATH": str(wheel_folder)})
 
 
@@ -64,7 +71,10 @@ def test_all_is_in_one_package(wheel_folder):
 
 
 def test_stages_depend_on_the_same_code(wheel_folder, tmp_path):
-    """So that what a checkout made is taken, and what a new version does differently is made again."""
+    """The same code has the same fingerprints in a wheel and a checkout.
+
+    An installed version thus reuses the results of a checkout, and repeats only stages whose code differs.
+    """
     app, hashes = wheel_folder / "reffusion" / "app", Hashes(tmp_path / "hashes.json")
     for stage in load_pipeline(ROOT).stages:
         for folder in ("stages", "stages/plan"):
@@ -74,7 +84,7 @@ def test_stages_depend_on_the_same_code(wheel_folder, tmp_path):
 
 
 def test_plan_in_any_folder(wheel_folder, tmp_path):
-    """data/ and runs/ are in the folder where the command is given."""
+    """The folders data/ and runs/ are those of the current working directory."""
     write_four_photos(tmp_path / "data" / "row")
     done = run_command(wheel_folder, tmp_path, "plan", "--scene", "row", "--profile", "laptop")
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""Round trips of every file format, and what is refused."""
+"""Round trips of every file format, and the files that are refused."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_exr_keeps_every_bit(tmp_path):
     depth[0, 0] = 0.0
     save_exr(tmp_path / "sub" / "depth.exr", depth)
     assert np.array_equal(load_exr(tmp_path / "sub" / "depth.exr"), depth)
-    time.sleep(1.1)  # the format has a date, in seconds
+    time.sleep(1.1)  # the format has a date in seconds, which must not change the bytes
     save_exr(tmp_path / "again.exr", depth)
     assert (tmp_path / "again.exr").read_bytes() == (tmp_path / "sub" / "depth.exr").read_bytes()
 
@@ -159,7 +159,7 @@ def test_ply_is_the_layout_that_viewers_expect(tmp_path):
     names += [f"f_rest_{i}" for i in range(45)] + ["opacity"]
     names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     assert [p.name for p in vertex.properties] == names and all(p.val_dtype == "f4" for p in vertex.properties)
-    # All of red's 15 coefficients first, then green's, then blue's.
+    # The file lists the 15 coefficients of red first, then those of green, then those of blue.
     assert np.array_equal(vertex["f_rest_0"], gaussians.sh[:, 1, 0])
     assert np.array_equal(vertex["f_rest_14"], gaussians.sh[:, 15, 0])
     assert np.array_equal(vertex["f_rest_15"], gaussians.sh[:, 1, 1])

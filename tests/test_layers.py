@@ -1,4 +1,4 @@
-"""Surface labels and depth of a hole's pixels: analytic steps, a vase on a table, a recess."""
+"""Surface labels and depth of a hole's pixels, in synthetic scenes: a depth step, a vase on a table, a recess."""
 
 import itertools
 
@@ -13,7 +13,10 @@ from reffusion.morphology import dilate_by_distance
 
 
 def step_scene():
-    """Disparity with a step at column 60 that continues through a hole, a picture with the same edge, and the hole."""
+    """Return disparity [H, W] with a step at column 60, a picture with the same edge, and the hole, bool [H, W].
+
+    The step continues through the hole.
+    """
     rows, columns = np.mgrid[:100, :120]
     disparity = np.where(columns < 60, 1.0 + 0.001 * rows, 0.6 + 0.0005 * columns)
     picture = np.where((columns < 60)[..., None], (0.8, 0.3, 0.2), (0.2, 0.5, 0.3))
@@ -31,7 +34,7 @@ def test_a_hole_is_label_surfaces_along_the_pictures_edge():
 
 
 def test_a_pattern_in_the_colours_of_another_surface_is_no_island_of_it():
-    """Stars on a wall are as bright as the floor: nothing of the floor stands in the middle of the wall."""
+    """A star-shaped pattern has the colour of the other surface; its pixels get the label of the surface around it."""
     disparity, picture, hole = step_scene()
     rows, columns = np.mgrid[:100, :120]
     star = (np.abs(rows - 45) + np.abs(columns - 50)) < 7
@@ -40,7 +43,10 @@ def test_a_pattern_in_the_colours_of_another_surface_is_no_island_of_it():
 
 
 def test_where_other_views_look_past_a_surface_its_colours_are_another_ones():
-    """Leaves on the ground, brown as the post beside them, do not stand up."""
+    """Leaves on the ground have the colours of the nearer surface beside them.
+
+    If other views see past the nearer surface at the leaves (free space), the leaves get the depth of the ground.
+    """
     disparity, picture, hole = step_scene()
     rows, columns = np.mgrid[:100, :120]
     leaves = (np.abs(rows - 45) < 8) & (columns >= 60) & (columns < 78)
@@ -66,8 +72,14 @@ def test_where_other_views_look_past_a_surface_its_colours_are_another_ones():
 
 
 def vase_scene():
-    """Depths [H, W] of a table's plane, and of what stands on it from column 80 on, nearer but touching it at row 90;
-    a picture in three colours, for a plate lies on the table; and a hole that hides the vase's left rim."""
+    """Return a scene with a vase and a plate on a table, and a hole that hides the left edge of the vase.
+
+    The vase starts at column 80. It is nearer than the table behind it and touches the table at row 90.
+
+    Returns:
+        Depth of the table's plane, depth of the scene, pixels of the vase, picture in three colours, hole: [H, W] each,
+        the picture [H, W, 3].
+    """
     rows, columns = np.mgrid[:100, :120]
     table = 1 / (0.4 + 0.006 * rows)
     vase = (columns >= 80) & (rows < 90)
@@ -79,8 +91,11 @@ def vase_scene():
 
 
 def test_what_stands_on_a_plane_that_goes_on_keeps_its_hidden_rim():
-    """Beside the hole nothing is known for some pixels, the vase touches the table, and the plane is supposed to go on
-    everywhere: under the vase's rim, too."""
+    """The depth in the hole is right on both sides of the vase's hidden edge.
+
+    Three conditions make this difficult: depth is unknown in a margin around the hole, the vase touches the table, and
+    the hints give the plane of the table everywhere, also behind the vase.
+    """
     table, depth, vase, picture, hole = vase_scene()
     view = make_camera("v", (120, 100), 100.0)
     how = CompletionSettings(planar_share=2.0, ring=0.2, margin=0.03)
@@ -101,7 +116,10 @@ def test_a_tuft_of_the_grounds_own_colours_takes_nothing_of_the_ground():
 
 
 def test_a_plinth_that_touches_the_lawn_at_its_foot_is_a_piece_of_its_own():
-    """A statue stands on a plinth on a lawn: around its mask both are connected, through the plinth's foot."""
+    """The masked object stands on a plinth on a lawn. Around the mask, plinth and lawn have connected depths.
+
+    With the hole given, the plinth is still separated from the lawn.
+    """
     rows, columns = np.mgrid[:160, :160]
     lawn = 0.2 + 0.005 * rows
     plinth = (rows >= 90) & (rows < 130) & (np.abs(columns - 80) < 40)
@@ -114,7 +132,7 @@ def test_a_plinth_that_touches_the_lawn_at_its_foot_is_a_piece_of_its_own():
     own = np.bincount(found[plinth & around]).argmax()
     assert (found[plinth & around] == own).mean() > 0.99
     assert (found[around & (rows < 90)] != own).all()
-    left_out = segment_surfaces(lawn, around, hole=hole)  # the lawn alone stands before nothing
+    left_out = segment_surfaces(lawn, around, hole=hole)  # without a plinth, the lawn is a single surface
     assert left_out.max() == 1
 
 
@@ -131,7 +149,7 @@ def test_labels_of_the_least_cost_are_found():
 
         found = alpha_expansion(cost, pairs, strength, cost.argmin(0))
         least = min(total(np.array(labels)) for labels in itertools.product(range(3), repeat=7))
-        assert total(found) < least + 0.02  # capacities are whole thousandths
+        assert total(found) < least + 0.02  # the graph's capacities are rounded to thousandths
 
 
 def test_depth_steps_where_the_picture_has_an_edge():
@@ -145,7 +163,10 @@ def test_depth_steps_where_the_picture_has_an_edge():
 
 
 def test_a_mirror_is_surrounded_and_a_recess_is_not():
-    """The wall of an L-shaped room is looked past beside its corner, between furniture, floor and picture."""
+    """A patch inside known surfaces is enclosed, although a part of its border is hidden.
+
+    A recess is not enclosed: known surfaces border it on two sides only, as beside the corner of an L-shaped room.
+    """
     rows, columns = np.mgrid[:100, :100]
     round_plate = np.hypot(rows - 50, columns - 50) < 20
     hidden = (rows > 60) & (columns < 40)

@@ -1,4 +1,4 @@
-"""Lens models against COLMAP, and the undistortion of pictures and masks."""
+"""Lens models agree with COLMAP, and pictures and masks are undistorted correctly."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from reffusion.io.scene import load_raw_masks, load_views
 
 
 def splat_dots(truth: Truth, name: str) -> np.ndarray:
-    """uint8 [H, W, 3]: a grid of soft dots on a plane through the lens, and the directions of the dots."""
+    """Return a distorted picture uint8 [H, W, 3] of soft dots on a plane, and the directions (x/z, y/z) [N, 2]."""
     pose = truth.world_to_camera[name]
     grid = np.stack(np.meshgrid(np.linspace(-1.2, 1.2, 5), np.linspace(-0.9, 0.9, 4), [0.0]), -1).reshape(-1, 3)
     at = grid @ pose[:3, :3].T + pose[:3, 3]
@@ -41,7 +41,7 @@ def test_a_dot_grid_undistorts_onto_the_pinhole(tmp_path, model):
             patch = image[max(top, 0) : top + 5, max(left, 0) : left + 5, 0].astype(float)
             if patch.shape != (5, 5) or top < 0 or left < 0:
                 continue
-            # Moments of a window are biased by its edge; the logarithm of a Gaussian is a paraboloid.
+            # Fit a paraboloid, which is the logarithm of a Gaussian, because moments are biased by the window's edge.
             rows, columns = np.mgrid[top : top + 5, left : left + 5] + 0.5
             inside = patch > 40
             design = np.stack([columns, rows, columns**2, rows**2, columns * rows, np.ones_like(rows)], -1)[inside]

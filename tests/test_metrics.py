@@ -1,4 +1,4 @@
-"""Metrics against independent implementations, and at the limits: one pixel, constant, identical."""
+"""Image metrics, compared with independent implementations and at limits: one pixel, constant or equal images."""
 
 import math
 
@@ -17,7 +17,7 @@ def noisy_pair(height, width, seed=0, noise=0.1):
     return np.clip(truth + noise * rng.standard_normal(truth.shape), 0, 1), truth
 
 
-# --- box
+# --- bounding box of the mask
 
 
 def test_box_grows_by_a_tenth_of_its_extent_on_each_side():
@@ -77,7 +77,7 @@ def test_a_mean_counts_an_identical_view_as_the_cap_and_skips_what_is_missing():
 
 
 def ssim_by_definition(x, y):
-    """Wang et al.: a window of 11 px at every place where it fits, one channel after another."""
+    """Compute the SSIM of Wang et al., averaged over channels and all Gaussian windows of 11 px inside the image."""
     line = np.exp(-0.5 * ((np.arange(11) - 5) / 1.5) ** 2)
     weight = np.outer(line, line) / line.sum() ** 2
     values = []
@@ -108,7 +108,7 @@ def test_ssim_edges():
         image_metrics.ssim(image[:10], truth[:10])
 
 
-# --- outside
+# --- scores outside the mask
 
 
 def test_outside_a_mask_only_what_lies_outside_counts():
@@ -158,7 +158,7 @@ def test_flip_is_zero_for_identical_one_for_the_worst_and_grows_between():
 
 
 def test_flip_is_that_of_its_authors():
-    """The mean and every pixel as flip-evaluator computes them, of all colours, odd sizes and flat parts."""
+    """The FLIP mean and map equal those of flip-evaluator, for random colours, odd image sizes and smooth images."""
     import flip_evaluator
 
     draw = np.random.default_rng(3)
@@ -181,7 +181,7 @@ def test_flip_of_one_pixel_and_of_a_view_into_a_larger_array():
     assert image_metrics.flip(window.crop(image), window.crop(truth)) == image_metrics.flip(*copies)
 
 
-# --- what every metric refuses
+# --- images that every metric refuses
 
 
 @pytest.mark.parametrize("metric", [image_metrics.psnr, image_metrics.ssim, image_metrics.flip])
@@ -206,7 +206,7 @@ def test_bytes_and_floats_score_alike():
         assert metric(image, truth) == pytest.approx(metric(image / 255, truth / 255), rel=1e-6)
 
 
-# --- a view's row
+# --- the scores of one view
 
 
 def test_score_view_leaves_out_what_is_too_small():

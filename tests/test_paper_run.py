@@ -1,4 +1,7 @@
-"""The profile `paper` from masks to scores with all terms, on small random models of the real architectures."""
+"""The profile `paper` from the stage `masks` to the scores, with all loss terms.
+
+The networks are small and have random weights; their architectures are the real ones.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,8 @@ STAGES = {
     "finish": ("poses", "fit", "reference", "initialize", "distill"),
     "evaluate": ("poses", "raw_masks", "fit", "finish", "masks", "initialize", "distill"),
 }
-# All that differs from the profile: sizes and numbers of steps; where to compute, and where the weights lie.
+# The test changes only these parameters of the profile: sizes and numbers of steps (SIZES), the folders of the weights
+# (WEIGHTS) and the device (HERE).
 SIZES = {
     "reference": {"candidates": 2, "sampler.steps": 2},
     "personalize": {"steps": 2, "optimizer.batch": 2},
@@ -58,7 +62,7 @@ WEIGHTS = {
     "distill": {"prior": "sd2", "depth.model": "depth"},
 }
 STANDS_FOR = {"sd2": published.SD2, "sdxl": published.SDXL, "depth": "depth-anything/Depth-Anything-V2-Small-hf"}
-# On a GPU nothing differs: bfloat16 is trained, float16 paints and distils.
+# On a GPU the profile's device and dtypes stay: bfloat16 for training, float16 for inpainting and distillation.
 HERE = {} if has_gpu() else {"device": "cpu", "dtype": "float32"}
 
 
@@ -67,7 +71,10 @@ def photo_tensor(view) -> torch.Tensor:
 
 
 def network_that_sees_the_tilt() -> torch.nn.Module:
-    """A random Depth Anything whose output correlates with the tilt of the wall; others are refused."""
+    """Return a random Depth Anything whose output correlates with the tilt of the wall.
+
+    The stages refuse a depth map that does not fit the visible depth, so the first random seed that fits is used.
+    """
     tilt = -np.mgrid[: wall_scene.HEIGHT, : wall_scene.WIDTH][0].ravel()
     for seed in (28, *range(200)):
         model = small_depth_model(seed=seed)
@@ -82,14 +89,14 @@ def network_that_sees_the_tilt() -> torch.nn.Module:
 
 
 def tilt_wall(fit: Path) -> None:
-    """Tilt the wall: parallel to the views it would leave the scale of a depth undetermined."""
+    """Tilt the wall in `fit`, because a wall parallel to the images would leave the scale of its depth undetermined."""
     gaussians = load_ply(fit / "gaussians.ply")
     means = gaussians.means / (1 - 0.2 * gaussians.means[:, 1:2] / wall_scene.WALL)
     save_ply(fit / "gaussians.ply", replace(gaussians, means=means))
 
 
 def small_paper_params(weights: Path) -> dict[str, Settings]:
-    """stage -> the profile's parameters but for `SIZES`, `WEIGHTS` and `HERE`."""
+    """Return a dict from stage to the profile's parameters, changed by `SIZES`, `WEIGHTS` and `HERE`."""
     params = resolve(Request(ROOT, ROOT / "runs", "", profile="paper"), scene=False).params
     found = {}
     for stage in STAGES:
@@ -103,7 +110,7 @@ def small_paper_params(weights: Path) -> dict[str, Settings]:
 
 @pytest.fixture(scope="module")
 def stage_outputs(tmp_path_factory):
-    """Stage -> its folder after the run."""
+    """Run all stages; return a dict from stage to its output folder."""
     home = tmp_path_factory.mktemp("paper")
     paths = {name: home / name for name in ("scene", "poses", "raw_masks", "fit", *STAGES)}
     for name, shape in (("sd2", full_size.SD2), ("sdxl", full_size.SDXL)):
@@ -147,7 +154,8 @@ def test_every_term_works_and_masked_gaussians_multiply(stage_outputs):
     last, first = lines[-1], lines[0]
     assert last["iteration"] == 9 and last["reason"] == "finished"
     assert last["sds_gradient_max"] > 0 and last["depth"] > 0 and last["reconstruction"] > 0
-    assert last["adversarial"] < 0 < last["critic_slope"]  # the saturating form; R1
+    # The saturating form of the generator's loss is negative; the slope is the R1 penalty of the critic.
+    assert last["adversarial"] < 0 < last["critic_slope"]
     assert not [name for name in last if name.startswith("depth_skipped")]
     assert last["masked_gaussians"] > first["masked_gaussians"]
     assert last["gaussians"] - last["masked_gaussians"] == first["gaussians"] - first["masked_gaussians"]

@@ -1,4 +1,7 @@
-"""Details in which the code follows the paper: supervision, references, prompts, masks, step sizes, colours."""
+"""Details in which the code follows the paper: supervision, references, prompts, masks, step sizes, colours.
+
+C is the mask of the removed object in a view (consistent mask), I the mask of the invented pixels (invent mask).
+"""
 
 from __future__ import annotations
 
@@ -46,12 +49,15 @@ ROOT = Path(__file__).resolve().parent.parent
 NEAR = 1.6
 
 
-# ------------------------------------------------------------------------------------------------ what supervises
+# --------------------------------------------------------------------------------------------------------- supervision
 
 
 @pytest.fixture(scope="module")
 def load_views_with(tmp_path_factory):
-    """A function from parameters to training views (I lies beside C, and view a3 has no I), and both masks."""
+    """Return a function that loads the training views for changed parameters, and the masks C and I, bool [H, W].
+
+    I lies beside C. View a3 has no I; view a4 is clean, which means that its photograph does not show the object.
+    """
     home = tmp_path_factory.mktemp("insertion")
     poses, fitted, _ = wall_scene.write_poses_and_fit(home, NEAR, clean=("a4",))
     hidden, invent, none = (np.zeros((wall_scene.HEIGHT, wall_scene.WIDTH), bool) for _ in range(3))
@@ -72,7 +78,7 @@ def test_photographs_do_not_supervise_where_an_object_is_drawn(load_views_with):
     views = made()
     assert torch.equal(views["a0"].supervises, ~(hidden | invent)) and torch.equal(views["a3"].supervises, ~hidden)
     assert views["a4"].clean and views["a4"].supervises.all()
-    _, _, not_seen = _downscale(views["a0"], 10_000)  # the depth term's
+    _, _, not_seen = _downscale(views["a0"], 10_000)  # the mask of the depth term
     assert torch.equal(not_seen, hidden | invent)
 
 
@@ -96,7 +102,10 @@ def test_the_refit_is_not_supervised_where_an_object_is_drawn(tmp_path, monkeypa
 
 
 def test_a_clean_view_can_be_a_reference(tmp_path):
-    """The stages on it: its hole is C, and what is behind the object lies where the wall is."""
+    """The stages `reference` and `initialize` accept a reference whose view is clean (it does not show the object).
+
+    The reference's hole is C, although the view has no invented pixels, and `initialize` fills the hole.
+    """
     paths = {name: tmp_path / name for name in ("scene", "poses", "fit", "masks", "reference", "initialize")}
     poses, fitted, _ = wall_scene.write_poses_and_fit(tmp_path, NEAR, clean=("a2",))
     wall_scene.write_capture_photos(paths["scene"], poses, wall_scene.CAMERAS)
@@ -114,7 +123,7 @@ def test_a_clean_view_can_be_a_reference(tmp_path):
     assert load_labels(paths["initialize"] / "labels.npy").any()
 
 
-# ------------------------------------------------------------------------------------- what a prior is told and shown
+# ---------------------------------------------------------------------------------------------------- input of a prior
 
 
 def test_an_unadapted_prior_is_not_prompted_unless_asked():
@@ -150,7 +159,7 @@ def test_colours_above_1_are_shown_as_1_and_may_only_come_back():
     color = torch.tensor([-0.2, 0.5, 1.5, 1.5], requires_grad=True)
     display = clamp_to_display(color)
     assert torch.equal(display, torch.tensor([0.0, 0.5, 1.0, 1.0]))
-    (display * torch.tensor([1.0, 1.0, 1.0, -1.0])).sum().backward()  # a step goes against the gradient
+    (display * torch.tensor([1.0, 1.0, 1.0, -1.0])).sum().backward()  # an optimization step goes against the gradient
     assert color.grad.tolist() == [0, 1, 1, 0]
 
 
@@ -172,7 +181,7 @@ def test_no_term_shows_a_prior_or_a_critic_colours_above_1(prior, monkeypatch):
     assert len(seen) >= 4 and max(seen) <= 1 + 1e-5
 
 
-# ------------------------------------------------------------------------------------------------ RealFill's choices
+# ------------------------------------------------------------------------------------------------- options of RealFill
 
 
 def test_a_tenth_of_realfills_masks_repaints_all():
@@ -194,7 +203,7 @@ def test_output_projections_are_adapted_or_not(layers):
     assert all(any(part in name for name in names) for part in ("to_q", "to_k", "to_v", "q_proj", "k_proj", "v_proj"))
 
 
-# ---------------------------------------------------------------------------------------------------- the fit's letter
+# ------------------------------------------------------------------------------------------------------------- the fit
 
 
 def test_positions_step_by_the_cameras_extent_as_3dgs_has_it():

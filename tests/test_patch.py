@@ -1,4 +1,7 @@
-"""A scene from which splats were deleted in an editor: detected, filled without masks, and returned to the editor."""
+"""Scenes from which a user deleted splats in an editor.
+
+The deleted splats are detected and take the place of masks, and the filled scene is written in the editor's format.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,7 @@ from stages.plan import poses as planned
 
 pytestmark = pytest.mark.integration
 
-NEAR = 1.7  # of the square before the wall, small_scene's
+NEAR = 1.7  # depth of the square before the wall
 HERE = Similarity(1.0, np.zeros(3))
 
 
@@ -191,7 +194,7 @@ def test_gaussians_in_another_frame_than_the_cameras_are_refused(tmp_path, moved
         run_masks(folder, fit, tmp_path)
 
 
-# ---------------------------------------------------------------------------------------------- what is given back
+# ---------------------------------------------------------------------------------------------- output for the editor
 
 
 def test_the_patch_is_given_back_as_the_editor_wrote_the_scene(tmp_path):
@@ -222,7 +225,7 @@ def test_the_patch_is_given_back_as_the_editor_wrote_the_scene(tmp_path):
 
 
 def test_exported_cameras_are_a_capture_without_photographs(tmp_path):
-    """What `export` wrote is what `patch` takes."""
+    """Cameras in the form that `export` writes can be used by `patch`, and keep their positions."""
     folder = tmp_path / "s"
     write_edited_capture(folder)
     out = run_poses_after_edit(folder, masks="none")

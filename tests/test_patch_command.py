@@ -1,5 +1,7 @@
-"""The command `reffusion patch before.ply after.ply --out patched.ply`: refusals, its folder, its output, and cameras
-around a hole."""
+"""The command `reffusion patch before.ply after.ply --out patched.ply`.
+
+Tested are refusals, the scene folder that the command writes, the output, and the cameras placed around a hole.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,7 @@ FRAME = Similarity(0.31, np.array([1.5, -20.0, 4.0]))
 
 @pytest.fixture
 def splat_files(tmp_path):
-    """before.ply and after.ply, 300 splats and 250."""
+    """Write before.ply with 300 splats and after.ply with 250 of them; return both paths."""
     made = random_gaussians(300, 1)
     save_ply(tmp_path / "before.ply", made)
     save_ply(tmp_path / "after.ply", made.map(lambda p: p[50:]))
@@ -91,7 +93,10 @@ def test_a_stage_that_refuses_ends_the_command(splat_files, tmp_path):
 
 
 def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
-    """Two files alone, then with their cameras: the same folder."""
+    """A call with two files, and a later call with their cameras too, use the same folder.
+
+    The later call keeps pictures that a user painted into the folder.
+    """
     made = tmp_path / "made"
     _, deleted = write_edited_capture(made)
     remove_pictures(made)
@@ -168,7 +173,7 @@ def test_export_writes_the_scene_with_the_object_too(tmp_path):
 def test_many_splats_are_matched_by_their_exact_places():
     draws = np.random.default_rng(0)
     points = draws.normal(size=(200_000, 3)).astype(np.float32).astype(np.float64)
-    points[1000:1010] = points[2000:2010]  # at one place
+    points[1000:1010] = points[2000:2010]  # ten pairs of splats at equal positions
     points[5] = (0.0, -0.0, 0.0)
     deleted = draws.random(len(points)) < 0.1
     deleted[[5, *range(1000, 1010)]], deleted[2000:2010] = False, True
@@ -195,7 +200,11 @@ def test_some_splats_that_moved_a_little_are_still_found():
 
 
 def sample_room(*walls: str) -> tuple[np.ndarray, np.ndarray]:
-    """Splats of a floor, of walls, and of a ball on the floor before the back wall; bool [N]: the ball."""
+    """Sample splats of a floor, of the named walls, and of a ball on the floor before the place of the back wall.
+
+    Returns:
+        The means of the splats, [N, 3], and bool [N], True for the splats of the ball.
+    """
     draws = np.random.default_rng(0)
     sheets = [draws.uniform((-1, -1, 0), (1, 1, 0), (6000, 3))]
     sheets += [draws.uniform((-1, 1, 0), (1, 1, 1), (6000, 3))] if "back" in walls else []

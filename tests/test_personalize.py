@@ -1,4 +1,4 @@
-"""Personalization: the pixels of a sample, the loss, learning, resume and early stops."""
+"""Personalization of the prior: training samples, loss, validation on photographs, resume, and early errors."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ def fresh_prior():
 
 
 def striped_reference(height=70, width=90):
-    """A reference of diagonal stripes, its hole in the middle."""
+    """Return a reference, a `Picture` of diagonal stripes with a hole of 30 x 30 px; height and width are in px."""
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     image = torch.stack([128 + 100 * torch.sin((rows + k * columns) / 4) for k in (1, 2, 3)], 2)
     hole = torch.zeros(height, width, dtype=torch.bool)
@@ -80,7 +80,10 @@ def test_global_samples_lose_a_thin_border_only():
 @pytest.mark.parametrize("local_share", [0.0, 1.0])
 @pytest.mark.parametrize("size", [SIZE, NATIVE])
 def test_samples_masked_by_the_hole_show_it_where_it_is(local_share, size, monkeypatch):
-    """The striped picture with its hole painted white: mask and white pixels must be the same."""
+    """In samples whose mask is the hole, the hole's pixels are white: only masked pixels may be white.
+
+    In local samples, which are crops at full resolution, the mask and the white pixels must be equal.
+    """
     source = striped_reference()
     source = crops.Picture(torch.where(source.region, 1.0, source.image.clamp(max=0)), source.region)
     chosen = TrainingSamples(local_share=local_share, hole_share=1.0)
@@ -164,7 +167,10 @@ def test_training_learns_the_reference_and_logs_it(fresh_prior, tmp_path):
 
 
 def test_photographs_are_measured_by_and_not_learnt_from(fresh_prior, tmp_path):
-    """Its hole lies beside the object; what is painted there, and nothing else, counts."""
+    """Photographs serve validation only: the trained weights are the same with and without them.
+
+    The validation hole of a photograph must not overlap the mask of the object.
+    """
     reference = striped_reference()
     thing = torch.zeros(70, 90, dtype=torch.bool)
     thing[:, :45] = True

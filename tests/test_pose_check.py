@@ -1,4 +1,7 @@
-"""Photographs that contradict their poses are left out, and a message names the line that keeps them."""
+"""The check of poses: photographs that contradict their poses are left out.
+
+A warning names them, and the line of scene.yaml that would keep them.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +29,12 @@ from reffusion.types import Camera
 from report import check
 from stages import poses
 
-WALL, SQUARE, HALF = 0.6, -0.4, 0.5  # depths of a wall and of a square before it, half the square's side
+WALL, SQUARE, HALF = 0.6, -0.4, 0.5  # depths of a wall and of a square before the wall; half the square's side
 BAD = "v04"
 
 
 def smooth_textures() -> tuple[np.ndarray, np.ndarray]:
-    """Two pictures of smooth noise, [256, 256, 3], levels of 255."""
+    """Return two images of smooth noise, float32 [256, 256, 3], with values around 128 on the scale 0 to 255."""
     noise = np.random.default_rng(5).uniform(0, 255, (2, 256, 256, 3)).astype(np.float32)
     blurred = (
         sum(weight * cv2.GaussianBlur(each, (0, 0), width) for width, weight in ((2, 4), (8, 12))) for each in noise
@@ -40,7 +43,7 @@ def smooth_textures() -> tuple[np.ndarray, np.ndarray]:
 
 
 def render_two_planes(camera: Camera, images: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """uint8 [H, W, 3]: the wall and the square as the camera sees them."""
+    """Render the textured wall and square as the camera sees them, uint8 [H, W, 3]; `images` are the two textures."""
     rays = world_rays(camera)
     at = [camera.center + rays * ((depth - camera.center[2]) / rays[..., 2:]) for depth in (WALL, SQUARE)]
     pictures = [
@@ -73,7 +76,11 @@ PICTURES = {name: render_two_planes(camera, smooth_textures()) for name, camera 
 
 
 def write_two_planes(folder: Path, **pictures: np.ndarray) -> Path:
-    """Write a COLMAP capture of the wall, with some pictures replaced; return the folder."""
+    """Write a COLMAP capture of the wall and the square to `folder`; return `folder`.
+
+    Args:
+        pictures: view name to image, uint8 [H, W, 3], in place of the right photograph.
+    """
     for name, image in (PICTURES | pictures).items():
         save_image(folder / "images" / f"{name}.png", image)
     captures.write_masks(folder / "masks", TRUTH.world_to_camera)
@@ -82,7 +89,7 @@ def write_two_planes(folder: Path, **pictures: np.ndarray) -> Path:
 
 
 def run_poses_with_warnings(folder: Path, **params) -> tuple[Path, list[str]]:
-    """Run `poses`: its folder and its warnings."""
+    """Run the stage `poses`; return its output folder and the warnings that it wrote."""
     out = folder.parent / "run" / "poses"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -96,7 +103,7 @@ def contradicting_views(cameras=CAMERAS, **pictures: np.ndarray) -> tuple[str, .
     return check_poses(list(cameras.values()), TRUTH.points, (PICTURES | pictures).__getitem__).contradicting
 
 
-# ------------------------------------------------------------------------------------------------ which ones
+# ----------------------------------------------------------------------------- which photographs contradict their poses
 
 
 def test_right_photographs_are_never_named():
@@ -137,7 +144,7 @@ def test_plain_photographs_and_few_points_tell_nothing():
     assert (few.judged, few.contradicting) == (0, ())
 
 
-# ------------------------------------------------------------------------------------------------ what becomes of them
+# ------------------------------------------------------------------------------- how the stage treats these photographs
 
 
 def test_a_photograph_that_contradicts_its_pose_is_left_out(tmp_path):
@@ -213,7 +220,7 @@ def test_what_scene_yaml_brings_for_such_a_view_is_refused(tmp_path):
         run_poses_with_warnings(folder, reference=reference)
     assert str(refused.value) == f"scene.yaml: reference: {refusal}"
     out, _ = run_poses_with_warnings(folder)
-    with pytest.raises(BadInput) as refused:  # named later, when `poses` is done
+    with pytest.raises(BadInput) as refused:  # the reader of references names the view too, after `poses` is done
         load_reference_files(folder, load_placed_views(out), ReferenceSpec(**reference))
     assert str(refused.value) == f"{folder / 'reference.png'}: {refusal}"
     out, _ = run_poses_with_warnings(folder, reference=reference, keep=[BAD])

@@ -1,4 +1,4 @@
-"""From every layout to a scene: cameras, masks, splits, frames."""
+"""The stages `poses` and `raw_masks`: captures of every layout become a scene with cameras, masks and splits."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_llff_alone_keeps_the_projection(tmp_path):
     truth = make_truth()
     scene, _ = run_stages(write_capture(tmp_path / "s", "llff", truth))
     assert reprojection_error(scene, truth) < 1e-3
-    assert len(scene.points) == 10_000  # drawn between the bounds
+    assert len(scene.points) == 10_000  # random points between the depth bounds
 
 
 def test_the_models_poses_win_over_poses_bounds(tmp_path):
@@ -126,7 +126,10 @@ def test_spin_nerf_split_and_masks(tmp_path, mask_value):
 
 
 def test_cameras_without_pixels_stay(tmp_path):
-    """Their pictures are no part of what is read, and one training view is enough beside them."""
+    """Views of `cameras_only` keep their cameras, but their pictures are not read.
+
+    A scene with such views needs only one training view.
+    """
     folder = write_capture(tmp_path / "s", "colmap", make_truth())
     everyone, out = run_stages(folder)
     for path in (folder / "masks", out):
@@ -188,7 +191,10 @@ def test_spin_nerf_with_a_missing_training_mask(tmp_path):
 
 @pytest.mark.parametrize("longest, taken", [(WIDTH, 1), (WIDTH + 2, 4), (4 * WIDTH, 4), (5000, 4)])
 def test_spin_nerf_at_the_size_that_is_asked_for(tmp_path, longest, taken):
-    """Pictures of images_4 or of the full size, the cameras with them, distortion too; the masks of images_4."""
+    """`longest` selects the pictures of images_4 or the pictures of full size.
+
+    The cameras are scaled to the pictures, with lens distortion, and so are the masks, which exist in images_4 only.
+    """
     truth = write_spin_nerf(tmp_path / "s")
     scene, out = run_stages(tmp_path / "s", longest=longest)
     width = min(longest, taken * WIDTH)
@@ -200,7 +206,8 @@ def test_spin_nerf_at_the_size_that_is_asked_for(tmp_path, longest, taken):
         rows, columns = np.nonzero(mask)
         factor = width / WIDTH
         sides = np.array([rows.min(), rows.max() + 1, columns.min(), columns.max() + 1]) / factor
-        np.testing.assert_allclose(sides, [HEIGHT / 4, HEIGHT / 2, WIDTH / 4, WIDTH / 2], atol=2.5)  # the lens bends
+        # The tolerance is 2.5 px, because undistortion moves the sides of the mask.
+        np.testing.assert_allclose(sides, [HEIGHT / 4, HEIGHT / 2, WIDTH / 4, WIDTH / 2], atol=2.5)
 
 
 def test_spin_nerf_the_folder_that_is_named_wins(tmp_path):
@@ -231,7 +238,7 @@ def test_spin_nerf_folders_are_named_in_a_line_each(tmp_path):
     assert "lacks images_4/test_label (no test views" in lines["2"] and "images (full size" in lines["2"]
     assert lines["3"].startswith("cannot be run: lacks poses_bounds.npy") and "4 training" in lines["book"]
     assert [name for name, state in lines.items() if state == "not there"] == ["4", "7", "9", "10", "12", "trash"]
-    run_stages(tmp_path / "book", longest=4 * WIDTH)  # the model stands for poses_bounds.npy
+    run_stages(tmp_path / "book", longest=4 * WIDTH)  # the COLMAP model replaces poses_bounds.npy
     assert image_size(tmp_path / "book_out/images/v00.png")[0] == 4 * WIDTH
     with pytest.raises(ValueError, match="no scenes of SPIn-NeRF"):
         spinnerf.summarize_scenes(tmp_path / "notes")
@@ -332,7 +339,7 @@ def test_pictures_of_several_sizes_each_with_its_camera(tmp_path, layout):
 
 @pytest.mark.parametrize("brings", ["points", "bounds", "nothing"])
 def test_normalisation_knows_no_units_and_no_offset(tmp_path, monkeypatch, brings):
-    """A scene a thousand times larger, a million extents away, has the same normalised numbers."""
+    """A scene 1000 times larger, and millions of extents from the origin, has the same normalised cameras."""
     monkeypatch.setattr(poses, "LEAST_POINTS", 1)
     found = []
     for k, (scale, offset) in enumerate([(1.0, (0.0, 0.0, 0.0)), (1000.0, (4e9, -3e9, 1e9))]):
@@ -371,7 +378,7 @@ def test_random_points_are_seen_seeded_and_coloured(tmp_path, monkeypatch):
         uv = at[:, :2] / at[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         seen += (at[:, 2] > 0) & ((uv >= 0) & (uv <= (camera.width, camera.height))).all(axis=1)
     assert (seen >= 2).mean() > 0.95
-    assert set(np.unique(scene.point_colors)) == set(range(40, 46))  # the six pictures' greys
+    assert set(np.unique(scene.point_colors)) == set(range(40, 46))  # the grey levels of the six pictures
 
 
 def test_what_the_scene_brings_comes_into_the_normalised_frame(tmp_path):
@@ -457,10 +464,10 @@ def test_statue(tmp_path):
     )
     assert next(iter(found.poses.lenses.values())).model == "PINHOLE" and not found.warnings
     names = ["IMG_2707", "IMG_2716", "IMG_2736"]
-    scene, out = run_on_real_capture(tmp_path, "statue", train=names, longest=504)  # images_2, whose masks these are
+    scene, out = run_on_real_capture(tmp_path, "statue", train=names, longest=504)  # the size of images_2
     masks = load_raw_masks(out, names)
     assert all(0.03 < mask.mean() < 0.3 and mask.shape == (378, 504) for mask in masks.values())
-    # The statue's points, by the masks, agree from view to view: the poses and the points share a frame.
+    # Most points that one mask contains are in all masks, so the poses and the points are in one frame.
     inside = np.ones(len(scene.points), bool)
     shares = []
     for name in names:
@@ -490,7 +497,7 @@ def test_bear(tmp_path):
         difference = image[uv[ok, 1], uv[ok, 0]].astype(float) - scene.point_colors[ok]
         chance = image[uv[ok, 1], uv[ok, 0]].astype(float) - np.roll(scene.point_colors[ok], 997, axis=0)
         shares.append(np.abs(difference).mean() / np.abs(chance).mean())
-    assert max(shares) < 0.8  # points have the colours of the pixels they fall on, more than by chance
+    assert max(shares) < 0.8  # points match their own pixels better than random ones
 
 
 def test_fox(tmp_path):
@@ -504,7 +511,10 @@ def test_fox(tmp_path):
 
 
 def test_statue_has_its_cameras_adjusted(tmp_path, monkeypatch):
-    """Its phone's stabiliser moved the lens: far things miss near ones by a third of a pixel at 252 x 189."""
+    """Adjusted cameras reduce the residual of the capture `statue`, whose phone moved the lens to stabilise the image.
+
+    At 252 x 189 px, the given cameras have an error of a third of a pixel between far and near objects.
+    """
     monkeypatch.setattr("reffusion.capture.refine.TRACKS", 4000)
     plain, _ = run_on_real_capture(tmp_path / "plain", "statue", longest=252)
     scene, out = run_on_real_capture(tmp_path / "adjusted", "statue", longest=252, refine=True)

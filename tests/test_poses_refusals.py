@@ -83,7 +83,7 @@ def test_refusals_name_file_and_remedy(tmp_path, change, params, message):
         change(folder)
     with pytest.raises(ValueError, match=message):
         run_stages(folder, **params)
-    assert not list((tmp_path / "s_out").rglob("*.*"))  # nothing was done before
+    assert not list((tmp_path / "s_out").rglob("*.*"))  # no file was written before the refusal
 
 
 def test_llff_refusals(tmp_path):

@@ -155,7 +155,7 @@ def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny
     with safe_open(tmp_path / "out" / "portable.safetensors", "pt") as file:
         assert all(key.startswith(("unet.", "text_encoder.text_model.")) for key in file.keys())
         bare = {key: file.get_tensor(key) for key in file.keys()}
-    save_file(bare, tmp_path / "out" / "bare.safetensors")  # as a tool reads it that knows no configuration: B A
+    save_file(bare, tmp_path / "out" / "bare.safetensors")  # without metadata: the update is B A
     for name in ("portable", "bare"):
         pipe.unload_lora_weights()
         pipe.load_lora_weights(tmp_path / "out", weight_name=f"{name}.safetensors")
@@ -169,7 +169,7 @@ def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny
 
 def test_lora_added_to_the_weights_has_the_gradients_of_lora_beside_them():
     gradients = []
-    for dropout in (0.1, 0.0):  # in evaluation mode dropout does nothing
+    for dropout in (0.1, 0.0):  # a dropout of 0 adds LoRA to the weights; in evaluation mode 0.1 has no effect
         prior = load_prior(TINY)
         found = lora.attach(prior, 4, 8.0, dropout, "attention+conv", 0)
         noise = generator(0, "lora")

@@ -1,4 +1,4 @@
-"""The report on a prior: scores inside a hole, a held-out set outside the training data, and the page."""
+"""The report on a prior: scores inside holes, the held-out test set, and the page with the results."""
 
 import argparse
 import json
@@ -42,9 +42,8 @@ def test_only_the_hole_counts(hole_cases):
     assert holes.hole_scores(spoilt, case.truth, case.hole)["psnr"] == image_metrics.PSNR_CAP
     inside = case.truth.copy()
     inside[case.hole] = np.clip(inside[case.hole].astype(int) + 10, 0, 255)
-    whole = image_metrics.psnr(inside, case.truth) + 10 * np.log10(
-        case.hole.mean()
-    )  # all of its error lies in the hole
+    # The whole error lies in the hole, so the PSNR of the hole follows from the PSNR of the image.
+    whole = image_metrics.psnr(inside, case.truth) + 10 * np.log10(case.hole.mean())
     assert holes.hole_scores(inside, case.truth, case.hole)["psnr"] == pytest.approx(whole)
     with pytest.raises(ValueError, match="hole is empty"):
         holes.hole_scores(case.truth, case.truth, case.hole & False)
@@ -66,7 +65,7 @@ def test_holes_are_objects_of_a_fair_size(hole_cases):
     for case in hole_cases:
         assert holes.COVER[0] <= case.hole.mean() <= holes.COVER[1]
         parts, _ = cv2.connectedComponents(case.hole.astype(np.uint8))
-        assert parts - 1 <= 3 + 2  # three outlines; a self-crossing one may fall into pieces
+        assert parts - 1 <= 3 + 2  # three outlines; one that crosses itself may form several parts
 
 
 def test_a_wrong_reference_has_another_picture_and_the_same_holes(tmp_path):
@@ -89,7 +88,7 @@ def test_settings_are_checked_and_come_last():
 
 
 def write_benchmark_result(folder: Path) -> None:
-    """Write a small synthetic result of the benchmark."""
+    """Write a small synthetic result of the benchmark: prior.json and the folders of images."""
     row = {"psnr": 20.0, "ssim": 0.5, "flip": 0.2, "energy": 0.7, "psnr_error": 0.3, "pictures": 2}
     better, scales = row | {"psnr": 22.0}, ("reference", "whole", "window")
     sampler = {"4": row | {"seconds": 0.05}}

@@ -1,4 +1,4 @@
-"""Training of the embedded prior: pictures and steps depend on the seed alone, and runs resume exactly."""
+"""Training of the embedded prior: images and training steps depend only on the seed, and runs resume exactly."""
 
 import subprocess
 import sys
@@ -98,7 +98,7 @@ def load_weights(folder):
 
 @pytest.fixture
 def train_command(monkeypatch, tmp_path):
-    """`train.py` with small batches, as a function that returns the exported weights."""
+    """Return a function that runs `train.py` with small batches and returns the exported weights."""
     for name, value in (
         ("POOL", 6),
         ("SMALL", (16, 2)),
@@ -122,13 +122,15 @@ def test_a_run_that_was_killed_and_resumed_equals_the_unbroken_one(train_command
     unbroken, once = train_command("one", 6), train.step_once
 
     def killed(*values):
-        if values[-2] == 4:  # one step after a checkpoint, an odd number of steps: a new image falls into the gap
+        # Step 4 comes one step after a checkpoint. A new image joins the pool between checkpoint and kill.
+        if values[-2] == 4:
             raise KeyboardInterrupt
         return once(*values)
 
     monkeypatch.setattr(train, "step_once", killed)
     with pytest.raises(KeyboardInterrupt):
-        train_command("two", 8)  # more steps than it will get: the first half of a run does not depend on their number
+        # The run is killed before step 8. The first half of a run does not depend on the number of steps.
+        train_command("two", 8)
     monkeypatch.setattr(train, "step_once", once)
     resumed = train_command("two", 6)
     for part, tensors in unbroken.items():
@@ -139,7 +141,8 @@ def test_start_begins_with_a_folders_weights(train_command):
     initial, after = load_weights(TINY), train_command("start", 1, "--start", str(TINY))
     fresh = train_command("anew", 1)
     for part, tensors in initial.items():
-        # The first step of the warm-up moves each weight by about its rate, 5e-6; half precision rounds to 1e-3 of it.
+        # The first warm-up step moves each weight by about the learning rate, 5e-6. The export in half precision
+        # rounds a weight to about 1e-3 of its value.
         moved = max(float((after[part][name] - value).abs().max()) for name, value in tensors.items())
         assert moved < 4e-3, part
         assert any(float((fresh[part][name] - value).abs().max()) > 0.05 for name, value in tensors.items())

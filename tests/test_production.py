@@ -1,4 +1,7 @@
-"""The production path at a small size: SDXL, parts of a batch, half precision, memory budgets, two benchmarks."""
+"""Features for production on a GPU, tested with small models on the CPU.
+
+They are SDXL, batches that are processed in parts, half precision, memory budgets, and two GPU benchmarks.
+"""
 
 import gc
 import json
@@ -28,7 +31,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @pytest.fixture(scope="module")
 def sdxl_prior(tmp_path_factory):
-    """A prior in the shape of SDXL, loaded from a folder that diffusers wrote."""
+    """Return a small prior with the architecture of SDXL, loaded from a folder that diffusers wrote."""
     folder = tmp_path_factory.mktemp("sdxl")
     pipeline(replace(F.build_prior(F.shrink(F.SDXL), torch.float32), zero_empty=True)).save_pretrained(folder)
     return load_prior(folder)
@@ -103,14 +106,15 @@ def test_a_training_step_in_parts_is_the_same_step():
     for rows in (0, 2):
         prior = F.build_prior(F.shrink(F.SD2), torch.float32)
         trained, optimizer, training = F.trainer(prior, 5)
-        for part in (prior.unet, prior.text_encoder):  # dropout's draws depend on the parts
+        for part in (prior.unet, prior.text_encoder):  # no dropout: its random draws depend on the split into parts
             for layer in part.modules():
                 layer.p = 0.0 if isinstance(layer, torch.nn.Dropout) else getattr(layer, "p", None)
         prior = replace(prior, rows_with_grad=rows)
         loss = train_step(prior, optimizer, [F.reference(32)], training, 0)
         after.append((loss, [p.detach().clone() for part in trained.values() for p in part]))
     assert after[0][0] == pytest.approx(after[1][0], rel=1e-5)
-    # Adam's first step has the size of the learning rate; where a gradient is all but 0 its sign is a rounding's.
+    # Adam's first step has the size of the learning rate and the gradient's sign. The sign of a gradient of almost 0
+    # depends on rounding, so a few weights may differ.
     close = [torch.isclose(a, b, atol=2e-5).float().mean() for a, b in zip(after[0][1], after[1][1], strict=True)]
     assert min(close) > 0.97
 
@@ -131,7 +135,7 @@ def test_half_precision_stays_near_and_leaves_the_vae_alone(sd2_prior):
     assert eps_half.dtype == clean_half.dtype == torch.float32
     error = (eps_half - eps).abs().max()
     assert 0 < error < 0.1
-    # x0 = (z - s eps) / a itself loses nothing: its error is that of eps, times s / a.
+    # The formula x0 = (z - s eps) / a runs in float32: the error of x0 is the error of eps times s / a.
     a = diffusion.alpha_bar(sd2_prior, at)
     assert torch.allclose(clean_half - clean, -((1 - a) / a).sqrt() * (eps_half - eps), atol=1e-4)
 
@@ -140,7 +144,7 @@ def test_half_precision_stays_near_and_leaves_the_vae_alone(sd2_prior):
 def test_a_small_lora_is_not_lost_in_half_precision(sd2_prior, dropout):
     half = F.build_prior(F.shrink(F.SD2), torch.bfloat16)
     half.unet.load_state_dict(sd2_prior.unet.state_dict())
-    sd2_prior.unet.load_state_dict(half.unet.state_dict())  # the same rounded weights in float32
+    sd2_prior.unet.load_state_dict(half.unet.state_dict())  # equal weights: both rounded to bfloat16
     noisy, condition, at, text = (
         draw_normal(1, 4, 16, 16),
         draw_normal(1, 5, 16, 16),
@@ -159,11 +163,14 @@ def test_a_small_lora_is_not_lost_in_half_precision(sd2_prior, dropout):
         changes.append((layer(x) - layer.base_layer(x)).float().flatten().detach())
         assert torch.isfinite(diffusion.raw_prediction(prior, noisy, at, condition, text) - before).all()
     exact, rounded = changes
-    assert torch.dot(exact, rounded) / exact.norm() / rounded.norm() > 0.65  # 0.41 where it is added to the weights
+    assert torch.dot(exact, rounded) / exact.norm() / rounded.norm() > 0.65  # 0.41 if LoRA is added to the weights
 
 
 def test_a_lora_loads_into_diffusers_own_pipeline_of_sd2(sd2_prior, tmp_path):
-    """Its UNet's and its text encoder's part, by `load_lora_weights`, into models of the same weights."""
+    """`load_lora_weights` of diffusers loads the saved LoRA of UNet and text encoder into a model of the same weights.
+
+    The predictions and text embeddings then equal those of the trained model.
+    """
     before = F.epsilon(sd2_prior)
     found = lora.attach(sd2_prior, 4, 8.0, 0.1, "attention", 0)
     noise = generator(0, "lora")
@@ -174,13 +181,16 @@ def test_a_lora_loads_into_diffusers_own_pipeline_of_sd2(sd2_prior, tmp_path):
     fresh = F.build_prior(F.shrink(F.SD2), torch.float32)
     pipe = pipeline(fresh)
     pipe.load_lora_weights(tmp_path)
-    lora.set_dropout(fresh, False)  # new layers begin in training mode
+    lora.set_dropout(fresh, False)  # turn dropout off, as new layers are in training mode
     assert (F.epsilon(fresh) - trained).abs().max() < 1e-5 < (trained - before).abs().max()
     assert (diffusion.embed_text(fresh, [crops.PROMPTS[0]]) - words).abs().max() < 1e-5
 
 
 def test_the_order_of_weights_in_memory_changes_nothing(sd2_prior, tmp_path):
-    """What a UNet on CUDA is laid out like: the same answer, with LoRA that is trained, saved and merged."""
+    """A UNet in the memory format channels_last, which is used on CUDA, gives the same answers.
+
+    This also holds after a trained and saved LoRA was merged into the UNet.
+    """
     lora.attach(sd2_prior, 4, 8.0, 0.0, "attention+conv", 0)
     before = F.epsilon(sd2_prior)
     sd2_prior.unet.to(memory_format=torch.channels_last)
@@ -215,8 +225,8 @@ def test_living_tensors_are_counted():
         a = torch.zeros(1000)  # 4000 bytes
         b = a + 1
         del a
-        c = b.view(10, 100)  # no memory of its own
-        return torch.cat([c, c])  # 8000 beside b's 4000
+        c = b.view(10, 100)  # a view, without memory of its own
+        return torch.cat([c, c])  # 8000 bytes, while b still holds 4000
 
     assert memory.peak_bytes(work, "cpu") == 12_000
     kept = torch.zeros(1000)
@@ -270,7 +280,7 @@ def test_memory_is_counted_without_computing():
     made = F.build_prior(shape, torch.float32)
     assert counted["weights"] == pytest.approx(made.bytes / 1e9, abs=1e-6)
     real = memory.peak_bytes(lambda: memory.encode_one_sample(made), "cpu") / 1e9
-    assert real <= counted["SDS"] < 2 * real  # attention is taken apart there
+    assert real <= counted["SDS"] < 2 * real  # the count decomposes attention, which needs more memory
     assert counted["personalization, checkpointing"] < counted["personalization"]
 
 
@@ -280,14 +290,17 @@ def test_the_full_size_benchmark_at_a_small_size(tmp_path, monkeypatch, dtype):
     F.main()
     report = json.loads((tmp_path / "full_size.json").read_text())
     assert report["personalization step"]["lora_text"] > 0 and report["SDS step"]["gradient_norm"] > 0
-    # Saved with rank, alpha and text encoder, loaded by diffusers into a fresh model of the same weights.
+    # The LoRA was saved with rank, alpha and text encoder, and diffusers loaded the file into a new, equal model.
     assert report["epsilon difference"] < (1e-5 if dtype == "float32" else 0.05 * report["epsilon size"])
 
 
 @pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes a minute; set REFFUSION_SLOW=1")
 def test_gpu_check_keeps_what_it_has(tmp_path, monkeypatch):
-    """At a small size on the CPU, with a critic that runs out of memory: that part says so in a line; all others have
-    their figures, against the oracle and in seconds; the file is whole after each part."""
+    """The benchmark runs at a small size on the CPU, and its part with the critic runs out of memory.
+
+    The report states this failure in one line and has the errors and seconds of all other parts. Its file is complete
+    after each part.
+    """
 
     def full(*arguments):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate\n 20.00 GiB")

@@ -1,4 +1,7 @@
-"""References with a redrawn texture are accepted if they show their view, and else refused with numbers."""
+"""References whose texture was redrawn, e.g. by an image model, are accepted if they show their view.
+
+Other pictures are refused with a message that gives the measured shares.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ def paint_object(image: np.ndarray) -> np.ndarray:
 
 
 def shift_bands(image: np.ndarray, parallax: float) -> np.ndarray:
-    """The picture from beside: bands displaced by 4 px, and every second one by `parallax` px more."""
+    """Imitate a picture from a neighbouring position: bands move by 4 px, every second band by `parallax` px more."""
     rows, columns = (grid.astype(np.float32) for grid in np.mgrid[: image.shape[0], : image.shape[1]])
     displaced = 4 + parallax * ((columns // 80).astype(int) % 2)
     return cv2.remap(
@@ -99,7 +102,10 @@ def test_what_cannot_be_compared_is_accepted_and_says_so(size, kind):
 
 
 def test_the_nearest_photograph_tells_views_of_a_plane_apart():
-    """Views of a plane are displaced alike: only the photograph that the picture shows tells it from a crop."""
+    """A picture of a wall from another view is recognised because it fits the photograph of that view better.
+
+    Two views of a plane differ like a photograph and its crop, so a comparison with one photograph cannot decide.
+    """
     views = {name: wall_scene.photo(wall_scene.CAMERAS[name]) for name in ("a2", "a3")}
     nothing = np.zeros(views["a2"].shape[:2], bool)
     picture = redrawn.redraw(views["a3"])
@@ -183,7 +189,10 @@ def test_a_painting_is_trusted_by_a_line_that_names_it(wall_folders, tmp_path):
 
 @pytest.mark.parametrize("name", ["bear", "dinosaur", "fox", "garden", "statue"])
 def test_real_photographs(name):
-    """Every tenth view: its redrawn picture is accepted; its nearest views' photographs and another scene's are not."""
+    """For every 40th view, its redrawn photograph is accepted.
+
+    The photographs of the two nearest views and a photograph of another scene are refused.
+    """
     capture, foreign = (
         redrawn.load_photographs(real_capture(each)) for each in (name, "bear" if name != "bear" else "garden")
     )

@@ -1,4 +1,7 @@
-"""User references: named, painted or from other tools; what reruns for them, and what is refused."""
+"""User references: pictures named in scene.yaml, painted by hand, or made by other tools.
+
+Tested are registration, depth maps, refusals, the stage `reference`, and which stages rerun for a new reference.
+"""
 
 from __future__ import annotations
 
@@ -122,7 +125,10 @@ def test_another_picture_fits_badly_and_a_plain_one_cannot_be_told():
 
 
 def test_of_a_picture_like_its_photograph_the_hole_alone_is_taken(wall_folders, tmp_path):
-    """A corner that the user repainted beside the hole stays that of the photograph."""
+    """If a reference matches its photograph, only the hole is taken from the reference.
+
+    A corner that the user repainted far from the hole keeps the photograph's pixels.
+    """
     photo = load_image(wall_folders["poses"] / "images/a2.png")
     picture = wall_scene.photo(wall_scene.CAMERAS["a2"]).copy()
     picture[:20, :20] = 255 - picture[:20, :20]
@@ -153,7 +159,10 @@ def test_only_the_hole_and_its_rim_are_taken():
 
 
 def test_a_moved_reference_is_read_once_through_the_lens(tmp_path):
-    """Distorted, cropped, resized: straight again, as the photograph's own undistorted picture."""
+    """Undistortion of a reference applies the lens and an affine map in one resampling.
+
+    The identity map changes nothing, and a depth map is undistorted and shifted like its picture.
+    """
     shot = lens.from_colmap(OPENCV[0], WIDTH, HEIGHT, OPENCV[1])
     image = natural_noise(3, (WIDTH, HEIGHT))
     save_image(tmp_path / "whole.png", image)
@@ -194,20 +203,23 @@ def test_depth_of_any_kind_is_brought_to_the_scenes(tmp_path, kind):
     known = np.ones_like(z, bool)
     known[20:40, 30:50] = False
     DEPTHS[kind](tmp_path / kind.split()[-1], z)
-    seen = np.where(rng.random(z.shape) < 0.2, 1.5 * z, z)  # a fifth of what is seen is something else
+    seen = np.where(rng.random(z.shape) < 0.2, 1.5 * z, z)  # a fifth of the visible depths are outliers
     aligned, space = alignment.align_either(load_depth(tmp_path / kind.split()[-1]), np.where(known, seen, 0), known)
     np.testing.assert_allclose(aligned, z, rtol=2e-3)
     assert space == ("disparity" if "disparity" in kind else "depth")
 
 
 def test_depth_in_the_scenes_unit_stays_as_it_is():
-    """Where what is seen is noisy a line of its own would move it; in another unit it has to be fitted."""
+    """A depth map in the scene's unit is not changed, because a line fitted to noisy visible depth would move it.
+
+    A depth map in another unit is fitted.
+    """
     rng = np.random.default_rng(1)
     z = 2 + 0.01 * np.arange(40)[:, None] + np.zeros((40, 40))
     seen = z * rng.normal(1.01, 0.05, z.shape)
     everywhere = np.ones(z.shape, bool)
     assert np.array_equal(alignment.align_either(z, seen, everywhere)[0], z)
-    assert np.array_equal(alignment.align_either(z, 1.015 * z, everywhere)[0], z)  # no chance, though a line is exact
+    assert np.array_equal(alignment.align_either(z, 1.015 * z, everywhere)[0], z)  # although a line fits exactly
     other, _ = alignment.align_either(3 * z, seen, everywhere)
     assert 0.9 < np.median(other / z) < 1.1 and not np.array_equal(other, z)
 
@@ -276,7 +288,7 @@ REFUSALS = [
 
 
 def write_reference_capture(folder: Path, painted=()) -> Path:
-    """Write a capture with the files that `REFUSALS` names."""
+    """Write a capture with the files that `REFUSALS` names; return `folder`. `painted` are file names in painted/."""
     write_capture(folder, "transforms", make_truth())
     write_pictures(folder, ["ref"])
     write_pictures(folder, ["tall"], (HEIGHT, WIDTH))
@@ -294,7 +306,8 @@ def test_references_are_refused_before_any_work(tmp_path, params, painted, messa
         plan_poses.preview(poses.Params(**params), folder)
 
 
-# A view that `poses` did not place may be the capture's all the same: what is said of it is said by `poses`' preview.
+# The stage `reference` cannot know whether a view without a pose exists in the capture. Its messages for such views
+# therefore differ from those of the preview of `poses`.
 UNPLACED = {
     "unknown view": r"ref\.png: its view 'q' could not be placed.*v0",
     "neither": r"ref\.png: its view 'v01' could not be placed, or is neither a training",
@@ -308,7 +321,7 @@ def test_references_are_refused_by_what_poses_wrote(tmp_path, name, params, pain
     spec = params.get("reference")
     _, placed = run_stages(folder, **{key: value for key, value in params.items() if key != "reference"})
     for layout in ("images", "masks"):
-        shutil.rmtree(folder / layout)  # nothing of the capture is looked at
+        shutil.rmtree(folder / layout)  # the stage must not read the capture
     (folder / "transforms.json").unlink()
     with pytest.raises(ValueError, match=UNPLACED.get(name, message)):
         plan_reference.preview(reference.Params(reference=spec), scene=folder, poses=placed)
@@ -319,7 +332,7 @@ def test_references_are_refused_by_what_poses_wrote(tmp_path, name, params, pain
 
 
 def test_the_stage_reads_nothing_of_the_capture(tmp_path):
-    """So mending a reader of captures reruns `poses` at most."""
+    """The code of the stage `reference` includes no reader of captures, so a change of a reader does not rerun it."""
     code = code_fingerprints(ROOT, "reference", Hashes(tmp_path / "hashes.json"))
     readers = ("reffusion/capture/layouts/", "reffusion/capture/load.py", "reffusion/capture/roles.py")
     assert "reffusion/references/files.py" in code and not [path for path in code if path.startswith(readers)]
@@ -347,7 +360,7 @@ def test_a_view_without_a_pose_is_named(tmp_path):
     save_json(tmp_path / "views.json", {"train": ["v00"], "test": [], "clean": []})
     with pytest.raises(ValueError, match=r"ref\.png: its view 'v01' could not be placed"):
         plan_reference.preview(reference.Params(**reference_entry("v01")), scene=folder, poses=tmp_path)
-    write_pictures(folder, ["painted/v00", "painted/v01_mask"])  # a mask that was copied along
+    write_pictures(folder, ["painted/v00", "painted/v01_mask"])  # a mask that the user copied too
     (note,) = plan_reference.preview(reference.Params(), scene=folder, poses=tmp_path)
     assert "v00 (painted)" in note
 
@@ -408,7 +421,10 @@ def test_pictures_to_paint_are_exported_and_paintings_are_read_back(wall_folders
 
 
 def test_views_are_ranked_by_what_they_cover_beyond_those_before():
-    """Three cameras at a wall: two see the same piece of it, the third another, of which its border cuts off a part."""
+    """Each next view in the ranking is the one that covers most of the hole not covered by the views before.
+
+    Cameras a and b see the same part of a wall. Camera c sees another part, which the image border cuts off.
+    """
 
     def hole(name: str, x: float, columns: slice) -> view_ranking.Hole:
         camera = wall_scene.front_camera(name, x)
@@ -423,7 +439,7 @@ def test_views_are_ranked_by_what_they_cover_beyond_those_before():
     assert [each.view for each in view_ranking.rank_views(holes, ["b"], 3)] == ["b", "c", "a"]
 
 
-# ------------------------------------------------------------------------------------------ what reruns, and what stays
+# -------------------------------------------------------------------------------------------------------------- reruns
 
 
 SMALL = "poses.refine=false fit.iterations=20 fit.densify.cap_max=1000 masks.invent=consistent masks.inside_share=1"
@@ -490,7 +506,7 @@ def test_saved_masks_rerun_neither_poses_nor_the_fit(tmp_path):
     last = max(masks)
     save_mask(last, np.roll(load_image(last)[..., 0] > 0, 2, 0))
     assert words()["raw_masks"] == "run" and words()["poses"] == "cached"
-    last.unlink()  # a view without a mask is a training view all the same
+    last.unlink()  # a view without a mask is still a training view
     assert words()["raw_masks"] == "run" and words()["poses"] == "cached"
     (folder / "scene.yaml").write_text("test: [a0]\n")
     assert words()["poses"] == "run"
@@ -513,7 +529,7 @@ def test_a_photograph_that_is_also_a_reference_still_counts_for_poses(tmp_path):
 
 
 def test_contradicting_references_are_detected():
-    """Two views of a wall: the same paint on it, then another in one of them."""
+    """References of two views of a wall agree if they show the same wall, and contradict if one has other colours."""
     views = [wall_scene.front_camera("a", -0.2), wall_scene.front_camera("b", 0.2)]
     depth = np.full((wall_scene.HEIGHT, wall_scene.WIDTH), wall_scene.WALL)
     hole = np.zeros_like(depth, bool)
@@ -531,7 +547,11 @@ def test_contradicting_references_are_detected():
 
 
 def test_objects_in_front_of_a_scene_are_compared_at_their_own_depth():
-    """A striped square before a wall and a step: true in both views; without its depth nothing can be said."""
+    """References that insert an object are compared at the depth of the object, which their depth maps give.
+
+    The object is a striped square before a wall and a step. The references agree at its depth, but not at the depth of
+    the wall. Without depth maps, no comparison is possible.
+    """
     near, step = 1.4, 1.7
     floor = wall_scene.rectangle_gaussians(step, 2.0, 0.25, wall_scene.wall_color)
     floor = replace(floor, means=floor.means + torch.tensor([0.0, 0.6, 0.0]))
@@ -551,7 +571,7 @@ def test_objects_in_front_of_a_scene_are_compared_at_their_own_depth():
     holes = view_ranking.find_holes(scene, cameras, hidden, {each.camera.name: each.mask for each in references})
     measured = agreement.refine_hole_depth(holes, references, scene, hidden)
     assert set(measured) == {"a", "b"} and not agreement.find_contradictions(references, measured)
-    assert agreement.find_contradictions(references, holes)  # at the wall's depth the stripes would not meet
+    assert agreement.find_contradictions(references, holes)  # the stripes differ at the wall's depth
     assert agreement.refine_hole_depth(holes, [replace(each, depth=None) for each in references], scene, hidden) == {}
     other = replace(references[1], image=references[1].image[..., [2, 0, 1]])
     assert agreement.find_contradictions([references[0], other], measured)

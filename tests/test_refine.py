@@ -1,4 +1,4 @@
-"""Camera refinement corrects wrong cameras, and leaves exact and undetermined ones."""
+"""Camera refinement corrects wrong cameras, and does not change exact cameras or cameras without constraints."""
 
 from dataclasses import replace
 from functools import cache
@@ -18,7 +18,7 @@ WIDTH, HEIGHT, FOCAL = 216, 162, 200.0
 
 
 def tilted_camera(name: str, x: float, y: float, z: float, turn: float) -> Camera:
-    """At (x, y, -1 + z), turned about y."""
+    """Return a camera at (x, y, -1 + z), rotated by `turn` radians about y and by 0.3 of this angle about x."""
     rotation = Rotation.from_rotvec((0.3 * turn, turn, 0.0)).as_matrix()
     return make_camera(name, (WIDTH, HEIGHT), FOCAL, (x, y, z - 1.0), rotation)
 
@@ -32,7 +32,10 @@ WAVES = RNG.normal(0, 1, (80, 2)), RNG.uniform(0, 6.3, (80, 3))
 
 
 def paint_two_walls(view: Camera) -> np.ndarray:
-    """A painted wall at z = 4 and another at z = 0.6 that covers its left half."""
+    """Render two textured walls as the camera sees them, uint8 [H, W, 3].
+
+    The far wall is at z = 4. The near wall at z = 0.6 covers x < 0.
+    """
     rays = world_rays(view)
     near, far = (view.center + rays * ((z - view.center[2]) / rays[..., 2:]) for z in (0.6, 4.0))
     paint = lambda at, scale: np.sin((at[..., :2] @ (scale * WAVES[0]).T)[..., None] + WAVES[1]).sum(2) / 80**0.5
@@ -44,7 +47,7 @@ PHOTOS = {view.name: paint_two_walls(view) for view in EXACT}
 
 
 def perturb_cameras(shift: float, turn: float) -> list[Camera]:
-    """Cameras that claim a principal point about `shift` px off and a rotation about `turn` degrees off."""
+    """Return cameras with errors of about `shift` px in the principal point and `turn` degrees in the rotation."""
     rng, views = np.random.default_rng(5), []
     for view in EXACT:
         pose = view.world_to_camera.copy()
@@ -75,11 +78,11 @@ def test_exact_cameras_are_left_as_they_are():
 def test_perturbed_cameras_are_corrected(shift, turn):
     views, found = perturb_cameras(shift, turn), refine_perturbed(shift, turn)
     assert found.before > 2 * refine.GOOD_RESIDUAL and found.after < 0.12
-    # where the pixels of the far and the near wall's points come to lie, against the truth
+    # The error is measured at points between the near and the far wall, projected with the found and the true cameras.
     points = np.random.default_rng(6).uniform((-0.3, -0.25, 0.6), (0.3, 0.25, 4.0), (400, 3))
 
     def spread(cameras) -> float:
-        """px between where these cameras and the true ones see points, less what is the same in all views."""
+        """Return the mean reprojection error in px against the true cameras, without the part common to all views."""
         errors = np.array([project_points(points, cameras[view.name]) - project_points(points, view) for view in EXACT])
         return float(np.abs(errors - errors.mean(0)).mean())
 
@@ -104,7 +107,7 @@ def test_a_view_that_shares_nothing_stays_and_hinders_nothing():
 
 def test_a_principal_point_beyond_reason_is_not_followed():
     cameras = perturb_cameras(0.5, 0.0)
-    cameras[4] = replace(cameras[4], cx=cameras[4].cx + 0.1 * WIDTH)  # a crop that nobody told of
+    cameras[4] = replace(cameras[4], cx=cameras[4].cx + 0.1 * WIDTH)  # an unrecorded crop
     found = refine.refine_cameras(cameras, PHOTOS)
     assert abs(found.cameras["v4"].cx - cameras[4].cx) < 1e-9
 
@@ -117,7 +120,10 @@ def test_the_same_pictures_give_the_same_cameras():
 
 
 def test_inexplicable_matches_move_no_camera():
-    """Leaves in the wind, a rolling shutter: each picture is bent by another half a pixel, the cameras are exact."""
+    """No camera changes if cameras cannot explain the residuals, as for leaves in the wind or a rolling shutter.
+
+    The cameras are exact, and each picture is distorted differently, by about half a pixel.
+    """
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     rng, pictures = np.random.default_rng(7), {}
     for name, picture in PHOTOS.items():

@@ -1,4 +1,4 @@
-"""Remnants: parts of the object that masks leave out are found, and nothing else is."""
+"""Detection of remnants: parts of the object that the masks miss are found, and no other parts of the scene."""
 
 from contextlib import nullcontext
 
@@ -21,7 +21,7 @@ BLUE = (0.1, 0.3, 0.9)
 
 
 def cut_away(labels: torch.Tensor, gaussians: Gaussians, axis: int, share: float) -> torch.Tensor:
-    """The labels without the outermost share of the object along an axis."""
+    """Return the labels without the outermost `share`, in [0, 1], of the object's Gaussians along an axis."""
     at = gaussians.means[:, axis]
     return labels & (at < at[labels].quantile(1 - share))
 
@@ -60,7 +60,10 @@ def test_nothing_is_found_where_everything_is_removed():
 
 
 def test_the_stage_removes_what_would_float(tmp_path):
-    """Masks without a fifth of the square: it goes, with a warning, a picture and a whole consistent mask."""
+    """The masks miss a fifth of the square. With `remnants`, the stage `masks` labels this part as the object, too.
+
+    The stage also writes a warning, an entry in facts.json and a picture of the remnant.
+    """
     poses, fit, _ = wall_scene.write_poses_and_fit(tmp_path, 1.0)
     raw_masks = poses.with_name("raw_masks")
     for path in sorted((raw_masks / "masks").glob("*.png")):
@@ -81,12 +84,15 @@ def test_the_stage_removes_what_would_float(tmp_path):
     assert load_warnings(tmp_path / "off") == [] and not (tmp_path / "off/remnants").exists()
 
 
-# --- its parts
+# --- functions of the detection
 
 
 def test_overlap_of_two_gaussians():
-    """At a distance of d in units of the standard deviation s of both: exp(-(d / 2 s)^2 / 2), along each axis."""
-    scales, quaternion = torch.tensor([0.1, 0.2, 0.4]), torch.tensor([0.5**0.5, 0.0, 0.0, 0.5**0.5])  # x becomes y
+    """The overlap of two equal Gaussians is exp(-(d / 2 s)^2 / 2).
+
+    The distance d of their means lies along one of their axes, and s is the standard deviation along this axis.
+    """
+    scales, quaternion = torch.tensor([0.1, 0.2, 0.4]), torch.tensor([0.5**0.5, 0.0, 0.0, 0.5**0.5])  # rotates x to y
     for axis, deviation in enumerate((0.2, 0.1, 0.4)):
         means = torch.zeros(2, 3)
         means[1, axis] = 0.3

@@ -1,4 +1,4 @@
-"""The repository works on every machine: no links, no paths of one machine."""
+"""The repository is portable: its files include no symbolic links and no paths of a single machine."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-HOME = re.compile(r"(?<![\w./-])/(?:home|Users|root|work|mnt/c)/[\w.-]+/")  # a folder of somebody's machine
+HOME = re.compile(r"(?<![\w./-])/(?:home|Users|root|work|mnt/c)/[\w.-]+/")  # an absolute folder of one machine
 
 
 def tracked_files() -> list[tuple[str, Path]]:
-    """Mode and path of each file that git keeps."""
+    """Return the git mode and the path of each file tracked by git."""
     listed = subprocess.run(["git", "ls-files", "--stage", "-z"], cwd=ROOT, capture_output=True, text=True)
     if listed.returncode:
         pytest.skip("no git repository here")

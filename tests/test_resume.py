@@ -1,4 +1,4 @@
-"""A small scene end to end, with the runner killed at random moments: the result is the same.
+"""Resume of a small scene, end to end: the runner is killed at random moments, and the result is that of a whole run.
 
 RESUME_KILLS sets the number of kills: 3 by default to save time, 20 before a release.
 """
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.integration
 ROOT = Path(__file__).resolve().parent.parent
 KILLS = int(os.environ.get("RESUME_KILLS", "3"))
 STAGES = ("fit", "masks", "reference", "personalize", "initialize", "distill", "finish", "evaluate")
-# Those that resume come first.
+# The order in which stages are killed. Stages with checkpoints come first.
 IN_TURN = ("fit", "distill", "personalize", "masks", "evaluate", "initialize", "finish", "reference")
 SMALL = (
     "fit.iterations=60 fit.checkpoint_seconds=0.2 personalize.steps=8 personalize.optimizer.batch=2 "
@@ -51,7 +51,7 @@ def run_to_end(mini_scene: Path, runs: Path) -> dict:
 
 
 def kill_during(mini_scene: Path, runs: Path, stage: str, delay: float) -> bool:
-    """Kill the runner `delay` seconds after `stage` has begun; False where the stage had ended before."""
+    """Kill the runner `delay` seconds after `stage` has begun. Return False if the runner had ended before."""
     process = start_run(mini_scene, runs, stage)
     while process.poll() is None and not list((runs / mini_scene.name).glob(f".partial-{stage}-*")):
         time.sleep(0.02)
@@ -64,7 +64,7 @@ def kill_during(mini_scene: Path, runs: Path, stage: str, delay: float) -> bool:
 
 
 def assert_outputs_match_receipts(home: Path) -> None:
-    """Assert that every artifact is one that a stage finished."""
+    """Assert that the files of each stage's folder have the hash recorded in its receipt, as after a finished stage."""
     for stage in ("poses", *STAGES):
         if (home / stage).exists():
             found = read_json(home / stage / RECEIPT)
@@ -73,7 +73,7 @@ def assert_outputs_match_receipts(home: Path) -> None:
 
 @pytest.fixture(scope="module")
 def unbroken_run(mini_scene, tmp_path_factory) -> tuple[Path, dict]:
-    """The folder of an uninterrupted run, and its metrics."""
+    """Run the scene without interruption; return its folder of results and its metrics."""
     runs = tmp_path_factory.mktemp("unbroken")
     return runs / "mini", run_to_end(mini_scene, runs)
 
@@ -87,12 +87,15 @@ def test_killed_at_random_moments(mini_scene, unbroken_run, tmp_path):
         killed += kill_during(mini_scene, tmp_path / "broken", stage, random.uniform(0, seconds[stage]))
         assert_outputs_match_receipts(tmp_path / "broken/mini")
     assert run_to_end(mini_scene, tmp_path / "broken") == metrics
-    assert killed >= KILLS // 2  # the others came too late, their stage was done
+    assert killed >= KILLS // 2  # the other kills came after the end of their stage
     assert not list((tmp_path / "broken/mini").glob(".partial*"))
 
 
 def test_one_byte_flipped_in_each_kind_of_file_is_noticed_and_named(mini_scene, unbroken_run, tmp_path, capsys):
-    """Of every stage; what then runs, tests of the runner tell."""
+    """`verify` finds a changed byte in each kind of file of every stage.
+
+    Size and time of the file are unchanged. Which stages then rerun is tested in test_runner.py.
+    """
     shutil.copytree(unbroken_run[0].parent, tmp_path / "runs")
     request = Request(ROOT, tmp_path / "runs", str(mini_scene), "laptop", set=SMALL)
     assert maintenance.verify(request) == 0

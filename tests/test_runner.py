@@ -1,4 +1,4 @@
-"""The runner on a toy pipeline: what reruns and why, kills, locks, refusals, variants, batches."""
+"""The runner on a toy pipeline of fast stages: reruns and their reasons, kills, locks, refusals, variants, batches."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WORDS = ["poses", "fit", "masks", "distill", "evaluate"]
 
 
 def statuses(project: Path, **options) -> dict[str, str]:
-    """Stage -> "status reason" of the plan."""
+    """Return the plan as a dict from stage to the string "status reason"."""
     job = resolve(make_request(project, **options))
     return {s: f"{d.status} {d.reason}".strip() for s, d in plan(job, job.pipeline.closure("all")).items()}
 
@@ -59,7 +59,7 @@ def finished_project(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def project(finished_project: Path, tmp_path: Path) -> Path:
-    """A toy project in which all stages are done."""
+    """Return the folder of a toy project in which all stages are done."""
     shutil.copytree(finished_project, tmp_path / "project")
     return tmp_path / "project"
 
@@ -71,7 +71,10 @@ def empty_project(tmp_path: Path) -> Path:
 
 
 def start_runner(project: Path, *arguments: str) -> subprocess.Popen[str]:
-    """Run `fit`. A shell starts background jobs, and their children, with Ctrl-C ignored; a terminal does not."""
+    """Start a process of the runner that runs the stage `fit`.
+
+    The process handles Ctrl-C as in a terminal: a shell lets its background jobs ignore the signal SIGINT.
+    """
     options = ("--root", project, "--profile", "laptop", *arguments)
     return start_module("runner", "run", "fit", *options, merge_stderr=True, preexec_fn=restore_ctrl_c)
 
@@ -80,11 +83,11 @@ def restore_ctrl_c() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-# ------------------------------------------------------------------------------------------------------ what reruns
+# -------------------------------------------------------------------------------------------------------------- reruns
 
 
 def test_first_run_and_receipts(project):
-    assert read_score(project) == 10.0  # 3 steps of 2, and the scene's 4
+    assert read_score(project) == 10.0  # 3 steps of 2, plus the scene's number 4
     receipt = json.loads((project / "runs/toy/fit/receipt.json").read_text())
     assert receipt["params"] == {"iterations": 3, "rate": 2, "pause": 0.0, "device": "cpu"}
     assert receipt["profile"] == "laptop" and receipt["peak_memory_mb"] > 0 and receipt["versions"]["python"]
@@ -102,9 +105,8 @@ def test_fresh_plan(empty_project):
     assert states["distill"].startswith("pending") and states["evaluate"].startswith("run")
     job = resolve(make_request(empty_project))
     assert "reads one number" in plan_table(job, plan(job, ["poses"]))
-    assert (
-        not (empty_project / "runs").exists() or not (empty_project / "runs/toy").exists()
-    )  # plan leaves nothing but hashes
+    # The plan writes no files but the cache of hashes.
+    assert not (empty_project / "runs").exists() or not (empty_project / "runs/toy").exists()
 
 
 def test_a_second_call_runs_nothing(project, capsys):
@@ -122,9 +124,9 @@ def test_parameter_reruns_its_stage_and_what_depends_on_it(project, capsys):
 
 
 def test_identical_output_stops_a_rerun(project, capsys):
-    """`masks` comes out the same, so `distill` and `evaluate` stay."""
+    """`masks` reruns and its output is the same as before, so `distill` and `evaluate` do not rerun."""
     assert run_project(capsys, project, set="masks.threshold=99") == ["masks"]
-    (project / "data/toy/number.txt").write_text("-4")  # the stage takes its magnitude
+    (project / "data/toy/number.txt").write_text("-4")  # the stage writes the absolute value
     assert statuses(project, set="masks.threshold=99")["poses"] == "run need scene changed"
     assert run_project(capsys, project, set="masks.threshold=99") == ["poses"]
 
@@ -166,7 +168,7 @@ def preview(""",
 
 
 def test_a_stage_reruns_once_an_optional_need_exists(project, capsys):
-    """And where it is gone again, on another machine, what was made with it stays."""
+    """If the optional need disappears again, as on another machine, the artifact that was made with it stays valid."""
     replace_text(
         project / "stages/evaluate.py",
         "def run(",
@@ -264,15 +266,15 @@ def test_weights_profile_and_hand_edits(project, capsys):
     (project / "weights/model.bin").write_text("v")
     assert statuses(project)["distill"] == "run weights prior changed"
     (project / "weights/model.bin").write_text("w")
-    paper = statuses(project, profile="paper")  # its name is nothing that an artifact depends on; what it sets is
+    # Artifacts depend on the values that a profile sets, and not on its name.
+    paper = statuses(project, profile="paper")
     assert paper["poses"] == "cached" and paper["fit"] == "run param rate 2 -> 1"
-    assert statuses(project, profile=None) == statuses(project)  # pinned by the first run
+    assert statuses(project, profile=None) == statuses(project)  # the first run recorded its profile
     (project / "runs/toy/fit/gaussians.ply").write_text("11")
     assert statuses(project, keep=True)["fit"] == "cached gaussians.ply changed"
     assert run_project(capsys, project, keep=True) == ["masks", "distill", "evaluate"] and read_score(project) == 11.0
-    assert (
-        statuses(project)["fit"] == "cached gaussians.ply by hand" and run_project(capsys, project) == []
-    )  # from then on
+    # After one run with keep=True, the edited file stays without this option.
+    assert statuses(project)["fit"] == "cached gaussians.ply by hand" and run_project(capsys, project) == []
     assert run_project(capsys, project, set="fit.rate=3") == ["fit", "masks", "distill", "evaluate"]
     assert (project / "runs/toy/kept/fit/gaussians.ply").read_text() == "11"
 
@@ -296,9 +298,8 @@ def test_the_scenes_own_file_stands_for_a_stage_only_while_its_parameter_allows(
     write_files(project, {"data/toy/scene.yaml": "gaussians: mine.ply\n", "data/toy/mine.ply": "50"})
     assert statuses(project)["fit"] == "provided the scene brings `gaussians`"
     run_project(capsys, project, set="fit.rate=3")
-    assert (
-        statuses(project, set="fit.rate=3")["fit"] == "cached" and read_score(project) == 13.0
-    )  # 3 steps of 3, and the scene's 4
+    # 13 is 3 steps of 3, plus the scene's number 4.
+    assert statuses(project, set="fit.rate=3")["fit"] == "cached" and read_score(project) == 13.0
     replace_text(project / "pipeline.yaml", "param: fit.rate", "param: fit.rat")
     with pytest.raises(Refused, match=r"a condition asks for fit\.rat, which is not there"):
         statuses(project)
@@ -363,7 +364,7 @@ def test_variants_share_what_they_do_not_change(project, capsys):
 
 
 def kill_in_fit(project: Path, steps: int, send: int) -> tuple[int, str]:
-    """Start a long fit, and send the runner a signal after a few steps; return exit code and output."""
+    """Start a long fit and send the runner the signal `send` after a checkpoint. Return exit code and output."""
     process = start_runner(project, "--scene", "toy", "--set", f"fit.pause=0.1 fit.iterations={steps}")
     wait_until(lambda: any((p / "checkpoint.pt").exists() for p in (project / "runs/toy").glob(".partial-fit-*")))
     process.send_signal(send)
@@ -378,7 +379,7 @@ def test_a_killed_run_leaves_the_old_artifact_and_resumes(project, capsys):
     assert (project / "runs/toy/fit/gaussians.ply").read_text() == "10"
     assert statuses(project, **options)["fit"].endswith("goes on where it stopped")
     assert run_project(capsys, project, "fit", **options) == ["fit"]
-    assert int((project / "runs/toy/fit/trace.jsonl").read_text()) > 0  # the step it went on from
+    assert int((project / "runs/toy/fit/trace.jsonl").read_text()) > 0  # the step from which the stage resumed
     assert (project / "runs/toy/fit/gaussians.ply").read_text() == "20"
     assert not list((project / "runs/toy").glob(".partial*"))
 
@@ -392,7 +393,7 @@ def test_ctrl_c(project):
 def test_two_runners_on_one_scene(project):
     first = start_runner(project, "--scene", "toy", "--set", "fit.pause=0.2", "--set", "fit.iterations=8")
     wait_until(lambda: list((project / "runs/toy").glob(".partial-fit-*")))
-    first.send_signal(signal.SIGSTOP)  # until the second has had to wait
+    first.send_signal(signal.SIGSTOP)  # stopped until the second runner waits for the lock
     with pytest.raises(Refused, match=f"toy is in use by process {first.pid}"):
         maintenance.clean(make_request(project))
     second = start_runner(project, "--scene", "toy", "--set", "fit.pause=0.2 fit.iterations=8")
@@ -405,7 +406,10 @@ def test_two_runners_on_one_scene(project):
 
 @pytest.mark.parametrize("moment", ["after the old is moved", "after the new is moved", "while the old is deleted"])
 def test_killed_in_the_swap(project, finished_project, capsys, moment):
-    """The next run finds one whole artifact at every moment, and does not repeat finished work."""
+    """A runner is killed while it replaces an old artifact by a new one.
+
+    The next run finds the complete new artifact, whatever the moment of the kill, and runs no stage again.
+    """
     home, five = project / "runs/toy", {"target": "fit", "set": "fit.iterations=5"}
     assert run_project(capsys, project, **five) == ["fit"]
     shutil.copytree(home / "fit", home / "new")
@@ -488,7 +492,7 @@ def test_two_folders_of_one_name(project, tmp_path):
     write_files(tmp_path, {"elsewhere/toy/number.txt": "4"})
     with pytest.raises(Refused, match=r"two scenes are called 'toy': .*data/toy.*elsewhere/toy"):
         resolve(make_request(project, scene=str(tmp_path / "elsewhere/toy")))
-    shutil.rmtree(project / "data/toy")  # moved, not doubled
+    shutil.rmtree(project / "data/toy")  # now the scene is moved and has no copy
     assert set(statuses(project, scene=str(tmp_path / "elsewhere/toy")).values()) == {"cached"}
 
 
@@ -668,9 +672,8 @@ def test_groups_merge_layer_over_layer(empty_project):
     )
     assert params["sds"] == {"weight": 4.0, "lora": {"rank": 3, **model}} and params["gain"] == 2
     assert resolve_params(empty_project)["extra"] == {"view": "a", "depth": "b"}
-    assert resolve_params(empty_project, set="distill.extra='{view: c}'")["extra"] == {
-        "view": "c"
-    }  # a value of the scene, no group
+    # `extra` is a single value and not a group of parameters, so the new value replaces the whole old one.
+    assert resolve_params(empty_project, set="distill.extra='{view: c}'")["extra"] == {"view": "c"}
     assert resolve_params(empty_project, set="distill.extra=[1,2]")["extra"] == ["1", "2"]
 
 
@@ -725,7 +728,8 @@ def test_a_parameter_that_is_no_part_of_the_key_reruns_nothing(empty_project, ca
 def test_profiles_that_set_the_same_share_artifacts_and_old_receipts_hold(project, capsys):
     replace_text(project / "pipeline.yaml", "paper: {}", "paper: {fit: {rate: 2}}")
     assert set(statuses(project, profile="paper").values()) == {"cached"}
-    for path in (project / "runs/toy").glob("*/receipt.json"):  # as written when the profile was part of the key
+    # Imitate receipts of older versions, in which the profile was a part of the key.
+    for path in (project / "runs/toy").glob("*/receipt.json"):
         found = json.loads(path.read_text())
         del found["unkeyed"]
         path.write_text(json.dumps(found | {"key": "0" * 20}))
@@ -733,7 +737,7 @@ def test_profiles_that_set_the_same_share_artifacts_and_old_receipts_hold(projec
     assert statuses(project, set="fit.rate=3")["fit"] == "run param rate 2 -> 3"
 
 
-# ------------------------------------------------------------------------------------------ where a stage is described
+# ---------------------------------------------------------------------------------------------- plan modules of stages
 
 PLANNED = {
     "stages/plan/__init__.py": "",
@@ -772,9 +776,8 @@ def test_a_stage_is_described_in_its_plan_module_and_that_is_no_part_of_its_code
     run_scene(make_request(empty_project), "poses")
     job = resolve(make_request(empty_project))
     assert "3 steps" in plan_table(job, plan(job, ["poses", "fit"])) and not imported.exists()
-    assert (
-        "fit" in run_project(capsys, empty_project) and imported.read_text() == "x"
-    )  # by the process that does the work
+    # Only the process that runs the stage imports `heavy`.
+    assert "fit" in run_project(capsys, empty_project) and imported.read_text() == "x"
     assert read_score(empty_project) == 10.0
     code = json.loads((empty_project / "runs/toy/fit/receipt.json").read_text())["code"]
     assert "stages/fit.py" in code and not any("plan" in name for name in code)
@@ -783,9 +786,8 @@ def test_a_stage_is_described_in_its_plan_module_and_that_is_no_part_of_its_code
     replace_text(empty_project / "stages/plan/fit.py", "rate: int = 1", "rate: int = 1\n    slope: int = 1")
     assert statuses(empty_project)["fit"] == "run param slope is new"
     replace_text(empty_project / "stages/fit.py", "import heavy", "import heavy\nfrom stages.plan import fit")
-    assert "stages/plan/fit.py" in code_fingerprints(
-        empty_project, "fit", Hashes(empty_project / "hashes")
-    )  # now it is imported
+    # Now the stage imports its plan module, so this module is a part of the stage's code.
+    assert "stages/plan/fit.py" in code_fingerprints(empty_project, "fit", Hashes(empty_project / "hashes"))
 
 
 def test_a_run_that_does_not_fit_its_needs_is_refused_without_importing_it(empty_project, monkeypatch):
@@ -797,12 +799,12 @@ def test_a_run_that_does_not_fit_its_needs_is_refused_without_importing_it(empty
     assert not (empty_project / "imported.txt").exists()
 
 
-# ------------------------------------------------------------------------------------------------------------- asking
+# ------------------------------------------------------------------------------------------------- questions to stages
 
 
 @pytest.fixture
 def worker_starts(monkeypatch) -> list[str]:
-    """The purpose of each process that is started to import stages."""
+    """Return a list that collects the purpose of each process that the runner starts to import stages."""
     started, start = [], process.start_worker
     monkeypatch.setattr(process, "start_worker", lambda *args, **how: started.append(args[1]) or start(*args, **how))
     return started
@@ -813,19 +815,17 @@ def test_stages_are_asked_once_for_the_same_inputs(project, capsys, worker_start
     assert len(worker_starts) == 1 and ": done in" not in capsys.readouterr().out
     replace_text(project / "data/toy/number.txt", "4", "5")
     assert compare.compare(make_request(project), "full,same") == 0
-    assert (
-        len(worker_starts) > 2
-    )  # which files are read, as the scene changed; what the run will do, as far as it is known
+    # The scene changed, so stages are asked again which files they read and what they will do.
+    assert len(worker_starts) > 2
 
 
 def test_descriptions_of_parameters_are_cached_until_the_code_changes(project, worker_starts):
-    statuses(project)  # in this folder for the first time
+    statuses(project)  # the first call in this folder fills the cache
     del worker_starts[:]
     assert set(statuses(project).values()) == {"cached"} and worker_starts == []
     assert statuses(project, set="fit.rate=3")["fit"] == "run param rate 2 -> 3" and worker_starts == ["describe"] * 2
-    assert (
-        statuses(project, set="fit.rate=3")["fit"].startswith("run") and worker_starts == ["describe"] * 3
-    )  # its preview anew
+    # The description of parameters is cached; the preview of a stage that will run is asked again.
+    assert statuses(project, set="fit.rate=3")["fit"].startswith("run") and worker_starts == ["describe"] * 3
     replace_text(project / "stages/fit.py", "rate: int = 1", "rate: int = 1\n    slope: int = 1")
     assert statuses(project)["fit"] == "run param slope is new, code of stages/fit.py changed"
     assert statuses(project, set="fit.slope=2")["poses"] == "cached"

@@ -1,5 +1,7 @@
-"""Faults of machines and users: kills, full disks, lost and corrupted files, locks, quotes. Nothing is lost, and each
-error is one line. REFFUSION_SLOW=1 runs all kills and all sizes of a disk."""
+"""Faults of machines and users: kills, full disks, lost and corrupted files, locks, quotes in names.
+
+No artifact is lost, and each error is one line. REFFUSION_SLOW=1 runs all kills and all disk sizes.
+"""
 
 # ruff: noqa: F401, F811 (fixtures are imported, and taken as arguments)
 
@@ -36,7 +38,7 @@ pytestmark = pytest.mark.integration
 
 SLOW = os.environ.get("REFFUSION_SLOW") == "1"
 KILLS, SIZES = (200, 30) if SLOW else (3, 1)
-SHORT = {  # two stages are enough for what concerns no stage
+SHORT = {  # a pipeline of two stages, for tests that concern the runner alone
     **RUNNER_FILES,
     "pipeline.yaml": """
 scene_keys: {}
@@ -61,14 +63,14 @@ OPTIONS = ("--profile", "laptop", "--root")
 
 
 def assert_one_line(ended: subprocess.CompletedProcess[str]) -> str:
-    """Assert that the command refused in one line; return it."""
+    """Assert that the command ended with one line of error and exit code 2; return this line."""
     errors = ended.stderr
     assert ended.returncode == 2 and errors.startswith("error: ") and errors.count("\n") == 1, (ended.stdout, errors)
     return errors
 
 
 def assert_artifacts_complete(runs: Path) -> None:
-    """Assert that every artifact is one that a stage finished, and that tables and records are complete."""
+    """Assert that all artifacts in the folder `runs` match their receipts, and that each compare.json is valid JSON."""
     for receipt in runs.glob("*/[a-z]*/" + RECEIPT):
         worn = diff_artifact(receipt.parent, Hashes(runs / "none"))
         assert json.loads(receipt.read_text())["files"] and not worn.describe(), receipt
@@ -99,7 +101,7 @@ def test_killed_at_random_moments(short_project, what):
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGKILL)
             killed += 1
-        else:  # too late: it was done
+        else:  # the process had ended before the kill
             shutil.rmtree(short_project / "runs")
         process.communicate()
         assert_artifacts_complete(short_project / "runs")
@@ -124,7 +126,10 @@ def test_killed_at_random_moments(short_project, what):
 
 @contextmanager
 def mounted_disk(folder: Path):
-    """A disk in memory at `folder`; yields a function that sets its size or makes it read-only."""
+    """Mount a disk in memory at `folder`, and unmount it at the end.
+
+    Yields a function that remounts the disk with an option, such as "size=1m" or "ro" (read-only).
+    """
     folder.mkdir(exist_ok=True)
     mount = lambda *how: subprocess.run(["mount", "-t", "tmpfs", *how, "none", str(folder)], capture_output=True)
     if shutil.which("mount") is None or mount("-o", "size=1m").returncode:
@@ -173,11 +178,11 @@ def test_a_folder_that_is_only_read(project):
         assert "Read-only file system; runs=FOLDER" in assert_one_line(cleaned)
 
 
-# ------------------------------------------------------------------------------------------- lost, rotten, edited files
+# --------------------------------------------------------------------------------------- lost, corrupted, edited files
 
 
 def flip_byte(path: Path, quietly: bool = False) -> None:
-    """Flip a bit in the middle of a file; `quietly` keeps its size and time."""
+    """Flip a bit in the middle of a file, which keeps its size; `quietly` keeps its modification time, too."""
     data, then = bytearray(path.read_bytes()), path.stat().st_mtime_ns
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
@@ -195,12 +200,8 @@ def test_missing_and_changed_files_are_named_and_made_again(project, capsys):
     assert states["fit"] == "run gaussians.ply changed since (keep=1 keeps it)" and states["poses"] == "cached"
     assert states["masks"] == "run facts.json missing" and states["evaluate"] == "run metrics.json missing"
     flip_byte(project / "runs/toy/poses/masks/a.png")
-    assert run_project(capsys, project) == [
-        "poses",
-        "fit",
-        "masks",
-        "evaluate",
-    ]  # `distill` is as it was, and so are its needs
+    # `distill` does not rerun: its artifact is undamaged, and its needs are made again with equal content.
+    assert run_project(capsys, project) == ["poses", "fit", "masks", "evaluate"]
     assert {path: path.read_bytes() for path in before} == before
     assert {path.name for path in (project / "runs/toy/kept").rglob("*.*")} == {"gaussians.ply", "a.png"}
 
@@ -211,7 +212,7 @@ def test_verify_hashes_everything(project, capsys):
     files = sorted((path for path in files if path.name != RECEIPT), key=lambda path: path.name == "facts.json")
     for path in (project / "data/toy/number.txt", *files):
         flip_byte(path, quietly=True)
-        assert path.name == "facts.json" or set(statuses(project).values()) == {"cached"}  # by size and time
+        assert path.name == "facts.json" or set(statuses(project).values()) == {"cached"}  # size and time are unchanged
     assert maintenance.verify(make_request(project)) == len(files) + 1
     output = capsys.readouterr().out
     assert all(f"toy/{path.parent.name}: {path.name} changed" in output for path in files)
@@ -276,7 +277,7 @@ def test_another_machine(project, capsys):
     assert "toy was last in use on elsewhere; is it still?" in capsys.readouterr().out
 
 
-# -------------------------------------------------------------------------------------------------- what a stage reads
+# ---------------------------------------------------------------------------------------------- input files of a stage
 
 
 def test_pictures_outside_the_scene_count_and_are_listed(tmp_path):
@@ -333,13 +334,13 @@ def test_scenes_that_cannot_be_read_are_rows_that_failed(project, capsys):
 @pytest.mark.parametrize("bad", ["toy", "toy-1"])
 def test_compare_goes_on_after_a_scene_that_cannot_be_read(project, bad):
     write_files(project, {"data/toy-1/number.txt": "4", f"data/{bad}/scene.yaml": "shift: [1"})
-    if bad == "toy":  # what is done stays, for the other
+    if bad == "toy":  # let the artifacts of toy serve toy-1
         (project / "runs/toy").rename(project / "runs/toy-1")
         (project / "runs/toy-1/source").unlink()
     assert compare.compare(make_request(project), "full", 2) == 1
     states = {run["scene"]: run["state"] for run in json.loads((project / "runs/toy/compare.json").read_text())["runs"]}
     assert states.pop(bad) == "failed" and list(states.values()) == ["done"]
-    with pytest.raises(Refused):  # nothing could be done
+    with pytest.raises(Refused):  # no run was possible
         compare.compare(make_request(project, set="fit.rat=1"), "full", 2)
 
 
@@ -358,7 +359,7 @@ TYPED = (
 
 @pytest.fixture
 def stub_environment(tmp_path) -> Path:
-    """An environment whose commands only print their arguments."""
+    """Make a stub of the Python environment, whose commands only print their arguments; return its folder."""
     (tmp_path / "bin").mkdir()
     for name in ("reffusion", "python"):
         (tmp_path / "bin" / name).write_text('#!/bin/sh\nfor each in "$@"; do printf "%s|" "$each"; done; echo\n')

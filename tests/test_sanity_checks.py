@@ -1,4 +1,4 @@
-"""Warnings about unusual captures, and their absence for good ones."""
+"""Warnings about unusual captures (inverted or inconsistent masks, exposure jumps), and none for good captures."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from report import check
 
 @pytest.fixture(scope="module")
 def wall_capture(tmp_path_factory):
-    """Scene, masks and pictures of a wall with a square before it; its texture is fine enough to localize."""
+    """Scene, masks and pictures of a wall with a square before it; the wall's texture has enough detail to localize."""
     folder = tmp_path_factory.mktemp("odd")
     poses, _, _ = wall_scene.write_poses_and_fit(folder, 1.5)
     scene = load_scene(poses)
@@ -60,7 +60,7 @@ def test_masks_that_disagree_in_3d(wall_capture):
 
 
 def test_masks_of_a_small_object_in_a_deep_scene_agree():
-    """A ball of radius 0.03, 1 away from each of ten cameras around it, in a garden that reaches to 40."""
+    """A ball of radius 0.03 at distance 1 from ten cameras, in a scene whose points reach to a distance of 40."""
     draws, cameras, masks = np.random.default_rng(0), {}, {}
     for k in range(10):
         turn, pose = np.radians(9 * k), np.eye(4)

@@ -1,4 +1,4 @@
-"""Score distillation against a distribution with a known score, and its two scales."""
+"""Score distillation (SDS) on a distribution whose score is known, and the two scales (whole views and patches)."""
 
 import pytest
 import torch
@@ -12,14 +12,14 @@ MEAN, VARIANCE = 0.7, 0.25
 
 
 def perfect_denoiser(noisy, t):
-    """The posterior means of a perfect denoiser for independent normal data."""
+    """Return the posterior means of the noise and of the clean latent for independent normal data."""
     a, s = ABAR[t].sqrt().view(-1, 1, 1, 1), (1 - ABAR[t]).sqrt().view(-1, 1, 1, 1)
     eps = s * (noisy - a * MEAN) / (a**2 * VARIANCE + s**2)
     return eps, (noisy - s * eps) / a
 
 
 def expected_gradient(latent, t, weighting):
-    """The expectation over noise of w(t) (eps_theta - eps), in closed form."""
+    """Return the expectation over the noise of w(t) (eps_theta - eps) in closed form."""
     a2 = ABAR[t]
     mean = (1 - a2).sqrt() * a2.sqrt() * (latent - MEAN) / (a2 * VARIANCE + 1 - a2)
     return mean * {"one": 1.0, "sigma2": 1 - a2, "x0": ((1 - a2) / a2).sqrt()}[weighting]
@@ -73,7 +73,10 @@ def test_weightings_differ_by_a_function_of_the_timestep_only():
 
 
 def fade_contrast(factor, shift=0.2):
-    """(x0, z, mask): x0 has `factor` of z's contrast and another mean inside the mask, and other noise outside."""
+    """Return (x0, z, mask); inside the mask, the denoised latent x0 has `factor` times the contrast of the latent z.
+
+    Inside the mask the mean of x0 differs by `shift` from the mean of z. Outside, x0 is independent noise.
+    """
     z, other = torch.randn(2, 3, 4, 8, 8, generator=generator(9), dtype=torch.float64)
     mask = torch.zeros(3, 1, 8, 8, dtype=torch.float64)
     mask[:, :, 1:6, 2:7] = 1
@@ -89,7 +92,7 @@ def test_a_faded_answer_gets_the_contrast_of_the_render_and_keeps_its_mean():
 
 
 def test_matching_contrast_keeps_contrast_that_the_prior_adds():
-    for factor in (1.0, 1.5, -0.5):  # as strong, stronger, the opposite
+    for factor in (1.0, 1.5, -0.5):  # the same contrast, a stronger one, an inverted one
         x0, z, mask = fade_contrast(factor)
         torch.testing.assert_close(match_contrast(x0, z, mask), x0)
 

@@ -1,4 +1,4 @@
-"""The prediction whether SDS can improve the initialization, from its error beside the hole."""
+"""The prediction from the error of the renders beside the hole whether SDS can improve the initialization."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -25,7 +25,7 @@ AT, TRAINED = 0.8, [CAMERAS[name] for name in TRAIN]
 
 @pytest.fixture(scope="module")
 def wall_without_square():
-    """The wall without its square, masks, and photographs that equal its renders."""
+    """Gaussians of the wall without the square, masks, and photographs that equal the renders of these Gaussians."""
     scene, labels = wall_and_square(AT)
     wall = scene.map(lambda p: p[~labels])
     hidden = {camera.name: true_mask(camera, AT) for camera in TRAINED}

@@ -1,4 +1,4 @@
-"""The variance of the SDS gradient: its parts against samples of known variance, and on a small run."""
+"""The benchmark of the variance of the SDS gradient, on samples of known variance and on a small run."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def test_variance_is_split_into_that_of_noise_and_that_of_timesteps():
-    """Means 0, 1, ..., 4 at five timesteps (variance 2.5), noise of variance 4 around them."""
+    """The gradients have the means 0, 1, ..., 4 at five timesteps (variance 2.5), and noise of variance 4."""
     draw = seeding.generator(0, "variances")
     means = torch.arange(5.0)[:, None, None]
     found = benchmark.variances(means + 2 * torch.randn(5, 8, 20_000, generator=draw))

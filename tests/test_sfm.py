@@ -1,4 +1,4 @@
-"""Structure from motion: on a small synthetic room, and with REFFUSION_SLOW=1 (minutes) on photographs."""
+"""Structure from motion on renders of a room's corner and, with REFFUSION_SLOW=1 (takes minutes), on photographs."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_pose_errors_are_those_that_no_similarity_explains():
     turn = Rotation.from_rotvec((0.3, -0.5, 0.2)).as_matrix()
 
     def elsewhere(pose: np.ndarray, shift=(0.0, 0.0, 0.0)) -> np.ndarray:
-        """The pose in a frame of another origin, direction and scale; its centre moved by `shift` in the old one."""
+        """Move the camera centre by `shift`, and return the pose [4, 4] in a rotated, scaled and translated frame."""
         center = 3 * turn @ (-pose[:3, :3].T @ pose[:3, 3] + shift) + (5, 6, 7)
         moved = np.eye(4)
         moved[:3, :3] = pose[:3, :3] @ turn.T
@@ -54,7 +54,7 @@ def test_pose_errors_are_those_that_no_similarity_explains():
     found = {name: elsewhere(pose) for name, pose in truth.items()}
     for errors in pose_errors(found, truth):
         assert np.abs(errors).max() < 1e-4
-    found["p2"] = elsewhere(truth["p2"], (0.0, 0.0, 0.016))  # 1 % of the extent; the similarity takes some
+    found["p2"] = elsewhere(truth["p2"], (0.0, 0.0, 0.016))  # 1 % of the extent; the similarity explains a part
     shifts, _ = pose_errors(found, truth)
     assert shifts.argmax() == 2 and 0.5 < shifts.max() < 1.0
 
@@ -75,7 +75,10 @@ def reconstruct_with_threads(threads: int, photographs: dict[str, Path], work: P
 
 
 def test_a_walk_past_a_corner(tmp_path, capsys):
-    """All views that belong to it are placed; the one that does not is named and left out, and so is its mask."""
+    """All six views of the corner are placed. The unrelated view "stray" is named, and left out with its mask.
+
+    The poses must not depend on the number of threads.
+    """
     generator, truth = np.random.default_rng(0), room_walk(6)
     textures = room_textures(generator)
     folder = tmp_path / "s"
@@ -112,11 +115,15 @@ def test_views_that_do_not_belong_together_are_named(tmp_path):
         run_poses(tmp_path / "s", tmp_path / "out", masks="none")
 
 
-UPRIGHT, ACROSS = (150, 200), (200, 150)  # px: a phone held both ways
+UPRIGHT, ACROSS = (150, 200), (200, 150)  # width and height in px of a phone's photographs in portrait and landscape
 
 
 def write_walk(folder: Path, sizes: Sequence[tuple[int, int]], endings: Sequence[str]) -> dict[str, np.ndarray]:
-    """Write a photograph of `room_walk` for each size and ending to folder/images; return the true poses."""
+    """Write a photograph of `room_walk` for each size (W, H) and file ending to folder/images.
+
+    Returns:
+        View name -> true pose [4, 4] from world to camera.
+    """
     generator, truth = np.random.default_rng(0), room_walk(len(sizes))
     textures = room_textures(generator)
     (folder / "images").mkdir(parents=True)
@@ -127,7 +134,7 @@ def write_walk(folder: Path, sizes: Sequence[tuple[int, int]], endings: Sequence
 
 
 def test_photographs_of_every_kind_are_placed(tmp_path):
-    """WebP and TIFF among them: COLMAP does not read their EXIF data, or them at all."""
+    """Among the photographs are WebP and TIFF files. COLMAP cannot read their EXIF data, or not even the pictures."""
     endings = ("webp", "webp", "tiff", "bmp", "png", "webp")
     truth = write_walk(tmp_path / "s", [ACROSS] * 6, endings)
     scene = run_poses(tmp_path / "s", tmp_path / "out", masks="none")
@@ -136,7 +143,7 @@ def test_photographs_of_every_kind_are_placed(tmp_path):
 
 
 def test_photographs_of_two_orientations_are_placed(tmp_path):
-    """They share a lens, for a phone that is turned is the same phone, and its focal length is found."""
+    """Portrait and landscape photographs of one phone share a lens, and its focal length is estimated within 2 %."""
     sizes = [ACROSS, UPRIGHT, UPRIGHT, ACROSS, UPRIGHT, ACROSS, UPRIGHT, UPRIGHT]
     truth = write_walk(tmp_path / "s", sizes, ["png"] * 8)
     scene = run_poses(tmp_path / "s", tmp_path / "out", masks="none")
@@ -148,7 +155,7 @@ def test_photographs_of_two_orientations_are_placed(tmp_path):
 
 
 def test_which_views_share_a_lens(tmp_path):
-    """Those of one size, either way up, whose EXIF focal lengths agree."""
+    """Views share a lens if their sizes agree (in portrait or landscape) and their EXIF focal lengths agree."""
 
     def written(name: str, size: tuple[int, int], film: float | None) -> Path:
         exif = Image.Exif()
@@ -161,7 +168,7 @@ def test_which_views_share_a_lens(tmp_path):
     photos |= {"f": ((150, 150), 28), "g": (ACROSS, None)}
     groups = sfm.group_by_lens({n: written(f"{n}.webp", *how) for n, how in photos.items()}, tmp_path)
     assert [group for group, _ in groups] == [["f"], ["e", "g"], ["a", "b", "c"], ["d"]]
-    film = 1.25 / 43.27  # of a 4:3 picture: the longer side over the diagonal, over the film's diagonal in mm
+    film = 1.25 / 43.27  # for 4:3: the longer side's share of the diagonal, divided by the film's diagonal in mm
     assert [focal for _, focal in groups][1:] == [None, pytest.approx(28 * film, 1e-3), pytest.approx(56 * film, 1e-3)]
 
 
@@ -177,7 +184,7 @@ def test_focal_length_from_exif(tmp_path, ending):
         return sfm.relative_focal_length(path, tmp_path)
 
     assert focal(xA405=28) == pytest.approx(28 / 36, rel=0.01)
-    # 18 mm of a camera whose sensor COLMAP knows, 23.6 mm wide; of one whose resolution is in the file
+    # 18 mm on a camera whose sensor width COLMAP knows (23.6 mm), then on a camera whose file states the resolution
     assert focal("NIKON CORPORATION", "NIKON D90", x920A=IFDRational(18)) == pytest.approx(18 / 23.6, rel=0.01)
     resolution = {"xA20E": IFDRational(360 / 2.36), "xA210": 3}
     assert focal("a", "b", x920A=IFDRational(18), **resolution) == pytest.approx(18 / 23.6, rel=0.01)
@@ -188,7 +195,7 @@ def test_focal_length_from_exif(tmp_path, ending):
 
 @slow
 def test_demo_photos(tmp_path):
-    """Every view of the generator's photographs, against its truth."""
+    """All photographs of the generated demo scene are placed at their true poses."""
     made = [sys.executable, str(ROOT / "data" / "generate.py"), "--out", str(tmp_path / "s"), "--kind", "photos"]
     subprocess.run(made, check=True)
     record = json.loads((tmp_path / "s" / "truth" / "cameras.json").read_text())
@@ -200,7 +207,7 @@ def test_demo_photos(tmp_path):
 
 @slow
 def test_bear(tmp_path):
-    """A dozen neighbouring photographs against the poses they came with (which are COLMAP's own, from 96)."""
+    """A dozen neighbouring photographs get the capture's poses, which COLMAP estimated from 96 photographs."""
     capture = load_capture(real_capture("bear"))
     names = sorted(capture.pictures)[:24:2]
     (tmp_path / "s" / "images").mkdir(parents=True)
@@ -212,10 +219,11 @@ def test_bear(tmp_path):
 
 
 def center_principal_ray(source: Poses, name: str) -> np.ndarray:
-    """The pose [4, 4] turned so that it looks along the ray through the middle of its picture.
+    """Return the view's pose [4, 4], rotated so that the camera looks along the ray through the middle of its picture.
 
-    bear's pictures are crops, their principal point 17 px off the middle. Structure from motion keeps it in the
-    middle and turns the camera by as much (1.8 degrees) instead, which the comparison must not count.
+    The pictures of the capture `bear` are crops whose principal point is 17 px off the middle. Structure from motion
+    assumes a principal point in the middle and compensates by a rotation of the camera (1.8 degrees), which the
+    comparison must not count as an error.
     """
     lens = source.lenses[name]
     ray = np.array([(lens.width / 2 - lens.cx) / lens.fx, (lens.height / 2 - lens.cy) / lens.fy, 1.0])

@@ -1,4 +1,4 @@
-"""Which of several references with depth supplies a surface, on surfaces in closed form that two cameras see."""
+"""The choice of the reference that supplies a surface if several references bring depth, on analytic surfaces."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ FRONT, SIDE = sphere_camera("front", 0.0, 3.0), sphere_camera("side", 0.0, 0.4)
 
 
 def floor_depth(camera, z=0.0):
-    """[H, W] depth of the plane at that height, 0 above the horizon."""
+    """Return the depth [H, W] of the horizontal plane at height z, 0 above the horizon."""
     rays = geometry.unproject(np.ones((SIZE, SIZE)), camera) - camera.center
     with np.errstate(divide="ignore"):
         depth = (z - camera.center[2]) / rays[..., 2]
@@ -43,7 +43,7 @@ def test_a_surface_is_drawn_by_the_view_that_shows_it_most_finely(order):
     ]
     finest = dict(zip(order, select_finest([views[k] for k in order]), strict=True))
     assert (finest[0] == views[0].pixels).mean() > 0.98
-    assert finest[1].sum() < 0.1 * views[1].pixels.sum()  # a border, to a pixel
+    assert finest[1].sum() < 0.1 * views[1].pixels.sum()  # only pixels at the border between both
 
 
 def test_of_two_equal_views_the_earlier_is_used():
@@ -62,7 +62,7 @@ def test_a_surface_of_one_view_stays_with_it():
 
 
 def test_a_surface_is_dropped_where_another_view_sees_past_it():
-    """A sheet that one view has in mid-air, where the other sees the floor."""
+    """One view has a sheet above the floor. The other view sees the floor behind it, so the sheet is dropped."""
     sheet = floor_depth(SIDE, z=0.2)
     hanging = is_near_origin(SIDE, sheet, 0.4)
     depth = np.where(hanging, sheet, floor_depth(SIDE))
@@ -93,5 +93,5 @@ def test_a_rim_that_looks_like_the_photograph_is_left():
     image, mask, thing = photo.copy(), np.zeros((40, 40), bool), np.zeros((40, 40), bool)
     mask[8:32, 8:32] = thing[12:28, 12:28] = True
     image[thing] = (photo[thing].astype(int) + 128) % 256
-    image[18:22, 18:22] = photo[18:22, 18:22]  # inside it is the thing's own colour by chance
+    image[18:22, 18:22] = photo[18:22, 18:22]  # here the object happens to have the photograph's colour
     assert np.array_equal(unchanged_rim(image, photo, mask), mask & ~thing)

@@ -1,4 +1,4 @@
-"""Holes filled with large pieces of their own photograph."""
+"""The shift map: holes filled with large pieces of the same photograph."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HOLE = disk_mask((HEIGHT, WIDTH), 58, 100, 27)
 
 
 def paint_lawn(path: bool = True) -> np.ndarray:
-    """uint8 [H, W, 3]: grass, and a pale path across it."""
+    """Return a picture, uint8 [H, W, 3], of grass and, if `path`, a pale path across it."""
     draws = np.random.default_rng(0)
     green = np.array([70, 110, 50]) + draws.normal(0, 18, (HEIGHT, WIDTH, 1))
     if path:
@@ -60,7 +60,10 @@ def test_a_path_goes_on_and_the_lawn_stays_as_sharp_as_it_is(seed):
 
 
 def test_pixels_of_other_slope_or_layer_are_not_copied():
-    """The lower half of the picture is bark of the lawn's colour; patches alone would not tell."""
+    """The lower part of the picture is plain and has the lawn's colour, but another normal or layer than the hole.
+
+    Patches alone could not distinguish it from the lawn, so the hole would be filled with plain colour.
+    """
     truth = paint_lawn(path=False)
     truth[80:] = (90, 100, 90)
     image = np.where(HOLE[..., None], np.uint8((255, 0, 0)), truth)

@@ -1,4 +1,4 @@
-"""Stages on a GPU, simulated where there is none, agree with the CPU and do not mix tensors of two devices."""
+"""Stages on a GPU give the CPU's results and do not mix tensors of two devices; without a GPU, one is simulated."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NEAR = 1.7
 
 @pytest.fixture(scope="module")
 def reference_folders(tmp_path_factory):
-    """The folders of a small scene with view-dependent colours, up to `reference`."""
+    """The folders of the stages up to `reference`, for a small scene with view-dependent colours."""
     home = tmp_path_factory.mktemp("scene")
     poses, fit_folder, _ = wall_scene.write_poses_and_fit(home, NEAR)
     gaussians = load_ply(fit_folder / "gaussians.ply")
@@ -68,7 +68,7 @@ def test_masks_on_a_gpu(reference_folders, tmp_path, vote):
     for name in wall_scene.TRAIN:
         for kind in ("consistent", "unobserved", "invent"):
             differs = getattr(before[name], kind) != getattr(after[name], kind)
-            assert differs.mean() <= (0.01 if has_gpu() else 0), (name, kind)  # a GPU rounds otherwise
+            assert differs.mean() <= (0.01 if has_gpu() else 0), (name, kind)  # a real GPU rounds differently
 
 
 def test_a_region_on_a_gpu():
@@ -90,8 +90,8 @@ def test_initialize_on_a_gpu(reference_folders, tmp_path, changed):
     )
     assert torch.equal(load_labels(cpu / "labels.npy"), load_labels(cuda / "labels.npy"))
     before, after = (load_ply(folder / "gaussians.ply") for folder in (cpu, cuda))
-    for name in PARAMETERS:  # settling takes other kernels of SSIM and Adam there, which round otherwise
-        near = (getattr(before, name) - getattr(after, name)).abs() <= 2e-2  # not where one is NaN
+    for name in PARAMETERS:  # the GPU's kernels of SSIM and Adam round differently
+        near = (getattr(before, name) - getattr(after, name)).abs() <= 2e-2  # False where a value is NaN
         assert (~near).float().mean() <= (0.01 if has_gpu() else 0), name
 
 

@@ -1,4 +1,4 @@
-"""Scenes skip what they do not need: libraries, pixels and coefficients."""
+"""Scenes skip work that they do not need: imports of libraries, negligible pixels, and spherical harmonics."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from reffusion.io.scene import load_mask_sets, load_scene
 from stages import fit, masks
 
 ROOT = Path(__file__).resolve().parent.parent
-# Diffusion, structure from motion, the viewer, clusters, LPIPS' backbones: none of it is asked for below.
+# Libraries for diffusion, structure from motion, the viewer, clusters and LPIPS, which the stages below do not need.
 UNUSED = ("diffusers", "transformers", "peft", "tokenizers", "pycolmap", "torchvision", "viser", "ray", "gsplat")
 
 
@@ -45,7 +45,7 @@ print(sorted({name.split(".")[0] for name in sys.modules} & set(sys.argv[2].spli
 
 @pytest.mark.integration
 def test_a_scene_whose_background_is_seen_imports_no_diffusion(tmp_path):
-    wall_scene.write_poses_and_fit(tmp_path, 0.8)  # far from the wall: each view shows what the others miss
+    wall_scene.write_poses_and_fit(tmp_path, 0.8)  # 1.2 before the wall, so other views show nearly all
     command = [sys.executable, "-c", RUN_STAGES, str(tmp_path), " ".join(UNUSED)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
@@ -65,7 +65,7 @@ def test_personalization_is_left_out_where_sds_cannot_gain_and_the_profile_asks(
     pipeline = yaml.safe_load((ROOT / "pipeline.yaml").read_text())
     (rule,) = (c for c in pipeline["stages"]["personalize"]["skip_if"] if c.get("fact") == "initialize.sds_may_gain")
     assert rule["equals"] is False and "{sds_reason}" in rule["reason"]
-    assert rule["only"] == {"distill.sds.run": "auto", "distill.depth.weight": 0}  # the depth term asks the prior too
+    assert rule["only"] == {"distill.sds.run": "auto", "distill.depth.weight": 0}  # the depth term needs the prior, too
     runs = {name: profile["distill"].get("sds", {}).get("run") for name, profile in pipeline["profiles"].items()}
     assert runs == {"paper": None, "best": None, "laptop": "auto", "laptop-terms": "always", "paper-terms": None}
 
@@ -89,7 +89,7 @@ def test_few_unseen_pixels_are_negligible_and_it_can_be_forced(tmp_path):
 @pytest.mark.parametrize("filter_", [cv2.INTER_LINEAR, cv2.INTER_CUBIC, cv2.INTER_LANCZOS4])
 def test_enlarged_pictures_are_told_from_sharp_ones(filter_):
     rng = np.random.default_rng(0)
-    # Photographs have about as much energy in each octave: noise whose amplitude falls as one over the frequency.
+    # Photographs have about equal energy in each octave, like noise whose amplitude is 1 / frequency.
     frequency = np.hypot(np.fft.fftfreq(96)[:, None], np.fft.fftfreq(128)[None]).clip(1 / 128)
     fields = [np.fft.ifft2(np.fft.fft2(rng.normal(size=(96, 128))) / frequency).real for _ in range(3)]
     sharp = [np.clip(128 + 45 * field / field.std(), 0, 255).astype(np.uint8) for field in fields]
@@ -97,8 +97,8 @@ def test_enlarged_pictures_are_told_from_sharp_ones(filter_):
     twice = [cv2.resize(picture, None, fx=2, fy=2, interpolation=filter_) for picture in sharp]
     assert not image_detail.is_enlarged(sharp, 0.1)
     assert image_detail.is_enlarged(twice, 0.1)
-    assert not image_detail.is_enlarged(twice, 0.0)  # never
-    assert not image_detail.is_enlarged([np.full((64, 64, 3), 7, np.uint8)], 0.1)  # plain: nothing says that it was
+    assert not image_detail.is_enlarged(twice, 0.0)  # a threshold of 0 turns the check off
+    assert not image_detail.is_enlarged([np.full((64, 64, 3), 7, np.uint8)], 0.1)  # a plain picture gives no evidence
 
 
 def test_no_more_harmonics_than_views():

@@ -1,4 +1,4 @@
-"""Splatting: the compiled kernel against the float64 reference, the reference against finite differences."""
+"""The rasterizer: the compiled kernel against the float64 reference, the reference against finite differences."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ IMAGES = ("color", "depth", "alpha", "features")
 
 
 def off_center_camera(width: int, height: int, distance: float = 3.0) -> Camera:
-    """A view of the origin, slightly turned and off-centre so that no symmetry hides an error."""
+    """Return a camera that sees the origin, slightly rotated and off-centre, so that no symmetry hides an error."""
     turn = 0.3
     pose = np.eye(4)
     pose[:3, :3] = [[math.cos(turn), 0, math.sin(turn)], [0, 1, 0], [-math.sin(turn), 0, math.cos(turn)]]
@@ -30,7 +30,7 @@ def off_center_camera(width: int, height: int, distance: float = 3.0) -> Camera:
 
 
 def random_cloud(count: int, log_scale: float, seed: int = 0, degree: int = 3, spread: float = 1.0) -> Gaussians:
-    """Random Gaussians around the origin, colours in and out of range, some opacities saturated."""
+    """Return random Gaussians around the origin, with colours in and out of [0, 1] and some saturated opacities."""
     generator = torch.Generator().manual_seed(seed)
     normal = lambda *shape: torch.randn(*shape, generator=generator)
     higher = 0.15 * normal(count, (degree + 1) ** 2 - 1, 3)
@@ -44,7 +44,7 @@ def random_cloud(count: int, log_scale: float, seed: int = 0, degree: int = 3, s
 
 
 def differentiate(gaussians, view, impl, dtype, channels=3, sh_degree=None):
-    """The rendering, and the gradients of a fixed random linear function of all its outputs."""
+    """Render, and return the rendering and the gradients of a fixed random linear function of all its outputs."""
     generator = torch.Generator().manual_seed(1)
     random = lambda *shape: torch.randn(*shape, generator=generator).to(dtype)
     leaf = lambda tensor: tensor.detach().to(dtype).clone().requires_grad_()
@@ -71,7 +71,7 @@ def assert_close(actual, expected, relative, floor, what):
 
 
 def assert_matches_reference(gaussians, view, relative=2e-5, **options):
-    """The compiled kernel equals the reference in float64, values and gradients, up to `relative` in L2."""
+    """Assert that values and gradients of the compiled kernel equal the float64 reference, up to `relative` in L2."""
     fast, fast_gradients = differentiate(gaussians, view, "cpu", torch.float32, **options)
     exact, exact_gradients = differentiate(gaussians, view, "torch", torch.float64, **options)
     assert torch.equal(fast.radii, exact.radii)
@@ -103,7 +103,7 @@ def test_stored_degrees(degree):
 
 
 def test_inside_the_cloud():
-    """Gaussians behind, around and right before the camera; the Jacobian's clamp is active for some."""
+    """Gaussians lie behind, around and close in front of the camera. The Jacobian's clamp is active for some."""
     exact = assert_matches_reference(
         random_cloud(400, -2.5, seed=3, spread=2.0), off_center_camera(48, 40, distance=0.1), relative=1e-4
     )
@@ -133,7 +133,7 @@ def test_a_sampled_view_draws_those_pixels_of_the_whole(antialiased):
 
 @pytest.mark.parametrize("footprint", [30.0, 300.0, 3000.0])
 def test_needles(footprint):
-    """Needles 1000:1, of so many pixels, at all angles."""
+    """Gaussians 1000 times longer than wide, `footprint` px long, at random angles."""
     gaussians = random_cloud(40, 0.0, seed=5, spread=0.5)
     length = math.log(footprint * 3.0 / (1.2 * 64))
     gaussians = replace(gaussians, log_scales=torch.tensor([length, length - math.log(1000), length - 7]).repeat(40, 1))
@@ -142,14 +142,17 @@ def test_needles(footprint):
 
 @pytest.mark.parametrize("log_scale", [-5.0, -3.2, -1.5])
 def test_antialiased_equals_reference(log_scale):
-    """From footprints far below a pixel to large ones; faint ones are left out alike."""
+    """Footprints reach from far below a pixel to large. Kernel and reference leave out the same faint Gaussians."""
     exact = assert_matches_reference(replace(random_cloud(300, log_scale), antialiased=True), off_center_camera(61, 47))
     assert exact.alpha.max() > 0.1
     assert_matches_reference(replace(random_cloud(300, log_scale), antialiased=False), off_center_camera(61, 47))
 
 
 def test_antialiased_needles_and_sheets():
-    """Shapes whose sharp determinant is next to nothing, or nothing: neither is drawn, nor is anything not finite."""
+    """The determinant of the 2D covariance before the low-pass filter is nearly 0 (needles), or 0 (lines).
+
+    Needles equal the reference. Lines are not drawn, and all gradients stay finite.
+    """
     gaussians = replace(random_cloud(40, 0.0, seed=5, spread=0.5), antialiased=True)
     needles = replace(gaussians, log_scales=torch.tensor([-1.0, -7.9, -7.9]).repeat(40, 1))
     assert (assert_matches_reference(needles, off_center_camera(64, 64), relative=1e-3).radii > 0).any()
@@ -160,8 +163,11 @@ def test_antialiased_needles_and_sheets():
 
 @pytest.mark.parametrize("impl", ["cpu", "torch"])
 def test_antialiased_adds_up_to_the_same_from_any_distance(impl):
-    """The sum of alpha of a round Gaussian is 2 pi o (f s / z)^2, also where that is far below a pixel; 3DGS's low-pass
-    makes it at least 2 pi o 0.3, as bright from afar as from near."""
+    """The sum of alpha of a round Gaussian is 2 pi o (f s / z)^2, even if the footprint is far below a pixel.
+
+    Here o is the opacity, s the standard deviation, f the focal length and z the depth. Without antialiasing, 3DGS's
+    low-pass filter makes the sum at least 2 pi o 0.3, however far the Gaussian is.
+    """
     turn, logit = torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([2.0])
     one = Gaussians(torch.zeros(1, 3), turn, torch.full((1, 3), -3.0), logit, torch.zeros(1, 1, 3))
     opacity = torch.tensor(2.0).sigmoid().item()
@@ -171,14 +177,14 @@ def test_antialiased_adds_up_to_the_same_from_any_distance(impl):
         size = 100 * math.exp(-3) / distance
         true = 2 * math.pi * opacity * size**2
         total = rasterizer.render(replace(one, antialiased=True), view, impl=impl).alpha.sum().item()
-        # what the 1/255 cut takes away is 1/255 of the peak's integral
+        # The cut at an alpha of 1/255 removes 2 pi / 255 times the variance of the footprint.
         faint = 2 * math.pi * (size**2 + 0.3) / 255
         assert total == pytest.approx(true, abs=faint + 0.01 * true), distance
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_reference_against_finite_differences(antialiased):
-    """Every parameter along random directions, in float64; the random scene has no pixel close to a threshold."""
+    """Each parameter is varied along random directions in float64. No pixel of the scene is close to a threshold."""
     gaussians, view = replace(random_cloud(12, -1.2, seed=2), antialiased=antialiased), off_center_camera(9, 8)
     gaussians = gaussians.map(torch.Tensor.double)
     _, gradients = differentiate(gaussians, view, "torch", torch.float64)
@@ -206,7 +212,7 @@ def test_reference_against_finite_differences(antialiased):
 
 
 def test_probe_is_the_gradient_of_the_2d_mean():
-    """Shifting the principal point shifts every 2D mean: the probe's gradients add up to that."""
+    """A shift of the principal point shifts every 2D mean, so its gradient is the sum of the probe's gradients."""
     gaussians, view = random_cloud(60, -2.5), off_center_camera(30, 30)
     _, gradients = differentiate(gaussians, view, "cpu", torch.float32)
     generator = torch.Generator().manual_seed(1)
@@ -245,13 +251,13 @@ def test_same_bits_for_any_number_of_threads():
 
 
 def test_footprints_over_many_tiles():
-    """Each covers the whole of an image of a hundred tiles, far more than room is made for at first."""
+    """Each Gaussian covers an image of a hundred tiles, far more than the buffers' initial size allows for."""
     exact = assert_matches_reference(random_cloud(6, 0.3), off_center_camera(200, 150), channels=1)
     assert (exact.radii > 200).all()
 
 
 def test_results_outlive_later_calls():
-    """Large arrays are made in memory of earlier calls, but only where nobody holds it any more."""
+    """Large arrays reuse the memory of earlier calls, but only after the earlier results were released."""
     view = off_center_camera(160, 150)
     rendering, gradients = differentiate(random_cloud(2000, -3.0), view, "cpu", torch.float32)
     kept = [*rendering, *gradients.values()]
@@ -262,7 +268,7 @@ def test_results_outlive_later_calls():
 
 
 def test_equal_depths_are_drawn_by_index():
-    """Forty opaque Gaussians in the same place, the first one red, the others green."""
+    """Of forty opaque Gaussians in the same place, the first is red and the rest are green; the pixel must be red."""
     gaussians = replace(random_cloud(40, -1.0), means=torch.zeros(40, 3), opacity_logits=torch.full((40,), 9.0))
     gaussians.sh[:] = 0.0
     gaussians.sh[:, 0] = torch.tensor([-2.0, 2.0, -2.0])
@@ -290,7 +296,7 @@ def test_order_and_length_of_quaternions_do_not_matter_to_values():
 
 
 def extreme_gaussians() -> Gaussians:
-    """Gaussians behind the camera, at its centre, far aside, huge, tiny, transparent and opaque."""
+    """Return Gaussians behind the camera, at its centre, far to the side, huge, tiny, transparent and opaque."""
     center = torch.tensor(off_center_camera(20, 20).center, dtype=torch.float32)
     gaussians = random_cloud(10, -1.0)
     for array, row, value in (
@@ -321,7 +327,7 @@ def test_extremes_stay_finite():
 
 @pytest.mark.parametrize("impl", ["cpu", "torch"])
 def test_nothing_to_draw(impl):
-    """No Gaussians, or all behind the camera: the background, zeros, and zero gradients."""
+    """Without Gaussians before the camera, the render is the background, all else is zero, and so are the gradients."""
     view, background = off_center_camera(5, 3), torch.tensor([0.1, 0.2, 0.3])
     behind = replace(random_cloud(4, -2.0), means=torch.tensor(view.center * 2, dtype=torch.float32).repeat(4, 1))
     for gaussians in (behind, random_cloud(0, -2.0)):
@@ -336,7 +342,7 @@ def test_nothing_to_draw(impl):
 
 
 def test_a_finished_pixel_stays_finished():
-    """Opaque sheets: transmittance never falls under 1e-4 and what lies behind changes nothing."""
+    """Opaque Gaussians cover each pixel. Transmittance never falls below 1e-4, and Gaussians behind change nothing."""
     view, count = off_center_camera(16, 16), 60
     gaussians = replace(random_cloud(count, 0.0), opacity_logits=torch.full((count,), 3.0))
     assert rasterizer.render(gaussians, view).alpha.max() <= 1 - 1e-4 + 1e-6
@@ -344,7 +350,7 @@ def test_a_finished_pixel_stays_finished():
 
 
 def test_deep_faint_stack():
-    """Two thousand layers of alpha about 1/150 at every pixel."""
+    """Each pixel blends two thousand layers of an alpha of about 1/150."""
     view, gaussians = off_center_camera(18, 12), random_cloud(2000, 2.0, seed=4)
     depths = torch.linspace(2.0, 4.0, 2000)[torch.randperm(2000, generator=torch.Generator().manual_seed(0))]
     forward = torch.tensor(view.world_to_camera[2, :3], dtype=torch.float32)
@@ -402,10 +408,10 @@ def test_bad_input_is_named(change, message):
 
 
 def test_gsplat_without_its_extension_is_named(monkeypatch):
-    """It can be imported all the same, and would fail at the first view with words that help nobody."""
+    """gsplat can be imported without its compiled extension, but fails at the first render with an unclear error."""
     for name, module in (("gsplat", types.ModuleType("gsplat")), ("gsplat.cuda", types.ModuleType("gsplat.cuda"))):
         monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.delitem(sys.modules, "gsplat.cuda._backend", raising=False)  # which a test before may have loaded
+    monkeypatch.delitem(sys.modules, "gsplat.cuda._backend", raising=False)  # an earlier test may have loaded it
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     like = types.SimpleNamespace(is_cuda=True, dtype=torch.float32, device="cuda:0")
     with pytest.raises(ValueError, match="needs gsplat: `make gpu`"):

@@ -1,4 +1,4 @@
-"""Files of splats from editors and other trainers are read to the right values, or refused in one line."""
+"""Splat files of editors and other trainers are read with the correct values, or refused with a message of one line."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ VIEW = make_camera("v", (48, 36), 40.0, (0.0, 0.0, -6.0))
 
 @pytest.fixture
 def splat_file(tmp_path):
-    """A .ply of 40 splats of degree 2, and its rows."""
+    """The path of a .ply file of 40 splats of degree 2, and its rows."""
     save_ply(tmp_path / "g.ply", random_gaussians(COUNT, 2))
     return tmp_path / "g.ply", read_rows(tmp_path / "g.ply")
 
@@ -57,7 +57,7 @@ def test_infinite_opacities_and_flat_scales_look_as_their_limits(splat_file):
     opaque, flat = made.opacity_logits.clone(), made.log_scales.clone()
     opaque[3], flat[5, 2], flat[6, 0] = 80.0, -60.0, -60.0
     limit = Gaussians(made.means, made.quaternions, flat, opaque, made.sh)
-    kept = limit.map(lambda p: p[torch.arange(COUNT) != 4])  # transparent: as if it were not there
+    kept = limit.map(lambda p: p[torch.arange(COUNT) != 4])  # a transparent splat renders like no splat
     np.testing.assert_allclose(render_color(made, VIEW), render_color(kept, VIEW), atol=1e-6)
 
 
@@ -202,9 +202,9 @@ def test_records_of_32_bytes_are_read(tmp_path):
 
 @pytest.mark.parametrize("version", [3, 4])
 def test_spz_is_read_in_the_frame_of_a_ply(tmp_path, version):
-    """The format has y up: its own writer turns a .ply by 180 degrees about x, rotations and harmonics too."""
+    """The format's y axis points up: its writer turns .ply splats, with their harmonics, by 180 degrees about x."""
     gsply, made, path = pytest.importorskip("gsply"), random_gaussians(300, 3), tmp_path / "s.spz"
-    made = replace(made, sh=0.3 * made.sh.clamp(-3, 3))  # the format holds -1 to 1
+    made = replace(made, sh=0.3 * made.sh.clamp(-3, 3))  # the format stores values in [-1, 1]
     save_spz(path, load_rows(tmp_path, made))
     raw = gsply.read_spz(str(path))
     np.testing.assert_allclose(raw.means, made.means.numpy() * (1, -1, -1), atol=1e-5)
@@ -262,7 +262,7 @@ def test_other_formats_are_refused_with_what_converts_them(tmp_path, ending):
 
 
 def test_rows_dropped_leave_what_was_deleted_consistent(tmp_path, recwarn):
-    """Both files hold invalid rows and padding; the mask has a value for each splat that stays."""
+    """scene.ply has invalid rows, cleaned.ply has padding. The mask of deleted splats has one value a valid splat."""
     folder = tmp_path / "s"
     whole, deleted = write_edited_capture(folder)
     table = read_rows(folder / "scene.ply")

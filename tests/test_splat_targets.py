@@ -1,4 +1,4 @@
-"""The compiled splatting for other processors than this one."""
+"""The compiled rasterizer, built for other processors than this machine's."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ print("ymm", "ymm" in assembly, "fma", "vfmadd" in assembly, "zmm", "zmm" in ass
 @pytest.mark.skipif(os.uname().machine != "x86_64", reason="needs an x86-64 processor")
 @pytest.mark.parametrize("target", [pytest.param(name, marks=SLOW) for name in ("x86-64", "avx2")])
 def test_other_processors(target, tmp_path):
-    """Values and gradients equal the reference's, and the code is what was asked for."""
+    """Values and gradients equal the reference, and the machine code uses the target's instruction set."""
     have = llvmlite.binding.get_host_cpu_features()
     if target == "avx2" and not (have.get("avx2") and have.get("fma")):
         pytest.skip("this processor has no AVX2")
-    for folder in ("reffusion", "tests"):  # a copy, so that kernels of another target do not enter this cache
+    for folder in ("reffusion", "tests"):  # a copy, so that kernels of another target do not enter the cache here
         shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__"))
     name, features = TARGETS[target]
     environment = {**os.environ, "NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": features, "PYTHONPATH": str(tmp_path)}

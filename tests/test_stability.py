@@ -13,7 +13,7 @@ from benchmarks.stability.cases import Case
 from benchmarks.stability.faults import FAULTS, is_caught
 
 CASES = {case.name: case for case in all_cases()}
-LONG = [case.name for case in random_scenes.CASES]  # a tenth of them here, all in `make stability`
+LONG = [case.name for case in random_scenes.CASES]  # a tenth of their scenes runs here, all run in `make stability`
 SCENES = 100
 
 

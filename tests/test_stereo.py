@@ -1,4 +1,4 @@
-"""Points by optical flow: exact for exact matches, robust to a wrong one, and far away without parallax."""
+"""3D points from optical flow: exact for exact matches, robust to a wrong match, and far away without parallax."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 
 
 def rig_camera(name: str, x: float, y: float = 0.0, turn: float = 0.0) -> Camera:
-    """At (x, y, -1), looking along z, turned about y."""
+    """Return a camera at (x, y, -1) that looks along z, then rotated about y by `turn` radians."""
     return make_camera(name, (WIDTH, HEIGHT), FOCAL, (x, y, -1.0), yaw(turn))
 
 
@@ -25,7 +25,13 @@ CAMERAS = [
 
 
 def make_matches(places_there, here, seen=None) -> stereo.Matches:
-    """Matches of view a with the other views."""
+    """Return the matches of view a with the other views.
+
+    Args:
+        places_there: positions in px of the matches in each other view, the views along the first axis.
+        here: positions in px in view a.
+        seen: bool, True for valid matches; None if all are valid.
+    """
     places = np.array(places_there)
     names = tuple(view.name for view in CAMERAS[1:])
     return stereo.Matches("a", here, names, places, np.ones(places.shape[:2], bool) if seen is None else seen)
@@ -78,7 +84,7 @@ def test_without_parallax_a_point_is_far_and_one_that_would_be_behind_is_none():
 
 
 def paint_slope(slope: float) -> dict[str, np.ndarray]:
-    """Views of the plane z = 1 + slope x, painted with noise of several sizes."""
+    """Return view name -> picture of the plane z = 1 + slope x, whose texture is noise at several scales."""
     rng, pictures = np.random.default_rng(3), {}
     waves = rng.normal(0, 14, (60, 2)), rng.uniform(0, 6.3, (60, 3))
     for view in CAMERAS:
@@ -94,14 +100,14 @@ def paint_slope(slope: float) -> dict[str, np.ndarray]:
 def test_a_painted_plane_comes_back(slope):
     points, colors = stereo.triangulate_points(CAMERAS, paint_slope(slope), 3)
     cells = WIDTH * HEIGHT / 9
-    assert 0.6 * cells < len(points) < 2 * cells  # later views add what the first does not see
+    assert 0.6 * cells < len(points) < 2 * cells  # later views add points that the first view does not see
     assert colors.shape == points.shape and colors.dtype == np.uint8
     away = np.abs(points[:, 2] - 1 - slope * points[:, 0]) / 2
     assert np.median(away) < 0.01 and np.quantile(away, 0.95) < 0.05
 
 
 def test_views_of_several_sizes_and_lenses_match(slope=0.3):
-    """One at 0.6 of the size, one cropped to a portrait, one larger."""
+    """One view has 0.6 times the size, one is cropped to portrait format, and one is larger."""
     pictures, cameras = paint_slope(slope), []
     for view, factor, left in zip(CAMERAS, (1.0, 0.6, 1.0, 1.5), (0, 0, 30, 0), strict=True):
         size = round((WIDTH - 2 * left) * factor), round(HEIGHT * factor)

@@ -23,7 +23,7 @@ METHODS = ("full", "no_sds", "inpaint_2d")
 
 @pytest.fixture
 def comparison_folder(tmp_path):
-    """Two compared scenes of a wall: `full` shows it, `no_sds` the square before it, `inpaint_2d` has only pictures."""
+    """Two compared scenes: `full` shows a wall, `no_sds` a square before the wall, `inpaint_2d` has pictures only."""
     everything, labels = wall_scene.wall_and_square(1.0)
     wall = everything.map(lambda part: part[~labels])
     runs = []
@@ -93,7 +93,7 @@ def test_images_where_no_encoder_is(comparison_folder, monkeypatch):
 
 
 def answer_trial(browser, key: dict, trial: dict) -> None:
-    """Answer a trial: `full` is better overall, the other more faithful; in a check the right one is better."""
+    """Answer a trial: `full` is better overall, the other more faithful. In a check, the correct clip is better."""
     ours = key["pairs"].get(trial["id"], {}).get("full") or key["checks"][trial["id"]]["right"]
     left = browser.get_attribute("#left video", "src")
     place = int(left != ours)
@@ -114,7 +114,7 @@ def test_a_whole_session(comparison_folder, tmp_path, width):
         order = browser.evaluate("order.map(each => each.trial)")
         assert len(order) == 6
         for number, trial in enumerate(order):
-            if number == 3:  # closed and opened again: it goes on
+            if number == 3:  # the session continues after a reload
                 browser.reload()
                 browser.fill("#name", "Ada L.")
                 browser.click("#begin")
@@ -142,8 +142,9 @@ def test_a_whole_session(comparison_folder, tmp_path, width):
 
 
 def simulate_votes(participants: int, truth: float, seed: int, spread: float = 0.15) -> tuple[list[dict], dict]:
-    """Votes on 12 pairs by participants who prefer the method with probabilities around `truth`. Every tenth of them
-    fails a check and always prefers the other method.
+    """Return votes on 12 pairs by participants who prefer the method with probabilities around `truth`.
+
+    Every tenth participant fails a check and always prefers the other method.
     """
     draws = np.random.default_rng(seed)
     pairs = {f"p{n}": {"scene": str(n), "method": "other", "full": f"ours{n}"} for n in range(12)}

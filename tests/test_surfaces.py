@@ -27,19 +27,23 @@ CAMERAS = [  # they look at the origin of the ground z = 0
 
 
 def intersect_ground(view: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Depth [H, W] and points [H, W, 3] of the ground."""
+    """Return the depth [H, W] and the points [H, W, 3] of the ground in the view."""
     rays = world_rays(view)
     depth = -view.center[2] / rays[..., 2]
     return depth, view.center + rays * depth[..., None]
 
 
 def reflection(way: np.ndarray) -> np.ndarray:
-    """What is added to the ground's colour in a direction [..., 3] to the camera: more from the right."""
+    """Return the reflection [..., 1] that is added to the ground's colour; it is stronger if seen from the right.
+
+    Args:
+        way: [..., 3], the direction from the ground to the camera.
+    """
     return (0.5 * way[..., 0] / np.linalg.norm(way, axis=-1))[..., None]
 
 
 def paint_ground(view: Camera, shines: bool = False) -> np.ndarray:
-    """uint8 [H, W, 3]: speckled ground."""
+    """Return the view's picture of speckled ground, uint8 [H, W, 3], with a reflection if `shines`."""
     _, points = intersect_ground(view)
     waves = sum(np.sin(points[..., :2] @ way + phase) for way, phase in WAVES)
     light = 0.45 + 0.12 * waves[..., None] / np.sqrt(len(WAVES)) * np.ones(3)
@@ -59,7 +63,7 @@ def ground_views() -> list[DepthView]:
 
 
 def uneven_depth(depth: np.ndarray) -> np.ndarray:
-    """Depth as splats render it: uneven by 2 %, and 2 % too near."""
+    """Return the depth with noise of 2 %, and 2 % too near, as rendered Gaussians show it."""
     return depth * (0.98 + 0.02 * np.random.default_rng(0).standard_normal(depth.shape))
 
 
@@ -84,7 +88,7 @@ def tilted_plane(height: float, tilt: float) -> Plane:
 def test_a_plane_moves_onto_what_is_known_around_the_hole():
     true, ring = intersect_ground(CAMERAS[0])[0], dilate(HOLE, 0.1) & ~HOLE
     noise = 1 + 0.004 * np.random.default_rng(1).standard_normal(true.shape)
-    far = np.random.default_rng(2).random(true.shape) < 0.2  # something else shows there
+    far = np.random.default_rng(2).random(true.shape) < 0.2  # a farther surface at a fifth of the pixels
     depth = np.where(ring, np.where(far, 1.5, noise) * true, 0.0)
     moved = continuation.align_plane(tilted_plane(0.08, 0.02), depth, CAMERAS[0], HOLE)
     assert np.abs(moved.depth(CAMERAS[0])[HOLE] / true[HOLE] - 1).max() < 0.003
@@ -96,7 +100,7 @@ def test_a_plane_moves_onto_what_is_known_around_the_hole():
 
 
 def hole_gaussians(sh_degree: int) -> Gaussians:
-    """Gaussians on the ground under the hole, in the colours of the first view without reflection."""
+    """Return Gaussians on the ground in the hole, whose colours are those of the first view in all directions."""
     view = CAMERAS[0]
     points, picture = intersect_ground(view)[1][HOLE], paint_ground(view, shines=True)[HOLE] / 255
     return round_gaussians(points, picture, np.exp(-4.0), 2.0, (sh_degree + 1) ** 2)

@@ -1,4 +1,4 @@
-"""Unseen parts of an object as its mirror image, where photographs agree: a vase beside a box, in analytic views."""
+"""Unseen parts of an object from its mirror image, if the photographs agree: a vase and a box in analytic views."""
 
 import cv2
 import numpy as np
@@ -24,12 +24,16 @@ CENTRE, RADIUS = (LOW + UPPER) / 2, 0.45
 
 
 def vase_camera(name: str, azimuth: float, height: float = 1.3, away: float = 3.0) -> Camera:
-    """Looks at the vase; azimuth in degrees; z is up in the world."""
+    """Return a camera that looks at the vase; azimuth in degrees; the world's z axis is up."""
     return orbit_camera(name, azimuth, height, away, np.array([0, 0, 0.2]), SIZE, FOCAL)
 
 
 def intersect_vase(rays: np.ndarray, center: np.ndarray, cut: bool) -> np.ndarray:
-    """[H, W], the distance along the rays to the vase, an elliptic cylinder; `cut` removes its right part aslant."""
+    """Return the distance [H, W] along the rays to the vase, an elliptic cylinder.
+
+    Args:
+        cut: whether an oblique cut removes the right part of the vase.
+    """
     scale = np.array([1 / WIDE, 1 / DEEP])
     d, o = rays[..., :2] * scale, center[:2] * scale
     a, b, c = (d * d).sum(-1), (d * o).sum(-1), o @ o - 1
@@ -50,7 +54,7 @@ def intersect_vase(rays: np.ndarray, center: np.ndarray, cut: bool) -> np.ndarra
 
 
 def render_vase(view: Camera, cut: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth [H, W] without the box, the mask of the box, and the mask of the vase without the box."""
+    """Return the depth [H, W] without the box, the box's mask, and the mask that the vase has without the box."""
     rays = world_rays(view)
     ground = np.where(rays[..., 2] < 0, -view.center[2] / np.minimum(rays[..., 2], -1e-9), 50.0).clip(0, 50)
     vase = intersect_vase(rays, view.center, cut)
@@ -64,14 +68,14 @@ def vase_depth_view(view: Camera, cut: bool = False) -> DepthView:
 
 
 def vase_color(points: np.ndarray, halved: bool) -> np.ndarray:
-    """[..., 3]: rising bands; `halved` gives one half other colours than the other."""
+    """Return the vase's colours [..., 3], a pattern of bands; `halved` gives its two halves different colours."""
     bands = 0.5 + 0.3 * np.sin(9 * points[..., 2])
     half = np.where(points[..., 0] > 0, 1 - bands, bands) if halved else bands
     return np.stack([half, 0.8 * half, 0.5 * bands], -1)
 
 
 def make_vase_scene(cut: bool = False, halved: bool = False):
-    """Depth views, photographs, and Gaussians of all visible points of vase and ground."""
+    """Return depth views, photographs, and the Gaussians of all visible points of the vase and the ground."""
     views = [
         vase_depth_view(vase_camera(f"v{k}", azimuth), cut) for k, azimuth in enumerate(np.linspace(-150, -30, 11))
     ]
@@ -87,7 +91,7 @@ def make_vase_scene(cut: bool = False, halved: bool = False):
 
 
 def select_left_right_mirrors(mirrors: list[Mirror]) -> list[Mirror]:
-    """The mirrors that exchange left and right, not front and back."""
+    """Return the mirrors that exchange left and right; mirrors that exchange front and back are left out."""
     return [mirror for mirror in mirrors if abs(mirror.normal[0]) > 0.8]
 
 
@@ -101,7 +105,7 @@ def vase_mirrors():
 def test_a_vase_is_its_own_mirror_image(vase_mirrors):
     _, _, _, mirrors = vase_mirrors
     found = select_left_right_mirrors(mirrors)
-    assert len(found) == 1 and len(mirrors) <= 2  # its back is like its front, too
+    assert len(found) == 1 and len(mirrors) <= 2  # front and back of the vase are symmetric, too
     assert abs(found[0].normal[0]) > 0.995 and abs(found[0].offset) < 0.02
 
 
@@ -127,7 +131,7 @@ def test_mirrored_pixels_are_unobserved_and_have_its_depth(vase_mirrors):
     supposed = np.isfinite(render_mirrors(mirrors, view.camera, hidden, views).plausible_depth) & vase
     inside = cv2.erode(supposed.astype(np.uint8), np.ones((9, 9))) > 0
     found = find_unobserved(gaussians, view.camera, hidden, views, planes, mirrors)
-    inside &= found.depth > 1.05 * true  # the ground behind it is seen by others, but not from here
+    inside &= found.depth > 1.05 * true  # without the ground behind the vase, which other views show
     assert inside.sum() > 200 and found.unobserved[inside].mean() > 0.9
     assert np.median(np.abs(found.continued_depth / true - 1)[inside & found.unobserved]) < 0.01
 

@@ -1,4 +1,4 @@
-"""Insertion, outpainting and other tasks are settings of a scene: the code has no case for any of them."""
+"""Insertion, outpainting and other tasks are settings of a scene: the code must not name any of these tasks."""
 
 import ast
 import re
@@ -9,7 +9,7 @@ TASKS = re.compile(r"outpaint|insertion|sparse.views", re.IGNORECASE)
 
 
 def code_words(path: Path) -> set[str]:
-    """Names and strings of a file's code, without docstrings."""
+    """Return the words in the names and strings of a file's code, without docstrings."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     docstrings = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)}
     strings = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str)

@@ -1,4 +1,4 @@
-"""The number of threads of a long computation on the CPU."""
+"""The choice of the number of threads for a long computation on the CPU."""
 
 import os
 import subprocess
@@ -15,7 +15,13 @@ STEPS = 12
 
 
 def record_parts(seconds, steps=MIN_STEPS, device="cpu", idle=time.perf_counter):
-    """The parts that run at once in each of `STEPS` steps, which take `seconds[parts]`; `idle`: idle time."""
+    """Run `STEPS` steps, and return the number of parallel parts in each step.
+
+    Args:
+        seconds: number of parts -> duration of a step in seconds.
+        steps: number of steps that is announced.
+        idle: function that returns the idle time of the cores in seconds.
+    """
     before, found = torch.get_num_threads(), []
     torch.set_num_threads(2)
     try:
@@ -44,7 +50,7 @@ def test_one_thread_is_used_where_the_others_hold_it_up():
 
 def test_a_core_that_others_use_is_left_to_them():
     assert record_parts({1: 0.01, 2: 0.0}, idle=lambda: 0.5 * time.perf_counter()) == [1] * STEPS
-    assert record_parts({1: 0.1, 2: 0.0}, idle=lambda: float("inf"))[-1] == 2  # where nobody tells
+    assert record_parts({1: 0.1, 2: 0.0}, idle=lambda: float("inf"))[-1] == 2  # where the idle time is unknown
     assert 0 < idle_seconds() < float("inf")
 
 
@@ -57,7 +63,7 @@ def test_little_work_and_gpus_are_left_to_torch():
 
 
 def test_the_benchmark_sets_one_thread_before_numpy_and_torch_are_loaded():
-    """They read the number only once; with two threads, CPU seconds would contain the time of waiting."""
+    """NumPy and PyTorch read the number once. With two threads, CPU seconds would include time spent waiting."""
     probe = """
 import os, sys
 class Watch:

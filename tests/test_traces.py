@@ -1,4 +1,4 @@
-"""Error against run time: traces of stages, pauses of the clock, early ends, budgets, and the regression gate."""
+"""Error over run time: traces of stages, their clock, kills and checkpoints, time budgets, the regression gate."""
 
 import copy
 import json
@@ -46,7 +46,7 @@ def initialized_folders(tmp_path_factory):
     """The folders of a small scene up to `initialize`, and of a random prior."""
     home = tmp_path_factory.mktemp("scene")
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(fill, "COMPLETION", CompletionSettings(planar_share=2.0))  # no planes: both solvers
+        patched.setattr(fill, "COMPLETION", CompletionSettings(planar_share=2.0))  # no planes, so that both solvers run
         folders = run_through_initialize(home, NEAR)
     save_small_prior(home / "prior")
     return folders | {"prior": home / "prior"}
@@ -60,7 +60,7 @@ def test_the_line_of_a_violation_is_that_of_the_file(tmp_path):
 
 
 def run_stage(stage: str, initialized_folders, out: Path, **changed) -> Path:
-    """Run one of the iterative stages on the small scene; return its folder."""
+    """Run an iterative stage on the small scene into the folder `out`; return this folder."""
     out.mkdir(parents=True, exist_ok=True)
     if stage == "fit":
         fit.run(fit.Params().changed(FIT | changed), out, poses=initialized_folders["poses"])
@@ -75,7 +75,7 @@ def run_stage(stage: str, initialized_folders, out: Path, **changed) -> Path:
 
 
 def load_result(folder: Path) -> list[torch.Tensor]:
-    """The numbers of a stage's result; the header of a LoRA file differs between runs."""
+    """Return the tensors of a stage's result. Files are not compared, because the header of a LoRA file differs."""
     if (folder / "gaussians.ply").exists():
         gaussians = load_ply(folder / "gaussians.ply")
         return [getattr(gaussians, name) for name in PARAMETERS]
@@ -176,7 +176,7 @@ KILLED = {
 
 @pytest.mark.parametrize(("saving", "every"), [(3.0, 10.0), (0.01, 10.0), (30.0, 0.1)])
 def test_checkpoints_cost_under_two_percent(tmp_path, monkeypatch, saving, every):
-    """Steps of half a second and checkpoints of so many: after the first, whose cost nobody knew."""
+    """A step takes 0.5 s and a checkpoint `saving` s. The first checkpoint, whose cost is unknown, does not count."""
     now, spent = [0.0], []
     monkeypatch.setattr(trace.time, "monotonic", lambda: now[0])
 
@@ -197,11 +197,11 @@ def test_checkpoints_cost_under_two_percent(tmp_path, monkeypatch, saving, every
 
 @pytest.mark.parametrize("stage", ["fit", "personalize", "distill"])
 def test_a_slow_disk_does_not_hold_a_stage_up(initialized_folders, tmp_path, monkeypatch, stage):
-    """One checkpoint of 0.3 s, and none more in a run of less than 15: by a clock of the test's own."""
+    """On a simulated clock, a checkpoint takes 0.3 s. A run of less than 15 s must write only one checkpoint."""
     now, saved = [0.0], []
 
     def monotonic():
-        now[0] += 1e-3  # each time that someone looks
+        now[0] += 1e-3  # each reading takes 1 ms
         return now[0]
 
     def slowly(folder, state):
@@ -276,7 +276,7 @@ def test_steps_that_fit_are_counted_once(tmp_path):
 
     def trial(folder, steps):
         tried.append(folder)
-        seconds = [100.0] + [100.0 + 0.5 * i for i in range(steps)]  # the first step takes its time
+        seconds = [100.0] + [100.0 + 0.5 * i for i in range(steps)]  # the first step is slow
         rows = [{"seconds": s, "iteration": i} for i, s in enumerate(seconds)]
         (folder / "trace.jsonl").write_text("\n".join(map(json.dumps, rows)))
 
@@ -295,7 +295,7 @@ def test_steps_that_fit_are_counted_once(tmp_path):
 
 @pytest.mark.parametrize("stage", ["fit", "personalize", "distill"])
 def test_a_budget_shortens_a_stage_and_its_schedule(initialized_folders, tmp_path, stage):
-    """A moment's budget: the fewest steps, a twentieth; the trial before them leaves no mark on the result."""
+    """A budget of 1 ms gives the smallest number of steps, a twentieth. The trial run must not change the result."""
     steps = {"fit": 2, "personalize": 1, "distill": 1}[stage]
     out = run_stage(stage, initialized_folders, tmp_path / "short", seconds=1e-3)
     assert trace_lines(out)[-1]["iteration"] == steps
@@ -319,7 +319,7 @@ def test_betas_are_parts(made, betas):
 
 
 def points_of_baselines(baselines: dict) -> list[Diagram]:
-    """The committed baselines as new measurements."""
+    """Return the committed baselines in the form of new measurements."""
     return [
         Diagram(name, "", "", None, [Point(*key.rsplit(", ", 1), 0.0, *value) for key, value in points.items()])
         for name, points in baselines["diagrams"].items()

@@ -1,4 +1,4 @@
-"""The visibility of the space behind an object: a table with free space below, in analytic views."""
+"""The visibility of surfaces behind an object: a box on a table with free space below, in analytic views."""
 
 from dataclasses import replace
 
@@ -33,13 +33,15 @@ SIZE, FOCAL = 160, 150.0
 
 
 def table_camera(name: str, azimuth: float, height: float, away: float = 3.5) -> Camera:
-    """Looks at the middle of the table; azimuth in degrees; z is up in the world."""
+    """Return a camera that looks at the middle of the table; azimuth in degrees; the world's z axis is up."""
     return orbit_camera(name, azimuth, height, away, np.zeros(3), SIZE, FOCAL)
 
 
 def render_table(view: Camera, notched: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth [H, W] of table and floor, the mask of the box, and the mask of the table without the box; `notched`
-    removes a quarter of the table, up to the middle of the box.
+    """Return the depth [H, W] of table and floor, the box's mask, and the mask that the table has without the box.
+
+    Args:
+        notched: whether a quarter of the table is missing, up to the middle of the box.
     """
     rays = world_rays(view)
     to = lambda z: (z - view.center[2]) / rays[..., 2]
@@ -62,7 +64,7 @@ def table_views():
     above = [table_depth_view(table_camera(f"a{k}", 30 * k, 1.6)) for k in range(12)]
     return above + [
         table_depth_view(table_camera(f"l{k}", 60 * k, -0.5)) for k in range(6)
-    ]  # these look under the table
+    ]  # these cameras look under the table
 
 
 def test_a_point_is_seen_on_its_surface_only(table_views):
@@ -108,7 +110,7 @@ def test_a_table_is_seen_from_above_though_what_stands_beside_it_is_lower(table_
 
 @pytest.mark.parametrize(("wide", "through"), [(0.15, False), (0.4, True)])
 def test_a_speck_that_views_see_through_is_no_hole(wide, through):
-    """Beside the box's edge views' depth is rough."""
+    """A spot of the table has too large a depth in all views. Only the larger spot (`wide` = 0.4) is a hole."""
     views = []
     for turn in range(0, 360, 30):
         view = table_depth_view(table_camera(f"a{turn}", turn, 1.6))
@@ -123,8 +125,10 @@ def test_a_speck_that_views_see_through_is_no_hole(wide, through):
 
 
 def test_borders_that_are_visible_go_on_under_the_box():
-    """The box hides the inner corner of an L-shaped table: what is beyond the line between its visible edges is free,
-    though the convex hull of the table has it."""
+    """The box hides the inner corner of an L-shaped table.
+
+    Cells beyond the straight line between the table's visible edges are free, although the convex hull contains them.
+    """
     views = [table_depth_view(table_camera(f"a{k}", 30 * k, 1.6), notched=True) for k in range(12)]
     planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.offset))
@@ -137,7 +141,7 @@ def test_borders_that_are_visible_go_on_under_the_box():
 
 
 def plinth_depth_view(view: Camera) -> DepthView:
-    """Rough ground with the upright face of a plinth behind the box, which ends where the box begins."""
+    """Return a view of rough ground and a plinth's upright face behind the box; the face ends where the box begins."""
     rays = world_rays(view)
     ground, face = -view.center[2] / rays[..., 2], (0.5 - view.center[1]) / rays[..., 1]
     place = view.center + rays * face[..., None]
@@ -147,7 +151,7 @@ def plinth_depth_view(view: Camera) -> DepthView:
 
 
 def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
-    """Near their crossing, and beneath it, rough ground looks like the wall's: on both sides of the box."""
+    """Close to the wall's plane, rough ground looks like seen cells of this plane, on both sides of the box."""
     views = [plinth_depth_view(table_camera(f"a{k}", 200 + 12 * k, 1.4)) for k in range(12)]
     planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
     face = max(planes, key=lambda plane: abs(plane.normal[1]))
@@ -161,7 +165,7 @@ def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
 
 
 def test_gaussians_beneath_the_table_are_not_the_surface_behind_the_box(table_views):
-    """Left there by a fit that is wrong about the ground in one view."""
+    """A fit whose depth is wrong in one view leaves floaters beneath the table."""
     camera = table_views[0].camera
     rays = world_rays(camera)
     beneath = np.clip((-0.2 - camera.center[2]) / np.minimum(rays[..., 2], -1e-3), 0, 20)
@@ -185,7 +189,7 @@ def test_gaussians_beneath_the_table_are_not_the_surface_behind_the_box(table_vi
 
 
 def test_objects_in_front_of_a_plane_do_not_refute_it():
-    """Half of what is around the patch is a ball before the wall; behind, it would be one that cuts through."""
+    """In half of the patch's surroundings an object is nearer than the wall. A farther object would refute the wall."""
     view, everywhere, nowhere = table_camera("v", 0, 0.0), np.ones((CELLS, CELLS), bool), np.zeros((CELLS, CELLS), bool)
     wall = Plane(
         np.array([1.0, 0, 0]), 0.0, np.zeros(3), np.eye(3)[1:], 0.05, nowhere, everywhere, nowhere, nowhere, nowhere
@@ -196,7 +200,7 @@ def test_objects_in_front_of_a_plane_do_not_refute_it():
     half, full = np.arange(SIZE) < 78, np.ones(SIZE, bool)
     agrees = lambda rate, where: _continues_surroundings(patch, wall, at, view, np.where(where, rate * at, at), ~patch)
     assert agrees(0.7, half) and not agrees(1.4, half)
-    assert not agrees(0.7, full)  # nothing of it is seen there
+    assert not agrees(0.7, full)  # the wall is seen nowhere around the patch
 
 
 def test_slivers_go_and_patches_stay():
@@ -208,7 +212,7 @@ def test_slivers_go_and_patches_stay():
 
 
 def test_an_object_that_hides_its_far_side_does_not_refute_it(table_views):
-    """Half of the views look at the box's side from behind: something stands before it there."""
+    """Half of the views look at the box's side from behind, where the box itself is nearer."""
     exact = lambda depth: (depth, (depth, depth))
     whole = [
         DepthView.from_range(v.camera, *exact(render_box_depth(v.camera)), np.zeros_like(v.masked))
@@ -220,7 +224,7 @@ def test_an_object_that_hides_its_far_side_does_not_refute_it(table_views):
 
 
 def render_box_depth(view: Camera) -> np.ndarray:
-    """Depth [H, W] of table, floor and box."""
+    """Return the depth [H, W] of table, floor and box."""
     depth, hidden, _ = render_table(view)
     return np.where(hidden, meet_box(view, *CORNERS)[0], depth)
 
@@ -233,7 +237,7 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(table_vi
     grain = np.random.default_rng(0).integers(-12, 13, (SIZE, SIZE, 1))
     truth = np.clip(np.full((SIZE, SIZE, 3), 140) + grain, 0, 255).astype(np.uint8)
     photo = np.where(shadow[..., None], (truth * 0.6).astype(np.uint8), truth)
-    photo[5:25, 5:25] = 40  # something else that differs, far from the mask
+    photo[5:25, 5:25] = 40  # another difference, far from the mask
     found = shadows.detect_shadows(truth, photo, hidden)
     assert (found & shadow).sum() > 0.9 * (shadow & ~view.masked).sum() and not found[5:25, 5:25].any()
     assert not shadows.detect_shadows(truth, truth, hidden).any()
@@ -250,7 +254,7 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(table_vi
 
 
 def test_gaussians_of_other_colours_than_gravel_are_debris():
-    """Before rough ground nearly everything counts as seen; a teal splinter of the object does not belong there."""
+    """Before rough ground nearly all Gaussians count as seen. The teal ones, remains of the object, must be found."""
     view = table_camera("v", 0, 2.0)
     depth, _, _ = render_table(view)
     rough = (depth * (1 + 0.1 * np.random.default_rng(0).random(depth.shape))).astype(np.float32)
@@ -266,7 +270,10 @@ def test_gaussians_of_other_colours_than_gravel_are_debris():
 
 
 def test_visibility_of_points_follows_the_formulas(table_views):
-    """Points on both surfaces, before, behind and beside them, behind cameras and nowhere; with and without a side."""
+    """Points lie on, before, behind and beside the surfaces, behind cameras, and at non-finite positions.
+
+    Visibility is computed with and without a normal.
+    """
     noise = np.random.default_rng(0)
     points = noise.uniform(-1.5, 1.5, (3000, 3)) * (1, 1, 0.7)
     points[:1000, 2], points[1000:1500, 2], points[-2], points[-1] = TOP, FLOOR, (9, 0, 0.5), np.nan

@@ -1,4 +1,4 @@
-"""The variants of pipeline.yaml: the stages that each skips and shares, the Gaussians it changes, and runs."""
+"""The variants of pipeline.yaml: the stages that each variant runs, skips or shares, and the results of their runs."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ pytestmark = pytest.mark.integration
 ROOT = Path(__file__).resolve().parent.parent
 NEAR = 1.7
 
-# Variant -> (stages that run, stages left out beside `lift`); all others are shared with the scene's own run.
+# Variant -> (stages that run, skipped stages without `lift`). All other stages are shared with the scene's own run.
 AFTER = ("distill", "finish", "evaluate")
 FILLED = ("reference", "personalize", "initialize", "distill")
 PLANS = {
     "no_personalization": (AFTER, ("personalize",)),
     "no_splitting": (AFTER, ()),
-    "no_reference_init": (("initialize", "personalize", *AFTER), ()),  # the latter waits for what the former says
-    "no_local_sds": ((), ()),  # the laptop profile has none of these three
+    "no_reference_init": (("initialize", "personalize", *AFTER), ()),  # personalize reads facts of initialize
+    "no_local_sds": ((), ()),  # the laptop profile lacks these three terms
     "no_adversarial": ((), ()),
     "no_depth": ((), ()),
     "no_sds": (AFTER, ("personalize",)),
@@ -78,7 +78,7 @@ def decide_stages(job: ResolvedJob) -> dict[str, Decision]:
 
 @pytest.fixture(scope="module")
 def finished_capture(tmp_path_factory):
-    """A small scene, and runs/ after its own run, as far as the runner looks."""
+    """A small scene, and the folder runs/ after the scene's own run, with the files that the runner reads."""
     home = tmp_path_factory.mktemp("variants")
     scene, runs = write_capture(home / "scene", "llff", make_truth()), home / "runs"
     job, decisions = resolve(Request(ROOT, runs, str(scene), profile="laptop")), {}
@@ -137,7 +137,7 @@ def test_the_papers_terms_are_the_papers_at_the_laptops_size(tmp_path):
 
 
 def by_dotted_name(params):
-    """Parameters by their dotted names."""
+    """Return dotted name -> value of the parameters."""
     groups = {name: value for name, value in params.items() if isinstance(value, dict)}
     inner = {f"{name}.{each}": value for name, group in groups.items() for each, value in group.items()}
     return {name: value for name, value in params.items() if name not in groups} | inner
@@ -188,7 +188,7 @@ def has_moved(start, ended):
 
 @pytest.fixture
 def check_regions_every_step(monkeypatch):
-    """Look for Gaussians that changed region after every step."""
+    """Make `distill` check after every step which Gaussians changed their region."""
     monkeypatch.setattr(D, "REGION_EVERY", 1)
 
 
@@ -279,7 +279,7 @@ def test_lift_goes_on_where_it_was_killed(masked_scene, lifted_views, tmp_path):
 
 
 def test_lift_paints_a_clean_view_if_it_is_the_best(masked_scene, tmp_path):
-    """So it is if scene.yaml asks to fill pixels of it."""
+    """A clean view has a hole if scene.yaml asks to fill pixels of this view."""
     best = load_json(masked_scene["masks"] / "facts.json")["best_reference"]
     shutil.copytree(masked_scene["poses"], tmp_path / "poses")
     views = load_json(tmp_path / "poses/views.json")
@@ -319,7 +319,7 @@ def test_random_gaussians_fill_the_region_of_the_hole_by_their_seed(masked_scene
     debris = int(load_labels(masked_scene["masks"] / "debris.npy").sum())
     assert int(new.sum()) == max(removed - debris, random_init.MIN_GAUSSIANS)
     at = gaussians.means[new]
-    # Removed were the square and what of the wall it hides from all views.
+    # The square, and the part of the wall that it hides from all views, were removed.
     assert (at[:, :2].abs() < 1.3 * wall_scene.HALF).all()
     assert (at[:, 2] > NEAR - 0.1).all() and (at[:, 2] < wall_scene.WALL + 0.1).all()
     again, _ = run_initialize(masked_scene, tmp_path / "again", "random")
@@ -340,7 +340,7 @@ def test_random_points_lie_in_the_holes():
 
 
 def test_the_chain_of_lifted_pictures(masked_scene, lifted_views, tmp_path, monkeypatch):
-    """The hole of the wall filled from pictures inpainted one by one: nearer to the wall than to nothing."""
+    """Pictures inpainted one by one fill the wall's hole; the result is nearer to the wall than an empty hole is."""
     assert run_initialize(masked_scene, tmp_path / "initialize", "lift", lift=lifted_views)[1].any()
     with pytest.raises(ValueError, match=r"set distill.lift.weight"):
         run_initialize(masked_scene, tmp_path / "without", "lift")
@@ -392,7 +392,7 @@ def test_rendered_views_inpainted_in_2d(masked_scene, tmp_path):
 
 
 def test_the_masked_fit_never_sees_a_masked_pixel(masked_scene, tmp_path):
-    """Photographs with noise where they are masked, and another object's colour, give the same Gaussians to the bit."""
+    """Noise in the masked pixels of the photographs and another colour of the object give identical Gaussians."""
     values = {"iterations": 12, "sh.degree": 0, "init.flow_cell": 6, "densify.cap_max": 1500, "densify.every": 4}
     params = fit.Params(pixels="unmasked").changed(values)
     found = []

@@ -1,4 +1,4 @@
-"""Videos as scenes: the choice of frames, refusals, and their cache; HEIC photographs."""
+"""Videos as scenes: the choice of frames, their cache, and refused videos; also HEIC photographs."""
 
 import base64
 import csv
@@ -24,7 +24,7 @@ from runner.resolve import Request, resolve
 
 ROOT = Path(__file__).resolve().parent.parent
 WIDTH, HEIGHT, STEP, SHOTS = 160, 120, 3, 60
-# 48 x 64 px upright: red above, green and blue below; its file holds them lying, and turns them.
+# 48 x 64 px in portrait format: red above, green and blue below. The file stores the picture rotated by 90 degrees.
 PHONE = """
 AAAAHGZ0eXBoZWljAAAAAG1pZjFoZWljbWlhZgAAAchtZXRhAAAAAAAAACFoZGxyAAAAAAAAAABwaWN0AAAAAAAAAAAAAAAAAAAAADRpbG9jAA
 AAAERAAAIAAQAAAAAB7AABAAAAAAAAAOEAAgAAAAACzQABAAAAAAAAACQAAAA4aWluZgAAAAAAAgAAABVpbmZlAgAAAAABAABodmMxAAAAABVp
@@ -40,7 +40,7 @@ AAAQAGAAAAAAAA
 
 
 def render_walk(step=STEP):
-    """Pictures of a camera that passes a wall of blocks."""
+    """Return the pictures of a camera that moves past a wall of blocks, by `step` px a picture."""
     draw = np.random.default_rng(1)
     wall = cv2.resize(draw.integers(0, 255, (40, 120, 3), np.uint8), None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
     return [wall[:HEIGHT, k * step : k * step + WIDTH] for k in range(SHOTS)]
@@ -56,7 +56,7 @@ def write_video(path, pictures):
 
 
 def blur_some(pictures):
-    """Four pictures for each: blurred, unchanged twice, and smeared."""
+    """Return four pictures for each picture: blurred, unchanged twice, and with motion blur."""
     soft = lambda picture: cv2.GaussianBlur(picture, (0, 0), 4)
     return [way(picture) for picture in pictures for way in (soft, np.copy, np.copy, lambda p: cv2.blur(p, (25, 1)))]
 
@@ -70,7 +70,7 @@ def test_sharp_frames_spaced_by_what_moves_and_the_same_ones_again(walk_video, t
     message = video.extract_frames(walk_video, tmp_path / "a", "hash")
     numbers = [int(path.stem.removeprefix("frame_")) for path in sorted((tmp_path / "a/images").iterdir())]
     assert all(number % 4 in (1, 2) for number in numbers), "none is blurred or smeared"
-    way = STEP * SHOTS / WIDTH  # widths
+    way = STEP * SHOTS / WIDTH  # path of the camera in picture widths
     assert len(numbers) == pytest.approx(way / video.SPACING, rel=0.3)
     apart = np.diff([number // 4 for number in numbers]) * STEP / WIDTH
     assert apart.min() > 0 and apart.max() <= 2.5 * video.SPACING

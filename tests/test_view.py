@@ -1,4 +1,4 @@
-"""The viewer: cameras, layers, and which picture a visitor gets when."""
+"""The viewer: cameras, layers of the result, and the pictures that a visitor receives."""
 
 import urllib.request
 from types import SimpleNamespace
@@ -28,7 +28,7 @@ NEEDS = {"poses": "a", "fit": "b", "masks": "c", "initialize": "d", "distill": "
 
 
 def write_finished_job(home, needs):
-    """Write a run whose result is the wall; before distillation the square stands in front of it."""
+    """Write a run whose result is the wall; before distillation, the square is in front of the wall."""
     gaussians, labels = wall_scene.wall_and_square(1.0)
     train = {name: wall_scene.CAMERAS[name] for name in wall_scene.TRAIN}
     points = gaussians.means.double().numpy()
@@ -49,7 +49,7 @@ def write_finished_job(home, needs):
 
 
 def visitor_camera(camera):
-    """A visitor's camera as viser describes it."""
+    """Return a visitor's camera as viser describes it."""
     rotation = camera.world_to_camera[:3, :3]
     place = {"wxyz": view._quaternion(rotation.T), "position": camera.center}
     return SimpleNamespace(**place, fov=view.vertical_fov(camera), aspect=camera.width / camera.height)
@@ -87,7 +87,7 @@ def test_the_layers_are_those_that_the_result_was_made_from(tmp_path):
 
 
 def test_the_backdrop_of_evaluate_counts_as_kept(tmp_path):
-    """And what it leaves out is missing from either."""
+    """Gaussians that the stage `evaluate` leaves out are missing from both layers."""
     gaussians, labels = write_finished_job(tmp_path / "x", NEEDS)
     backdrop = gaussians.map(lambda p: p[:5] + 3)
     fewer = join_gaussians(gaussians.map(lambda p: p[1:]), backdrop)
@@ -100,7 +100,7 @@ def test_unobserved_pixels_are_hatched(tmp_path):
     gaussians, _ = write_finished_job(tmp_path / "x", NEEDS)
     scene = load_scene(tmp_path / "x/poses")
     shape = next(iter(scene.cameras.values()))
-    for name in scene.train:  # all of them hide what lies on the left
+    for name in scene.train:  # the object covers the left of all training views
         save_mask(tmp_path / f"x/masks/consistent/{name}.png", np.indices((shape.height, shape.width))[1] < 12)
     seen_by = unseen_overlay.load_seen_views(tmp_path / "x", scene)
     camera = scene.cameras[scene.train[0]]
@@ -153,7 +153,7 @@ def test_a_visitor_gets_a_small_picture_at_once_then_the_whole_and_another_when_
 
 @pytest.mark.parametrize("width", [1280, 390])
 def test_a_browser_shows_the_result_without_what_is_unchecked_and_before_distillation(viewer, width):
-    """The square, added by distillation, is red and in the middle of the picture; the page asks no other machine."""
+    """The square, which distillation added, is red and in the middle. The page sends no request to another machine."""
     with open_page(f"http://127.0.0.1:{viewer.server.get_port()}", width) as page:
         page.wait_for_selector("canvas", timeout=60000)
 

@@ -1,4 +1,4 @@
-"""Weights: found in each layout without a network, a message for each fault, and downloads."""
+"""Network weights: found in each folder layout without internet access, a message for each fault, and downloads."""
 
 import hashlib
 import http.server
@@ -28,7 +28,7 @@ PARTS = ("unet", "vae", "text_encoder", "tokenizer", "scheduler")
 
 @pytest.fixture
 def isolated_machine(tmp_path, monkeypatch):
-    """Empty caches, an empty working directory, and no network."""
+    """Empty caches, an empty working directory, and no internet access."""
     for name in ("HF_HUB_CACHE", "HF_HUB_OFFLINE", "TORCH_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -54,7 +54,7 @@ def copy_prior(target: Path) -> Path:
 
 
 def write_hub_entry(tmp_path, name="acme/paint", state="0123abc", main=True) -> Path:
-    """Write an entry of the hub's cache."""
+    """Write a model to the hub's cache; return the entry's folder."""
     entry = tmp_path / "hub" / "hub" / f"models--{name.replace('/', '--')}"
     copy_prior(entry / "snapshots" / state)
     if main:
@@ -233,10 +233,13 @@ def test_one_set_of_weights_a_part_is_chosen():
 
 
 class Hub(http.server.BaseHTTPRequestHandler):
-    """The part of a hub that downloads use: models, one of them gated.
+    """A local model hub that answers the requests of downloads; one of its models is gated. The fixture `hub` sets:
 
-    `models`: name -> file -> bytes. `spoilt`: files that arrive with a byte flipped. `stalls`: files of which half is
-    sent, and then nothing. `ranges`: the first bytes of range requests, where not 0. Set by `hub`.
+    Attributes:
+        models: name -> file -> bytes.
+        spoilt: files that are sent with one wrong byte.
+        stalls: files of which only the first half is sent.
+        ranges: nonzero start positions of the range requests so far.
     """
 
     STATE = "a" * 40
@@ -296,7 +299,7 @@ class Hub(http.server.BaseHTTPRequestHandler):
 
 @pytest.fixture
 def hub():
-    """(address, the handler's class) of a local hub."""
+    """The address of a local hub, and its handler class."""
     tiny = {p.relative_to(TINY).as_posix(): p.read_bytes() for p in sorted(TINY.rglob("*"))
             if p.suffix in (".json", ".safetensors")}  # fmt: skip
     fields = {"models": {"acme/paint": tiny}, "spoilt": set(), "stalls": set(), "ranges": []}
@@ -321,7 +324,7 @@ for name in sys.argv[1:]:
 
 
 def fetch_models(*names, **environment) -> list[str]:
-    """The output of downloading these models, in lines; in a new process, which reads the hub's address."""
+    """Download these models in a new process, which reads the hub's address; return the lines of its output."""
     variables = {k: v for k, v in os.environ.items() if not k.startswith("HF_")} | environment
     variables |= {"PYTHONPATH": str(ROOT), "HF_HUB_DISABLE_XET": "1", "HF_HUB_ETAG_TIMEOUT": "2"}
     done = subprocess.run(
@@ -346,7 +349,7 @@ def test_a_model_is_fetched_from_the_hub_and_each_refusal_has_its_message(tmp_pa
 
 @pytest.mark.integration
 def test_weights_of_the_laptop_are_fetched_killed_resumed_and_checked(tmp_path, hub):
-    """LaMa, MI-GAN, Depth Anything: what `make weights` lists, from a local hub."""
+    """The weights that `make weights` lists (LaMa, MI-GAN, Depth Anything) are downloaded from a local hub."""
     address, handler = hub
     small = {
         "config.json": b"{}",

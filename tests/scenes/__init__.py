@@ -1,1 +1,1 @@
-"""Small scenes, captures, pipelines and networks with known truth, from which tests are built."""
+"""Small scenes, captures, pipelines and networks, on which the tests run; the correct results are known."""

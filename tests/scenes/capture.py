@@ -1,4 +1,4 @@
-"""A small capture with known truth in each layout, and the stages `poses` and `raw_masks` run on it."""
+"""Write small captures with known poses in each supported layout, and run `poses` and `raw_masks` on them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,13 @@ PINHOLE = ("SIMPLE_PINHOLE", (90.0, 48.0, 36.0))
 
 @dataclass(frozen=True)
 class Truth:
-    """A capture in its own frame: view name -> world to camera [4, 4], points [N, 3], COLMAP model and parameters."""
+    """The true poses, points and lens of a capture, in the capture's own frame.
+
+    Attributes:
+        world_to_camera: view name -> [4, 4].
+        points: [N, 3].
+        model: name and parameters of the COLMAP camera model of all views.
+    """
 
     world_to_camera: dict[str, np.ndarray]
     points: np.ndarray
@@ -41,12 +47,12 @@ class Truth:
 
 
 def load_test_masks(folder: Path) -> dict[str, np.ndarray]:
-    """Test view name -> bool [H, W], where the object would be visible."""
+    """Return test view name -> bool [H, W], True where the object would be visible if it were present."""
     return {path.stem: load_mask(path) for path in sorted((folder / "test_masks").glob("*.png"))}
 
 
 def make_truth(model=PINHOLE, views=6, scale=1.0, offset=(0.0, 0.0, 0.0)) -> Truth:
-    """Cameras on an arc, 4 away from a cloud of points around the offset."""
+    """Return cameras on an arc that look at a cloud of points around `offset` from a distance of 4 * scale."""
     generator, cameras, offset = np.random.default_rng(3), {}, np.array(offset)
     for k in range(views):
         angle = np.radians(-25 + 50 * k / (views - 1))
@@ -72,7 +78,7 @@ def write_masks(folder: Path, names, size=(WIDTH, HEIGHT), value=255) -> None:
 
 
 def write_model(folder: Path, truth: Truth, text=False, factor=1, ending=".jpg") -> None:
-    """Write a COLMAP model for pictures `factor` times larger than those written."""
+    """Write a COLMAP model whose image size is `factor` times that of the written pictures."""
     at = truth.lens.resized(WIDTH * factor, HEIGHT * factor)
     single = truth.model[0].startswith(("SIMPLE", "RADIAL"))
     head = (at.fx, at.cx, at.cy) if single else (at.fx, at.fy, at.cx, at.cy)
@@ -89,7 +95,7 @@ def write_model(folder: Path, truth: Truth, text=False, factor=1, ending=".jpg")
 
 
 def convert_to_text(folder: Path) -> None:
-    """Replace a binary COLMAP model by the same one as text."""
+    """Replace the binary COLMAP model in a folder by the same model in text format."""
     import pycolmap
 
     pycolmap.Reconstruction(folder).write_text(folder)
@@ -124,7 +130,12 @@ def write_poses_bounds(folder: Path, truth: Truth, factor=4) -> None:
 
 
 def write_capture(folder: Path, layout: str, truth: Truth) -> Path:
-    """Write pictures, masks and poses in one of the layouts; return the folder."""
+    """Write pictures, masks and poses of a capture; return the folder.
+
+    Args:
+        layout: "llff", "llff+bin", "llff+txt", "colmap", "colmap txt", or a name that begins with "transforms" (with
+            intrinsics for each frame if the name ends with "each"). Other names write pictures and masks only.
+    """
     images = folder / ("images_4" if layout.startswith("llff") else "images")
     write_pictures(images, truth.world_to_camera)
     write_masks(images / "label" if layout.startswith("llff") else folder / "masks", truth.world_to_camera)
@@ -138,7 +149,13 @@ def write_capture(folder: Path, layout: str, truth: Truth) -> Path:
 
 
 def write_spin_nerf(folder: Path, test=2, full=True, mask_value=1, label_size=(WIDTH, HEIGHT + 3)) -> Truth:
-    """Write 6 views in the layout of the SPIn-NeRF dataset; the first `test` are test views."""
+    """Write 6 views in the layout of the SPIn-NeRF dataset, the first `test` of them as test views; return the truth.
+
+    Args:
+        full: whether the pictures in full resolution are written, too.
+        mask_value: value of masked pixels in the masks of training views.
+        label_size: width and height in px of the masks of test views.
+    """
     truth = make_truth(RADIAL)
     names = sorted(truth.world_to_camera)
     write_pictures(folder / "images_4", names)
@@ -152,7 +169,7 @@ def write_spin_nerf(folder: Path, test=2, full=True, mask_value=1, label_size=(W
 
 
 def run_stages(folder: Path, **params):
-    """Run `poses` and `raw_masks`: the scene, and the folder that both write to."""
+    """Run `poses` and `raw_masks` on a capture; return the scene, and the folder to which both stages write."""
     out = folder.parent / (folder.name + "_out")
     out.mkdir(exist_ok=True)
     run_stages_into(folder, out, **params)
@@ -160,14 +177,14 @@ def run_stages(folder: Path, **params):
 
 
 def run_stages_into(folder: Path, out: Path, **params) -> None:
-    """Run `poses` and `raw_masks` into the same folder, after the preview of the masks."""
+    """Preview `raw_masks`, then run `poses` and `raw_masks`; both stages write to the folder `out`."""
     raw_masks_plan.preview(_mask_params(params), scene=folder)
     poses.run(poses.Params(**params), out, scene=folder)
     raw_masks.run(_mask_params(params), out, scene=folder, poses=out)
 
 
 def preview_stages(folder: Path, **params) -> list[str]:
-    """The messages of both stages before they run."""
+    """Return the messages with which `poses` and `raw_masks` announce their work before they run."""
     notes = poses_plan.preview(poses.Params(**params), folder)
     return notes + raw_masks_plan.preview(_mask_params(params), scene=folder)
 
@@ -177,7 +194,10 @@ def _mask_params(params: dict) -> raw_masks.Params:
 
 
 def reprojection_error(scene, truth: Truth) -> float:
-    """Largest distance in px between a point in the photograph and the place that undistortion reads it from."""
+    """Return the largest reprojection error of the true points over all views, in px of the distorted photograph.
+
+    Each point is projected by the true camera, and by the scene's undistorted camera followed by the true distortion.
+    """
     worst = 0.0
     for name, pose in truth.world_to_camera.items():
         at = truth.points @ pose[:3, :3].T + pose[:3, 3]
@@ -192,7 +212,7 @@ def reprojection_error(scene, truth: Truth) -> float:
 
 
 def write_four_photos(folder: Path) -> None:
-    """Write four photographs of 32 x 24 px from a row of cameras, and masks."""
+    """Write a capture of four photographs of 32 x 24 px from a row of cameras, with masks and transforms.json."""
     (folder / "images").mkdir(parents=True)
     (folder / "masks").mkdir()
     frames = []
@@ -206,7 +226,7 @@ def write_four_photos(folder: Path) -> None:
 
 
 def real_capture(name: str) -> Path:
-    """The folder of a real capture; skips the test where it is not on this machine."""
+    """Return the folder of a real capture; skip the test if the capture is not on this machine."""
     if not (CAPTURES / name).is_dir():
         pytest.skip(f"the capture {name} is not in ../shared/data")
     return CAPTURES / name

@@ -1,4 +1,4 @@
-"""Runs of the first stages with their messages and refusals, and captures with names of any kind."""
+"""Run `poses` and `raw_masks`, check their messages, refusals and results, and write captures with given names."""
 
 from __future__ import annotations
 
@@ -26,24 +26,27 @@ from scenes.capture import (
     run_stages_into,
 )
 
-SHARE = 1 / 16  # of a view, the rectangle that `scenes.capture.write_masks` masks
-EXACT = 0.01  # px, between a pinhole camera and the truth
+SHARE = 1 / 16  # share of a view's pixels that `scenes.capture.write_masks` masks
+EXACT = 0.01  # px, largest allowed difference from the true cameras
 OBJECT = np.zeros((HEIGHT, WIDTH), bool)
 OBJECT[HEIGHT // 4 : HEIGHT // 2, WIDTH // 4 : WIDTH // 2] = True
 
 
 def run_with_messages(folder: Path, **params) -> tuple[Scene, Path, list[str]]:
-    """Preview and run the stages: the scene, its folder, and all messages, with paths relative to `folder`."""
+    """Preview and run the stages; return the scene, the output folder, and all messages and warnings.
+
+    The path of `folder` is removed from the messages.
+    """
     sentences = preview_stages(folder, **params)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         scene, out = run_stages(folder, **params)
     sentences += [str(each.message) for each in caught]
-    return scene, out, [each.replace(str(folder), "") for each in sentences]  # whose path may hold any word or number
+    return scene, out, [each.replace(str(folder), "") for each in sentences]  # the path may hold any word or number
 
 
 def assert_message(sentences: Iterable[str], *words: str) -> None:
-    """One of the messages contains all words; a number must not be part of a longer number."""
+    """Assert that one of the messages contains all words. A number must not be part of a longer number."""
     sentences = list(sentences)
     patterns = [rf"(?<![\d.]){word}(?![\d])" if word.isdigit() else re.escape(word) for word in words]
     found = any(all(re.search(p, each, re.IGNORECASE) for p in patterns) for each in sentences)
@@ -51,7 +54,7 @@ def assert_message(sentences: Iterable[str], *words: str) -> None:
 
 
 def refusal_message(folder: Path, **params) -> str:
-    """The one line with which the preview refuses a capture."""
+    """Return the message of one line with which the preview refuses a capture."""
     with pytest.raises(BadInput) as caught:
         preview_stages(folder, **params)
     assert "\n" not in str(caught.value)
@@ -59,7 +62,10 @@ def refusal_message(folder: Path, **params) -> str:
 
 
 def refusal_before_writing(folder: Path, **params) -> str:
-    """The one line with which the preview, or the stages before they write anything, refuse a capture."""
+    """Return the message of one line with which the preview or the stages refuse a capture.
+
+    Asserts that the stages wrote nothing before.
+    """
     out = folder.parent / f"{folder.name}_refused"
     out.mkdir()
     with pytest.raises(BadInput) as caught, warnings.catch_warnings():
@@ -82,17 +88,17 @@ def assert_cameras(scene: Scene, truth: Truth) -> None:
 
 
 def rename_views(truth: Truth, names: Mapping[str, str]) -> Truth:
-    """The truth of the views in `names`, under their new names."""
+    """Return the truth of the views in `names` (new name -> old name) under their new names."""
     return replace(truth, world_to_camera={new: truth.world_to_camera[old] for old, new in names.items()})
 
 
 def select_views(truth: Truth, first: int, last: int) -> Truth:
-    """The truth of the views from `first` up to `last`."""
+    """Return the truth of the views whose index in alphabetical order is at least `first` and below `last`."""
     return replace(truth, world_to_camera=dict(sorted(truth.world_to_camera.items())[first:last]))
 
 
 def write_named_model(folder: Path, truth: Truth, names: Mapping[str, str], text: bool = False) -> None:
-    """Write a COLMAP model whose images are called `names`: view of the truth -> name."""
+    """Write a COLMAP model with given image names: `names` maps each view of the truth to the name of its image."""
     at = truth.lens
     cameras = {1: colmap.ModelCamera("PINHOLE", WIDTH, HEIGHT, (at.fx, at.fy, at.cx, at.cy))}
     listed = enumerate(sorted(names.items(), reverse=True), start=3)
@@ -108,7 +114,7 @@ def write_mask(path: Path, mask: np.ndarray = OBJECT) -> None:
 
 
 def masked_share(out: Path, view: str) -> float:
-    """The share of the view's pixels that its mask covers."""
+    """Return the share in [0, 1] of the view's pixels that its mask covers."""
     return float((np.array(Image.open(out / "masks" / f"{view}.png")) > 0).mean())
 
 
@@ -117,7 +123,7 @@ def masked_views(out: Path) -> list[str]:
 
 
 def assert_masked_views(out: Path, views: Iterable[str], share: float = SHARE) -> None:
-    """Exactly these views have a mask of this share, and objects are not distinguished."""
+    """Assert that exactly these views have a mask, and that each mask covers this share of the pixels."""
     views = sorted(views)
     assert masked_views(out) == views, masked_views(out)
     shares = [masked_share(out, view) for view in views]

@@ -1,4 +1,4 @@
-"""A small wall of random Gaussians whose middle is masked, and the views and settings that distill it."""
+"""A small wall of random Gaussians whose middle is masked, and training views and settings for its distillation."""
 
 import math
 
@@ -20,12 +20,12 @@ ADVERSARIAL = AdversarialTerm(patches=4, size=8, width=4)
 
 
 def wall_camera(name="a", shift=0.0):
-    """Looks at the wall from 1 away, `shift` to the left of its middle."""
+    """Return a camera that looks at the wall from a distance of 1, `shift` to the left of the wall's middle."""
     return make_camera(name, (WIDTH, HEIGHT), 30.0, (-shift, 0.0, -1.0))
 
 
 def random_wall(count=150, seed=0):
-    """Gaussians on a wall in front of the camera, and a mask [N] of those in its middle."""
+    """Return Gaussians on a wall in front of the camera, and bool [N], True for the Gaussians in the wall's middle."""
     draw = generator(seed, "wall")
     means = torch.rand(count, 3, generator=draw) * torch.tensor([1.2, 0.9, 0.1]) - torch.tensor([0.6, 0.45, 0.0])
     sh = torch.zeros(count, 4, 3)
@@ -58,7 +58,7 @@ def as_leaves(gaussians):
 
 
 def has_gradient(gaussians):
-    """[N] bool: Gaussians with any gradient."""
+    """Return bool [N], True for the Gaussians of which any parameter has a nonzero gradient."""
     columns = [getattr(gaussians, name).grad.flatten(1).ne(0).any(1) for name in PARAMETERS if name != "opacity_logits"]
     return torch.stack([*columns, gaussians.opacity_logits.grad != 0]).any(0)
 
@@ -72,13 +72,18 @@ PLAIN = with_changes(SETTINGS, adversarial=OFF, reference=OFF, densify={"every":
 
 
 def has_changed(before, after):
-    """[N] bool: Gaussians of which any parameter differs."""
+    """Return bool [N], True for the Gaussians of which any parameter differs."""
     rows = [(getattr(before, n) != getattr(after, n)).reshape(len(before), -1) for n in PARAMETERS]
     return torch.cat(rows, 1).any(1)
 
 
 def write_initialized_run(home, invent):
-    """Write a wall in front of three views, each with the hole `invent`, bool [H, W]; return the folder."""
+    """Write a run of a wall before three views up to `initialize`; return the folder.
+
+    Args:
+        home: folder to which the folders of the stages are written.
+        invent: bool [H, W], the hole in each view (the pixels to be invented).
+    """
     draw = generator(0, "wall")
     means = torch.rand(80, 3, generator=draw) * torch.tensor([1.6, 1.2, 0.1]) - torch.tensor([0.8, 0.6, -1.5])
     wall = round_gaussians(means, torch.full((80, 3), 0.5), math.exp(-2.0), 2.0)

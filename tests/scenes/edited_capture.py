@@ -1,4 +1,4 @@
-"""A capture with its Gaussians, and what an editor leaves of them after splats are deleted."""
+"""A capture with its Gaussians, and the file that a splat editor writes after some of these Gaussians were deleted."""
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ EDITOR = ("x", "y", "z", "scale_0", "scale_1", "scale_2", "f_dc_0", "f_dc_1", "f
 
 
 def plane_with_ball(count=4000):
-    """Positions on a plane and above it, and which of them are in a ball."""
+    """Return points [count, 3] on a plane and in a ball above it, and bool [count], True for the points in the ball."""
     draws = np.random.default_rng(0)
     points = draws.uniform(-1, 1, (count, 3)) * (1, 1, 0.02)
     points[: count // 4] = 0.1 * draws.normal(size=(count // 4, 3)) + (0.2, 0.1, 0.5)
@@ -20,7 +20,13 @@ def plane_with_ball(count=4000):
 
 
 def write_edited_capture(folder, scale=5.0, offset=(50.0, 0.0, 0.0)):
-    """Write a capture with its Gaussians, and what an editor left: other properties, order and degree."""
+    """Write a capture with its Gaussians (scene.ply), and the Gaussians that an editor kept (cleaned.ply).
+
+    cleaned.ply has another set of properties, the reverse order and degree 0 of spherical harmonics.
+
+    Returns:
+        All Gaussians, and bool [N], True for the deleted Gaussians.
+    """
     truth = make_truth(scale=scale, offset=offset)
     points, deleted = plane_with_ball()
     means = torch.from_numpy(points * scale + offset).float()

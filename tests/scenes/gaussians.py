@@ -18,12 +18,12 @@ def round_gaussians(
     opacity_logit: float,
     sh_count: int = 1,
 ) -> Gaussians:
-    """Round Gaussians of one size and opacity.
+    """Return round Gaussians of the same size and opacity.
 
     Args:
         means: [N, 3].
         colors: [N, 3] in [0, 1], the same in all directions.
-        sh_count: spherical harmonics of a channel.
+        sh_count: number of spherical harmonics of each channel.
     """
     means, colors = (torch.as_tensor(np.asarray(each), dtype=torch.float32) for each in (means, colors))
     count = len(means)
@@ -34,5 +34,5 @@ def round_gaussians(
 
 
 def join_gaussians(first: Gaussians, second: Gaussians) -> Gaussians:
-    """The Gaussians of both, in this order."""
+    """Return the Gaussians of both sets, those of `first` first."""
     return first.zip_map(second, lambda a, b: torch.cat([a, b]))

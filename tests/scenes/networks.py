@@ -10,7 +10,10 @@ TINY = Path(__file__).resolve().parents[2] / "priors" / "tiny"
 
 
 def small_prior(seed: int = 0) -> Prior:
-    """The embedded prior's VAE, text encoder and schedule around a UNet of 16 and 16 channels, seeded."""
+    """Return a diffusion prior with a small random UNet (two levels of 16 channels).
+
+    The VAE, the text encoder and the noise schedule are those of the prior that the package embeds.
+    """
     from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
     from transformers import CLIPTextModel, CLIPTokenizer
 
@@ -38,12 +41,12 @@ def small_prior(seed: int = 0) -> Prior:
 
 
 def save_small_prior(folder: Path, seed: int = 0) -> None:
-    """Write `small_prior` as a diffusers folder."""
+    """Write `small_prior(seed)` in the folder layout of diffusers."""
     pipeline(small_prior(seed)).save_pretrained(folder)
 
 
 def small_depth_model(kind="relative", seed=0):
-    """Depth Anything's architecture with random weights, 4 layers of 16 channels, for pictures of 56 px."""
+    """Return a network of Depth Anything's architecture: random weights, 4 layers of 16 channels, pictures of 56 px."""
     from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
     backbone = Dinov2Config(

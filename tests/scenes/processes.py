@@ -1,4 +1,4 @@
-"""Commands of the project in processes of their own."""
+"""Start the project's commands in separate processes, and wait for their results."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def start_module(
     merge_stderr: bool = False,
     preexec_fn: Callable[[], object] | None = None,
 ) -> subprocess.Popen[str]:
-    """Start `python -m module arguments`; its output is captured.
+    """Start `python -m module arguments` in a new process whose output is captured.
 
     Args:
-        env: variables that are set beside those of this process.
-        merge_stderr: errors go into the output.
+        env: environment variables, added to those of this process.
+        merge_stderr: whether stderr is captured together with stdout.
         preexec_fn: called in the new process before it runs the module.
     """
     command = [sys.executable, "-m", module, *map(str, arguments)]
@@ -43,7 +43,7 @@ def run_module(
     timeout: float | None = None,
     preexec_fn: Callable[[], object] | None = None,
 ) -> subprocess.CompletedProcess[str]:
-    """Run `python -m module arguments` to its end, at most `timeout` seconds."""
+    """Run `python -m module arguments` until it ends; raise subprocess.TimeoutExpired after `timeout` seconds."""
     process = start_module(module, *arguments, cwd=cwd, env=env, preexec_fn=preexec_fn)
     output, errors = process.communicate(timeout=timeout)
     return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
@@ -59,7 +59,7 @@ def wait_until(condition: Callable[[], object]) -> None:
 
 
 def fake_nvidia_smi(folder: Path, output: str) -> dict[str, str]:
-    """An environment in which `nvidia-smi` prints this output."""
+    """Return environment variables under which `nvidia-smi` is a script that prints this output."""
     tool = folder / "nvidia-smi"
     tool.write_text(f"#!/bin/sh\necho '{output}'\n")
     tool.chmod(0o755)

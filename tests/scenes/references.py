@@ -1,4 +1,4 @@
-"""References as other tools write them, and a wall with a square before it whose hole they fill."""
+"""Reference pictures as other tools write them, and captures of a wall with a square before it, which they complete."""
 
 import io
 from pathlib import Path
@@ -21,7 +21,7 @@ COMMON = {"inpainter": "exemplar"}
 
 
 def resize_and_compress(image: np.ndarray, scale=0.97, crop=5, quality=80, gain=0.92) -> np.ndarray:
-    """The picture resized, cropped at its upper left, darkened, and compressed as JPEG."""
+    """Return the picture resized, cropped by `crop` px at the top and the left, darkened, and compressed as JPEG."""
     size = tuple(round(side * scale) for side in image.shape[1::-1])
     small_one = cv2.resize(image, size, interpolation=cv2.INTER_AREA)[crop:, crop:]
     file = io.BytesIO()
@@ -34,7 +34,10 @@ def reference_entry(view, image="ref.png", **more):
 
 
 def write_wall_stages(folder: Path) -> dict[str, Path]:
-    """Write the input folders of the stage `reference`; the hole of view a2 is to be invented."""
+    """Write the input folders of the stage `reference`; return input name -> folder.
+
+    The views show a wall with a red square before it. View a2 is the best reference.
+    """
     made_poses, fitted, labels = wall_scene.write_poses_and_fit(folder, 1.6)
     wall_scene.write_capture_photos(folder / "scene", made_poses, wall_scene.CAMERAS)
     sets = {}
@@ -50,7 +53,7 @@ def write_wall_stages(folder: Path) -> dict[str, Path]:
 
 
 def run_reference_stage(wall: dict[str, Path], out: Path, **params) -> dict[str, Reference]:
-    """Run the stage: view name -> reference."""
+    """Run the stage `reference` into the folder `out`; return view name -> reference."""
     out.mkdir()
     reference.run(reference.Params(**COMMON, **params), out, **wall)
     return {r.camera.name: r for r in load_references(out, load_scene(wall["poses"]))}

@@ -1,4 +1,4 @@
-"""A corner of a room with textures in which features are found, and a walk past it."""
+"""Photographs of a room's corner, whose textures are rich in features, by a camera that walks past it."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from scenes.cameras import rotation_along
 
 
 def speckle_texture(generator: np.random.Generator, size: int = 256) -> np.ndarray:
-    """[size, size, 3] speckle at several scales, in [0, 255]."""
+    """Return a texture [size, size, 3] of speckle at several scales, in [0, 255]."""
     total = np.zeros((size, size, 3))
     for cell in (2, 4, 8, 16, 32):
         coarse = generator.random((size // cell, size // cell, 3))
@@ -15,12 +15,19 @@ def speckle_texture(generator: np.random.Generator, size: int = 256) -> np.ndarr
 
 
 def room_textures(generator: np.random.Generator) -> np.ndarray:
-    """[3, 256, 256, 3] speckle, a texture for each wall."""
+    """Return textures [3, 256, 256, 3] of speckle, one for each plane of the corner."""
     return np.stack([speckle_texture(generator) for _ in range(3)])
 
 
 def render_room_corner(pose: np.ndarray, textures: np.ndarray, size=(200, 150), focal=170.0) -> np.ndarray:
-    """uint8 [H, W, 3]: the corner of a room with the planes x = 2, y = 1.5 and z = 3."""
+    """Render the corner of a room with the planes x = 2, y = 1.5 and z = 3; return uint8 [H, W, 3].
+
+    Args:
+        pose: [4, 4], from world to camera.
+        textures: [3, S, S, 3], the textures of these planes in [0, 255].
+        size: width and height in px.
+        focal: focal length in px.
+    """
     columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
     rays = np.stack([(columns - size[0] / 2) / focal, (rows - size[1] / 2) / focal, np.ones_like(rows)], -1)
     rays, center = rays @ pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
@@ -36,7 +43,10 @@ def render_room_corner(pose: np.ndarray, textures: np.ndarray, size=(200, 150), 
 
 
 def room_walk(count: int) -> dict[str, np.ndarray]:
-    """Views that face the corner. They alternate in height, for centres on a line leave the alignment undetermined."""
+    """Return view name -> pose [4, 4] from world to camera, of `count` views that face the corner.
+
+    The camera centres alternate in height, because a similarity cannot be estimated from centres on one line.
+    """
     result = {}
     for k in range(count):
         t = k / (count - 1) - 0.5

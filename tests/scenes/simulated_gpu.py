@@ -1,8 +1,9 @@
-"""A GPU that is not there: tensors that say they are on `cuda:0` and refuse to be mixed with the CPU's.
+"""A simulated GPU: CPU tensors that report the device `cuda:0` and cannot be combined with other CPU tensors.
 
-Inside `gpu()` whatever is made on, or moved to, the device `cuda` is an ordinary tensor in disguise. An operation on
-it and on a tensor of the CPU is refused, as CUDA refuses it; so is to take it for an array of numpy. gsplat's part is
-played by the CPU's rasterizer. Where there is a GPU, and gsplat for it, nothing is disguised: the GPU itself answers.
+Inside `simulated_gpu()`, each tensor created on or moved to the device `cuda` is a `GpuTensor`, a CPU tensor that
+reports `cuda:0`. An operation on a GpuTensor and an ordinary CPU tensor raises RuntimeError, as with CUDA. The
+conversion of a GpuTensor to a numpy array raises TypeError. The CPU rasterizer renders in place of gsplat. If the
+machine has a GPU and gsplat with its compiled extension, nothing is simulated and the real GPU is used.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ INDEXING = (torch.Tensor.__getitem__, torch.Tensor.__setitem__)
 
 
 class GpuTensor(torch.Tensor):
-    """A CPU tensor that claims to be on the GPU."""
+    """A CPU tensor that reports the device `cuda:0`."""
 
 
 def disguise(tensor: torch.Tensor) -> torch.Tensor:
@@ -59,7 +60,7 @@ class GpuMode(TorchFunctionMode):
             if func in ONLY_ON_CPU and here:
                 raise TypeError("can't convert cuda:0 device type tensor to numpy")
             to_gpu = _is_gpu(kwargs.get("device"))
-            leaf = to_gpu and kwargs.pop("requires_grad", False)  # the disguised one, not what it hides
+            leaf = to_gpu and kwargs.pop("requires_grad", False)  # the GpuTensor must be the leaf, not the CPU tensor
             if to_gpu:
                 kwargs.pop("device")
             on_gpu = any(isinstance(t, GpuTensor) for t in tensors)
@@ -76,7 +77,7 @@ class GpuMode(TorchFunctionMode):
         positional = [*rest]
         if rest and (isinstance(rest[0], (str, torch.device))):
             device = positional.pop(0)
-        elif rest and isinstance(rest[0], torch.Tensor):  # to(other): its type and its place
+        elif rest and isinstance(rest[0], torch.Tensor):  # to(other): dtype and device of the other tensor
             device, positional = (GPU_DEVICE if isinstance(rest[0], GpuTensor) else "cpu"), [rest[0].dtype, *rest[1:]]
         if func is not torch.Tensor.to:
             device, positional, kwargs = ("cpu" if func is torch.Tensor.cpu else GPU_DEVICE), [], {}
@@ -87,7 +88,7 @@ class GpuMode(TorchFunctionMode):
     def _refuse_mixed(self, func: Any, args: Any, tensors: list[torch.Tensor]) -> None:
         if func is torch.Tensor.copy_:
             return
-        if func in INDEXING and isinstance(args[0], GpuTensor):  # CUDA takes indices from the CPU
+        if func in INDEXING and isinstance(args[0], GpuTensor):  # CUDA tensors accept indices on the CPU
             tensors = [args[0], *(leaf for leaf in tree_leaves(args[2:]) if isinstance(leaf, torch.Tensor))]
         kinds = {isinstance(t, GpuTensor) for t in tensors if t.ndim or isinstance(t, GpuTensor)}
         if len(kinds) > 1:
@@ -95,7 +96,7 @@ class GpuMode(TorchFunctionMode):
 
 
 def has_gpu() -> bool:
-    """Whether there is a GPU, and gsplat with its extension."""
+    """Return whether the machine has a GPU, and gsplat with its compiled extension."""
     try:
         cuda.require_gpu(torch.zeros(1, device="cuda" if torch.cuda.is_available() else "cpu"))
     except ValueError:
@@ -105,7 +106,7 @@ def has_gpu() -> bool:
 
 @contextmanager
 def simulated_gpu() -> Iterator[None]:
-    """A context with a GPU: the real one, or a simulation where there is none."""
+    """Open a context in which the device `cuda` works: the real GPU, or a simulation if the machine has none."""
     if has_gpu():
         yield
         return

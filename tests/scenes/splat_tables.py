@@ -9,12 +9,17 @@ from plyfile import PlyData, PlyElement
 
 
 def read_rows(path: Path) -> np.ndarray:
-    """The structured array of the element `vertex`."""
+    """Return the element `vertex` of a PLY file as a structured array."""
     return PlyData.read(str(path), mmap=False)["vertex"].data
 
 
 def write_rows(path: Path, table: np.ndarray, text: bool = False, byte_order: str = "<") -> None:
-    """Write a structured array as the element `vertex`, as text or in this byte order."""
+    """Write a structured array as the element `vertex` of a PLY file.
+
+    Args:
+        text: True for an ASCII file, False for a binary file.
+        byte_order: byte order of a binary file, "<" (little-endian) or ">" (big-endian).
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     table = table if text else table.astype(table.dtype.newbyteorder(byte_order))
     element = PlyElement.describe(table, "vertex")
@@ -22,7 +27,7 @@ def write_rows(path: Path, table: np.ndarray, text: bool = False, byte_order: st
 
 
 def replace_columns(table: np.ndarray, columns: dict[str, np.ndarray], leave_out: tuple[str, ...] = ()) -> np.ndarray:
-    """A copy of the table with these columns, and without those in `leave_out`."""
+    """Return a copy of the table with these columns added or replaced, without the columns in `leave_out`."""
     kept = [name for name in table.dtype.names if name not in (*columns, *leave_out)]
     made = np.empty(
         len(table), [(name, table.dtype[name]) for name in kept] + [(n, c.dtype) for n, c in columns.items()]

@@ -1,4 +1,4 @@
-"""Small pipelines of arithmetic in place of stages, on which the runner and the comparison are tested."""
+"""Small projects whose stages do arithmetic on one number, for tests of the runner and the comparison of variants."""
 
 from __future__ import annotations
 

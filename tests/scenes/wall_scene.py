@@ -1,4 +1,7 @@
-"""A wall of Gaussians with a square of other Gaussians before it, seen by cameras side by side, and their truth."""
+"""A wall of Gaussians with a square of Gaussians (the object) before it, cameras side by side, and the true masks.
+
+The cameras look along z. The wall is at depth `WALL`; `square_at` is the z of the square.
+"""
 
 from pathlib import Path
 
@@ -24,7 +27,7 @@ WIDTH, HEIGHT, FOCAL = 96, 72, 90.0
 
 
 def front_camera(name: str, x: float, y: float = 0.0, z: float = 0.0) -> Camera:
-    """A camera that looks along z, straight at the wall."""
+    """Return a camera at (x, y, z) that looks along z, perpendicular to the wall."""
     return make_camera(name, (WIDTH, HEIGHT), FOCAL, (x, y, z))
 
 
@@ -34,12 +37,18 @@ TRAIN, TEST = ("a0", "a1", "a2", "a3", "a4"), ("t0", "t1")
 
 
 def wall_color(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Colour of the wall at (x, y), [..., 3] in [0, 1]."""
+    """Return the colour [..., 3] in [0, 1] of the wall at (x, y)."""
     return np.stack([0.5 + 0.3 * np.sin(9 * x), 0.5 + 0.3 * np.cos(8 * y), 0.5 + 0.2 * np.sin(6 * (x + y))], -1)
 
 
 def rectangle_gaussians(depth: float, half_x: float, half_y: float, color):
-    """Gaussians of a fronto-parallel rectangle, one for each pixel of a camera that sees just the rectangle."""
+    """Return the Gaussians of a rectangle perpendicular to z, one for each pixel of a camera whose picture it fills.
+
+    Args:
+        depth: z of the rectangle.
+        half_x, half_y: half its width and height.
+        color: function (x, y) -> colours [..., 3] in [0, 1].
+    """
     wide, high = (max(2, round(2 * half * FOCAL / depth * 1.3)) for half in (half_x, half_y))
     fx, fy = wide * depth / 2 / half_x, high * depth / 2 / half_y
     view = Camera("sheet", wide, high, fx, fy, wide / 2, high / 2, np.eye(4))
@@ -51,7 +60,10 @@ def rectangle_gaussians(depth: float, half_x: float, half_y: float, color):
 
 
 def wall_and_square(square_at: float):
-    """Gaussians without the wall that no training view sees, and labels: True for the square at depth `square_at`."""
+    """Return the Gaussians of the wall and of the square, and labels, bool [N], True for those of the square.
+
+    The part of the wall that the square hides from all training views has no Gaussians.
+    """
     wall = rectangle_gaussians(WALL, 2.0, 1.4, wall_color)
     seen = torch.from_numpy(~is_hidden_everywhere(wall.means.numpy(), square_at))
     square = rectangle_gaussians(square_at, HALF, HALF, lambda x, y: np.broadcast_to((0.9, 0.1, 0.1), (*x.shape, 3)))
@@ -60,7 +72,7 @@ def wall_and_square(square_at: float):
 
 
 def is_behind_square(points: np.ndarray, view: Camera, square_at: float) -> np.ndarray:
-    """bool [...]: wall points [..., 3] that the square hides from the view."""
+    """Return bool [...], True for the points [..., 3] of the wall that the square hides from the view."""
     at = view.center + (points - view.center) * (square_at - view.center[2]) / (points[..., 2:] - view.center[2])
     return (np.abs(at[..., :2]) <= HALF + RIM).all(-1)
 
@@ -82,16 +94,18 @@ def true_unobserved(view: Camera, square_at: float) -> np.ndarray:
 
 
 def photo(view: Camera) -> np.ndarray:
-    """uint8 [H, W, 3]: the wall without the square."""
+    """Return the true picture of the wall without the square, uint8 [H, W, 3]."""
     points = wall_points(view)
     return (255 * wall_color(points[..., 0], points[..., 1])).round().astype(np.uint8)
 
 
 def write_poses_and_fit(folder, square_at: float, masks=None, clean=()):
-    """Write the folders `poses`, `fit` and `raw_masks`; return the first two and the labels of the square.
+    """Write the folders `poses`, `fit` and `raw_masks`; return `poses`, `fit` and the labels of the Gaussians.
+
+    The labels, bool [N], are True for the Gaussians of the square.
 
     Args:
-        masks: view name -> bool [H, W]; None: the true masks of all training views.
+        masks: view name -> bool [H, W]; None for the true masks of all training views.
         clean: names of training views without the square.
     """
     poses, fit = folder / "poses", folder / "fit"
@@ -112,7 +126,7 @@ def write_poses_and_fit(folder, square_at: float, masks=None, clean=()):
 
 
 def write_capture_photos(scene, poses, cameras) -> None:
-    """Write a capture from which the pictures in `poses` could come, and the lenses that undistort it."""
+    """Write a capture whose photographs equal the pictures in `poses`, and the lenses with which it is undistorted."""
     for name in cameras:
         save_image(scene / "images" / f"{name}.png", load_image(poses / "images" / f"{name}.png"))
     lenses = {n: Lens(c.width, c.height, c.fx, c.fy, c.cx, c.cy) for n, c in cameras.items()}
@@ -125,7 +139,10 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def write_background(poses: Path, fit: Path, masks: Path) -> None:
-    """Write the planes and mirrors of a scene whose masks are written by hand, as the stage `masks` does."""
+    """Write the planes and mirror planes of the scene to the folder `masks`, as the stage `masks` does.
+
+    For tests that write the masks themselves and do not run this stage.
+    """
     space = Workspace(poses, fit, masks)
     background = space.background_views.with_planes(space.gaussians, space.labels).with_mirrors(space.remaining)
     save_arrays(masks / SURFACES, surfaces_to_arrays(background))
