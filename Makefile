@@ -212,10 +212,10 @@ sparse: ready $(others)
 	$(PY) -m benchmarks.studies.sparse --scenes data/$(made) $(patsubst %/.generated,%,$(others)) \
 		--out="$${runs:-runs}/sparse"
 
-# Four processes with one thread each, since many tests wait for others that they start. Each gets whole files, so that
+# Three processes with one thread each, since many tests wait for others that they start. Each gets whole files, so that
 # tests of a file share compiled kernels.
 test test-fast: $(VENV)/.ready-dev
-	$(if $(slow),REFFUSION_SLOW=1) OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses 4 --dist loadfile \
+	$(if $(slow),REFFUSION_SLOW=1) OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses 3 --dist loadfile \
 		--no-loadscope-reorder $(if $(filter test-fast,$@),-m "not integration")
 
 # Every reader on damaged files, ten minutes each.

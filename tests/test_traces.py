@@ -293,7 +293,10 @@ def test_steps_that_fit_are_counted_once(tmp_path):
     assert not any(folder.exists() for folder in tried)
 
 
-@pytest.mark.parametrize("stage", ["fit", "personalize", "distill"])
+SLOW = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="half a minute")
+
+
+@pytest.mark.parametrize("stage", ["fit", pytest.param("personalize", marks=SLOW), "distill"])
 def test_a_budget_shortens_a_stage_and_its_schedule(initialized_folders, tmp_path, stage):
     """A budget of 1 ms gives the smallest number of steps, a twentieth. The trial run must not change the result."""
     steps = {"fit": 2, "personalize": 1, "distill": 1}[stage]
