@@ -18,6 +18,8 @@ from stages import distill
 
 pytestmark = pytest.mark.integration
 
+slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="half a minute; set REFFUSION_SLOW=1")
+
 ROOT = Path(__file__).resolve().parent.parent
 
 NEAR = 1.7
@@ -60,6 +62,7 @@ def test_a_curve_begins_at_the_initialization_and_ends_where_the_stage_ends(init
         assert {name: line[name] for name in benchmark.SCORES} == pytest.approx(expected, rel=1e-4)
 
 
+@slow
 def test_scores_are_those_of_the_box(initialized_run):
     gaussians = load_ply(initialized_run / "initialize" / "gaussians.ply")
     camera, truth, box = benchmark.load_test_views(initialized_run)[0]
@@ -70,6 +73,7 @@ def test_scores_are_those_of_the_box(initialized_run):
     assert found == pytest.approx({name: expected[name] for name in benchmark.SCORES})
 
 
+@slow
 def test_a_scene_without_ground_truth_is_refused(initialized_run, tmp_path):
     poses, _, _ = wall_scene.write_poses_and_fit(tmp_path, NEAR)
     with pytest.raises(ValueError, match="take another scene"):
