@@ -59,6 +59,22 @@ def workplace(root: Path) -> Path:
     return Path.cwd() if is_installed(root) else root
 
 
+def scene_path(text: str, root: Path) -> Path | None:
+    """Return the folder or video that the name or path of a scene means, as an absolute path; None if there is none.
+
+    Args:
+        text: a name under data/, or else a path.
+        root: the result of `root()`.
+    """
+    places = (workplace(root) / "data" / text, Path(text).expanduser())
+    return next((place.resolve() for place in places if text and (place.is_dir() or place.is_file())), None)
+
+
+def scene_name(scene: Path) -> str:
+    """Return the name of a scene: that of its folder, or that of its video without the ending."""
+    return scene.stem if scene.is_file() else scene.name
+
+
 def overview() -> str:
     """Return the text of `reffusion --help`."""
     width = max(map(len, COMMANDS))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from reffusion.command import root, workplace
+from reffusion.command import root, scene_name, scene_path
 
 
 def scene_parser(name: str, description: str, needs_scene: bool = True) -> argparse.ArgumentParser:
@@ -30,7 +30,5 @@ def run_folder(arguments: argparse.Namespace) -> Path:
         arguments: the result of a parser of `scene_parser`. The scene may be a name under data/, the path of a folder,
             or the name or path of a video, whose name without its ending is then the scene's name.
     """
-    scene = workplace(root()) / "data" / arguments.scene.expanduser()
-    scene = (scene if scene.exists() else arguments.scene.expanduser()).resolve()
-    name = scene.stem if scene.is_file() else scene.name
+    name = scene_name(scene_path(str(arguments.scene), root()) or arguments.scene.expanduser().resolve())
     return arguments.runs / (f"{name}@{arguments.variant}" if arguments.variant else name)

@@ -8,12 +8,13 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
+from reffusion.command import scene_name
 from runner import Refused, say
 from runner.artifacts import delete_folder, diff_artifact, recover_swap
 from runner.files import RECEIPT, hold_lock, list_files, read_receipt, read_text
 from runner.frames import FRAMES
 from runner.keys import HASHES, Hashes
-from runner.pipeline import NAME, Pipeline, find_scene, load_pipeline, scene_name, unknown_name
+from runner.pipeline import NAME, Pipeline, find_scene, load_pipeline, unknown_name
 from runner.resolve import Request, check_unique_name
 from runner.text import display_path, join_names
 

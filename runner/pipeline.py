@@ -13,7 +13,7 @@ from typing import Annotated, Any, Self
 import yaml
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
-from reffusion.command import workplace
+from reffusion.command import scene_name, scene_path, workplace
 from runner import Refused
 from runner.user_yaml import read_user_yaml
 
@@ -290,11 +290,6 @@ def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
     return SceneFile(path, content.get("profile"), brings, stages, content.get("budget"))
 
 
-def scene_name(scene: Path) -> str:
-    """Return the name of a scene: that of its folder, or that of its video without the ending."""
-    return scene.stem if scene.is_file() else scene.name
-
-
 def find_scene(text: str, root: Path) -> Path:
     """Find the folder or video that `scene=` means, as an absolute path.
 
@@ -305,16 +300,14 @@ def find_scene(text: str, root: Path) -> Path:
     Raises:
         Refused: there is no such folder or video, or its name has characters that are not allowed.
     """
+    scene = scene_path(text, root)
+    if scene is not None:
+        if not NAME.fullmatch(scene_name(scene)):
+            raise Refused(
+                f"{scene}: a scene is called by its folder's name; use letters, digits, blanks and _ . , - + ' ( ) only"
+            )
+        return scene
     data = workplace(root) / "data"
-    for scene in (data / text, Path(text).expanduser()):
-        if text and (scene.is_dir() or scene.is_file()):
-            scene = scene.resolve()
-            if not NAME.fullmatch(scene_name(scene)):
-                raise Refused(
-                    f"{scene}: a scene is called by its folder's name; use letters, digits, blanks and "
-                    "_ . , - + ' ( ) only"
-                )
-            return scene
     known = sorted(p.name for p in data.glob("[!._]*/")) if data.is_dir() else []
     raise Refused(
         f"unknown scene {text!r}: there is no folder data/{text}, nor one or a video at that path; "

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from reffusion.command import scene_name
 from runner import Refused
 from runner.files import list_files, read_text
 from runner.frames import FRAMES, update_frames
@@ -22,7 +23,6 @@ from runner.pipeline import (
     find_scene,
     load_pipeline,
     load_scene_file,
-    scene_name,
     unknown_name,
 )
 from runner.process import ask_stages

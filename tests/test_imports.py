@@ -113,6 +113,8 @@ def test_runner_knows_nothing_of_3d(path):
     assert own <= {
         "reffusion.command",
         "reffusion.command.is_installed",
+        "reffusion.command.scene_name",
+        "reffusion.command.scene_path",
         "reffusion.command.workplace",
     }
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from reffusion import command
 from reffusion.capture import sfm
 from reffusion.capture.layouts import video
 from reffusion.io.files import BadInput
@@ -146,7 +147,7 @@ def test_a_video_is_a_scene(walk_video, tmp_path, capfd):
 
 
 def test_pages_find_the_results_of_a_video_by_its_name(walk_video, tmp_path, monkeypatch):
-    monkeypatch.setattr(cli, "workplace", lambda root: tmp_path)
+    monkeypatch.setattr(command, "workplace", lambda root: tmp_path)
     walk_video.parent.rename(tmp_path / "data")
     for name in ("walk.mp4", "walk", str(tmp_path / "data/walk.mp4")):
         arguments = cli.scene_parser("view", "Show.").parse_args(["--scene", name, "--runs", str(tmp_path / "runs")])

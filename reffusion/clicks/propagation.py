@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from scipy import ndimage
@@ -23,8 +22,8 @@ from reffusion.clicks.all_views import remove_rim
 from reffusion.clicks.marks import UNKNOWN, Clicks
 from reffusion.clicks.segmenter import Candidate, Prompt
 from reffusion.clicks.single_view import ViewEvidence, bounding_box, erode, refine_edges
-from reffusion.clicks.supports import on_supports
-from reffusion.morphology import disk
+from reffusion.clicks.supports import find_support_gaussians
+from reffusion.morphology import open_mask
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
@@ -37,7 +36,7 @@ POINTS = 3  # largest number of points in a prompt
 MIN_REST = 0.01  # share of the visible silhouette; the network gets a further prompt for larger parts that it left out
 # Votes exclude a pixel whose `Projection.outside` is above MIN_AGAINST and whose `Projection.inside` is below MAX_FOR.
 MIN_AGAINST, MAX_FOR = 0.5, 0.2
-MIN_WIDTH = 0.004  # share of the larger image side: radius of the narrowest part that votes take from a network's mask
+MIN_WIDTH = 0.004  # share of the image's width: radius of the narrowest part that votes take from a network's mask
 # Points of a prompt are at least this far from the mask's border: as a share of the largest such distance, and in px.
 MIN_DEPTH = 0.3
 MIN_DEPTH_PX = 1.5
@@ -58,6 +57,16 @@ class Votes:
 
     counts: np.ndarray
     least: float
+
+    @property
+    def known(self) -> np.ndarray:
+        """bool [N], True for the Gaussians that the votes label."""
+        return self.counts.sum(1) > self.least
+
+    @property
+    def shares(self) -> np.ndarray:
+        """[N] in [0, 1], the share of each Gaussian's votes for the object; 0 for Gaussians without a label."""
+        return np.where(self.known, self.counts[:, 0] / np.maximum(self.counts.sum(1), self.least), 0.0)
 
     def plus(self, counts: np.ndarray) -> Votes:
         """Return the sum of these votes and of `counts` [N, 2], the votes of a further view."""
@@ -137,11 +146,10 @@ def count_votes(gaussians: Gaussians, camera: Camera, mask: np.ndarray) -> np.nd
 
 
 def assume_supports(gaussians: Gaussians, votes: Votes) -> Votes:
-    """Add votes against the object for Gaussians without a label on the planes that it stands on."""
-    weight = votes.counts.sum(1)
-    known, share = weight > votes.least, votes.counts[:, 0] / np.maximum(weight, 1e-9)
-    is_object, is_other = known & (share > 0.5), known & (share < MAX_OTHER_SHARE)
-    assumed = on_supports(gaussians.means.detach().double().cpu().numpy(), is_object, is_other) & ~known
+    """Add votes against the object for Gaussians without a label on planes beside the object (see `supports`)."""
+    known, share = votes.known, votes.shares
+    means = gaussians.means.detach().double().cpu().numpy()
+    assumed = find_support_gaussians(means, share > 0.5, known & (share < MAX_OTHER_SHARE)) & ~known
     return Votes(np.where(assumed[:, None], (0.0, 1.01 * votes.least), votes.counts), votes.least)
 
 
@@ -151,11 +159,9 @@ def project_votes(gaussians: Gaussians, camera: Camera, votes: Votes) -> Project
 
     A Gaussian belongs to the object's silhouette if more than half of its votes are for the object.
     """
-    weight = votes.counts.sum(1)
-    known = weight > votes.least
-    share = np.where(known, votes.counts[:, 0] / np.maximum(weight, votes.least), 0.0)
+    share = votes.shares
     labels = torch.as_tensor(share > 0.5, device=gaussians.means.device)
-    shares = torch.as_tensor(np.stack([share, (1 - share) * known], -1)).to(gaussians.means)
+    shares = torch.as_tensor(np.stack([share, (1 - share) * votes.known], -1)).to(gaussians.means)
     blended = rasterizer.render(gaussians, camera, sh_degree=0, features=shares).features.cpu().numpy()
     silhouette = np.zeros(blended.shape[:2], bool)
     if labels.any():
@@ -210,7 +216,7 @@ def draw_mask(view: ViewEvidence, projection: Projection) -> np.ndarray:
     ]
     candidates = _ask(view, prompts)
     mask = _select(candidates, projection)
-    excluded = mask & _excluded(projection)
+    excluded = mask & _find_excluded(projection)
     if excluded.sum() > MIN_REST * silhouette.sum():
         others = _deepest_points(excluded)
         points = Clicks(
@@ -222,18 +228,12 @@ def draw_mask(view: ViewEvidence, projection: Projection) -> np.ndarray:
         both = mask | _select(_ask(view, [Prompt(_deepest_points(part), bounding_box(part))]), projection, mask)
         if agreement(both, projection) > agreement(mask, projection):
             mask = both
-    return mask & ~_open(mask & _excluded(projection) & ~projection.silhouette)
+    return mask & ~open_mask(mask & _find_excluded(projection) & ~projection.silhouette, MIN_WIDTH)
 
 
-def _excluded(projection: Projection) -> np.ndarray:
+def _find_excluded(projection: Projection) -> np.ndarray:
     """Return bool [H, W], the pixels that votes exclude from the object."""
     return (projection.outside > MIN_AGAINST) & (projection.inside < MAX_FOR)
-
-
-def _open(mask: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the mask without parts thinner than the uncertainty of Gaussians at borders."""
-    kernel = disk(max(1, round(MIN_WIDTH * max(mask.shape))))
-    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
 
 
 def _ask(view: ViewEvidence, prompts: Sequence[Prompt], parts: bool = False) -> list[tuple[Candidate, float]]:

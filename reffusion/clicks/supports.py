@@ -23,17 +23,17 @@ MIN_GAUSSIANS = 20  # least number of the object's Gaussians, and of those of a 
 SAMPLES = 4000  # largest number of Gaussians in which planes are searched
 
 
-def on_supports(means: np.ndarray, is_object: np.ndarray, is_other: np.ndarray) -> np.ndarray:
-    """Return bool [N], True for Gaussians on planes that hold many Gaussians of the rest of the scene, but few of the
-    object.
-
-    The result is True for Gaussians of any label, also of the object. It is False far from the object (`REACH`), and
-    everywhere if the object has fewer than `MIN_GAUSSIANS` Gaussians.
+def find_support_gaussians(means: np.ndarray, is_object: np.ndarray, is_other: np.ndarray) -> np.ndarray:
+    """Find planes around the object that hold much of the rest of the scene, but little of the object.
 
     Args:
         means: [N, 3] positions of the Gaussians.
         is_object: bool [N], Gaussians labelled as the object.
         is_other: bool [N], Gaussians labelled as not the object. Gaussians in neither array have no label.
+
+    Returns:
+        bool [N], True for the Gaussians on these planes, whatever their label. False far from the object (`REACH`), and
+        everywhere if the object has fewer than `MIN_GAUSSIANS` Gaussians.
     """
     found = np.zeros(len(means), bool)
     if is_object.sum() < MIN_GAUSSIANS:

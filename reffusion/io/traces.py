@@ -67,10 +67,10 @@ def read_trace(path: Path) -> list[dict[str, Any]]:
 
     A line that is not valid JSON is skipped, because a killed process may leave an incomplete line.
     """
-    return [record for _, record in _numbered_records(path)]
+    return [record for _, record in _read_numbered_records(path)]
 
 
-def _numbered_records(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+def _read_numbered_records(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield the number, counted from 1, and the content of each line that is valid JSON."""
     for number, line in enumerate(path.read_text().splitlines(), 1):
         with suppress(json.JSONDecodeError):
@@ -96,7 +96,7 @@ def load_trace(path: Path, stage: str) -> dict[str, list[dict[str, Any]]]:
         raise ValueError(f"{path}: no such file")
     series: dict[str, list[dict[str, Any]]] = {}
     seconds = 0.0
-    for number, line in _numbered_records(path):
+    for number, line in _read_numbered_records(path):
         own = series.setdefault(str(line.get("series", "")), [])
         if wrong := _find_violation(line, own[-1] if own else None, seconds, stage):
             raise ValueError(f"{path}: line {number}: {wrong}")

@@ -91,17 +91,5 @@ def lacks(params: Params) -> list[str]:
 
 
 def cost(params: Params, gpu: str) -> Mapping[str, object] | None:
-    """Estimate the stage's time and memory on a GPU.
-
-    Args:
-        gpu: name of the GPU; "" for this machine's.
-
-    Returns:
-        "gpu": its name in the table of GPUs; "seconds"; "gb": GPU memory; "basis": the assumptions, as text. None if
-        the stage does not run on CUDA or cannot be estimated, or if `gpu` is "" and this machine has no GPU of the
-        table.
-
-    Raises:
-        ValueError: `gpu` is named and not in the table.
-    """
+    """Estimate the stage's time and memory on a GPU: see `estimate.format_estimate`; "" is this machine's GPU."""
     return estimate.format_estimate(gpu, params.device, estimate.reference(params))
