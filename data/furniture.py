@@ -314,3 +314,27 @@ def daybed(f: Furniture, draw, x: float, z: float) -> None:
     f.box(x, high, z, (wide + 0.04, 0.025, deep + 0.04), WOOD, yaw=yaw, top=Material("quilt"), removable=True)
     f.sphere(x + 0.2, high + 0.025, z - 0.1, 0.11, Material("ball"), removable=True)
     f.cylinder(x - 0.25, high + 0.025, z + 0.1, 0.08, 0.13, Material("jar"), removable=True)
+
+
+def crowded(f: Furniture, draw, x: float, z: float) -> None:
+    """Add the removable object of the kind "beside", a chest with a ball and a jar, and four things that stay.
+
+    The things stand around the chest, within half its radius, one on each side. So from every side the chest hides a
+    part of one of them.
+    """
+    front = z + draw.uniform(0.2, 0.23)
+    chest(f, draw, x, 0.008, front)
+    turn, things = draw.uniform(-20, 20), draw.permutation(4)
+    for k in range(4):
+        angle = np.radians(90 * k + turn)
+        reach = 0.47 if k % 2 == 0 else 0.38
+        at = x + reach * np.sin(angle + np.pi / 2), z + reach * np.cos(angle + np.pi / 2)
+        yaw = draw.uniform(0, 90)
+        if things[k] == 0:
+            f.box(at[0], 0.008, at[1], (0.22, 0.26, 0.2), Material("crate"), yaw=yaw)
+        elif things[k] == 1:
+            f.box(at[0], 0.008, at[1], (0.2, 0.34, 0.14), Material("books2"), yaw=yaw, top=WHITE)
+        elif things[k] == 2:
+            f.sphere(at[0], 0.008, at[1], 0.12, Material("globe"), draw.uniform(0, 360))
+        else:
+            f.cylinder(at[0], 0.008, at[1], 0.09, 0.3, Material("vase"))

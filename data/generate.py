@@ -5,6 +5,7 @@ A furnished room is ray-cast with and without one object. Kinds:
   mini    demo with 3 test and 8 training views of 64 x 48 px, for tests
   wide    demo with cameras +-50 degrees around the object
   360     demo with cameras all around an object that lies on the floor
+  beside  360 with a chest on the floor, close to four things that stay and that it partly hides in every view
   seen    demo with an object in mid-air: other views see everything that it hides, so nothing has to be invented
   behind  wide with a second object in front, which stays and hides a part of what the reference is to fill
   table   an object on the edge of a table, free space under it, some cameras low enough to look there

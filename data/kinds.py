@@ -28,8 +28,8 @@ class Kind:
         points: largest number of sparse points.
         hangs: True if the object hangs in mid-air, so that other views show everything that it hides.
         place: where the object is: "room" (against a wall), "behind" (another object, which stays, is in front),
-            "table" (on the edge of a table), "corner" (in front of the corner of a wall), "grass" (on a lawn), "floor"
-            or "pair" (two objects side by side).
+            "table" (on the edge of a table), "corner" (in front of the corner of a wall), "grass" (on a lawn), "floor",
+            "beside" (on the floor, close to things that stay) or "pair" (two objects side by side).
         task: what the scene asks for. "remove": remove the object. "insert": insert the object, which only the test
             views and the references show. "outpaint": continue the scene beyond a sphere. "sparse": no object is
             removed or inserted, but few views have pixels.
@@ -72,6 +72,7 @@ KINDS = {
     "mini": Kind(width=64, height=48, train=8, test=3, texture=256, node=0.1, points=400),
     "wide": Kind(spread=50.0),
     "360": Kind(spread=180.0),
+    "beside": Kind(spread=180.0, place="beside", least=0.1),
     "seen": Kind(spread=34.0, hangs=True),
     "behind": Kind(spread=50.0, place="behind"),
     "table": Kind(spread=34.0, place="table", least=0.05, low=0.45),

@@ -6,7 +6,21 @@
 from __future__ import annotations
 
 import numpy as np
-from furniture import WHITE, WOOD, Furniture, Material, cabinet, chest, daybed, keepsake, lantern, pair, plant, shelf
+from furniture import (
+    WHITE,
+    WOOD,
+    Furniture,
+    Material,
+    cabinet,
+    chest,
+    crowded,
+    daybed,
+    keepsake,
+    lantern,
+    pair,
+    plant,
+    shelf,
+)
 from kinds import Kind, randomness
 from places import PLAIN, RUG, WALL, garden, shell, table_room, wall_corner
 
@@ -16,7 +30,7 @@ def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
     f, draw = Furniture(), randomness(seed, "layout")
     planks = Material("floor", 3.0, turned=bool(draw.integers(2)))
     if kind.is_circle:
-        return f, _round_room(f, draw, planks)
+        return f, _round_room(f, draw, planks, crowded if kind.place == "beside" else daybed)
     others = {"table": table_room, "corner": wall_corner, "grass": garden}
     if kind.place in others:
         return f, others[kind.place](f, draw, planks)
@@ -59,10 +73,10 @@ def _pictures_and_clutter(f: Furniture, draw, side: int) -> None:
           yaw=draw.uniform(10, 60))  # fmt: skip
 
 
-def _round_room(f: Furniture, draw, planks: Material) -> np.ndarray:
+def _round_room(f: Furniture, draw, planks: Material, add_object) -> np.ndarray:
     f.room((0, 1.35, 3.2), (3.2, 1.35, 3.2), PLAIN, WALL, WHITE, planks, WALL, WALL)
     f.box(0.1, 0, 3.15, (2.3, 0.008, 1.6), RUG, yaw=draw.uniform(-30, 30))
-    daybed(f, draw, 0.0, 3.2)
+    add_object(f, draw, 0.0, 3.2)
     for x, z, wide, deep in ((0, 0.008, 6.4, 0.016), (0, 6.392, 6.4, 0.016), (-3.192, 3.2, 0.016, 6.4),
                              (3.192, 3.2, 0.016, 6.4)):  # fmt: skip
         f.box(x, 0, z, (wide, 0.1, deep), WHITE)

@@ -100,6 +100,17 @@ def test_where_the_depth_is_known_a_click_goes_as_far_as_the_surface():
     assert wall_scene.iou(click_mask(picture, (165, 90), relief=relief, before=half), disk) > 0.9
 
 
+def test_a_click_on_a_small_mistake_changes_little():
+    """The mask lacks a few pixels at the rim of the disk. The network proposes nothing but the whole picture."""
+    picture, disk = disk_picture()
+    rows, columns = np.mgrid[:240, :320]
+    before = disk & ~((np.hypot(rows - 120, columns - 206) < 4) & disk)
+    everything = Candidate(np.ones_like(disk), 0.9)
+    view = ViewEvidence(picture, np.where(disk, 0.0, 300.0), lambda prompt: [everything] * 3)
+    found = apply_marks(view, make_clicks((150, 90), (206, 120)), before, first=1)
+    assert found[120, 206] and (found ^ before).sum() < 60
+
+
 def test_a_click_takes_back_what_it_is_on():
     picture, disk = disk_picture()
     stripe = disk & (abs(np.mgrid[:240, :320][0] - 120) < 12)
@@ -291,24 +302,61 @@ def sheet_points(origin, along, up, color, step=0.04):
     return means, np.broadcast_to(color, means.shape)
 
 
-def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
+@cache
+def box_scene():
+    """Return a scene of a wall and a box before it, cameras at its left, middle and right, photographs, and bool [N].
+
+    The middle camera shows the front of the box alone. The other two show one of its two darker sides, too. The bool
+    array is True for the Gaussians of the box.
+    """
     parts = [
         sheet_points((-4, -2, 4), (8, 0, 0), (0, 4, 0), (0.2, 0.3, 0.7)),  # the wall
-        sheet_points(
-            (-0.5, -0.5, 2.5), (1, 0, 0), (0, 1, 0), (0.8, 0.5, 0.2)
-        ),  # the front of a box; its two darker sides follow
+        sheet_points((-0.5, -0.5, 2.5), (1, 0, 0), (0, 1, 0), (0.8, 0.5, 0.2)),
         sheet_points((-0.5, -0.5, 2.5), (0, 0, 0.8), (0, 1, 0), (0.5, 0.3, 0.12)),
         sheet_points((0.5, -0.5, 2.5), (0, 0, 0.8), (0, 1, 0), (0.5, 0.3, 0.12)),
     ]
     means, colors = (np.concatenate(each) for each in zip(*parts, strict=True))
     scene = round_gaussians(means, colors, 0.025, 4.0)
-    cameras = {name: wall_scene.front_camera(name, x) for name, x in (("left", -1.6), ("middle", 0.0), ("right", 1.6))}
+    cameras = {name: wall_scene.front_camera(name, x) for name, x in (("left", -1.2), ("middle", 0.0), ("right", 1.2))}
     with torch.no_grad():
         images = {n: to_uint8(rasterizer.render(scene, c).color.clamp(0, 1).numpy()) for n, c in cameras.items()}
-    box = torch.arange(len(means)) >= len(parts[0][0])
+    return scene, cameras, images, torch.arange(len(means)) >= len(parts[0][0])
+
+
+def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
+    scene, cameras, images, box = box_scene()
     near, mask = find_neighbours(scene), voting.render_labels(scene, box, cameras["middle"]) > 0.5
     found = all_views.label_gaussians(scene, near, cameras, {"middle": mask}, images.__getitem__)
     assert (found & box).sum() > 0.95 * box.sum() and (found & ~box).sum() < 0.01 * box.sum()
+
+
+@pytest.mark.parametrize("knows", [True, False])
+def test_a_stroke_reaches_sides_that_its_view_does_not_show(knows):
+    """All masks lack the right half of the box. A stroke is made in the middle view, which shows the front alone.
+
+    In the right view, the network adds the side of the box near the stroke. If the network takes the whole photograph
+    for the object, only the pixels of the stroke are added.
+    """
+    scene, cameras, images, box = box_scene()
+    right = scene.means[:, 0] > 0.1
+    whole = {name: voting.render_labels(scene, box, c) > 0.5 for name, c in cameras.items()}
+    lost = {name: voting.render_labels(scene, box & right, c) > 0.5 for name, c in cameras.items()}
+    masks = {name: whole[name] & ~lost[name] for name in whole}
+
+    def evidence_of(name):
+        answer = whole[name] if knows else np.ones_like(whole[name])
+        relief = all_views.surface_relief(scene, cameras[name])
+        return ViewEvidence(images[name], relief, lambda prompt: [Candidate(answer, 0.9)])
+
+    rows, columns = np.nonzero(lost["middle"])
+    radius = (columns.max() - columns.min()) / 2
+    path = np.stack([np.full(2, columns.mean()), [rows.min() + radius, rows.max() - radius]], 1) + 0.5
+    stroke = Event("middle", Mark(path, True, radius))
+    found = correct_scene(FittedViews(scene, cameras, evidence_of), [stroke], masks, {})
+    gained = {name: found[name] & ~masks[name] for name in found}
+    assert all((gained[name] & ~whole[name]).sum() < 0.02 * whole[name].sum() for name in gained)
+    shares = {name: (gained[name] & lost[name]).sum() / lost[name].sum() for name in gained}
+    assert shares["right"] > 0.85 if knows else 0.4 < shares["right"] < 0.75, shares
 
 
 # ---------------------------------------------------------------------------------------- clicks that a scene gives

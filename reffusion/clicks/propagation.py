@@ -208,24 +208,24 @@ def draw_mask(view: ViewEvidence, projection: Projection) -> np.ndarray:
     visible = _drop_small_parts(silhouette & (projection.inside > projection.outside))
     if visible.sum() < MIN_PART * silhouette.sum():
         visible = silhouette
-    inside, box = _deepest_points(visible), bounding_box(silhouette)
+    inside, box = deepest_points(visible), bounding_box(silhouette)
     prompts = [
         Prompt(inside, box),
         Prompt(inside, bounding_box(visible)),
-        Prompt(_deepest_points(silhouette), box),
+        Prompt(deepest_points(silhouette), box),
     ]
     candidates = _ask(view, prompts)
     mask = _select(candidates, projection)
     excluded = mask & _find_excluded(projection)
     if excluded.sum() > MIN_REST * silhouette.sum():
-        others = _deepest_points(excluded)
+        others = deepest_points(excluded)
         points = Clicks(
             np.concatenate([inside.points, others.points]), np.concatenate([inside.positive, ~others.positive])
         )
         candidates += _ask(view, [Prompt(points, box), Prompt(points)], parts=True)
         mask = _select(candidates, projection)
     for part in _large_parts(erode(visible & ~mask, 1), MIN_REST * visible.sum()):
-        both = mask | _select(_ask(view, [Prompt(_deepest_points(part), bounding_box(part))]), projection, mask)
+        both = mask | _select(_ask(view, [Prompt(deepest_points(part), bounding_box(part))]), projection, mask)
         if agreement(both, projection) > agreement(mask, projection):
             mask = both
     return mask & ~open_mask(mask & _find_excluded(projection) & ~projection.silhouette, MIN_WIDTH)
@@ -324,7 +324,7 @@ def _drop_small_parts(mask: np.ndarray) -> np.ndarray:
     return mask & (sizes >= MIN_PART * sizes.max())[parts]
 
 
-def _deepest_points(mask: np.ndarray) -> Clicks:
+def deepest_points(mask: np.ndarray) -> Clicks:
     """Return up to `POINTS` positive clicks inside a mask, far from its border and from each other; at least one."""
     depth = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
     least, points = max(MIN_DEPTH * depth.max(), MIN_DEPTH_PX), []

@@ -1,9 +1,9 @@
 """Masks of all views from marks (clicks and brush strokes) in some views.
 
 The view of the first mark is segmented, and its mask is propagated to all views. Each later mark is a correction. A
-correction adds a region to the mask of its own view, or removes one. In each other view it changes only the pixels that
-show the surface of this region, without pixels that earlier marks confirm to be the opposite. A click on another object
-adds that object to all views.
+correction adds a region to the mask of its own view, or removes one. In each other view it changes the pixels that show
+the surface of this region, and pixels near it by the segmentation network, without pixels that earlier marks confirm to
+be the opposite. A click on another object adds that object to all views.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ import numpy as np
 
 from reffusion import geometry
 from reffusion.clicks import all_views
-from reffusion.clicks.marks import OBJECT, OTHER, Mark, confirmed_pixels
-from reffusion.clicks.propagation import propagate_masks
-from reffusion.clicks.single_view import ViewEvidence, apply_marks
+from reffusion.clicks.marks import OBJECT, OTHER, Clicks, Mark, confirmed_pixels
+from reffusion.clicks.propagation import MIN_PIXELS, deepest_points, iou, propagate_masks
+from reffusion.clicks.segmenter import Prompt
+from reffusion.clicks.single_view import ViewEvidence, apply_marks, bounding_box
 from reffusion.gaussians.neighbours import find_neighbours
 from reffusion.morphology import dilate
 from reffusion.types import Camera, Gaussians
@@ -26,6 +27,8 @@ from reffusion.types import Camera, Gaussians
 Masks = Mapping[str, np.ndarray]  # view -> bool [H, W]
 Recall = Callable[[Hashable, Callable[[], Masks]], Masks]  # (key, compute) -> masks, see `segment_scene`
 SAME_SURFACE = 0.02  # relative difference of depth below which two views show the same surface point
+SPHERE_QUANTILE = 0.95  # share of a region's pixels inside its bounding sphere; the depth of the others may be wrong
+LEAST_IOU = 0.75  # between the network's mask after a correction and the mask expected by depth alone
 
 
 @dataclass(frozen=True)
@@ -213,6 +216,46 @@ def transfer_region(views: FittedViews, name: str, region: np.ndarray, other: st
     return hit & inside & (np.abs(here - z) < SAME_SURFACE * z)
 
 
+def transfer_change(
+    views: FittedViews, name: str, region: np.ndarray, other: str, mask: np.ndarray, positive: bool
+) -> np.ndarray:
+    """Return bool [H, W], the pixels of the view `other` that change with a region of the view `name`.
+
+    These are the pixels that show the surface inside the region. The segmentation network finds further pixels, such as
+    those of other sides of the same part of the object. They lie within the region's bounding sphere in 3D. The network
+    is not used if its best mask differs much from the mask that is expected by depth alone.
+
+    Args:
+        region: bool [H, W], the changed pixels of the view `name`; not empty.
+        mask: bool [H, W], the mask of the view `other` before the change.
+        positive: True if the region is added to the object, False if it is removed.
+    """
+    shown = transfer_region(views, name, region, other)
+    view, expected = views.evidence_of(other), mask | shown if positive else mask & ~shown
+    near = _find_near(views, name, region, other)
+    if view.ask is None or not near.any() or expected.sum() < MIN_PIXELS:
+        return shown
+    points, signs = [deepest_points(expected).points], [True]
+    if shown.any():
+        points, signs = [*points, deepest_points(shown).points], [*signs, positive]
+    clicks = Clicks(np.concatenate(points), np.repeat(signs, [len(each) for each in points]))
+    boxes = [None, bounding_box(expected), bounding_box(expected | near)]
+    candidates = [each.mask for box in boxes for each in view.ask(Prompt(clicks, box))]
+    best = max(candidates, key=lambda candidate: iou(candidate, expected))
+    if iou(best, expected) < LEAST_IOU:
+        return shown
+    return shown | (near & (best if positive else ~best))
+
+
+def _find_near(views: FittedViews, name: str, region: np.ndarray, other: str) -> np.ndarray:
+    """Return bool [H, W], the pixels of `other` that show surfaces inside the bounding sphere of a region of `name`."""
+    points = geometry.unproject(_depth(views.evidence_of(name), views.cameras[name]), views.cameras[name])[region]
+    center = np.median(points, 0)
+    radius = np.quantile(np.linalg.norm(points - center, axis=1), SPHERE_QUANTILE)
+    surface = geometry.unproject(_depth(views.evidence_of(other), views.cameras[other]), views.cameras[other])
+    return np.linalg.norm(surface - center, axis=-1) < radius
+
+
 def _depth(view: ViewEvidence, camera: Camera) -> np.ndarray:
     assert view.relief is not None
     return np.exp(view.relief / camera.fx)
@@ -228,7 +271,7 @@ def spread_change(
     """Return the masks of all views, view -> bool [H, W], after the last event's change is made in all other views.
 
     If a click on the object added a region that does not touch the mask before, the region is another object. Its mask
-    is propagated to all views. Otherwise the changed region is transferred by depth. Pixels that marks of a view
+    is propagated to all views. Otherwise the change is transferred (see `transfer_change`). Pixels that marks of a view
     confirm to be the opposite do not change.
 
     Args:
@@ -245,7 +288,11 @@ def spread_change(
     if apart:  # other views may show parts of the new object that this view hides, so depth alone is not enough
         regions = propagate_masks(views.gaussians, views.cameras, views.evidence_of, {name: change})
     else:
-        regions = {other: transfer_region(views, name, change, other) for other in views.cameras}
+        regions = {
+            other: transfer_change(views, name, change, other, masks[other], mark.positive)
+            for other in views.cameras
+            if other != name and other not in given
+        }
     found = dict(masks)
     for other, region in regions.items():
         if other == name or other in given or not region.any():

@@ -26,6 +26,9 @@ DEPTH_SLOPE = 4.0, 10.0
 LEAST_EDGE_SHARE = 0.25  # share of an object's border that must be an edge between surfaces, for depth to be used
 LEAST_REGION = 12  # number of pixels (at the size for segmentation) that a region with a click must have
 RING = 0.25  # width of the ring around a mask in which colours are compared, per square root of the mask's pixels
+# Penalties on a correction's merit. CHANGE_PENALTY is multiplied by log(1 + size), the region's size relative to the
+# mask before. DOT_PENALTY is that of changing a dot around the click only, which is right if all regions are too large.
+CHANGE_PENALTY, DOT_PENALTY = 0.25, 0.3
 MARGIN = 3  # `refine_edges` uses the colours up to this many bands (`BAND`) away from a mask
 
 
@@ -90,8 +93,8 @@ def segment_view(view: ViewEvidence, clicks: Clicks) -> np.ndarray:
 def correct_mask(view: ViewEvidence, before: np.ndarray, clicks: Clicks, confirmed: np.ndarray) -> np.ndarray:
     """Return bool [H, W], the mask `before` with one connected region added or removed around the last click.
 
-    A positive click adds a region, a negative click removes one. The mask is returned unchanged if it agrees with the
-    last click already, or if no region is found.
+    A positive click adds a region, a negative click removes one. Small changes are preferred. The mask is returned
+    unchanged if it agrees with the last click already.
 
     Args:
         before: bool [H, W], the mask to correct.
@@ -109,14 +112,16 @@ def correct_mask(view: ViewEvidence, before: np.ndarray, clicks: Clicks, confirm
         np.append(np.zeros((clicks.positive != positive).sum(), bool), True),
     )
     masks += [mask if positive else ~mask for mask in _propose(view, alone)]
-    results, kept = [], confirmed == (OTHER if positive else OBJECT)
-    for mask in masks:
-        region = _part_at((mask & ~before if positive else before & ~mask) & ~kept, at)
-        if region.any():
-            results.append(before | region if positive else before & ~region)
-    if not results:
-        return before
-    best = _most_object(view, clicks, results)
+    kept = confirmed == (OTHER if positive else OBJECT)
+    regions = [_part_at((mask & ~before if positive else before & ~mask) & ~kept, at) for mask in masks]
+    regions = [region for region in regions if region.any()]
+    sizes = [float(region.sum() / max(before.sum(), 1)) for region in regions]
+    penalties = [CHANGE_PENALTY * float(np.log1p(size)) for size in sizes]
+    dot = stroke_pixels(Mark(at[None], positive, max(2.0, BAND * max(before.shape))), before.shape)
+    regions.append((dot & ~before if positive else dot & before) & ~kept)
+    penalties.append(DOT_PENALTY)
+    results = [before | region if positive else before & ~region for region in regions]
+    best = _most_object(view, clicks, results, penalties)
     return results[0] if best is None else best
 
 
@@ -135,32 +140,38 @@ def _propose(view: ViewEvidence, clicks: Clicks) -> list[np.ndarray]:
     return [*masks, view.ask(Prompt(clicks, bounding_box(own)))[-1].mask] if own.any() else masks
 
 
-def _most_object(view: ViewEvidence, clicks: Clicks, masks: Sequence[np.ndarray]) -> np.ndarray | None:
+def _most_object(
+    view: ViewEvidence, clicks: Clicks, masks: Sequence[np.ndarray], penalties: Sequence[float] | None = None
+) -> np.ndarray | None:
     """Return the mask that best outlines one complete object, among the masks that agree with all clicks.
 
-    The merit of a mask is its `object_score`, plus the share of its border that lies on edges of surfaces. None if no
-    mask agrees with all clicks.
+    The merit of a mask is its `object_score`, plus the share of its border that lies on edges of surfaces, minus its
+    penalty. None if no mask agrees with all clicks.
+
+    Args:
+        penalties: of each mask; None for no penalties.
     """
     agreeing = [
-        mask
-        for mask in masks
+        k
+        for k, mask in enumerate(masks)
         if all(_value_at(mask, at) == positive for at, positive in zip(clicks.points, clicks.positive, strict=True))
     ]
     if len(agreeing) < 2:
-        return agreeing[0] if agreeing else None
+        return masks[agreeing[0]] if agreeing else None
     lab, small, _ = _downscale(view.image, clicks)
     pairs, length = _pixel_pairs(small)
     edges = _find_depth_edges(view.relief, small, pairs, length)
     depth_edges = np.zeros(len(pairs)) if edges is None else edges
 
-    def merit(mask: np.ndarray) -> float:
-        labels = cv2.resize(mask.astype(np.float32), small[::-1], interpolation=cv2.INTER_AREA) > 0.5
+    def merit(k: int) -> float:
+        labels = cv2.resize(masks[k].astype(np.float32), small[::-1], interpolation=cv2.INTER_AREA) > 0.5
         ends = labels.ravel()[pairs]
         rim = ends[:, 0] != ends[:, 1]
         on_edges = float(depth_edges[rim].mean()) if rim.any() else 0.0
-        return object_score(labels.ravel(), _ring(labels).ravel(), lab, pairs, depth_edges) + on_edges
+        score = object_score(labels.ravel(), _ring(labels).ravel(), lab, pairs, depth_edges) + on_edges
+        return score - (penalties[k] if penalties else 0.0)
 
-    return max(agreeing, key=merit)
+    return masks[max(agreeing, key=merit)]
 
 
 def _value_at(mask: np.ndarray, at: np.ndarray) -> bool:
