@@ -25,6 +25,7 @@ from reffusion.clicks.scene_segmentation import (
     Event,
     FittedViews,
     Masks,
+    correct_own_view,
     count_first,
     segment_own_view,
     segment_scene,
@@ -372,7 +373,11 @@ class Session:
                 first = segment_own_view(evidence_of, events[: count_first(events)], self._recall)
                 self._show(self.masks | first, revision)
             cameras = {name: self.scene.cameras[name] for name in {*self.views, *given}}
-            masks = segment_scene(FittedViews(self.gaussians, cameras, evidence_of), events, given, self._recall)
+            views = FittedViews(self.gaussians, cameras, evidence_of)
+            if len(events) > (0 if given else count_first(events)):  # likewise the correction of the last mark's view
+                masks = segment_scene(views, events[:-1], given, self._recall)
+                self._show(masks | correct_own_view(views, events, masks, self._recall), revision)
+            masks = segment_scene(views, events, given, self._recall)
         self._show(masks, revision)
 
     def _recall(self, key: Hashable, compute: Callable[[], Masks]) -> Masks:

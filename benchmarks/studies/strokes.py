@@ -31,6 +31,7 @@ from reffusion.types import Camera, Gaussians
 from reffusion.weights.segmenters import AUTO
 
 CUT = 0.2  # share of the object's Gaussians that the masks lose
+RIGHT = 0.99  # views whose masks have a higher IoU do not show the wrong part
 LENGTH, RADIUS = 40.0, 8.0  # length of the stroke and radius of the brush, px
 
 
@@ -93,10 +94,12 @@ def main() -> None:
             direction = np.random.default_rng(seeding.seed_for(trial, "cut")).normal(size=3)
             masks = spoil_masks(gaussians, cameras, true, direction, arguments.erase)
             name = max(true, key=lambda view: int((true[view] ^ masks[view]).sum()))
+            if iou(true[name], masks[name]) > RIGHT:
+                continue  # nothing stands around this end of the object
             stroke = paint_stroke(true[name] ^ masks[name], not arguments.erase)
             after = correct_scene(views, [Event(name, stroke)], masks, {})
             gains = {view: iou(after[view], true[view]) - iou(masks[view], true[view]) for view in true}
-            shown = [view for view in true if view != name and iou(masks[view], true[view]) < 0.99]
+            shown = [view for view in true if view != name and iou(masks[view], true[view]) < RIGHT]
             others = np.array([gains[view] for view in shown])
             ratios.append(others.mean() / gains[name])
             text = f"own {gains[name]:+.3f}, others {others.mean():+.3f} ({others.min():+.3f} and more)"

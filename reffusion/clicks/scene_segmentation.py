@@ -17,7 +17,7 @@ import numpy as np
 from reffusion import geometry
 from reffusion.clicks import all_views
 from reffusion.clicks.marks import OBJECT, OTHER, Clicks, Mark, confirmed_pixels
-from reffusion.clicks.propagation import MIN_PIXELS, deepest_points, iou, propagate_masks
+from reffusion.clicks.propagation import MIN_PIXELS, deepest_points, iou, order_by_distance, propagate_masks
 from reffusion.clicks.segmenter import Prompt
 from reffusion.clicks.single_view import ViewEvidence, apply_marks, bounding_box
 from reffusion.gaussians.neighbours import find_neighbours
@@ -27,7 +27,10 @@ from reffusion.types import Camera, Gaussians
 Masks = Mapping[str, np.ndarray]  # view -> bool [H, W]
 Recall = Callable[[Hashable, Callable[[], Masks]], Masks]  # (key, compute) -> masks, see `segment_scene`
 SAME_SURFACE = 0.02  # relative difference of depth below which two views show the same surface point
-SPHERE_QUANTILE = 0.95  # share of a region's pixels inside its bounding sphere; the depth of the others may be wrong
+SOURCES = 3  # a change is transferred to a view from this many nearest views
+# A region's bounding sphere has this many times the radius that holds this share of the region's pixels. The depth of
+# the other pixels may be wrong.
+SPHERE_FACTOR, SPHERE_QUANTILE = 1.2, 0.95
 LEAST_IOU = 0.75  # between the network's mask after a correction and the mask expected by depth alone
 
 
@@ -89,9 +92,8 @@ def segment_scene(
     if count:
         masks = segment_own_view(views.evidence_of, events[:count], recall)
     for k in range(count, len(events) + 1):
-        step = (
-            partial(correct_scene, views, events[:k], masks, given) if k > count else partial(propagate, views, masks)
-        )
+        correct = partial(correct_scene, views, events[:k], masks, given, recall)
+        step = correct if k > count else partial(propagate, views, masks)
         masks = recall(("all views", *(event.key for event in events[:k])), step)
     return dict(masks)
 
@@ -152,17 +154,35 @@ def propagate(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
     }
 
 
-def correct_scene(views: FittedViews, events: Sequence[Event], masks: Masks, given: Masks) -> dict[str, np.ndarray]:
+def correct_scene(
+    views: FittedViews, events: Sequence[Event], masks: Masks, given: Masks, recall: Recall = compute_always
+) -> dict[str, np.ndarray]:
     """Return the masks of all views after the last event, view -> bool [H, W].
 
     Args:
         events: all marks so far; the last one is applied.
         masks: view -> bool [H, W], the masks of all views before the last event.
         given: view -> bool [H, W], masks that the scene provides; they do not change by events in other views.
+        recall: cache of results, as for `segment_scene`.
     """
     name = events[-1].view
-    after = correct_view(views, events, masks[name])
-    return spread_change(views, events, dict(masks) | {name: after}, masks[name], given)
+    own = correct_own_view(views, events, masks, recall)
+    return spread_change(views, events, dict(masks) | own, masks[name], given)
+
+
+def correct_own_view(
+    views: FittedViews, events: Sequence[Event], masks: Masks, recall: Recall = compute_always
+) -> Masks:
+    """Return the mask of the last event's view after this event, as {view: bool [H, W]}.
+
+    Args:
+        events: all marks so far; the last one is applied.
+        masks: view -> bool [H, W], the masks of all views before the last event.
+        recall: cache of results, as for `segment_scene`.
+    """
+    name = events[-1].view
+    step = lambda: {name: correct_view(views, events, masks[name])}
+    return recall(("corrected view", *(event.key for event in events)), step)
 
 
 def correct_view(views: FittedViews, events: Sequence[Event], before: np.ndarray) -> np.ndarray:
@@ -203,38 +223,64 @@ def transfer_marks(views: FittedViews, events: Sequence[Event], name: str) -> li
     return found
 
 
-def transfer_region(views: FittedViews, name: str, region: np.ndarray, other: str) -> np.ndarray:
-    """Return bool [H, W], the pixels of the view `other` that show the surface inside a region of the view `name`.
+def is_shown(views: FittedViews, name: str, region: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return bool [P], True for the points that a view shows inside a region, in front of everything else.
 
     Args:
         region: bool [H, W], pixels of the view `name`.
+        points: [P, 3].
     """
-    camera, there = views.cameras[name], views.cameras[other]
-    uv, z = geometry.project(geometry.unproject(_depth(views.evidence_of(other), there), there), camera)
+    uv, z = geometry.project(points, views.cameras[name])
     hit, inside = geometry.sample_nearest(region, uv)
-    here, _ = geometry.sample_nearest(_depth(views.evidence_of(name), camera), uv)
+    here, _ = geometry.sample_nearest(_depth(views.evidence_of(name), views.cameras[name]), uv)
     return hit & inside & (np.abs(here - z) < SAME_SURFACE * z)
 
 
 def transfer_change(
-    views: FittedViews, name: str, region: np.ndarray, other: str, mask: np.ndarray, positive: bool
-) -> np.ndarray:
-    """Return bool [H, W], the pixels of the view `other` that change with a region of the view `name`.
+    views: FittedViews, name: str, region: np.ndarray, masks: Masks, fixed: Masks, positive: bool
+) -> dict[str, np.ndarray]:
+    """Return the pixels of all other views that change with a region of one view, view -> bool [H, W].
 
-    These are the pixels that show the surface inside the region. The segmentation network finds further pixels, such as
-    those of other sides of the same part of the object. They lie within the region's bounding sphere in 3D. The network
-    is not used if its best mask differs much from the mask that is expected by depth alone.
+    The change goes from view to view, by distance. In each view the pixels change that show the surface changed in the
+    nearest views so far. The segmentation network finds further pixels, such as those of other sides of the same part
+    of the object. They lie within the region's bounding sphere in 3D. The network is not used where its best mask
+    differs much from the mask that is expected by depth alone.
 
     Args:
-        region: bool [H, W], the changed pixels of the view `name`; not empty.
-        mask: bool [H, W], the mask of the view `other` before the change.
+        name: the view of the region.
+        region: bool [H, W], the changed pixels; not empty.
+        masks: view -> bool [H, W], the masks of all views before the change.
+        fixed: the views whose masks do not change.
         positive: True if the region is added to the object, False if it is removed.
     """
-    shown = transfer_region(views, name, region, other)
-    view, expected = views.evidence_of(other), mask | shown if positive else mask & ~shown
-    near = _find_near(views, name, region, other)
+    center, radius = _bounding_sphere(views, name, region)
+    changes, cameras = {name: region}, {key: each for key, each in views.cameras.items() if key not in fixed}
+    for other in order_by_distance(cameras | {name: views.cameras[name]}, changes):
+        distance = lambda key, at=cameras[other].center: float(np.linalg.norm(views.cameras[key].center - at))
+        sources = sorted(changes, key=distance)[:SOURCES]
+        surface = geometry.unproject(_depth(views.evidence_of(other), cameras[other]), cameras[other])
+        near = np.linalg.norm(surface - center, axis=-1) < radius
+        shown, points = np.zeros_like(near), surface[near]
+        if len(points):
+            shown[near] = np.any([is_shown(views, source, changes[source], points) for source in sources], 0)
+        change = shown | _ask_near(views.evidence_of(other), masks[other], shown, near, positive)
+        if change.any():
+            changes[other] = change
+    return {other: change for other, change in changes.items() if other != name}
+
+
+def _ask_near(view: ViewEvidence, mask: np.ndarray, shown: np.ndarray, near: np.ndarray, positive: bool) -> np.ndarray:
+    """Return bool [H, W], the pixels of `near` at which the segmentation network adds to a mask, or removes from it.
+
+    Args:
+        mask: bool [H, W], the mask of the view before the change.
+        shown: bool [H, W], the pixels that change by depth alone.
+        near: bool [H, W], the pixels that may change.
+        positive: True to add pixels, False to remove them.
+    """
+    expected = mask | shown if positive else mask & ~shown
     if view.ask is None or not near.any() or expected.sum() < MIN_PIXELS:
-        return shown
+        return np.zeros_like(mask)
     points, signs = [deepest_points(expected).points], [True]
     if shown.any():
         points, signs = [*points, deepest_points(shown).points], [*signs, positive]
@@ -243,17 +289,15 @@ def transfer_change(
     candidates = [each.mask for box in boxes for each in view.ask(Prompt(clicks, box))]
     best = max(candidates, key=lambda candidate: iou(candidate, expected))
     if iou(best, expected) < LEAST_IOU:
-        return shown
-    return shown | (near & (best if positive else ~best))
+        return np.zeros_like(mask)
+    return near & (best & ~mask if positive else mask & ~best)
 
 
-def _find_near(views: FittedViews, name: str, region: np.ndarray, other: str) -> np.ndarray:
-    """Return bool [H, W], the pixels of `other` that show surfaces inside the bounding sphere of a region of `name`."""
+def _bounding_sphere(views: FittedViews, name: str, region: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return centre [3] and radius of a sphere around the surface that a view shows inside a region, bool [H, W]."""
     points = geometry.unproject(_depth(views.evidence_of(name), views.cameras[name]), views.cameras[name])[region]
     center = np.median(points, 0)
-    radius = np.quantile(np.linalg.norm(points - center, axis=1), SPHERE_QUANTILE)
-    surface = geometry.unproject(_depth(views.evidence_of(other), views.cameras[other]), views.cameras[other])
-    return np.linalg.norm(surface - center, axis=-1) < radius
+    return center, SPHERE_FACTOR * float(np.quantile(np.linalg.norm(points - center, axis=1), SPHERE_QUANTILE))
 
 
 def _depth(view: ViewEvidence, camera: Camera) -> np.ndarray:
@@ -288,11 +332,7 @@ def spread_change(
     if apart:  # other views may show parts of the new object that this view hides, so depth alone is not enough
         regions = propagate_masks(views.gaussians, views.cameras, views.evidence_of, {name: change})
     else:
-        regions = {
-            other: transfer_change(views, name, change, other, masks[other], mark.positive)
-            for other in views.cameras
-            if other != name and other not in given
-        }
+        regions = transfer_change(views, name, change, masks, given, mark.positive)
     found = dict(masks)
     for other, region in regions.items():
         if other == name or other in given or not region.any():
