@@ -31,7 +31,9 @@ SOURCES = 3  # a change is transferred to a view from this many nearest views
 # A region's bounding sphere has this many times the radius that holds this share of the region's pixels. The depth of
 # the other pixels may be wrong.
 SPHERE_FACTOR, SPHERE_QUANTILE = 1.2, 0.95
-LEAST_IOU = 0.75  # between the network's mask after a correction and the mask expected by depth alone
+# Least IoU between the network's mask after a correction and the mask that is expected by depth alone, in the whole view
+# and outside the sphere.
+LEAST_IOU, LEAST_IOU_OUTSIDE = 0.75, 0.85
 
 
 @dataclass(frozen=True)
@@ -288,7 +290,7 @@ def _ask_near(view: ViewEvidence, mask: np.ndarray, shown: np.ndarray, near: np.
     boxes = [None, bounding_box(expected), bounding_box(expected | near)]
     candidates = [each.mask for box in boxes for each in view.ask(Prompt(clicks, box))]
     best = max(candidates, key=lambda candidate: iou(candidate, expected))
-    if iou(best, expected) < LEAST_IOU:
+    if iou(best, expected) < LEAST_IOU or iou(best & ~near, expected & ~near) < LEAST_IOU_OUTSIDE:
         return np.zeros_like(mask)
     return near & (best & ~mask if positive else mask & ~best)
 
