@@ -31,9 +31,9 @@ SOURCES = 3  # a change is transferred to a view from this many nearest views
 # A region's bounding sphere has this many times the radius that holds this share of the region's pixels. The depth of
 # the other pixels may be wrong.
 SPHERE_FACTOR, SPHERE_QUANTILE = 1.2, 0.95
-# Least IoU between the network's mask after a correction and the mask that is expected by depth alone, in the whole view
-# and outside the sphere.
-LEAST_IOU, LEAST_IOU_OUTSIDE = 0.75, 0.85
+# Least IoU between the network's mask after a correction and the mask that is expected by depth alone, in the whole
+# view and outside the sphere.
+LEAST_IOU, LEAST_IOU_OUTSIDE = 0.75, 0.8
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,9 @@ DEPTH_SLOPE = 4.0, 10.0
 LEAST_EDGE_SHARE = 0.25  # share of an object's border that must be an edge between surfaces, for depth to be used
 LEAST_REGION = 12  # number of pixels (at the size for segmentation) that a region with a click must have
 RING = 0.25  # width of the ring around a mask in which colours are compared, per square root of the mask's pixels
-# Penalties on a correction's merit. CHANGE_PENALTY is multiplied by log(1 + size), the region's size relative to the
-# mask before. DOT_PENALTY is that of changing a dot around the click only, which is right if all regions are too large.
-CHANGE_PENALTY, DOT_PENALTY = 0.25, 0.3
+# Penalties on a correction's merit: for each unit by which the logarithm of the mask's size grows or shrinks, and for
+# changing a dot around the click only, which is right if all proposed regions are too large.
+GROWTH_PENALTY, SHRINKAGE_PENALTY, DOT_PENALTY = 0.25, 0.15, 0.3
 MARGIN = 3  # `refine_edges` uses the colours up to this many bands (`BAND`) away from a mask
 
 
@@ -114,13 +114,12 @@ def correct_mask(view: ViewEvidence, before: np.ndarray, clicks: Clicks, confirm
     masks += [mask if positive else ~mask for mask in _propose(view, alone)]
     kept = confirmed == (OTHER if positive else OBJECT)
     regions = [_part_at((mask & ~before if positive else before & ~mask) & ~kept, at) for mask in masks]
-    regions = [region for region in regions if region.any()]
-    sizes = [float(region.sum() / max(before.sum(), 1)) for region in regions]
-    penalties = [CHANGE_PENALTY * float(np.log1p(size)) for size in sizes]
     dot = stroke_pixels(Mark(at[None], positive, max(2.0, BAND * max(before.shape))), before.shape)
+    regions = [region for region in regions if region.sum() > dot.sum()]
     regions.append((dot & ~before if positive else dot & before) & ~kept)
-    penalties.append(DOT_PENALTY)
     results = [before | region if positive else before & ~region for region in regions]
+    changes = [np.log(max(result.sum(), 1) / max(before.sum(), 1)) for result in results[:-1]]
+    penalties = [float(GROWTH_PENALTY * c if positive else -SHRINKAGE_PENALTY * c) for c in changes] + [DOT_PENALTY]
     best = _most_object(view, clicks, results, penalties)
     return results[0] if best is None else best
 
