@@ -332,13 +332,13 @@ def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
 
 @pytest.mark.parametrize("knows", [True, False])
 def test_a_stroke_reaches_sides_that_its_view_does_not_show(knows):
-    """All masks lack the right half of the box. A stroke is made in the middle view, which shows the front alone.
+    """All masks lack the right quarter of the box. A stroke is made in the middle view, which shows the front alone.
 
     In the right view, the network adds the side of the box near the stroke. If the network takes the whole photograph
     for the object, only the pixels of the stroke are added.
     """
     scene, cameras, images, box = box_scene()
-    right = scene.means[:, 0] > 0.1
+    right = scene.means[:, 0] > 0.25
     whole = {name: voting.render_labels(scene, box, c) > 0.5 for name, c in cameras.items()}
     lost = {name: voting.render_labels(scene, box & right, c) > 0.5 for name, c in cameras.items()}
     masks = {name: whole[name] & ~lost[name] for name in whole}
@@ -354,7 +354,7 @@ def test_a_stroke_reaches_sides_that_its_view_does_not_show(knows):
     stroke = Event("middle", Mark(path, True, radius))
     found = correct_scene(FittedViews(scene, cameras, evidence_of), [stroke], masks, {})
     gained = {name: found[name] & ~masks[name] for name in found}
-    assert all((gained[name] & ~whole[name]).sum() < 0.02 * whole[name].sum() for name in gained)
+    assert all((gained[name] & ~whole[name]).sum() < 0.03 * whole[name].sum() for name in gained)
     shares = {name: (gained[name] & lost[name]).sum() / lost[name].sum() for name in gained}
     assert shares["right"] > 0.85 if knows else 0.4 < shares["right"] < 0.75, shares
 

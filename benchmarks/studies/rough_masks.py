@@ -67,15 +67,14 @@ def run_job(scene: Path, runs: Path, seed: int, refine: bool, shared: Path | Non
         runs: folder of runs.
         seed: seed of fit and distillation.
         refine: True redraws the masks.
-        shared: run of the same photographs whose cameras and fit are taken over; None for none.
+        shared: run of the same photographs; its stages are taken over as far as their inputs are equal. None for none.
 
     Raises:
         ValueError: the job failed.
     """
     run, settings = runs / scene.name, f"fit.seed={seed} distill.seed={seed} masks.refine={str(refine).lower()}"
-    for stage in ("poses", "fit") if shared else ():
-        if not (run / stage).exists():
-            shutil.copytree(shared / stage, run / stage)
+    if shared and not run.exists():
+        shutil.copytree(shared, run)
     command = ["run", "all", "--scene", str(scene), "--runs", str(runs), "--profile", "laptop", "--set", settings]
     if subprocess.run([sys.executable, "-m", "runner", *command], cwd=ROOT).returncode:
         raise ValueError(f"{scene.name}: the job failed; see above")
@@ -111,8 +110,10 @@ def main() -> None:
             runs = out / f"seed-{seed}"
             exact = run_job(scene, runs, seed, refine=False)
             print(f"seed {seed}, {score_run(exact, exact)}", flush=True)
+            shared = exact
             for each in spoiled:
-                print(f"seed {seed}, {score_run(run_job(each, runs, seed, True, exact), exact)}", flush=True)
+                shared = run_job(each, runs, seed, True, shared)
+                print(f"seed {seed}, {score_run(shared, exact)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -225,8 +225,10 @@ def transfer_marks(views: FittedViews, events: Sequence[Event], name: str) -> li
     return found
 
 
-def is_shown(views: FittedViews, name: str, region: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return bool [P], True for the points that a view shows inside a region, in front of everything else.
+def find_in_region(
+    views: FittedViews, name: str, region: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the points that a view shows, in front of everything else, inside and outside a region: bool [P] each.
 
     Args:
         region: bool [H, W], pixels of the view `name`.
@@ -235,7 +237,8 @@ def is_shown(views: FittedViews, name: str, region: np.ndarray, points: np.ndarr
     uv, z = geometry.project(points, views.cameras[name])
     hit, inside = geometry.sample_nearest(region, uv)
     here, _ = geometry.sample_nearest(_depth(views.evidence_of(name), views.cameras[name]), uv)
-    return hit & inside & (np.abs(here - z) < SAME_SURFACE * z)
+    visible = inside & (np.abs(here - z) < SAME_SURFACE * z)
+    return hit & visible, ~hit & visible
 
 
 def transfer_change(
@@ -243,10 +246,10 @@ def transfer_change(
 ) -> dict[str, np.ndarray]:
     """Return the pixels of all other views that change with a region of one view, view -> bool [H, W].
 
-    The change goes from view to view, by distance. In each view the pixels change that show the surface changed in the
-    nearest views so far. The segmentation network finds further pixels, such as those of other sides of the same part
-    of the object. They lie within the region's bounding sphere in 3D. The network is not used where its best mask
-    differs much from the mask that is expected by depth alone.
+    The change goes from view to view, by distance. In each view the pixels change whose surface is changed in most of
+    the nearest views so far that show it. The segmentation network finds further pixels, such as those of other sides
+    of the same part of the object. They lie within the region's bounding sphere in 3D. The network is not used where
+    its best mask differs much from the mask that is expected by depth alone.
 
     Args:
         name: the view of the region.
@@ -264,7 +267,11 @@ def transfer_change(
         near = np.linalg.norm(surface - center, axis=-1) < radius
         shown, points = np.zeros_like(near), surface[near]
         if len(points):
-            shown[near] = np.any([is_shown(views, source, changes[source], points) for source in sources], 0)
+            ballots = [(source, *find_in_region(views, source, changes[source], points)) for source in sources]
+            inside = np.sum([hit for _, hit, _ in ballots], 0)
+            # A stroke covers a part of what is wrong in its own view, so this view never votes against a change.
+            outside = np.sum([missed & (source != name) for source, _, missed in ballots], 0)
+            shown[near] = inside > outside
         change = shown | _ask_near(views.evidence_of(other), masks[other], shown, near, positive)
         if change.any():
             changes[other] = change

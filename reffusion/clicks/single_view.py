@@ -115,11 +115,16 @@ def correct_mask(view: ViewEvidence, before: np.ndarray, clicks: Clicks, confirm
     kept = confirmed == (OTHER if positive else OBJECT)
     regions = [_part_at((mask & ~before if positive else before & ~mask) & ~kept, at) for mask in masks]
     dot = stroke_pixels(Mark(at[None], positive, max(2.0, BAND * max(before.shape))), before.shape)
-    regions = [region for region in regions if region.sum() > dot.sum()]
+    regions = [region for region in regions if region.any()]
     regions.append((dot & ~before if positive else dot & before) & ~kept)
     results = [before | region if positive else before & ~region for region in regions]
     changes = [np.log(max(result.sum(), 1) / max(before.sum(), 1)) for result in results[:-1]]
-    penalties = [float(GROWTH_PENALTY * c if positive else -SHRINKAGE_PENALTY * c) for c in changes] + [DOT_PENALTY]
+    tiny = [max(0.0, 1 - region.sum() / dot.sum()) for region in regions[:-1]]  # hardly what a person clicks on
+    penalties = [
+        float(GROWTH_PENALTY * change if positive else -SHRINKAGE_PENALTY * change) + DOT_PENALTY * part
+        for change, part in zip(changes, tiny, strict=True)
+    ]
+    penalties.append(DOT_PENALTY)
     best = _most_object(view, clicks, results, penalties)
     return results[0] if best is None else best
 
