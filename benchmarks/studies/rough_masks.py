@@ -74,7 +74,7 @@ def run_job(scene: Path, runs: Path, seed: int, refine: bool, shared: Path | Non
     """
     run, settings = runs / scene.name, f"fit.seed={seed} distill.seed={seed} masks.refine={str(refine).lower()}"
     if shared and not run.exists():
-        shutil.copytree(shared, run)
+        shutil.copytree(shared, run, ignore=shutil.ignore_patterns("source"))
     command = ["run", "all", "--scene", str(scene), "--runs", str(runs), "--profile", "laptop", "--set", settings]
     if subprocess.run([sys.executable, "-m", "runner", *command], cwd=ROOT).returncode:
         raise ValueError(f"{scene.name}: the job failed; see above")

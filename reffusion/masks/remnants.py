@@ -37,6 +37,7 @@ COLOR_BLUR = 0.02  # added to the distances of colours in [0, 1], so that smalle
 LEAST_SCORE = 2.5  # score from which a part is a remnant
 LEAST_COUNT = 10  # least number of Gaussians of a remnant
 LEAST_SHARE = 0.003  # least number of a remnant's visible pixels, relative to those of the object
+ROUNDS = 3  # largest number of searches, each without the floating parts that the former ones found
 FLOATING_RATIO = 10.0  # ratio of contact with the object to contact with the rest above which a part would float
 SOLID = 0.1  # opacity above which a Gaussian belongs to a surface
 TOUCHING = 0.1  # overlap above which two Gaussians touch
@@ -74,11 +75,29 @@ class Remnant:
 def find_remnants(gaussians: Gaussians, labels: Tensor, cameras: Sequence[Camera]) -> list[Remnant]:
     """Find the remnants of the object that are visible enough, the largest first.
 
+    Parts that would float are removed with the object. This may leave further parts in the air, such as a claw of a
+    hand, so the search is repeated with these parts as the object, at most `ROUNDS` times.
+
     Args:
         gaussians: the N Gaussians of the whole scene.
         labels: bool [N], True for the Gaussians of the object.
         cameras: the views in which visible pixels are counted.
     """
+    floating: list[Remnant] = []
+    for _ in range(ROUNDS):
+        found = _find_visible(gaussians, labels, cameras)
+        removed = [each for each in found if each.would_float]
+        floating += removed
+        if not removed:
+            break
+        gone = np.any([each.members for each in removed], 0)
+        labels = labels | torch.as_tensor(gone, device=labels.device)
+    touching = [each for each in found if not each.would_float]
+    return sorted([*floating, *touching], key=lambda remnant: -remnant.share)
+
+
+def _find_visible(gaussians: Gaussians, labels: Tensor, cameras: Sequence[Camera]) -> list[Remnant]:
+    """Find the parts that seem to belong to the object and that are visible enough, in one search."""
     parts = find_parts(gaussians, labels.cpu().numpy())
     if not parts:
         return []
@@ -93,7 +112,7 @@ def find_remnants(gaussians: Gaussians, labels: Tensor, cameras: Sequence[Camera
         if share >= LEAST_SHARE:
             best = int(np.argmax(pixels))
             found.append(Remnant(part, would_float, share, cameras[best].name, shown[best][k]))
-    return sorted(found, key=lambda remnant: -remnant.share)
+    return found
 
 
 def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarray, bool]]:
