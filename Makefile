@@ -23,8 +23,8 @@
 ## make data=FOLDER study         after compare, or with scene=X: paired clips for people to judge
 ## make weights [profile=paper]   fetch the weights of a profile; offline=1: only list what is missing
 ## make demo [seed=N]             make the demo scene, or data/demo-N; others are made when they are named: demo-wide,
-##                                -360, -seen, -photos, -behind, -table, -corner, -grass, -insert, -outpaint, -pair,
-##                                -sparse, each also with -N
+##                                -360, -seen, -photos, -behind, -beside, -table, -corner, -grass, -insert, -outpaint,
+##                                -pair, -sparse, each also with -N
 ## make scene=X adapted           views painted by the adapted prior and the unadapted one: runs/X/adapted/sheet.png
 ## make scene=X sds-variance      variance of the SDS gradient before and after personalization
 ##                                both: device=cuda dtype=float16

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.integration
 
 @pytest.mark.parametrize(
     ("name", "mask", "share"),
-    [("behind", 0.06, 0.6), ("table", 0.05, 0.05), ("corner", 0.1, 0.4), ("grass", 0.1, 0.5)],
+    [("behind", 0.06, 0.6), ("beside", 0.04, 0.1), ("table", 0.05, 0.05), ("corner", 0.1, 0.4), ("grass", 0.1, 0.5)],
 )
 def test_harder_places_have_masks_of_the_demos_size(generate, tmp_path, name, mask, share):
     for seed in (0, 11):
@@ -57,6 +57,34 @@ def test_what_stays_hides_a_part_of_the_hole_from_the_reference_only(generate):
         reference = session.middle - kind.test
         assert 0.05 < 1 - seen[:, reference].mean() < 0.6
         assert seen.any(1).mean() > 0.99
+
+
+def test_the_object_hides_a_part_of_a_thing_close_to_it_in_the_reference_view(generate):
+    """Four things that stay stand within half the object's radius. Other views show the hidden part."""
+    import photographs
+    import raycast
+    from solids import ROOM
+
+    kind = shrink_kind(generate.KINDS["beside"])
+    for seed in (0, 1):
+        solids, cameras, session = photograph_scene(generate, kind, seed)
+        chest = np.flatnonzero(solids.removable)[0]
+        from_chest = np.linalg.norm(solids.center[:, ::2] - solids.center[chest, ::2], axis=1)
+        near = np.flatnonzero(
+            ~solids.removable & (from_chest < 0.6) & (solids.kind != ROOM) & (solids.half[:, 1] > 0.1)
+        )
+        assert len(near) == 4
+        reference = session.middle - kind.test
+        every = photographs.pixel_centers(np.ones((kind.height, kind.width), bool))
+        hidden = session.masks[session.middle].ravel()
+        _, which = raycast.surface_points(solids, cameras[reference], every, False)
+        shares = [hidden[which == thing].mean() for thing in near]
+        assert max(shares) > 0.3, shares
+        behind = near[int(np.argmax(shares))]
+        points, _ = raycast.surface_points(solids, cameras[reference], every[hidden & (which == behind)], False)
+        without = solids._replace(**{f: v[~solids.removable] for f, v in solids._asdict().items()})
+        seen = np.isfinite(raycast.observations(without, cameras, kind.width, kind.height, points)[..., 0])
+        assert seen.sum(1).min() > 1
 
 
 def test_the_table_stands_in_free_space(generate):
