@@ -225,20 +225,17 @@ def transfer_marks(views: FittedViews, events: Sequence[Event], name: str) -> li
     return found
 
 
-def find_in_region(
-    views: FittedViews, name: str, region: np.ndarray, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find the points that a view shows, in front of everything else, inside and outside a region: bool [P] each.
+def sample_visible(views: FittedViews, name: str, picture: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the values [P] of a view's picture at points; 0 where the view does not show the point.
 
     Args:
-        region: bool [H, W], pixels of the view `name`.
+        picture: int8 [H, W], of the view `name`.
         points: [P, 3].
     """
     uv, z = geometry.project(points, views.cameras[name])
-    hit, inside = geometry.sample_nearest(region, uv)
+    values, inside = geometry.sample_nearest(picture, uv)
     here, _ = geometry.sample_nearest(_depth(views.evidence_of(name), views.cameras[name]), uv)
-    visible = inside & (np.abs(here - z) < SAME_SURFACE * z)
-    return hit & visible, ~hit & visible
+    return np.where(inside & (np.abs(here - z) < SAME_SURFACE * z), values, 0)
 
 
 def transfer_change(
@@ -259,22 +256,23 @@ def transfer_change(
         positive: True if the region is added to the object, False if it is removed.
     """
     center, radius = _bounding_sphere(views, name, region)
-    changes, cameras = {name: region}, {key: each for key, each in views.cameras.items() if key not in fixed}
-    for other in order_by_distance(cameras | {name: views.cameras[name]}, changes):
-        distance = lambda key, at=cameras[other].center: float(np.linalg.norm(views.cameras[key].center - at))
-        sources = sorted(changes, key=distance)[:SOURCES]
+    cameras = {key: camera for key, camera in views.cameras.items() if key == name or key not in fixed}
+    changes = {name: region}
+    # Votes for a change, 1, and against it, -1. A stroke covers a part of what is wrong in its own view, so this view
+    # does not vote against a change.
+    ballots = {name: region.astype(np.int8)}
+    for other in order_by_distance(cameras, changes):
+        distance = lambda key, at=cameras[other].center: float(np.linalg.norm(cameras[key].center - at))
+        sources = sorted(ballots, key=distance)[:SOURCES]
         surface = geometry.unproject(_depth(views.evidence_of(other), cameras[other]), cameras[other])
         near = np.linalg.norm(surface - center, axis=-1) < radius
         shown, points = np.zeros_like(near), surface[near]
         if len(points):
-            ballots = [(source, *find_in_region(views, source, changes[source], points)) for source in sources]
-            inside = np.sum([hit for _, hit, _ in ballots], 0)
-            # A stroke covers a part of what is wrong in its own view, so this view never votes against a change.
-            outside = np.sum([missed & (source != name) for source, _, missed in ballots], 0)
-            shown[near] = inside > outside
+            shown[near] = sum(sample_visible(views, source, ballots[source], points) for source in sources) > 0
         change = shown | _ask_near(views.evidence_of(other), masks[other], shown, near, positive)
         if change.any():
             changes[other] = change
+            ballots[other] = change.astype(np.int8) - (~change & (masks[other] != positive))
     return {other: change for other, change in changes.items() if other != name}
 
 
