@@ -316,7 +316,7 @@ def daybed(f: Furniture, draw, x: float, z: float) -> None:
     f.cylinder(x - 0.25, high + 0.025, z + 0.1, 0.08, 0.13, Material("jar"), removable=True)
 
 
-def crowded(f: Furniture, draw, x: float, z: float) -> None:
+def chest_with_neighbours(f: Furniture, draw, x: float, z: float) -> None:
     """Add the removable object of the kind "beside", a chest with a ball and a jar, and four things that stay.
 
     The things stand around the chest, within half its radius, one on each side. So from every side the chest hides a

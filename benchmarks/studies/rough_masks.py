@@ -41,7 +41,7 @@ def spoil_mask(mask: np.ndarray, distance: int, random: np.random.Generator) -> 
 
 
 def spoil_scene(scene: Path, fault: str, out: Path) -> Path:
-    """Write a copy of a scene with a fault in its masks, and with `masks.refine`; return its folder.
+    """Write a copy of a scene with a fault in its masks, and return its folder.
 
     Args:
         scene: folder of a scene with the folder `masks`.

@@ -59,14 +59,14 @@ class Votes:
     least: float
 
     @property
-    def known(self) -> np.ndarray:
+    def has_label(self) -> np.ndarray:
         """bool [N], True for the Gaussians that the votes label."""
         return self.counts.sum(1) > self.least
 
     @property
     def shares(self) -> np.ndarray:
         """[N] in [0, 1], the share of each Gaussian's votes for the object; 0 for Gaussians without a label."""
-        return np.where(self.known, self.counts[:, 0] / np.maximum(self.counts.sum(1), self.least), 0.0)
+        return np.where(self.has_label, self.counts[:, 0] / np.maximum(self.counts.sum(1), self.least), 0.0)
 
     def plus(self, counts: np.ndarray) -> Votes:
         """Return the sum of these votes and of `counts` [N, 2], the votes of a further view."""
@@ -147,7 +147,7 @@ def count_votes(gaussians: Gaussians, camera: Camera, mask: np.ndarray) -> np.nd
 
 def assume_supports(gaussians: Gaussians, votes: Votes) -> Votes:
     """Add votes against the object for Gaussians without a label on planes beside the object (see `supports`)."""
-    known, share = votes.known, votes.shares
+    known, share = votes.has_label, votes.shares
     means = gaussians.means.detach().double().cpu().numpy()
     assumed = find_support_gaussians(means, share > 0.5, known & (share < MAX_OTHER_SHARE)) & ~known
     return Votes(np.where(assumed[:, None], (0.0, 1.01 * votes.least), votes.counts), votes.least)
@@ -161,7 +161,7 @@ def project_votes(gaussians: Gaussians, camera: Camera, votes: Votes) -> Project
     """
     share = votes.shares
     labels = torch.as_tensor(share > 0.5, device=gaussians.means.device)
-    shares = torch.as_tensor(np.stack([share, (1 - share) * votes.known], -1)).to(gaussians.means)
+    shares = torch.as_tensor(np.stack([share, (1 - share) * votes.has_label], -1)).to(gaussians.means)
     blended = rasterizer.render(gaussians, camera, sh_degree=0, features=shares).features.cpu().numpy()
     silhouette = np.zeros(blended.shape[:2], bool)
     if labels.any():

@@ -114,19 +114,28 @@ def correct_mask(view: ViewEvidence, before: np.ndarray, clicks: Clicks, confirm
     masks += [mask if positive else ~mask for mask in _propose(view, alone)]
     kept = confirmed == (OTHER if positive else OBJECT)
     regions = [_part_at((mask & ~before if positive else before & ~mask) & ~kept, at) for mask in masks]
-    dot = stroke_pixels(Mark(at[None], positive, max(2.0, BAND * max(before.shape))), before.shape)
+    inside = at.clip(0.5, np.array(before.shape[::-1]) - 0.5)  # a click outside the picture is moved to its border
+    dot = stroke_pixels(Mark(inside[None], positive, max(2.0, BAND * max(before.shape))), before.shape)
     regions = [region for region in regions if region.any()]
     regions.append((dot & ~before if positive else dot & before) & ~kept)
     results = [before | region if positive else before & ~region for region in regions]
-    changes = [np.log(max(result.sum(), 1) / max(before.sum(), 1)) for result in results[:-1]]
-    tiny = [max(0.0, 1 - region.sum() / dot.sum()) for region in regions[:-1]]  # hardly what a person clicks on
-    penalties = [
-        float(GROWTH_PENALTY * change if positive else -SHRINKAGE_PENALTY * change) + DOT_PENALTY * part
-        for change, part in zip(changes, tiny, strict=True)
-    ]
-    penalties.append(DOT_PENALTY)
+    penalties = [_change_penalty(before, result, int(dot.sum())) for result in results[:-1]] + [DOT_PENALTY]
     best = _most_object(view, clicks, results, penalties)
     return results[0] if best is None else best
+
+
+def _change_penalty(before: np.ndarray, after: np.ndarray, dot: int) -> float:
+    """Return the penalty on a correction's merit, which grows with the change of the mask's size.
+
+    A change smaller than a dot around the click is hardly what a person clicks on, so it is penalised, too.
+
+    Args:
+        before, after: bool [H, W], the mask before and after the correction.
+        dot: number of pixels of the dot.
+    """
+    growth = float(np.log(max(after.sum(), 1) / max(before.sum(), 1)))
+    tiny = max(0.0, 1 - float((after ^ before).sum()) / dot)
+    return GROWTH_PENALTY * max(growth, 0.0) + SHRINKAGE_PENALTY * max(-growth, 0.0) + DOT_PENALTY * tiny
 
 
 def _propose(view: ViewEvidence, clicks: Clicks) -> list[np.ndarray]:
