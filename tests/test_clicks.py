@@ -119,6 +119,21 @@ def test_a_click_takes_back_what_it_is_on():
     assert wall_scene.iou(click_mask(picture, (150, 120), before=without), disk) > 0.95
 
 
+def test_a_correction_keeps_the_region_around_an_earlier_click():
+    """A foot of an animal stands on a plinth. The network proposes the animal without its foot, and with it."""
+    rows, columns = np.mgrid[:240, :320]
+    animal = np.hypot(rows - 90, columns - 150) < 50
+    foot = (abs(columns - 150) < 14) & (rows >= 120) & (rows < 172) & ~animal
+    plinth = (abs(columns - 150) < 60) & (rows >= 160) & (rows < 220) & ~foot
+    picture = np.full((240, 320, 3), (60, 90, 150), np.uint8)
+    picture[animal], picture[foot], picture[plinth] = (200, 50, 40), (150, 140, 120), (140, 130, 115)
+    candidates = [Candidate(each, 0.9) for each in (animal, animal | foot, animal | foot | plinth)]
+    clicks = make_clicks((150, 90), (150, 165), (180, 200, False))
+    view = ViewEvidence(picture, np.where(animal, 0.0, 300.0), lambda prompt: candidates)
+    found = apply_marks(view, clicks, animal | foot | plinth, first=2)
+    assert found[foot].mean() > 0.5 and found[plinth].mean() < 0.5
+
+
 def test_a_correction_changes_one_region_and_keeps_what_marks_confirm():
     """Marks are random clicks and strokes, on the object or beside it.
 

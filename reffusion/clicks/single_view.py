@@ -116,12 +116,29 @@ def correct_mask(view: ViewEvidence, before: np.ndarray, clicks: Clicks, confirm
     regions = [_part_at((mask & ~before if positive else before & ~mask) & ~kept, at) for mask in masks]
     inside = at.clip(0.5, np.array(before.shape[::-1]) - 0.5)  # a click outside the picture is moved to its border
     dot = stroke_pixels(Mark(inside[None], positive, max(2.0, BAND * max(before.shape))), before.shape)
-    regions = [region for region in regions if region.any()]
     regions.append((dot & ~before if positive else dot & before) & ~kept)
-    results = [before | region if positive else before & ~region for region in regions]
+    results = [before | region if positive else before & ~region for region in regions if region.any()]
+    opposite = clicks.points[clicks.positive != positive]
+    whole = [result for result in results[:-1] if not _isolates_click(before, result, opposite, int(dot.sum()))]
+    results = [*whole, results[-1]]
     penalties = [_change_penalty(before, result, int(dot.sum())) for result in results[:-1]] + [DOT_PENALTY]
     best = _most_object(view, clicks, results, penalties)
     return results[0] if best is None else best
+
+
+def _isolates_click(before: np.ndarray, after: np.ndarray, points: np.ndarray, least: int) -> bool:
+    """Return True if a correction leaves only a speck of the region that an earlier click is on.
+
+    Args:
+        before, after: bool [H, W], the mask before and after the correction.
+        points: float [n, 2], the earlier clicks, all positive or all negative, in pixels.
+        least: number of pixels below which a connected region is a speck.
+    """
+
+    def is_speck(mask: np.ndarray, at: np.ndarray) -> bool:
+        return bool(_part_at(mask == _value_at(before, at), at).sum() < least)
+
+    return any(is_speck(after, at) and not is_speck(before, at) for at in points)
 
 
 def _change_penalty(before: np.ndarray, after: np.ndarray, dot: int) -> float:
