@@ -17,11 +17,12 @@ from scipy import ndimage
 
 from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points
 from reffusion.clicks import all_views
+from reffusion.clicks.corrections import apply_marks
 from reffusion.clicks.marks import Mark, confirmed_pixels, stroke_pixels
 from reffusion.clicks.refinement import redraw_masks
 from reffusion.clicks.scene_segmentation import Event, FittedViews, correct_scene, segment_scene
 from reffusion.clicks.segmenter import Candidate
-from reffusion.clicks.single_view import ViewEvidence, apply_marks
+from reffusion.clicks.single_view import ViewEvidence
 from reffusion.gaussians.neighbours import find_neighbours
 from reffusion.graph_cut import min_cut
 from reffusion.io.files import BadInput

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scenes import wall_scene
 
+from reffusion.clicks.corrections import apply_marks
 from reffusion.clicks.marks import Mark
-from reffusion.clicks.single_view import ViewEvidence, apply_marks
+from reffusion.clicks.single_view import ViewEvidence
 
 
 def checkered_disk_on_gravel():

@@ -17,7 +17,7 @@ from torch import Tensor
 from reffusion.clicks import color_evidence
 from reffusion.clicks.geodesic_cut import keep_connected, relative_distance
 from reffusion.clicks.marks import UNKNOWN
-from reffusion.clicks.single_view import erode, refine_edges
+from reffusion.clicks.mask_borders import erode, refine_edges
 from reffusion.gaussians.neighbours import NeighbourGraph
 from reffusion.graph_cut import min_cut
 from reffusion.masks import voting

@@ -17,7 +17,7 @@ import torch
 
 from reffusion import geometry
 from reffusion.clicks.geodesic_cut import color_frequency
-from reffusion.clicks.single_view import erode
+from reffusion.clicks.mask_borders import erode
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 

@@ -20,8 +20,9 @@ from scipy import ndimage
 from reffusion import trace
 from reffusion.clicks.all_views import remove_rim
 from reffusion.clicks.marks import UNKNOWN, Clicks
+from reffusion.clicks.mask_borders import bounding_box, erode, refine_edges
 from reffusion.clicks.segmenter import Candidate, Prompt
-from reffusion.clicks.single_view import ViewEvidence, bounding_box, erode, refine_edges
+from reffusion.clicks.single_view import ViewEvidence
 from reffusion.clicks.supports import find_support_gaussians
 from reffusion.morphology import open_mask
 from reffusion.splat import rasterizer

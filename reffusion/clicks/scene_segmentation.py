@@ -16,10 +16,12 @@ import numpy as np
 
 from reffusion import geometry
 from reffusion.clicks import all_views
+from reffusion.clicks.corrections import apply_marks
 from reffusion.clicks.marks import OBJECT, OTHER, Clicks, Mark, confirmed_pixels
+from reffusion.clicks.mask_borders import bounding_box
 from reffusion.clicks.propagation import MIN_PIXELS, deepest_points, iou, order_by_distance, propagate_masks
 from reffusion.clicks.segmenter import Prompt
-from reffusion.clicks.single_view import ViewEvidence, apply_marks, bounding_box
+from reffusion.clicks.single_view import ViewEvidence
 from reffusion.gaussians.neighbours import find_neighbours
 from reffusion.morphology import dilate
 from reffusion.types import Camera, Gaussians

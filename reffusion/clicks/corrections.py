@@ -1,0 +1,131 @@
+"""Application of clicks and strokes to the mask of one photograph.
+
+The first click selects an object. Each later click adds or removes one connected region around the clicked pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from reffusion.clicks.geodesic_cut import correct_labels
+from reffusion.clicks.marks import OBJECT, OTHER, Clicks, Mark, clicks_of, confirmed_pixels, mark_pixels, stroke_pixels
+from reffusion.clicks.mask_borders import BAND, refine_edges
+from reffusion.clicks.pixel_grid import downscale, find_depth_edges, part_at, pixel_pairs, upscale, value_at
+from reffusion.clicks.single_view import ViewEvidence, propose_masks, segment_view, select_object
+
+# Penalties on a correction's merit: for each unit by which the logarithm of the mask's size grows or shrinks, and for
+# changing a dot around the click only, which is right if all proposed regions are too large.
+GROWTH_PENALTY, SHRINKAGE_PENALTY, DOT_PENALTY = 0.25, 0.15, 0.3
+
+
+def apply_marks(
+    view: ViewEvidence, marks: Sequence[Mark], before: np.ndarray | None = None, first: int = 0
+) -> np.ndarray:
+    """Return bool [H, W], the mask after marks are applied one after the other.
+
+    A stroke changes the pixels below the brush. While the mask is empty, a click on the object selects the object. Each
+    later click adds or removes one connected region around the clicked pixel. The region contains no pixel that
+    earlier marks confirm to be the opposite. So a click never changes pixels that are not connected with it.
+
+    Args:
+        marks: all marks of the view, in the order in which they were made.
+        before: bool [H, W], the mask after the marks before `first`; None for an empty mask.
+        first: index of the first mark that is not yet applied in `before`.
+    """
+    shape = view.image.shape[:2]
+    mask = np.zeros(shape, bool) if before is None else before
+    for k in range(first, len(marks)):
+        mark = marks[k]
+        if mark.radius:
+            painted = stroke_pixels(mark, shape)
+            mask = mask | painted if mark.positive else mask & ~painted
+            continue
+        for i in range(len(mark.points)):
+            done = [*marks[:k], Mark(mark.points[: i + 1], mark.positive)]
+            if mask.any():
+                mask = correct_mask(view, mask, clicks_of(done), confirmed_pixels(done, shape))
+            elif mark.positive:
+                mask = segment_view(view, clicks_of(done))
+    return mask
+
+
+def correct_mask(view: ViewEvidence, before: np.ndarray, clicks: Clicks, confirmed: np.ndarray) -> np.ndarray:
+    """Return bool [H, W], the mask `before` with one connected region added or removed around the last click.
+
+    A positive click adds a region, a negative click removes one. Small changes are preferred. The mask is returned
+    unchanged if it agrees with the last click already.
+
+    Args:
+        before: bool [H, W], the mask to correct.
+        clicks: all clicks of the view; the last one is applied.
+        confirmed: int8 [H, W], the pixels of all marks, from `marks.confirmed_pixels`. Pixels that are confirmed to be
+            the opposite of the last click do not change.
+    """
+    at, positive = clicks.points[-1], bool(clicks.positive[-1])
+    if value_at(before, at) == positive:
+        return before
+    reach = _reach_of_click(view, before, clicks)
+    masks = [reach, *propose_masks(view, clicks)]
+    alone = Clicks(
+        np.concatenate([clicks.points[clicks.positive != positive], at[None]]),
+        np.append(np.zeros((clicks.positive != positive).sum(), bool), True),
+    )
+    masks += [mask if positive else ~mask for mask in propose_masks(view, alone)]
+    kept = confirmed == (OTHER if positive else OBJECT)
+    regions = [part_at((mask & ~before if positive else before & ~mask) & ~kept, at) for mask in masks]
+    inside = at.clip(0.5, np.array(before.shape[::-1]) - 0.5)  # a click outside the picture is moved to its border
+    dot = stroke_pixels(Mark(inside[None], positive, max(2.0, BAND * max(before.shape))), before.shape)
+    regions.append((dot & ~before if positive else dot & before) & ~kept)
+    results = [before | region if positive else before & ~region for region in regions if region.any()]
+    opposite = clicks.points[clicks.positive != positive]
+    whole = [result for result in results[:-1] if not _isolates_click(before, result, opposite, int(dot.sum()))]
+    results = [*whole, results[-1]]
+    penalties = [_change_penalty(before, result, int(dot.sum())) for result in results[:-1]] + [DOT_PENALTY]
+    best = select_object(view, clicks, results, penalties)
+    return results[0] if best is None else best
+
+
+def _isolates_click(before: np.ndarray, after: np.ndarray, points: np.ndarray, least: int) -> bool:
+    """Return True if a correction leaves only a speck of the region that an earlier click is on.
+
+    Args:
+        before, after: bool [H, W], the mask before and after the correction.
+        points: float [n, 2], the earlier clicks, all positive or all negative, in pixels.
+        least: number of pixels below which a connected region is a speck.
+    """
+
+    def is_speck(mask: np.ndarray, at: np.ndarray) -> bool:
+        return bool(part_at(mask == value_at(before, at), at).sum() < least)
+
+    return any(is_speck(after, at) and not is_speck(before, at) for at in points)
+
+
+def _change_penalty(before: np.ndarray, after: np.ndarray, dot: int) -> float:
+    """Return the penalty on a correction's merit, which grows with the change of the mask's size.
+
+    A change smaller than a dot around the click is hardly what a person clicks on, so it is penalised, too.
+
+    Args:
+        before, after: bool [H, W], the mask before and after the correction.
+        dot: number of pixels of the dot.
+    """
+    growth = float(np.log(max(after.sum(), 1) / max(before.sum(), 1)))
+    tiny = max(0.0, 1 - float((after ^ before).sum()) / dot)
+    return GROWTH_PENALTY * max(growth, 0.0) + SHRINKAGE_PENALTY * max(-growth, 0.0) + DOT_PENALTY * tiny
+
+
+def _reach_of_click(view: ViewEvidence, before: np.ndarray, clicks: Clicks) -> np.ndarray:
+    """Return bool [H, W], the mask `before`, corrected around the clicks that contradict it.
+
+    A correction extends up to changes of colour, and up to edges of surfaces if the view has a relief.
+    """
+    lab, small, marks = downscale(view.image, clicks)
+    before_small = cv2.resize(before.astype(np.float32), small[::-1], interpolation=cv2.INTER_AREA) > 0.5
+    grid = pixel_pairs(small)
+    depth_edges = find_depth_edges(view.relief, small, *grid)
+    mask = correct_labels(lab, *grid, marks.ravel(), before_small.ravel(), depth_edges).reshape(small)
+    same = upscale(mask == before_small, before.shape)
+    return refine_edges(view.image, np.where(same, before, ~before), mark_pixels(clicks, before.shape))
