@@ -138,15 +138,15 @@ def report_remnants(remnants: Sequence[Remnant], out: Path, photo_of: Callable[[
     """
     lines = []
     for k, remnant in enumerate(remnants, start=1):
-        photo, picture = photo_of(remnant.view).copy(), out / "remnants" / f"{k}.png"
+        photo, picture = photo_of(remnant.view).copy(), f"remnants/{k}.png"
         photo[remnant.mask] = photo[remnant.mask] // 2 + np.array(TINT) // 2
-        save_image(picture, photo)
+        save_image(out / picture, photo)
         outcome = (
             "a part that the masks leave out would float in the air and is removed too (masks.remnants=false keeps it)"
             if remnant.would_float
             else "part of the object seems to be left; if so, mark it in that view and run again"
         )
-        lines.append(f"{outcome}: {remnant.describe()}, see {picture.relative_to(out.parent)}")
+        lines.append(f"{outcome}: {remnant.describe()}, see masks/{picture}")
         warnings.warn(lines[-1], stacklevel=1)
     if lines:
         save_json(out / WARNINGS, lines)

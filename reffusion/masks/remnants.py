@@ -24,6 +24,7 @@ from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
+EXTENT = 4.0  # in radii of the object: labelled Gaussians farther from its middle are errors, and are not used
 REACH = 1.0  # in radii of the object: Gaussians farther from the object than this belong to the surroundings
 # In radii of the object: distance up to which the surroundings are considered. The distance is increased until the
 # surroundings have `SAMPLES` Gaussians.
@@ -36,7 +37,8 @@ SAMPLES, NEAREST = 2000, 10  # density of a colour: from the distance to the NEA
 COLOR_BLUR = 0.02  # added to the distances of colours in [0, 1], so that smaller differences hardly count
 LEAST_SCORE = 2.5  # score from which a part is a remnant
 LEAST_COUNT = 10  # least number of Gaussians of a remnant
-LEAST_SHARE = 0.003  # least number of a remnant's visible pixels, relative to those of the object
+# Least number of a remnant's visible pixels, relative to those of the object. Parts that would float stand out more.
+LEAST_SHARE, LEAST_FLOATING_SHARE = 0.003, 0.001
 ROUNDS = 3  # largest number of searches, each without the floating parts that the former ones found
 FLOATING_RATIO = 10.0  # ratio of contact with the object to contact with the rest above which a part would float
 SOLID = 0.1  # opacity above which a Gaussian belongs to a surface
@@ -109,7 +111,7 @@ def _find_visible(gaussians: Gaussians, labels: Tensor, cameras: Sequence[Camera
     for k, (part, would_float) in enumerate(parts, start=1):
         pixels = [int(masks[k].sum()) for masks in shown]
         share = sum(pixels) / object_pixels
-        if share >= LEAST_SHARE:
+        if share >= (LEAST_FLOATING_SHARE if would_float else LEAST_SHARE):
             best = int(np.argmax(pixels))
             found.append(Remnant(part, would_float, share, cameras[best].name, shown[best][k]))
     return found
@@ -129,7 +131,9 @@ def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarra
     means = gaussians.means.detach().cpu().double().numpy()
     if not labels.any():
         return []
-    radius = float(np.median(np.linalg.norm(means[labels] - np.median(means[labels], axis=0), axis=1)))
+    from_middle = np.linalg.norm(means - np.median(means[labels], axis=0), axis=1)
+    radius = float(np.median(from_middle[labels]))
+    taken, labels = labels, labels & (from_middle <= EXTENT * radius)
     distance = cKDTree(means[labels]).query(means)[0]
     opacities = gaussians.opacity_logits.detach().sigmoid().cpu().double().numpy()
     beyond = np.sort(distance[(distance > REACH * radius) & (opacities > SOLID)])
@@ -151,7 +155,7 @@ def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarra
     unit = max(float(strength.mean()), 1e-12)
     gain = COLOR_WEIGHT * opacities * size * log_ratio * free / unit
     sides = (HARD * stays + np.maximum(-gain, 0), HARD * inside + np.maximum(gain, 0))
-    found = min_cut(*sides, graph.pairs, strength / unit) & ~inside
+    found = min_cut(*sides, graph.pairs, strength / unit) & ~taken[near]
     parts = []
     for part in connected_parts(found, graph.pairs[overlap > TOUCHING]):
         to_object = (part[first] & inside[second]) | (part[second] & inside[first])
