@@ -164,7 +164,10 @@ def extract_depth(
     plane_depth, outer = hints.plane_depth, hints.photographed_depth
     if outer is not None:
         depth, alpha = np.where(outer > 0, outer, depth), np.where(outer > 0, 1.0, alpha)
-    known = (alpha > settings.explained) & (depth > 0) & ~morphology.dilate_by_distance(hole, settings.margin)
+    apart = ~morphology.dilate_by_distance(hole, settings.margin)
+    if outer is not None:
+        apart |= (outer > 0) & ~hole
+    known = (alpha > settings.explained) & (depth > 0) & apart
     if hints.confirmed is not None:
         known |= hole & hints.confirmed
     anchored = hole & ~known & np.isfinite(plane_depth) if plane_depth is not None else np.zeros_like(hole)

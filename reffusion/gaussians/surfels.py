@@ -10,6 +10,8 @@ from reffusion.geometry import pixel_rays, unproject
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
+STEP = 0.02  # change of the disparity's slope per pixel, relative to the disparity, above which a pixel lies at a step
+
 
 def surface_gaussians(
     image: np.ndarray,
@@ -94,14 +96,14 @@ def surface_normals(depth: np.ndarray, camera: Camera) -> np.ndarray:
 
     Slopes are computed in disparity, where they are exact for planes. They are forward or backward differences,
     whichever belongs to the side where the slope changes less. So pixels beside a crease or a step get the normal of
-    their own surface.
+    their own surface. The slope is 0 along an axis if the pixel lies between two steps.
 
     Args:
         depth: [H, W] camera z; 0 where unknown. The normals of unknown pixels have no meaning.
         camera: the view.
     """
     disparity = np.divide(1.0, depth, out=np.zeros(depth.shape), where=np.asarray(depth) > 0)
-    along_x, along_y = _one_sided_slope(disparity.T).T, _one_sided_slope(disparity)
+    along_x, along_y = one_sided_slope(disparity.T).T, one_sided_slope(disparity)
     # disparity = a x + b y + c over normalised image points is the plane with normal (a, b, c) in camera axes.
     rays = pixel_rays(camera)
     a, b = along_x * camera.fx, along_y * camera.fy
@@ -111,11 +113,11 @@ def surface_normals(depth: np.ndarray, camera: Camera) -> np.ndarray:
     return normal @ camera.world_to_camera[:3, :3]
 
 
-def _one_sided_slope(values: np.ndarray) -> np.ndarray:
+def one_sided_slope(values: np.ndarray) -> np.ndarray:
     """Return the derivative of values [H, W] down the rows, per row.
 
     At each element it is the forward or the backward difference, whichever has the smaller second difference next to
-    it.
+    it. It is 0 where both second differences exceed `STEP` times the value.
     """
     if len(values) < 3:
         return np.gradient(values, axis=0) if len(values) > 1 else np.zeros_like(values)
@@ -127,4 +129,5 @@ def _one_sided_slope(values: np.ndarray) -> np.ndarray:
     backward = np.concatenate([step[:1], step])
     forward_bend = np.concatenate([bend, unknown, unknown])
     backward_bend = np.concatenate([unknown, unknown, bend])
-    return np.where(forward_bend <= backward_bend, forward, backward)
+    slope = np.where(forward_bend <= backward_bend, forward, backward)
+    return np.where(np.minimum(forward_bend, backward_bend) <= STEP * np.abs(values), slope, 0.0)

@@ -13,6 +13,7 @@ from reffusion.background.unobserved import find_unobserved
 from reffusion.depth import billboard, monocular
 from reffusion.depth.background_depth import CompletionSettings, Hints
 from reffusion.depth.monocular import DepthNetwork
+from reffusion.depth.steps import beside_steps, sharpen_steps
 from reffusion.gaussians.sheets import Sheets
 from reffusion.initialize import coverage, unprojection
 from reffusion.initialize.draft import Draft
@@ -139,6 +140,7 @@ def fill_reference(
     )
     inserted = drawn_over = np.zeros_like(hole)
     ceded = share.ceded if share else inserted
+    depth, estimate = sharpen_steps(depth, reference.image), sharpen_steps(estimate, reference.image)
     if over.any():
         visible = rasterizer.render(remaining, camera, sh_degree=0).depth.double().cpu().numpy()
         behind, inserted = np.where(visible > 0, visible, depth), hole & over
@@ -153,7 +155,10 @@ def fill_reference(
             inserted, depth = inserted & ~ceded | back, np.where(back, estimate, depth)
         drawn_over = inserted & ~coverage.beside_depth_edges(depth, behind)
     print(f"depth of reference {camera.name}: {words}")
-    pixels = dilate_by_distance(hole & ~inserted & ~ceded, OVERLAP) & ~ceded | drawn_over
+    filled = hole & ~inserted & ~ceded
+    # At a step no seam has to be closed: the surface beyond it is another one.
+    overlap = dilate_by_distance(filled, OVERLAP) & ~ceded & ~beside_steps(depth)
+    pixels = filled | overlap | drawn_over
     draft = unprojection.add_surface(draft, reference, depth, pixels, background, sheets)
     if farthest or not params.tidy:  # gaps that are still open are left to the extra views, if there are any
         return Filled(draft, depth)
