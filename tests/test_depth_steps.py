@@ -11,6 +11,7 @@ from reffusion.depth.steps import beside_steps, sharpen_steps
 from reffusion.gaussians.surfels import surface_normals
 
 SHAPE = (120, 160)
+EVERYWHERE = np.ones(SHAPE, bool)
 
 
 def floor_and_box():
@@ -29,7 +30,7 @@ def test_a_plane_of_any_slant_has_no_steps(slope):
     depth = 1 / (0.3 + slope[0] * rows + slope[1] * columns)
     assert not beside_steps(depth).any()
     picture = np.random.default_rng(0).integers(0, 255, (*SHAPE, 3)).astype(np.uint8)
-    assert (sharpen_steps(depth, picture) == depth).all()
+    assert (sharpen_steps(depth, picture, EVERYWHERE) == depth).all()
 
 
 def test_a_ramp_between_two_surfaces_becomes_a_step_where_the_picture_has_its_edge():
@@ -37,7 +38,7 @@ def test_a_ramp_between_two_surfaces_becomes_a_step_where_the_picture_has_its_ed
     blurred = 1 / cv2.GaussianBlur(1 / depth, (0, 0), 1.0)
     wrong = lambda found: np.abs(found / depth - 1) > 0.05
     assert wrong(blurred).sum() > 300
-    assert wrong(sharpen_steps(blurred, picture)).sum() < 0.03 * wrong(blurred).sum()
+    assert wrong(sharpen_steps(blurred, picture, EVERYWHERE)).sum() < 0.03 * wrong(blurred).sum()
 
 
 def test_pixels_away_from_steps_keep_their_depth():
@@ -45,7 +46,7 @@ def test_pixels_away_from_steps_keep_their_depth():
     far = cv2.distanceTransform(
         (box ^ (cv2.erode(box.astype(np.uint8), np.ones((3, 3))) > 0)).astype(np.uint8) ^ 1, 2, 5
     )
-    assert (sharpen_steps(depth, picture) == depth)[far > 6].all()
+    assert (sharpen_steps(depth, picture, EVERYWHERE) == depth)[far > 6].all()
 
 
 def test_pixels_between_two_steps_face_the_camera():

@@ -39,8 +39,8 @@ class CompletionSettings:
 
     Attributes:
         explained: Alpha above which the rendered depth counts as known.
-        margin: Distance as a fraction of the image's width. Pixels nearer to the hole do not count as known, because
-            their rendered depth is blended with that of the object.
+        margin: Distance as a fraction of the image's width. The rendered depth of pixels nearer to the hole does not
+            count as known, because it is blended with that of the object.
         ring: Width of the surroundings, as a fraction of the image's width.
         planar_share: Share of the surroundings that planes must explain to be used. A value above 1 excludes planes.
         planar_tolerance: Relative difference in disparity up to which planes explain a sample.
@@ -106,8 +106,9 @@ class ViewDepth:
     Attributes:
         camera: The camera of the view.
         depth: [H, W] float64 camera z of the rendering, replaced where `hints` know a better depth.
-        known: bool [H, W], True where `depth` is the depth of the scene: outside the hole and its margin where
-            Gaussians or photographs show a surface, and inside the hole where other views confirm the rendered depth.
+        known: bool [H, W], True where `depth` is the depth of the scene: outside the hole where photographs show a
+            surface, or Gaussians do beyond the margin, and inside the hole where other views confirm the rendered
+            depth.
         hole: bool [H, W], True at the pixels to fill.
         hidden: bool [H, W], True at pixels that show the removed object (the consistent mask C).
         anchored: bool [H, W], True at pixels of the hole whose `depth` is that of a plane that continues there.
@@ -149,8 +150,8 @@ def extract_depth(
 ) -> ViewDepth:
     """Return the depth of the scene in one view from a rendering of its Gaussians and from `hints`.
 
-    Depth counts as known where alpha is high, except in the hole and in a margin around it. In the hole the depth is
-    known only where `hints.confirmed` is True.
+    Depth counts as known where alpha is high, except in the hole, where it is known only where `hints.confirmed` is
+    True, and except in a margin around the hole, where only `hints.photographed_depth` is known.
 
     Args:
         rendering: The rendering of the Gaussians without the object.

@@ -11,10 +11,12 @@ from reffusion.gaussians.surfels import one_sided_slope
 WINDOW, LEAST_WINDOW_PX = 0.01, 4
 STEP = 0.04  # least bend of the disparity, relative to the disparity, from which a pixel lies beside a step
 ON_RAMP = 0.01  # weight of a neighbour at which the depth changes as fast as at a step
+SAMPLES = 9  # number of rows, and of columns, of the window that are used
+CHUNK = 2**16  # number of pixels that are computed together
 COLOR = 20.0  # of 255: colour difference at which the weight of a neighbour falls to 1 / e
 
 
-def sharpen_steps(depth: np.ndarray, image: np.ndarray) -> np.ndarray:
+def sharpen_steps(depth: np.ndarray, image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Return a depth map [H, W] without ramps between a surface and the surface behind it.
 
     A rendering of Gaussians, and a smooth continuation, blend the depths of two surfaces along their border. A Gaussian
@@ -24,30 +26,35 @@ def sharpen_steps(depth: np.ndarray, image: np.ndarray) -> np.ndarray:
     Args:
         depth: [H, W], camera z, positive.
         image: uint8 [H, W, 3], the picture of the view.
+        pixels: bool [H, W], the pixels whose depth may change.
     """
-    radius, disparity = _radius(depth), 1.0 / depth
+    disparity, colors = 1.0 / depth, image.astype(np.float32)
     square = np.ones((3, 3), np.uint8)
     ramp = cv2.dilate(disparity, square) - cv2.erode(disparity, square) > STEP * disparity
-    rows, columns = np.nonzero(beside_steps(depth))
-    steps = np.arange(-radius, radius + 1)
-    down, right = (each.ravel() for each in np.meshgrid(steps, steps, indexing="ij"))
-    near_rows = (rows[:, None] + down).clip(0, depth.shape[0] - 1)
-    near_columns = (columns[:, None] + right).clip(0, depth.shape[1] - 1)
-    colors = image.astype(np.float32)
-    difference = np.abs(colors[near_rows, near_columns] - colors[rows, columns][:, None]).max(-1)
-    # The surface around each neighbour, continued to the pixel as a plane, whose disparity is linear.
-    down_slope, right_slope = one_sided_slope(disparity), one_sided_slope(disparity.T).T
-    values = disparity[near_rows, near_columns] - down_slope[near_rows, near_columns] * (near_rows - rows[:, None])
-    values -= right_slope[near_rows, near_columns] * (near_columns - columns[:, None])
-    weights = np.exp(-difference / COLOR)
-    weights *= np.where(ramp[near_rows, near_columns], ON_RAMP, 1.0)
+    slopes = one_sided_slope(disparity), one_sided_slope(disparity.T).T
+    steps = np.linspace(-_radius(depth), _radius(depth), SAMPLES).round().astype(int)
+    offsets = np.stack(np.meshgrid(steps, steps, indexing="ij"), -1).reshape(-1, 2)
+    found, limits = depth.copy(), (disparity.min(), disparity.max())
+    places = np.argwhere(beside_steps(depth) & pixels)
+    for first in range(0, len(places), CHUNK):
+        place = places[first : first + CHUNK]
+        near = (place[:, None] + offsets).clip(0, np.array(depth.shape) - 1)
+        moved = np.moveaxis(place[:, None] - near, -1, 0)
+        at, near = tuple(place.T), tuple(np.moveaxis(near, -1, 0))
+        # The surface around each neighbour, continued to the pixel as a plane, whose disparity is linear.
+        values = disparity[near] + slopes[0][near] * moved[0] + slopes[1][near] * moved[1]
+        difference = np.abs(colors[near] - colors[at][:, None]).max(-1)
+        weights = np.exp(-difference / COLOR) * np.where(ramp[near], ON_RAMP, 1.0)
+        found[at] = 1.0 / _weighted_median(values, weights).clip(*limits)
+    return found
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return [N], the weighted median of each row of values [N, S], with positive weights [N, S]."""
     order = np.argsort(values, axis=1)
     total = np.cumsum(np.take_along_axis(weights, order, 1), 1)
-    middle = (total >= total[:, -1:] / 2).argmax(1)
-    found = depth.copy()
-    chosen = values[np.arange(len(rows)), order[np.arange(len(rows)), middle]]
-    found[rows, columns] = 1.0 / chosen.clip(disparity.min(), disparity.max())
-    return found
+    middle = (total >= total[:, -1:] / 2).argmax(1)[:, None]
+    return np.take_along_axis(values, np.take_along_axis(order, middle, 1), 1)[:, 0]
 
 
 def beside_steps(depth: np.ndarray) -> np.ndarray:

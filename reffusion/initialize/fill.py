@@ -140,7 +140,8 @@ def fill_reference(
     )
     inserted = drawn_over = np.zeros_like(hole)
     ceded = share.ceded if share else inserted
-    depth, estimate = sharpen_steps(depth, reference.image), sharpen_steps(estimate, reference.image)
+    near_hole = dilate_by_distance(hole | mask | reference.mask, OVERLAP)
+    depth, estimate = (sharpen_steps(each, reference.image, near_hole) for each in (depth, estimate))
     if over.any():
         visible = rasterizer.render(remaining, camera, sh_degree=0).depth.double().cpu().numpy()
         behind, inserted = np.where(visible > 0, visible, depth), hole & over
