@@ -25,6 +25,13 @@ from report.sheet import pick_evenly
 MAX_MASK_VIEWS, FIRST_MASK_VIEWS, MASK_SIDE = 60, 12, 240  # most views, views shown unfolded, longer side in px
 REFERENCE_SIDE, DEPTH_SIDE = 640, 480  # longer side, px
 DEPTH_VIEWS = 4  # number of views
+ORIGIN_VIEWS = 6  # number of views
+WORDS_OF_ORIGINS = {
+    "photographs": "green, other photographs show it:",
+    "reference": "blue, a reference:",
+    "patches": "orange, made up of patches of the photographs:",
+    "nothing": "red, no picture shows it:",
+}
 REMOVED, INVENTED = (255, 210, 0), (0, 230, 230)  # outline colours of consistent masks and of invent masks
 MIN_ALPHA = 0.5  # below this alpha there is no depth
 RESULTS = ("distill", "initialize", "fit")  # stages with Gaussians, latest first
@@ -139,7 +146,7 @@ def references_section(job: JobFiles) -> list[str]:
                 )
             )
         parts.append(inline_images.picture_grid(cells))
-    return [*parts, *extra_views_section(job)]
+    return [*parts, *extra_views_section(job), *origins_section(job)]
 
 
 def _facts(folder: Path) -> dict:
@@ -180,6 +187,24 @@ def extra_views_section(job: JobFiles) -> list[str]:
         for view, share in shares.items()
     ]
     return [page.heading("Extra views", 3), page.paragraph(reason), inline_images.picture_grid(cells)]
+
+
+def origins_section(job: JobFiles) -> list[str]:
+    """Return HTML parts with the origin of what views show in the hole; empty before the stage `initialize`."""
+    folder = job.folders.get("initialize", Path())
+    shares = _facts(folder).get("origins", {}) if "initialize" in job.folders else {}
+    names = sorted(path.stem for path in (folder / "origins").glob("*.png")) if shares else []
+    if not names or "poses" not in job.folders:
+        return []
+    words = "; ".join(f"{WORDS_OF_ORIGINS[origin]} {share:.0%}" for origin, share in shares.items())
+    cells = []
+    for name in pick_evenly(names, ORIGIN_VIEWS):
+        photo = load_image(job.folders["poses"] / "images" / f"{name}.png")
+        origin = load_image(folder / "origins" / f"{name}.png")
+        tinted = np.where(origin.any(-1, keepdims=True), photo // 3 + origin // 3 * 2, photo)
+        cells.append((inline_images.photo_address(tinted, DEPTH_SIDE), name))
+    parts = [page.heading("Where the filling comes from", 3), page.paragraph(f"Mean over views: {words}.")]
+    return [*parts, inline_images.picture_grid(cells)]
 
 
 def depth_section(job: JobFiles) -> list[str]:

@@ -15,11 +15,11 @@ import numpy as np
 
 from reffusion.background.model import Background
 from reffusion.depth import monocular
-from reffusion.initialize import coverage
 from reffusion.initialize.draft import Draft
 from reffusion.initialize.draft_steps import add_random, refit_draft, restrict_invent_masks
 from reffusion.initialize.extra_views import FLOATER_RATIO, complete_extra_views
 from reffusion.initialize.fill import fill_references
+from reffusion.initialize.origins import ORIGINS, OriginMap, find_origins
 from reffusion.initialize.relighting import remove_shadows
 from reffusion.initialize.sds_gain import GainPrediction, predict_gain
 from reffusion.inpaint import feedforward
@@ -47,6 +47,8 @@ def run(
     - facts.json;
     - depth/<view>.exr: the depth at which each reference and each extra view was unprojected;
     - extra_views/<view>.png: views that were completed besides the references, because gaps were left;
+    - origins/<view>.png: the origin of what each view shows in C: other photographs (green), a reference (blue),
+      patches in an extra view (orange), nothing (red);
     - shadows/<view>.png: masks of the object's shadow in all views, if a reference shows the scene without it;
     - invent/<view>.png: the invent masks I that reach beyond C (where the scene asks to fill a region), restricted
       there to pixels that show new Gaussians;
@@ -104,7 +106,10 @@ def run(
     save_ply(out / "gaussians.ply", draft.gaussians)
     save_labels(out / "labels.npy", draft.is_new.cpu())
     photos = background.photos if is_method else None
-    save_json(out / "facts.json", summarize(params, space, draft, floaters, sets, extra, trusted, photos))
+    origins = {name: find_origins(draft, scene.cameras[name], sets[name]) for name in scene.train}
+    for name, origin in origins.items():
+        save_image(out / "origins" / f"{name}.png", origin.picture)
+    save_json(out / "facts.json", summarize(params, space, draft, floaters, sets, origins, extra, trusted, photos))
 
 
 def summarize(
@@ -113,6 +118,7 @@ def summarize(
     draft: Draft,
     floaters: int,
     sets: Mapping[str, MaskSet],
+    origins: Mapping[str, OriginMap],
     extra: Sequence[Reference],
     trusted: Sequence[Reference],
     photos: Mapping[str, np.ndarray] | None,
@@ -127,15 +133,16 @@ def summarize(
         draft: the initialized scene.
         floaters: number of Gaussians that were removed as floaters.
         sets: view name -> pixel classes.
+        origins: view name -> origin of the pixels of C.
         extra: the extra views that were completed. A view may occur more than once, with different masks.
         trusted: all completed views that supervise: references and extra views.
         photos: view name -> uint8 [H, W, 3], the photographs, without the object's shadow if one was found; None for a
             baseline, or if there is no reference.
     """
     train = [space.scene.cameras[name] for name in space.scene.train]
-    uncovered = {
-        each.name: coverage.uncovered_share(draft.gaussians, each, sets[each.name].consistent) for each in train
-    }
+    uncovered = {name: each.uncovered_share for name, each in origins.items()}
+    shown = [each.shares for name, each in origins.items() if sets[name].consistent.any()]
+    mean_shares = {key: sum(each[key] for each in shown) / max(len(shown), 1) for key in ORIGINS[1:]}
     guessed: dict[str, np.ndarray] = {}
     for each in extra:  # a view may have been completed more than once
         guessed[each.camera.name] = guessed.get(each.camera.name, False) | each.mask
@@ -143,6 +150,7 @@ def summarize(
     gain = GainPrediction(True, f"start is {params.start}", None)
     if photos is not None:
         gain = predict_gain(draft.gaussians, train, sets, photos, max(shares.values(), default=0.0))
+    print("what the object hid, mean over views: " + ", ".join(f"{mean_shares[key]:.0%} {key}" for key in mean_shares))
     print(f"SDS {'may' if gain.may_gain else 'cannot'} gain: {gain.reason}")
     if named := [f"{name} ({share:.1%})" for name, share in uncovered.items() if share > WARN_SHARE]:
         print(
@@ -158,6 +166,7 @@ def summarize(
         "sds_may_gain": gain.may_gain,
         "sds_reason": gain.reason,
         "psnr_beside": gain.psnr_beside,
+        "origins": mean_shares,
         "uncovered_share": sum(uncovered.values()) / max(len(uncovered), 1),
     }
 

@@ -96,7 +96,7 @@ def test_the_refit_is_not_supervised_where_an_object_is_drawn(tmp_path, monkeypa
     background = Background([type("View", (), {"camera": wall_camera(), "masked": masked})], {})
     scene = type("Scene", (), {"clean": (), "blank": ()})
     sets = {"a": MaskSet(masked, masked, invent, invent)}
-    draft = Draft(None, torch.zeros(0, dtype=torch.bool))
+    draft = Draft(None, torch.zeros(0, dtype=torch.uint8))
     draft_steps.refit_draft(draft, 1, scene, background, [], sets, True, tmp_path)
     assert (found["a"] == masked | invent).all()
 

@@ -34,6 +34,8 @@ KINDS = (
     "360",
     "seen",
     "behind",
+    "beside",
+    "pair",
     "table",
     "corner",
     "grass",

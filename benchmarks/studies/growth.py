@@ -73,8 +73,8 @@ def run_stages(scene: Path, runs: Path, profile: str, last: str) -> dict[str, di
 
     Args:
         scene: folder of the scene.
-        runs: folder of runs, which also keeps the measured costs. If it has costs of the scene, nothing is run, and
-            these costs are returned, whatever `last` is.
+        runs: folder of runs, which also keeps the measured costs. If it has costs of the scene in this profile, up to
+            this last stage, nothing is run, and these costs are returned.
         profile: name of the profile.
         last: last stage to run.
 
@@ -85,7 +85,7 @@ def run_stages(scene: Path, runs: Path, profile: str, last: str) -> dict[str, di
     Raises:
         RuntimeError: a stage failed.
     """
-    record, costs = runs / f"{scene.name}.json", {}
+    record, costs = runs / f"{scene.name}-{profile}-{last}.json", {}
     if record.exists():
         return load_json(record)
     for stage in STAGES[: STAGES.index(last) + 1]:

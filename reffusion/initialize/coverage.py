@@ -181,16 +181,6 @@ def is_narrow(mask: np.ndarray) -> bool:
 
 
 @torch.no_grad()
-def uncovered_share(gaussians: Gaussians, camera: Camera, mask: np.ndarray, min_alpha: float = 0.9) -> float:
-    """Return the share in [0, 1] of the pixels of `mask`, bool [H, W], whose rendered alpha is below `min_alpha`.
-
-    The share is 0 for an empty mask.
-    """
-    alpha = rasterizer.render(gaussians, camera, sh_degree=0).alpha.cpu().numpy()
-    return float((alpha[mask] < min_alpha).mean()) if mask.any() else 0.0
-
-
-@torch.no_grad()
 def pixels_in_front(gaussians: Gaussians, depth: np.ndarray, reference: Reference, mask: np.ndarray) -> np.ndarray:
     """Return bool [H, W], the reference's pixels outside C whose surface lies clearly in front of the rendered draft.
 

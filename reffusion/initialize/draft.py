@@ -13,6 +13,9 @@ from torch import Tensor
 
 from reffusion.types import Gaussians
 
+# Origins of Gaussians: the fit; a reference; an extra view, completed from patches; random Gaussians of an ablation.
+REMAINING, REFERENCE, EXTRA_VIEW, RANDOM = range(4)
+
 
 @dataclass(frozen=True)
 class Draft:
@@ -20,16 +23,21 @@ class Draft:
 
     Attributes:
         gaussians: all N Gaussians, remaining and new ones.
-        is_new: bool [N], True for the new Gaussians.
+        origin: uint8 [N], REMAINING, or for the new Gaussians REFERENCE, EXTRA_VIEW or RANDOM.
     """
 
     gaussians: Gaussians
-    is_new: Tensor
+    origin: Tensor
 
     @classmethod
     def start(cls, remaining: Gaussians) -> Draft:
         """Return a draft that holds the remaining Gaussians and no new ones."""
-        return cls(remaining, torch.zeros(len(remaining), dtype=torch.bool, device=remaining.means.device))
+        return cls(remaining, torch.zeros(len(remaining), dtype=torch.uint8, device=remaining.means.device))
+
+    @property
+    def is_new(self) -> Tensor:
+        """bool [N], True for the new Gaussians."""
+        return self.origin != REMAINING
 
     @property
     def remaining(self) -> Gaussians:
@@ -38,9 +46,9 @@ class Draft:
 
     def drop(self, dropped: Tensor) -> Draft:
         """Return the draft without the Gaussians at which `dropped`, bool [N], is True."""
-        return Draft(self.gaussians.map(lambda p: p[~dropped]), self.is_new[~dropped])
+        return Draft(self.gaussians.map(lambda p: p[~dropped]), self.origin[~dropped])
 
-    def add(self, added: Gaussians) -> Draft:
-        """Return the draft with the Gaussians `added` appended, labelled as new."""
+    def add(self, added: Gaussians, origin: int) -> Draft:
+        """Return the draft with new Gaussians of one origin appended."""
         together = self.gaussians.zip_map(added, lambda a, b: torch.cat([a, b]))
-        return Draft(together, torch.cat([self.is_new, self.is_new.new_ones(len(added))]))
+        return Draft(together, torch.cat([self.origin, self.origin.new_full((len(added),), origin)]))

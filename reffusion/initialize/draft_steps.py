@@ -12,7 +12,7 @@ from pathlib import Path
 from reffusion import seeding
 from reffusion.background.model import Background
 from reffusion.initialize import random_init
-from reffusion.initialize.draft import Draft
+from reffusion.initialize.draft import RANDOM, Draft
 from reffusion.initialize.refit import Supervision, refit
 from reffusion.masks import regions, voting
 from reffusion.types import MaskSet, Reference, Scene
@@ -71,7 +71,7 @@ def add_random(draft: Draft, space: Workspace) -> Draft:
     points = random_init.sample_points(box, count, train, holes, places)
     colors = seeding.generator(SEED, "initialize", "random colours")
     added = random_init.random_gaussians(points, draft.gaussians.sh.shape[1], draft.gaussians.antialiased, colors)
-    return draft.add(added.map(lambda p: p.to(draft.gaussians.means)))
+    return draft.add(added.map(lambda p: p.to(draft.gaussians.means)), RANDOM)
 
 
 def refit_draft(
@@ -104,4 +104,4 @@ def refit_draft(
     completed = [each for each in trusted if each.mask.any()]
     supervision = Supervision([view.camera for view in views], background.photos, hidden, completed)
     placed = draft.is_new & has_exact_depth
-    return Draft(refit(draft.gaussians, placed, supervision, steps, SEED, folder), draft.is_new)
+    return Draft(refit(draft.gaussians, placed, supervision, steps, SEED, folder), draft.origin)

@@ -16,14 +16,14 @@ from reffusion.depth.monocular import DepthNetwork
 from reffusion.depth.steps import beside_steps, sharpen_steps
 from reffusion.gaussians.sheets import Sheets
 from reffusion.initialize import coverage, unprojection
-from reffusion.initialize.draft import Draft
+from reffusion.initialize.draft import EXTRA_VIEW, REFERENCE, Draft
 from reffusion.initialize.sharing import Share, share_surfaces
 from reffusion.initialize.sweep import refine_background
 from reffusion.morphology import dilate_by_distance
 from reffusion.params.initialize import Params
 from reffusion.splat import rasterizer
 from reffusion.trace import Trace
-from reffusion.types import Reference
+from reffusion.types import Camera, Gaussians, Reference
 
 OVERLAP = 0.006  # of the image's width: how far new Gaussians extend beyond the hole
 COVERED = 0.9  # a reference also fills the pixels of C (the object's mask) whose alpha is below this
@@ -122,37 +122,28 @@ def fill_reference(
     hole = unprojection.find_hole(draft, reference, mask, COVERED)
     if farthest and background.mirrors:
         hole |= reference.mask  # also where the visible surface lies behind a mirror image
-    remaining = draft.remaining
     # The plane sweep cannot measure depth at the rim of a gap as narrow as this.
     sweep = params.depth.sweep and not (farthest and coverage.is_narrow(hole))
     near, swept = refine_background(background, camera, hole) if sweep else (background, None)
-    uncovered = find_unobserved(remaining, camera, mask, near.views, near.planes, near.mirrors)
-    hints = Hints(
-        plane_depth=uncovered.continued_depth,
-        planes=uncovered.plane_depths,
-        confirmed=uncovered.confirmed,
-        photographed_depth=near.photographed_depth(camera),
-        swept=swept,
-        free_space=(lambda depth: near.is_empty(camera, depth)) if params.depth.sweep else None,
-    )
+    hints = _gather_hints(draft.remaining, camera, near, swept, params.depth.sweep)
     depth, estimate, words = unprojection.estimate_depth(
-        remaining, reference, hole, mask, background.points, COMPLETION, disparity, log, hints, farthest
+        draft.remaining, reference, hole, mask, background.points, COMPLETION, disparity, log, hints, farthest
     )
+    if reference.depth is None:  # a depth map that the scene provides has no ramps
+        near_hole = dilate_by_distance(hole | mask | reference.mask, OVERLAP)
+        depth, estimate = (sharpen_steps(each, reference.image, near_hole) for each in (depth, estimate))
     inserted = drawn_over = np.zeros_like(hole)
     ceded = share.ceded if share else inserted
-    near_hole = dilate_by_distance(hole | mask | reference.mask, OVERLAP)
-    depth, estimate = (sharpen_steps(each, reference.image, near_hole) for each in (depth, estimate))
     if over.any():
-        visible = rasterizer.render(remaining, camera, sh_degree=0).depth.double().cpu().numpy()
+        visible = rasterizer.render(draft.remaining, camera, sh_degree=0).depth.double().cpu().numpy()
         behind, inserted = np.where(visible > 0, visible, depth), hole & over
         if reference.depth is None and disparity is None:
             upright = billboard.billboard_depth(inserted, behind, camera)
             depth, estimate = (np.where(inserted, upright, each) for each in (depth, estimate))
             words += f"; a billboard, good within {billboard.MAX_ANGLE_DEG} degrees, stands where the scene goes on"
         else:
-            back = (
-                share.drawn if share else coverage.pixels_in_front(draft.gaussians, estimate, reference, mask) & ~hole
-            )
+            in_front = coverage.pixels_in_front(draft.gaussians, estimate, reference, mask)
+            back = share.drawn if share else in_front & ~hole
             inserted, depth = inserted & ~ceded | back, np.where(back, estimate, depth)
         drawn_over = inserted & ~coverage.beside_depth_edges(depth, behind)
     print(f"depth of reference {camera.name}: {words}")
@@ -160,7 +151,9 @@ def fill_reference(
     # At a step no seam has to be closed: the surface beyond it is another one.
     overlap = dilate_by_distance(filled, OVERLAP) & ~ceded & ~beside_steps(depth)
     pixels = filled | overlap | drawn_over
-    draft = unprojection.add_surface(draft, reference, depth, pixels, background, sheets)
+    draft = unprojection.add_surface(
+        draft, reference, depth, pixels, background, sheets, EXTRA_VIEW if farthest else REFERENCE
+    )
     if farthest or not params.tidy:  # gaps that are still open are left to the extra views, if there are any
         return Filled(draft, depth)
     views = [(each, background.masks[each.name]) for each in background.cameras]
@@ -168,6 +161,31 @@ def fill_reference(
     if gaps.any():
         draft = unprojection.add_surface(draft, reference, estimate, gaps, background, sheets)
     return Filled(draft, depth)
+
+
+def _gather_hints(
+    remaining: Gaussians, camera: Camera, background: Background, swept: np.ndarray | None, sees_past: bool
+) -> Hints:
+    """Return what planes, mirror images and other views tell about the depth in the hole of a view.
+
+    Args:
+        remaining: the scene without the removed and without new Gaussians.
+        camera: the view.
+        background: the photographs and surfaces around the object.
+        swept: bool [H, W], the pixels whose depth was found by a plane sweep; None without one.
+        sees_past: True to compare continued surfaces with what other views see past them.
+    """
+    uncovered = find_unobserved(
+        remaining, camera, background.masks[camera.name], background.views, background.planes, background.mirrors
+    )
+    return Hints(
+        plane_depth=uncovered.continued_depth,
+        planes=uncovered.plane_depths,
+        confirmed=uncovered.confirmed,
+        photographed_depth=background.photographed_depth(camera),
+        swept=swept,
+        free_space=(lambda depth: background.is_empty(camera, depth)) if sees_past else None,
+    )
 
 
 def _predict_disparity(network: DepthNetwork | None, reference: Reference) -> np.ndarray | None:

@@ -19,7 +19,7 @@ from reffusion.depth import background_depth, estimates
 from reffusion.depth.background_depth import NO_HINTS, CompletionSettings, Hints
 from reffusion.depth.solverlog import SolverLog
 from reffusion.gaussians.sheets import Sheets, sheet_gaussians
-from reffusion.initialize.draft import Draft
+from reffusion.initialize.draft import REFERENCE, Draft
 from reffusion.initialize.view_dependent_color import measure_change, transfer_sh
 from reffusion.morphology import square
 from reffusion.splat import rasterizer
@@ -149,7 +149,13 @@ def find_gaps(
 
 
 def add_surface(
-    draft: Draft, reference: Reference, depth: np.ndarray, pixels: np.ndarray, background: Background, sheets: Sheets
+    draft: Draft,
+    reference: Reference,
+    depth: np.ndarray,
+    pixels: np.ndarray,
+    background: Background,
+    sheets: Sheets,
+    origin: int = REFERENCE,
 ) -> Draft:
     """Return the draft with pixels of a reference added, as a surface of new Gaussians.
 
@@ -162,10 +168,11 @@ def add_surface(
         pixels: bool [H, W], the pixels to add.
         background: the photographs, from which view-dependent colour is estimated.
         sheets: settings of the Gaussians on a surface.
+        origin: origin of the new Gaussians, see `draft.Draft`.
     """
     camera = reference.camera
     added = sheet_gaussians(reference.image, depth, pixels, camera, draft.gaussians.sh.shape[1], sheets)
-    old_count, draft = len(draft.gaussians), draft.add(added.map(lambda p: p.to(draft.gaussians.means)))
+    old_count, draft = len(draft.gaussians), draft.add(added.map(lambda p: p.to(draft.gaussians.means)), origin)
     gaussians = draft.gaussians
     is_added = torch.arange(len(gaussians), device=draft.is_new.device) >= old_count
     if sheets.view_dependent:
@@ -174,7 +181,7 @@ def add_surface(
         change = measure_change(reference.image, known, hole, camera, background.views, background.photos)
         gaussians = transfer_sh(gaussians, is_added, camera, change, background.views)
     gaussians = match_colors(gaussians, is_added, reference.image, pixels, camera, sheets.color_steps)
-    return Draft(gaussians, draft.is_new)
+    return Draft(gaussians, draft.origin)
 
 
 @torch.no_grad()
