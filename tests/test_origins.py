@@ -10,7 +10,7 @@ from reffusion.types import MaskSet
 
 
 def test_each_pixel_has_the_origin_of_its_surface():
-    """The left half of a wall remains. A reference added the upper right quarter, and an extra view the lower right one."""
+    """The left half of a wall remains; a reference added the upper right quarter, an extra view the lower right."""
     camera = wall_scene.CAMERAS[wall_scene.TRAIN[0]]
     wall = wall_scene.wall_and_square(1.7)[0]
     wall = wall.map(lambda p: p[wall.means[:, 2] > wall.means[:, 2].max() - 1e-3])
