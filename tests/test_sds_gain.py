@@ -11,6 +11,7 @@ from scenes.wall_scene import CAMERAS, TRAIN, true_mask, wall_and_square
 
 from reffusion.distill.inputs import resolve_sds
 from reffusion.initialize.draft import Draft
+from reffusion.initialize.origins import find_origins
 from reffusion.initialize.sds_gain import GUESSED_SHARE, HOLE_LOSS, MAX_VIEWS, PRIOR_PSNR, predict_gain
 from reffusion.io.arrays import save_json
 from reffusion.params import initialize
@@ -57,7 +58,9 @@ def test_a_view_that_was_completed_twice_counts_with_all_its_guessed_pixels(wall
     extra = [Reference(camera, photos[camera.name], each) for each in (first, second)]
     scene = SimpleNamespace(train=TRAIN, cameras=CAMERAS)
     space = SimpleNamespace(scene=scene, labels=torch.zeros(1, dtype=torch.bool))
-    facts = summarize(initialize.Params(), space, Draft.start(wall), 0, sets, extra, extra, photos)
+    draft = Draft.start(wall)
+    origins = {name: find_origins(draft, CAMERAS[name], sets[name]) for name in TRAIN}
+    facts = summarize(initialize.Params(), space, draft, 0, sets, origins, extra, extra, photos)
     assert facts["extra_views"] == {camera.name: pytest.approx(0.5, abs=0.01)}
     assert facts["sds_may_gain"] and "50%" in facts["sds_reason"]
 
