@@ -10,7 +10,6 @@ from scenes.cameras import meet_box, orbit_camera, uneven_depth_view, world_rays
 
 from reffusion import geometry
 from reffusion.background.continuation import find_planes
-from reffusion.background.model import Background
 from reffusion.background.plane import CELLS, Plane
 from reffusion.background.unobserved import _continues_surroundings, find_unobserved
 from reffusion.background.visibility import (
@@ -294,20 +293,3 @@ def test_visibility_of_points_follows_the_formulas(table_views):
             assert (is_seen(view, points) == (visible & on)).all()
         for name, count in zip(("seen", "free", "occluded", "masked"), expected, strict=True):
             assert (getattr(counts, name) == count).all() and count.any(), name
-
-
-def test_a_plane_does_not_continue_where_a_completed_view_sees_past_it():
-    """A plane parallel to the table, above it, was taken for a surface. The completed view shows the table below."""
-    everywhere = np.ones((CELLS, CELLS), bool)
-    plane = Plane(
-        np.array([0.0, 0.0, 1.0]), 0.4, np.array([0.0, 0.0, 0.4]), np.eye(3)[:2], 2 / CELLS, *[everywhere] * 2,
-        *[~everywhere] * 3,
-    )  # fmt: skip
-    table = replace(plane, offset=TOP, origin=np.zeros(3))
-    view = table_depth_view(table_camera("v", 0, 1.6))
-    completed = replace(view, masked=np.zeros_like(view.masked))
-    picture = np.zeros((SIZE, SIZE, 3), np.uint8)
-    above, on_it = Background([view], {}, planes=[plane, table]).with_completed([(completed, picture)]).planes
-    middle = slice(CELLS // 4, -CELLS // 4)
-    assert not above.continued[middle, middle].any() and not above.enclosed[middle, middle].any()
-    assert on_it.continued.all()

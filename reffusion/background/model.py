@@ -108,20 +108,6 @@ class Background:
         planes = find_planes(center, radius, self.views, self.points, seed)
         return replace(self, planes=planes, center=center, radius=radius)
 
-    def with_completed(self, completed: Sequence[tuple[DepthView, np.ndarray]]) -> Background:
-        """Return the background with completed views, and with planes that do not continue where these see past them.
-
-        Args:
-            completed: see the attribute.
-        """
-        views, planes = [view for view, _ in completed], []
-        for plane in self.planes:
-            cells = plane.cell_centers
-            past = count_views(cells.reshape(-1, 3), views).free.reshape(cells.shape[:2]) > 0
-            continued, enclosed = plane.continued & ~past, plane.enclosed & ~past
-            planes.append(replace(plane, continued=continued, enclosed=enclosed))
-        return replace(self, completed=completed, planes=planes)
-
     def with_mirrors(self, remaining: Gaussians) -> Background:
         """Return the background with newly found mirrors: symmetric things around the object, and their mirror planes.
 

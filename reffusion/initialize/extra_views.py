@@ -8,6 +8,7 @@ filled.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -55,14 +56,15 @@ def complete_extra_views(
     )
     uncovered = find(draft, background.cameras)
     draft = draft.drop(coverage.find_floaters(draft.gaussians, draft.is_new, background, uncovered, FLOATER_RATIO))
-    background = background.with_completed(coverage.completed_views(references, draft.gaussians, background))
+    completed = coverage.completed_views(references, draft.gaussians, background)
+    sources = replace(background, completed=completed)
     cameras = coverage.cameras_near_photographs(background)
     while len(extra) < params.extra_views:
         camera = coverage.least_covered_view(cameras, background, uncovered)
         if camera is None:
             break
         hole, mask = uncovered[camera.name], background.masks[camera.name]
-        picture = _complete_view(draft, camera, hole, background, painter)
+        picture = _complete_view(draft, camera, hole, sources, painter)
         reference = Reference(camera, picture, hole)
         print(f"extra view {camera.name}: {hole.sum() / mask.sum():.1%} of the mask is covered by nothing")
         try:
