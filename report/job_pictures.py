@@ -192,7 +192,8 @@ def extra_views_section(job: JobFiles) -> list[str]:
 def origins_section(job: JobFiles) -> list[str]:
     """Return HTML parts with the origin of what views show in the hole; empty before the stage `initialize`."""
     folder = job.folders.get("initialize", Path())
-    shares = _facts(folder).get("origins", {}) if "initialize" in job.folders else {}
+    facts = _facts(folder) if "initialize" in job.folders else {}
+    shares, made_up = facts.get("origins", {}), facts.get("made_up", {})
     names = sorted(path.stem for path in (folder / "origins").glob("*.png")) if shares else []
     if not names or "poses" not in job.folders:
         return []
@@ -202,7 +203,7 @@ def origins_section(job: JobFiles) -> list[str]:
         photo = load_image(job.folders["poses"] / "images" / f"{name}.png")
         origin = load_image(folder / "origins" / f"{name}.png")
         tinted = np.where(origin.any(-1, keepdims=True), photo // 3 + origin // 3 * 2, photo)
-        cells.append((inline_images.photo_address(tinted, DEPTH_SIDE), name))
+        cells.append((inline_images.photo_address(tinted, DEPTH_SIDE), f"{name}: {made_up.get(name, 0):.0%} made up"))
     parts = [page.heading("Where the filling comes from", 3), page.paragraph(f"Mean over views: {words}.")]
     return [*parts, inline_images.picture_grid(cells)]
 
