@@ -29,7 +29,7 @@ ORIGIN_VIEWS = 6  # number of views
 WORDS_OF_ORIGINS = {
     "photographs": "green, other photographs show it:",
     "reference": "blue, a reference:",
-    "patches": "orange, made up of patches of the photographs:",
+    "patches": "orange, invented from patches of the photographs:",
     "nothing": "red, no picture shows it:",
 }
 REMOVED, INVENTED = (255, 210, 0), (0, 230, 230)  # outline colours of consistent masks and of invent masks
@@ -193,7 +193,7 @@ def origins_section(job: JobFiles) -> list[str]:
     """Return HTML parts with the origin of what views show in the hole; empty before the stage `initialize`."""
     folder = job.folders.get("initialize", Path())
     facts = _facts(folder) if "initialize" in job.folders else {}
-    shares, made_up = facts.get("origins", {}), facts.get("made_up", {})
+    shares, invented = facts.get("origins", {}), facts.get("invented_shares", {})
     names = sorted(path.stem for path in (folder / "origins").glob("*.png")) if shares else []
     if not names or "poses" not in job.folders:
         return []
@@ -203,7 +203,7 @@ def origins_section(job: JobFiles) -> list[str]:
         photo = load_image(job.folders["poses"] / "images" / f"{name}.png")
         origin = load_image(folder / "origins" / f"{name}.png")
         tinted = np.where(origin.any(-1, keepdims=True), photo // 3 + origin // 3 * 2, photo)
-        cells.append((inline_images.photo_address(tinted, DEPTH_SIDE), f"{name}: {made_up.get(name, 0):.0%} made up"))
+        cells.append((inline_images.photo_address(tinted, DEPTH_SIDE), f"{name}: {invented.get(name, 0):.0%} invented"))
     parts = [page.heading("Where the filling comes from", 3), page.paragraph(f"Mean over views: {words}.")]
     return [*parts, inline_images.picture_grid(cells)]
 

@@ -33,7 +33,7 @@ from reffusion.trace import Trace
 from reffusion.types import MaskSet, Reference
 from reffusion.workspace import Workspace
 
-MADE_UP = 0.1  # share of the hole that no picture shows, above which a view is named as worth painting
+LEAST_INVENTED_SHARE = 0.1  # share of the hole that no picture shows, above which a view is worth painting
 WARN_SHARE = 0.01  # share of uncovered pixels of C above which a view is named in a message
 
 
@@ -151,11 +151,15 @@ def summarize(
     gain = GainPrediction(True, f"start is {params.start}", None)
     if photos is not None:
         gain = predict_gain(draft.gaussians, train, sets, photos, max(shares.values(), default=0.0))
-    made_up = {name: each.shares["patches"] + each.shares["nothing"] for name, each in origins.items()}
-    worst = max(made_up, key=lambda name: made_up[name] * np.count_nonzero(origins[name].classes), default=None)
+    invented_shares = {name: each.shares["patches"] + each.shares["nothing"] for name, each in origins.items()}
+    invented_pixels = lambda name: invented_shares[name] * np.count_nonzero(origins[name].classes)
+    worst = max(origins, key=invented_pixels, default=None)
     print("what the object hid, mean over views: " + ", ".join(f"{mean_shares[key]:.0%} {key}" for key in mean_shares))
-    if worst and made_up[worst] > MADE_UP:
-        print(f"worth painting next: {worst}, where {made_up[worst]:.0%} of what the object hid is made up")
+    if worst and photos is not None and invented_shares[worst] > LEAST_INVENTED_SHARE:
+        share = invented_shares[worst]
+        print(
+            f"worth painting next: {worst}; no photograph or reference shows {share:.0%} of what the object hid there"
+        )
     print(f"SDS {'may' if gain.may_gain else 'cannot'} gain: {gain.reason}")
     if named := [f"{name} ({share:.1%})" for name, share in uncovered.items() if share > WARN_SHARE]:
         print(
@@ -172,7 +176,7 @@ def summarize(
         "sds_reason": gain.reason,
         "psnr_beside": gain.psnr_beside,
         "origins": mean_shares,
-        "made_up": made_up,
+        "invented_shares": invented_shares,
         "uncovered_share": sum(uncovered.values()) / max(len(uncovered), 1),
     }
 

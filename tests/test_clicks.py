@@ -120,6 +120,16 @@ def test_a_click_takes_back_what_it_is_on():
     assert wall_scene.iou(click_mask(picture, (150, 120), before=without), disk) > 0.95
 
 
+def test_a_click_outside_the_picture_is_one_on_its_border():
+    picture, _ = disk_picture()
+    corner = np.zeros(picture.shape[:2], bool)
+    corner[:30, :40] = True
+    outside, on_border = (
+        apply_marks(ViewEvidence(picture), make_clicks(at), corner) for at in ((-9, -9, False), (0, 0, False))
+    )
+    assert not outside[0, 0] and (outside == on_border).all()
+
+
 def test_a_correction_keeps_the_region_around_an_earlier_click():
     """A foot of an animal stands on a plinth. The network proposes the animal without its foot, and with it."""
     rows, columns = np.mgrid[:240, :320]

@@ -78,12 +78,13 @@ def correct_mask(view: ViewEvidence, before: np.ndarray, clicks: Clicks, confirm
     regions = [part_at((mask & ~before if positive else before & ~mask) & ~kept, at) for mask in masks]
     inside = at.clip(0.5, np.array(before.shape[::-1]) - 0.5)  # a click outside the picture is moved to its border
     dot = stroke_pixels(Mark(inside[None], positive, max(2.0, BAND * max(before.shape))), before.shape)
-    regions.append((dot & ~before if positive else dot & before) & ~kept)
-    results = [before | region if positive else before & ~region for region in regions if region.any()]
-    opposite = clicks.points[clicks.positive != positive]
-    whole = [result for result in results[:-1] if not _isolates_click(before, result, opposite, int(dot.sum()))]
-    results = [*whole, results[-1]]
-    penalties = [_change_penalty(before, result, int(dot.sum())) for result in results[:-1]] + [DOT_PENALTY]
+    dot_region = (dot & ~before if positive else dot & before) & ~kept
+    apply = lambda region: before | region if positive else before & ~region
+    opposite, speck = clicks.points[clicks.positive != positive], int(dot.sum())
+    proposed = [apply(region) for region in regions if region.any()]
+    results = [result for result in proposed if not _isolates_click(before, result, opposite, speck)]
+    penalties = [_change_penalty(before, result, speck) for result in results]
+    results, penalties = [*results, apply(dot_region)], [*penalties, DOT_PENALTY]
     best = select_object(view, clicks, results, penalties)
     return results[0] if best is None else best
 

@@ -72,9 +72,8 @@ def find_depth_edges(
 
 
 def value_at(mask: np.ndarray, at: np.ndarray) -> bool:
-    """Return the value of a mask, bool [H, W], at the point `at` = (x, y) in pixels."""
-    column, row = (int(each) for each in at)
-    return bool(mask[min(row, mask.shape[0] - 1), min(column, mask.shape[1] - 1)])
+    """Return the value of a mask, bool [H, W], at the point `at` = (x, y) in pixels, or at the nearest pixel."""
+    return bool(mask[_pixel_at(mask, at)])
 
 
 def part_at(mask: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -87,4 +86,10 @@ def part_at(mask: np.ndarray, at: np.ndarray) -> np.ndarray:
     if not value_at(mask, at):
         return np.zeros_like(mask)
     parts, _ = ndimage.label(mask, np.ones((3, 3)))
-    return parts == parts[min(int(at[1]), mask.shape[0] - 1), min(int(at[0]), mask.shape[1] - 1)]
+    return parts == parts[_pixel_at(mask, at)]
+
+
+def _pixel_at(mask: np.ndarray, at: np.ndarray) -> tuple[int, int]:
+    """Return (row, column) of the pixel of a mask that is nearest to the point `at` = (x, y)."""
+    row, column = (int(min(max(at[axis], 0), mask.shape[1 - axis] - 1)) for axis in (1, 0))
+    return row, column

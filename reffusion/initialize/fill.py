@@ -164,7 +164,7 @@ def fill_reference(
 
 
 def _gather_hints(
-    remaining: Gaussians, camera: Camera, background: Background, swept: np.ndarray | None, sees_past: bool
+    remaining: Gaussians, camera: Camera, background: Background, swept: np.ndarray | None, use_free_space: bool
 ) -> Hints:
     """Return what planes, mirror images and other views tell about the depth in the hole of a view.
 
@@ -173,7 +173,7 @@ def _gather_hints(
         camera: the view.
         background: the photographs and surfaces around the object.
         swept: bool [H, W], the pixels whose depth was found by a plane sweep; None without one.
-        sees_past: True to compare continued surfaces with what other views see past them.
+        use_free_space: True to reject continued surfaces that other views see past.
     """
     uncovered = find_unobserved(
         remaining, camera, background.masks[camera.name], background.views, background.planes, background.mirrors
@@ -184,7 +184,7 @@ def _gather_hints(
         confirmed=uncovered.confirmed,
         photographed_depth=background.photographed_depth(camera),
         swept=swept,
-        free_space=(lambda depth: background.is_empty(camera, depth)) if sees_past else None,
+        free_space=(lambda depth: background.is_empty(camera, depth)) if use_free_space else None,
     )
 
 

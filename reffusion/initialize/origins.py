@@ -61,11 +61,11 @@ def find_origins(draft: Draft, camera: Camera, masks: MaskSet) -> OriginMap:
     kinds = torch.stack([draft.origin == REFERENCE, draft.origin == EXTRA_VIEW, draft.is_new], -1)
     rendering = rasterizer.render(draft.gaussians, camera, features=kinds.to(draft.gaussians.means), sh_degree=0)
     reference, patches, new = rendering.features.cpu().numpy().transpose(2, 0, 1)
-    gap, hidden = rendering.alpha.cpu().numpy() < OPAQUE, masks.consistent
+    gap, mask = rendering.alpha.cpu().numpy() < OPAQUE, masks.consistent
     classes = np.full(gap.shape, ORIGINS.index("nothing"), np.uint8)
     classes[(new <= 0.5) & ~masks.unobserved] = ORIGINS.index("photographs")
     classes[(new > 0.5) & (reference > 0)] = ORIGINS.index("reference")
     classes[(new > 0.5) & (patches > reference)] = ORIGINS.index("patches")
     classes[gap] = ORIGINS.index("nothing")
-    classes[~hidden & ((new <= 0.5) | gap)] = ORIGINS.index("outside")
-    return OriginMap(classes, float(gap[hidden].mean()) if hidden.any() else 0.0)
+    classes[~mask & ((new <= 0.5) | gap)] = ORIGINS.index("outside")
+    return OriginMap(classes, float(gap[mask].mean()) if mask.any() else 0.0)

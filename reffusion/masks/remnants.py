@@ -133,7 +133,7 @@ def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarra
         return []
     from_middle = np.linalg.norm(means - np.median(means[labels], axis=0), axis=1)
     radius = float(np.median(from_middle[labels]))
-    taken, labels = labels, labels & (from_middle <= EXTENT * radius)
+    all_labels, labels = labels, labels & (from_middle <= EXTENT * radius)
     distance = cKDTree(means[labels]).query(means)[0]
     opacities = gaussians.opacity_logits.detach().sigmoid().cpu().double().numpy()
     beyond = np.sort(distance[(distance > REACH * radius) & (opacities > SOLID)])
@@ -155,7 +155,7 @@ def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarra
     unit = max(float(strength.mean()), 1e-12)
     gain = COLOR_WEIGHT * opacities * size * log_ratio * free / unit
     sides = (HARD * stays + np.maximum(-gain, 0), HARD * inside + np.maximum(gain, 0))
-    found = min_cut(*sides, graph.pairs, strength / unit) & ~taken[near]
+    found = min_cut(*sides, graph.pairs, strength / unit) & ~all_labels[near]
     parts = []
     for part in connected_parts(found, graph.pairs[overlap > TOUCHING]):
         to_object = (part[first] & inside[second]) | (part[second] & inside[first])
