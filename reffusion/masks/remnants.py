@@ -24,7 +24,7 @@ from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
-EXTENT = 4.0  # in radii of the object: labelled Gaussians farther from its middle are errors, and are not used
+EXTENT = 4.0  # in radii of the object: a part farther from its middle touches Gaussians that are labelled by mistake
 REACH = 1.0  # in radii of the object: Gaussians farther from the object than this belong to the surroundings
 # In radii of the object: distance up to which the surroundings are considered. The distance is increased until the
 # surroundings have `SAMPLES` Gaussians.
@@ -133,7 +133,6 @@ def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarra
         return []
     from_middle = np.linalg.norm(means - np.median(means[labels], axis=0), axis=1)
     radius = float(np.median(from_middle[labels]))
-    all_labels, labels = labels, labels & (from_middle <= EXTENT * radius)
     distance = cKDTree(means[labels]).query(means)[0]
     opacities = gaussians.opacity_logits.detach().sigmoid().cpu().double().numpy()
     beyond = np.sort(distance[(distance > REACH * radius) & (opacities > SOLID)])
@@ -155,7 +154,7 @@ def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarra
     unit = max(float(strength.mean()), 1e-12)
     gain = COLOR_WEIGHT * opacities * size * log_ratio * free / unit
     sides = (HARD * stays + np.maximum(-gain, 0), HARD * inside + np.maximum(gain, 0))
-    found = min_cut(*sides, graph.pairs, strength / unit) & ~all_labels[near]
+    found = min_cut(*sides, graph.pairs, strength / unit) & ~inside
     parts = []
     for part in connected_parts(found, graph.pairs[overlap > TOUCHING]):
         to_object = (part[first] & inside[second]) | (part[second] & inside[first])
@@ -163,7 +162,8 @@ def find_parts(gaussians: Gaussians, labels: np.ndarray) -> list[tuple[np.ndarra
         ratio = (contact * similarity)[to_object].sum() / max((contact * similarity)[to_rest].sum(), 1e-12)
         weight = (opacities * size**2)[part]  # the visible area of each Gaussian
         score = np.log(max(ratio, 1e-12)) + float((log_ratio[part] * weight).sum() / weight.sum())
-        if score >= LEAST_SCORE:
+        is_near = np.median(from_middle[near[part]]) <= EXTENT * radius
+        if score >= LEAST_SCORE and is_near:
             members = np.zeros(len(gaussians), bool)
             members[near[part]] = True
             parts.append((members, bool(contact[to_object].sum() > FLOATING_RATIO * contact[to_rest].sum())))
