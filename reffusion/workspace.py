@@ -21,10 +21,11 @@ from reffusion.fit import exposure
 from reffusion.io.arrays import load_arrays, load_json, load_labels
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_object_labels, load_scene
+from reffusion.masks.soft_shadow import SoftShadow
 from reffusion.prior import inpaint
 from reffusion.types import Gaussians, MaskSet, Scene
 
-SURFACES = "background.npz"  # file in the folder of `masks`, with the planes and mirrors that `masks` found
+SURFACES = "background.npz"  # file in the folder of `masks`: planes, mirrors and the object's shadow
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,18 @@ class Workspace:
 
     @cached_property
     def remaining(self) -> Gaussians:
-        """The remaining Gaussians: those of the scene without the object and debris."""
-        return self.gaussians.map(lambda p: p[~self.labels])
+        """The remaining Gaussians: those of the scene without the object, its shadow, and debris."""
+        return self.lit_gaussians.map(lambda p: p[~self.labels])
+
+    @cached_property
+    def lit_gaussians(self) -> Gaussians:
+        """The N Gaussians of the whole scene in the light that they have without the object's shadow."""
+        return self.shadow.remove_from_gaussians(self.gaussians) if self.shadow else self.gaussians
+
+    @cached_property
+    def shadow(self) -> SoftShadow | None:
+        """The object's soft shadow, which no mask contains; None if the stage `masks` found none."""
+        return SoftShadow.from_arrays(load_arrays(self.masks / SURFACES))
 
     @cached_property
     def mask_sets(self) -> dict[str, MaskSet]:
@@ -89,12 +100,16 @@ class Workspace:
         return load_json(self.masks / "facts.json")
 
     def load_photos(self, names: Iterable[str]) -> dict[str, np.ndarray]:
-        """Return the photographs of some views, corrected to the exposure of the Gaussians.
+        """Return the photographs of some views in the exposure of the Gaussians, without the object's soft shadow.
 
         Returns:
             View name -> uint8 [H, W, 3]. A view without a photograph gets a rendering of the Gaussians with the object.
         """
-        return exposure.load_normalized_views(self.poses, self.fit, list(names))
+        photos = exposure.load_normalized_views(self.poses, self.fit, list(names))
+        shaded = [self.scene.cameras[name] for name in photos if self.shadow and name not in self.scene.clean]
+        for view in render_depth_views(self.gaussians, shaded, {each.name: self.hidden(each.name) for each in shaded}):
+            photos[view.camera.name] = self.shadow.remove_from_photo(photos[view.camera.name], view.camera, view.depth)
+        return photos
 
     def hidden(self, name: str) -> np.ndarray:
         """Return bool [H, W], the pixels where a view's photograph shows the object.
@@ -138,7 +153,7 @@ class Workspace:
         for name in scene.blank:
             everything = np.ones_like(hidden[name])
             nothing = np.zeros((1, 1, 3), np.uint8)
-            photos[name] = inpaint.composite_background(self.gaussians, scene.cameras[name], nothing, everything)
+            photos[name] = inpaint.composite_background(self.lit_gaussians, scene.cameras[name], nothing, everything)
         return Background(
             render_depth_views(self.gaussians, [scene.cameras[name] for name in names], hidden),
             photos,

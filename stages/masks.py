@@ -37,6 +37,7 @@ from reffusion.masks import consolidation, frame_check, voting
 from reffusion.masks.debris import find_debris
 from reffusion.masks.regions import FillRequest, Region
 from reffusion.masks.remnants import Remnant, find_remnants
+from reffusion.masks.soft_shadow import SoftShadow, find_soft_shadow
 from reffusion.params.masks import Params
 from reffusion.types import Camera, Gaussians, Scene
 from reffusion.workspace import SURFACES
@@ -52,7 +53,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
 
     - labels.npy, bool [N]: the Gaussians to remove, which are the object's and debris;
     - debris.npy, bool [N], if debris is searched: Gaussians that the object had hidden and that no photograph supports;
-    - background.npz: planes and mirror planes around the object;
+    - background.npz: planes and mirror planes around the object, and its soft shadow if one is found;
     - raw/, consistent/, unobserved/ and invent/<view>.png: the pixel classes;
     - facts.json;
     - warnings.json and remnants/<number>.png, if the masks seem to leave out parts of the object.
@@ -94,6 +95,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     background = Background(views, {}, points=scene.points).with_planes(gaussians, labels)
     photos = exposure.load_normalized_views(poses, fit, scene.train) if background.planes or params.debris else {}
     background = replace(background, photos=photos)
+    shadow = find_shadow(params, background, gaussians.means[labels], scene)
     if params.debris and (raw or deleted is not None):
         debris = find_debris(gaussians, labels, views, hidden, photos)
         save_labels(out / "debris.npy", debris.cpu())
@@ -106,7 +108,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     share = consolidation.unobserved_share(sets, repainted)
     sets = consolidation.drop_negligible(params, sets, repainted, fill)
     save_labels(out / "labels.npy", labels.cpu())
-    save_arrays(out / SURFACES, surfaces_to_arrays(background))
+    save_arrays(out / SURFACES, surfaces_to_arrays(background) | (shadow.to_arrays() if shadow else {}))
     save_mask_sets(out, sets)
     invent = {name: each.invent for name, each in sets.items()}
     facts = {
@@ -120,9 +122,28 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
         "invent_views": [name for name in repainted if invent[name].any()],
         "best_reference": voting.best_view(invent, scene.train),
         "remnants": [{"removed": each.would_float, "share": each.share, "view": each.view} for each in remnants],
+        "shadow": shadow and float(1 - np.exp(shadow.log_light.min())),
         "region": region and {"center": list(region.center), "size": list(region.size)},
     }
     save_json(out / "facts.json", facts)
+
+
+def find_shadow(params: Params, background: Background, object_means: Tensor, scene: Scene) -> SoftShadow | None:
+    """Find the object's soft shadow, which no mask contains, and print a line if there is one.
+
+    Args:
+        background: with the photographs and the planes around the object.
+        object_means: [N, 3], the centers of the object's Gaussians.
+        scene: names the views that were photographed without the object, and so without its shadow.
+    """
+    if not params.shadows or not background.planes:
+        return None
+    shaded = {name: photo for name, photo in background.photos.items() if name not in scene.clean}
+    shadow = find_soft_shadow(replace(background, photos=shaded), object_means)
+    if shadow:
+        darkest = 1 - np.exp(shadow.log_light.min())
+        print(f"the object's shadow, up to {darkest:.0%} darker, is removed (masks.shadows=false keeps it)", flush=True)
+    return shadow
 
 
 def report_remnants(remnants: Sequence[Remnant], out: Path, photo_of: Callable[[str], np.ndarray]) -> None:

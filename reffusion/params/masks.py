@@ -47,6 +47,10 @@ class Params(Settings):
         description="find parts of the object that the masks leave out: remove those that would float in the air, and "
         "warn of the others",
     )
+    shadows: bool = Field(
+        True,
+        description="find the object's soft shadow, which no mask contains, and remove it from photographs and scene",
+    )
     # PAPER leaves open: the paper always invents. If so few pixels are unobserved, they are rims of masks and crevices,
     # which are not worth a diffusion model.
     negligible: float = Field(

@@ -1,0 +1,287 @@
+"""Detection and removal of the object's soft shadow, where no reference shows the scene without it.
+
+A shadow changes the light smoothly, whatever the texture below it, whereas borders of materials are sharp. The light is
+therefore estimated on the plane on which the object stands: a smooth function whose differences between neighbouring
+cells follow those of the logarithmic brightness in most cells, but not across sharp borders. The dark region of this
+function is taken for the object's shadow only if it lies beside the object, is surrounded by lit cells, and darkens
+all colours about equally. Weak shadows are left as they are, because a stain looks the same.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import numpy as np
+import torch
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from reffusion import geometry
+from reffusion.background.model import Background
+from reffusion.background.plane import Plane
+from reffusion.inpaint.plane_frames import label_planes
+from reffusion.masks.shadows import DARK_OFFSET, relight
+from reffusion.splat.conventions import SH0
+from reffusion.types import Camera, Gaussians
+
+CELLS, CELL = 64, 1 / 8  # side of the map in cells; side of a cell in radii of the object
+FINE = 4  # parts into which the side of a cell is divided; the brightness of a cell is the median of its parts
+MAX_VIEWS, MAX_WIDTH = 24, 640  # number of views whose pixels are used, and columns of them at most
+MIN_VIEWS = 2  # number of views that must show a cell
+MIN_PARTS = 1 / 3  # share of a cell's parts that must be seen
+NEAR, MIN_NEAR = 0.3, 0.03  # radii; a plane is a candidate if this share of the object's Gaussians is so near
+
+# Weights of the terms of `_smooth_light`. With the stiff ones, hardly anything but a shadow is dark. The soft ones
+# follow the shadow more closely, and are used once a shadow is found.
+STIFF, SOFT = (3.0, 2.0), (0.7, 3.0)  # weight of the second differences; clipping of first differences, in deviations
+# A smooth function with clipped differences is too flat: without this factor, a lifted shadow stays too dark.
+GAIN = 1.1
+LIT_DISTANCE = 3.0  # radii from the object's middle beyond which there is no shadow
+LIT_WEIGHT, PRIOR_WEIGHT = 0.05, 3e-5  # weights of the squared log light, beyond that distance and within it
+# Standard deviation of the texture's differences from cell to cell, at least. On a floor without texture, the edges of
+# a soft shadow would else count as borders of materials.
+MIN_DEVIATION = 0.05
+ITERATIONS = 30  # of the reweighting
+
+DARK = 0.08  # log light below which a cell is dark
+MIN_DEPTH, MIN_VOLUME = 0.4, 0.8  # log light of the darkest cell; sum of log light over cells, times squared radii
+CORE, MAX_CORE_DISTANCE = 0.7, 0.25  # cells this share of the darkest one; their distance in radii from hidden cells
+MAX_TINT = 0.35  # spread of the channels' log light, relative to their mean
+MAX_HIDDEN = 1.2  # radii from the object's middle: unseen cells up to there are hidden by the object
+MIN_LIT = 0.4  # share of the cells around the shadow that are seen
+FADE = (0.15, 0.45)  # radii: a point up to the first height above the plane is in the shadow, above the second is not
+EDGE = 0.03  # log light below which the shadow's rim ends
+
+
+@dataclass(frozen=True)
+class SoftShadow:
+    """The light that a soft shadow leaves on a plane.
+
+    Attributes:
+        normal: [3], unit normal of the plane.
+        center: [3], the point of the plane below the middle of the map.
+        axes: [2, 3], unit vectors of the map's rows and columns.
+        cell_size: side of a cell, in world units.
+        fade: [2] heights over the plane in world units; up to the first the shadow is complete, from the second none.
+        log_light: [CELLS, CELLS], logarithm of the brightness relative to that without the shadow, at most 0.
+        tint: [3], the log light of each colour channel divided by `log_light`.
+    """
+
+    normal: np.ndarray
+    center: np.ndarray
+    axes: np.ndarray
+    cell_size: float
+    fade: np.ndarray
+    log_light: np.ndarray
+    tint: np.ndarray
+
+    def log_light_at(self, points: np.ndarray) -> np.ndarray:
+        """Return [P, 3], the log light of each colour channel at world points [P, 3]; 0 outside the shadow."""
+        offset = points - self.center
+        at = offset @ self.axes.T / self.cell_size + (CELLS - 1) / 2
+        on_plane = ndimage.map_coordinates(self.log_light, at.T, order=1, mode="constant", cval=0.0)
+        low, high = self.fade
+        share = np.clip((high - np.abs(offset @ self.normal)) / (high - low), 0, 1)
+        return (on_plane * share)[:, None] * self.tint
+
+    def remove_from_photo(self, photo: np.ndarray, camera: Camera, depth: np.ndarray) -> np.ndarray:
+        """Return a photograph, uint8 [H, W, 3], without the shadow.
+
+        Args:
+            photo: uint8 [H, W, 3].
+            camera: its view.
+            depth: [H, W], camera z of what it shows; 0 where unknown. There the photograph stays the same.
+        """
+        known = depth > 0
+        light = np.zeros((*depth.shape, 3))
+        light[known] = -self.log_light_at(geometry.unproject(np.where(known, depth, 1.0), camera)[known])
+        return relight(photo, light)
+
+    def remove_from_gaussians(self, gaussians: Gaussians) -> Gaussians:
+        """Return the Gaussians with the colours that they have without the shadow."""
+        light = self.log_light_at(gaussians.means.detach().double().cpu().numpy())
+        gain = torch.from_numpy(np.exp(-light)).to(gaussians.sh)[:, None, :]
+        offset = DARK_OFFSET / 255
+        sh = gaussians.sh * gain
+        sh[:, 0] += (gain[:, 0] - 1) * (0.5 + offset) / SH0
+        return replace(gaussians, sh=sh)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Return the attributes as arrays, for a file that `from_arrays` reads."""
+        return {f"shadow_{each.name}": np.asarray(getattr(self, each.name)) for each in fields(self)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Self | None:
+        """Return the shadow that `to_arrays` stored among `arrays`; None if there is none."""
+        if "shadow_normal" not in arrays:
+            return None
+        values: dict[str, Any] = {each.name: arrays[f"shadow_{each.name}"] for each in fields(cls)}
+        return cls(**values)
+
+
+def find_soft_shadow(background: Background, object_means: Tensor) -> SoftShadow | None:
+    """Find the soft shadow that the object casts on the plane on which it stands.
+
+    Args:
+        background: the photographs and the planes around the object.
+        object_means: [N, 3], the centers of the object's Gaussians.
+
+    Returns:
+        The shadow with the largest sum of log light; None if there is none.
+    """
+    means = object_means.detach().double().cpu().numpy()
+    best, best_volume = None, MIN_VOLUME
+    for index, plane in enumerate(background.planes, start=1):
+        heights = np.abs(means @ plane.normal - plane.offset) / background.radius
+        if (heights < NEAR).mean() < MIN_NEAR:
+            continue
+        brightness = _cell_brightness(background, index)
+        seen = np.isfinite(brightness[..., 0])
+        light = _smooth_light(brightness, seen, *STIFF)
+        region = _find_region(light, seen)
+        if region is None or (volume := -light[region].mean(1).sum() * CELL**2) < best_volume:
+            continue
+        best, best_volume = _make_shadow(background, plane, brightness, seen, region), volume
+    return best
+
+
+def _cell_brightness(background: Background, index: int) -> np.ndarray:
+    """Return [CELLS, CELLS, 3], the logarithmic brightness of a plane's cells in the photographs; NaN where unseen.
+
+    A cell's brightness is the median over its parts, and that of a part the median over views, so that neither joints
+    of planks nor shine counts.
+
+    Args:
+        index: position of the plane in `background.planes`, counted from 1.
+    """
+    plane, views = background.planes[index - 1], [v for v in background.views if v.camera.name in background.photos]
+    views = [view for view in views if view.camera.name not in background.without_photo]
+    side, samples = CELLS * FINE, []
+    for view in views[:: -(-len(views) // MAX_VIEWS)]:
+        every = max(1, view.camera.width // MAX_WIDTH)
+        chosen = (label_planes(view.depth, view.camera, background.planes) == index) & ~view.masked
+        chosen[np.arange(chosen.shape[0]) % every != 0] = False
+        chosen[:, np.arange(chosen.shape[1]) % every != 0] = False
+        points = geometry.unproject(view.depth, view.camera)[chosen]
+        cells = _map_index(points, background, plane) * FINE
+        inside = ((cells >= 0) & (cells < side)).all(1)
+        row, column = cells[inside].astype(np.int64).T
+        colors = np.log(background.photos[view.camera.name][chosen][inside].astype(np.float32) + DARK_OFFSET)
+        at = row * side + column
+        count = np.bincount(at, minlength=side * side)
+        total = np.stack([np.bincount(at, channel, side * side) for channel in colors.T], 1)
+        with np.errstate(invalid="ignore"):
+            samples.append((total / count[:, None]).astype(np.float32))
+    views_of_part = np.isfinite([sample[:, 0] for sample in samples]).sum(0)
+    in_cells = lambda x: x.reshape(CELLS, FINE, CELLS, FINE, -1).swapaxes(1, 2).reshape(CELLS, CELLS, FINE**2, -1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a cell that no view shows has no median
+        brightness = np.nanmedian(in_cells(np.nanmedian(samples, axis=0)), 2)
+    parts = in_cells(views_of_part)[..., 0]
+    seen = ((parts > 0).mean(2) > MIN_PARTS) & (parts.max(2) >= MIN_VIEWS)
+    return np.where(seen[..., None], brightness, np.nan)
+
+
+def _map_index(points: np.ndarray, background: Background, plane: Plane) -> np.ndarray:
+    """Return [P, 2], the coordinates of world points [P, 3] on the map of a plane, in cells; cell 0 is [0, 1)."""
+    return (points - background.center) @ plane.axes.T / (CELL * background.radius) + CELLS / 2
+
+
+def _smooth_light(brightness: np.ndarray, seen: np.ndarray, stiffness: float, clip: float) -> np.ndarray:
+    """Return [CELLS, CELLS, 3], the smooth log light of each channel; 0 where unseen.
+
+    The light L minimises sum w (dL - dB)^2 + stiffness sum (d2L)^2 + sum a L^2, where B is the brightness, d is the
+    difference of neighbouring cells and d2 the second difference. The weights w are small where dL and dB differ by
+    more than `clip` standard deviations of dB, as at the border of two materials; they are those of the mean channel.
+    The weights a keep L at 0 far from the object.
+
+    Args:
+        brightness: [CELLS, CELLS, 3], see `_cell_brightness`.
+        seen: bool [CELLS, CELLS], True where it is known.
+    """
+    light = np.zeros((CELLS, CELLS, 3))
+    number = np.where(seen, np.cumsum(seen).reshape(seen.shape) - 1, -1)
+    first = sparse.vstack([_difference(number, [[-1.0], [1.0]]), _difference(number, [[-1.0, 1.0]])]).tocsr()
+    if not first.shape[0]:
+        return light
+    curvature = [[[1.0], [-2.0], [1.0]], [[1.0, -2.0, 1.0]], np.sqrt(2) * np.array([[1.0, -1.0], [-1.0, 1.0]])]
+    second = sparse.vstack([_difference(number, stencil) for stencil in curvature])
+    values = brightness[seen].astype(np.float64)
+    steps = first @ values
+    deviation = max(1.4826 * np.median(np.abs(steps.mean(1))), MIN_DEVIATION)
+    distance = np.hypot(*(np.indices(seen.shape) - (CELLS - 1) / 2))[seen] * CELL
+    prior = sparse.diags(np.where(distance > LIT_DISTANCE, LIT_WEIGHT, PRIOR_WEIGHT))
+    fixed = stiffness * (second.T @ second) + prior
+    weights = np.ones(len(steps))
+    for _ in range(ITERATIONS):
+        solver = splu((first.T @ sparse.diags(weights) @ first + fixed).tocsc())
+        misfit = first @ solver.solve(first.T @ (weights * steps.mean(1))) - steps.mean(1)
+        weights = (1 + (misfit / (clip * deviation)) ** 2) ** -2.0
+    light[seen] = solver.solve(first.T @ (weights[:, None] * steps))
+    return light
+
+
+def _difference(number: np.ndarray, stencil: list[list[float]] | np.ndarray) -> sparse.csr_matrix:
+    """Return the sparse matrix that applies a stencil at each place where all its cells are numbered.
+
+    Args:
+        number: int [CELLS, CELLS], position of each cell in the vector; -1 for cells that are not in it.
+        stencil: [h, w].
+    """
+    stencil = np.asarray(stencil)
+    height, width = stencil.shape
+    windows = np.lib.stride_tricks.sliding_window_view(number, (height, width)).reshape(-1, height * width)
+    windows = windows[(windows >= 0).all(1)]
+    rows = np.repeat(np.arange(len(windows)), stencil.size)
+    data = np.tile(stencil.reshape(-1), len(windows))
+    return sparse.csr_matrix((data, (rows, windows.reshape(-1))), (len(windows), int(number.max()) + 1))
+
+
+def _find_region(light: np.ndarray, seen: np.ndarray) -> np.ndarray | None:
+    """Return bool [CELLS, CELLS], the dark cells that are the object's shadow; None if there is no shadow.
+
+    Args:
+        light: [CELLS, CELLS, 3], the stiff light.
+        seen: bool [CELLS, CELLS], the cells that photographs show.
+    """
+    mean = light.mean(2)
+    parts, count = ndimage.label(mean < -DARK)
+    if not count:
+        return None
+    volumes = ndimage.sum(-mean, parts, np.arange(1, count + 1)) * CELL**2
+    region = parts == 1 + int(np.argmax(volumes))
+    center_distance = np.hypot(*(np.indices(seen.shape) - (CELLS - 1) / 2)) * CELL
+    hidden = ~seen & (center_distance < MAX_HIDDEN)
+    if volumes.max() < MIN_VOLUME or mean[region].min() > -MIN_DEPTH or not hidden.any():
+        return None
+    core = region & (mean < CORE * mean[region].min())
+    around = ndimage.binary_dilation(region) & ~region & ~hidden
+    tint = light[region].mean(0)
+    near = (ndimage.distance_transform_edt(~hidden) * CELL)[core].min() <= MAX_CORE_DISTANCE
+    lit = seen[around].mean() >= MIN_LIT if around.any() else False
+    return region if near and lit and np.ptp(tint) <= MAX_TINT * abs(tint.mean()) else None
+
+
+def _make_shadow(
+    background: Background, plane: Plane, brightness: np.ndarray, seen: np.ndarray, region: np.ndarray
+) -> SoftShadow:
+    """Return the shadow of the given region: the soft light there, and the colours of the region.
+
+    Cells that no photograph shows take the value of the nearest cell that one shows.
+    """
+    soft = _smooth_light(brightness, seen, *SOFT)
+    tint = soft[region].mean(0)
+    mean = GAIN * np.minimum(soft.mean(2), 0)
+    parts, _ = ndimage.label(mean < -EDGE)
+    whole = np.isin(parts, np.unique(parts[region & (mean < -EDGE)]))
+    mean = np.where(whole, mean, 0)
+    nearest = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
+    foot = background.center - (background.center @ plane.normal - plane.offset) * plane.normal
+    fade = np.array(FADE) * background.radius
+    return SoftShadow(
+        plane.normal, foot, plane.axes, CELL * background.radius, fade, mean[tuple(nearest)], tint / tint.mean()
+    )
