@@ -12,6 +12,7 @@ A furnished room is ray-cast with and without one object. Kinds:
   corner  an object in front of the corner of a projecting wall: behind the object the depth has a step
   pair    two objects side by side, each with masks of its own, and two references
   sparse  nothing to remove; only four training views have pixels, the others are cameras
+  past    demo with test views that are turned away, so that they look past what training views show
   grass   an object on a lawn in front of a hedge: thousands of blades and leaves, nothing flat
   insert  an object on the floor that only the test views and four references show, and that is to be inserted
   outpaint  the room as photographed, and a sphere beyond which references continue it

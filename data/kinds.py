@@ -35,6 +35,8 @@ class Kind:
             removed or inserted, but few views have pixels.
         references: number of references in the scene's folder for the tasks "remove" (none if the object hangs) and
             "insert". For "outpaint" there are as many as are needed to show everything, for "sparse" there are `shown`.
+        past: share of the picture's width by which test views are turned away, in random directions, so that they look
+            past what training views show.
         shown: for the task "sparse" the number of training views with pixels; the other training views are cameras
             only. 0 for all other tasks, in which all training views have pixels.
         least: smallest allowed mean share of the masks whose background no training view shows, in [0, 1]. It is
@@ -60,6 +62,7 @@ class Kind:
     low: float | None = None
     references: int = 1
     shown: int = 0
+    past: float = 0.0
 
     @property
     def is_circle(self) -> bool:
@@ -76,6 +79,7 @@ KINDS = {
     "seen": Kind(spread=34.0, hangs=True),
     "behind": Kind(spread=50.0, place="behind"),
     "table": Kind(spread=34.0, place="table", least=0.05, low=0.45),
+    "past": Kind(past=0.15),
     "corner": Kind(spread=30.0, place="corner", least=0.25),
     "grass": Kind(samples=2, spread=30.0, node=0.08, place="grass"),
     "insert": Kind(place="floor", task="insert", least=0, references=4),

@@ -119,11 +119,29 @@ def path(seed: int, kind: Kind, target: np.ndarray, count: int, label: str) -> n
     roll = np.radians(draw.normal(0, 1.2, count))
     focal = kind.width * (0.82 if kind.is_circle else 0.85)
     bend = kind.bend * randomness(seed, "lens").uniform(0.7, 1.0)
+    if kind.past and label == "test":
+        aim = _turn_away(center, aim, kind.past * kind.width / focal, randomness(seed, "past"))
     cameras = np.empty((count, 16))
     for k in range(count):
         turn = _look_at(aim[k] - center[k], roll[k])
         cameras[k] = focal, kind.width / 2, kind.height / 2, bend, *turn.ravel(), *center[k]
     return cameras
+
+
+def _turn_away(center: np.ndarray, aim: np.ndarray, slope: float, draw: np.random.Generator) -> np.ndarray:
+    """Return other points [V, 3] to look at, so that each camera is turned in a random direction.
+
+    Args:
+        center: [V, 3], the cameras.
+        aim: [V, 3], the points that they look at.
+        slope: tangent of the angle by which a camera turns.
+    """
+    ahead = aim - center
+    right = np.cross(ahead, [0.0, 1.0, 0.0])
+    right *= np.linalg.norm(ahead, axis=1, keepdims=True) / np.linalg.norm(right, axis=1, keepdims=True)
+    up = np.cross(right, ahead) / np.linalg.norm(ahead, axis=1, keepdims=True)
+    angle = draw.uniform(0, 2 * np.pi, (len(aim), 1))
+    return aim + slope * (np.cos(angle) * right + np.sin(angle) * up)
 
 
 def _middle(cameras: np.ndarray, kind: Kind) -> int:

@@ -59,6 +59,11 @@ class Camera:
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
+    def shrunk(self, longest: int) -> Camera:
+        """Return the view at a reduced resolution, with no side above `longest` px; small views stay the same."""
+        share = min(1.0, longest / max(self.width, self.height))
+        return self.resized(max(1, round(self.width * share)), max(1, round(self.height * share)))
+
     def sampled(self, every: int, left: int, top: int) -> Camera:
         """Return the view that consists of every `every`-th pixel of this view in both directions.
 

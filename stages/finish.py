@@ -1,10 +1,11 @@
-"""The stage `finish`: the final Gaussians get a backdrop behind the scene, and are written as `scene.ply`."""
+"""The stage `finish`: the final Gaussians are continued beyond the capture, and are written as `scene.ply`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from reffusion.background.backdrop import complete_scene
+from reffusion.inpaint.plane_extension import extend_planes
 from reffusion.io.arrays import save_json
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_scene
@@ -24,10 +25,10 @@ def run(
     """Run the stage: write scene.ply, in the scene's own frame, and facts.json.
 
     The result is that of `distill`; if this stage was skipped, that of `initialize`; and if both were skipped, that of
-    `fit`. With `params.backdrop`, scene.ply is the result with a backdrop. Gaussians that the scene brings get no
-    backdrop, because they may cover places that its views do not show. If a backdrop is added, the result with backdrop
-    is also written in the normalised frame, as completed/<name of the stage that made it>.ply, and the initialization
-    with the same backdrop as completed/initialize.ply.
+    `fit`. With `params.backdrop`, planes go on beyond the training views, and a backdrop closes the scene. Gaussians
+    that the scene brings get neither, because they may cover places that its views do not show. If they are added, the
+    result with them is also written in the normalised frame, as completed/<name of the stage that made it>.ply, and the
+    initialization with the same additions as completed/initialize.ply.
 
     Args:
         out: folder of this stage.
@@ -45,7 +46,9 @@ def run(
         # count as training views.
         views = (*scene.train, *scene.blank) if reference else scene.train
         stages = [stage for stage in dict.fromkeys((result, "initialize")) if stage in gaussians]
-        completed = complete_scene([gaussians[stage] for stage in stages], [scene.cameras[name] for name in views])
+        cameras = [scene.cameras[name] for name in views]
+        extension = extend_planes(gaussians[result], cameras)
+        completed = complete_scene([gaussians[stage] for stage in stages], cameras, extension)
         gaussians |= dict(zip(stages, completed, strict=True))
         for stage in stages:
             save_ply(out / "completed" / f"{stage}.ply", gaussians[stage])

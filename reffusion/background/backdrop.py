@@ -49,8 +49,8 @@ class Patches(NamedTuple):
     blur: np.ndarray
 
 
-def complete_scene(scenes: Sequence[Gaussians], cameras: Sequence[Camera]) -> list[Gaussians]:
-    """Return each scene with its unsupported Gaussians removed and the backdrop of the first scene appended.
+def complete_scene(scenes: Sequence[Gaussians], cameras: Sequence[Camera], extension: Gaussians) -> list[Gaussians]:
+    """Return each scene without its unsupported Gaussians, with an extension and the backdrop of the first scene.
 
     A Gaussian is supported if its blending weight, summed over all pixels of the training views, exceeds `SUPPORT`. For
     each scene this is the weight in its own renderings. The training views look the same as before: the removed
@@ -59,14 +59,17 @@ def complete_scene(scenes: Sequence[Gaussians], cameras: Sequence[Camera]) -> li
     Args:
         scenes: states of one scene (e.g. after `distill` and after `initialize`), the final state first.
         cameras: the training views.
+        extension: Gaussians beyond what the training views show, e.g. of planes that go on there
+            (`inpaint.plane_extension`); there may be none.
 
     Returns:
-        The completed scenes, in the order of `scenes`: first the supported Gaussians in their order, then the backdrop.
-        The scenes are returned unchanged if there are no cameras, or if the first scene shows nothing in them.
+        The completed scenes, in the order of `scenes`: first the supported Gaussians in their order, then the extension
+        and the backdrop. The scenes are returned unchanged if there are no cameras, or if the first scene shows nothing
+        in them.
     """
     if not cameras:
         return list(scenes)
-    small = [shrink_camera(camera, LONGEST) for camera in cameras]
+    small = [camera.shrunk(LONGEST) for camera in cameras]
     pixels = [full.width * full.height / (s.width * s.height) for full, s in zip(cameras, small, strict=True)]
     supported = [blending_weights(gaussians, small, pixels) > SUPPORT for gaussians in scenes]
     kept = [gaussians.map(lambda p, stays=stays: p[stays]) for gaussians, stays in zip(scenes, supported, strict=True)]
@@ -74,8 +77,11 @@ def complete_scene(scenes: Sequence[Gaussians], cameras: Sequence[Camera]) -> li
     if not len(kept[0]) or not len(patches.colors):
         return list(scenes)
     removed = scenes[0].map(lambda p: p[~supported[0]])
-    behind = build_backdrop(kept, cameras, concatenate([patches, patches_outside_views(removed, cameras)]))
-    return [each.zip_map(behind, lambda a, b: torch.cat([a, b.to(a)])) for each in kept]
+    colored = concatenate([patches, patches_outside_views(removed, cameras)])
+    join = lambda first, second: first.zip_map(second, lambda a, b: torch.cat([a, b.to(a)]))
+    extended = [join(each, extension) for each in kept]
+    behind = build_backdrop(extended, cameras, colored)
+    return [join(each, behind) for each in extended]
 
 
 def blending_weights(gaussians: Gaussians, cameras: Sequence[Camera], pixels: Sequence[float]) -> torch.Tensor:
@@ -129,12 +135,6 @@ def patches_outside_views(gaussians: Gaussians, cameras: Sequence[Camera]) -> Pa
 def concatenate(patches: Sequence[Patches]) -> Patches:
     """Concatenate several sets of patches."""
     return Patches(*(np.concatenate(column) for column in zip(*patches, strict=True)))
-
-
-def shrink_camera(camera: Camera, longest: int) -> Camera:
-    """Return the view at a reduced resolution, with no side longer than `longest` px; small views stay as they are."""
-    share = min(1.0, longest / max(camera.width, camera.height))
-    return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
 
 
 def _blocks(camera: Camera, color: np.ndarray, alpha: np.ndarray) -> Patches:

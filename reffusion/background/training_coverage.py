@@ -13,7 +13,6 @@ import torch
 from scipy import ndimage
 
 from reffusion import geometry
-from reffusion.background.backdrop import shrink_camera
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
@@ -58,7 +57,7 @@ def render_coverage_views(
     """
     views = []
     for camera in cameras:
-        small = shrink_camera(camera, LONGEST)
+        small = camera.shrunk(LONGEST)
         hidden = np.zeros((small.height, small.width), bool)
         if camera.name in masks:
             centers = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in (small.width, small.height))), -1)

@@ -10,7 +10,7 @@ from reffusion.params.base import Device, Settings
 class Params(Settings):
     backdrop: bool = Field(
         True,
-        description="close the scene by a soft backdrop where no training view looked, and remove the Gaussians "
-        "that no training view supports",
+        description="where no training view looked, continue planes and close the scene by a soft backdrop; remove the "
+        "Gaussians that no training view supports",
     )
     device: Device = Field("cpu", description="where the training views are rendered")
