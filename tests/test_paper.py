@@ -86,6 +86,7 @@ ABSENT = {
     "masks.inside_share": 1,
     "masks.debris": False,
     "masks.remnants": False,
+    "masks.shadows": False,
     "masks.negligible": 0,
     "personalize.samples.hole_share": 0,
     "personalize.samples.outside_weight": 1,
