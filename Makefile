@@ -108,7 +108,7 @@ $(VENV)/.lpips: | $(VENV)/.ready
 # --------------------------------------------------------------------------------------------------------- scenes
 
 # Generated scenes: `demo` and `demo-<kind>`, with or without `-<seed>`.
-kinds := photos wide 360 seen behind table corner grass insert outpaint pair sparse
+kinds := photos wide 360 beside past seen behind table corner grass insert outpaint pair sparse
 # Their names are parts of recipes, so that they may have these characters only.
 plain := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 -
 rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)

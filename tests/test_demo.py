@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +16,9 @@ from reffusion.io import colmap
 from reffusion.io.images import load_image, load_mask
 
 pytestmark = pytest.mark.integration
+
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def png_stems(folder: Path) -> list[str]:
@@ -225,3 +230,23 @@ def test_the_photos_layout_has_no_poses(generate, tmp_path):
     generate.generate(tmp_path / "photos", 7, kind)
     assert png_stems(tmp_path / "photos/images") == png_stems(tmp_path / "photos/masks")
     assert sorted(p.name for p in (tmp_path / "photos").iterdir()) == ["images", "masks", "truth"]
+
+
+def test_make_knows_every_kind_by_its_name(generate, tmp_path):
+    (tmp_path / ".ready").touch()
+    for kind in generate.KINDS.keys() - {"demo", "mini"}:
+        words = ["make", "-n", "-C", str(ROOT), f"VENV={tmp_path}", f"data/demo-{kind}-3/.generated"]
+        recipe = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+        assert f"--out data/demo-{kind}-3 --kind {kind} --seed 3" in recipe
+
+
+def test_views_that_look_past_differ_from_the_demo_in_direction_alone(generate):
+    photographs = importlib.import_module("photographs")
+    demo, past = generate.KINDS["mini"], replace(generate.KINDS["mini"], past=0.15)
+    target = np.array([0.0, 1.0, 0.0])
+    assert (photographs.path(0, demo, target, 8, "train") == photographs.path(0, past, target, 8, "train")).all()
+    cameras, turned = (photographs.path(0, kind, target, 8, "test") for kind in (demo, past))
+    assert (cameras[:, [0, 1, 2, 3, 13, 14, 15]] == turned[:, [0, 1, 2, 3, 13, 14, 15]]).all()
+    axes, turned_axes = (each[:, 4:13].reshape(-1, 3, 3)[:, :, 2] for each in (cameras, turned))
+    tangent = np.tan(np.arccos((axes * turned_axes).sum(1)))
+    assert np.allclose(tangent, 0.15 * demo.width / cameras[:, 0], rtol=1e-6)
