@@ -87,7 +87,8 @@ class Workspace:
     @cached_property
     def shadow(self) -> SoftShadow | None:
         """The object's soft shadow, which no mask contains; None if the stage `masks` found none."""
-        return SoftShadow.from_arrays(load_arrays(self.masks / SURFACES))
+        path = self.masks / SURFACES
+        return SoftShadow.from_arrays(load_arrays(path)) if path.exists() else None
 
     @cached_property
     def mask_sets(self) -> dict[str, MaskSet]:

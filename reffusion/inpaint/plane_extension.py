@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from scipy import ndimage
@@ -224,10 +223,9 @@ def _map_plane(
         frontal = np.abs(ray @ normal) / np.linalg.norm(ray, axis=1) ** 3  # cosine over the squared distance
         better = shows & (frontal > best)
         best[better] = frontal[better]
-        at = (uv[better] - 0.5).astype(np.float32)[None]
-        color[better] = cv2.remap(
-            view.color, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )[0]
+        at = uv[better, ::-1].T - 0.5
+        bilinear = lambda channel, at=at: ndimage.map_coordinates(channel, at, order=1, mode="nearest")
+        color[better] = np.stack([bilinear(channel) for channel in np.moveaxis(view.color, -1, 0)], 1)
     reshape = lambda values: values.reshape(height, width, *values.shape[1:])
     return replace(plane_map, color=reshape(color), seen=reshape((seen > free) & (best > 0))), reshape(framed)
 
