@@ -77,11 +77,11 @@ class Workspace:
     @cached_property
     def remaining(self) -> Gaussians:
         """The remaining Gaussians: those of the scene without the object, its shadow, and debris."""
-        return self.lit_gaussians.map(lambda p: p[~self.labels])
+        return self.shadowless_gaussians.map(lambda p: p[~self.labels])
 
     @cached_property
-    def lit_gaussians(self) -> Gaussians:
-        """The N Gaussians of the whole scene in the light that they have without the object's shadow."""
+    def shadowless_gaussians(self) -> Gaussians:
+        """The N Gaussians of the whole scene, with the colours that they have without the object's soft shadow."""
         return self.shadow.remove_from_gaussians(self.gaussians) if self.shadow else self.gaussians
 
     @cached_property
@@ -107,9 +107,13 @@ class Workspace:
             View name -> uint8 [H, W, 3]. A view without a photograph gets a rendering of the Gaussians with the object.
         """
         photos = exposure.load_normalized_views(self.poses, self.fit, list(names))
-        shaded = [self.scene.cameras[name] for name in photos if self.shadow and name not in self.scene.clean]
-        for view in render_depth_views(self.gaussians, shaded, {each.name: self.hidden(each.name) for each in shaded}):
-            photos[view.camera.name] = self.shadow.remove_from_photo(photos[view.camera.name], view.camera, view.depth)
+        if shadow := self.shadow:
+            cameras = [self.scene.cameras[name] for name in photos if name not in self.scene.clean]
+            for view in render_depth_views(
+                self.gaussians, cameras, {each.name: self.hidden(each.name) for each in cameras}
+            ):
+                name = view.camera.name
+                photos[name] = shadow.remove_from_photo(photos[name], view.camera, view.depth)
         return photos
 
     def hidden(self, name: str) -> np.ndarray:
@@ -154,7 +158,9 @@ class Workspace:
         for name in scene.blank:
             everything = np.ones_like(hidden[name])
             nothing = np.zeros((1, 1, 3), np.uint8)
-            photos[name] = inpaint.composite_background(self.lit_gaussians, scene.cameras[name], nothing, everything)
+            photos[name] = inpaint.composite_background(
+                self.shadowless_gaussians, scene.cameras[name], nothing, everything
+            )
         return Background(
             render_depth_views(self.gaussians, [scene.cameras[name] for name in names], hidden),
             photos,

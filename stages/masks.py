@@ -138,8 +138,8 @@ def find_shadow(params: Params, background: Background, object_means: Tensor, sc
     """
     if not params.shadows or not background.planes:
         return None
-    shaded = {name: photo for name, photo in background.photos.items() if name not in scene.clean}
-    shadow = find_soft_shadow(replace(background, photos=shaded), object_means)
+    with_object = {name: photo for name, photo in background.photos.items() if name not in scene.clean}
+    shadow = find_soft_shadow(replace(background, photos=with_object), object_means)
     if shadow:
         darkest = 1 - np.exp(shadow.log_light.min())
         print(f"the object's shadow, up to {darkest:.0%} darker, is removed (masks.shadows=false keeps it)", flush=True)

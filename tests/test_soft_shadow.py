@@ -1,6 +1,7 @@
 """The object's soft shadow, found without a reference: a box on a tiled floor, in analytic views."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -122,3 +123,12 @@ def far_shadow(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("color", [tiles, rug, stain, far_shadow], ids=lambda color: color.__name__)
 def test_what_is_no_shadow_of_the_object_stays(color):
     assert find_soft_shadow(background(color), MEANS) is None
+
+
+def test_without_photographs_there_is_no_shadow(shaded):
+    assert find_soft_shadow(replace(shaded, photos={}), MEANS) is None
+
+
+def test_a_plane_that_no_view_shows_has_no_shadow(shaded):
+    nothing = [replace(view, depth=np.zeros_like(view.depth)) for view in shaded.views]
+    assert find_soft_shadow(replace(shaded, views=nothing), MEANS) is None

@@ -77,10 +77,10 @@ def complete_scene(scenes: Sequence[Gaussians], cameras: Sequence[Camera], exten
     if not len(kept[0]) or not len(patches.colors):
         return list(scenes)
     removed = scenes[0].map(lambda p: p[~supported[0]])
-    colored = concatenate([patches, patches_outside_views(removed, cameras)])
+    patches = concatenate([patches, patches_outside_views(removed, cameras)])
     join = lambda first, second: first.zip_map(second, lambda a, b: torch.cat([a, b.to(a)]))
     extended = [join(each, extension) for each in kept]
-    behind = build_backdrop(extended, cameras, colored)
+    behind = build_backdrop(extended, cameras, patches)
     return [join(each, behind) for each in extended]
 
 

@@ -1,8 +1,8 @@
 """Continuation of the scene's large planes, such as floors and walls, beyond what the training views show.
 
 New views may look past the border of the capture. There, each plane that reaches the border goes on for a share of a
-picture's width, with texture that patches of its visible part make. Cells that a training view frames stay as they are,
-so the training views do not change.
+picture's width, with texture that patches of its visible part make. Cells in the frame of a training view stay as they
+are, so the training views do not change.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ CROSSING = 6.0  # in inlier distances: cells so close to an earlier plane belong
 MIN_COSINE = 0.8  # between the normals of a plane and of the surface that a view shows on it
 REACH = 0.3  # of a picture's larger side at the median distance: how far a plane goes on
 SIDE = 320  # cells, larger side of a plane's map at most
-MAIN = 0.4  # of the area of the largest patch of seen cells: only such patches go on
-CONTACT = 3  # cells between a seen cell and the first cell beyond the border
+MAIN = 0.4  # of the area of the largest patch of seen cells: smaller patches do not go on
+CONTACT = 3  # cells between a seen cell and the first cell outside all frames
 MIN_CONTACT = 0.3  # number of cells along the border, relative to the square root of the number of seen cells
 MIN_CELLS = 20  # a plane with fewer cells to paint does not go on
 DISK, THICKNESS, OPACITY = 0.45, 0.02, 0.98  # standard deviations of the disks in cells; their opacity
@@ -59,8 +59,9 @@ class _PlaneMap:
         corner: [3], the point on the plane at the corner of cell [0, 0].
         axes: [2, 3], unit vectors of the map's rows and columns.
         cell_size: side of a cell in world units.
-        color: [h, w, 3] in [0, 1], what the view that sees a cell best shows there; 0 where not seen.
+        in_frame: bool [h, w], True for cells that lie in the frame of a training view, even if something hides them.
         seen: bool [h, w], True where views show the plane.
+        color: [h, w, 3] in [0, 1], what the view that sees a cell best shows there; 0 where not seen.
         target: bool [h, w], True for cells into which the plane may go on.
     """
 
@@ -69,8 +70,9 @@ class _PlaneMap:
     corner: np.ndarray
     axes: np.ndarray
     cell_size: float
-    color: np.ndarray
+    in_frame: np.ndarray
     seen: np.ndarray
+    color: np.ndarray
     target: np.ndarray
 
     @property
@@ -102,33 +104,21 @@ def extend_planes(gaussians: Gaussians, cameras: Sequence[Camera], seed: int = 0
     Returns:
         Thin disks of one colour each, none if no plane reaches the border of the capture.
     """
-    nothing = gaussians.map(lambda p: p[:0].float().cpu())
+    extension = gaussians.map(lambda p: p[:0].float().cpu())
     views = [_render(gaussians, camera) for camera in cameras[:: max(1, -(-len(cameras) // MAX_VIEWS))]]
     samples, pixel_size = _sample(views, seed)
     if not len(samples):
-        return nothing
-    planes = _find_planes(samples, INLIER * pixel_size, seed)
+        return extension
     reach = REACH * max(views[0].camera.width, views[0].camera.height) * pixel_size
-    maps = []
-    for index, plane in enumerate(planes):
-        plane_map, framed = _map_plane(plane, samples, pixel_size, reach, views, cameras)
-        seen = plane_map.seen
-        for normal, offset in planes[:index]:
-            seen = seen & (np.abs(plane_map.centers @ normal - offset) > CROSSING * INLIER * pixel_size)
-        maps.append(_with_targets(replace(plane_map, seen=seen), framed, reach))
+    maps = _map_planes(_find_planes(samples, INLIER * pixel_size, seed), samples, pixel_size, reach, views, cameras)
+    maps = [_mark_targets(each, reach) for each in maps]
     viewpoint = np.mean([camera.center for camera in cameras], axis=0)
-    parts = []
     for each in maps:
-        others = [other for other in maps if other is not each]
-        occluded = [other.occludes(each.centers, viewpoint) for other in others]
-        target = each.target & ~np.any(occluded, axis=0) if occluded else each.target
-        patches, _ = ndimage.label(target | each.seen)
-        target &= np.isin(patches, np.unique(patches[each.seen]))
+        target = _visible_target(each, [other for other in maps if other is not each], viewpoint)
         if target.sum() >= MIN_CELLS:
-            parts.append(_disks(each, target, _paint(each, target, seed), gaussians))
-    for part in parts:
-        nothing = nothing.zip_map(part, lambda a, b: torch.cat([a, b]))
-    return nothing
+            disks = _make_disks(each, target, _paint(each, target, seed), gaussians)
+            extension = extension.zip_map(disks, lambda a, b: torch.cat([a, b]))
+    return extension
 
 
 def _render(gaussians: Gaussians, camera: Camera) -> _View:
@@ -169,96 +159,115 @@ def _find_planes(samples: np.ndarray, inlier: float, seed: int) -> list[tuple[np
     return planes
 
 
-def _map_plane(
-    plane: tuple[np.ndarray, float],
+def _map_planes(
+    planes: Sequence[tuple[np.ndarray, float]],
     samples: np.ndarray,
     pixel_size: float,
     reach: float,
     views: Sequence[_View],
     cameras: Sequence[Camera],
-) -> tuple[_PlaneMap, np.ndarray]:
-    """Map a plane: which cells views show, with which colours, and which cells lie in the frame of a training view.
+) -> list[_PlaneMap]:
+    """Map all planes, without targets yet. A cell near an earlier plane counts as unseen, since it belongs to that one.
 
     Args:
-        plane: normal [3] and offset.
+        planes: normal [3] and offset of each plane.
         samples: [S, 3], points of the visible surfaces.
         pixel_size: median size of a pixel of the rendered views on the surfaces.
-        reach: distance by which the map extends beyond the samples on the plane.
+        reach: distance by which a map extends beyond the samples on its plane.
         views: some training views, rendered.
         cameras: all training views.
-
-    Returns:
-        The map, whose targets are all False, and bool [h, w], the cells that a training view frames.
     """
-    normal, offset = plane
-    near = samples[np.abs(samples @ normal - offset) < INLIER * pixel_size]
-    middle = np.median(near, 0)
+    maps = []
+    for index, (normal, offset) in enumerate(planes):
+        near = samples[np.abs(samples @ normal - offset) < INLIER * pixel_size]
+        plane_map = _observe(_empty_map(normal, offset, near, pixel_size, reach), views, cameras)
+        for other, distance in planes[:index]:
+            apart = np.abs(plane_map.centers @ other - distance) > CROSSING * INLIER * pixel_size
+            plane_map = replace(plane_map, seen=plane_map.seen & apart)
+        maps.append(plane_map)
+    return maps
+
+
+def _empty_map(normal: np.ndarray, offset: float, points: np.ndarray, pixel_size: float, reach: float) -> _PlaneMap:
+    """Return a map that covers points [P, 3] near the plane and a margin of width `reach`, with all cells unseen."""
+    middle = np.median(points, 0)
     middle = middle - (middle @ normal - offset) * normal
-    first = np.linalg.svd(near - middle, full_matrices=False)[2][0]
+    first = np.linalg.svd(points - middle, full_matrices=False)[2][0]
     first = first - (first @ normal) * normal
     axes = np.stack([first, np.cross(normal, first)]) / np.linalg.norm(first)
-    low, high = np.percentile((near - middle) @ axes.T, [1, 99], axis=0)
+    low, high = np.percentile((points - middle) @ axes.T, [1, 99], axis=0)
     low, high = low - reach, high + reach
     cell_size = max(pixel_size, float((high - low).max()) / SIDE)
-    height, width = np.ceil((high - low) / cell_size).astype(int)
-    empty = np.zeros((height, width), bool)
-    plane_map = _PlaneMap(
-        normal, offset, middle + low @ axes, axes, cell_size, np.zeros((height, width, 3)), empty, empty
-    )
+    shape = tuple(np.ceil((high - low) / cell_size).astype(int))
+    none = np.zeros(shape, bool)
+    return _PlaneMap(normal, offset, middle + low @ axes, axes, cell_size, none, none, np.zeros((*shape, 3)), none)
+
+
+def _observe(plane_map: _PlaneMap, views: Sequence[_View], cameras: Sequence[Camera]) -> _PlaneMap:
+    """Return the map with the cells that views show, their colours, and the cells in the frame of a training view.
+
+    Args:
+        plane_map: an empty map.
+        views: some training views, rendered.
+        cameras: all training views.
+    """
+    shape, normal = plane_map.seen.shape, plane_map.normal
     points = plane_map.centers.reshape(-1, 3)
-    framed = np.zeros(len(points), bool)
+    in_frame = np.zeros(len(points), bool)
     for camera in cameras:
-        framed |= _project(points, camera)[2]
+        uv, z = geometry.project(points, camera)
+        in_frame |= (z > 0) & (uv >= 0).all(1) & (uv < (camera.width, camera.height)).all(1)
     seen, free = np.zeros(len(points), int), np.zeros(len(points), int)
     best, color = np.zeros(len(points)), np.zeros((len(points), 3))
     for view in views:
-        uv, z, inside = _project(points, view.camera)
-        column, row = np.where(inside[:, None], uv, 0).astype(np.int64).T
-        depth = view.depth[row, column]
-        aligned = np.abs(view.normal[row, column] @ normal) > MIN_COSINE
-        shows = inside & (depth > 0) & (np.abs(z - depth) < SURFACE * depth) & aligned
+        uv, z = geometry.project(points, view.camera)
+        depth, inside = geometry.sample_nearest(view.depth, uv)
+        aligned = np.abs(geometry.sample_nearest(view.normal, uv)[0] @ normal) > MIN_COSINE
+        shows = inside & (z > 0) & (depth > 0) & (np.abs(z - depth) < SURFACE * depth) & aligned
         seen += shows
-        free += inside & (z < (1 - FREE) * depth)
+        free += inside & (z > 0) & (z < (1 - FREE) * depth)
         ray = points - view.camera.center
-        frontal = np.abs(ray @ normal) / np.linalg.norm(ray, axis=1) ** 3  # cosine over the squared distance
-        better = shows & (frontal > best)
-        best[better] = frontal[better]
+        quality = np.abs(ray @ normal) / np.linalg.norm(ray, axis=1) ** 3  # cosine over the squared distance
+        better = shows & (quality > best)
+        best[better] = quality[better]
         at = uv[better, ::-1].T - 0.5
         bilinear = lambda channel, at=at: ndimage.map_coordinates(channel, at, order=1, mode="nearest")
         color[better] = np.stack([bilinear(channel) for channel in np.moveaxis(view.color, -1, 0)], 1)
-    reshape = lambda values: values.reshape(height, width, *values.shape[1:])
-    return replace(plane_map, color=reshape(color), seen=reshape((seen > free) & (best > 0))), reshape(framed)
+    seen = (seen > free) & (best > 0)
+    return replace(
+        plane_map, in_frame=in_frame.reshape(shape), seen=seen.reshape(shape), color=color.reshape(*shape, 3)
+    )
 
 
-def _project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return image points [P, 2], camera z [P], and bool [P], True where a point lies in the frame of the view."""
-    uv, z = geometry.project(points, camera)
-    return uv, z, (z > 0) & (uv >= 0).all(1) & (uv < (camera.width, camera.height)).all(1)
+def _mark_targets(plane_map: _PlaneMap, reach: float) -> _PlaneMap:
+    """Return the map with the cells into which the plane may go on: those up to `reach` from where the capture ends it.
 
-
-def _with_targets(plane_map: _PlaneMap, framed: np.ndarray, reach: float) -> _PlaneMap:
-    """Return the map with the cells into which the plane may go on: near a border at which only the capture ends.
-
-    Args:
-        plane_map: the map.
-        framed: bool [h, w], cells in the frame of a training view; they are no targets.
-        reach: distance from the border up to which the plane may go on.
+    The capture ends the plane where the large patches of seen cells meet cells outside all frames.
     """
-    seen = plane_map.seen
+    seen, outside = plane_map.seen, ~plane_map.in_frame
     parts, count = ndimage.label(seen)
-    sizes = np.bincount(parts.ravel(), minlength=count + 1)[1:]
     if not count:
         return plane_map
-    main = np.isin(parts, 1 + np.flatnonzero(sizes >= MAIN * sizes.max()))
-    contact = ndimage.binary_dilation(main, iterations=CONTACT) & ~framed
-    beyond, _ = ndimage.label(~framed)
-    lengths = np.bincount(beyond[contact], minlength=beyond.max() + 1)
-    reached = np.isin(beyond, np.flatnonzero(lengths > MIN_CONTACT * math.sqrt(seen.sum()))) & ~framed
-    contact &= reached
-    if not contact.any():
+    sizes = np.bincount(parts.ravel())[1:]
+    large = np.isin(parts, 1 + np.flatnonzero(sizes >= MAIN * sizes.max()))
+    border = ndimage.binary_dilation(large, iterations=CONTACT) & outside
+    areas, area_count = ndimage.label(outside)
+    lengths = np.bincount(areas[border], minlength=area_count + 1)
+    reached = outside & np.isin(areas, np.flatnonzero(lengths > MIN_CONTACT * math.sqrt(seen.sum())))
+    border &= reached
+    if not border.any():
         return plane_map
-    distance = ndimage.distance_transform_edt(~contact) * plane_map.cell_size
+    distance = ndimage.distance_transform_edt(~border) * plane_map.cell_size
     return replace(plane_map, target=reached & (distance < reach))
+
+
+def _visible_target(plane_map: _PlaneMap, others: Sequence[_PlaneMap], viewpoint: np.ndarray) -> np.ndarray:
+    """Return bool [h, w], the target cells that no other plane occludes from `viewpoint` [3], next to seen cells."""
+    target = plane_map.target.copy()
+    for other in others:
+        target &= ~other.occludes(plane_map.centers, viewpoint)
+    patches, _ = ndimage.label(target | plane_map.seen)
+    return target & np.isin(patches, np.unique(patches[plane_map.seen]))
 
 
 def _paint(plane_map: _PlaneMap, target: np.ndarray, seed: int) -> np.ndarray:
@@ -269,7 +278,7 @@ def _paint(plane_map: _PlaneMap, target: np.ndarray, seed: int) -> np.ndarray:
     return complete(source, target, [source], seed=seed).image[target] / 255
 
 
-def _disks(plane_map: _PlaneMap, target: np.ndarray, colors: np.ndarray, like: Gaussians) -> Gaussians:
+def _make_disks(plane_map: _PlaneMap, target: np.ndarray, colors: np.ndarray, like: Gaussians) -> Gaussians:
     """Return one disk for each of the n target cells, with the colours [n, 3] and as many harmonics as `like` has."""
     count = len(colors)
     sh = np.zeros((count, like.sh.shape[1], 3))

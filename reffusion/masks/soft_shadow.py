@@ -52,7 +52,7 @@ MIN_DEPTH, MIN_VOLUME = 0.4, 0.8  # log light of the darkest cell; sum of log li
 CORE, MAX_CORE_DISTANCE = 0.7, 0.25  # cells this share of the darkest one; their distance in radii from hidden cells
 MAX_TINT = 0.35  # spread of the channels' log light, relative to their mean
 MAX_HIDDEN = 1.2  # radii from the object's middle: unseen cells up to there are hidden by the object
-MIN_LIT = 0.4  # share of the cells around the shadow that are seen
+MIN_LIT = 0.4  # share of the cells around the shadow that are seen, and thus lit
 FADE = (0.15, 0.45)  # radii: a point up to the first height above the plane is in the shadow, above the second is not
 EDGE = 0.03  # log light below which the shadow's rim ends
 
@@ -127,12 +127,14 @@ def find_soft_shadow(background: Background, object_means: Tensor) -> SoftShadow
     """Find the soft shadow that the object casts on the plane on which it stands.
 
     Args:
-        background: the photographs and the planes around the object.
+        background: the photographs that show the object, and the planes around it.
         object_means: [N, 3], the centers of the object's Gaussians.
 
     Returns:
-        The shadow with the largest sum of log light; None if there is none.
+        The shadow with the largest sum of log light; None if there is none, or fewer than `MIN_VIEWS` photographs.
     """
+    if len(background.photos) < MIN_VIEWS:
+        return None
     means = object_means.detach().double().cpu().numpy()
     best, best_volume = None, MIN_VOLUME
     for index, plane in enumerate(background.planes, start=1):
@@ -158,9 +160,8 @@ def _cell_brightness(background: Background, index: int) -> np.ndarray:
     Args:
         index: position of the plane in `background.planes`, counted from 1.
     """
-    plane, views = background.planes[index - 1], [v for v in background.views if v.camera.name in background.photos]
-    views = [view for view in views if view.camera.name not in background.without_photo]
-    side, samples = CELLS * FINE, []
+    plane, side, samples = background.planes[index - 1], CELLS * FINE, []
+    views = [view for view in background.views if view.camera.name in background.photos]
     for view in views[:: -(-len(views) // MAX_VIEWS)]:
         every = max(1, view.camera.width // MAX_WIDTH)
         chosen = (label_planes(view.depth, view.camera, background.planes) == index) & ~view.masked
@@ -261,9 +262,10 @@ def _find_region(light: np.ndarray, seen: np.ndarray) -> np.ndarray | None:
     core = region & (mean < CORE * mean[region].min())
     around = ndimage.binary_dilation(region) & ~region & ~hidden
     tint = light[region].mean(0)
-    near = (ndimage.distance_transform_edt(~hidden) * CELL)[core].min() <= MAX_CORE_DISTANCE
-    lit = seen[around].mean() >= MIN_LIT if around.any() else False
-    return region if near and lit and np.ptp(tint) <= MAX_TINT * abs(tint.mean()) else None
+    is_near = (ndimage.distance_transform_edt(~hidden) * CELL)[core].min() <= MAX_CORE_DISTANCE
+    is_surrounded = around.any() and seen[around].mean() >= MIN_LIT
+    is_neutral = np.ptp(tint) <= MAX_TINT * abs(tint.mean())
+    return region if is_near and is_surrounded and is_neutral else None
 
 
 def _make_shadow(
