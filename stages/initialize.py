@@ -22,6 +22,7 @@ from reffusion.initialize.fill import fill_references
 from reffusion.initialize.origins import ORIGINS, OriginMap, find_origins
 from reffusion.initialize.relighting import remove_shadows
 from reffusion.initialize.sds_gain import GainPrediction, predict_gain
+from reffusion.initialize.warped_views import warp_references
 from reffusion.inpaint import feedforward
 from reffusion.io.arrays import load_json, save_json, save_labels
 from reffusion.io.images import save_exr, save_image, save_mask
@@ -90,8 +91,8 @@ def run(
                 save_mask(out / "shadows" / f"{name}.png", mask)
         if params.extra_views:
             painter = feedforward.load_inpainter(params.inpainter, params.device)
-            draft, extra, depths = complete_extra_views(params, draft, background, trusted, painter)
-            save_depths(out, depths)
+            draft, extra, extra_depths = complete_extra_views(params, draft, background, trusted, painter)
+            save_depths(out, extra_depths)
             for each in extra:
                 save_image(out / "extra_views" / f"{each.camera.name}.png", each.image)
             trusted = [*trusted, *extra]
@@ -101,7 +102,8 @@ def run(
         work = out / ".refit"  # a hidden folder, because its trace holds run times, which must not enter the hash
         work.mkdir(exist_ok=True)
         has_exact_depth = all(each.depth is not None for each in references)
-        draft = refit_draft(draft, params.refit_steps, scene, background, trusted, sets, has_exact_depth, work)
+        completed = [*trusted, *warp_references(draft, trusted, depths, background.cameras)]
+        draft = refit_draft(draft, params.refit_steps, scene, background, completed, sets, has_exact_depth, work)
         shutil.rmtree(work)
 
     save_ply(out / "gaussians.ply", draft.gaussians)

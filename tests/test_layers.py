@@ -162,6 +162,23 @@ def test_depth_steps_where_the_picture_has_an_edge():
     assert np.quantile(error, 0.95) < 0.01
 
 
+def test_each_gap_continues_the_farthest_surface_that_it_touches():
+    """A gap within a near surface continues this surface, though another gap of the view shows a farther one."""
+    rows, columns = np.mgrid[:100, :120]
+    near = (np.abs(columns - 40) < 30) & (np.abs(rows - 50) < 35)
+    disparity = np.where(near, 1.0, 0.3 + 0.001 * columns)
+    within, beside = (np.abs(columns - at) < 4 for at in (35, 73))
+    within, beside = (each & (np.abs(rows - 50) < 8) for each in (within, beside))
+    hole = within | beside
+    view = make_camera("v", (120, 100), 100.0)
+    seen = ViewDepth(view, 1 / np.where(hole, 9.0, disparity), ~hole, hole, hole, np.zeros_like(hole))
+    picture, how = np.where(near[..., None], (0.8, 0.4, 0.2), (0.2, 0.4, 0.8)), CompletionSettings(planar_share=2.0)
+    found, message = continue_depth(seen, picture, np.zeros((0, 3)), how, farthest=True)
+    assert "the farthest of" in message
+    np.testing.assert_allclose(found[within], 1.0, rtol=1e-3)
+    np.testing.assert_allclose(found[beside], (0.3 + 0.001 * columns)[beside], rtol=1e-3)
+
+
 def test_a_mirror_is_surrounded_and_a_recess_is_not():
     """A patch inside known surfaces is enclosed, although a part of its border is hidden.
 

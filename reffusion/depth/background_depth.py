@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from scipy import ndimage
 
 from reffusion import geometry, morphology, seeding
 from reffusion.depth import bilateral, planes
@@ -27,6 +28,8 @@ OCCLUSION_RATIO = 1.03  # a sparse point this many times as deep as the renderin
 MAX_EXTRAPOLATION = 1.15  # a continued surface exceeds the range of its known disparities by this factor at most
 MAX_REFUTED_SHARE = 0.05  # share of the hole in which intersecting planes are refuted, above which they are rejected
 IN_FRONT_RATIO = 1.03  # planes are refuted where their disparity exceeds that of a continued plane by this factor
+GAP_RING = 0.01  # of the image's width: width of the ring in which a gap touches surfaces
+MIN_GAP_SHARE = 0.15  # share of this ring that a surface must have
 FARTHEST_RATIO = 2.0  # depth is limited to this many times the farthest known depth
 
 
@@ -227,9 +230,7 @@ def continue_depth(
     label = partial(label_surfaces, view.disparity, surroundings, hole, guide, planes, view.anchored)
     surfaces = label()
     if surfaces.max() > 1 and farthest:
-        far_disparity = complete(
-            view.disparity, usable & (surfaces == _farthest_surface(view, surfaces, usable)), guide, plate
-        )
+        far_disparity = _complete_gaps(view, surfaces, usable, guide, plate)
         return np.where(
             view.anchored, view.disparity, far_disparity
         ), f"{description}: the farthest of {surfaces.max()} surfaces"
@@ -269,6 +270,35 @@ def _farthest_surface(view: ViewDepth, surfaces: np.ndarray, usable: np.ndarray)
     median_disparity = lambda surface: float(np.median(view.disparity[usable & ~view.anchored & (surfaces == surface)]))
     present = [k for k in range(1, surfaces.max() + 1) if (usable & ~view.anchored & (surfaces == k)).any()]
     return min(present, key=median_disparity)
+
+
+def _complete_gaps(
+    view: ViewDepth, surfaces: np.ndarray, usable: np.ndarray, guide: np.ndarray, plate: Plate
+) -> np.ndarray:
+    """Return [H, W] disparity in which each gap of the hole continues the farthest of the surfaces that it touches.
+
+    Args:
+        surfaces: int [H, W], the surface of each pixel (`layers.label_surfaces`).
+        usable: bool [H, W], True at pixels whose disparity is known or anchored.
+        guide: [H, W, 3] picture.
+        plate: Settings of the smooth continuation.
+    """
+    result, continued = view.disparity.copy(), {}
+    gaps, count = ndimage.label(view.hole, np.ones((3, 3)))
+    nearest = ndimage.distance_transform_edt(~view.hole, return_distances=False, return_indices=True)
+    for gap in range(1, count + 1):
+        pixels = gaps == gap
+        border = usable & ~view.anchored & (surfaces > 0) & morphology.dilate(pixels, GAP_RING)
+        sizes = np.bincount(surfaces[border], minlength=surfaces.max() + 1)
+        touching = np.flatnonzero(sizes >= max(MIN_GAP_SHARE * border.sum(), 1))
+        if not len(touching):
+            touching = np.arange(1, surfaces.max() + 1)
+        chosen = _farthest_surface(view, np.where(np.isin(surfaces, touching), surfaces, 0), usable)
+        if chosen not in continued:
+            continued[chosen] = complete(view.disparity, usable & (surfaces == chosen), guide, plate)
+        around = gaps[tuple(nearest)] == gap
+        result[around] = continued[chosen][around]
+    return result
 
 
 def _complete_layers(

@@ -126,8 +126,9 @@ def fill_reference(
     sweep = params.depth.sweep and not (farthest and coverage.is_narrow(hole))
     near, swept = refine_background(background, camera, hole) if sweep else (background, None)
     hints = _gather_hints(draft.remaining, camera, near, swept, params.depth.sweep)
+    base = draft.gaussians if farthest else draft.remaining
     depth, estimate, words = unprojection.estimate_depth(
-        draft.remaining, reference, hole, mask, background.points, COMPLETION, disparity, log, hints, farthest
+        base, reference, hole, mask, background.points, COMPLETION, disparity, log, hints, farthest
     )
     if reference.depth is None:  # a depth map that the scene provides has no ramps
         near_hole = dilate_by_distance(hole | mask | reference.mask, OVERLAP)
