@@ -28,6 +28,7 @@ DEPTH_VIEWS = 4  # number of views
 ORIGIN_VIEWS = 6  # number of views
 WORDS_OF_ORIGINS = {
     "photographs": "green, other photographs show it:",
+    "conflict": "white, photographs show it in another colour:",
     "reference": "blue, a reference:",
     "patches": "orange, invented from patches of the photographs:",
     "nothing": "red, no picture shows it:",

@@ -49,8 +49,8 @@ def run(
     - facts.json;
     - depth/<view>.exr: the depth at which each reference and each extra view was unprojected;
     - extra_views/<view>.png: views that were completed besides the references, because gaps were left;
-    - origins/<view>.png: the origin of what each view shows in C: other photographs (green), a reference (blue),
-      patches in an extra view (orange), nothing (red);
+    - origins/<view>.png: the origin of what each view shows in C: other photographs (green), photographs in conflict
+      with the scene (white), a reference (blue), patches in an extra view (orange), nothing (red);
     - shadows/<view>.png: masks of the object's shadow in all views, if a reference shows the scene without it;
     - invent/<view>.png: the invent masks I that reach beyond C (where the scene asks to fill a region), restricted
       there to pixels that show new Gaussians;
@@ -109,7 +109,8 @@ def run(
     save_ply(out / "gaussians.ply", draft.gaussians)
     save_labels(out / "labels.npy", draft.is_new.cpu())
     photos = background.photos if is_method else None
-    origins = {name: find_origins(draft, scene.cameras[name], sets[name]) for name in scene.train}
+    compared = background if is_method else None
+    origins = {name: find_origins(draft, scene.cameras[name], sets[name], compared) for name in scene.train}
     for name, origin in origins.items():
         save_image(out / "origins" / f"{name}.png", origin.picture)
     save_json(out / "facts.json", summarize(params, space, draft, floaters, sets, origins, extra, trusted, photos))

@@ -4,8 +4,12 @@ import numpy as np
 import torch
 from scenes import wall_scene
 
+from reffusion import geometry
+from reffusion.background.model import Background
+from reffusion.background.visibility import render_depth_views
 from reffusion.initialize.draft import EXTRA_VIEW, REFERENCE, REMAINING, Draft
 from reffusion.initialize.origins import ORIGINS, find_origins
+from reffusion.splat import rasterizer
 from reffusion.types import MaskSet
 
 
@@ -37,3 +41,26 @@ def test_a_gap_shows_nothing():
     assert found.uncovered_share > 0.9 and found.shares["nothing"] > 0.9
     none = find_origins(Draft.start(faint), camera, MaskSet(*[~everywhere] * 4))
     assert none.uncovered_share == 0 and set(none.shares.values()) == {0.0}
+
+
+def test_surfaces_that_most_photographs_show_in_another_colour_are_in_conflict():
+    """The wall is as photographed on the left; on the right, where x > 0, the photographs are 60 levels darker."""
+    cameras = [wall_scene.CAMERAS[name] for name in wall_scene.TRAIN]
+    wall = wall_scene.wall_and_square(1.7)[0]
+    wall = wall.map(lambda p: p[wall.means[:, 2] > wall.means[:, 2].max() - 1e-3])
+    own, others = cameras[0], cameras[1:]
+    nothing = {camera.name: np.zeros((camera.height, camera.width), bool) for camera in cameras}
+    views, photos = render_depth_views(wall, others, nothing), {}
+    for view in views:
+        rendering = rasterizer.render(wall, view.camera)
+        x = geometry.unproject(rendering.depth.double().numpy(), view.camera)[..., 0]
+        shown = 255 * rendering.color.numpy() - 60 * (x > 0)[..., None]
+        photos[view.camera.name] = shown.clip(0, 255).round().astype(np.uint8)
+    everywhere = ~nothing[own.name]
+    sets = MaskSet(everywhere, everywhere, ~everywhere, ~everywhere)
+    found = find_origins(Draft.start(wall), own, sets, Background(views, photos))
+    x = geometry.unproject(rasterizer.render(wall, own).depth.double().numpy(), own)[..., 0]
+    seen = np.isin(found.classes, [ORIGINS.index("photographs"), ORIGINS.index("conflict")])
+    clear = seen & (np.abs(x) > 0.1)
+    assert clear.sum() > 0.5 * x.size
+    assert (((found.classes == ORIGINS.index("conflict")) == (x > 0))[clear]).mean() > 0.95

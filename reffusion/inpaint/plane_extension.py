@@ -32,7 +32,8 @@ MAX_PLANES, MIN_SHARE = 8, 0.025  # number of planes at most; least share of all
 INLIER = 2.5  # px of a rendered view at the median distance: distance within which a sample lies on a plane
 CROSSING = 6.0  # in inlier distances: cells so close to an earlier plane belong to that plane
 MIN_COSINE = 0.8  # between the normals of a plane and of the surface that a view shows on it
-REACH = 0.3  # of a picture's larger side at the median distance: how far a plane goes on
+REACH = 0.3  # of a picture's larger side at the median distance: how far from its seen part a plane goes on
+PAST = 0.2  # of a picture's width and height: how far beyond the frame of a view a plane goes on
 SIDE = 320  # cells, larger side of a plane's map at most
 MAIN = 0.4  # of the area of the largest patch of seen cells: smaller patches do not go on
 CONTACT = 3  # cells between a seen cell and the first cell outside all frames
@@ -60,6 +61,7 @@ class _PlaneMap:
         axes: [2, 3], unit vectors of the map's rows and columns.
         cell_size: side of a cell in world units.
         in_frame: bool [h, w], True for cells that lie in the frame of a training view, even if something hides them.
+        near_frame: bool [h, w], the same for frames that are `PAST` wider on each side.
         seen: bool [h, w], True where views show the plane.
         color: [h, w, 3] in [0, 1], what the view that sees a cell best shows there; 0 where not seen.
         target: bool [h, w], True for cells into which the plane may go on.
@@ -71,6 +73,7 @@ class _PlaneMap:
     axes: np.ndarray
     cell_size: float
     in_frame: np.ndarray
+    near_frame: np.ndarray
     seen: np.ndarray
     color: np.ndarray
     target: np.ndarray
@@ -200,7 +203,9 @@ def _empty_map(normal: np.ndarray, offset: float, points: np.ndarray, pixel_size
     cell_size = max(pixel_size, float((high - low).max()) / SIDE)
     shape = tuple(np.ceil((high - low) / cell_size).astype(int))
     none = np.zeros(shape, bool)
-    return _PlaneMap(normal, offset, middle + low @ axes, axes, cell_size, none, none, np.zeros((*shape, 3)), none)
+    return _PlaneMap(
+        normal, offset, middle + low @ axes, axes, cell_size, none, none, none, np.zeros((*shape, 3)), none
+    )
 
 
 def _observe(plane_map: _PlaneMap, views: Sequence[_View], cameras: Sequence[Camera]) -> _PlaneMap:
@@ -213,10 +218,12 @@ def _observe(plane_map: _PlaneMap, views: Sequence[_View], cameras: Sequence[Cam
     """
     shape, normal = plane_map.seen.shape, plane_map.normal
     points = plane_map.centers.reshape(-1, 3)
-    in_frame = np.zeros(len(points), bool)
+    in_frame, near_frame = np.zeros((2, len(points)), bool)
     for camera in cameras:
         uv, z = geometry.project(points, camera)
-        in_frame |= (z > 0) & (uv >= 0).all(1) & (uv < (camera.width, camera.height)).all(1)
+        size = np.array([camera.width, camera.height])
+        in_frame |= (z > 0) & (uv >= 0).all(1) & (uv < size).all(1)
+        near_frame |= (z > 0) & (uv >= -PAST * size).all(1) & (uv < (1 + PAST) * size).all(1)
     seen, free = np.zeros(len(points), int), np.zeros(len(points), int)
     best, color = np.zeros(len(points)), np.zeros((len(points), 3))
     for view in views:
@@ -235,7 +242,11 @@ def _observe(plane_map: _PlaneMap, views: Sequence[_View], cameras: Sequence[Cam
         color[better] = np.stack([bilinear(channel) for channel in np.moveaxis(view.color, -1, 0)], 1)
     seen = (seen > free) & (best > 0)
     return replace(
-        plane_map, in_frame=in_frame.reshape(shape), seen=seen.reshape(shape), color=color.reshape(*shape, 3)
+        plane_map,
+        in_frame=in_frame.reshape(shape),
+        near_frame=near_frame.reshape(shape),
+        seen=seen.reshape(shape),
+        color=color.reshape(*shape, 3),
     )
 
 
@@ -258,7 +269,7 @@ def _mark_targets(plane_map: _PlaneMap, reach: float) -> _PlaneMap:
     if not border.any():
         return plane_map
     distance = ndimage.distance_transform_edt(~border) * plane_map.cell_size
-    return replace(plane_map, target=reached & (distance < reach))
+    return replace(plane_map, target=reached & plane_map.near_frame & (distance < reach))
 
 
 def _visible_target(plane_map: _PlaneMap, others: Sequence[_PlaneMap], viewpoint: np.ndarray) -> np.ndarray:
