@@ -202,9 +202,9 @@ def continue_depth(
         points: [P, 3] sparse points of the scene; P = 0 is allowed.
         settings: Settings of the fits.
         log: Records the result of each solver.
-        farthest: If True, the smooth continuation continues only the farthest of several surfaces around the hole. This
-            suits a gap through which the view looks at the background. Intersecting planes, if they are accepted, are
-            not affected.
+        farthest: If True, each connected part of the hole continues only the farthest of the surfaces that it touches.
+            This suits gaps through which the view looks at the background. Intersecting planes, if they are accepted,
+            are not affected.
 
     Returns:
         disparity: [H, W] float64, at all pixels. At known pixels it is that of the fit, which may differ from the

@@ -126,6 +126,7 @@ def fill_reference(
     sweep = params.depth.sweep and not (farthest and coverage.is_narrow(hole))
     near, swept = refine_background(background, camera, hole) if sweep else (background, None)
     hints = _gather_hints(draft.remaining, camera, near, swept, params.depth.sweep)
+    # The gap of an extra view lies among new surfaces too; a reference must not continue what an earlier one invented.
     base = draft.gaussians if farthest else draft.remaining
     depth, estimate, words = unprojection.estimate_depth(
         base, reference, hole, mask, background.points, COMPLETION, disparity, log, hints, farthest

@@ -32,7 +32,7 @@ COLOR_MARGIN = 0.1  # colours in [0, 1]: how far beyond these bounds a Gaussian'
 
 @torch.no_grad()
 def estimate_depth(
-    remaining: Gaussians,
+    gaussians: Gaussians,
     reference: Reference,
     hole: np.ndarray,
     mask: np.ndarray,
@@ -50,7 +50,7 @@ def estimate_depth(
     the hole.
 
     Args:
-        remaining: the Gaussians of the scene without the object.
+        gaussians: the scene without the object, whose depth is continued.
         reference: the completed view.
         hole: bool [H, W], the pixels to fill.
         mask: bool [H, W], C of the view (the object's pixels).
@@ -73,7 +73,7 @@ def estimate_depth(
         ValueError: too little depth is known around the hole, or the depth map or the model's output does not fit the
             scene. The message names the view.
     """
-    rendering = rasterizer.render(remaining, reference.camera, sh_degree=0)
+    rendering = rasterizer.render(gaussians, reference.camera, sh_degree=0)
     view = background_depth.extract_depth(rendering, reference.camera, hole, mask, completion, hints)
     solvers = SolverLog(log, reference.camera.name, *background_depth.points_around(view, points, completion))
     try:
