@@ -16,7 +16,6 @@ import torch
 from scipy import ndimage
 
 from reffusion import geometry
-from reffusion.background.visibility import SURFACE
 from reffusion.gaussians.surfels import surface_normals
 from reffusion.initialize.draft import Draft
 from reffusion.morphology import to_pixels
@@ -27,6 +26,7 @@ VIEWS = 12  # views to which a reference is warped, at most
 MIN_SHARE = 0.15  # a view is used if the reference's pixels cover at least this share of their number in it
 MIN_NEW = 0.9  # share that new Gaussians must have in a pixel
 ITERATIONS = 4  # of the intersection of a ray with the surface
+MATCH = 0.005  # relative difference from the depth that the view shows, above which it shows another surface
 MAX_MOVE = 0.5  # px: larger last steps have not converged
 MIN_SCALE = 0.5  # pixels of the reference per pixel of the view, along any direction; with fewer the picture is blurred
 FINE = 4  # samples along each side of a pixel, whose mean is the colour of the pixel
@@ -152,7 +152,7 @@ def _intersect(surface: _Surface, camera: Camera, depth: np.ndarray, pixels: np.
         faces = inside & known & (slope < 0)
         z = np.where(faces, ((point - camera.center) * normal).sum(1) / np.where(faces, slope, 1.0), z)
         before, uv = uv, position(z)
-    is_same = faces & (np.abs(z - start) < SURFACE * start) & (np.abs(uv - before) < MAX_MOVE).all(1)
+    is_same = faces & (np.abs(z - start) < MATCH * start) & (np.abs(uv - before) < MAX_MOVE).all(1)
     found = np.full((*depth.shape, 2), np.nan, np.float32)
     found[pixels] = np.where(is_same[:, None], uv, np.nan)
     return found
