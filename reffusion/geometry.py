@@ -43,6 +43,18 @@ def project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]
     return uv, z
 
 
+def is_in_frame(uv: np.ndarray, z: np.ndarray, camera: Camera, margin: float = 0.0) -> np.ndarray:
+    """Return bool [...], which points of `project` lie in the camera's image.
+
+    Args:
+        uv: [..., 2], pixel coordinates.
+        z: [...], camera depth.
+        margin: width of a margin around the image that counts as image, as a fraction of the image's width and height.
+    """
+    size = np.array([camera.width, camera.height])
+    return (z > 0) & (uv >= -margin * size).all(-1) & (uv < (1 + margin) * size).all(-1)
+
+
 def pixel_rays(camera: Camera) -> np.ndarray:
     """Return the ray directions through the pixel centres in the camera's axes, scaled to z = 1: float64 [H, W, 3]."""
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx

@@ -286,18 +286,16 @@ def _complete_gaps(
     result, continued = view.disparity.copy(), {}
     gaps, count = ndimage.label(view.hole, np.ones((3, 3)))
     nearest = ndimage.distance_transform_edt(~view.hole, return_distances=False, return_indices=True)
+    nearest_gap = gaps[tuple(nearest)]
     for gap in range(1, count + 1):
-        pixels = gaps == gap
-        border = usable & ~view.anchored & (surfaces > 0) & morphology.dilate(pixels, GAP_RING)
+        border = usable & ~view.anchored & (surfaces > 0) & morphology.dilate(gaps == gap, GAP_RING)
         sizes = np.bincount(surfaces[border], minlength=surfaces.max() + 1)
-        touching = np.flatnonzero(sizes >= max(MIN_GAP_SHARE * border.sum(), 1))
-        if not len(touching):
-            touching = np.arange(1, surfaces.max() + 1)
+        # A gap that touches no surface continues the farthest of all.
+        touching = np.flatnonzero(sizes >= MIN_GAP_SHARE * border.sum())
         chosen = _farthest_surface(view, np.where(np.isin(surfaces, touching), surfaces, 0), usable)
         if chosen not in continued:
             continued[chosen] = complete(view.disparity, usable & (surfaces == chosen), guide, plate)
-        around = gaps[tuple(nearest)] == gap
-        result[around] = continued[chosen][around]
+        result[nearest_gap == gap] = continued[chosen][nearest_gap == gap]
     return result
 
 

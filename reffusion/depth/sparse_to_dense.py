@@ -152,7 +152,7 @@ def _visible_points(
     """Return image points [S, 2], disparities [S] and indices [S] of the points that are visible in a photograph."""
     uv, z = geometry.project(points.positions, camera)
     with np.errstate(invalid="ignore"):
-        in_frame = (z > 0) & (uv >= 0).all(1) & (uv < (camera.width, camera.height)).all(1)
+        in_frame = geometry.is_in_frame(uv, z, camera)
     index = np.flatnonzero(in_frame)
     uv, disparity = uv[index], 1 / z[index]
     if len(uv) <= OCCLUSION_NEIGHBORS:

@@ -127,9 +127,9 @@ def fill_reference(
     near, swept = refine_background(background, camera, hole) if sweep else (background, None)
     hints = _gather_hints(draft.remaining, camera, near, swept, params.depth.sweep)
     # The gap of an extra view lies among new surfaces too; a reference must not continue what an earlier one invented.
-    base = draft.gaussians if farthest else draft.remaining
+    surroundings = draft.gaussians if farthest else draft.remaining
     depth, estimate, words = unprojection.estimate_depth(
-        base, reference, hole, mask, background.points, COMPLETION, disparity, log, hints, farthest
+        surroundings, reference, hole, mask, background.points, COMPLETION, disparity, log, hints, farthest
     )
     if reference.depth is None:  # a depth map that the scene provides has no ramps
         near_hole = dilate_by_distance(hole | mask | reference.mask, OVERLAP)

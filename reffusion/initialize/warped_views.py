@@ -23,7 +23,7 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera, Reference
 
 VIEWS = 12  # views to which a reference is warped, at most
-MIN_SHARE = 0.15  # a view is used if the reference's pixels cover at least this share of their number in it
+MIN_COVERAGE = 0.15  # a view is used if the reference's n pixels would cover more than this share of n pixels in it
 MIN_NEW = 0.9  # share that new Gaussians must have in a pixel
 ITERATIONS = 4  # of the intersection of a ray with the surface
 MATCH = 0.005  # relative difference from the depth that the view shows, above which it shows another surface
@@ -47,14 +47,14 @@ class _Surface(NamedTuple):
     points: np.ndarray
     normals: np.ndarray
 
-    def share_in(self, camera: Camera, pixels: np.ndarray) -> float:
+    def predict_coverage(self, camera: Camera, pixels: np.ndarray) -> float:
         """Return how many pixels of another view the pixels bool [H, W] would cover, divided by their number.
 
         It does not matter what occludes the surface there.
         """
         points, normals = self.points[pixels], self.normals[pixels]
         uv, z = geometry.project(points, camera)
-        inside = (z > 0) & (uv >= 0).all(1) & (uv < (camera.width, camera.height)).all(1)
+        inside = geometry.is_in_frame(uv, z, camera)
         if not inside.any():
             return 0.0
         areas = [
@@ -97,7 +97,7 @@ def _choose_views(surface: _Surface, pixels: np.ndarray, cameras: Sequence[Camer
     middle = np.median(surface.points[pixels], axis=0)
     direction = lambda camera: (camera.center - middle) / np.linalg.norm(camera.center - middle)
     left = [each for each in cameras if each.name != surface.camera.name]
-    left = [each for each in left if surface.share_in(each, pixels) > MIN_SHARE]
+    left = [each for each in left if surface.predict_coverage(each, pixels) > MIN_COVERAGE]
     chosen = [surface.camera]
     while left and len(chosen) <= VIEWS:
         nearest = [max(direction(each) @ direction(other) for other in chosen) for each in left]
@@ -152,9 +152,9 @@ def _intersect(surface: _Surface, camera: Camera, depth: np.ndarray, pixels: np.
         faces = inside & known & (slope < 0)
         z = np.where(faces, ((point - camera.center) * normal).sum(1) / np.where(faces, slope, 1.0), z)
         before, uv = uv, position(z)
-    is_same = faces & (np.abs(z - start) < MATCH * start) & (np.abs(uv - before) < MAX_MOVE).all(1)
+    shows_surface = faces & (np.abs(z - start) < MATCH * start) & (np.abs(uv - before) < MAX_MOVE).all(1)
     found = np.full((*depth.shape, 2), np.nan, np.float32)
-    found[pixels] = np.where(is_same[:, None], uv, np.nan)
+    found[pixels] = np.where(shows_surface[:, None], uv, np.nan)
     return found
 
 

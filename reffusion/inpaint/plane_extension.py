@@ -33,7 +33,7 @@ INLIER = 2.5  # px of a rendered view at the median distance: distance within wh
 CROSSING = 6.0  # in inlier distances: cells so close to an earlier plane belong to that plane
 MIN_COSINE = 0.8  # between the normals of a plane and of the surface that a view shows on it
 REACH = 0.3  # of a picture's larger side at the median distance: how far from its seen part a plane goes on
-PAST = 0.2  # of a picture's width and height: how far beyond the frame of a view a plane goes on
+FRAME_MARGIN = 0.2  # of a picture's width and height: how far beyond the frame of a view a plane goes on
 SIDE = 320  # cells, larger side of a plane's map at most
 MAIN = 0.4  # of the area of the largest patch of seen cells: smaller patches do not go on
 CONTACT = 3  # cells between a seen cell and the first cell outside all frames
@@ -61,7 +61,7 @@ class _PlaneMap:
         axes: [2, 3], unit vectors of the map's rows and columns.
         cell_size: side of a cell in world units.
         in_frame: bool [h, w], True for cells that lie in the frame of a training view, even if something hides them.
-        near_frame: bool [h, w], the same for frames that are `PAST` wider on each side.
+        near_frame: bool [h, w], the same for frames that are `FRAME_MARGIN` wider on each side.
         seen: bool [h, w], True where views show the plane.
         color: [h, w, 3] in [0, 1], what the view that sees a cell best shows there; 0 where not seen.
         target: bool [h, w], True for cells into which the plane may go on.
@@ -221,9 +221,8 @@ def _observe(plane_map: _PlaneMap, views: Sequence[_View], cameras: Sequence[Cam
     in_frame, near_frame = np.zeros((2, len(points)), bool)
     for camera in cameras:
         uv, z = geometry.project(points, camera)
-        size = np.array([camera.width, camera.height])
-        in_frame |= (z > 0) & (uv >= 0).all(1) & (uv < size).all(1)
-        near_frame |= (z > 0) & (uv >= -PAST * size).all(1) & (uv < (1 + PAST) * size).all(1)
+        in_frame |= geometry.is_in_frame(uv, z, camera)
+        near_frame |= geometry.is_in_frame(uv, z, camera, FRAME_MARGIN)
     seen, free = np.zeros(len(points), int), np.zeros(len(points), int)
     best, color = np.zeros(len(points)), np.zeros((len(points), 3))
     for view in views:
