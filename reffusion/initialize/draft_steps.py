@@ -86,7 +86,8 @@ def refit_draft(
 ) -> Draft:
     """Return the draft after a refit: `steps` steps of reconstruction, in which all Gaussians move (`refit.refit`).
 
-    Photographs supervise outside the object and outside the invent masks. Completed views supervise inside their masks.
+    Photographs supervise outside the object, the given masks and the invent masks: what a given mask marks beyond the
+    object is its border or its shadow more often than background. Completed views supervise inside their masks.
 
     Args:
         draft: the filled scene.
@@ -100,7 +101,7 @@ def refit_draft(
     """
     invented = lambda name: sets[name].invent & (name not in scene.clean)  # no photograph shows these pixels
     views = [view for view in background.views if view.camera.name not in scene.blank]
-    hidden = {view.camera.name: view.masked | invented(view.camera.name) for view in views}
+    hidden = {name: view.masked | sets[name].raw | invented(name) for view in views if (name := view.camera.name)}
     completed = [each for each in trusted if each.mask.any()]
     supervision = Supervision([view.camera for view in views], background.photos, hidden, completed)
     placed = draft.is_new & has_exact_depth
