@@ -188,8 +188,11 @@ spinnerf batch: setup $(if $(engine),$(VENV)/.ready-cluster)
 weights: setup
 	@$(RUN) weights $(call flags,$(options) offline)
 
-prior: setup
-	$(PY) -m priors.tiny.train --start priors/tiny $(call flags,steps)
+prior: runs/prior/photographs
+	$(PY) -m priors.tiny.train --start priors/tiny --photographs runs/prior/photographs $(call flags,steps)
+
+runs/prior/photographs: | setup
+	$(PY) -m priors.tiny.photographs $@
 
 # Personalizes on the reference of the demo scene, which is made first where it is missing.
 prior-report: data/demo/.generated setup

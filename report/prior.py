@@ -23,11 +23,12 @@ ENLARGE = 3  # whole factor; held-out pictures have 64 px
 SCALES = ("reference", "whole", "window")
 SHEETS = {
     "inpainting": "Held-out pictures, filled from pure noise",
+    "photographs": "Held-out photographs, whole and in windows, filled from pure noise",
     "reference": "The reference's own hole, filled from pure noise three times, before and after personalization",
     "whole": "Unseen views of the scene, whole, before and after personalization",
     "window": "Unseen views, windows around the hole",
 }
-SCORES = {"psnr": "PSNR, dB", "ssim": "SSIM", "flip": "FLIP", "energy": "gradient energy"}
+SCORES = {"psnr": "PSNR, dB", "ssim": "SSIM", "flip": "FLIP", "energy": "gradient energy", "lpips": "LPIPS"}
 
 
 def make(folder: Path) -> Path:
@@ -40,9 +41,10 @@ def make(folder: Path) -> Path:
         raise ValueError(f"{folder / 'prior.json'}: missing; first `python -m benchmarks.studies.prior --out {folder}`")
     measured = load_json(folder / "prior.json")
     lines = [f"# {measured['prior']}, measured", ""]
-    if "inpainting" in measured:
-        lines += [inpainting_table(measured["inpainting"]["scores"])]
-        lines += save_sheet(folder, "inpainting", measured["inpainting"]["columns"])
+    for name in ("inpainting", "photographs"):
+        if name in measured:
+            lines += [inpainting_table(measured[name]["scores"])]
+            lines += save_sheet(folder, name, measured[name]["columns"])
     if measured.get("sampler"):
         lines += ["## Numbers of sampler steps", "", sampler_table({"held out": measured["sampler"]})]
     if "personalization" in measured:

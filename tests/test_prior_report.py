@@ -28,12 +28,15 @@ def hole_cases():
 def test_a_perfect_picture_a_blurred_one_and_a_flat_one_are_told_apart(hole_cases):
     for case in hole_cases[:6]:
         perfect = holes.hole_scores(case.truth, case.truth, case.hole)
-        assert perfect == {"psnr": image_metrics.PSNR_CAP, "ssim": 1, "flip": 0, "energy": 1}
+        has_lpips = not np.isnan(perfect["lpips"])  # its weights have been fetched
+        lpips = {"lpips": 0 if has_lpips else pytest.approx(np.nan, nan_ok=True)}
+        assert perfect == {"psnr": image_metrics.PSNR_CAP, "ssim": 1, "flip": 0, "energy": 1} | lpips
         soft, softer = (holes.hole_scores(cv2.GaussianBlur(case.truth, (0, 0), s), case.truth, case.hole)
                         for s in (1, 4))  # fmt: skip
         for better, worse in ((perfect, soft), (soft, softer)):
             assert better["psnr"] > worse["psnr"] and better["ssim"] > worse["ssim"]
             assert better["flip"] < worse["flip"] and better["energy"] > worse["energy"]
+            assert better["lpips"] < worse["lpips"] or not has_lpips
 
 
 def test_only_the_hole_counts(hole_cases):
@@ -62,7 +65,11 @@ def test_the_held_out_set_is_fixed_and_shares_no_picture_with_training(hole_case
 
 
 def test_holes_are_objects_of_a_fair_size(hole_cases):
-    for case in hole_cases:
+    photographs = [(str(k), np.random.default_rng(k).integers(0, 256, (200, 300, 3), np.uint8)) for k in range(2)]
+    photograph_cases = holes.make_photograph_cases(photographs, 4)
+    assert [case.kind for case in photograph_cases] == ["whole", "window"] * 4
+    for case in [*hole_cases, *photograph_cases]:
+        assert case.truth.shape == (holes.SIDE, holes.SIDE, 3)
         assert holes.COVER[0] <= case.hole.mean() <= holes.COVER[1]
         parts, _ = cv2.connectedComponents(case.hole.astype(np.uint8))
         assert parts - 1 <= 3 + 2  # three outlines; one that crosses itself may form several parts
@@ -89,7 +96,7 @@ def test_settings_are_checked_and_come_last():
 
 def write_benchmark_result(folder: Path) -> None:
     """Write a small synthetic result of the benchmark: prior.json and the folders of images."""
-    row = {"psnr": 20.0, "ssim": 0.5, "flip": 0.2, "energy": 0.7, "psnr_error": 0.3, "pictures": 2}
+    row = {"psnr": 20.0, "ssim": 0.5, "flip": 0.2, "energy": 0.7, "lpips": 0.1, "psnr_error": 0.3, "pictures": 2}
     better, scales = row | {"psnr": 22.0}, ("reference", "whole", "window")
     sampler = {"4": row | {"seconds": 0.05}}
     levels = {"error": [0.1, 0.4], "variance": [0.2, 0.3], "samples": row}
@@ -120,7 +127,7 @@ def test_the_page_holds_every_table_and_picture(tmp_path):
     text = page.make(tmp_path).read_text()
     assert "| all: Telea | 2 | 20.00 ± 0.30 | 0.500 | 0.200 | 0.700 |" in text
     assert "| window, after | 0.2500 | 0.2500 | 20.00 ± 0.30 |" in text
-    assert "| held out, 4 | 20.00 ± 0.30 | 0.500 | 0.200 | 0.700 | 50 |" in text
+    assert "| held out, 4 | 20.00 ± 0.30 | 0.500 | 0.200 | 0.700 | 0.100 | 50 |" in text
     assert "| whole, after | 21.00 (20.00 to 22.00) | 0.500 (0.500 to 0.500) |" in text
     assert "| whole, wrong | 20.00 (20.00 to 20.00) |" in text
     linked = [line[4:-1] for line in text.splitlines() if line.startswith("![](")]

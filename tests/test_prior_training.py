@@ -1,9 +1,11 @@
 """Training of the embedded prior: images and training steps depend only on the seed, and runs resume exactly."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import safetensors.torch
@@ -11,6 +13,7 @@ import torch
 from scenes.networks import save_small_prior
 
 from priors.tiny import build, images, train
+from priors.tiny.photographs import PHOTOGRAPHS, load_photographs, short_name
 
 pytestmark = pytest.mark.integration
 
@@ -31,9 +34,24 @@ def test_images_depend_on_seed_and_number_only():
     assert not np.array_equal(first[0], images.image(3, 7, held_out=True)[0])
 
 
-def test_held_out_photographs_never_train():
-    names = {n for n, _ in images.photographs(tuple(n for n in images.PHOTOS if n not in images.HELD_OUT_PHOTOS))}
-    assert names and not names & set(images.HELD_OUT_PHOTOS)
+def test_held_out_photographs_never_train(photographs):
+    for load in (images.bundled_photographs, lambda held_out: load_photographs(photographs, held_out)):
+        train_names, held_out_names = ({name for name, _ in load(held_out)} for held_out in (False, True))
+        assert train_names and held_out_names and not train_names & held_out_names
+
+
+def test_a_missing_photograph_is_named(photographs, tmp_path):
+    shutil.copytree(photographs, tmp_path / "some")
+    (tmp_path / "some" / "Wood.jpg").unlink()
+    with pytest.raises(ValueError, match=r"Wood missing; run python -m priors\.tiny\.photographs"):
+        load_photographs(tmp_path / "some", held_out=False)
+
+
+def test_images_are_cropped_from_the_given_photographs():
+    plain = [("plain", np.full((200, 300, 3), 90, np.uint8))]
+    found = [images.image(0, index, plain) for index in range(20)]
+    crops = [picture for picture, caption in found if caption == "A photo of plain"]
+    assert len(crops) > 5 and all(crop.std(axis=(0, 1)).max() == 0 for crop in crops)
 
 
 def test_masks_cover_between_nothing_and_everything():
@@ -64,8 +82,18 @@ def test_timesteps_cover_the_schedule_in_every_batch():
 
 
 @pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    """Return a folder of small pictures that stand for the photographs."""
+    folder = tmp_path_factory.mktemp("photographs")
+    for number, each in enumerate(PHOTOGRAPHS):
+        picture = np.random.default_rng(number).integers(0, 256, (140, 180, 3), np.uint8)
+        cv2.imwrite(str(folder / f"{short_name(each)}.jpg"), picture)
+    return folder
+
+
+@pytest.fixture(scope="module")
 def pool():
-    return train.Pool(0, 0, size=12)
+    return train.Pool(0, 0, 12, images.bundled_photographs())
 
 
 def train_steps(pool, count, start=0, state=None):
@@ -97,7 +125,7 @@ def load_weights(folder):
 
 
 @pytest.fixture
-def train_command(monkeypatch, tmp_path):
+def train_command(monkeypatch, tmp_path, photographs):
     """Return a function that runs `train.py` with small batches and returns the exported weights."""
     for name, value in (
         ("POOL", 6),
@@ -111,6 +139,7 @@ def train_command(monkeypatch, tmp_path):
     def run(work, count, *more):
         out = tmp_path / f"{work}-{count}"
         options = ["--steps", str(count), "--threads", "1", "--work", str(tmp_path / work), "--out", str(out), *more]
+        options += ["--photographs", str(photographs)]
         monkeypatch.setattr(sys, "argv", ["train.py", *options])
         train.main()
         return load_weights(out)
@@ -129,8 +158,7 @@ def test_a_run_that_was_killed_and_resumed_equals_the_unbroken_one(train_command
 
     monkeypatch.setattr(train, "step_once", killed)
     with pytest.raises(KeyboardInterrupt):
-        # The run is killed before step 8. The first half of a run does not depend on the number of steps.
-        train_command("two", 8)
+        train_command("two", 6)
     monkeypatch.setattr(train, "step_once", once)
     resumed = train_command("two", 6)
     for part, tensors in unbroken.items():

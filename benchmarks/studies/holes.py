@@ -7,6 +7,7 @@ prior's training data, with seeds that no training uses. Every random draw is se
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,7 @@ from torch import Tensor
 from priors.tiny import images
 from reffusion import seeding
 from reffusion.io.images import save_image
-from reffusion.metrics import image_metrics
+from reffusion.metrics import image_metrics, lpips
 from reffusion.prior import diffusion
 from reffusion.prior.model import Prior
 
@@ -28,7 +29,8 @@ SEED = 20  # seed of the held-out set; training and validation of the prior use 
 COVER = (0.05, 0.4)  # share of a held-out picture that its hole covers
 SAMPLER_STEPS = 12  # default number of sampler steps: that of the laptop profile for its reference
 BATCH = 16  # holes filled at once
-COLUMNS = ("psnr", "ssim", "flip", "energy")
+COLUMNS = ("psnr", "ssim", "flip", "energy", "lpips")
+WINDOW_SCALES = (0.35, 1.0)  # scales of the photographs of which windows are cut
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Case:
     Attributes:
         truth: uint8 [H, W, 3], the whole picture.
         hole: bool [H, W], True for the pixels to fill.
-        kind: "photograph" or "procedural" for held-out pictures, else the name of a view.
+        kind: "photograph", "procedural", "whole" or "window" for held-out pictures, else the name of a view.
     """
 
     truth: np.ndarray
@@ -53,12 +55,41 @@ def make_cases(count: int, seed: int = SEED) -> list[Case]:
         picture, caption = images.image(seed, index, held_out=True)
         truth = cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
         rng = np.random.default_rng(seeding.seed_for(seed, "hole", index))
-        hole = images.silhouettes(rng, SIDE)
-        while not COVER[0] <= hole.mean() <= COVER[1]:
-            hole = images.silhouettes(rng, SIDE)
         kind = "photograph" if caption.split()[-1] in images.HELD_OUT_PHOTOS else "procedural"
-        cases.append(Case(truth, hole, kind))
+        cases.append(Case(truth, _draw_hole(rng), kind))
     return cases
+
+
+def make_photograph_cases(photographs: images.Photographs, count: int, seed: int = SEED) -> list[Case]:
+    """Make `count` pictures of each kind from photographs, `SIDE` px, with holes as in `make_cases`.
+
+    Of kind "whole" is the largest square of a photograph at a random place, reduced; of kind "window" a square of
+    `SIDE` px from a photograph at one of `WINDOW_SCALES`.
+    """
+    cases = []
+    for index in range(count):
+        _, photograph = photographs[index % len(photographs)]
+        rng = np.random.default_rng(seeding.seed_for(seed, "photograph", index))
+        scale = rng.uniform(*WINDOW_SCALES)
+        reduced = cv2.resize(photograph, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        whole = _cut_square(rng, photograph, min(photograph.shape[:2]))
+        whole = cv2.resize(whole, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+        cases.append(Case(whole, _draw_hole(rng), "whole"))
+        cases.append(Case(_cut_square(rng, reduced, SIDE), _draw_hole(rng), "window"))
+    return cases
+
+
+def _cut_square(rng: np.random.Generator, picture: np.ndarray, side: int) -> np.ndarray:
+    top, left = (rng.integers(length - side + 1) for length in picture.shape[:2])
+    return np.ascontiguousarray(picture[top : top + side, left : left + side])
+
+
+def _draw_hole(rng: np.random.Generator) -> np.ndarray:
+    """Draw a silhouette, bool [SIDE, SIDE], whose size is within `COVER`."""
+    hole = images.silhouettes(rng, SIDE)
+    while not COVER[0] <= hole.mean() <= COVER[1]:
+        hole = images.silhouettes(rng, SIDE)
+    return hole
 
 
 def hole_scores(picture: np.ndarray, truth: np.ndarray, hole: np.ndarray) -> dict[str, float]:
@@ -71,7 +102,8 @@ def hole_scores(picture: np.ndarray, truth: np.ndarray, hole: np.ndarray) -> dic
 
     Returns:
         "psnr" over the hole's pixels in dB, at most `PSNR_CAP`; "ssim" and "flip" as means of their maps over the hole;
-        "energy", the gradient energy in the hole relative to that of the truth (below 1 is too smooth).
+        "energy", the gradient energy in the hole relative to that of the truth (below 1 is too smooth); "lpips", of the
+        whole picture by AlexNet, NaN if its weights have not been fetched.
 
     Raises:
         ValueError: the hole is empty.
@@ -85,7 +117,22 @@ def hole_scores(picture: np.ndarray, truth: np.ndarray, hole: np.ndarray) -> dic
         "ssim": float(ssim_map(picture, truth)[hole].mean()),
         "flip": float(flip_map(picture, truth)[hole].mean()),
         "energy": gradient_energy(picture, hole) / max(gradient_energy(truth, hole), 1e-9),
+        "lpips": _lpips(picture, truth),
     }
+
+
+@torch.no_grad()
+def _lpips(picture: np.ndarray, truth: np.ndarray) -> float:
+    network = _load_alexnet()
+    if network is None:
+        return float("nan")
+    to_input = lambda image: torch.from_numpy(image).permute(2, 0, 1)[None].float() / 127.5 - 1
+    return float(network(to_input(picture), to_input(truth)))
+
+
+@lru_cache
+def _load_alexnet() -> lpips.Lpips | None:
+    return lpips.load("alex")[0]
 
 
 def ssim_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:

@@ -3,8 +3,9 @@
 Measurements and options:
 
   inpainting    held-out pictures of 64 px (not in the training set) with a silhouette as a hole, filled by the priors
-                and by OpenCV's methods Telea and Navier-Stokes: PSNR, SSIM, FLIP and gradient energy inside the hole.
-                All priors start from the same noise
+                and by OpenCV's methods Telea and Navier-Stokes: PSNR, SSIM, FLIP and gradient energy inside the hole,
+                LPIPS of the picture. All priors start from the same noise
+  --photographs the same for whole views and windows of the held-out photographs of `priors.tiny.photographs`
   --steps       the first prior with other numbers of sampler steps. Few steps give nearly the mean of all fillings,
                 which is blurred and best by PSNR and SSIM; many steps give one of the fillings
   personalize   the first prior, personalized to a scene's reference with the laptop profile. Measured are the error
@@ -18,8 +19,7 @@ Measurements and options:
                 another scene's run, whose personalized prior is used as it is
 
 The study writes prior.json and rows of pictures to --out; `python -m report.prior` makes a page of them
-(`make prior-report` does both). Every draw is seeded. LPIPS is left out, because the weights of its network are not in
-the repository.
+(`make prior-report` does both). Every draw is seeded. LPIPS needs the network's weights (`make weights`).
 """
 
 from __future__ import annotations
@@ -43,10 +43,12 @@ from benchmarks.studies.holes import (
     fill_holes,
     hole_scores,
     make_cases,
+    make_photograph_cases,
     mean_scores,
     save_row,
     to_tensors,
 )
+from priors.tiny.photographs import load_photographs
 from reffusion import seeding, trace
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.ground_truth import load_ground_truth, load_object_mask
@@ -64,6 +66,7 @@ TIMESTEPS = (20, 100, 250, 400, 550, 700, 850, 980)
 NOISES = 4  # draws for the variance of the SDS gradient
 VIEWS = 6  # number of unseen views
 SHOWN = 12  # held-out pictures on the sheet
+PHOTOGRAPH_CASES = 36  # pictures of each kind from held-out photographs
 PROMPTS = {"reference": "A photo of sks", "whole": "A photo of sks", "window": "A photo of sks, cropped"}
 LEARNS = ("poses", "reference")  # stages that personalization needs of a run
 
@@ -89,7 +92,7 @@ def measure_inpainting(priors: list[str], cases: list[Case], out: Path) -> dict:
     Args:
         priors: diffusers folders.
         cases: pictures with holes.
-        out: folder of the study.
+        out: folder for the rows of pictures.
 
     Returns:
         "columns": titles of the columns of pictures; "scores": method -> kind of picture ("all" too) -> mean scores.
@@ -104,7 +107,7 @@ def measure_inpainting(priors: list[str], cases: list[Case], out: Path) -> dict:
         prior = load_prior(name)
         ways[name], seconds[name] = time_cpu(lambda prior=prior: fill_holes(prior, cases, SEED))
     for index, case in enumerate(cases[:SHOWN]):
-        save_row(out / "inpainting" / f"{index:02d}.png", case, [pictures[index] for pictures in ways.values()])
+        save_row(out / f"{index:02d}.png", case, [pictures[index] for pictures in ways.values()])
     result = {}
     for name, pictures in ways.items():
         rows = [(c.kind, hole_scores(p, c.truth, c.hole)) for p, c in zip(pictures, cases, strict=True)]
@@ -385,6 +388,7 @@ def parse_arguments() -> argparse.Namespace:
         "--priors", nargs="+", default=["priors/tiny"], help="diffusers folders; the first one is personalized"
     )
     parser.add_argument("--pictures", type=int, default=64, help="held-out pictures to fill; 0 skips this part")
+    parser.add_argument("--photographs", type=Path, help="the output of `priors.tiny.photographs`")
     parser.add_argument("--steps", type=int, nargs="*", default=[], help="numbers of sampler steps to compare")
     parser.add_argument("--run", type=Path, help="runs/<scene>, with its reference; without it no personalization")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of personalization")
@@ -401,18 +405,24 @@ def parse_arguments() -> argparse.Namespace:
 def main() -> None:
     arguments = parse_arguments()
     torch.set_num_threads(arguments.threads)
-    for folder in ("inpainting", "reference", "whole", "window"):
+    for folder in ("inpainting", "photographs", "reference", "whole", "window"):
         shutil.rmtree(arguments.out / folder, ignore_errors=True)
     first = arguments.priors[0]
     result: dict = {"prior": first}
     if arguments.pictures:
         cases = make_cases(arguments.pictures)
-        result["inpainting"] = measure_inpainting(arguments.priors, cases, arguments.out)
+        result["inpainting"] = measure_inpainting(arguments.priors, cases, arguments.out / "inpainting")
         for name, kinds in result["inpainting"]["scores"].items():
             print(name, {column: round(kinds["all"][column], 3) for column in (*COLUMNS, "seconds")}, flush=True)
         result["sampler"] = measure_steps(load_prior(first), cases, arguments.steps)
         for count, row in result["sampler"].items():
             print(f"{count} steps", {column: round(row[column], 3) for column in (*COLUMNS, "seconds")}, flush=True)
+    if arguments.photographs:
+        cases = make_photograph_cases(load_photographs(arguments.photographs, held_out=True), PHOTOGRAPH_CASES)
+        result["photographs"] = measure_inpainting(arguments.priors, cases, arguments.out / "photographs")
+        for name, kinds in result["photographs"]["scores"].items():
+            for kind in ("whole", "window"):
+                print(name, kind, {column: round(kinds[kind][column], 3) for column in COLUMNS}, flush=True)
     if arguments.run:
         params = profile_params(first, dict(arguments.set))
         result["personalization"] = measure_personalization(

@@ -1,13 +1,15 @@
-"""Training images of the embedded prior: procedural surfaces, corners of rooms, bundled photographs; and their masks.
+"""Training images of the embedded prior: procedural surfaces, corners of rooms, photographs; and their masks.
 
-Image number k of a seed is a pure function of (seed, k), so training resumes to the same pictures without a
-data set on disk. Nothing is downloaded: patterns are made here, photographs come with scikit-image (the model
-card lists them with their licences).
+Image number k of a seed is a pure function of (seed, k) and the photographs, so training resumes to the same pictures.
+The patterns are made here. Photographs come with scikit-image, and from `photographs` (the model card lists them with
+their licences).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -20,13 +22,27 @@ SUPERSAMPLE = 2
 PHOTOS = ("astronaut", "chelsea", "coffee", "rocket", "brick", "grass", "gravel", "camera", "coins")
 HELD_OUT_PHOTOS = ("chelsea", "gravel")
 
+Photographs: TypeAlias = Sequence[tuple[str, np.ndarray]]  # names, and pictures uint8 [H, W, 3]
 
-def image(seed: int, index: int, held_out: bool = False) -> tuple[np.ndarray, str]:
-    """Training image number `index`: ([SIZE, SIZE, 3] uint8, caption). `held_out`: never trained on."""
+
+def image(
+    seed: int, index: int, photographs: Photographs | None = None, held_out: bool = False
+) -> tuple[np.ndarray, str]:
+    """Make an image.
+
+    Args:
+        seed, index: seed and number of the image.
+        photographs: the photographs to crop; None for those of scikit-image.
+        held_out: make an image that training never sees. Fewer of these are photographs.
+
+    Returns:
+        The image, uint8 [SIZE, SIZE, 3], and a caption.
+    """
     rng = np.random.default_rng(seed_for(seed, "held-out" if held_out else "train", index))
-    kind = rng.choice(["surface", "corner", "photo"], p=[0.35, 0.45, 0.2])
+    shares = [0.35, 0.45, 0.2] if held_out else [0.2, 0.25, 0.55]
+    kind = rng.choice(["surface", "corner", "photo"], p=shares)
     if kind == "photo":
-        return photo_crop(rng, held_out)
+        return photo_crop(rng, bundled_photographs(held_out) if photographs is None else photographs)
     picture, caption = surface(rng) if kind == "surface" else corner(rng)
     if rng.random() < 0.5:
         picture = with_props(rng, picture)
@@ -107,25 +123,23 @@ def with_props(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
 
 
 @lru_cache
-def photographs(names: tuple[str, ...]) -> tuple[tuple[str, np.ndarray], ...]:
-    """The named photographs of scikit-image that are on disk, as uint8 [H, W, 3]."""
+def bundled_photographs(held_out: bool = False) -> Photographs:
+    """Load the photographs of scikit-image that are on disk."""
     from pathlib import Path
 
     import skimage
 
     folder, found = Path(skimage.__file__).parent / "data", []
-    for name in names:
+    for name in HELD_OUT_PHOTOS if held_out else [each for each in PHOTOS if each not in HELD_OUT_PHOTOS]:
         path = next((folder / f"{name}{end}" for end in (".png", ".jpg") if (folder / f"{name}{end}").exists()), None)
         if path is not None:
             found.append((name, cv2.imread(str(path), cv2.IMREAD_COLOR)[..., ::-1].copy()))
-    return tuple(found)
+    return found
 
 
-def photo_crop(rng: np.random.Generator, held_out: bool) -> tuple[np.ndarray, str]:
+def photo_crop(rng: np.random.Generator, photographs: Photographs) -> tuple[np.ndarray, str]:
     """A crop of a photograph at a random scale, flipped, with its colours shifted."""
-    names = HELD_OUT_PHOTOS if held_out else tuple(n for n in PHOTOS if n not in HELD_OUT_PHOTOS)
-    found = photographs(names)
-    name, photo = found[rng.integers(len(found))]
+    name, photo = photographs[rng.integers(len(photographs))]
     side = int(SIZE * np.exp(rng.uniform(0, np.log(max(min(photo.shape[:2]) / SIZE, 1.01)))))
     top, left = rng.integers(photo.shape[0] - side + 1), rng.integers(photo.shape[1] - side + 1)
     crop = cv2.resize(photo[top : top + side, left : left + side], (SIZE, SIZE), interpolation=cv2.INTER_AREA)

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from transformers import CLIPTextModel
 
 from priors.tiny import build, images
+from priors.tiny.photographs import load_photographs
 from reffusion.io.arrays import save_json
 from reffusion.prior import harmonic_fill
 from reffusion.prior.denoising import spread_timesteps
@@ -36,7 +37,8 @@ SMALL, LARGE = (
     (32, 24),
     (64, 8),
 )  # (crop side in px, batch): small crops three steps of four, whole native ones the fourth
-PEAK_RATE, WARMUP, DECAY_SHARE, EMA = 1e-3, 200, 0.5, 0.999  # DECAY_SHARE: last part of the run, with a falling rate
+PEAK_RATE, WARMUP, DECAY_SHARE, EMA = 6e-4, 200, 0.7, 0.999  # DECAY_SHARE: last part of the run, with a falling rate
+HAS_BFLOAT16 = torch.ops.mkldnn._is_mkldnn_bf16_supported()  # then a step on the CPU takes .75 of its time
 OUTSIDE_WEIGHT = 0.2  # weight of the loss outside the mask
 FILLED_SHARE = 0.8  # of samples have the hole filled as in conditioning.json; the others a grey hole
 NOISY_SHARE = 0.15  # noisy end of the schedule, from which every fourth timestep is sampled
@@ -48,8 +50,8 @@ CHECKPOINT_STEPS = 100  # steps between checkpoints
 class Pool:
     """The last `size` images of a seed; `advance` replaces the oldest by image number `index`."""
 
-    def __init__(self, seed: int, step: int, size: int, held_out: bool = False):
-        self.seed, self.held_out = seed, held_out
+    def __init__(self, seed: int, step: int, size: int, photographs: images.Photographs, held_out: bool = False):
+        self.seed, self.photographs, self.held_out = seed, photographs, held_out
         self.items: list[np.ndarray | None] = [None] * size
         self.captions = [""] * size
         for index in range(step, step + size):
@@ -57,7 +59,7 @@ class Pool:
 
     def advance(self, index: int) -> None:
         slot = index % len(self.items)
-        self.items[slot], self.captions[slot] = images.image(self.seed, index, self.held_out)
+        self.items[slot], self.captions[slot] = images.image(self.seed, index, self.photographs, self.held_out)
 
     def batch(self, rng: np.random.Generator, side: int, count: int) -> tuple[Tensor, Tensor, list[str]]:
         """Crops [B, 3, side, side] in [-1, 1], masks [B, 1, side, side] (1 = repaint), captions."""
@@ -104,16 +106,18 @@ def noisy_quarter(t: Tensor, steps: int) -> Tensor:
 
 def loss(model: Model, alphas: Tensor, batch: tuple[Tensor, Tensor, list[str]], random: torch.Generator) -> Tensor:
     """Mean squared error of v = sqrt(a) eps - sqrt(1 - a) z, with OUTSIDE_WEIGHT (1 in holes) and LATENT_WEIGHTS."""
-    pixels, masks, captions = batch
-    filled = torch.rand(len(pixels), 1, 1, 1, generator=random) < FILLED_SHARE
+    device = alphas.device
+    pixels, masks, captions = batch[0].to(device), batch[1].to(device), batch[2]
+    filled = (torch.rand(len(pixels), 1, 1, 1, generator=random) < FILLED_SHARE).to(device)
     shown = torch.where(filled, harmonic_fill.harmonic_extension(pixels, masks), pixels * (masks < 0.5))
     clean, given = build.latents(pixels), build.latents(shown)
-    t = noisy_quarter(spread_timesteps(len(pixels), len(alphas), random), len(alphas))
-    noise = torch.randn(clean.shape, generator=random)
+    t = noisy_quarter(spread_timesteps(len(pixels), len(alphas), random), len(alphas)).to(device)
+    noise = torch.randn(clean.shape, generator=random).to(device)
     a = alphas[t].view(-1, 1, 1, 1)
     noisy, target = a.sqrt() * clean + (1 - a).sqrt() * noise, a.sqrt() * noise - (1 - a).sqrt() * clean
-    predicted = model(noisy, t, torch.cat([masks, given], 1), captions)
-    weight = (OUTSIDE_WEIGHT + (1 - OUTSIDE_WEIGHT) * masks) * torch.tensor(LATENT_WEIGHTS).view(-1, 1, 1)
+    with torch.autocast(device.type, torch.bfloat16, enabled=HAS_BFLOAT16 or device.type == "cuda"):
+        predicted = model(noisy, t, torch.cat([masks, given], 1), captions).float()
+    weight = (OUTSIDE_WEIGHT + (1 - OUTSIDE_WEIGHT) * masks) * torch.tensor(LATENT_WEIGHTS).to(device).view(-1, 1, 1)
     return (weight * (predicted - target) ** 2).sum() / weight.sum()
 
 
@@ -202,12 +206,14 @@ def arguments() -> argparse.Namespace:
         "--steps",
         type=int,
         default=20000,
-        help="training steps in all; a resume may change it until half of them are done, when the rate starts to fall",
+        help="training steps in all; a resume may change it before the rate falls, i.e. before 1 - DECAY_SHARE of them",
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--work", type=Path, default=HERE.parent.parent / "runs" / "prior", help="checkpoint and log")
     parser.add_argument("--start", type=Path, help="an exported folder whose weights a new run begins with")
+    parser.add_argument("--photographs", type=Path, required=True, help="the output of `priors.tiny.photographs`")
     parser.add_argument("--out", type=Path, default=HERE, help="the folder to export to")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--export-every", type=int, default=500, help="steps between exports")
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     return parser.parse_args()
@@ -217,18 +223,20 @@ def main() -> None:
     options = arguments()
     torch.set_num_threads(options.threads)
     options.work.mkdir(parents=True, exist_ok=True)
-    model, averaged = Model(options.seed), Model(options.seed)
+    model, averaged = Model(options.seed).to(options.device), Model(options.seed).to(options.device)
     state = load_checkpoint(options.work)
     if options.start and state is None:
         load_weights(model, options.start)
-    alphas = build.scheduler().alphas_cumprod
+    alphas = build.scheduler().alphas_cumprod.to(options.device)
     optimiser = make_optimiser(model)
     average, start = {k: v.clone() for k, v in model.state_dict().items()}, 0
     if state is not None:
         model.load_state_dict(state["model"])
         optimiser.load_state_dict(state["optimiser"])
         average, start = state["average"], state["step"]
-    pool, held_out = Pool(options.seed, start // STEPS_PER_IMAGE, POOL), Pool(0, 0, VALIDATION_CROPS, held_out=True)
+    photographs = [*images.bundled_photographs(), *load_photographs(options.photographs, held_out=False)]
+    pool = Pool(options.seed, start // STEPS_PER_IMAGE, POOL, photographs)
+    held_out = Pool(0, 0, VALIDATION_CROPS, load_photographs(options.photographs, held_out=True), held_out=True)
     began = time.time()
     for step in range(start, options.steps):
         error = step_once(model, alphas, optimiser, pool, step, options.steps)
