@@ -10,12 +10,15 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, save_image
+
+Item = TypeVar("Item")
 
 GAP = 6  # space between pictures, px
 TITLES = {
@@ -55,14 +58,14 @@ def make(scene_dir: Path, out: Path, *, views: list[str] | int = 3, scale: int |
     return out
 
 
-def pick_evenly(names: list[str], count: int) -> list[str]:
-    """Return `count` names evenly spread over a list, or all names if there are fewer.
+def pick_evenly(items: list[Item], count: int) -> list[Item]:
+    """Return `count` items evenly spread over a list, or all items if there are fewer.
 
-    Each name is from the middle of one of `count` equal parts of the list, so the first and the last name of a long
+    Each item is from the middle of one of `count` equal parts of the list, so the first and the last item of a long
     list are not chosen.
     """
-    places = (np.arange(min(count, len(names))) + 0.5) * len(names) / min(count, len(names))
-    return [names[int(place)] for place in places]
+    places = (np.arange(min(count, len(items))) + 0.5) * len(items) / max(min(count, len(items)), 1)
+    return [items[int(place)] for place in places]
 
 
 def stage_folder(scene_dir: Path, stage: str) -> Path:

@@ -38,6 +38,7 @@ from reffusion.prior.personalize import personalize
 from reffusion.splat import rasterizer
 from reffusion.types import Camera
 from reffusion.workspace import Workspace
+from report.sheet import pick_evenly
 
 WAYS = {  # name -> noise level from which the whole view is painted, and the finer sizes
     "whole view": {"start": 1.0, "finest": 0.35, "levels": 0},
@@ -48,7 +49,7 @@ SAMPLER_STEPS = 12
 PHOTOGRAPHS = 12  # of the scene, at most, that a prior is personalized to
 MIN_SHARE = 0.02  # a test view counts if more than this share of its mask is unseen
 MATCH = 0.02  # relative difference of depth up to which a view shows a point
-SHOWN = 6  # views of a run on the sheet
+VIEWS = 6  # test views, at most, that are painted
 
 
 class UnseenView(NamedTuple):
@@ -69,7 +70,7 @@ class UnseenView(NamedTuple):
 
 @torch.no_grad()
 def find_unseen_views(run: Path) -> list[UnseenView]:
-    """Find the test views of a finished run that have ground truth and unseen pixels."""
+    """Find up to `VIEWS` evenly spread test views of a finished run that have ground truth and unseen pixels."""
     space = Workspace(run / "poses", run / "fit", run / "masks")
     scene, sets = space.scene, space.mask_sets
     gaussians = load_ply(run / "initialize/gaussians.ply")
@@ -97,7 +98,7 @@ def find_unseen_views(run: Path) -> list[UnseenView]:
         if unseen.sum() > MIN_SHARE * mask.sum():
             start = (255 * rendering.color.clamp(0, 1)).round().byte().cpu().numpy()
             views.append(UnseenView(name, start, truth, unseen))
-    return views
+    return pick_evenly(views, VIEWS)
 
 
 def _is_seen(points: np.ndarray, camera: Camera, depth: np.ndarray) -> np.ndarray:
@@ -188,7 +189,7 @@ def study_run(run: Path, prior: str, seeds: list[int], out: Path) -> dict:
     score = make_scorer()
     mean = lambda rows: {net: float(np.mean([row[net] for row in rows])) for net in rows[0]}
     scores = {"patches": {"0": mean([score(view.start, view) for view in views])}}
-    shown = {view.name: [np.where(view.unseen[..., None], 128, view.start), view.start] for view in views[:SHOWN]}
+    rows = {view.name: [np.where(view.unseen[..., None], 128, view.start), view.start] for view in views}
     for seed in seeds:
         params = profile_params(prior, {"seed": seed})
         for teaching in ("base", "reference", "photographs"):
@@ -202,11 +203,11 @@ def study_run(run: Path, prior: str, seeds: list[int], out: Path) -> dict:
                 method = f"{teaching}, {way}"
                 scores.setdefault(method, {})[str(seed)] = mean([score(pictures[view.name], view) for view in views])
                 if seed == seeds[0]:
-                    for name, row in shown.items():
+                    for name, row in rows.items():
                         row.append(pictures[name])
-    for view in views[:SHOWN]:
+    for view in views:
         crop = _crop(view.unseen)
-        row = [cell[crop] for cell in (*shown[view.name], view.truth)]
+        row = [cell[crop] for cell in (*rows[view.name], view.truth)]
         save_image(out / f"{view.name}.png", np.hstack(row).astype(np.uint8))
     share = float(np.mean([view.unseen.mean() for view in views]))
     return {"views": len(views), "share": share, "scores": scores}
