@@ -62,8 +62,8 @@ def black_train_view(hole=HOLE):
     return TrainView(VIEW, torch.zeros(HEIGHT, WIDTH, 3), ~hole, hole, False)
 
 
-def evaluate_term(gaussians, masked, estimator, prior=None, text=None, view=None, **more):
-    arguments = view or black_train_view(), prior, text, DEPTH, 7.5, generator(1), estimator
+def evaluate_term(gaussians, masked, estimator, prior=None, text=None, view=None, settings=DEPTH, **more):
+    arguments = view or black_train_view(), prior, text, settings, 7.5, generator(1), estimator
     return depth_term.evaluate_depth(gaussians, masked, *arguments, **more)
 
 
@@ -137,10 +137,11 @@ def test_a_surface_that_is_right_has_no_loss_and_one_that_is_not_is_pulled_the_r
         assert (sign * pull.sum()) > 0 and (sign * pull > 0).float().mean() > 0.8
 
 
-def test_the_loss_is_in_units_of_the_extent():
+def test_the_loss_is_in_its_unit():
     gaussians, masked = slanted_wall(0.9)
     estimator = depth_estimator.continuation_estimator(NO_POINTS, HOW)
-    once, thrice = (float(evaluate_term(gaussians, masked, estimator, extent=e)[0]) for e in (1, 3))
+    units = [DEPTH.changed({"unit": unit}) for unit in (1, 3)]
+    once, thrice = (float(evaluate_term(gaussians, masked, estimator, settings=each)[0]) for each in units)
     assert once == pytest.approx(9 * thrice)
 
 

@@ -1,6 +1,7 @@
 """The fit of a whole scene: it improves, resumes, ignores masked pixels, and errors name the view and the value."""
 
 import json
+import math
 import re
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from scenes.cameras import make_camera, make_scene, yaw
+from scenes.gaussians import round_gaussians
 
 from reffusion import seeding, trace
 from reffusion.fit import exposure, step, view_loader
@@ -16,6 +18,8 @@ from reffusion.fit import reconstruction as fitting
 from reffusion.fit.preparation import limit_gaussians
 from reffusion.fit.reconstruction import PLACED_RATE_FACTOR, fit
 from reffusion.fit.start import initial_gaussians
+from reffusion.fit.step import control_density
+from reffusion.gaussians.optimize import GaussianOptimizer
 from reffusion.io.arrays import load_json
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply, save_ply
@@ -417,3 +421,32 @@ def test_the_end_of_a_fit_is_a_mean_where_no_gaussian_is_added_any_more():
     assert counted() == [], "as 3DGS"
     assert counted(init=Init(flow_cell=3)) == counted(densify=Densify(stop=0.0)) == [92, 94, 96, 98, 100]
     assert counted(init=Init(flow_cell=3), densify=Densify(stop=0.95)) == [96, 98, 100]
+
+
+@pytest.mark.parametrize(("growth", "number"), [("linear", 37), ("immediate", 60)])
+def test_the_cap_grows_linearly_or_holds_from_the_start(growth, number):
+    """The first densification of 3DGS's schedule clones 30 Gaussians with large gradients as far as the cap allows."""
+    optimizer = GaussianOptimizer(round_gaussians(np.zeros((30, 3)), np.full((30, 3), 0.5), 0.001, 2.0))
+    optimizer.grad2d_sum += 1.0
+    settings = Params(densify=Densify(cap_max=1000, cap_growth=growth, start=500 / 30_000))
+    control_density(optimizer, [make_camera("a", (16, 16), 16.0, center=(0.0, 0.0, -1.0))], 30, settings, 500)
+    assert len(optimizer.gaussians) == number
+
+
+def test_sizes_are_measured_in_the_distance_or_in_the_cameras_extent():
+    """A Gaussian far behind the others is pruned in units of the cameras' extent, and kept in units of its distance.
+
+    Before the first reset of opacities no Gaussian is pruned for its size.
+    """
+    cameras = [make_camera(f"{x}", (16, 16), 16.0, center=(x, 0.0, 0.0)) for x in (-0.5, 0.5)]
+    means = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 100.0]])
+    kept = {}
+    for unit in ("distance", "cameras"):
+        schedule = Densify(start=0, every=1, size_unit=unit, prune_scale3d=0.1, reset_every=0.5)
+        settings = Params(iterations=10, densify=schedule)
+        for done in (4, 6):
+            optimizer = GaussianOptimizer(round_gaussians(means, torch.full((2, 3), 0.5), 2.0, 2.0))
+            optimizer.gaussians.log_scales.data[0] = math.log(0.001)
+            control_density(optimizer, cameras, 2, settings.changed({"densify.stop": 1.0}), done)
+            kept[unit, done] = len(optimizer.gaussians)
+    assert kept == {("distance", 4): 2, ("distance", 6): 2, ("cameras", 4): 2, ("cameras", 6): 1}

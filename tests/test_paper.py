@@ -32,6 +32,9 @@ FIXED = {
     "fit.densify.stop": 15_000 / 30_000,
     "fit.densify.every": 100,
     "fit.densify.grow_grad2d": 2e-4,
+    "fit.densify.cap_growth": "immediate",
+    "fit.densify.size_unit": "cameras",
+    "fit.densify.prune_scale3d": 0.1,
     "fit.densify.reset_every": 3000 / 30_000,
     "fit.lr.means": 1.6e-4,
     "fit.lr.means_unit": "cameras",
@@ -62,16 +65,14 @@ FIXED = {
     "distill.sds.weight": 1e-3,
     "distill.sds.patches": 2,
     "distill.sds.reaches": "masked",
+    "distill.sds.antialias": False,
     "distill.depth.weight": 0.0625,
     "distill.depth.every": 8,
     "distill.adversarial.weight": 0.03,
     "distill.adversarial.patches": 64,
     "distill.adversarial.size": 64,
-    "distill.adversarial.form": "saturating",
-    "distill.adversarial.penalized": "fake",
     "distill.reconstruction.reaches": "unmasked",
     "distill.repaint": "consistent",
-    "distill.prompts": "sks",
     "distill.confined": True,
 }
 # Features that the paper does not have, each with the value that turns the feature off.
@@ -91,6 +92,8 @@ ABSENT = {
     "personalize.samples.hole_share": 0,
     "personalize.samples.outside_weight": 1,
     "initialize.depth.sweep": False,
+    "initialize.depth.hints": False,
+    "initialize.overlap": 0,
     "initialize.tidy": False,
     "initialize.view_dependent_color": False,
     "initialize.extra_views": 0,
@@ -103,7 +106,7 @@ ABSENT = {
     "finish.backdrop": False,
 }
 # Features that the paper mentions but the profile `paper` does not follow, or for which the paper gives no details.
-OTHERWISE = {"fit.densify.cap_max", "fit.densify.prune_scale3d", "distill.densify.every"}
+OTHERWISE = {"fit.densify.cap_max", "distill.densify.grow_grad2d"}
 
 
 def flatten(params, above=""):

@@ -6,7 +6,6 @@ C is the mask of the removed object in a view (consistent mask), I the mask of t
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +27,11 @@ from reffusion.distill.terms.depth import _downscale
 from reffusion.fit import step
 from reffusion.fit.preparation import limit_sh_degree
 from reffusion.gaussians.optimize import Rates
-from reffusion.geometry import cameras_extent
+from reffusion.geometry import cameras_extent, project, sample_nearest
 from reffusion.initialize import draft_steps
 from reffusion.initialize.draft import Draft
 from reffusion.io.arrays import load_labels
+from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_references, load_scene, save_mask_sets
 from reffusion.masks.consolidation import clean_mask
 from reffusion.params.distill import Params, SdsTerm
@@ -123,23 +123,42 @@ def test_a_clean_view_can_be_a_reference(tmp_path):
     assert load_labels(paths["initialize"] / "labels.npy").any()
 
 
+def test_without_overlap_new_gaussians_lie_in_the_hole(tmp_path):
+    paths = {name: tmp_path / name for name in ("scene", "poses", "fit", "masks", "reference")}
+    poses, fitted, _ = wall_scene.write_poses_and_fit(tmp_path, NEAR)
+    wall_scene.write_capture_photos(paths["scene"], poses, wall_scene.CAMERAS)
+    paths["reference"].mkdir()
+    run_masks(poses, fitted, paths["masks"], masks.Params(invent="consistent"))
+    spec = {"view": "a2", "image": "images/a2.png"}
+    needs = {k: paths[k] for k in ("scene", "poses", "fit", "masks")}
+    reference.run(reference.Params(reference=spec), paths["reference"], **needs)
+    scene, hole = load_scene(poses), load_mask_sets(paths["masks"], ["a2"])["a2"].consistent
+    beyond = []
+    for overlap in (0, 0.05):
+        out = tmp_path / str(overlap)
+        out.mkdir()
+        params = initialize.Params(overlap=overlap, tidy=False)
+        initialize.run(params, out, **{k: paths[k] for k in ("poses", "fit", "masks", "reference")})
+        means = load_ply(out / "gaussians.ply").means[load_labels(out / "labels.npy")]
+        inside, _ = sample_nearest(hole, project(means.double().numpy(), scene.cameras["a2"])[0])
+        beyond.append((~inside).mean())
+    assert beyond[0] == 0 < beyond[1]
+
+
 # ---------------------------------------------------------------------------------------------------- input of a prior
 
 
-def test_an_unadapted_prior_is_not_prompted_unless_asked():
-    cases = [(None, ""), *product(("no_personalization", "sds_plain"), ("", "distill.prompts=sks"))]
-    where = ROOT, ROOT / "runs", ""
-    requests = [Request(*where, profile="paper", variant=variant, set=chosen) for variant, chosen in cases]
-    jobs = resolve_all(requests, Hashes(ROOT / "runs" / HASHES), scene=False)
-    assert [job.params["distill"]["prompts"] for job in jobs] == ["sks", "empty", "sks", "empty", "sks"]
+def test_without_personalization_only_the_lora_is_missing():
+    requests = [Request(ROOT, ROOT / "runs", "", profile="paper", variant=v) for v in (None, "no_personalization")]
+    full, ablated = resolve_all(requests, Hashes(ROOT / "runs" / HASHES), scene=False)
+    changed = [stage for stage in full.params if full.params[stage] != ablated.params[stage]]
+    assert changed == ["personalize"] and ablated.params["personalize"] == full.params["personalize"] | {"steps": 0}
 
 
 def test_prompts_of_the_prior(prior, monkeypatch):
     monkeypatch.setattr(inputs, "load_prior", lambda *_, **__: prior)
     _, embeddings = inputs.load_adapted_prior(Params(), None)
-    _, empty = inputs.load_adapted_prior(Params(prompts="empty"), None)
     assert torch.equal(embeddings, diffusion.embed_text(prior, list(crops.PROMPTS)))
-    assert torch.equal(empty, diffusion.embed_text(prior, [""] * 3)) and not torch.equal(embeddings[0], empty[0])
 
 
 def test_guidance_of_the_empty_prompt_changes_nothing_and_costs_nothing(prior, monkeypatch):

@@ -22,10 +22,13 @@ def expected_gradient(latent, t, weighting):
     """Return the expectation over the noise of w(t) (eps_theta - eps) in closed form."""
     a2 = ABAR[t]
     mean = (1 - a2).sqrt() * a2.sqrt() * (latent - MEAN) / (a2 * VARIANCE + 1 - a2)
-    return mean * {"one": 1.0, "sigma2": 1 - a2, "x0": ((1 - a2) / a2).sqrt()}[weighting]
+    return (
+        mean
+        * {"one": 1.0, "sigma2": 1 - a2, "alpha_sigma2": a2.sqrt() * (1 - a2), "x0": ((1 - a2) / a2).sqrt()}[weighting]
+    )
 
 
-@pytest.mark.parametrize("weighting", ["x0", "sigma2", "one"])
+@pytest.mark.parametrize("weighting", ["x0", "sigma2", "alpha_sigma2", "one"])
 def test_mean_gradient_converges_to_the_closed_form_as_one_over_root_n(weighting):
     latent, t, counts = torch.tensor(2.0, dtype=torch.float64), 60, (100, 1_000, 10_000)
     errors = []
@@ -41,6 +44,18 @@ def test_mean_gradient_converges_to_the_closed_form_as_one_over_root_n(weighting
     rates = [float((errors[i] / errors[i + 1]).log10() / 1.0) for i in range(2)]
     assert all(0.35 < rate < 0.65 for rate in rates), rates
     assert errors[-1] < 0.05 * expected_gradient(latent, t, weighting).abs()
+
+
+@pytest.mark.parametrize(("weighting", "strong", "weak"), [("sigma2", 0.59, 0.09), ("alpha_sigma2", 0.33, 0.20)])
+def test_shares_of_timesteps_with_stable_diffusions_schedule(weighting, strong, weak):
+    """Share of the total weight at t >= 600 and t < 300, for errors of the noise that do not depend on t."""
+    alpha_bar = torch.cumprod(1 - torch.linspace(0.00085**0.5, 0.012**0.5, 1000, dtype=torch.float64) ** 2, 0)
+    timesteps, noise = torch.arange(20, 980), torch.zeros(960, 1, 1, 1, dtype=torch.float64)
+    wrong_by_one = lambda noisy, t: (torch.ones_like(noisy), noisy)
+    weight = sds_gradient(noise, wrong_by_one, timesteps, noise, alpha_bar, weighting=weighting).flatten()
+    share = lambda chosen: float(weight[chosen].sum() / weight.sum())
+    assert share(timesteps >= 600) == pytest.approx(strong, abs=0.006)
+    assert share(timesteps < 300) == pytest.approx(weak, abs=0.006)
 
 
 def test_descent_along_the_gradient_ends_at_the_mean_of_the_data():
@@ -159,6 +174,14 @@ def test_two_scales_gradient_reaches_every_pixel_and_matches_differences():
         torch.testing.assert_close(gradient[0, row, column], numeric.detach(), rtol=1e-6, atol=1e-9)
 
 
+def test_plain_bilinear_reduction_is_that_of_torch_and_skips_pixels():
+    image = torch.rand(1, 40, 60, generator=generator(6), dtype=torch.float64, requires_grad=True)
+    reduced = two_scales(image, [], 8, antialias=False)
+    expected = torch.nn.functional.interpolate(image[None], size=(8, 8), mode="bilinear", align_corners=False)
+    (gradient,) = torch.autograd.grad(reduced.sum(), image)
+    assert torch.equal(reduced, expected) and (gradient != 0).sum() <= 4 * 64
+
+
 def test_a_mask_keeps_the_gradient_inside_it_and_drops_the_rest():
     t, draw = torch.tensor([5, 90]), generator(3)
     latents, noise = torch.randn(2, 2, 4, 6, 6, generator=draw, dtype=torch.float64)
@@ -195,6 +218,11 @@ def test_windows_show_the_mask_and_stay_inside():
         for row, column in seen:
             seen[row, column] += top <= row < top + 12 and left <= column < left + 12
     assert min(seen.values()) > 8, "one part of the mask is hardly ever drawn"
+    hole = torch.zeros(1200, 1600, dtype=torch.bool)
+    hole[400:700, 600:950] = True  # a window anywhere around a masked pixel would cover .73 of it
+    corners = [window_around(hole, 512, generator(11, seed)) for seed in range(200)]
+    shares = [float(hole[top : top + 512, left : left + 512].sum() / hole.sum()) for top, left in corners]
+    assert sum(shares) / len(shares) == pytest.approx(0.91, abs=0.02)
     with pytest.raises(ValueError, match="empty mask"):
         window_around(torch.zeros(30, 50, dtype=torch.bool), 12, generator(0))
     with pytest.raises(ValueError, match="does not fit"):

@@ -77,15 +77,15 @@ def load_adapted_prior(params: Params, personalize: Path | None) -> tuple[Prior 
             not adapted.
 
     Returns:
-        The prior, and [3, L, D], the embeddings of the global, the local and the empty prompt. With `params.prompts` =
-            "empty" all three are embeddings of the empty prompt. (None, None) if no term uses the prior.
+        The prior, and [3, L, D], the embeddings of the global, the local and the empty prompt. (None, None) if no term
+            uses the prior.
     """
     if not params.needs_prior:
         return None, None
     prior = load_prior(params.prior, params.device, params.dtype)
     prior = prior if personalize is None else lora.merge(prior, personalize)
     with torch.no_grad():
-        text = diffusion.embed_text(prior, list(PROMPTS) if params.prompts == "sks" else [""] * len(PROMPTS))
+        text = diffusion.embed_text(prior, list(PROMPTS))
     prior = drop_text_encoders(prior)
     return enable_checkpointing(prior) if params.checkpointing else prior, text
 

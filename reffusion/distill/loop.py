@@ -127,7 +127,8 @@ def distill(
         line = take_step(optimizer, step, objective)
         run.step = done = step + 1
         if _densifies_after(settings, done):
-            densify_masked(optimizer, seeding.generator(settings.seed, "distill", "densify", done))
+            draws = seeding.generator(settings.seed, "distill", "densify", done)
+            densify_masked(optimizer, int(masked.sum()), settings.densify, draws)
         average(optimizer, settings, done)
         if region is not None and (done % REGION_EVERY == 0 or done == settings.iterations):
             optimizer.select(~has_changed_region(region, optimizer.gaussians.means.detach(), optimizer.masked))

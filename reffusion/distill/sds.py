@@ -8,12 +8,12 @@ sqrt(alpha_bar_t) and s = sqrt(1 - alpha_bar_t).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
-Weighting = Literal["x0", "sigma2", "one"]
+Weighting = Literal["sigma2", "alpha_sigma2", "x0", "one"]
 Denoiser = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # (z_t [B, C, h, w], t [B]) -> (eps, x0)
 
 
@@ -72,9 +72,11 @@ def sds_gradient(
 ) -> Tensor:
     """Return the SDS gradient w(t) (eps_theta(z_t, t) - eps), without the UNet's Jacobian (DreamFusion eq. 3).
 
-    PAPER leaves open: w(t), the factor a of dz_t/dz (part of w here), and any normalisation (none here). Since
-    eps_theta - eps = (a / s) (z - x0_theta), the weightings differ only by a function of t:
+    PAPER leaves open: w(t), and any normalisation (none here). Equation 2 has the factor dz_t/dz = a, which libraries
+    omit; it is part of w here. Since eps_theta - eps = (a / s) (z - x0_theta), the weightings differ only by a function
+    of t:
       "sigma2"  s^2 (eps_theta - eps), as in DreamFusion and threestudio;
+      "alpha_sigma2"  a s^2 (eps_theta - eps): w = s^2 in equation 2, as in Fantasia3D;
       "x0"      z - x0_theta, i.e. w = s / a, bounded at both ends of the schedule;
       "one"     eps_theta - eps; with v-prediction, noise dominates it near t = 0.
 
@@ -109,10 +111,12 @@ def sds_gradient(
             gradient = latents - x0
         elif weighting == "sigma2":
             gradient = variance * (eps - noise)
+        elif weighting == "alpha_sigma2":
+            gradient = signal * variance * (eps - noise)
         elif weighting == "one":
             gradient = eps - noise
         else:
-            raise ValueError(f"weighting must be x0, sigma2 or one, got {weighting!r}")
+            raise ValueError(f"weighting must be one of {', '.join(get_args(Weighting))}; got {weighting!r}")
         if mask is not None:
             gradient = gradient * mask
         return gradient

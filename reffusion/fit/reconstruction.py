@@ -90,7 +90,6 @@ def fit(
     )
     optimizer = run.optimizer
     log = trace.Trace(folder, run.seconds, run.iteration + 1 if run.iteration else 0)
-    centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
     checkpoints = trace.Checkpoints(folder, settings.checkpoint_seconds)
     trace_inputs = (held_out, images, settings, impl)
     if run.iteration == 0:
@@ -102,7 +101,7 @@ def fit(
         strict=True,
     ):
         run.count(*step(optimizer, run.exposures, camera, target, counts, settings, i, impl))
-        control_density(optimizer, centers, run.started_with, settings, run.iteration)
+        control_density(optimizer, cameras, run.started_with, settings, run.iteration)
         average(optimizer, settings, run.iteration)
         is_line_due = trace.log_spaced(run.iteration, settings.iterations, first=FIRST_TRACED_STEP)
         is_checkpoint_due = checkpoints.due and run.iteration < settings.iterations

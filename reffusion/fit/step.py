@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,7 +18,7 @@ from reffusion.gaussians.densify import densify, prune, viewing_distance
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates, reconstruction_loss
 from reffusion.geometry import cameras_extent
 from reffusion.kernels.compiled import torch_on_one_thread
-from reffusion.params.fit import LearningRates, Params
+from reffusion.params.fit import Densify, LearningRates, Params
 from reffusion.splat.rasterizer import Implementation, render
 from reffusion.types import Camera
 
@@ -30,7 +31,7 @@ REFIT_RATES = Rates(
 COARSE_SHARE = 0.3  # share of the steps, at the start, that use views of half the size
 SPARSE_UNTIL = 0.9  # share of the steps up to which every second pixel is used
 AVERAGED_FROM = 0.9  # share of the steps after which Gaussians are averaged into the result
-GROW_SCALE3D = 0.01  # standard deviation / distance to the camera above which a Gaussian is split, not cloned
+GROW_SCALE3D = 0.01  # size (see `densify.size_unit`) above which a Gaussian is split, not cloned
 
 
 def learning_rates(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:
@@ -181,37 +182,47 @@ def degree_at(settings: Params, i: int) -> int:
 
 
 def control_density(
-    optimizer: GaussianOptimizer, centers: Tensor, started_with: int, settings: Params, done: int
+    optimizer: GaussianOptimizer, cameras: Sequence[Camera], started_with: int, settings: Params, done: int
 ) -> None:
     """Densify, prune and reset opacities (cap them at 0.01), if `settings.densify` schedules it after `done` steps.
 
     Args:
         optimizer: holds the Gaussians, which are changed.
-        centers: [V, 3], the camera centres. The size of a Gaussian is divided by its distance to the nearest of these.
+        cameras: the training views. `settings.densify.size_unit` is measured from them.
         started_with: number of Gaussians at the start of the fit.
         done: number of steps done.
     """
     schedule, progress = settings.densify, done / settings.iterations
     if not schedule.start <= progress < schedule.stop:
         return
+    period = round(schedule.reset_every * settings.iterations)
     if done % schedule.every == 0:
         generator = seeding.generator(settings.seed, "densify", done)
         max_gaussians = _max_gaussians(started_with, settings, done)
-        distance = viewing_distance(optimizer.gaussians.means, centers)
-        densify(optimizer, schedule.grow_grad2d, GROW_SCALE3D * distance, max_gaussians, generator)
-        distance = viewing_distance(optimizer.gaussians.means, centers)
-        prune(optimizer, PRUNE_OPA, schedule.prune_scale3d * distance)
-    period = round(schedule.reset_every * settings.iterations)
+        unit = _size_unit(optimizer.gaussians.means, cameras, schedule)
+        densify(optimizer, schedule.grow_grad2d, GROW_SCALE3D * unit, max_gaussians, generator)
+        unit = _size_unit(optimizer.gaussians.means, cameras, schedule)
+        # As in 3DGS, large Gaussians stay until the first reset of opacities: at first they stand for whole surfaces.
+        prune(optimizer, PRUNE_OPA, schedule.prune_scale3d * unit if done > period else math.inf)
     if period and done % period == 0:
         optimizer.cap_opacity(0.01)
+
+
+def _size_unit(means: Tensor, cameras: Sequence[Camera], schedule: Densify) -> Tensor | float:
+    """Return the unit of sizes: one for all Gaussians, or [N]."""
+    if schedule.size_unit == "cameras":
+        return cameras_extent(cameras)
+    return viewing_distance(means, torch.tensor(np.stack([each.center for each in cameras]), dtype=torch.float32))
 
 
 def _max_gaussians(started_with: int, settings: Params, done: int) -> int:
     """Return the maximum number of Gaussians after the densification at `done` steps.
 
-    The maximum grows linearly from `started_with` to `densify.cap_max` while the schedule densifies, so that late
-    densifications can still add Gaussians.
+    With `densify.cap_growth: linear` it grows linearly from `started_with` to `densify.cap_max` while the schedule
+    densifies, so that late densifications can still add Gaussians.
     """
+    if settings.densify.cap_growth == "immediate":
+        return settings.densify.cap_max
     first, last = settings.densify.start * settings.iterations, settings.densify.stop * settings.iterations
     progress = (done + settings.densify.every - first) / (last - first)
     return round(started_with + (settings.densify.cap_max - started_with) * min(1.0, progress))

@@ -11,7 +11,7 @@ import torch
 from reffusion.background.model import Background
 from reffusion.background.unobserved import find_unobserved
 from reffusion.depth import billboard, monocular
-from reffusion.depth.background_depth import CompletionSettings, Hints
+from reffusion.depth.background_depth import NO_HINTS, CompletionSettings, Hints
 from reffusion.depth.monocular import DepthNetwork
 from reffusion.depth.steps import beside_steps, sharpen_steps
 from reffusion.gaussians.sheets import Sheets
@@ -25,7 +25,7 @@ from reffusion.splat import rasterizer
 from reffusion.trace import Trace
 from reffusion.types import Camera, Gaussians, Reference
 
-OVERLAP = 0.006  # of the image's width: how far new Gaussians extend beyond the hole
+STEPS_MARGIN = 0.006  # of the image's width: how far beyond the hole ramps of the depth are sharpened to steps
 COVERED = 0.9  # a reference also fills the pixels of C (the object's mask) whose alpha is below this
 GAP_ALPHA = 0.5  # the new surface has a gap where another view renders a lower alpha in its C
 COMPLETION = CompletionSettings()
@@ -125,14 +125,14 @@ def fill_reference(
     # The plane sweep cannot measure depth at the rim of a gap as narrow as this.
     sweep = params.depth.sweep and not (farthest and coverage.is_narrow(hole))
     near, swept = refine_background(background, camera, hole) if sweep else (background, None)
-    hints = _gather_hints(draft.remaining, camera, near, swept, params.depth.sweep)
+    hints = _gather_hints(draft.remaining, camera, near, swept, params.depth.sweep) if params.depth.hints else NO_HINTS
     # The gap of an extra view lies among new surfaces too; a reference must not continue what an earlier one invented.
     surroundings = draft.gaussians if farthest else draft.remaining
     depth, estimate, words = unprojection.estimate_depth(
         surroundings, reference, hole, mask, background.points, COMPLETION, disparity, log, hints, farthest
     )
     if reference.depth is None:  # a depth map that the scene provides has no ramps
-        near_hole = dilate_by_distance(hole | mask | reference.mask, OVERLAP)
+        near_hole = dilate_by_distance(hole | mask | reference.mask, STEPS_MARGIN)
         depth, estimate = (sharpen_steps(each, reference.image, near_hole) for each in (depth, estimate))
     inserted = drawn_over = np.zeros_like(hole)
     ceded = share.ceded if share else inserted
@@ -151,7 +151,7 @@ def fill_reference(
     print(f"depth of reference {camera.name}: {words}")
     filled = hole & ~inserted & ~ceded
     # At a step no seam has to be closed: the surface beyond it is another one.
-    overlap = dilate_by_distance(filled, OVERLAP) & ~ceded & ~beside_steps(depth)
+    overlap = dilate_by_distance(filled, params.overlap) & ~ceded & ~beside_steps(depth)
     pixels = filled | overlap | drawn_over
     draft = unprojection.add_surface(
         draft, reference, depth, pixels, background, sheets, EXTRA_VIEW if farthest else REFERENCE

@@ -41,7 +41,10 @@ class SdsTerm(Settings):
     # PAPER leaves open: timesteps, w(t), normalisation, guidance, reduction (see `distill.sds`). The values are those
     # of threestudio.
     t_high: float = Field(0.98, ge=0, le=1, description="highest timestep")
-    weighting: Literal["x0", "sigma2", "one"] = Field("sigma2", description="w(t) of the SDS gradient")
+    weighting: Literal["sigma2", "alpha_sigma2", "x0", "one"] = Field(
+        "sigma2", description="w(t) of the SDS gradient, see `distill.sds.sds_gradient`"
+    )
+    antialias: bool = Field(False, description="average over all pixels when a whole view is reduced, or skip pixels")
     hole_only: bool = Field(False, description="drop the gradient at latents that are not repainted")
     # Not in the paper: the predictions of a small prior have too little contrast, and fade a correct rendering.
     keep_contrast: bool = Field(False, description="raise the prediction's contrast to that of the rendered hole")
@@ -59,8 +62,9 @@ class DepthTerm(Settings):
 
     weight: float = Field(0.0625, ge=0, description="lambda of the depth term; 0 leaves it out")
     every: int = Field(8, ge=1, description="steps between two evaluations of the depth term")
-    # PAPER leaves open: the depth model, and the sampler's steps.
+    # PAPER leaves open: the depth model, the unit of depth, and the sampler's steps.
     model: str | None = depth_model_field()
+    unit: float = Field(1, gt=0, description="the depth that counts as 1 in the loss, in the normalised frame's unit")
     steps: int = Field(20, ge=1, description="sampler steps from pure noise; a later start takes proportionally fewer")
 
 
@@ -76,9 +80,10 @@ class AdversarialTerm(Settings):
     start: float = Field(
         0.0, ge=0, le=1, description="fraction of the run after which the term starts (PAPER leaves open)"
     )
-    # PAPER leaves open: its "all spherical harmonics" may mean all coefficients, or those of all Gaussians.
+    # PAPER leaves open: its "all spherical harmonics" may mean all coefficients of masked Gaussians, or those of all
+    # Gaussians. The latter can remove the colour differences at the mask's border that the section describes.
     reaches: Literal["masked", "all"] = Field(
-        "masked", description="Gaussians whose spherical harmonics the term moves (PAPER leaves open)"
+        "all", description="Gaussians whose spherical harmonics the term moves: masked ones, or all in its patches"
     )
     patches: int = Field(64, ge=4, multiple_of=4, description="real patches in a step, and as many fake ones")
     size: Literal[8, 16, 32, 64, 128, 256] = Field(64, description="side of a patch, px")
@@ -86,13 +91,13 @@ class AdversarialTerm(Settings):
     width: int = Field(
         256, ge=1, description="the critic's channels at that side; doubled with each halving, up to 512"
     )
-    # The paper prints the saturating form. GANeRF's code has the non-saturating form, whose gradient does not vanish
-    # where the critic is certain.
+    # PAPER leaves open: the form. It prints a min-max problem, as GANeRF does, and says that it follows GANeRF, whose
+    # code has the non-saturating form. The gradient of the saturating form vanishes where the critic is certain.
     form: Literal["non-saturating", "saturating"] = Field("non-saturating", description="form of the generator's loss")
-    # PAPER leaves open: the weight, which is GANeRF's. The paper prints the penalty at fake patches; GANeRF takes it at
-    # real patches.
+    # PAPER leaves open: the weight, which is GANeRF's, and the patches. The paper prints fake patches; GANeRF's code
+    # takes real ones, for which R1 is defined.
     penalty: float = Field(0.2, ge=0, description="weight of half the squared gradient norm of the critic (R1)")
-    penalized: Literal["real", "fake"] = Field("fake", description="the patches at which that gradient is taken")
+    penalized: Literal["real", "fake"] = Field("real", description="the patches at which that gradient is taken")
 
 
 class ReconstructionTerm(Settings):
@@ -149,13 +154,19 @@ class LearningRates(Settings):
 class Densify(Settings):
     """Settings of the densification of masked Gaussians (those that `initialize` added).
 
-    PAPER leaves open: how densification changes. Here a fixed share of the masked Gaussians is cloned or split, those
-    with the largest screen-space gradients. A threshold, as in 3DGS, is not possible, because the SDS gradient has no
-    fixed scale.
+    PAPER leaves open: how densification changes, so that the gradients of SDS do not add too many Gaussians. Here the
+    threshold is higher than that of 3DGS, and the number of masked Gaussians is bounded, because the gradient of SDS
+    has no fixed scale.
     """
 
     every: int = Field(0, ge=0, description="steps between densifications of masked Gaussians; 0: never")
     stop: float = Field(0.5, ge=0, le=1, description="fraction of the run after which no Gaussian is added")
+    grow_grad2d: float = Field(
+        1e-3, gt=0, description="screen-space gradient for cloning or splitting, image in [-1, 1]; 3DGS: 2e-4"
+    )
+    max_growth: float = Field(
+        1.5, ge=1, description="largest number of masked Gaussians, relative to that at the start"
+    )
 
 
 class Params(Settings):
@@ -173,13 +184,6 @@ class Params(Settings):
     # PAPER leaves open: which mask m is. Its text repaints the consistent mask. Repainting only the invent mask keeps
     # the background that other views see.
     repaint: Literal["invent", "consistent"] = Field("invent", description="the pixels the UNet repaints")
-    # PAPER leaves open: the prompt of a prior that was not adapted. Such a prior was not taught "sks", but the word may
-    # mean something to it all the same.
-    prompts: Literal["sks", "empty"] = Field(
-        "sks",
-        description="the prior's prompts: those it is adapted with, or empty ones; guidance, which amplifies what a "
-        "prompt adds, has then no effect",
-    )
     confined: bool = Field(
         True,
         description="each term reaches its own Gaussians; false (an ablation): every term reaches all, and none is "

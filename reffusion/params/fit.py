@@ -2,9 +2,9 @@
 
 Times are fractions of the run in [0, 1]. Default values are those of 3DGS unless a description says otherwise.
 
-PAPER leaves open: 3DGS measures the size of Gaussians by the extent of the cameras, and so prunes large distant
-Gaussians, for example in a street. Here the size of a Gaussian is its standard deviation divided by its distance from
-the nearest camera.
+3DGS measures the size of Gaussians by the extent of the cameras, and so prunes large distant Gaussians, for example in
+a street. By default the size of a Gaussian here is its standard deviation divided by its distance from the nearest
+camera.
 """
 
 from __future__ import annotations
@@ -36,16 +36,21 @@ class Densify(Settings):
     grow_grad2d: float = Field(
         2e-4, gt=0, description="screen-space gradient for cloning or splitting, image in [-1, 1]"
     )
-    cap_max: int = Field(
-        1_000_000,
-        ge=4,
-        description="maximum number of Gaussians, reached at `stop`: the limit grows linearly from the initial number, "
-        "so that some are left for late densifications",
+    cap_max: int = Field(1_000_000, ge=4, description="maximum number of Gaussians")
+    cap_growth: Literal["linear", "immediate"] = Field(
+        "linear",
+        description="the maximum grows linearly from the initial number to `cap_max` at `stop`, so that late "
+        "densifications can still add Gaussians; or it is `cap_max` from the start (3DGS)",
     )
     per_pixel: float = Field(
         0.0, ge=0, description="maximum number of Gaussians per pixel of a view; 0: `cap_max` only"
     )
-    prune_scale3d: float = Field(0.5, gt=0, description="size (deviation / distance) above which Gaussians are pruned")
+    size_unit: MeansUnit = Field(
+        "distance", description="unit of a Gaussian's size: its distance, or the cameras' extent (3DGS)"
+    )
+    prune_scale3d: float = Field(
+        0.5, gt=0, description="size (standard deviation) above which Gaussians are pruned, once opacities were reset"
+    )
     reset_every: float = Field(0.1, ge=0, le=1, description="fraction of the run between opacity resets; 0 = none")
 
 

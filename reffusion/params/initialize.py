@@ -16,6 +16,12 @@ class Depth(Settings):
     # PAPER leaves open: the depth model, and whether its alignment is plain or robust.
     model: str | None = depth_model_field()
     sweep: bool = Field(False, description="recompute depth around the hole by plane sweep stereo")
+    # The paper aligns the model's depth and unprojects it in the whole hole.
+    hints: bool = Field(
+        True,
+        description="in the hole, keep depth that other views confirm, and continue planes and mirror images; off: the "
+        "estimate holds in the whole hole",
+    )
 
 
 class Params(Settings):
@@ -25,6 +31,10 @@ class Params(Settings):
         "painted by the stage lift, random Gaussians, or nothing: the object is only removed",
     )
     depth: Depth = Depth()
+    # Not in the paper: it closes the seam around the hole, where photographs supervise these Gaussians, too.
+    overlap: float = Field(
+        0.006, ge=0, description="how far new Gaussians extend beyond the hole, as a fraction of the image's width"
+    )
     tidy: bool = Field(
         True,
         description="remove haze that mostly covers unobserved pixels; add a second surface where other views see past "

@@ -8,11 +8,11 @@ from torch import Tensor
 
 
 def window_around(mask: Tensor, size: int, generator: torch.Generator) -> tuple[int, int]:
-    """Draw a random size x size window that contains a masked pixel, and return its upper left corner (top, left).
+    """Draw a size x size window around a random masked pixel, and return its upper left corner (top, left).
 
-    PAPER leaves open: how a patch is sampled from the bounding box of the mask. The box may be mostly unmasked (a ring,
-    two objects), so a masked pixel is drawn first, then its position in the window. A window that extends beyond the
-    view is moved inside.
+    PAPER leaves open: how a patch is sampled from the bounding box of the mask. The centre of the window is a masked
+    pixel, because the box may be mostly unmasked (a ring, two objects). A window that extends beyond the view is moved
+    inside.
 
     Args:
         mask: bool [H, W] with at least one True pixel.
@@ -37,9 +37,7 @@ def windows_around(mask: Tensor, size: int, count: int, generator: torch.Generat
     pixels = torch.nonzero(mask)
     if len(pixels) == 0:
         raise ValueError("no window can be drawn around an empty mask; leave this view out")
-    picks = torch.randint(len(pixels), (count,), generator=generator)
-    shifts = torch.randint(size, (count, 2), generator=generator)
-    corners = pixels[picks] - shifts
+    corners = pixels[torch.randint(len(pixels), (count,), generator=generator)] - size // 2
     return torch.minimum(corners.clamp(min=0), torch.tensor([height - size, width - size]))
 
 
@@ -57,23 +55,21 @@ def enlarge_to_fit(image: Tensor, size: int) -> Tensor:
     return F.interpolate(image[None], size=shape, mode="bilinear", align_corners=False)[0]
 
 
-def two_scales(image: Tensor, windows: list[tuple[int, int]], size: int) -> Tensor:
+def two_scales(image: Tensor, windows: list[tuple[int, int]], size: int, *, antialias: bool = True) -> Tensor:
     """Return an image at two scales: the whole view resized to a square, and patches at full resolution (section 4.2).
 
     The proportions of the whole view are not kept.
-
-    PAPER leaves open: whether the bilinear reduction is antialiased. It is, so that each rendered pixel receives a part
-    of the global gradient; plain bilinear sampling of a large view would skip most pixels.
 
     Args:
         image: [C, H, W].
         windows: (top, left) of each patch.
         size: Side of the square and of the patches in pixels.
+        antialias: Whether the bilinear reduction averages over all pixels, or skips those between its samples.
 
     Returns:
         [1 + len(windows), C, size, size], the whole view first; differentiable in `image`.
     """
-    whole = F.interpolate(image[None], size=(size, size), mode="bilinear", align_corners=False, antialias=True)
+    whole = F.interpolate(image[None], size=(size, size), mode="bilinear", align_corners=False, antialias=antialias)
     patches = [image[None, :, top : top + size, left : left + size] for top, left in windows]
     return torch.cat([whole, *patches])
 

@@ -28,7 +28,6 @@ T_LOW, T_HIGH = 0.02, 0.98
 LEVELS = 0  # number of finer sizes at which the view is painted as well, see `inpaint.repaint`
 FINEST = 0.6  # the latest timestep from which a finer size would start, as a fraction of the schedule
 MAX_SIDE = 512  # px, the longer side at which a larger view is rendered: prior and estimator use no finer detail
-EXTENT = 1.0  # PAPER leaves open: the unit of the loss. Here it is the scene's extent, 1 in the normalised frame
 
 
 def build(inputs: TermInputs, settings: Params) -> Term | None:
@@ -78,13 +77,12 @@ def evaluate_depth(
     estimator: DepthEstimator,
     *,
     max_side: int = MAX_SIDE,
-    extent: float = EXTENT,
 ) -> tuple[Tensor, Rendering]:
     """Return the depth loss of one view, and its rendering.
 
     The view is rendered, its hole is repainted by the prior from a random timestep, and the depth of the repainted
     picture is estimated. An estimator that does not use the picture estimates without repainting. The loss is the mean
-    of ((rendered depth - estimated depth) / extent)^2 over the pixels of the hole that can be compared (see
+    of ((rendered depth - estimated depth) / depth.unit)^2 over the pixels of the hole that can be compared (see
     `depth_target`).
 
     Args:
@@ -98,7 +96,6 @@ def evaluate_depth(
         generator: Draws timestep and noise, on the CPU.
         estimator: The depth estimator.
         max_side: Longer side, in pixels, at which a larger view is rendered. The returned rendering has this size.
-        extent: The unit of depth.
 
     Raises:
         Degenerate: No pixel of the view can be compared, or its estimate cannot be aligned with the scene.
@@ -122,7 +119,7 @@ def evaluate_depth(
     disparity = estimator.disparity(seen, repaint_hole)
     target, compared = depth_target(seen, disparity, alpha > estimator.how.explained)
     to_device = lambda array: torch.from_numpy(array).to(rendering.depth.device)
-    return depth_loss(rendering.depth, to_device(target), to_device(compared), extent), rendering
+    return depth_loss(rendering.depth, to_device(target), to_device(compared), depth.unit), rendering
 
 
 def depth_target(view: ViewDepth, disparity: np.ndarray, covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -151,15 +148,15 @@ def depth_target(view: ViewDepth, disparity: np.ndarray, covered: np.ndarray) ->
     return np.divide(1.0, disparity, out=np.zeros_like(disparity), where=compared), compared
 
 
-def depth_loss(depth: Tensor, target: Tensor, compared: Tensor, extent: float) -> Tensor:
-    """Return the mean of ((depth - target) / extent)^2 over the compared pixels.
+def depth_loss(depth: Tensor, target: Tensor, compared: Tensor, unit: float) -> Tensor:
+    """Return the mean of ((depth - target) / unit)^2 over the compared pixels.
 
     Args:
         depth, target: [H, W].
         compared: bool [H, W], with at least one True pixel.
-        extent: The unit of depth.
+        unit: The depth that counts as 1.
     """
-    return ((depth[compared] - target[compared].to(depth.dtype)) / extent).square().mean()
+    return ((depth[compared] - target[compared].to(depth.dtype)) / unit).square().mean()
 
 
 def _downscale(view: TrainView, max_side: int) -> tuple[Camera, Tensor, Tensor]:

@@ -148,8 +148,9 @@ def evaluate_sds(
 
     windows = [window_around(hole.cpu(), size, generator) for _ in range(sds.patches)]
     masks = two_scale_masks(hole, windows, size)
-    condition = diffusion.conditioning(prior, two_scales(known, windows, size), masks)
-    latents = diffusion.encode(prior, two_scales(rendered, windows, size))
+    reduce = lambda image: two_scales(image, windows, size, antialias=sds.antialias)
+    latents = diffusion.encode(prior, reduce(rendered))
+    condition = diffusion.conditioning(prior, reduce(known), masks)
     prompts = torch.cat([text[:1], text[1:2].expand(sds.patches, -1, -1)])
     empty = text[2:].expand(len(latents), -1, -1)
 
