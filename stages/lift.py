@@ -77,8 +77,9 @@ def load_painter(params: Params) -> tuple[str, Callable[[np.ndarray, np.ndarray,
             prompt=params.prompt,
             seeds=[seeding.seed_for(SEED, "lift", name)],
             steps=params.steps,
-            start=REFINED_FROM,
             guidance=GUIDANCE,
+            start=1.0,
+            finest=REFINED_FROM,
         )
         return inpaint.to_picture(picture)
 

@@ -166,7 +166,7 @@ def inpaint_by_prior(params: Params, out: Path, base: np.ndarray, name: str, mas
             hole,
             prompt=params.prompt,
             seeds=[params.seed + index for index in range(params.candidates)],
-            start=REFINED_FROM,
+            finest=REFINED_FROM,
             **params.sampler.model_dump(),
         ).cpu()
     seams = inpaint.seam_score(candidates, hole)

@@ -356,7 +356,7 @@ def test_nan_names_step_term_and_view(prior, text, tmp_path):
 
 def test_painting_keeps_known_pixels_and_a_candidates_picture_is_its_seeds(prior):
     image = torch.rand(3, HEIGHT, WIDTH, generator=generator(5)) * 2 - 1
-    options = {"prompt": "", "steps": 2, "start": 0.6, "guidance": 0.0}
+    options = {"prompt": "", "steps": 2, "start": 1.0, "finest": 0.6, "guidance": 0.0}
     pair = inpaint.paint(prior, image, square_hole(), seeds=[0, 1], **options)
     assert pair.shape == (2, 3, HEIGHT, WIDTH) and torch.isfinite(pair).all()
     assert (pair[:, :, ~square_hole()] == image[:, ~square_hole()]).all()
@@ -366,12 +366,25 @@ def test_painting_keeps_known_pixels_and_a_candidates_picture_is_its_seeds(prior
     assert (inpaint.paint(prior, other, square_hole(), seeds=[1], **options)[0] == pair[1])[:, square_hole()].all()
 
 
+def test_painting_starts_from_the_hole_filled_with_the_colours_around_it(prior):
+    image, size = torch.full((3, 16, 16), 0.3), prior.native_size
+    assert size == 16
+    hole = torch.zeros(16, 16, dtype=torch.bool)
+    hole[4:12, 4:12] = True
+    hollow = torch.where(hole, -1.0, image)
+    options = {"prompt": "", "seeds": [0], "steps": 4, "guidance": 0.0, "finest": 1 / prior.timesteps}
+    difference = lambda start: float(
+        (inpaint.paint(prior, hollow, hole, start=start, **options)[0] - image).abs().max()
+    )
+    assert difference(1 / prior.timesteps) < 0.1 < difference(1.0)
+
+
 def test_painting_works_on_views_smaller_and_larger_than_the_prior(prior):
     for height, width in ((10, 13), (16, 16), (36, 34)):
         mask = torch.zeros(height, width, dtype=torch.bool)
         mask[-14:-3, 2:9] = True
         painted = inpaint.paint(
-            prior, torch.zeros(3, height, width), mask, prompt="", seeds=[0], steps=1, start=0.5, guidance=1.0
+            prior, torch.zeros(3, height, width), mask, prompt="", seeds=[0], steps=1, start=1, finest=0.5, guidance=1
         )
         assert painted.shape == (1, 3, height, width) and (painted[:, :, ~mask] == 0).all()
 

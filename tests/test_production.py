@@ -71,7 +71,7 @@ def test_sdxl_prompts_and_unet_are_those_of_the_stock_pipeline(sdxl_prior):
 def test_sdxl_paints_a_reference(sdxl_prior):
     image, hole = torch.rand(3, 40, 50, generator=generator(0, "image")) * 2 - 1, torch.zeros(40, 50, dtype=torch.bool)
     hole[10:30, 15:40] = True
-    options = {"prompt": "a red chair", "seeds": [0], "steps": 2, "start": 0.5, "guidance": 1.0}
+    options = {"prompt": "a red chair", "seeds": [0], "steps": 2, "start": 0.999, "finest": 0.5, "guidance": 1.0}
     painted = inpaint.paint(sdxl_prior, image, hole, **options)
     assert painted.shape == (1, 3, 40, 50) and torch.isfinite(painted).all()
     assert torch.equal(painted[0][:, ~hole], image[:, ~hole])

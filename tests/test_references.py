@@ -365,6 +365,13 @@ def test_a_view_without_a_pose_is_named(tmp_path):
     assert "v00 (painted)" in note
 
 
+def test_the_plan_says_that_guidance_needs_a_prompt(tmp_path):
+    preview = lambda **params: plan_reference.preview(reference.Params(**params), scene=tmp_path)
+    (note,) = preview(sampler={"guidance": 6.5})
+    assert note == "reference.prompt is empty: reference.sampler.guidance has no effect"
+    assert preview(sampler={"guidance": 6.5}, prompt="a lawn") == preview() == []
+
+
 # ---------------------------------------------------------------------------------------------- the stage's artifact
 
 

@@ -103,4 +103,14 @@ class Sampler(Settings):
     """Settings of the sampler with which the diffusion prior inpaints a view (`reffusion.prior.inpaint`)."""
 
     steps: int = Field(50, ge=1, description="sampler steps from pure noise")
-    guidance: float = Field(0.0, ge=0, description="a of the paper; the guidance scale of libraries is 1 + a")
+    guidance: float = Field(
+        0.0, ge=0, description="a of the paper; the guidance scale of libraries is 1 + a; no effect without a prompt"
+    )
+    # PAPER leaves open: the noise level. SDXL's authors advise against pure noise: diffusers starts just below it.
+    start: float = Field(
+        1.0,
+        gt=0,
+        le=1,
+        description="initial noise level, as a fraction of the schedule; below 1 the sampler starts from the hole "
+        "filled with the colours around it",
+    )

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from reffusion.io.images import to_uint8
-from reffusion.prior import diffusion
+from reffusion.prior import diffusion, harmonic_fill
 from reffusion.prior.model import Prior
 from reffusion.seeding import generator as seeded
 from reffusion.splat import rasterizer
@@ -100,14 +100,15 @@ def paint(
     prompt: str,
     seeds: Sequence[int],
     steps: int,
-    start: float,
     guidance: float,
+    start: float,
+    finest: float,
 ) -> Tensor:
     """Return copies of a view, each with another candidate painted into its hole. All other pixels are unchanged.
 
-    First the whole view is painted at the prior's native size from pure noise. Each finer level (`level_sizes`) starts
-    from the enlarged result of the coarser level, and is repainted window by window from the noise level `start`. A
-    window sees the results of its neighbours. The seeds determine the result.
+    First the whole view is painted at the prior's native size from the noise level `start`. Each finer level
+    (`level_sizes`) starts from the enlarged result of the coarser level, and is repainted window by window from the
+    noise level `finest`. A window sees the results of its neighbours. The seeds determine the result.
 
     Args:
         prior: The diffusion prior.
@@ -116,8 +117,10 @@ def paint(
         prompt: The text prompt.
         seeds: One seed for each candidate.
         steps: Number of sampler steps from pure noise. A lower noise level takes a proportional part of them.
-        start: Initial noise level of refinements in (0, 1], as a fraction of the schedule (1 = pure noise).
         guidance: The paper's a, the strength of classifier-free guidance.
+        start: Initial noise level of the whole view in (0, 1], as a fraction of the schedule (1 = pure noise). Below 1
+            noise is added to the harmonic extension of the known pixels into the hole.
+        finest: Initial noise level at finer levels.
 
     Returns:
         [len(seeds), 3, H, W] in [-1, 1], in the order of the seeds, on the prior's device.
@@ -143,11 +146,12 @@ def paint(
         return resize(known, *shape) / weight.clamp_min(1e-3), (weight < 1 - 1e-4).to(torch.float32)
 
     view, mask = scaled((size, size))
-    painted = sample((view * (1 - mask)).expand(count, -1, -1, -1), mask, start=1.0, level="whole")
+    begin = harmonic_fill.harmonic_extension(view, mask)
+    painted = sample(begin.expand(count, -1, -1, -1), mask, start=start, level="whole")
     for level, shape in enumerate(level_sizes(height, width, size)):
         view, mask = scaled(shape)
         painted = view * (1 - mask) + resize(painted, *shape) * mask
-        _paint_windows(painted, mask, size, partial(sample, start=start, level=level))
+        _paint_windows(painted, mask, size, partial(sample, start=finest, level=level))
     painted = resize(painted, height, width)
     return image.to(device) * (1 - whole_hole) + painted * whole_hole
 

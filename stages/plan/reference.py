@@ -77,7 +77,8 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
         )
         return [f"takes over the scene's reference{views and ' ' + views}: no diffusion here"]
     if params.inpainter.kind == "diffusion":
-        return []
+        has_effect = params.prompt or not params.sampler.guidance
+        return [] if has_effect else ["reference.prompt is empty: reference.sampler.guidance has no effect"]
     unread = f"; the prompt '{params.prompt}' is not read, reference.inpainter=diffusion would" if params.prompt else ""
     how = "puts the reference together from patches of the photographs"
     if (kind := painters.resolve_inpainter(params.inpainter).kind) in PAINTERS:
