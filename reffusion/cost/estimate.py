@@ -188,7 +188,7 @@ def reference(params: Reference) -> tuple[Work, float] | None:
         finer += max(1.0, HOLE_SHARE * shorter * shorter * WIDTH / HEIGHT / (0.75 * size) ** 2)
         side *= 2
     sampler, half = params.sampler, params.dtype != "float32"
-    guided = sampler.guidance > 0
+    guided = sampler.guidance > 0 and bool(params.prompt)
     whole = inpainting(prior, half, sampler.steps, guided)
     window = inpainting(prior, half, REFINED_FROM * sampler.steps, guided)
     return (whole + window.times(finer)).times(params.candidates), WEIGHTS * (2.6 if prior == "SDXL" else 1) + PAINTED
@@ -202,9 +202,7 @@ def personalize(params: Personalize) -> tuple[Work, float] | None:
     rate = (params.samples.size or 512) / 512
     sample = network("SD2 personalize a sample", params.dtype != "float32").times(rate**2)
     samples = _samples_per_pass(params.memory_gb, TRAINED * rate**2, params.optimizer.batch)
-    recompute = (
-        4 / 3 if samples < params.optimizer.batch or params.checkpointing else 1
-    )  # activations are computed twice
+    recompute = 4 / 3 if params.checkpointing else 1  # activations are computed twice
     return sample.times(params.steps * params.optimizer.batch * recompute), WEIGHTS + samples * TRAINED * rate**2
 
 

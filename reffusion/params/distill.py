@@ -39,7 +39,7 @@ class SdsTerm(Settings):
         180, gt=0, le=180, description="degrees; views farther than this from every reference are not distilled"
     )
     # PAPER leaves open: timesteps, w(t), normalisation, guidance, reduction (see `distill.sds`). The values are those
-    # of threestudio.
+    # of threestudio, except guidance: its scale of 100 suits a prior that was not adapted.
     t_high: float = Field(0.98, ge=0, le=1, description="highest timestep")
     weighting: Literal["sigma2", "alpha_sigma2", "x0", "one"] = Field(
         "sigma2", description="w(t) of the SDS gradient, see `distill.sds.sds_gradient`"
@@ -48,7 +48,7 @@ class SdsTerm(Settings):
     hole_only: bool = Field(False, description="drop the gradient at latents that are not repainted")
     # Not in the paper: the predictions of a small prior have too little contrast, and fade a correct rendering.
     keep_contrast: bool = Field(False, description="raise the prediction's contrast to that of the rendered hole")
-    guidance: float = Field(7.5, ge=0, description="the paper's a; libraries' guidance scale is 1 + a")
+    guidance: float = Field(6.5, ge=0, description="the paper's a; libraries' guidance scale is 1 + a")
     reduction: Literal["sum", "mean"] = Field("sum", description="over a latent's elements")
 
     @property
