@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from reffusion import trace
-from reffusion.io.scene import load_raw_masks, load_references, load_scene, load_views
+from reffusion.io.scene import load_raw_masks, load_references, load_scene, load_teaching, load_views
 from reffusion.params.personalize import Params
 from reffusion.prior import crops, denoising, lora, memory, validation
 from reffusion.prior.inpaint import to_input
@@ -39,7 +40,9 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, reference: P
     prior = enable_checkpointing(prior) if params.checkpointing else prior
     references = load_references(reference, scene)
     to_tensor = torch.from_numpy
-    pictures = [crops.make_picture(to_tensor(r.image), to_tensor(r.mask), prior.native_size) for r in references]
+    taught = [(each.image, each.mask) for each in references]
+    taught += [(image, np.zeros(image.shape[:2], bool)) for image in load_teaching(reference)]
+    pictures = [crops.make_picture(to_tensor(image), to_tensor(hole), prior.native_size) for image, hole in taught]
     masks = load_raw_masks(raw_masks, scene.train)
     names = validation.choose_photos(list(masks), [r.camera.name for r in references])
     photographs = [(to_input(image), to_tensor(masks[name])) for name, image in load_views(poses, names).items()]

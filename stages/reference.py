@@ -13,15 +13,15 @@ import torch
 from reffusion.capture.views import load_placed_views
 from reffusion.inpaint import exemplar, feedforward
 from reffusion.io.arrays import save_json, save_text
-from reffusion.io.images import save_image, save_mask
-from reffusion.io.scene import save_references
+from reffusion.io.images import load_image, save_image, save_mask
+from reffusion.io.scene import save_references, save_teaching
 from reffusion.params.base import REFINED_FROM
 from reffusion.params.reference import Params
 from reffusion.prior import inpaint, memory
 from reffusion.prior.model import load_prior
 from reffusion.references import view_ranking
 from reffusion.references.adoption import adopt_references
-from reffusion.references.files import load_reference_files
+from reffusion.references.files import list_teaching_files, load_reference_files
 from reffusion.types import MaskSet, Reference
 from reffusion.workspace import Workspace
 
@@ -32,8 +32,9 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks
     """Run the stage: align the references that the scene brings, or inpaint one view.
 
     Writes references/<view>.png, masks/<view>.png (the pixels that the reference fills), depth/<view>.exr (for
-    references with a depth map) and facts.json. Writes also to_paint/ (`save_views_to_paint`) unless scene.yaml names
-    references, and candidates.png and candidates.json if a view is inpainted.
+    references with a depth map), teaching/ (pictures that only personalize the prior) and facts.json. Writes also
+    to_paint/ (`save_views_to_paint`) unless scene.yaml names references, and candidates.png and candidates.json if a
+    view is inpainted.
 
     Args:
         out: folder of this stage.
@@ -47,6 +48,7 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks
     else:
         references, fits = [inpaint_reference(params, out, space)], {}
     save_references(out, references)
+    save_teaching(out, {path.stem: load_image(path) for path in list_teaching_files(scene, params.teach)})
     save_json(out / "facts.json", {"given": [each.camera.name for each in references] if files else [], "fits": fits})
     if params.reference is None:
         save_views_to_paint(out / TO_PAINT, [each.view for each in files], space)

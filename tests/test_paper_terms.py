@@ -13,7 +13,7 @@ import pytest
 import torch
 from scenes import wall_scene
 from scenes.distill_scene import random_wall, train_view, wall_camera
-from scenes.networks import small_prior
+from scenes.networks import save_small_prior, small_prior
 from scenes.settings import with_changes
 from scenes.stage_runs import run_masks
 
@@ -43,7 +43,8 @@ from reffusion.types import MaskSet
 from reffusion.workspace import Workspace
 from runner.keys import HASHES, Hashes
 from runner.resolve import Request, resolve_all
-from stages import fit, initialize, masks, reference
+from stages import fit, initialize, masks, personalize, reference
+from stages.plan import reference as plan_reference
 
 ROOT = Path(__file__).resolve().parent.parent
 NEAR = 1.6
@@ -121,6 +122,30 @@ def test_a_clean_view_can_be_a_reference(tmp_path):
     needs = {k: paths[k] for k in ("poses", "fit", "masks", "reference")}
     initialize.run(initialize.Params(), paths["initialize"], **needs)
     assert load_labels(paths["initialize"] / "labels.npy").any()
+
+
+def test_a_picture_that_teaches_reaches_personalization_only(tmp_path):
+    """The paper's sparse views: "Ours (LoRA)" learns pictures that are neither unprojected nor reconstructed."""
+    paths = {name: tmp_path / name for name in ("scene", "poses", "fit", "masks", "prior")}
+    poses, fitted, _ = wall_scene.write_poses_and_fit(tmp_path, NEAR)
+    wall_scene.write_capture_photos(paths["scene"], poses, wall_scene.CAMERAS)
+    run_masks(poses, fitted, paths["masks"], masks.Params(invent="consistent"))
+    save_small_prior(paths["prior"])
+    raw_masks = poses.with_name("raw_masks")
+    learnt = []
+    for number, teach in enumerate(([], ["images/a4.png"])):
+        found, adapted = tmp_path / f"reference-{number}", tmp_path / f"personalize-{number}"
+        found.mkdir()
+        adapted.mkdir()
+        params = reference.Params(reference={"view": "a2", "image": "images/a2.png"}, teach=teach)
+        reference.run(params, found, **{k: paths[k] for k in ("scene", "poses", "fit", "masks")})
+        assert [each.camera.name for each in load_references(found, load_scene(poses))] == ["a2"]
+        params = personalize.Params(prior=str(paths["prior"]), steps=2, lora={"rank": 2})
+        personalize.run(params, adapted, poses=poses, raw_masks=raw_masks, reference=found)
+        learnt.append((adapted / lora.LORA_FILE).read_bytes())
+    assert learnt[0] != learnt[1]
+    with pytest.raises(ValueError, match=r"a9\.png: no such file; correct `teach`"):
+        plan_reference.preview(reference.Params(teach=["images/a9.png"]), scene=paths["scene"])
 
 
 def test_without_overlap_new_gaussians_lie_in_the_hole(tmp_path):

@@ -208,6 +208,17 @@ def save_references(reference_dir: Path, references: Sequence[Reference]) -> Non
             save_exr(_depth_file(reference_dir, reference.camera.name), reference.depth)
 
 
+def save_teaching(reference_dir: Path, pictures: Mapping[str, np.ndarray]) -> None:
+    """Write pictures that only personalize the prior, uint8 [H, W, 3] each, as teaching/<name>.png."""
+    for name, picture in pictures.items():
+        save_image(Path(reference_dir) / "teaching" / f"{name}.png", picture)
+
+
+def load_teaching(reference_dir: Path) -> list[np.ndarray]:
+    """Read the pictures that `save_teaching` wrote, sorted by name."""
+    return [load_image(path) for path in sorted((Path(reference_dir) / "teaching").glob("*.png"))]
+
+
 def _depth_file(reference_dir: Path, view: str) -> Path:
     return Path(reference_dir) / "depth" / f"{view}.exr"
 

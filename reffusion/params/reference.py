@@ -29,6 +29,8 @@ class Params(Settings):
     reference: ReferenceSpec | list[ReferenceSpec] | None = Field(
         None, description="completed views that the scene brings"
     )
+    # "Ours (LoRA)" of the paper's sparse-view experiment: pictures that are neither reconstructed nor unprojected.
+    teach: list[str] = Field([], description="pictures of the scene that only personalize the prior; files")
     inpainter: Inpainter[ReferenceKind] = Inpainter[ReferenceKind](kind="diffusion")
     prior: str = prior_field()
     prompt: str = Field("", description="what the invented region shows, for a prior with a text encoder")

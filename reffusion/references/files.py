@@ -52,6 +52,21 @@ def list_paintings(folder: Path) -> list[Path]:
     return sorted(path for path in (Path(folder) / PAINTED).glob("[!.]*") if path.is_file())
 
 
+def list_teaching_files(folder: Path, names: Sequence[str]) -> list[Path]:
+    """Return the files of the pictures that only personalize the prior, which scene.yaml names by the key `teach`.
+
+    Raises:
+        BadInput: a file is missing, or two files have the same name.
+    """
+    paths = [Path(folder) / name for name in names]
+    for path in paths:
+        if not path.is_file():
+            raise BadInput(f"{path}: no such file; correct `teach` in scene.yaml")
+        if sum(path.stem == other.stem for other in paths) > 1:
+            raise BadInput(f"{path}: another picture in `teach` has the same name; rename one")
+    return paths
+
+
 def load_reference_files(
     folder: Path, views: ViewTable, specs: ReferenceSpec | Sequence[ReferenceSpec] | None
 ) -> list[ReferenceFile]:

@@ -10,7 +10,13 @@ from reffusion.cost import estimate
 from reffusion.io import machine
 from reffusion.params.inpainter import Inpainter
 from reffusion.params.reference import Params, reference_list
-from reffusion.references.files import PAINTED, describe_references, list_paintings, load_reference_files
+from reffusion.references.files import (
+    PAINTED,
+    describe_references,
+    list_paintings,
+    list_teaching_files,
+    load_reference_files,
+)
 from reffusion.weights import local, painters
 from reffusion.weights.published import PAINTERS
 
@@ -55,6 +61,7 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
         files: all files of the scene.
     """
     named = {scene / name for each in reference_list(params.reference) for name in (each.image, each.depth) if name}
+    named |= {scene / name for name in params.teach}
     return sorted({path for path in named if path.is_file()} | {p for p in files if p.parent == scene / PAINTED})
 
 
@@ -69,6 +76,7 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
     Raises:
         ValueError: the stage would refuse a reference because of its name, file or view.
     """
+    list_teaching_files(scene, params.teach)
     if reference_list(params.reference) or list_paintings(scene):
         views = (
             describe_references(load_reference_files(scene, load_placed_views(poses), params.reference))
