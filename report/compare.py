@@ -15,7 +15,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from reffusion.io.arrays import load_json
 from report import charts, compare_pictures, compare_tables, page
 from report.results import (
     BOX_SCORES,
@@ -30,6 +29,7 @@ from report.results import (
     load_comparison,
     save_csv,
     summarize_methods,
+    used_tools,
 )
 
 TITLES = {
@@ -57,7 +57,7 @@ SHORT |= {"psnr_box": "PSNR, dB", "ssim_box": "SSIM", "flip_box": "FLIP"}
 SHORT |= {"psnr_outside": "PSNR outside, dB", "ssim_outside": "SSIM outside", "flip_outside": "FLIP outside"}
 # Columns that are omitted if no method has a value.
 OPTIONAL_COLUMNS = ("consistency", "lpips_vgg_box", "lpips_alex_box", *OUTSIDE_SCORES)
-FACTS = {"inpainter": "2D inpainter", "perceptual": "perceptual distance"}  # keys of metrics.json and facts.json
+FACTS = {"inpainter": "2D inpainter", "perceptual": "perceptual distance"}  # keys of `used_tools`
 
 
 def make(home: Path) -> dict[str, Path]:
@@ -155,6 +155,7 @@ def method_table(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]
     texts, bold = [], []
     for row in table:
         state = f" ({row['state']})" if row["state"] != "done" else f" = {row['same_as']}" if row["same_as"] else ""
+        state += " *" if row["stand_ins"] else ""
         texts.append([row["method"] + state if n == "method" else _cell(row, n) for n in names])
         bold.append(
             [best.get(n) is not None and row[n] is not None and round(row[n], DIGITS[n]) == best[n] for n in names]
@@ -256,6 +257,8 @@ def table_notes(comparison: Comparison, table: list[dict[str, Any]]) -> list[str
     if any(row["consistency"] is not None for row in table):
         words = "mean absolute difference to the next view in the mask, by rendered depth; blur is consistent too."
         lines.append(f"consistency: {words}")
+    if stand_ins := dict.fromkeys(name for row in table if row["stand_ins"] for name in row["stand_ins"].split("; ")):
+        lines.append(f"*: {', '.join(stand_ins)} stands in for LaMa or LPIPS, with which the published method works.")
     lines += [f"{method} is the very same job as {other} here." for method, other in comparison.same_as.items()]
     lines += dict.fromkeys(words for run in done for words in method_facts(run))
     for run in done:
@@ -271,13 +274,10 @@ def table_notes(comparison: Comparison, table: list[dict[str, Any]]) -> list[str
 def method_facts(run: Run) -> list[str]:
     """Return a list of one sentence with the 2D inpainter and the perceptual distance that a run used.
 
-    The list is empty if neither is recorded. The names are recorded in metrics.json, or in facts.json of one of the
-    run's stages.
+    The list is empty if neither is recorded.
     """
-    paths = [folder / "facts.json" for folder in run.folders.values()]
-    records = [run.metrics, *(load_json(path) for path in paths if path.is_file())]
-    named = {words: facts[key] for facts in records for key, words in FACTS.items() if facts.get(key)}
-    return [f"{run.method}: " + ", ".join(f"{words} {name}" for words, name in named.items()) + "."] if named else []
+    named = [f"{FACTS[key]} {name}" for key, name in used_tools(run).items()]
+    return [f"{run.method}: {', '.join(named)}."] if named else []
 
 
 def explain_intervals(comparison: Comparison) -> str:

@@ -39,6 +39,7 @@ COLUMNS = (
     "method",
     "state",
     "same_as",
+    "stand_ins",
     *SCORES,
     *MEASURED,
     *(f"{metric}_{what}" for metric in SCORES for what in DIFFERENCE_COLUMNS),
@@ -209,7 +210,8 @@ def summarize_methods(comparison: Comparison) -> list[dict[str, Any]]:
     Scores, "consistency", seconds and number of Gaussians are means over the method's finished scenes, None where
     unknown; a scene's score is its mean over test views. "<score>_interval" is half the width of the score's confidence
     interval over scenes (`mean_interval`). "peak_memory_mb" is the maximum over stages and scenes, and "scenes" the
-    number of finished scenes. Differences to the full method are means over views, see `Difference`.
+    number of finished scenes. "stand_ins" names the stand-ins (`is_stand_in`) among the method's tools. Differences to the
+    full method are means over views, see `Difference`.
 
     Of a method that computes the same as an earlier method, only "method", "state", "scenes" and "same_as" are filled.
     The methods are sorted by the score `MAIN`, the best first. Methods without this score come next in their order,
@@ -235,6 +237,8 @@ def _row(comparison: Comparison, method: str) -> dict[str, Any]:
     row["same_as"] = comparison.same_as.get(method)
     if row["same_as"]:
         return row
+    tools = dict.fromkeys(name for run in done for name in used_tools(run).values())
+    row["stand_ins"] = "; ".join(name for name in tools if is_stand_in(name)) or None
     for name in SCORES:
         values = [run.metrics.get("mean", {}).get(name) for run in done]
         row |= {name: finite_mean(values), f"{name}_interval": mean_interval(values)}
@@ -246,6 +250,21 @@ def _row(comparison: Comparison, method: str) -> dict[str, Any]:
     counts = finite_mean([run.metrics.get("gaussians", {}).get(run.metrics.get("result")) for run in done])
     row["gaussians"] = None if counts is None else round(counts)
     return row
+
+
+def used_tools(run: Run) -> dict[str, str]:
+    """Return what a run recorded of the tools that it used: "inpainter" (in 2D) and "perceptual" distance -> name.
+
+    The names are recorded in metrics.json, or in facts.json of one of the run's stages.
+    """
+    paths = [folder / "facts.json" for folder in run.folders.values()]
+    records = [run.metrics, *(load_json(path) for path in paths if path.is_file())]
+    return {key: facts[key] for facts in records for key in ("inpainter", "perceptual") if facts.get(key)}
+
+
+def is_stand_in(tool: str) -> bool:
+    """Return whether a tool only stands in for the one of the published method: OpenCV for LaMa, D-SSIM for LPIPS."""
+    return tool.startswith(("OpenCV", "multi-scale D-SSIM"))
 
 
 def finite_mean(values: list[float | None]) -> float | None:

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -254,6 +255,7 @@ def test_the_page_needs_no_other_file(pages):
     text = re.sub(r'src="[^"]*"', "", html)  # encoded pictures may contain any word
     assert "http" not in text and "<script" not in text and "@import" not in text
     assert html.count("no weights") == 1 and "2D inpainter a brush" in html and "perceptual" not in html
+    assert "better *" in text and "full *" not in text and "OpenCV's brush stands in for LaMa" in unescape(text)
     linked = re.findall(r"\]\((.*?)\)", pages["md"].read_text())
     assert len(linked) == 5 and all((pages["md"].parent / name).stat().st_size > 1000 for name in linked)
 

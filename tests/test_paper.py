@@ -18,7 +18,8 @@ NETWORK = "depth-anything/Depth-Anything-V2-Small-hf"
 SHORT = {"SD2": SD2, "SDXL": SDXL, "Depth Anything": NETWORK, "embedded": "priors/tiny", "none": None}
 SHORT |= {"on": True, "off": False}
 MACHINE = ("device", "dtype", "memory_gb")  # parameters that depend on the machine: docs/gpu.md
-BASELINES = ("lift.prior", "lift.steps")  # parameters of baselines, which are no part of the method
+# Parameters of baselines, which are no part of the method.
+BASELINES = ("lift.prior", "lift.steps", "lift.inpainter.kind", "evaluate.inpainter.kind")
 
 # Values that the paper fixes, and the defaults of 3DGS where the paper uses them.
 FIXED = {

@@ -190,7 +190,7 @@ def run(params, out, *, poses):
     lines = [{"seconds": 2.0 ** i, "iteration": i, "reference_psnr": 20.0 + i * params.gain} for i in range(4)]
     lines[-1] |= {"reason": "finished"}
     (out / "trace.jsonl").write_text("".join(json.dumps(line) + "\\n" for line in lines))
-    (out / "facts.json").write_text(json.dumps({"inpainter": "a brush", "perceptual": None}))
+    (out / "facts.json").write_text(json.dumps({"inpainter": "OpenCV's brush" if params.gain > 1 else "a brush"}))
     (out / "gain.txt").write_text(str(params.gain))
     ran(out, "distill")
 """,
