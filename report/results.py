@@ -210,8 +210,8 @@ def summarize_methods(comparison: Comparison) -> list[dict[str, Any]]:
     Scores, "consistency", seconds and number of Gaussians are means over the method's finished scenes, None where
     unknown; a scene's score is its mean over test views. "<score>_interval" is half the width of the score's confidence
     interval over scenes (`mean_interval`). "peak_memory_mb" is the maximum over stages and scenes, and "scenes" the
-    number of finished scenes. "stand_ins" names the stand-ins (`is_stand_in`) among the method's tools. Differences to the
-    full method are means over views, see `Difference`.
+    number of finished scenes. "stand_ins" names the stand-ins (`is_stand_in`) among the method's tools. Differences to
+    the full method are means over views, see `Difference`.
 
     Of a method that computes the same as an earlier method, only "method", "state", "scenes" and "same_as" are filled.
     The methods are sorted by the score `MAIN`, the best first. Methods without this score come next in their order,
