@@ -1,6 +1,6 @@
 """Photographs for the training of the embedded prior: `python -m priors.tiny.photographs OUT`.
 
-Three packages of Debian 12 hold them. The command downloads the packages, checks them, and writes each photograph at
+Four packages of Debian 12 hold them. The command downloads the packages, checks them, and writes each photograph at
 reduced size. The folder is 11 MB; training on another machine needs nothing else.
 """
 
