@@ -116,6 +116,18 @@ def test_lpips_takes_the_smallest_size_and_refuses_smaller(net):
         lpips_distance(image[1:], truth[1:], model)
 
 
+def test_the_map_is_zero_far_from_a_difference_and_its_mean_is_the_distance():
+    model = lpips.from_states("vgg", *random_states("vgg"))
+    first, _ = smooth_pair(96, 128)
+    second = first.copy()
+    second[:32, :32] = 1 - second[:32, :32]
+    pair = [torch.from_numpy(2 * image - 1).permute(2, 0, 1)[None].float() for image in (first, second)]
+    (values,) = model.distance_map(*pair)
+    assert values.shape == (96, 128)
+    assert float(values.mean()) == pytest.approx(float(model(*pair)), rel=0.05)
+    assert values[:32, :32].mean() > 20 * values[:, 112:].mean()
+
+
 def test_lpips_weights_of_another_shape_are_refused_by_name():
     backbone, linear = random_states("alex")
     with pytest.raises(ValueError, match=r"no `features.3.bias`"):
