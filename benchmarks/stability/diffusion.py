@@ -156,14 +156,15 @@ def sds_error(t: int, dtype: torch.dtype) -> float:
     abar, times, worst = model().alphas_cumprod, torch.full((2,), t % model().timesteps), 0.0
     a, s = (x.double()[times[0]] for x in (abar.sqrt(), (1 - abar.double()).sqrt()))
     noisy = a * latents.double() + s * noise.double()
-    exact = {"x0": latents.double() - a * noisy, "sigma2": s**2 * (s * noisy - noise), "one": s * noisy - noise}
-    for weighting, truth in exact.items():
+    factors = {"one": 1, "sigma2": s**2, "alpha_sigma2": a * s**2}
+    exact = {"x0": (latents.double() - a * noisy, latents.double())}
+    exact |= {name: (factor * (s * noisy - noise), factor * noise.double()) for name, factor in factors.items()}
+    for weighting, (truth, size) in exact.items():
         gradient = sds.sds_gradient(
             latents, lambda z, _: (s.to(z) * z, a.to(z) * z), times, noise, abar, weighting=weighting
         )
         # The gradient is a difference of numbers of order one (at t = 0, or at T-1). Its error is relative to them.
-        size = {"x0": latents.double(), "sigma2": s**2 * noise.double(), "one": noise.double()}[weighting].norm()
-        worst = nan_safe_max(worst, ((gradient.double() - truth).norm() / size).item())
+        worst = nan_safe_max(worst, ((gradient.double() - truth).norm() / size.norm()).item())
     return worst
 
 
