@@ -78,7 +78,7 @@ def find_unseen_views(run: Path) -> list[UnseenView]:
 
     known = []
     for name in scene.train:
-        hidden = sets[name].consistent
+        hidden = sets[name].consistent & (name not in scene.clean)
         if name in references:
             hidden = hidden & ~references[name]
         depth = rasterizer.render(gaussians, scene.cameras[name]).depth.double().cpu().numpy()
