@@ -1,4 +1,4 @@
-"""The study of unseen pixels finds the pixels that neither a photograph nor a reference shows, and paints these alone."""
+"""The study of unseen pixels: it finds the pixels that neither a photograph nor a reference shows, and paints them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LEFT = HOLE & (np.arange(48) < 20)
 
 
 def write_run(home, filled):
-    """Write a run with the training views `a` and `b`, the test view `c`, and a reference that fills `filled` in `a`."""
+    """Write a run with training views `a` and `b`, test view `c`, and a reference that fills `filled` in `a`."""
     run = write_initialized_run(home, HOLE)
     scene = load_scene(run / "poses")
     save_scene(run / "poses", replace(scene, train=("a", "b"), test=("c",), clean=frozenset()))
