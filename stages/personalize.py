@@ -40,9 +40,9 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, reference: P
     prior = enable_checkpointing(prior) if params.checkpointing else prior
     references = load_references(reference, scene)
     to_tensor = torch.from_numpy
-    taught = [(each.image, each.mask) for each in references]
-    taught += [(image, np.zeros(image.shape[:2], bool)) for image in load_teaching(reference)]
-    pictures = [crops.make_picture(to_tensor(image), to_tensor(hole), prior.native_size) for image, hole in taught]
+    examples = [(each.image, each.mask) for each in references]
+    examples += [(image, np.zeros(image.shape[:2], bool)) for image in load_teaching(reference)]
+    pictures = [crops.make_picture(to_tensor(image), to_tensor(hole), prior.native_size) for image, hole in examples]
     masks = load_raw_masks(raw_masks, scene.train)
     names = validation.choose_photos(list(masks), [r.camera.name for r in references])
     photographs = [(to_input(image), to_tensor(masks[name])) for name, image in load_views(poses, names).items()]

@@ -76,13 +76,13 @@ def find_unseen_views(run: Path) -> list[UnseenView]:
     gaussians = load_ply(run / "initialize/gaussians.ply")
     references = {each.camera.name: each.mask for each in load_references(run / "reference", scene)}
 
-    known = []
+    depth_maps = []
     for name in scene.train:
         hidden = sets[name].consistent & (name not in scene.clean)
         if name in references:
             hidden = hidden & ~references[name]
         depth = rasterizer.render(gaussians, scene.cameras[name]).depth.double().cpu().numpy()
-        known.append((scene.cameras[name], np.where(hidden, 0.0, depth)))
+        depth_maps.append((scene.cameras[name], np.where(hidden, 0.0, depth)))
     views = []
     for name in scene.test:
         camera = scene.cameras[name]
@@ -93,7 +93,7 @@ def find_unseen_views(run: Path) -> list[UnseenView]:
         rendering = rasterizer.render(gaussians, camera)
         points = geometry.unproject(rendering.depth.double().cpu().numpy(), camera)[mask]
         unseen = mask.copy()
-        unseen[mask] = ~np.any([_is_seen(points, *view) for view in known], axis=0)
+        unseen[mask] = ~np.any([_is_seen(points, *view) for view in depth_maps], axis=0)
         unseen = cv2.morphologyEx(unseen.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3))).astype(bool)
         if unseen.sum() > MIN_SHARE * mask.sum():
             start = (255 * rendering.color.clamp(0, 1)).round().byte().cpu().numpy()
@@ -192,15 +192,15 @@ def study_run(run: Path, prior: str, seeds: list[int], out: Path) -> dict:
     rows = {view.name: [np.where(view.unseen[..., None], 128, view.start), view.start] for view in views}
     for seed in seeds:
         params = profile_params(prior, {"seed": seed})
-        for teaching in ("base", "reference", "photographs"):
-            folder = out / "personalize" / f"{teaching}-{seed}"
+        for training in ("base", "reference", "photographs"):
+            folder = out / "personalize" / f"{training}-{seed}"
             model = load_prior(prior)
-            if teaching != "base":
-                model = personalize_prior(run, params, teaching == "photographs", folder)
-            prompts = ("", "", "") if teaching == "base" else crops.PROMPTS
+            if training != "base":
+                model = personalize_prior(run, params, training == "photographs", folder)
+            prompts = ("", "", "") if training == "base" else crops.PROMPTS
             for way in WAYS:
                 pictures = {view.name: paint(model, view, way, prompts, seed) for view in views}
-                method = f"{teaching}, {way}"
+                method = f"{training}, {way}"
                 scores.setdefault(method, {})[str(seed)] = mean([score(pictures[view.name], view) for view in views])
                 if seed == seeds[0]:
                     for name, row in rows.items():

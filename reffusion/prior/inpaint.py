@@ -146,8 +146,8 @@ def paint(
         return resize(known, *shape) / weight.clamp_min(1e-3), (weight < 1 - 1e-4).to(torch.float32)
 
     view, mask = scaled((size, size))
-    begin = harmonic_fill.harmonic_extension(view, mask)
-    painted = sample(begin.expand(count, -1, -1, -1), mask, start=start, level="whole")
+    initial = harmonic_fill.harmonic_extension(view, mask)
+    painted = sample(initial.expand(count, -1, -1, -1), mask, start=start, level="whole")
     for level, shape in enumerate(level_sizes(height, width, size)):
         view, mask = scaled(shape)
         painted = view * (1 - mask) + resize(painted, *shape) * mask
