@@ -29,7 +29,8 @@
 ## make scene=X sds-variance      variance of the SDS gradient before and after personalization
 ##                                both: device=cuda dtype=float16
 ## make scene=demo-sparse sparse  scores against the number of photographs (hours); seeds=3: on two more scenes
-## make gpu                       on a CUDA machine: install gsplat and build its extension (minutes, once)
+## make gpu                       on a CUDA machine: install gsplat and build its extension (minutes, once);
+##                                cuda=12: with the last torch for CUDA 12, for older drivers
 ## make gpu-check                 values, time and memory at the paper's sizes on a CUDA machine (1 to 8 minutes)
 ## make prior [steps=N]           train the embedded prior further (hours)
 ## make prior-report              measure the embedded prior (minutes): runs/prior-report
@@ -46,7 +47,7 @@
 # The options. They are set here so that variables of the environment are ignored. Recipes read them as shell variables
 # in double quotes, so that neither the shell nor make expands what was typed.
 given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port gpu \
-	device dtype engine address cores yes
+	device dtype engine address cores yes cuda
 $(foreach each,$(given),$(eval $(each) :=))
 data := data
 folder := $(findstring command,$(origin data))
@@ -91,13 +92,21 @@ $(VENV)/bin/python:
 		{ echo 'error: $(PYTHON) is not Python 3.11 or later; name one: make PYTHON=python3.12 setup' >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV) || { rm -f $@; exit 1; }
 
-$(VENV)/.ready: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable .
+# The versions that are installed: those of constraints.txt, or after `make gpu cuda=12` those with another torch.
+pins := $(if $(cuda),$(VENV)/constraints.txt,$(firstword $(wildcard $(VENV)/constraints.txt) constraints.txt))
+# PyPI's last torch for CUDA 12, which driver 525 runs.
+CUDA12_TORCH := 2.10.0
+$(VENV)/constraints.txt: constraints.txt | $(VENV)/bin/python
+	@test "$${cuda:-12}" = 12 || { echo "error: cuda=$$cuda: 12, or nothing for the torch of constraints.txt" >&2; exit 2; }
+	@sed 's/^torch==.*/torch==$(CUDA12_TORCH)/' $< > $@
+
+$(VENV)/.ready: pyproject.toml $(pins) | $(VENV)/bin/python
+	$(PY) -m pip install --quiet $(bytecode) --constraint $(pins) --editable .
 	@touch $@
 
 # With an extra of pyproject.toml: view, export, cluster, dev.
 $(VENV)/.ready-%: $(VENV)/.ready
-	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable '.[$*]'
+	$(PY) -m pip install --quiet $(bytecode) --constraint $(pins) --editable '.[$*]'
 	@touch $@
 
 # Once, whether it succeeds or not: `make weights` tries again.
@@ -242,7 +251,7 @@ stability: $(VENV)/.ready-dev
 # Checks first what an installation cannot fix. MAX_JOBS limits the number of compilers, which take up to 1 GB each.
 gpu: $(VENV)/.ready
 	@$(PY) -m benchmarks.gpu.ready --before
-	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable '.[gpu]'
+	$(PY) -m pip install --quiet $(bytecode) --constraint $(pins) --editable '.[gpu]'
 	@$(PY) -m benchmarks.gpu.ready
 
 gpu-check: $(VENV)/.ready

@@ -135,12 +135,15 @@ class Workspace:
 
     @cached_property
     def background(self) -> Background:
-        """The surroundings of the object as the photographs show them, with the planes and mirrors that `masks` found.
+        """The surroundings of the object as the photographs show them, with planes and mirrors.
 
         It also has the object's center and radius. A mirror is a plane of mirror symmetry of a thing beside the object
-        (`background/mirrors.py`).
+        (`background/mirrors.py`). They are searched here if `masks` had no use for them.
         """
-        return surfaces_from_arrays(self.background_views, load_arrays(self.masks / SURFACES), self.device)
+        arrays = load_arrays(self.masks / SURFACES)
+        if "center" not in arrays:
+            return self.background_views.with_planes(self.gaussians, self.labels).with_mirrors(self.remaining)
+        return surfaces_from_arrays(self.background_views, arrays, self.device)
 
     @cached_property
     def background_views(self) -> Background:

@@ -77,11 +77,13 @@ class Engine(Protocol):
     Attributes:
         cuda: whether its machines have a GPU; None if it is this machine, see `resolve.has_cuda`.
         cores: total number of CPU cores.
+        gpus: number of GPUs that stages share; 0 if there is none, or on a cluster.
         is_remote: True if stages may run on other machines, which write to the folder of results.
     """
 
     cuda: bool | None
     cores: int
+    gpus: int
     is_remote: bool
 
     def run(self, task: Task, resources: Resources, lock: int, on_start: Callable[[], None]) -> StageResult:
@@ -130,7 +132,7 @@ class LocalEngine:
         """
         self._cores = sorted(os.sched_getaffinity(0)) if cores is None else list(cores)
         self._gpus = visible_gpus() if gpus is None else list(gpus)
-        self.cores, self._gpu_count = len(self._cores), len(self._gpus)
+        self.cores, self.gpus = len(self._cores), len(self._gpus)
         self.memory_mb = memory_mb if memory_mb is not None else free_memory_mb()
         self._asks_system = memory_mb is None
         self._reserved: dict[int, int] = {}  # running task -> its memory, MB
@@ -154,7 +156,7 @@ class LocalEngine:
         with self._reserve(resources) as (cores, gpus):
             on_start()
             where = {"cores": len(cores), "on": cores} if resources.cores is not None else {}
-            where |= {"gpus": ",".join(gpus)} if gpus and self._gpu_count > 1 else {}
+            where |= {"gpus": ",".join(gpus)} if gpus and self.gpus > 1 else {}
             result = run_process(replace(task, line=task.line | where), lock, self._follow)
             others = len(self._reserved) - 1
         if result.interrupted:
@@ -195,7 +197,7 @@ class LocalEngine:
             The numbers of the cores and of the GPUs.
         """
         core_count = min(resources.cores or self.cores, self.cores)
-        gpu_count = min(resources.gpus, self._gpu_count)
+        gpu_count = min(resources.gpus, self.gpus)
         with self._change:
             self._number += 1
             number = self._number

@@ -62,6 +62,7 @@ class Execution:
         engine: the engine that runs them.
         cores: number of cores of each stage. None for an equal part of the engine's cores if several scenes run; else
             for all cores of this machine, or for one core on a cluster.
+        gpu_cores: number of cores of each stage that has a GPU; None for `cores`.
         output: the file to which stages append what they print; None for the runner's own output.
         on_change: called with the name of a stage and its new state: "waits" (for cores, GPUs or memory), "runs" or
             "done". A stage that need not run is done at once.
@@ -69,6 +70,7 @@ class Execution:
 
     engine: Engine
     cores: int | None = None
+    gpu_cores: int | None = None
     output: Path | None = None
     on_change: Callable[[str, str], None] = lambda stage, state: None
 
@@ -166,7 +168,8 @@ def _run_in_engine(
     line = {"stage": stage, "params": job.params[stage], "out": partial, "log": log, "needs": needs}
     task = Task(job.root, json.loads(json.dumps(line, default=str)), execution.output)
     gpus = int(job.params[stage].get("device") == "cuda")
-    resources = Resources(execution.cores, gpus, expected_memory_mb(job, stage, needs))
+    cores = (gpus and execution.gpu_cores) or execution.cores
+    resources = Resources(cores, gpus, expected_memory_mb(job, stage, needs))
     execution.on_change(stage, "waits")
     result = execution.engine.run(task, resources, lock, lambda: execution.on_change(stage, "runs"))
     code, answer = result.code, result.answer

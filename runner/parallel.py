@@ -65,8 +65,8 @@ def run_all(
 ) -> None:
     """Do several runs, in parallel if cores allow. If one fails, the others go on.
 
-    By default each group gets an equal part of the engine's cores, at least one. The number of cores of a stage does
-    not change when other runs end, so that no result depends on the order in which runs end.
+    By default each group gets an equal part of the engine's cores, at least one. Few stages have a GPU at a time, so
+    each of them gets more cores: one core in two with one GPU. The number of cores of a stage does not change when other runs end, so that no result depends on the order in which runs end.
 
     If runs are parallel or on a cluster, each run's output goes to output.log in its home, and a table of the progress
     is displayed instead.
@@ -92,10 +92,11 @@ def run_all(
                 say(run.announcement)
             on_end(place, _run(run, hashes, Execution(engine, cores and cores_each)))
         return
+    gpu_cores = None if cores or not engine.gpus else max(cores_each, engine.cores // (engine.gpus + 1))
     header = f"{len(groups)} scenes, {at_once} at once, {cores_each} core{'s' * (cores_each > 1)} each"
     homes = [run.home for run in runs]
     with Progress([run.name for run in runs], homes, stages, at_once, header) as progress:
-        run_one = partial(_run_with_progress, progress, hashes, Execution(engine, cores_each))
+        run_one = partial(_run_with_progress, progress, hashes, Execution(engine, cores_each, gpu_cores))
         _run_in_threads(runs, groups, at_once, run_one, on_end, engine)
 
 

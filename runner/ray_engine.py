@@ -29,7 +29,7 @@ class RayEngine:
     on this machine.
     """
 
-    is_remote = True
+    is_remote, gpus = True, 0
 
     def __init__(self, address: str | None, root: Path, runs: Path):
         here = os.pathsep.join(dict.fromkeys([str(root), str(Path(__file__).resolve().parent.parent)]))

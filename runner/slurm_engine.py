@@ -33,7 +33,7 @@ class SlurmEngine:
     Its `address` is the name of a partition, None for the default partition, or "local" for processes on this machine.
     """
 
-    is_remote = True
+    is_remote, gpus = True, 0
 
     def __init__(self, address: str | None, root: Path, runs: Path):
         self._folder = runs / FOLDER

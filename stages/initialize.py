@@ -73,7 +73,7 @@ def run(
     extra: list[Reference] = []
     trusted: list[Reference] = []
     if references:
-        background = space.background
+        background = space.background if params.uses_surfaces else space.background_views
         network = monocular.load_network(params.depth.model, params.device) if params.depth.model else None
         best = space.facts["best_reference"]
         draft, depths = fill_references(params, draft, references, best, background, network, Trace(out))

@@ -53,7 +53,8 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
 
     - labels.npy, bool [N]: the Gaussians to remove, which are the object's and debris;
     - debris.npy, bool [N], if debris is searched: Gaussians that the object had hidden and that no photograph supports;
-    - background.npz: planes and mirror planes around the object, and its soft shadow if one is found;
+    - background.npz: planes and mirror planes around the object if the classes depend on them, and its soft shadow if
+      one is found;
     - raw/, consistent/, unobserved/ and invent/<view>.png: the pixel classes;
     - facts.json;
     - warnings.json and remnants/<number>.png, if the masks seem to leave out parts of the object.
@@ -92,7 +93,10 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
         consistent = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
     views = render_depth_views(gaussians, train, hidden)
-    background = Background(views, {}, points=scene.points).with_planes(gaussians, labels)
+    background = Background(views, {}, points=scene.points)
+    needs_surfaces = params.shadows or consolidation.needs_unobserved(params, fill)
+    if needs_surfaces:
+        background = background.with_planes(gaussians, labels)
     photos = exposure.load_normalized_views(poses, fit, scene.train) if background.planes or params.debris else {}
     background = replace(background, photos=photos)
     shadow = find_shadow(params, background, gaussians.means[labels], scene)
@@ -101,14 +105,16 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
         save_labels(out / "debris.npy", debris.cpu())
         labels = labels | debris
     remaining = gaussians.map(lambda p: p[~labels])
-    background = background.with_mirrors(remaining)
+    if needs_surfaces:
+        background = background.with_mirrors(remaining)
     sets = consolidation.classify_pixels(params, scene, remaining, raw, consistent, background, fill)
     sets |= consolidation.add_uncaptured_pixels(params, scene, gaussians, hidden, sets)
     repainted = (*scene.train, *scene.blank)
     share = consolidation.unobserved_share(sets, repainted)
     sets = consolidation.drop_negligible(params, sets, repainted, fill)
     save_labels(out / "labels.npy", labels.cpu())
-    save_arrays(out / SURFACES, surfaces_to_arrays(background) | (shadow.to_arrays() if shadow else {}))
+    surfaces = surfaces_to_arrays(background) if needs_surfaces else {}
+    save_arrays(out / SURFACES, surfaces | (shadow.to_arrays() if shadow else {}))
     save_mask_sets(out, sets)
     invent = {name: each.invent for name, each in sets.items()}
     facts = {

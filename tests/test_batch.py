@@ -72,10 +72,10 @@ def max_concurrent(found: list[list]) -> int:
     return max(sum(a <= begun < b for a, b, *_ in found) for begun, *_ in found)
 
 
-def local_engine(cores: int, memory_mb: int = 10_000) -> LocalEngine:
+def local_engine(cores: int, memory_mb: int = 10_000, gpus: tuple[str, ...] = ()) -> LocalEngine:
     """Return an engine with this many cores, even if the machine has fewer: a core then appears several times."""
     real = sorted(os.sched_getaffinity(0))
-    return LocalEngine([real[n % len(real)] for n in range(cores)], memory_mb, [])
+    return LocalEngine([real[n % len(real)] for n in range(cores)], memory_mb, list(gpus))
 
 
 def test_several_at_once_and_a_second_call_runs_what_failed(tmp_path, capsys):
@@ -138,6 +138,19 @@ def test_cores_are_as_asked_for(tmp_path):
     batch(make_request(root, "", variant="better"), root / "many", Execution(local_engine(4), 2))
     assert {threads for _, _, threads, _ in read_spans(root)} == {"2"}
     assert (root / "runs/results@better.csv").is_file()
+
+
+@pytest.mark.parametrize("gpus, threads", [(1, "6"), (2, "4")])
+def test_stages_that_share_a_gpu_get_more_cores(tmp_path, gpus, threads):
+    """Four scenes share twelve cores. At most as many stages as there are GPUs have one."""
+    root = write_projects(tmp_path, 0.3)
+    (root / "stages/distill.py").write_text(
+        (root / "stages/distill.py").read_text().replace("    pause: float", '    device: str = "cuda"\n    pause: float')
+    )
+    engine = local_engine(12, gpus=tuple("01"[:gpus]))
+    assert batch(make_request(root, "", cuda=True), root / "many", Execution(engine)) == 1
+    found = read_spans(root)
+    assert {each for _, _, each, _ in found} == {threads} and max_concurrent(found) <= gpus
 
 
 def test_variants_of_several_scenes_at_once(tmp_path):

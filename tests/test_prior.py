@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -92,7 +93,9 @@ def test_a_folder_says_what_the_hole_shows(tiny_prior, tmp_path):
         file.write_text(text) if text else file.unlink()
         grey = diffusion.conditioning(load_prior(folder), images, masks)
         assert torch.equal(grey, torch.cat([masks, diffusion.encode(tiny_prior, images * (1 - masks))], 1))
-    for text in ('{"hole": "blue"}', "{}", "[", "3"):
+    file.write_text('{"hole": "grey", "contrast": 0.5}')
+    assert load_prior(folder).contrast == 0.5
+    for text in ('{"hole": "blue"}', '{"hole": "grey", "contrast": -1}', '{"hole": "grey", "contrast": []}', "{}", "[", "3"):
         file.write_text(text)
         with pytest.raises(ValueError, match=CONDITIONING):
             load_prior(folder)
@@ -219,3 +222,16 @@ def test_clear_errors(tmp_path):
     config.write_text(json.dumps(json.loads(config.read_text()) | {"prediction_type": "sample"}))
     with pytest.raises(ValueError, match="prediction_type"):
         load_prior(copy)
+
+
+def test_a_model_with_contrast_paints_a_pale_picture_as_it_paints_the_strong_one(tiny_prior):
+    prior = replace(tiny_prior, contrast=0.5)
+    text, masks = diffusion.embed_text(prior, [""] * 2), half_masks()
+    strong = 0.4 * random_images()
+    pale = 0.4 + 0.4 * strong
+    paint = lambda images: diffusion.sample(prior, images, masks, text, 3, generator(0), start=0.8)
+    assert torch.allclose(paint(pale), 0.4 + 0.4 * paint(strong), atol=2e-3)
+    everything = torch.ones_like(masks)
+    assert torch.isfinite(diffusion.sample(prior, strong, everything, text, 3, generator(0))).all()
+    flat = diffusion.sample(prior, torch.full_like(strong, 0.3), masks, text, 3, generator(0))
+    assert (flat - 0.3).abs().max() < 0.2, "errors are small where the surroundings have no contrast"

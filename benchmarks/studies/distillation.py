@@ -79,7 +79,9 @@ def sds_gradient(prior, pictures: Tensor, holes: Tensor, timestep: int, text: Te
     Returns:
         Two estimates, [B, 3, H, W] each. A step against the gradient moves a picture towards the prior's prediction.
     """
-    latents, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
+    levels = diffusion.measure_levels(prior, pictures, holes)
+    shown = levels.normalize(pictures)
+    latents, condition = diffusion.encode(prior, shown), diffusion.conditioning(prior, shown, holes)
     t, halves = torch.full((len(pictures),), timestep), []
     for half in range(2):
         guesses = torch.zeros_like(latents)
@@ -87,7 +89,8 @@ def sds_gradient(prior, pictures: Tensor, holes: Tensor, timestep: int, text: Te
             noise = torch.randn(latents.shape, generator=seeding.generator(0, "distillation", timestep, half, k))
             noisy = diffusion.add_noise(prior, latents, noise, t)
             guesses += diffusion.predict(prior, noisy, t, condition, text)[1] / (NOISES // 2)
-        halves.append(diffusion.decode(prior, latents) - diffusion.decode(prior, guesses))
+        difference = diffusion.decode(prior, latents) - diffusion.decode(prior, guesses)
+        halves.append(difference / levels.gain)
     return halves[0], halves[1]
 
 

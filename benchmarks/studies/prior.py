@@ -209,7 +209,8 @@ def measure_timesteps(prior: Prior, cases: list[Case], prompt: str) -> dict[str,
         variance of x0 over `NOISES` draws of the noise, which is also the variance of the SDS gradient z - x0.
     """
     pictures, holes = to_tensors(cases)
-    clean, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
+    shown = diffusion.measure_levels(prior, pictures, holes).normalize(pictures)
+    clean, condition = diffusion.encode(prior, shown), diffusion.conditioning(prior, shown, holes)
     text = diffusion.embed_text(prior, [prompt]).expand(len(cases), -1, -1)
     inside = condition[:, :1].expand_as(clean) > 0.5
     result: dict[str, list[float]] = {"error": [], "variance": []}

@@ -77,8 +77,10 @@ def load_inputs(run: Path, prior: Prior) -> dict[str, tuple[Tensor, Tensor]]:
 
 @torch.no_grad()
 def sds_gradients(prior: Prior, pictures: Tensor, holes: Tensor, prompt: str) -> Tensor:
-    """Return SDS gradients z - x0(z_t), [T, K, M]: T `TIMESTEPS`, K = `NOISES` draws, M latent values in the holes."""
-    latents, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
+    """Return SDS gradients z - x0(z_t) at the levels of the pictures, [T, K, M]: T `TIMESTEPS`, K = `NOISES` draws, M latent values in the holes."""
+    levels = diffusion.measure_levels(prior, pictures, holes)
+    shown = levels.normalize(pictures)
+    latents, condition = diffusion.encode(prior, shown), diffusion.conditioning(prior, shown, holes)
     text = diffusion.embed_text(prior, [prompt]).expand(len(latents), -1, -1)
     inside, gradients = condition[:, :1].expand_as(latents) > 0.5, []
     for part in TIMESTEPS:
@@ -87,7 +89,7 @@ def sds_gradients(prior: Prior, pictures: Tensor, holes: Tensor, prompt: str) ->
             noise = torch.randn(latents.shape, generator=seeding.generator(SEED, "sds variance", int(t[0]), k))
             noise = noise.to(latents)
             clean = diffusion.predict(prior, diffusion.add_noise(prior, latents, noise, t), t, condition, text)[1]
-            gradients.append((latents - clean)[inside])
+            gradients.append(((latents - clean) / levels.gain)[inside])
     return torch.stack(gradients).view(len(TIMESTEPS), NOISES, -1)
 
 

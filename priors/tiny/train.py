@@ -25,6 +25,7 @@ from priors.tiny.photographs import load_photographs
 from reffusion.io.arrays import save_json
 from reffusion.prior import harmonic_fill
 from reffusion.prior.denoising import spread_timesteps
+from reffusion.prior.levels import measure_levels
 from reffusion.prior.model import CONDITIONING
 from reffusion.seeding import generator, seed_for
 from reffusion.trace import load_checkpoint, save_checkpoint
@@ -43,9 +44,7 @@ OUTSIDE_WEIGHT = 0.2  # weight of the loss outside the mask
 FILLED_SHARE = 0.8  # of samples have the hole filled as in conditioning.json; the others a grey hole
 NOISY_SHARE = 0.15  # noisy end of the schedule, from which every fourth timestep is sampled
 LATENT_WEIGHTS = (1.0, 1.0, 1.0, 0.02)  # of each latent; the fourth is empty, and only has to stay close to 0
-# The weight of a sample is 1 / (variance of its lightness + CONTRAST^2). With equal weights samples of low contrast
-# count too little, and their holes become mottled.
-CONTRAST = 0.15
+CONTRAST = 0.5  # standard deviation at which the model sees the known pixels of a sample (`reffusion.prior.levels`)
 VALIDATION_CROPS = 32  # held-out crops
 CHECKPOINT_STEPS = 100  # steps between checkpoints
 
@@ -108,12 +107,10 @@ def noisy_quarter(t: Tensor, steps: int) -> Tensor:
 
 
 def loss(model: Model, alphas: Tensor, batch: tuple[Tensor, Tensor, list[str]], random: torch.Generator) -> Tensor:
-    """Mean squared error of v = sqrt(a) eps - sqrt(1 - a) z, weighted.
-
-    The weights are OUTSIDE_WEIGHT (1 in holes), LATENT_WEIGHTS, and those of samples (CONTRAST).
-    """
+    """Mean squared error of v = sqrt(a) eps - sqrt(1 - a) z, weighted by OUTSIDE_WEIGHT (1 in holes), LATENT_WEIGHTS."""
     device = alphas.device
     pixels, masks, captions = batch[0].to(device), batch[1].to(device), batch[2]
+    pixels = measure_levels(pixels, masks, CONTRAST).normalize(pixels)
     filled = (torch.rand(len(pixels), 1, 1, 1, generator=random) < FILLED_SHARE).to(device)
     shown = torch.where(filled, harmonic_fill.harmonic_extension(pixels, masks), pixels * (masks < 0.5))
     clean, given = build.latents(pixels), build.latents(shown)
@@ -125,8 +122,8 @@ def loss(model: Model, alphas: Tensor, batch: tuple[Tensor, Tensor, list[str]], 
         predicted = model(noisy, t, torch.cat([masks, given], 1), captions).float()
     weight = (OUTSIDE_WEIGHT + (1 - OUTSIDE_WEIGHT) * masks) * torch.tensor(LATENT_WEIGHTS).to(device).view(-1, 1, 1)
     error = (weight * (predicted - target) ** 2).sum((1, 2, 3)) / weight.sum((1, 2, 3))
-    importance = 1 / (clean[:, 0].var((1, 2)) + CONTRAST**2)
-    return (importance * error).sum() / importance.sum()
+    # A hole that shows more contrast than its surroundings has high values, and would outweigh all other samples.
+    return (error / clean.square().mean((1, 2, 3)).clamp(min=1)).mean()
 
 
 def make_optimiser(model: Model) -> torch.optim.Optimizer:
@@ -205,7 +202,7 @@ def export(average: dict[str, Tensor], folder: Path) -> None:
         requires_safety_checker=False,
     )
     pipeline.to(dtype=torch.float16).save_pretrained(folder)
-    save_json(folder / CONDITIONING, {"hole": "harmonic"})
+    save_json(folder / CONDITIONING, {"hole": "harmonic", "contrast": CONTRAST})
 
 
 def arguments() -> argparse.Namespace:

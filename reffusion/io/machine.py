@@ -78,7 +78,7 @@ def find_missing(here: Machine, memory_gb: float = 0.0, splats: bool = True, mem
     if here.driver is not None and here.driver < oldest:
         found.append(
             f"the NVIDIA driver is {here.driver}, and torch's CUDA {here.torch_cuda} needs {oldest} or later: "
-            f"update the driver, or install a torch for an older CUDA"
+            f"update the driver{_older_torch(cuda_major)}"
         )
     if splats and not here.gsplat:
         found.append(f"gsplat is not installed: {INSTALL}")
@@ -109,9 +109,14 @@ def _cannot_build(here: Machine, cuda_major: int | None) -> list[str]:
     if cuda_major and here.nvcc and _major(here.nvcc) != cuda_major:
         return [
             f"gsplat has no compiled extension, and nvcc {here.nvcc} cannot build it for torch's CUDA "
-            f"{here.torch_cuda}: install CUDA toolkit {cuda_major}, then `make gpu`"
+            f"{here.torch_cuda}: install CUDA toolkit {cuda_major}, then `make gpu`{_older_torch(cuda_major)}"
         ]
     return []
+
+
+def _older_torch(cuda_major: int | None) -> str:
+    """Return the other remedy for a driver or a compiler that is too old for torch's CUDA, if there is one."""
+    return ", or `make gpu cuda=12`" if cuda_major and cuda_major > 12 else ""
 
 
 def _major(version: str | None) -> int | None:

@@ -103,6 +103,14 @@ def clean_mask(params: Params, mask: np.ndarray) -> np.ndarray:
     return morphology.remove_small_parts(mask, ISLAND * width, GAP * width) if params.tidy else mask
 
 
+def needs_unobserved(params: Params, fill: FillRequest) -> bool:
+    """Return whether the pixel classes depend on what other photographs show.
+
+    They do not if all of C is invented (`params.invent` "consistent") and the scene asks to fill nothing else.
+    """
+    return params.invent != "consistent" or bool(fill)
+
+
 def classify_pixels(
     params: Params,
     scene: Scene,
@@ -115,7 +123,8 @@ def classify_pixels(
     """Split the consistent mask of each view into observed and unobserved pixels, and select the pixels to invent.
 
     Unobserved pixels are invented (with `params.invent` "consistent": all of C), as well as the pixels that the scene
-    asks to fill. In a clean view C stays, but no pixel of it is unobserved, and none is invented unless the scene asks
+    asks to fill. If nothing depends on them, unobserved pixels are not searched, and all of C counts as unobserved. In
+    a clean view C stays, but no pixel of it is unobserved, and none is invented unless the scene asks
     to fill it.
 
     Args:
@@ -133,11 +142,14 @@ def classify_pixels(
 
     def classify(name: str) -> MaskSet:
         camera, mask, is_dirty = scene.cameras[name], consistent[name], name not in scene.clean
+        given = raw.get(name, np.zeros_like(mask))
+        if not needs_unobserved(params, fill):
+            return MaskSet(given, mask, mask & is_dirty, mask & is_dirty)
         found = find_unobserved(remaining, camera, mask, background.views, background.planes, background.mirrors)
         unobserved = clean_mask(params, found.unobserved) & mask & is_dirty
         invent = mask & is_dirty if params.invent == "consistent" else unobserved
         invent = invent | fill.render(camera, found.depth)
-        return MaskSet(raw.get(name, np.zeros_like(mask)), mask, unobserved, invent)
+        return MaskSet(given, mask, unobserved, invent)
 
     with closing(side_by_side(classify, names, MAX_PARALLEL if params.device == "cpu" else 1)) as found:
         return {names[k]: next(found) for k in trace.progress(len(names), "masks")}

@@ -51,3 +51,8 @@ class Params(Settings):
     )
     refit_steps: int = Field(0, ge=0, description="reconstruction steps after filling; 0: none")
     device: Device = Field("cpu", description="device for rendering and the depth model")
+
+    @property
+    def uses_surfaces(self) -> bool:
+        """Whether planes and mirrors around the object are used."""
+        return self.depth.hints or self.depth.sweep or self.extra_views > 0

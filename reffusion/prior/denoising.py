@@ -43,7 +43,8 @@ def denoising_error(
     """Return two mean squared errors of the denoiser for each sample: of its target, and of the clean latent, [B] each.
 
     The target is the quantity that the network was trained to predict: eps, or v = a eps - s z. Both errors are means
-    over all latents of a sample, with the weight `outside_weight` outside the mask.
+    over all latents of a sample, with the weight `outside_weight` outside the mask. The latents are those of the
+    picture at the levels at which the model sees it.
 
     PAPER leaves open: the target (the paper's prior predicts eps) and whether the loss covers the whole image or the
     mask. As in RealFill, it covers the whole image.
@@ -60,6 +61,7 @@ def denoising_error(
     images, masks = samples.images.to(prior.device), samples.masks.to(prior.device)
     timesteps, noise = timesteps.to(prior.device), noise.to(prior.device)
     with torch.no_grad():
+        images = diffusion.measure_levels(prior, images, masks).normalize(images)
         latents = diffusion.encode(prior, images)
         condition = diffusion.conditioning(prior, images, masks)
         noisy = diffusion.add_noise(prior, latents, noise, timesteps)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 from torch.utils.checkpoint import checkpoint
 
-from reffusion.prior import harmonic_fill
+from reffusion.prior import harmonic_fill, levels
 from reffusion.prior.model import Prior
 
 
@@ -84,6 +84,17 @@ def decode(prior: Prior, latents: Tensor) -> Tensor:
     dtype = next(prior.vae.parameters()).dtype
     scaled = latents / prior.vae.config.scaling_factor
     return _in_batches(prior, lambda part: prior.vae.decode(part.to(dtype)).sample, scaled).float()
+
+
+def measure_levels(prior: Prior, images: Tensor, masks: Tensor) -> levels.Levels:
+    """Return the levels at which a model sees pictures. The caller normalises pictures before `encode`, `conditioning`.
+
+    Args:
+        prior: The diffusion prior. Only one with `contrast` has other levels than the pictures themselves.
+        images: [B, 3, H, W] in [-1, 1].
+        masks: [B, 1, H, W], 1 = repaint.
+    """
+    return levels.measure_levels(images, (masks > 0.5).to(images.dtype), prior.contrast)
 
 
 @torch.no_grad()
@@ -198,6 +209,8 @@ def sample(
     """
     if not 0 < start <= 1:
         raise ValueError(f"start must lie in (0, 1], not {start}")
+    shown = measure_levels(prior, images, masks)
+    images = shown.normalize(images)
     condition = conditioning(prior, images, masks)
     shape = (len(images), condition.shape[1] - 1, *condition.shape[-2:])
     noise = torch.randn(shape, generator=random).to(images.device)
@@ -208,7 +221,7 @@ def sample(
     for t, next_t in itertools.pairwise(times):
         eps, clean = guided(prior, noisy, torch.full_like(batch, t), condition, text, empty, guidance)
         noisy = clean if next_t == times[-1] else add_noise(prior, clean, eps, torch.full_like(batch, next_t))
-    return decode(prior, noisy).clamp(-1, 1)
+    return shown.restore(decode(prior, noisy)).clamp(-1, 1)
 
 
 def guided(

@@ -25,7 +25,8 @@ from torch import Tensor, nn
 
 from reffusion.weights import local
 
-# File in a model folder, {"hole": one of HOLES}: content of the hole in the masked image.
+# File in a model folder, {"hole": one of HOLES, "contrast": number}: content of the hole in the masked image, and the
+# contrast to which pictures are normalised (`Prior.contrast`).
 CONDITIONING = "conditioning.json"
 HOLES = ("grey", "harmonic")
 
@@ -48,6 +49,8 @@ class Prior:
             pass.
         fills: Whether the hole in the conditioning picture is filled from its surroundings
             (`harmonic_fill.harmonic_extension`), as conditioning.json may ask. Else the hole is grey, as usual.
+        contrast: Standard deviation of the known pixels of a picture as the model sees it (`levels`), which
+            conditioning.json may set. 0, as usual: the model sees the picture as it is.
     """
 
     unet: nn.Module
@@ -63,6 +66,7 @@ class Prior:
     rows: int = 0
     rows_with_grad: int = 0
     fills: bool = False
+    contrast: float = 0.0
 
     @property
     def device(self) -> torch.device:
@@ -137,25 +141,29 @@ def load_prior(source: str | Path, device: str = "cpu", dtype: torch.dtype | str
     prior = make_prior(unet, vae, text, tokenizers[0], scheduler, device, str(source), text_2, tokenizer_2)
     index = folder / "model_index.json"
     zero_empty = has_second and '"force_zeros_for_empty_prompt": true' in index.read_text()
-    return replace(prior, zero_empty=zero_empty, fills=_fills_hole(folder))
+    fills, contrast = _load_conditioning(folder)
+    return replace(prior, zero_empty=zero_empty, fills=fills, contrast=contrast)
 
 
-def _fills_hole(folder: Path) -> bool:
-    """Return True if conditioning.json in the folder asks for filled holes. Without this file holes are grey.
+def _load_conditioning(folder: Path) -> tuple[bool, float]:
+    """Return `Prior.fills` and `Prior.contrast` as conditioning.json in the folder has them; without it False and 0.
 
     Raises:
-        ValueError: The file cannot be read or names an unknown content.
+        ValueError: The file cannot be read, names an unknown content, or its contrast is negative.
     """
     path = folder / CONDITIONING
     if not path.exists():
-        return False
+        return False, 0.0
     try:
-        hole = json.loads(path.read_text())["hole"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        content = json.loads(path.read_text())
+        hole, contrast = content["hole"], float(content.get("contrast", 0))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"prior {path}: cannot be read: {_one_line(error)}") from error
     if hole not in HOLES:
         raise ValueError(f"prior {path}: hole is {hole!r}, not one of {', '.join(HOLES)}")
-    return hole == "harmonic"
+    if not 0 <= contrast < float("inf"):
+        raise ValueError(f"prior {path}: contrast is {contrast}, not a number of at least 0")
+    return hole == "harmonic", contrast
 
 
 def _load_network(kind: Any, folder: Path, part: str, **dtype: torch.dtype) -> nn.Module:

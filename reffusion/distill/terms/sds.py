@@ -149,8 +149,10 @@ def evaluate_sds(
     windows = [window_around(hole.cpu(), size, generator) for _ in range(sds.patches)]
     masks = two_scale_masks(hole, windows, size)
     reduce = lambda image: two_scales(image, windows, size, antialias=sds.antialias)
-    latents = diffusion.encode(prior, reduce(rendered))
-    condition = diffusion.conditioning(prior, reduce(known), masks)
+    pictures = reduce(known)
+    levels = diffusion.measure_levels(prior, pictures, masks)
+    latents = diffusion.encode(prior, levels.normalize(reduce(rendered)))
+    condition = diffusion.conditioning(prior, levels.normalize(pictures), masks)
     prompts = torch.cat([text[:1], text[1:2].expand(sds.patches, -1, -1)])
     empty = text[2:].expand(len(latents), -1, -1)
 
@@ -169,4 +171,5 @@ def evaluate_sds(
     )
     if not torch.isfinite(gradient).all():
         raise FloatingPointError(f"the prior's answer at timesteps {timesteps.tolist()} is not finite")
-    return sds_loss(latents, gradient, sds.reduction), rendering
+    # The gain enters the gradient of the latents, and once more their gradient in the rendering.
+    return sds_loss(latents, gradient / levels.gain.square(), sds.reduction), rendering

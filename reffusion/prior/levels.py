@@ -1,0 +1,53 @@
+"""Levels: the brightness and contrast of a picture, as its known pixels have them.
+
+A small model makes errors of a fixed size, which stand out in a picture of low contrast, such as a window of a smooth
+wall. Such a model sees pictures at levels that are the same for all, and its answers are restored to the picture's own.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+LEAST_CONTRAST = 0.05  # standard deviation, of a range of 2, below which contrast is not raised further
+
+
+class Levels(NamedTuple):
+    """Brightness and contrast of pictures, relative to those at which a model sees them.
+
+    Attributes:
+        mean: [B, 3, 1, 1], the colour that the model sees as 0.
+        gain: [B, 1, 1, 1], the factor by which the model sees differences of colour enlarged.
+    """
+
+    mean: Tensor
+    gain: Tensor
+
+    def normalize(self, images: Tensor) -> Tensor:
+        """Return images [B, 3, H, W] as the model sees them; differentiable."""
+        return (images - self.mean) * self.gain
+
+    def restore(self, images: Tensor) -> Tensor:
+        """Return images [B, 3, H, W] at their own levels, given as the model sees them."""
+        return images / self.gain + self.mean
+
+
+@torch.no_grad()
+def measure_levels(images: Tensor, hidden: Tensor, contrast: float) -> Levels:
+    """Return the levels at which the known pixels have mean 0 and the standard deviation `contrast`.
+
+    Without known pixels, and with a contrast of 0, the levels are those of the picture itself.
+
+    Args:
+        images: [B, 3, H, W] in [-1, 1]. Values in the hole are ignored.
+        hidden: [B, 1, H, W], 1 = hole, 0 = known.
+        contrast: The standard deviation over all pixels and channels, or 0.
+    """
+    known = (1 - hidden) * (contrast > 0)
+    count = known.sum((2, 3), keepdim=True)
+    mean = (images * known).sum((2, 3), keepdim=True) / count.clamp(min=1)
+    variance = ((images - mean).square() * known).sum((1, 2, 3), keepdim=True) / (3 * count.clamp(min=1))
+    gain = contrast / variance.sqrt().clamp(min=LEAST_CONTRAST)
+    return Levels(mean, torch.where(count > 0, gain, 1.0))
