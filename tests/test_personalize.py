@@ -224,6 +224,38 @@ def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch)
     assert errors("whole") == errors("broken")
 
 
+def test_training_that_gains_little_more_ends_and_resumes_to_the_same_end(tmp_path, monkeypatch):
+    monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
+
+    def train(folder, steps=64, least_gain=0.9):
+        folder.mkdir(exist_ok=True)
+        prior = small_prior()
+        trained = lora.attach(prior, 4, 8, 0.1, "attention", 0)
+        training = with_changes(TRAINING, steps=steps, least_gain=least_gain, checkpoint_seconds=1e-9)
+        P.personalize(prior, trained, [striped_reference()], training, folder)
+        return lora.state(prior), read_trace(folder / "trace.jsonl")[-1]
+
+    whole, end = train(tmp_path / "whole")
+    assert end["reason"] == "settled" and end["iteration"] == 8, "from 4 to 8 steps the error does not fall to a tenth"
+    assert train(tmp_path / "never", least_gain=0)[1]["iteration"] == 64
+    alone, _ = train(tmp_path / "alone", 8, 0)
+    assert all(torch.allclose(alone[name], weight, atol=1e-6) for name, weight in whole.items())
+    real = P.train_step
+
+    def interrupted(*arguments):
+        if arguments[4] == 6:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    monkeypatch.setattr(P, "train_step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path / "broken")
+    monkeypatch.setattr(P, "train_step", real)
+    resumed, end = train(tmp_path / "broken")
+    assert end["iteration"] == 8
+    assert all(torch.allclose(resumed[name], weight, atol=1e-6) for name, weight in whole.items())
+
+
 def test_nan_stops_the_training_and_names_the_step(fresh_prior, tmp_path):
     trained = lora.attach(fresh_prior, 4, 8, 0.0, "attention", 0)
     broken = replace(striped_reference(), image=torch.full((3, 70, 90), float("nan")))

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from reffusion.distill.sds import draw_timesteps, match_contrast, sds_gradient, sds_loss
+from reffusion.distill.sds import anneal, draw_timesteps, match_contrast, sds_gradient, sds_loss
 from reffusion.prior.windows import enlarge_to_fit, two_scale_masks, two_scales, window_around
 from reffusion.seeding import generator
 
@@ -85,6 +85,11 @@ def test_weightings_differ_by_a_function_of_the_timestep_only():
     torch.testing.assert_close(sigma2, (1 - a2) * one)
     with pytest.raises(ValueError, match="weighting"):
         sds_gradient(latents, perfect_denoiser, t, noise, ABAR, weighting="w")
+
+
+def test_the_highest_timestep_falls_in_the_first_half():
+    assert [anneal(0.98, 0.5, progress) for progress in (0, 0.25, 0.5, 1)] == pytest.approx([0.98, 0.74, 0.5, 0.5])
+    assert anneal(0.98, None, 0.7) == 0.98
 
 
 def fade_contrast(factor, shift=0.2):

@@ -35,6 +35,17 @@ def draw_timesteps(count: int, steps: int, low: float, high: float, generator: t
     return torch.randint(first, last + 1, (count,), generator=generator)
 
 
+def anneal(first: float, last: float | None, progress: float) -> float:
+    """Return a value that goes linearly from `first` to `last` in the first half of a run, and then stays.
+
+    Args:
+        first: The value at the start.
+        last: The value in the second half; None for `first`.
+        progress: The finished share of the run, in [0, 1].
+    """
+    return first if last is None else first + (last - first) * min(2 * progress, 1.0)
+
+
 def match_contrast(x0: Tensor, latents: Tensor, mask: Tensor) -> Tensor:
     """Return `x0` with its contrast inside the mask raised to that of the latents, as far as their patterns agree.
 

@@ -41,6 +41,10 @@ class SdsTerm(Settings):
     # PAPER leaves open: timesteps, w(t), normalisation, guidance, reduction (see `distill.sds`). The values are those
     # of threestudio, except guidance: its scale of 100 suits a prior that was not adapted.
     t_high: float = Field(0.98, ge=0, le=1, description="highest timestep")
+    # Not in the paper: high timesteps decide the layout, which is settled first.
+    t_high_last: float | None = Field(
+        None, ge=0, le=1, description="highest timestep in the second half of the run; it falls linearly until then"
+    )
     weighting: Literal["sigma2", "alpha_sigma2", "x0", "one"] = Field(
         "sigma2", description="w(t) of the SDS gradient, see `distill.sds.sds_gradient`"
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from math import ceil, cos, isfinite, pi
+from math import ceil, cos, inf, isfinite, pi
 from pathlib import Path
 
 import torch
@@ -74,25 +74,31 @@ def personalize(
     rates = (options.lr_unet, options.lr_text)
     groups = [{"params": trained[part], "lr": rate} for part, rate in zip(("unet", "text"), rates, strict=True)]
     optimizer = torch.optim.AdamW(groups, betas=options.betas, weight_decay=WEIGHT_DECAY, fused=True)
-    state, start, seconds = trace.load_checkpoint(folder), 0, 0.0
+    state, start, seconds, error = trace.load_checkpoint(folder), 0, 0.0, inf
     if state is not None:
         lora.load_state(prior, state["lora"])
         optimizer.load_state_dict(state["optimizer"])
-        start, seconds = state["step"], state["seconds"]
+        start, seconds, error = state["step"], state["seconds"], state["error"]
     log, checkpoints = trace.Trace(folder, seconds, start), trace.Checkpoints(folder, settings.checkpoint_seconds)
     validation_set = make_held_out(references, photographs, prior.native_size, settings.seed)
     references = [replace(each, image=each.image.to(prior.device)) for each in references]
     threads = Threads(steps - start, prior.device)
 
-    def measure(step: int) -> None:
-        end = {"reason": "finished"} if step == steps else {}
+    def measure(step: int, previous: float = inf) -> tuple[float, bool]:
         with log.paused():
-            log.log(step, **measure_errors(prior, validation_set, settings.seed, threads.map), **end)
+            errors = measure_errors(prior, validation_set, settings.seed, threads.map)
+            error = errors["clean_latent_mse"]
+            settled = step < steps and error > (1 - settings.least_gain) * previous and settings.least_gain > 0
+            reason = "settled" if settled else "finished" if step == steps else ""
+            log.log(step, **errors, **({"reason": reason} if reason else {}))
+        return error, settled
 
     with threads:
         for step in trace.progress(steps, "personalize", start):
             if trace.log_spaced(step, steps, per_octave=1, first=FIRST_MEASURED_STEP):
-                measure(step)
+                error, settled = measure(step, error if step > FIRST_MEASURED_STEP else inf)
+                if settled:
+                    break
             factor = learning_rate_factor(step, steps, options.warm_up, options.schedule)
             for group, rate in zip(optimizer.param_groups, rates, strict=True):
                 group["lr"] = rate * factor
@@ -100,8 +106,10 @@ def personalize(
                 train_step(prior, optimizer, references, settings, step, threads)
             if checkpoints.due:
                 progress_state = {"optimizer": optimizer.state_dict(), "step": step + 1, "seconds": log.seconds}
+                progress_state |= {"error": error}
                 checkpoints.save(lambda progress_state=progress_state: progress_state | {"lora": lora.state(prior)})
-        measure(steps)
+        else:
+            measure(steps)
     lora.set_dropout(prior, False)
 
 

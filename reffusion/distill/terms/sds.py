@@ -9,7 +9,7 @@ from torch import Tensor
 
 from reffusion import seeding
 from reffusion.distill.display_range import clamp_to_display
-from reffusion.distill.sds import draw_timesteps, sds_gradient, sds_loss
+from reffusion.distill.sds import anneal, draw_timesteps, sds_gradient, sds_loss
 from reffusion.distill.terms.term import Term, TermInputs, TermValue, cycle_through, reach_hole
 from reffusion.distill.train_view import ReferenceHole, TrainView
 from reffusion.gaussians.optimize import confine
@@ -52,7 +52,8 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
     def loss(gaussians: Gaussians, reached: Tensor, view: TrainView, step: int) -> TermValue:
         probe = torch.zeros(len(reached), 2, device=reached.device, requires_grad=True)
         draws = seeding.generator(settings.seed, "distill", "sds", step)
-        value, rendering = evaluate_sds(gaussians, reached, view, prior, text, sds, draws, probe)
+        progress = step / settings.iterations
+        value, rendering = evaluate_sds(gaussians, reached, view, prior, text, sds, draws, probe, progress=progress)
         return TermValue(value, rendering, probe=probe)
 
     return Term(
@@ -113,6 +114,7 @@ def evaluate_sds(
     generator: torch.Generator,
     probe: Tensor | None = None,
     t_low: float = T_LOW,
+    progress: float = 0.0,
 ) -> tuple[Tensor, Rendering]:
     """Return the SDS loss L_global + mean(L_local) of one view, and the rendering.
 
@@ -133,6 +135,7 @@ def evaluate_sds(
         generator: Draws windows, timesteps and noise, on the CPU.
         probe: [N, 2], see `splat.render`. Its gradient is zero for Gaussians that are not reached. None: no probe.
         t_low: Lowest timestep, as a fraction of the schedule.
+        progress: The finished share of the run, in [0, 1], on which the highest timestep depends.
 
     Raises:
         FloatingPointError: The prior's prediction is not finite.
@@ -157,7 +160,8 @@ def evaluate_sds(
     empty = text[2:].expand(len(latents), -1, -1)
 
     count = len(latents)
-    timesteps = draw_timesteps(count, prior.timesteps, t_low, sds.t_high, generator).to(latents.device)
+    t_high = anneal(sds.t_high, sds.t_high_last, progress)
+    timesteps = draw_timesteps(count, prior.timesteps, t_low, t_high, generator).to(latents.device)
     noise = torch.randn(latents.shape, generator=generator).to(latents)
     gradient = sds_gradient(
         latents,
