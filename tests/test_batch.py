@@ -145,7 +145,9 @@ def test_stages_that_share_a_gpu_get_more_cores(tmp_path, gpus, threads):
     """Four scenes share twelve cores. At most as many stages as there are GPUs have one."""
     root = write_projects(tmp_path, 0.3)
     (root / "stages/distill.py").write_text(
-        (root / "stages/distill.py").read_text().replace("    pause: float", '    device: str = "cuda"\n    pause: float')
+        (root / "stages/distill.py")
+        .read_text()
+        .replace("    pause: float", '    device: str = "cuda"\n    pause: float')
     )
     engine = local_engine(12, gpus=tuple("01"[:gpus]))
     assert batch(make_request(root, "", cuda=True), root / "many", Execution(engine)) == 1

@@ -25,11 +25,17 @@ ROOT = Path(__file__).resolve().parent.parent
 GOOD = Machine("NVIDIA GeForce RTX 4090", 25.3, 580, "13.0", gsplat=True, extension=True, nvcc="13.0")
 POOR = {
     "torch without CUDA": ({"torch_cuda": ""}, r"torch is built without CUDA: `make gpu`"),
-    "old driver": ({"driver": 570}, r"the NVIDIA driver is 570, and torch's CUDA 13.0 needs 580 or later: update .*, or `make gpu cuda=12`$"),
+    "old driver": (
+        {"driver": 570},
+        r"the NVIDIA driver is 570, and torch's CUDA 13.0 needs 580 or later: update .*, or `make gpu cuda=12`$",
+    ),
     "old driver for 12": ({"driver": 470, "torch_cuda": "12.4"}, r"is 470, and torch's CUDA 12.4 needs 525"),
     "no gsplat": ({"gsplat": False, "extension": False}, r"gsplat is not installed: `make gpu`"),
     "no compiler": ({"extension": False, "nvcc": None}, r"no nvcc to build it: install CUDA toolkit 13 .*`make gpu`"),
-    "another compiler": ({"extension": False, "nvcc": "12.8"}, r"nvcc 12.8 cannot build it for torch's CUDA 13.0: .* `make gpu cuda=12`"),
+    "another compiler": (
+        {"extension": False, "nvcc": "12.8"},
+        r"nvcc 12.8 cannot build it for torch's CUDA 13.0: .* `make gpu cuda=12`",
+    ),
     "little memory": (
         {"gigabytes": 12.9},
         r'distill.memory_gb is 16, and .*4090 has 13 GB: set="distill.memory_gb=10"',

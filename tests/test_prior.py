@@ -95,7 +95,14 @@ def test_a_folder_says_what_the_hole_shows(tiny_prior, tmp_path):
         assert torch.equal(grey, torch.cat([masks, diffusion.encode(tiny_prior, images * (1 - masks))], 1))
     file.write_text('{"hole": "grey", "contrast": 0.5}')
     assert load_prior(folder).contrast == 0.5
-    for text in ('{"hole": "blue"}', '{"hole": "grey", "contrast": -1}', '{"hole": "grey", "contrast": []}', "{}", "[", "3"):
+    for text in (
+        '{"hole": "blue"}',
+        '{"hole": "grey", "contrast": -1}',
+        '{"hole": "grey", "contrast": []}',
+        "{}",
+        "[",
+        "3",
+    ):
         file.write_text(text)
         with pytest.raises(ValueError, match=CONDITIONING):
             load_prior(folder)

@@ -67,7 +67,14 @@ def test_personalization_is_left_out_where_sds_cannot_gain_and_the_profile_asks(
     assert rule["equals"] is False and "{sds_reason}" in rule["reason"]
     assert rule["only"] == {"distill.sds.run": "auto", "distill.depth.weight": 0}  # the depth term needs the prior, too
     runs = {name: profile["distill"].get("sds", {}).get("run") for name, profile in pipeline["profiles"].items()}
-    assert runs == {"paper": None, "best": None, "fast": None, "laptop": "auto", "laptop-terms": "always", "paper-terms": None}
+    assert runs == {
+        "paper": None,
+        "best": None,
+        "fast": None,
+        "laptop": "auto",
+        "laptop-terms": "always",
+        "paper-terms": None,
+    }
 
 
 def test_few_unseen_pixels_are_negligible_and_it_can_be_forced(tmp_path):
