@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import binary_erosion
 from scenes import wall_scene
 from scenes.cameras import make_camera, yaw
 from scenes.distill_scene import random_wall, train_view, wall_camera
 from scenes.networks import save_small_prior, small_prior
 from scenes.settings import with_changes
 from scenes.stage_runs import run_masks
+from scipy.ndimage import binary_erosion
 
 from reffusion.background.model import Background
 from reffusion.capture import image_detail

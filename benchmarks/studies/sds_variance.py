@@ -77,7 +77,7 @@ def load_inputs(run: Path, prior: Prior) -> dict[str, tuple[Tensor, Tensor]]:
 
 @torch.no_grad()
 def sds_gradients(prior: Prior, pictures: Tensor, holes: Tensor, prompt: str) -> Tensor:
-    """Return SDS gradients z - x0(z_t) at the levels of the pictures, [T, K, M]: T `TIMESTEPS`, K = `NOISES` draws, M latent values in the holes."""
+    """Return SDS gradients z - x0(z_t), [T, K, M]: T `TIMESTEPS`, K = `NOISES` draws, M latent values in the holes."""
     levels = diffusion.measure_levels(prior, pictures, holes)
     shown = levels.normalize(pictures)
     latents, condition = diffusion.encode(prior, shown), diffusion.conditioning(prior, shown, holes)

@@ -107,7 +107,7 @@ def noisy_quarter(t: Tensor, steps: int) -> Tensor:
 
 
 def loss(model: Model, alphas: Tensor, batch: tuple[Tensor, Tensor, list[str]], random: torch.Generator) -> Tensor:
-    """Mean squared error of v = sqrt(a) eps - sqrt(1 - a) z, weighted by OUTSIDE_WEIGHT (1 in holes), LATENT_WEIGHTS."""
+    """Mean squared error of v = sqrt(a) eps - sqrt(1 - a) z, weighted by OUTSIDE_WEIGHT and LATENT_WEIGHTS."""
     device = alphas.device
     pixels, masks, captions = batch[0].to(device), batch[1].to(device), batch[2]
     pixels = measure_levels(pixels, masks, CONTRAST).normalize(pixels)
