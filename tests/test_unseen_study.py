@@ -33,10 +33,10 @@ def write_run(home, filled):
 
 
 def test_unseen_pixels_are_those_that_no_picture_shows(tmp_path):
-    (view,) = unseen.find_unseen_views(write_run(tmp_path / "half", LEFT))
+    (view,) = unseen.find_unseen_views(write_run(tmp_path / "half", LEFT), 6)
     assert view.name == "c" and not (view.unseen & ~HOLE).any()
     assert view.unseen[HOLE & ~LEFT].mean() > 0.9 and view.unseen[LEFT].mean() < 0.1
-    assert unseen.find_unseen_views(write_run(tmp_path / "whole", HOLE)) == []
+    assert unseen.find_unseen_views(write_run(tmp_path / "whole", HOLE), 6) == []
     painted = unseen.paint(small_prior(), view, "whole view", ("", "", ""), seed=0)
     assert (painted[~view.unseen] == view.start[~view.unseen]).all()
     assert (painted[view.unseen] != view.start[view.unseen]).any()

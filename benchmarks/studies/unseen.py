@@ -45,11 +45,11 @@ WAYS = {  # name -> noise level from which the whole view is painted, and the fi
     "all sizes": {"start": 1.0, "finest": 0.35, "levels": 9},
     "on top of patches": {"start": 0.35, "finest": 0.35, "levels": 9},
 }
+TRAININGS = ("base", "reference", "photographs")
 SAMPLER_STEPS = 12
 PHOTOGRAPHS = 12  # of the scene, at most, that a prior is personalized to
 MIN_SHARE = 0.02  # a test view counts if more than this share of its mask is unseen
 MATCH = 0.02  # relative difference of depth up to which a view shows a point
-VIEWS = 6  # test views, at most, that are painted
 
 
 class UnseenView(NamedTuple):
@@ -69,8 +69,8 @@ class UnseenView(NamedTuple):
 
 
 @torch.no_grad()
-def find_unseen_views(run: Path) -> list[UnseenView]:
-    """Find up to `VIEWS` evenly spread test views of a finished run that have ground truth and unseen pixels."""
+def find_unseen_views(run: Path, count: int) -> list[UnseenView]:
+    """Find up to `count` evenly spread test views of a finished run that have ground truth and unseen pixels."""
     space = Workspace(run / "poses", run / "fit", run / "masks")
     scene, sets = space.scene, space.mask_sets
     gaussians = load_ply(run / "initialize/gaussians.ply")
@@ -98,7 +98,7 @@ def find_unseen_views(run: Path) -> list[UnseenView]:
         if unseen.sum() > MIN_SHARE * mask.sum():
             start = (255 * rendering.color.clamp(0, 1)).round().byte().cpu().numpy()
             views.append(UnseenView(name, start, truth, unseen))
-    return pick_evenly(views, VIEWS)
+    return pick_evenly(views, count)
 
 
 def _is_seen(points: np.ndarray, camera: Camera, depth: np.ndarray) -> np.ndarray:
@@ -176,14 +176,16 @@ def make_scorer() -> Callable[[np.ndarray, UnseenView], dict[str, float]]:
     return score
 
 
-def study_run(run: Path, prior: str, seeds: list[int], out: Path) -> dict:
-    """Score all paintings of a run.
+def study_run(
+    run: Path, prior: str, seeds: list[int], out: Path, trainings: list[str], ways: list[str], count: int
+) -> dict:
+    """Score the paintings of at most `count` views of a run by some `TRAININGS` in some `WAYS`.
 
     Returns:
         "views": number of views; "share": mean unseen share of a view; "scores": method -> seed -> network -> mean over
         the views. The method "patches" has one seed.
     """
-    views = find_unseen_views(run)
+    views = find_unseen_views(run, count)
     if not views:
         return {"views": 0}
     score = make_scorer()
@@ -192,13 +194,13 @@ def study_run(run: Path, prior: str, seeds: list[int], out: Path) -> dict:
     rows = {view.name: [np.where(view.unseen[..., None], 128, view.start), view.start] for view in views}
     for seed in seeds:
         params = profile_params(prior, {"seed": seed})
-        for training in ("base", "reference", "photographs"):
+        for training in trainings:
             folder = out / "personalize" / f"{training}-{seed}"
             model = load_prior(prior)
             if training != "base":
                 model = personalize_prior(run, params, training == "photographs", folder)
             prompts = ("", "", "") if training == "base" else crops.PROMPTS
-            for way in WAYS:
+            for way in ways:
                 pictures = {view.name: paint(model, view, way, prompts, seed) for view in views}
                 method = f"{training}, {way}"
                 scores.setdefault(method, {})[str(seed)] = mean([score(pictures[view.name], view) for view in views])
@@ -242,12 +244,23 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="+", help="runs/<scene>, finished up to `initialize`")
     parser.add_argument("--prior", default="priors/tiny", help="diffusers folder")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--trainings", nargs="+", choices=TRAININGS, default=list(TRAININGS))
+    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS), help="minutes each")
+    parser.add_argument("--views", type=int, default=6, help="test views, at most, that are painted")
     parser.add_argument("--out", type=Path, default=Path("runs/unseen"))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     results = {}
     for run in arguments.runs:
-        results[run.name] = study_run(run, arguments.prior, arguments.seeds, arguments.out / run.name)
+        results[run.name] = study_run(
+            run,
+            arguments.prior,
+            arguments.seeds,
+            arguments.out / run.name,
+            arguments.trainings,
+            arguments.ways,
+            arguments.views,
+        )
         print_table({run.name: results[run.name]})
         save_json(arguments.out / "unseen.json", results)
 
