@@ -1,7 +1,7 @@
 """What a prior can add where neither a photograph nor a reference looks: `python -m benchmarks.studies.unseen RUN ...`.
 
-An *unseen* pixel of a test view lies in the object's mask and shows a surface that no photograph and no reference
-shows. The stage `initialize` fills such pixels by patches. The study paints them by a prior instead, in each test view
+An *unseen* pixel of a test view lies in the object's mask and shows a surface that no photograph and no given
+reference shows. The stage `initialize` fills such pixels by patches. The study paints them by a prior instead, in each test view
 by itself. The rest of the view is the initialization. That is more than distillation can do with the same prior,
 because the pictures need not agree with each other.
 
@@ -25,7 +25,7 @@ import torch
 
 from benchmarks.studies.prior import profile_params
 from reffusion import geometry, seeding
-from reffusion.io.arrays import save_json
+from reffusion.io.arrays import load_json, save_json
 from reffusion.io.ground_truth import load_ground_truth, load_object_mask
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
@@ -74,7 +74,10 @@ def find_unseen_views(run: Path, count: int) -> list[UnseenView]:
     space = Workspace(run / "poses", run / "fit", run / "masks")
     scene, sets = space.scene, space.mask_sets
     gaussians = load_ply(run / "initialize/gaussians.ply")
-    references = {each.camera.name: each.mask for each in load_references(run / "reference", scene)}
+    given = load_json(run / "reference" / "facts.json")["given"]
+    references = {
+        each.camera.name: each.mask for each in load_references(run / "reference", scene) if each.camera.name in given
+    }
 
     depth_maps = []
     for name in scene.train:
