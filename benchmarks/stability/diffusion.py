@@ -19,7 +19,7 @@ from reffusion.distill import discriminator, sds
 from reffusion.distill.terms.sds import evaluate_sds
 from reffusion.distill.train_view import TrainView
 from reffusion.params.distill import SdsTerm
-from reffusion.prior import diffusion, windows
+from reffusion.prior import diffusion, levels, windows
 from reffusion.prior.model import Prior, load_prior
 from reffusion.types import PARAMETERS
 
@@ -165,6 +165,29 @@ def sds_error(t: int, dtype: torch.dtype) -> float:
         )
         # The gradient is a difference of numbers of order one (at t = 0, or at T-1). Its error is relative to them.
         worst = nan_safe_max(worst, ((gradient.double() - truth).norm() / size.norm()).item())
+    return worst
+
+
+def levels_error(known_share: float) -> float:
+    """Return the largest error of pictures at the model's levels, and of those restored, against float64.
+
+    The pictures are dark, grey or bright, of contrasts from 1e-8 to 1. The error at the model's levels is relative to
+    the largest possible gain.
+
+    Args:
+        known_share: share of the rows that are known.
+    """
+    hidden = torch.zeros(1, 1, SIZE, SIZE)
+    hidden[:, :, round(known_share * SIZE) :] = 1
+    worst = 0.0
+    for mean in (-1.0, 0.0, 0.9):
+        for contrast in (1e-8, 1e-5, 1e-2, 1.0):
+            picture = mean + contrast * images()
+            found = levels.measure_levels(picture, hidden, 0.5)
+            truth = levels.measure_levels(picture.double(), hidden.double(), 0.5)
+            shown = found.normalize(picture)
+            error = (shown - truth.normalize(picture.double())).abs().max() / (0.5 / levels.LEAST_CONTRAST)
+            worst = nan_safe_max(worst, error.item(), (found.restore(shown) - picture).abs().max().item())
     return worst
 
 
@@ -323,6 +346,9 @@ CASES = (
          equal_prompts_error),
     Case("mask empty, conditioning", "difference from the picture's latents", EXACT, empty_mask_error),
     Case("mask full, conditioning", "what of the picture is seen", EXACT, full_mask_leak),
+    # The mean is a sum over a thousand pixels.
+    *(Case(f"contrast 1e-8 to 1, {name} known", "error at the model's levels, and restored", 16 * EPS32,
+           partial(levels_error, share)) for name, share in (("all", 1), ("one row", 1 / SIZE), ("nothing", 0))),
     Case("mask empty, gradient", "largest number", EXACT, empty_mask_gradient),
     Case("mask empty, window", UNCLEAR, EXACT, refuse_empty_window),
     Case("mask full, timestep 0, guidance 100, scene", SDS, EXACT, partial(count_bad_gradients, 0.0, 1e-9, 100.0)),
