@@ -1,9 +1,9 @@
 """What a prior can add where neither a photograph nor a reference looks: `python -m benchmarks.studies.unseen RUN ...`.
 
 An *unseen* pixel of a test view lies in the object's mask and shows a surface that no photograph and no given
-reference shows. The stage `initialize` fills such pixels by patches. The study paints them by a prior instead, in each test view
-by itself. The rest of the view is the initialization. That is more than distillation can do with the same prior,
-because the pictures need not agree with each other.
+reference shows. The stage `initialize` fills such pixels by patches. The study paints them by a prior instead, in each
+test view by itself. The rest of the view is the initialization. That is more than distillation can do with the same
+prior, because the pictures need not agree with each other.
 
 The prior is used as it is ("base"), personalized to the references ("reference"), and personalized to the references
 and the scene's photographs, in which the initialization replaces the object ("photographs"). Each paints in the `WAYS`.
