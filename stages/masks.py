@@ -69,44 +69,35 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply", device=params.device)
     train = [scene.cameras[name] for name in scene.train]
     check_frame(poses, fit, gaussians, train)
-    region = load_region(raw_masks)
-    deleted = load_deleted(poses, params.device)
+    region, deleted = load_region(raw_masks), load_deleted(poses, params.device)
     raw = {} if deleted is not None else collect_raw_masks(params, scene, gaussians, poses, raw_masks)
-    empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
-    ballots = {name: raw[name] for name in scene.train if name in raw}
-    ballots |= {name: empty[name] for name in scene.clean} if raw else {}
     fill = FillRequest(region, load_fill_masks(raw_masks)) if params.invent != "unobserved" else FillRequest(None, {})
     if deleted is None and not raw and region is None and not fill.masks and not scene.blank:
         raise ValueError(f"{raw_masks}: neither masks nor a region say what is to be changed: add masks, or a region")
 
+    empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
+    ballots = {name: raw[name] for name in scene.train if name in raw}
+    ballots |= {name: empty[name] for name in scene.clean} if raw else {}
     labels = deleted if deleted is not None else consolidation.label_object(params, gaussians, train, ballots, region)
-    consistent = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
-    # A Gaussian whose centre lies inside C in (almost) every view can only belong to the object, whatever its votes.
-    dirty = {name: consistent[name] for name in scene.train if name not in scene.clean}
-    labels = labels | voting.hidden_inside(gaussians, train, dirty, share=params.inside_share)
-    remnants = (
-        find_remnants(gaussians, labels, [c for c in train if c.name in dirty]) if params.remnants and raw else []
-    )
-    report_remnants(remnants, out, lambda name: load_views(poses, [name])[name])
-    for remnant in (each for each in remnants if each.would_float):
-        labels = labels | torch.as_tensor(remnant.members, device=labels.device)
-        consistent = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
+    photo_of = lambda name: load_views(poses, [name])[name]
+    labels, consistent, remnants = complete_object(params, scene, gaussians, labels, out, photo_of, bool(raw))
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
-    views = render_depth_views(gaussians, train, hidden)
-    background = Background(views, {}, points=scene.points)
+
+    background = Background(render_depth_views(gaussians, train, hidden), {}, points=scene.points)
     needs_surfaces = params.shadows or consolidation.needs_unobserved(params, fill)
     if needs_surfaces:
         background = background.with_planes(gaussians, labels)
-    photos = exposure.load_normalized_views(poses, fit, scene.train) if background.planes or params.debris else {}
-    background = replace(background, photos=photos)
+    if background.planes or params.debris:
+        background = replace(background, photos=exposure.load_normalized_views(poses, fit, scene.train))
     shadow = find_shadow(params, background, gaussians.means[labels], scene)
     if params.debris and (raw or deleted is not None):
-        debris = find_debris(gaussians, labels, views, hidden, photos)
+        debris = find_debris(gaussians, labels, background.views, hidden, background.photos)
         save_labels(out / "debris.npy", debris.cpu())
         labels = labels | debris
     remaining = gaussians.map(lambda p: p[~labels])
     if needs_surfaces:
         background = background.with_mirrors(remaining)
+
     sets = consolidation.classify_pixels(params, scene, remaining, raw, consistent, background, fill)
     sets |= consolidation.add_uncaptured_pixels(params, scene, gaussians, hidden, sets)
     repainted = (*scene.train, *scene.blank)
@@ -132,6 +123,43 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
         "region": region and {"center": list(region.center), "size": list(region.size)},
     }
     save_json(out / "facts.json", facts)
+
+
+def complete_object(
+    params: Params,
+    scene: Scene,
+    gaussians: Gaussians,
+    labels: Tensor,
+    out: Path,
+    photo_of: Callable[[str], np.ndarray],
+    has_masks: bool,
+) -> tuple[Tensor, dict[str, np.ndarray], list[Remnant]]:
+    """Extend the labels of an object by what can only belong to it, and by remnants that would float in the air.
+
+    A Gaussian whose center lies inside C in (almost) every view can only belong to the object, whatever its votes.
+    Remnants are reported.
+
+    Args:
+        labels: bool [N], the Gaussians that won the vote.
+        out: folder of this stage.
+        photo_of: view name -> uint8 [H, W, 3].
+        has_masks: whether the scene brings masks, which alone can leave out parts.
+
+    Returns:
+        The labels, bool [N]; the consistent mask C of every view, view name -> bool [H, W]; and all remnants.
+    """
+    train = [scene.cameras[name] for name in scene.train]
+    consistent = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
+    dirty = {name: consistent[name] for name in scene.train if name not in scene.clean}
+    labels = labels | voting.hidden_inside(gaussians, train, dirty, share=params.inside_share)
+    if not (params.remnants and has_masks):
+        return labels, consistent, []
+    remnants = find_remnants(gaussians, labels, [camera for camera in train if camera.name in dirty])
+    report_remnants(remnants, out, photo_of)
+    for remnant in (each for each in remnants if each.would_float):
+        labels = labels | torch.as_tensor(remnant.members, device=labels.device)
+        consistent = consolidation.render_consistent_masks(params, gaussians, labels, scene.cameras)
+    return labels, consistent, remnants
 
 
 def find_shadow(params: Params, background: Background, object_means: Tensor, scene: Scene) -> SoftShadow | None:
