@@ -240,21 +240,25 @@ def replace_references(reference: Path, picture: Path, folder: Path) -> Path:
     return folder
 
 
-def personalize_prior(params: stage.Params, needs: dict[str, Path], folder: Path) -> tuple[Prior, list[dict]]:
-    """Personalize a prior in `folder`; return the personalized prior and the trace.
-
-    An earlier attempt with the same parameters continues, or is taken as it is if it is finished. One with other
-    parameters is removed.
-
-    Args:
-        params: parameters of the stage `personalize`.
-        needs: stage -> folder, for the stages that `personalize` needs.
-    """
+def keep_if_same(folder: Path, params: stage.Params) -> None:
+    """Make the folder of a personalization. An earlier attempt with other parameters is removed."""
     settings, record = params.model_dump(mode="json"), folder / "settings.json"
     if not record.exists() or load_json(record) != settings:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         save_json(record, settings)
+
+
+def personalize_prior(params: stage.Params, needs: dict[str, Path], folder: Path) -> tuple[Prior, list[dict]]:
+    """Personalize a prior in `folder`; return the personalized prior and the trace.
+
+    An earlier attempt with the same parameters continues, or is taken as it is if it is finished.
+
+    Args:
+        params: parameters of the stage `personalize`.
+        needs: stage -> folder, for the stages that `personalize` needs.
+    """
+    keep_if_same(folder, params)
     if not (folder / lora.LORA_FILE).exists():
         stage.run(params, folder, **needs)
     return lora.merge(load_prior(params.prior), folder), trace.read_trace(folder / "trace.jsonl")

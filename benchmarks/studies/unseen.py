@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 import torch
 
-from benchmarks.studies.prior import profile_params
+from benchmarks.studies.prior import keep_if_same, profile_params
 from reffusion import geometry, seeding
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.ground_truth import load_ground_truth, load_object_mask
@@ -114,9 +114,9 @@ def _is_seen(points: np.ndarray, camera: Camera, depth: np.ndarray) -> np.ndarra
     return inside & (z > 0) & (np.abs(shown - z) < MATCH * z)
 
 
-def personalize_prior(run: Path, params: Params, with_photographs: bool, folder: Path) -> Prior:
+def adapt_prior(run: Path, params: Params, with_photographs: bool, folder: Path) -> Prior:
     """Return the prior personalized to a run's references, and perhaps to its photographs without the object."""
-    folder.mkdir(parents=True, exist_ok=True)
+    keep_if_same(folder, params)
     prior = load_prior(params.prior)
     if not (folder / lora.LORA_FILE).exists():
         trained = lora.attach(prior, **params.lora.model_dump(), seed=params.seed)
@@ -201,7 +201,7 @@ def study_run(
             folder = out / "personalize" / f"{training}-{seed}"
             model = load_prior(prior)
             if training != "base":
-                model = personalize_prior(run, params, training == "photographs", folder)
+                model = adapt_prior(run, params, training == "photographs", folder)
             prompts = ("", "", "") if training == "base" else crops.PROMPTS
             for way in ways:
                 pictures = {view.name: paint(model, view, way, prompts, seed) for view in views}
