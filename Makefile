@@ -206,7 +206,7 @@ runs/prior/photographs: | setup
 # Personalizes on the reference of the demo scene, which is made first where it is missing.
 prior-report: data/demo/.generated setup
 	@$(RUN) run reference --scene demo --profile laptop
-	$(PY) -m benchmarks.studies.prior --steps 1 4 12 --run runs/demo --out runs/prior-report
+	$(PY) -m benchmarks.studies.prior --start 0.35 --steps 1 4 12 --run runs/demo --out runs/prior-report
 	$(PY) -m report.prior runs/prior-report
 
 # Runs personalization and initialization first, where they are missing.

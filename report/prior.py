@@ -22,8 +22,8 @@ from report.sheet import compose_sheet, enlarge
 ENLARGE = 3  # whole factor; held-out pictures have 64 px
 SCALES = ("reference", "whole", "window")
 SHEETS = {
-    "inpainting": "Held-out pictures, filled from pure noise",
-    "photographs": "Held-out photographs, whole and in windows, filled from pure noise",
+    "inpainting": "Held-out pictures, filled",
+    "photographs": "Held-out photographs, whole and in windows, filled",
     "reference": "The reference's own hole, filled from pure noise three times, before and after personalization",
     "whole": "Unseen views of the scene, whole, before and after personalization",
     "window": "Unseen views, windows around the hole",

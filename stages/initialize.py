@@ -147,13 +147,13 @@ def summarize(
     uncovered = {name: each.uncovered_share for name, each in origins.items()}
     shown = [each.shares for name, each in origins.items() if sets[name].consistent.any()]
     mean_shares = {key: sum(each[key] for each in shown) / max(len(shown), 1) for key in ORIGINS[1:]}
-    guessed: dict[str, np.ndarray] = {}
+    patches: dict[str, np.ndarray] = {}
     for each in extra:  # a view may have been completed more than once
-        guessed[each.camera.name] = guessed.get(each.camera.name, False) | each.mask
-    shares = {name: float(mask.sum() / sets[name].consistent.sum()) for name, mask in guessed.items()}
+        patches[each.camera.name] = patches.get(each.camera.name, False) | each.mask
+    shares = {name: float(mask.sum() / sets[name].consistent.sum()) for name, mask in patches.items()}
     gain = GainPrediction(True, f"start is {params.start}", None)
     if photos is not None:
-        gain = predict_gain(draft.gaussians, train, sets, photos, max(shares.values(), default=0.0))
+        gain = predict_gain(draft.gaussians, train, sets, photos)
     invented_shares = {name: each.shares["patches"] + each.shares["nothing"] for name, each in origins.items()}
     invented_pixels = lambda name: invented_shares[name] * np.count_nonzero(origins[name].classes)
     worst = max(origins, key=invented_pixels, default=None)

@@ -94,7 +94,7 @@ def test_torch_is_asked_without_importing_it(tmp_path, monkeypatch, line, built)
 
 def test_a_stage_reports_missing_requirements_first(tmp_path, monkeypatch):
     """The plan's question to a stage lists what this simulated machine lacks: it has an old driver and a small GPU."""
-    monkeypatch.setattr(os, "environ", fake_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 535.183.01"))
+    monkeypatch.setattr(os, "environ", fake_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 470.256.02"))
     monkeypatch.chdir(ROOT)
     machine.detect.cache_clear()
     question = lambda **params: {"stage": "distill", "params": params, "takes": TAKES, "brings": []}
@@ -102,7 +102,7 @@ def test_a_stage_reports_missing_requirements_first(tmp_path, monkeypatch):
     problems = worker._describe(question(device="cuda", memory_gb=16))["lacks"]
     assert time.perf_counter() - began < 1
     assert any("distill.memory_gb is 16, and NVIDIA GeForce GTX 1080 has 9 GB" in line for line in problems)
-    assert any("built without CUDA" in line or "needs 580" in line for line in problems)
+    assert any("built without CUDA" in line or "needs 5" in line for line in problems)
     assert "lacks" not in worker._describe(question(device="cpu"))
     machine.detect.cache_clear()
 

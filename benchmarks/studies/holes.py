@@ -19,7 +19,7 @@ from priors.tiny import images
 from reffusion import seeding
 from reffusion.io.images import save_image
 from reffusion.metrics import image_metrics, lpips
-from reffusion.prior import diffusion
+from reffusion.prior import diffusion, harmonic_fill
 from reffusion.prior.model import Prior
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -181,18 +181,25 @@ def to_tensors(cases: list[Case]) -> tuple[Tensor, Tensor]:
 
 
 def fill_holes(
-    prior: Prior, cases: list[Case], seed: int, prompt: str = "", steps: int = SAMPLER_STEPS
+    prior: Prior, cases: list[Case], seed: int, prompt: str = "", steps: int = SAMPLER_STEPS, start: float = 1.0
 ) -> list[np.ndarray]:
-    """Fill the holes with the prior, from pure noise in `steps` sampler steps; return uint8 [H, W, 3] for each case.
+    """Fill the holes with the prior; return uint8 [H, W, 3] for each case.
 
     Outside the holes the new pictures equal the cases'. All priors get the same noise for the same seed.
+
+    Args:
+        steps: number of sampler steps from pure noise.
+        start: noise level from which the harmonic extension into the hole is painted, in a proportional part of the
+            steps, as `inpaint.paint` does. 1: pure noise.
     """
     done = []
     for first in range(0, len(cases), BATCH):
         pictures, holes = to_tensors(cases[first : first + BATCH])
         text = diffusion.embed_text(prior, [prompt]).detach().expand(len(pictures), -1, -1)
         noise = seeding.generator(seed, "sample", first)
-        filled = diffusion.sample(prior, pictures * (1 - holes), holes, text, steps, noise)
+        initial = harmonic_fill.harmonic_extension(pictures, holes)
+        taken = max(1, round(steps * start))
+        filled = diffusion.sample(prior, initial, holes, text, taken, noise, start=start)
         filled = ((pictures * (1 - holes) + filled * holes).permute(0, 2, 3, 1) + 1) * 127.5
         done += list(filled.round().clamp(0, 255).to(torch.uint8).numpy())
     return done

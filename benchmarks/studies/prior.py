@@ -84,7 +84,7 @@ def time_cpu(work) -> tuple:
     return work(), time.process_time() - began
 
 
-def measure_inpainting(priors: list[str], cases: list[Case], out: Path) -> dict:
+def measure_inpainting(priors: list[str], cases: list[Case], start: float, out: Path) -> dict:
     """Fill held-out pictures by OpenCV's methods and by priors, and score them.
 
     The first `SHOWN` cases are saved as rows of pictures.
@@ -92,6 +92,7 @@ def measure_inpainting(priors: list[str], cases: list[Case], out: Path) -> dict:
     Args:
         priors: diffusers folders.
         cases: pictures with holes.
+        start: see `fill_holes`.
         out: folder for the rows of pictures.
 
     Returns:
@@ -105,7 +106,7 @@ def measure_inpainting(priors: list[str], cases: list[Case], out: Path) -> dict:
         ways[name], seconds[name] = time_cpu(fill)
     for name in priors:
         prior = load_prior(name)
-        ways[name], seconds[name] = time_cpu(lambda prior=prior: fill_holes(prior, cases, SEED))
+        ways[name], seconds[name] = time_cpu(lambda prior=prior: fill_holes(prior, cases, SEED, start=start))
     for index, case in enumerate(cases[:SHOWN]):
         save_row(out / f"{index:02d}.png", case, [pictures[index] for pictures in ways.values()])
     result = {}
@@ -394,6 +395,7 @@ def parse_arguments() -> argparse.Namespace:
     )
     parser.add_argument("--pictures", type=int, default=64, help="held-out pictures to fill; 0 skips this part")
     parser.add_argument("--photographs", type=Path, help="the output of `priors.tiny.photographs`")
+    parser.add_argument("--start", type=float, default=1.0, help="noise level from which filled holes are painted")
     parser.add_argument("--steps", type=int, nargs="*", default=[], help="numbers of sampler steps to compare")
     parser.add_argument("--run", type=Path, help="runs/<scene>, with its reference; without it no personalization")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of personalization")
@@ -416,7 +418,9 @@ def main() -> None:
     result: dict = {"prior": first}
     if arguments.pictures:
         cases = make_cases(arguments.pictures)
-        result["inpainting"] = measure_inpainting(arguments.priors, cases, arguments.out / "inpainting")
+        result["inpainting"] = measure_inpainting(
+            arguments.priors, cases, arguments.start, arguments.out / "inpainting"
+        )
         for name, kinds in result["inpainting"]["scores"].items():
             print(name, {column: round(kinds["all"][column], 3) for column in (*COLUMNS, "seconds")}, flush=True)
         result["sampler"] = measure_steps(load_prior(first), cases, arguments.steps)
@@ -424,7 +428,9 @@ def main() -> None:
             print(f"{count} steps", {column: round(row[column], 3) for column in (*COLUMNS, "seconds")}, flush=True)
     if arguments.photographs:
         cases = make_photograph_cases(load_photographs(arguments.photographs, held_out=True), PHOTOGRAPH_CASES)
-        result["photographs"] = measure_inpainting(arguments.priors, cases, arguments.out / "photographs")
+        result["photographs"] = measure_inpainting(
+            arguments.priors, cases, arguments.start, arguments.out / "photographs"
+        )
         for name, kinds in result["photographs"]["scores"].items():
             for kind in ("whole", "window"):
                 print(name, kind, {column: round(kinds[kind][column], 3) for column in COLUMNS}, flush=True)

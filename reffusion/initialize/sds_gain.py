@@ -3,8 +3,8 @@
 The embedded prior, adapted to the reference, improves renders whose PSNR is below `PRIOR_PSNR`, and degrades better
 ones (docs/method.md#the-embedded-prior). The PSNR is that of a whole view, reduced to the prior's size of `SIDE_PX`
 pixels. Inside the hole the truth is unknown. So the PSNR is measured against the photographs beside the hole, and
-assumed to be lower by `HOLE_LOSS` inside. This assumption tells nothing of pixels that no reference shows, and that
-were filled by patches of photographs.
+assumed to be lower by `HOLE_LOSS` inside. Patches of photographs, which fill pixels that no reference shows, are better
+there than what the embedded prior paints (docs/results.md#score-distillation).
 """
 
 from __future__ import annotations
@@ -27,9 +27,6 @@ PRIOR_PSNR = 26.0  # dB, PSNR of the best renders that the prior improves
 HOLE_LOSS = 8.5  # dB, by which the PSNR of renders is lower inside the hole than beside it
 RING_PX = 4  # pixels of the reduced view: width of the ring around the mask in which errors are measured
 MAX_VIEWS = 12  # views that are compared at most, evenly spread
-# Share of a view's mask filled by patches above which SDS may gain. It was 0.19 in the scene where SDS gained
-# (`demo-corner`), and below 0.03 in the others.
-GUESSED_SHARE = 0.05
 
 
 class GainPrediction(NamedTuple):
@@ -53,20 +50,17 @@ def predict_gain(
     cameras: Sequence[Camera],
     sets: Mapping[str, MaskSet],
     photos: Mapping[str, np.ndarray],
-    guessed_share: float = 0.0,
 ) -> GainPrediction:
     """Predict whether SDS may improve an initialization, from its renders of views in which something is invented.
 
-    SDS may gain if the PSNR estimated inside the hole is below `PRIOR_PSNR`, if patches fill more than `GUESSED_SHARE`
-    of some view's mask, or if there is no photograph to compare with.
+    SDS may gain if the PSNR estimated inside the hole is below `PRIOR_PSNR`, or if there is no photograph to compare
+    with.
 
     Args:
         gaussians: the initialization.
         cameras: the training views.
         sets: view name -> pixel classes.
         photos: view name -> uint8 [H, W, 3]; views without an entry are not compared.
-        guessed_share: share in [0, 1] of a view's mask that no reference covers and that patches of photographs fill,
-            in the view where it is largest.
     """
     usable = [camera for camera in cameras if camera.name in photos and sets[camera.name].invent.any()]
     indices = np.unique(np.linspace(0, len(usable) - 1, MAX_VIEWS).round().astype(int)) if usable else []
@@ -78,9 +72,6 @@ def predict_gain(
     if not len(squared):
         return GainPrediction(True, "no photograph tells how good the initialization is", None)
     beside = decibels(float(squared.mean()))
-    if guessed_share > GUESSED_SHARE:
-        reason = f"no reference covers {guessed_share:.0%} of a view's mask, and patches are a guess"
-        return GainPrediction(True, reason, beside)
     inside = beside - HOLE_LOSS
     reason = f"beside the hole renders show photographs at {beside:.1f} dB, so about {inside:.1f} dB in it"
     return GainPrediction(inside < PRIOR_PSNR, f"{reason}; the embedded prior teaches up to {PRIOR_PSNR:g} dB", beside)
