@@ -40,7 +40,7 @@
 ## make stability                 stiff and extreme cases, each with its bound (minutes): runs/stability.json
 ##
 ## scene=  a name under data/, or a path
-## profile=auto|laptop|paper|best|paper-terms  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER
+## profile=auto|laptop|paper|best|fast|paper-terms  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER
 ## budget=5m  time for the whole job: sets the number of steps of fit, personalize and distill
 ## trust=1  accept results of older code; keep=1  accept results that you changed by hand
 
