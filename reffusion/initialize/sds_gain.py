@@ -23,7 +23,7 @@ from reffusion.trace import decibels
 from reffusion.types import Camera, Gaussians, MaskSet
 
 SIDE_PX = 64  # side of the images that the embedded prior takes
-PRIOR_PSNR = 26.0  # dB, PSNR of the best renders that the prior improves
+PRIOR_PSNR = 25.0  # dB, PSNR of the best renders that the prior improves
 HOLE_LOSS = 8.5  # dB, by which the PSNR of renders is lower inside the hole than beside it
 RING_PX = 4  # pixels of the reduced view: width of the ring around the mask in which errors are measured
 MAX_VIEWS = 12  # views that are compared at most, evenly spread
