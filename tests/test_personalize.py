@@ -227,7 +227,7 @@ def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch)
 def test_training_that_gains_little_more_ends_and_resumes_to_the_same_end(tmp_path, monkeypatch):
     monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
 
-    def train(folder, steps=64, least_gain=0.9):
+    def train(folder, steps=16, least_gain=0.9):
         folder.mkdir(exist_ok=True)
         prior = small_prior()
         trained = lora.attach(prior, 4, 8, 0.1, "attention", 0)
@@ -237,7 +237,7 @@ def test_training_that_gains_little_more_ends_and_resumes_to_the_same_end(tmp_pa
 
     whole, end = train(tmp_path / "whole")
     assert end["reason"] == "settled" and end["iteration"] == 8, "from 4 to 8 steps the error does not fall to a tenth"
-    assert train(tmp_path / "never", least_gain=0)[1]["iteration"] == 64
+    assert train(tmp_path / "never", least_gain=0)[1]["iteration"] == 16
     alone, _ = train(tmp_path / "alone", 8, 0)
     assert all(torch.allclose(alone[name], weight, atol=1e-6) for name, weight in whole.items())
     real = P.train_step
