@@ -61,11 +61,6 @@ def wall_folders(tmp_path):
     return write_wall_stages(tmp_path)
 
 
-# The order of the test files: the longest; then, while it compiles the kernels, those that run none; then all others.
-FIRST = ("test_resume", "test_runner", "test_batch", "test_cluster", "test_compare", "test_fuzz", "test_capture")
-
-
 def pytest_collection_modifyitems(items):
-    """Sort the tests by file, so that no process ends long after the others or compiles what another one compiles."""
-    place = lambda name: next((k for k, start in enumerate(FIRST) if name.startswith(start)), len(FIRST))
-    items.sort(key=lambda item: place(item.path.name))
+    """Run test_resume.py, the longest file, first. Two test processes would otherwise end with one idle process."""
+    items.sort(key=lambda item: item.path.name != "test_resume.py")
