@@ -65,8 +65,8 @@ def run_all(
 ) -> None:
     """Do several runs, in parallel if cores allow. If one fails, the others go on.
 
-    By default each group gets an equal part of the engine's cores, at least one. Few stages have a GPU at a time, so
-    each of them gets more cores: one core in two with one GPU. The number of cores of a stage does not
+    By default each group gets an equal part of the engine's cores, at least one. With n GPUs at most n stages have one
+    at a time, and each of them gets at least the part 1 / (n + 1) of the cores. The number of cores of a stage does not
     change when other runs end, so that no result depends on the order in which runs end.
 
     If runs are parallel or on a cluster, each run's output goes to output.log in its home, and a table of the progress

@@ -1,5 +1,6 @@
 """Personalization of the prior: training samples, loss, validation on photographs, resume, and early errors."""
 
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -192,6 +193,21 @@ def test_photographs_are_measured_by_and_not_learnt_from(fresh_prior, tmp_path):
     assert {"clean_latent_mse", "crop_latent_mse"} <= row.keys()
 
 
+@contextmanager
+def interrupt_at(step, monkeypatch):
+    """Interrupt a training inside the context when it reaches this step, and check that it was."""
+    real = P.train_step
+
+    def interrupted(*arguments):
+        if arguments[4] == step:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(P, "train_step", interrupted)
+        yield
+
+
 def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch):
     monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # a checkpoint after every step
 
@@ -205,18 +221,9 @@ def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch)
     (tmp_path / "whole").mkdir()
     (tmp_path / "broken").mkdir()
     whole = trained(tmp_path / "whole")
-    real = P.train_step
-
-    def interrupted(*arguments):
-        if arguments[4] == 2:
-            raise KeyboardInterrupt
-        return real(*arguments)
-
-    monkeypatch.setattr(P, "train_step", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupt_at(2, monkeypatch):
         trained(tmp_path / "broken")
     assert load_checkpoint(tmp_path / "broken")["step"] == 2
-    monkeypatch.setattr(P, "train_step", real)
     torch.manual_seed(12345)
     resumed = trained(tmp_path / "broken")
     assert all((resumed[name] == weight).all() for name, weight in whole.items())
@@ -240,17 +247,8 @@ def test_training_that_gains_little_more_ends_and_resumes_to_the_same_end(tmp_pa
     assert train(tmp_path / "never", least_gain=0)[1]["iteration"] == 16
     alone, _ = train(tmp_path / "alone", 8, 0)
     assert all(torch.allclose(alone[name], weight, atol=1e-6) for name, weight in whole.items())
-    real = P.train_step
-
-    def interrupted(*arguments):
-        if arguments[4] == 6:
-            raise KeyboardInterrupt
-        return real(*arguments)
-
-    monkeypatch.setattr(P, "train_step", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupt_at(6, monkeypatch):
         train(tmp_path / "broken")
-    monkeypatch.setattr(P, "train_step", real)
     resumed, end = train(tmp_path / "broken")
     assert end["iteration"] == 8
     assert all(torch.allclose(resumed[name], weight, atol=1e-6) for name, weight in whole.items())

@@ -123,9 +123,9 @@ def classify_pixels(
     """Split the consistent mask of each view into observed and unobserved pixels, and select the pixels to invent.
 
     Unobserved pixels are invented (with `params.invent` "consistent": all of C), as well as the pixels that the scene
-    asks to fill. If nothing depends on them, unobserved pixels are not searched, and all of C counts as unobserved. In
-    a clean view C stays, but no pixel of it is unobserved, and none is invented unless the scene asks
-    to fill it.
+    asks to fill. If nothing depends on them (`needs_unobserved`), unobserved pixels are not searched, and all of C
+    counts as unobserved. In a clean view C stays, but no pixel of it is unobserved, and none is invented unless the
+    scene asks to fill it.
 
     Args:
         params: parameters of the stage `masks`.

@@ -73,7 +73,10 @@ class Params(Settings):
     steps: int = Field(2000, ge=0, description="optimiser steps; 0 skips the stage: the prior is not adapted")
     # Not in the paper. Its 2,000 steps suit no reference in particular.
     least_gain: float = Field(
-        0, ge=0, lt=1, description="end when twice the steps lower the error in the hole by less than this share; 0: no"
+        0,
+        ge=0,
+        lt=1,
+        description="end when doubling the steps lowers the error in the hole by less than this share; 0: no",
     )
     lora: Lora = Lora()
     optimizer: Optimizer = Optimizer()

@@ -87,10 +87,10 @@ def decode(prior: Prior, latents: Tensor) -> Tensor:
 
 
 def measure_levels(prior: Prior, images: Tensor, masks: Tensor) -> levels.Levels:
-    """Return the levels at which a model sees pictures. The caller normalises pictures before `encode`, `conditioning`.
+    """Measure the levels by which pictures are normalised before `encode` and `conditioning`.
 
     Args:
-        prior: The diffusion prior. Only one with `contrast` has other levels than the pictures themselves.
+        prior: The diffusion prior. Without `contrast` normalisation changes nothing.
         images: [B, 3, H, W] in [-1, 1].
         masks: [B, 1, H, W], 1 = repaint.
     """

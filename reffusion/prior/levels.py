@@ -1,7 +1,8 @@
 """Levels: the brightness and contrast of a picture, as its known pixels have them.
 
 A small model makes errors of a fixed size, which stand out in a picture of low contrast, such as a window of a smooth
-wall. Such a model sees pictures at levels that are the same for all, and its answers are restored to the picture's own.
+wall. So pictures are normalised to the same mean and contrast before such a model sees them, and its outputs are
+converted back.
 """
 
 from __future__ import annotations
@@ -19,18 +20,18 @@ class Levels(NamedTuple):
 
     Attributes:
         mean: [B, 3, 1, 1], the colour that the model sees as 0.
-        gain: [B, 1, 1, 1], the factor by which the model sees differences of colour enlarged.
+        gain: [B, 1, 1, 1], the factor by which differences of colour are multiplied for the model.
     """
 
     mean: Tensor
     gain: Tensor
 
     def normalize(self, images: Tensor) -> Tensor:
-        """Return images [B, 3, H, W] as the model sees them; differentiable."""
+        """Convert images [B, 3, H, W] to the levels of the model; differentiable."""
         return (images - self.mean) * self.gain
 
     def restore(self, images: Tensor) -> Tensor:
-        """Return images [B, 3, H, W] at their own levels, given as the model sees them."""
+        """Convert images [B, 3, H, W] from the levels of the model to their own."""
         return images / self.gain + self.mean
 
 
@@ -41,13 +42,14 @@ def measure_levels(images: Tensor, hidden: Tensor, contrast: float) -> Levels:
     Without known pixels, and with a contrast of 0, the levels are those of the picture itself.
 
     Args:
-        images: [B, 3, H, W] in [-1, 1]. Values in the hole are ignored.
+        images: [B, 3, H, W] in [-1, 1]. Values in the hole are ignored and need not be finite.
         hidden: [B, 1, H, W], 1 = hole, 0 = known.
         contrast: The standard deviation over all pixels and channels, or 0.
     """
     known = (1 - hidden) * (contrast > 0)
     count = known.sum((2, 3), keepdim=True)
-    mean = (images * known).sum((2, 3), keepdim=True) / count.clamp(min=1)
+    images = torch.where(known > 0, images, 0)
+    mean = images.sum((2, 3), keepdim=True) / count.clamp(min=1)
     variance = ((images - mean).square() * known).sum((1, 2, 3), keepdim=True) / (3 * count.clamp(min=1))
     gain = contrast / variance.sqrt().clamp(min=LEAST_CONTRAST)
     return Levels(mean, torch.where(count > 0, gain, 1.0))

@@ -88,16 +88,16 @@ def personalize(
         with log.paused():
             errors = measure_errors(prior, validation_set, settings.seed, threads.map)
             error = errors["clean_latent_mse"]
-            settled = step < steps and error > (1 - settings.least_gain) * previous and settings.least_gain > 0
-            reason = "settled" if settled else "finished" if step == steps else ""
+            is_settled = step < steps and error > (1 - settings.least_gain) * previous and settings.least_gain > 0
+            reason = "settled" if is_settled else "finished" if step == steps else ""
             log.log(step, **errors, **({"reason": reason} if reason else {}))
-        return error, settled
+        return error, is_settled
 
     with threads:
         for step in trace.progress(steps, "personalize", start):
             if trace.log_spaced(step, steps, per_octave=1, first=FIRST_MEASURED_STEP):
-                error, settled = measure(step, error if step > FIRST_MEASURED_STEP else inf)
-                if settled:
+                error, is_settled = measure(step, error if step > FIRST_MEASURED_STEP else inf)
+                if is_settled:
                     break
             factor = learning_rate_factor(step, steps, options.warm_up, options.schedule)
             for group, rate in zip(optimizer.param_groups, rates, strict=True):
