@@ -20,6 +20,7 @@ from typing import Any
 
 from runner import Failed, Refused, say
 from runner.artifacts import accept_changes, delete_folder, diff_artifact, hash_contents, recover_swap, replace_artifact
+from runner.durations import earlier_receipts, expected_seconds, format_range, job_seconds, typical_seconds
 from runner.engine import Engine, LocalEngine, Resources, Task
 from runner.files import (
     MACHINE,
@@ -38,16 +39,14 @@ from runner.pipeline import SCENE
 from runner.plan import (
     Decision,
     decide,
-    earlier_receipts,
-    expected_seconds,
     partial_folder,
     plan,
-    plan_table,
     used_needs,
 )
+from runner.plan_table import plan_table
 from runner.resolve import Request, ResolvedJob, resolve
 from runner.retry import take_over
-from runner.text import REMEDIES, display_path
+from runner.text import REMEDIES, display_path, format_seconds
 
 # packages whose versions a receipt records
 PACKAGES = ("reffusion", "numpy", "torch", "numba", "diffusers", "transformers", "peft", "pycolmap", "gsplat")
@@ -76,7 +75,13 @@ class Execution:
 
 
 def _run_stage(
-    job: ResolvedJob, stage: str, decision: Decision, earlier: dict[str, Decision], lock: int, execution: Execution
+    job: ResolvedJob,
+    stage: str,
+    decision: Decision,
+    time_left: str,
+    earlier: dict[str, Decision],
+    lock: int,
+    execution: Execution,
 ) -> Decision:
     """Run one stage of a job, and move its artifact into place.
 
@@ -88,6 +93,7 @@ def _run_stage(
         job: the job.
         stage: name of the stage.
         decision: the decision to run it.
+        time_left: text on the expected time, which follows the reason for the run.
         earlier: decisions about all earlier stages, which are done.
         lock: file descriptor of the lock of the job's folder.
         execution: settings.
@@ -106,8 +112,7 @@ def _run_stage(
     if not read_receipt(partial):  # a receipt is there if it was copied, or the runner was killed before the renames
         resumed = partial.exists()
         partial.mkdir(parents=True, exist_ok=True)
-        seconds = expected_seconds(job, stage)
-        say(f"{stage}: {decision.reason}" + (f"; about {seconds:.0f} s" if seconds is not None else ""))
+        say(f"{stage}: {decision.reason}{time_left}")
         result = _run_in_engine(execution, job, stage, partial, earlier, lock)  # its seconds are of the last try only
         say(f"{stage}: done in {result['seconds']:.1f} s, {result['peak_memory_mb']} MB")
         check_lock(lock)
@@ -119,6 +124,13 @@ def _run_stage(
         delete_folder(abandoned)
     job.hashes.save()
     return replace(decision, status="cached", reason="made now", path=place, is_final=True)
+
+
+def _time_left(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
+    """Return text on the expected time of the first of these stages and of all of them; "" if it is unknown."""
+    seconds, total = expected_seconds(job, next(iter(decisions))), job_seconds(job, decisions)
+    stage_time = "" if seconds is None else f"; about {format_seconds(seconds)}"
+    return stage_time if total is None or len(decisions) == 1 else f"{stage_time}, {format_range(total)} to the end"
 
 
 def _copy_from_variant(job: ResolvedJob, stage: str, key: str, to: Path) -> str | None:
@@ -216,6 +228,7 @@ def _receipt(job: ResolvedJob, stage: str, inputs: Inputs, folder: Path, result:
         "platform": platform.platform(),
         "machine": MACHINE,
         "device": job.params[stage].get("device", "cpu"),
+        "typical_seconds": typical_seconds(job, stage),
         **result,
         "date": time.strftime("%FT%T%z"),
     }
@@ -274,7 +287,8 @@ def run_scene(
                 for warning in read_json(done[stage].path / "warnings.json") or ():
                     say(f"warning: {warning}")
             if done[stage].status == "run":
-                done[stage] = _run_stage(job, stage, done[stage], done, lock, execution)
+                time_left = _time_left(job, {later: planned[later] for later in stages[position:]})
+                done[stage] = _run_stage(job, stage, done[stage], time_left, done, lock, execution)
                 if any(planned[later].status == "pending" for later in stages[position + 1 :]):
                     planned = plan(job, stages, done)
                     if not any(planned[later].status == "pending" for later in stages[position + 1 :]):

@@ -39,6 +39,7 @@ class Condition(Strict):
         empty: <stage>/<folder>; true if this folder of an earlier stage's artifact has no files.
         unless: the condition is false if scene.yaml has one of these keys.
         only: <stage>.<name> -> value; the condition is false unless each of these parameters has its value.
+        common: whether ordinary scenes meet the condition, so that the expected time of a job is a range.
     """
 
     reason: str
@@ -48,6 +49,7 @@ class Condition(Strict):
     empty: str | None = None
     unless: tuple[str, ...] = ()
     only: dict[str, Any] = {}
+    common: bool = False
 
     @model_validator(mode="after")
     def _has_one_test(self) -> Self:
@@ -132,6 +134,22 @@ class Memory(Strict):
     each: Annotated[float, Field(ge=0)] = 0
 
 
+class Rates(Strict):
+    """The expected seconds of a stage: `base`, and those for each training view, test view and step.
+
+    Attributes:
+        placed: seconds for each training view whose pose structure from motion has to find.
+        steps: the parameter of the stage that counts its steps; "" if it has none.
+    """
+
+    base: Annotated[float, Field(ge=0)]
+    view: Annotated[float, Field(ge=0)] = 0
+    test: Annotated[float, Field(ge=0)] = 0
+    placed: Annotated[float, Field(ge=0)] = 0
+    step: Annotated[float, Field(ge=0)] = 0
+    steps: str = ""
+
+
 class Pipeline(Strict):
     """The content of pipeline.yaml.
 
@@ -143,6 +161,7 @@ class Pipeline(Strict):
             an entry this is the scene's profile, too.
         budget: stage -> its part of a time budget, as a fraction; the sum is at most 1.
         memory: stage -> expected memory, used while no earlier run has measured it.
+        durations: profile -> stage -> its expected seconds on two cores, used likewise.
     """
 
     stages: dict[str, Stage]
@@ -152,6 +171,7 @@ class Pipeline(Strict):
     comparisons: dict[str, str] = {}
     budget: dict[str, Annotated[float, Field(gt=0)]] = {}
     memory: dict[str, Memory] = {}
+    durations: dict[str, dict[str, Rates]] = {}
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Self:
@@ -168,6 +188,7 @@ class Pipeline(Strict):
             "scene_keys": self.scene_keys,
             "budget": self.budget,
             "memory": self.memory,
+            **self.durations,
             **self.profiles,
             **self.variants,
         }

@@ -6,7 +6,6 @@ Terms are explained in `runner`. This module imports nothing heavy.
 import json
 import os
 import string
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,12 +13,11 @@ from typing import Any
 
 from runner import Refused
 from runner.artifacts import ArtifactDiff, diff_artifact
-from runner.files import MACHINE, RECEIPT, list_files, read_receipt
+from runner.files import RECEIPT, list_files, read_receipt
 from runner.keys import (
     Inputs,
     code_fingerprints,
     digest,
-    files_outside,
     flatten_params,
     list_changes,
     list_code_changes,
@@ -57,6 +55,7 @@ class Decision:
         notes: notes of the stage's preview.
         needed: the weights that the stage will use, as fields of reffusion.weights.local.Need.
         lacks: what this machine lacks for CUDA, a line each with the remedy.
+        is_open: True if the stage is pending on a condition that ordinary scenes meet (`pipeline.Condition.common`).
     """
 
     status: str
@@ -67,6 +66,7 @@ class Decision:
     notes: tuple[str, ...] = ()
     needed: tuple[dict[str, Any], ...] = ()
     lacks: tuple[str, ...] = ()
+    is_open: bool = False
 
 
 def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decision:
@@ -87,24 +87,26 @@ def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decisi
     if own and own.by in job.brings and (not own.param or _has_value(job, own.param, own.equals)):
         source = earlier[own.artifact]
         return Decision("provided", f"the scene brings `{own.by}`", source.path, source.is_final)
-    open_questions = []
+    open_questions: dict[str, bool] = {}  # text -> whether the answer is open in ordinary scenes
     for condition in spec.skip_if:
         if holds := _is_true(job, condition, earlier):
             return Decision("skip", _format_reason(condition, earlier), is_final=True)
         if holds is None:
-            open_questions.append(f"left out if {condition.reason.split(':')[0]}: known after {condition.names[0]}")
+            unknown = f"left out if {condition.reason.split(':')[0]}: known after {condition.names[0]}"
+            open_questions[unknown] = condition.common
     needs = {need: earlier[need] for need in used_needs(job, stage) if need != SCENE}
     for need in (need for need in spec.needs if need != SCENE):
         if needs[need].status == "skip":
             return Decision("skip", f"needs {need}, which is left out", is_final=True)
         if needs[need].status == "pending":
-            open_questions.append(f"waits for {need}")
+            open_questions[f"waits for {need}"] = needs[need].is_open
     for param, _, folder in _weights(job, stage):
         if folder and not folder.exists():
             return Decision("missing", f"{stage}.{param}: no weights at {folder}; name a folder, a file or owner/model")
     code = code_fingerprints(job.root, stage, job.hashes)
     if open_questions:
-        return Decision("pending", open_questions[0], _existing_artifact(job, stage))
+        first, is_open = next(iter(open_questions)), any(open_questions.values())
+        return Decision("pending", first, _existing_artifact(job, stage), is_open=is_open)
     changing = [need for need, decision in needs.items() if not decision.is_final]
     if changing:
         path = _existing_artifact(job, stage)
@@ -350,46 +352,6 @@ def _apply_answer(job: ResolvedJob, question: dict[str, Any], decision: Decision
     return replace(decision, notes=notes, needed=needed)
 
 
-def plan_table(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
-    """Format a plan as text.
-
-    It has a line with the profile and the reason for it, a line per stage with status, expected time and reason, the
-    notes of the stages, the weights to fetch, and the folders outside the scene's folder from which files are read.
-    """
-    lines = [f"{job.home.name} (profile {job.profile}: {job.why})"]
-    for stage, decision in decisions.items():
-        seconds = expected_seconds(job, stage) if decision.status in TO_DO else None
-        time = f"~{seconds:.0f} s" if seconds is not None else ""
-        lines.append(f"  {decision.status:<9} {stage:<12} {time:>7}  {decision.reason}".rstrip())
-        lines += [f"{'':33}{note}" for note in decision.notes]
-    rest = dict.fromkeys(line for decision in decisions.values() for line in decision.lacks[1:])
-    lines += [f"  besides, {line}" for line in rest]
-    needs = {need["name"]: need for decision in decisions.values() for need in decision.needed if need["problem"]}
-    if sizes := [need["bytes"] or 0 for need in needs.values() if need["fetched"] and not need["optional"]]:
-        lines.append(f"  weights to fetch: {format_bytes(sum(sizes))}, by `make weights profile={job.profile}`")
-    if paths := _paths_outside_scene(job, list(decisions)):
-        folders = Counter(str(path if path.is_dir() else path.parent) for path in paths)
-        named = [f"{path} ({count} file{'s' * (count > 1)})" for path, count in folders.items()]
-        lines.append(f"  read outside the scene's folder: {join_names(named)}")
-    return "\n".join(lines)
-
-
-def _paths_outside_scene(job: ResolvedJob, stages: list[str]) -> list[Path]:
-    """Return the paths outside the scene's folder that the stages read, sorted.
-
-    scene.yaml or files of the capture name such paths.
-    """
-    readers = [stage for stage in stages if stage in job.stages and SCENE in job.pipeline.stages[stage].all_needs]
-    reads = [path for stage in readers for path in files_outside(job.stages[stage].reads or (), job.folder)]
-    named = [
-        path
-        for stage in readers
-        if job.stages[stage].reads is None
-        for path in paths_outside(job.params[stage], job.folder)
-    ]
-    return sorted({*reads, *named})
-
-
 def plan_record(job: ResolvedJob, decisions: dict[str, Decision], unset: ResolvedJob) -> dict[str, Any]:
     """Return the content of plan.json, which the report reads.
 
@@ -406,19 +368,3 @@ def plan_record(job: ResolvedJob, decisions: dict[str, Decision], unset: Resolve
     entry = lambda d: {"word": d.status, "reason": d.reason, "notes": list(d.notes), "folder": folder(d.path)}
     stages = {stage: entry(decision) for stage, decision in decisions.items()}
     return {"profile": job.profile, "stages": stages, "params": unset.params}
-
-
-def earlier_receipts(job: ResolvedJob, stage: str) -> list[dict[str, Any]]:
-    """Return the receipts of a stage in the scene's own run and in its variants, as far as there are any."""
-    places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
-    return [receipt for place in places if (receipt := read_receipt(place / stage))]
-
-
-def expected_seconds(job: ResolvedJob, stage: str) -> float | None:
-    """Return how many seconds the stage took in its last run on this scene or a variant of it; None if unknown.
-
-    Only runs on this machine and with this profile count. Of a run that was interrupted and resumed, the time is that
-    of the last attempt alone.
-    """
-    here = [r for r in earlier_receipts(job, stage) if r.get("machine") == MACHINE and r.get("profile") == job.profile]
-    return max(here, key=lambda r: r["date"])["seconds"] if here else None

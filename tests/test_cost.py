@@ -17,7 +17,8 @@ from reffusion.cost.counts import COUNTS
 from reffusion.params import distill, fit, personalize, reference
 from runner import Refused
 from runner.gpu_costs import cost_table
-from runner.plan import plan, plan_table
+from runner.plan import plan
+from runner.plan_table import plan_table
 from runner.resolve import Request, resolve
 from runner.text import format_seconds
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -14,9 +15,11 @@ from scenes.processes import start_module, wait_until
 from scenes.toy_projects import RUNNER_FILES, make_request, write_files
 
 from runner import Failed, Refused, compare, maintenance, process, results
+from runner.durations import expected_seconds, job_seconds, typical_seconds
 from runner.execute import run_scene
 from runner.keys import Hashes, code_fingerprints, fingerprint
-from runner.plan import plan, plan_table
+from runner.plan import plan
+from runner.plan_table import plan_table
 from runner.resolve import resolve
 
 pytestmark = pytest.mark.integration
@@ -96,6 +99,33 @@ def test_first_run_and_receipts(project):
     ]  # fmt: skip
     assert not list((project / "runs/toy").glob(".partial*")) and not list((project / "runs/toy").glob(".old*"))
     assert (project / "runs/toy/profile").read_text() == "laptop\n"
+
+
+def test_the_expected_time_follows_the_table_then_this_machine_then_the_scene(capsys, empty_project):
+    """The laptop's table says 100 s a step; the toy's stages take milliseconds."""
+    facts = "{'views': [['a', 'b'], ['c'], [], []], 'brings_poses': True}"
+    with open(empty_project / "stages/poses.py", "a") as file:
+        file.write(f"\ndef scene_facts(params, scene):\n    return {facts}\n")
+    replace_text(
+        empty_project / "pipeline.yaml", "reason: nothing to invent", "reason: nothing to invent, common: true"
+    )
+    rates = "{fit: {base: 0, step: 100, steps: iterations}, distill: {base: 30}, evaluate: {base: 10, test: 5}}"
+    rates = f"{{poses: {{base: 1, view: 2}}, masks: {{base: 1}}, {rates[1:]}"
+    with open(empty_project / "pipeline.yaml", "a") as file:
+        file.write(f"durations: {{laptop: {rates}}}\n")
+    job = resolve(make_request(empty_project))
+    factor = typical_seconds(job, "masks")  # 1 on two cores
+    assert typical_seconds(job, "poses") == pytest.approx(5 * factor)
+    assert typical_seconds(job, "fit") == pytest.approx(300 * factor)
+    least, most = job_seconds(job, plan(job, job.pipeline.closure("all")))
+    assert least == pytest.approx((5 + 300 + 1 + 15) * factor) and most == least + 30 * factor
+    capsys.readouterr()
+    run_scene(make_request(empty_project), "fit")
+    assert re.search(r"\nfit: no artifact yet; about \d min\n", capsys.readouterr().out)
+    job = resolve(make_request(empty_project))
+    taken = [json.loads((empty_project / f"runs/toy/{stage}/receipt.json").read_text()) for stage in ("poses", "fit")]
+    assert 3 * factor < expected_seconds(job, "distill") < 8 * factor, "faster than 30 s, as the stages before"
+    assert expected_seconds(job, "fit") == taken[1]["seconds"], "as in its last run"
 
 
 def test_fresh_plan(empty_project):

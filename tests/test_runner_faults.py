@@ -31,7 +31,8 @@ from runner.artifacts import diff_artifact
 from runner.execute import run_scene
 from runner.files import RECEIPT
 from runner.keys import Hashes
-from runner.plan import decide, plan_table
+from runner.plan import decide
+from runner.plan_table import plan_table
 from runner.resolve import Request, resolve
 
 pytestmark = pytest.mark.integration

@@ -68,7 +68,7 @@ VIEWS = 6  # number of unseen views
 SHOWN = 12  # held-out pictures on the sheet
 PHOTOGRAPH_CASES = 36  # pictures of each kind from held-out photographs
 PROMPTS = {"reference": "A photo of sks", "whole": "A photo of sks", "window": "A photo of sks, cropped"}
-LEARNS = ("poses", "reference")  # stages that personalization needs of a run
+LEARNS = ("poses", "raw_masks", "reference")  # stages that personalization needs of a run
 
 # ---------------------------------------------------------------------------------------------- inpainting
 

@@ -48,6 +48,7 @@ def fit(
     placed: Tensor | None = None,
     spent: float = 0.0,
     impl: Implementation = "auto",
+    label: str = "fit",
 ) -> Gaussians:
     """Optimise the initial Gaussians so that their renderings match the views, and return the result.
 
@@ -73,6 +74,7 @@ def fit(
         spent: seconds already spent on making `initial`; "seconds" in the trace, which is cumulative, starts from this
             value.
         impl: implementation of the renderer.
+        label: name of the optimisation in its progress bar.
 
     Returns:
         The Gaussians, detached. Their number differs from that of `initial` if the schedule densifies or prunes.
@@ -96,7 +98,7 @@ def fit(
         _write_line(log, run, *trace_inputs)
     steps, view_schedule = range(run.iteration, settings.iterations), (coarse_steps(settings), sparse_steps(settings))
     for i, (camera, target, counts) in zip(
-        trace.progress(settings.iterations, "fit", run.iteration),
+        trace.progress(settings.iterations, label, run.iteration),
         iterate_views(cameras, images, weights, steps, settings.seed, *view_schedule, optimizer.masked.device),
         strict=True,
     ):

@@ -45,9 +45,11 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
-    """Return {"views": [training, test, clean, cameras-only]}, a list of view names each; {} without photographs.
+    """Return facts about the capture; {} without photographs.
 
-    The stage depends on these roles, which may depend on the names of masks, while it does not read the masks.
+    They are "views": [training, test, clean, cameras-only], a list of view names each; and "brings_poses": whether
+    structure from motion is left out. The stage depends on the roles of views, which may depend on the names of masks,
+    while it does not read the masks.
 
     Args:
         scene: folder of the scene.
@@ -57,8 +59,9 @@ def scene_facts(params: Params, scene: Path) -> dict[str, object]:
     """
     if is_gaussians_only(params, scene):
         return {}
-    roles = read_scene(params, scene, params.longest)[1]
-    return {"views": [roles.train, roles.test, sorted(roles.clean), roles.blank]}
+    capture, roles = read_scene(params, scene, params.longest)
+    views = [roles.train, roles.test, sorted(roles.clean), roles.blank]
+    return {"views": views, "brings_poses": capture.poses is not None}
 
 
 def preview(params: Params, scene: Path) -> list[str]:
