@@ -21,7 +21,7 @@ from reffusion.io.ground_truth import load_ground_truth, load_object_mask, load_
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import has_object_mask, load_scene
-from reffusion.kernels.compiled import side_by_side
+from reffusion.kernels.compiled import side_by_side, views_at_once
 from reffusion.metrics import image_metrics, lpips, rows
 from reffusion.metrics.consistency import RenderedView
 from reffusion.metrics.view_renders import ViewRenderer, ViewRenders
@@ -29,7 +29,6 @@ from reffusion.params.evaluate import Params
 from reffusion.types import Gaussians, Scene
 
 FOLDERS = {"fit": "renders_fit", "initialize": "renders_initialize", "distill": "renders"}  # stage -> its renders
-MAX_PARALLEL_VIEWS = 4  # views that are evaluated at once; all pictures of each are in memory
 
 
 def run(
@@ -82,7 +81,7 @@ def run(
 
     scored: list[dict[str, Any]] = []
     previous = None
-    with closing(side_by_side(evaluate_view, names, MAX_PARALLEL_VIEWS if params.device == "cpu" else 1)) as views:
+    with closing(side_by_side(evaluate_view, names, views_at_once(params.device))) as views:
         for _ in trace.progress(len(names), "evaluate"):
             view, row = next(views)
             if previous:

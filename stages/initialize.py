@@ -28,6 +28,7 @@ from reffusion.io.arrays import load_json, save_json, save_labels
 from reffusion.io.images import save_exr, save_image, save_mask
 from reffusion.io.ply import save_ply
 from reffusion.io.scene import load_references
+from reffusion.kernels.compiled import side_by_side, views_at_once
 from reffusion.masks import voting
 from reffusion.params.initialize import Params
 from reffusion.trace import Trace
@@ -110,7 +111,8 @@ def run(
     save_labels(out / "labels.npy", draft.is_new.cpu())
     photos = background.photos if is_method else None
     compared = background if is_method else None
-    origins = {name: find_origins(draft, scene.cameras[name], sets[name], compared) for name in scene.train}
+    find = lambda name: find_origins(draft, scene.cameras[name], sets[name], compared)
+    origins = dict(zip(scene.train, side_by_side(find, scene.train, views_at_once(params.device)), strict=True))
     for name, origin in origins.items():
         save_image(out / "origins" / f"{name}.png", origin.picture)
     save_json(out / "facts.json", summarize(params, space, draft, floaters, sets, origins, extra, trusted, photos))

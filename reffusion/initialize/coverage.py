@@ -18,6 +18,7 @@ from reffusion import morphology
 from reffusion.background.mirrors import render_mirrors
 from reffusion.background.model import Background
 from reffusion.background.visibility import OPAQUE, DepthView
+from reffusion.kernels.compiled import side_by_side, views_at_once
 from reffusion.masks import voting
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference, Rendering
@@ -45,10 +46,13 @@ def expected_mirror_depth(background: Background) -> dict[str, np.ndarray]:
     render = lambda camera: (
         render_mirrors(background.mirrors, camera, background.masks[camera.name], background.views).plausible_depth
     )
-    return {camera.name: render(camera) for camera in background.cameras}
+    names, at_once = (
+        [camera.name for camera in background.cameras],
+        views_at_once(background.mirrors[0].thing.means.device),
+    )
+    return dict(zip(names, side_by_side(render, background.cameras, at_once), strict=True))
 
 
-@torch.no_grad()
 def find_uncovered(
     gaussians: Gaussians,
     is_new: Tensor,
@@ -72,18 +76,25 @@ def find_uncovered(
     Returns:
         View name -> bool [H, W], True for uncovered pixels, without small islands and with small holes filled.
     """
-    found = {}
-    for camera in cameras:
+    features = is_new[:, None].to(gaussians.means.dtype)
+
+    @torch.no_grad()
+    def find(camera: Camera) -> np.ndarray:
         mask = background.masks[camera.name]
-        rendering = rasterizer.render(
-            gaussians, camera, features=is_new[:, None].to(gaussians.means.dtype), sh_degree=0
-        )
+        rendering = rasterizer.render(gaussians, camera, features=features, sh_degree=0)
         uncovered = rendering.alpha.cpu().numpy() <= OPAQUE
         if camera.name in mirror_depth:
             uncovered |= _contradicts(mirror_depth[camera.name], rendering, background.unobserved[camera.name])
         island, gap = ISLAND * camera.width, GAP * camera.width
-        found[camera.name] = morphology.remove_small_parts(mask & uncovered, island, gap) & mask
-    return found
+        return morphology.remove_small_parts(mask & uncovered, island, gap) & mask
+
+    return dict(
+        zip(
+            [camera.name for camera in cameras],
+            side_by_side(find, cameras, views_at_once(gaussians.means.device)),
+            strict=True,
+        )
+    )
 
 
 def _contradicts(image_depth: np.ndarray, rendering: Rendering, unobserved: np.ndarray) -> np.ndarray:

@@ -36,6 +36,7 @@ FREE_ROUNDING = "contract", "reassoc", "nsz", "arcp"
 _PACKAGES = "kernels", "splat", "gaussians", "depth", "background", "inpaint/patchmatch"  # packages with kernels
 # Inside `torch_on_one_thread`, torch's number of threads outside of it. It is thread-local, as torch's number itself.
 _torch_threads = threading.local()
+MAX_VIEWS = 4  # views that are processed at once; all arrays of each are in memory
 _CACHE = "splat-"  # prefix of the folder of machine code in __pycache__; its name ends in a hash of the sources
 
 
@@ -175,6 +176,11 @@ def parallel_for(function: Callable, *arguments, gaussians: int = MIN_PARALLEL) 
     for future in pending:
         if not future.cancel():  # a call that has not begun by now finds no ticket left, and need not run
             future.result()
+
+
+def views_at_once(device: str | torch.device) -> int:
+    """Return how many views to process `side_by_side`: one on a GPU, which a single view occupies."""
+    return MAX_VIEWS if torch.device(device).type == "cpu" else 1
 
 
 def side_by_side(function: Callable[[T], R], items: Iterable[T], most: int = 8) -> Iterator[R]:

@@ -19,7 +19,7 @@ from reffusion import morphology, trace
 from reffusion.background import training_coverage
 from reffusion.background.model import Background
 from reffusion.background.unobserved import find_unobserved
-from reffusion.kernels.compiled import side_by_side
+from reffusion.kernels.compiled import side_by_side, views_at_once
 from reffusion.masks import regions, voting
 from reffusion.masks.regions import FillRequest, Region
 from reffusion.masks.voting import Votes
@@ -28,7 +28,6 @@ from reffusion.types import Camera, Gaussians, MaskSet, Scene
 
 UNSEEN_WEIGHT = 0.1  # px, total blending weight in all views up to which a Gaussian is labelled by its position
 ISLAND, GAP = 0.01, 0.02  # of the image's width: smaller islands of a mask are removed, smaller holes filled
-MAX_PARALLEL = 4  # number of views processed at once; each holds its pixels as points in memory
 
 
 def label_object(
@@ -151,7 +150,7 @@ def classify_pixels(
         invent = invent | fill.render(camera, found.depth)
         return MaskSet(given, mask, unobserved, invent)
 
-    with closing(side_by_side(classify, names, MAX_PARALLEL if params.device == "cpu" else 1)) as found:
+    with closing(side_by_side(classify, names, views_at_once(params.device))) as found:
         return {names[k]: next(found) for k in trace.progress(len(names), "masks")}
 
 

@@ -99,6 +99,8 @@ def find_floaters(
     Raises:
         ValueError: as `cast_votes`.
     """
+    if not any(mask.any() for mask in unobserved.values()):
+        return torch.zeros(len(remaining), dtype=torch.bool, device=remaining.means.device)
     return label_gaussians(cast_votes(remaining, cameras, unobserved, mode="weight"), tau)
 
 
