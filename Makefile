@@ -1,6 +1,6 @@
 ## make scene=demo all            the whole job; a second call finds everything cached
 ## make scene=X STAGE             one stage and what it needs: the stages of pipeline.yaml
-## make scene=X plan              what would run, and why; gpu=rtx-4090: time and memory of each stage on that GPU
+## make scene=X plan              what would run, why, and how long; gpu=rtx-4090: on that GPU
 ## make scene=X mask              make masks from clicks, in a browser; port=8090
 ## make scene=X check             look for problems of photographs, masks and poses; draw each mask over its photograph
 ## make scene=X compare           the full method, ablations and baselines: runs/X/compare.html

@@ -19,7 +19,7 @@ Modules:
   - frames.py: extracts the frames of a video, which become a scene.
 - plan.py: gives each stage a status and a reason, from the files on disk.
   - keys.py: hashes of everything that an artifact depends on: contents of folders, code, parameters.
-  - plan_table.py: a plan as text. durations.py: expected times; gpu_costs.py: times and memory on a GPU.
+  - plan_table.py: a plan as text. durations.py: expected times.
 - execute.py: runs stages, each in a new process, writes receipts, and renames folders into place.
   - engine.py: runs the process on this machine; on a cluster: ray_engine.py, slurm_engine.py, retry.py.
   - artifacts.py: compares artifacts with their receipts, and replaces them so that a killed runner loses nothing.

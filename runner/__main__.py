@@ -15,7 +15,6 @@ from runner.engine import ENGINES, make_engine
 from runner.execute import Execution, run_scene
 from runner.files import write_json
 from runner.garbage import collect_garbage
-from runner.gpu_costs import cost_table
 from runner.maintenance import clean, verify
 from runner.plan import plan, plan_record
 from runner.plan_table import plan_table
@@ -34,7 +33,7 @@ def main() -> int:
     root = arguments.root.resolve()
     runs = (arguments.runs or workplace(root) / "runs").resolve()
     names = ("scene", "profile", "variant", "trust", "set", "budget", "keep")
-    request = Request(root, runs, *(getattr(arguments, name) for name in names))
+    request = Request(root, runs, *(getattr(arguments, name) for name in names), gpu=arguments.gpu)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # SIGTERM is handled like Ctrl-C
     try:
         return _COMMANDS[arguments.command](request, arguments)
@@ -56,8 +55,7 @@ def _plan(request: Request, arguments: argparse.Namespace) -> int:
         unset = resolve(replace(request, set="", budget=None), job.hashes)
         write_json(job.home / "plan.json", plan_record(job, decisions, unset))
     else:
-        parts = [plan_table(job, decisions), cost_table(job, decisions, arguments.gpu)]
-        print("\n".join(filter(None, parts)))
+        print(plan_table(job, decisions))
     return 0
 
 
@@ -127,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--variants", default="", help="compare: only these, separated by commas")
     parser.add_argument("--seeds", type=int, default=1, help="compare: number of scenes: X, X-1, X-2 ...")
     parser.add_argument("--record", action="store_true", help="plan: write it to runs/<scene>/plan.json")
-    parser.add_argument("--gpu", help="plan: seconds and GB of each stage on this GPU, such as rtx-4090, a100, h100")
+    parser.add_argument("--gpu", help="plan: expected time on this GPU: rtx-3090, rtx-4090, a100, h100, h200")
     parser.add_argument("--trust", action="store_true", help="accept artifacts made by older code")
     parser.add_argument("--keep", action="store_true", help="accept artifacts that people changed, from now on")
     parser.add_argument("--budget", help="time for the whole job, such as 5m: sets the number of steps")

@@ -1,19 +1,23 @@
 """Expected durations of stages and jobs: from earlier runs of the scene, or else from the table `durations`.
 
-The table of pipeline.yaml has rates of the CPU, measured on two cores. The receipts of other scenes on this machine
-tell how much slower or faster this machine is. Durations on a GPU: gpu_costs.py.
+The table of pipeline.yaml has rates that were measured on two cores and on one kind of GPU. The receipts of other
+scenes on this machine tell how much slower or faster this machine is.
 """
 
 from __future__ import annotations
 
+import functools
 import os
+import re
+import subprocess
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from runner.files import MACHINE, read_receipt
 from runner.keys import flatten_params
-from runner.plan import TO_DO, Decision
-from runner.resolve import ResolvedJob
+from runner.plan import FINAL, TO_DO, Decision
+from runner.resolve import ResolvedJob, has_cuda
 from runner.text import format_seconds
 
 CORES = 2  # cores on which the table was measured
@@ -29,40 +33,65 @@ def earlier_receipts(job: ResolvedJob, stage: str) -> list[dict[str, Any]]:
 
 
 def expected_seconds(job: ResolvedJob, stage: str) -> float | None:
-    """Return the expected seconds of a stage on this machine; None if they are unknown.
+    """Return the expected seconds of a stage; None if they are unknown.
 
     They are those of the last run of this scene or a variant of it, on this machine and with this profile. Of a run
     that was interrupted and resumed, that is the time of the last attempt alone. Before the first run they are those of
-    the table, times the slowness of this machine.
+    the table, times the slowness of this machine. If the job names a GPU, they are those of the table for this GPU.
     """
+    typical = typical_seconds(job, stage)
+    if job.gpu:
+        return typical
     here = [r for r in earlier_receipts(job, stage) if r.get("machine") == MACHINE and r.get("profile") == job.profile]
     if here:
         return max(here, key=lambda r: r["date"])["seconds"]
-    typical = typical_seconds(job, stage)
     return None if typical is None else typical * _slowness(job)
 
 
 def typical_seconds(job: ResolvedJob, stage: str) -> float | None:
-    """Return the seconds of a stage by the table `durations`, on as many cores as this machine has.
+    """Return the seconds of a stage by the table `durations`, with this machine's number of cores or its GPU.
 
-    None if the table has no entry for the stage in this profile, the stage runs on a GPU, or the number of views is
-    unknown.
+    None if the table has no rates for the stage in this profile and on its device, the GPU is not in the table, or the
+    number of views is unknown.
     """
     rates = job.pipeline.durations.get(job.profile, {}).get(stage)
     capture = next((info.facts for info in job.stages.values() if "views" in info.facts), None)
-    if rates is None or capture is None or job.params[stage].get("device") == "cuda":
+    device = job.params[stage].get("device", "cpu")
+    if rates is None or capture is None or rates.device != device:
+        return None
+    factor = job.pipeline.gpus.get(_gpu(job)) if device == "cuda" else _time_share(_cores()) / _time_share(CORES)
+    if factor is None:
         return None
     train, test, *_ = map(len, capture["views"])
     steps = flatten_params(job.params)[f"{stage}.{rates.steps}"] if rates.steps else 0
     seconds = rates.base + rates.view * train + rates.test * test + rates.step * steps
-    seconds += 0 if capture["brings_poses"] else rates.placed * train
-    cores = len(os.sched_getaffinity(0))
-    return seconds * _relative_time(cores) / _relative_time(CORES)
+    return factor * (seconds + (0 if capture["brings_poses"] else rates.placed * train))
 
 
-def _relative_time(cores: int) -> float:
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _time_share(cores: int) -> float:
     """Return the time on `cores` cores as a share of that on one (Amdahl's law)."""
     return 1 - PARALLEL_SHARE + PARALLEL_SHARE / cores
+
+
+def _gpu(job: ResolvedJob) -> str:
+    """Return the key in `pipeline.gpus` of the job's GPU or this machine's; "" if there is none."""
+    if job.gpu or not has_cuda():
+        return job.gpu or ""
+    plain = lambda text: re.sub(r"[^a-z0-9]", "", text.lower())
+    return next((name for name in job.pipeline.gpus if plain(name) in plain(_gpu_names())), "")
+
+
+@functools.cache
+def _gpu_names() -> str:
+    """Return what nvidia-smi prints as names of this machine's GPUs; "" if it gives no answer."""
+    with suppress(OSError, subprocess.TimeoutExpired):
+        query = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
+        return subprocess.run(query, capture_output=True, text=True, timeout=10).stdout
+    return ""
 
 
 def _slowness(job: ResolvedJob) -> float:
@@ -76,27 +105,33 @@ def _slowness(job: ResolvedJob) -> float:
     return seconds / typical
 
 
-def job_seconds(job: ResolvedJob, decisions: Mapping[str, Decision]) -> tuple[float, float] | None:
-    """Return the least and the greatest expected seconds of a plan's stages that are still to run.
+def is_timed(job: ResolvedJob, decision: Decision) -> bool:
+    """Return whether a stage counts in the expected time of the job.
 
-    The least omits the stages that ordinary scenes may leave out, which is not known yet.
+    It does if it is to run here or, if the job names another machine's GPU, if it would run there.
+    """
+    return decision.status in TO_DO or (bool(job.gpu) and decision.status not in FINAL)
 
-    Returns:
-        None if the duration of one of these stages is unknown.
+
+def total_time(job: ResolvedJob, decisions: Mapping[str, Decision]) -> str:
+    """Return the expected time of the stages of a plan that are still to run, as text; "" if no stage has one.
+
+    It is a range if ordinary scenes may leave out a stage, which is not known yet. Stages without a known time are
+    named.
     """
     least = greatest = 0.0
+    unknown = []
     for stage, decision in decisions.items():
-        if decision.status not in TO_DO:
+        if not is_timed(job, decision):
             continue
         seconds = expected_seconds(job, stage)
         if seconds is None:
-            return None
+            unknown.append(stage)
+            continue
         greatest += seconds
         least += 0.0 if decision.is_open else seconds
-    return least, greatest
-
-
-def format_range(seconds: tuple[float, float]) -> str:
-    """Format a range of durations, as one duration if both ends read the same."""
-    least, greatest = map(format_seconds, seconds)
-    return greatest if least == greatest else f"{least} to {greatest}"
+    if not greatest:
+        return ""
+    shortest, longest = format_seconds(least), format_seconds(greatest)
+    span = longest if shortest == longest or not least else f"{shortest} to {longest}"
+    return span + (f" and the time of {', '.join(unknown)}" if unknown else "")

@@ -20,7 +20,7 @@ from typing import Any
 
 from runner import Failed, Refused, say
 from runner.artifacts import accept_changes, delete_folder, diff_artifact, hash_contents, recover_swap, replace_artifact
-from runner.durations import earlier_receipts, expected_seconds, format_range, job_seconds, typical_seconds
+from runner.durations import earlier_receipts, expected_seconds, total_time, typical_seconds
 from runner.engine import Engine, LocalEngine, Resources, Task
 from runner.files import (
     MACHINE,
@@ -128,9 +128,10 @@ def _run_stage(
 
 def _time_left(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
     """Return text on the expected time of the first of these stages and of all of them; "" if it is unknown."""
-    seconds, total = expected_seconds(job, next(iter(decisions))), job_seconds(job, decisions)
-    stage_time = "" if seconds is None else f"; about {format_seconds(seconds)}"
-    return stage_time if total is None or len(decisions) == 1 else f"{stage_time}, {format_range(total)} to the end"
+    seconds, total = expected_seconds(job, next(iter(decisions))), total_time(job, decisions)
+    if seconds is None:
+        return ""
+    return f"; about {format_seconds(seconds)}" + (f", {total} to the end" if len(decisions) > 1 else "")
 
 
 def _copy_from_variant(job: ResolvedJob, stage: str, key: str, to: Path) -> str | None:

@@ -138,6 +138,7 @@ class Rates(Strict):
     """The expected seconds of a stage: `base`, and those for each training view, test view and step.
 
     Attributes:
+        device: the device on which they were measured, "cpu" or "cuda".
         placed: seconds for each training view whose pose structure from motion has to find.
         steps: the parameter of the stage that counts its steps; "" if it has none.
     """
@@ -148,6 +149,7 @@ class Rates(Strict):
     placed: Annotated[float, Field(ge=0)] = 0
     step: Annotated[float, Field(ge=0)] = 0
     steps: str = ""
+    device: str = "cpu"
 
 
 class Pipeline(Strict):
@@ -161,7 +163,8 @@ class Pipeline(Strict):
             an entry this is the scene's profile, too.
         budget: stage -> its part of a time budget, as a fraction; the sum is at most 1.
         memory: stage -> expected memory, used while no earlier run has measured it.
-        durations: profile -> stage -> its expected seconds on two cores, used likewise.
+        durations: profile -> stage -> its expected seconds on two cores or an H200, used likewise.
+        gpus: name of a GPU -> how many times longer it takes than an H200.
     """
 
     stages: dict[str, Stage]
@@ -172,6 +175,7 @@ class Pipeline(Strict):
     budget: dict[str, Annotated[float, Field(gt=0)]] = {}
     memory: dict[str, Memory] = {}
     durations: dict[str, dict[str, Rates]] = {}
+    gpus: dict[str, Annotated[float, Field(gt=0)]] = {}
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Self:

@@ -3,12 +3,12 @@
 from collections import Counter
 from pathlib import Path
 
-from runner.durations import expected_seconds, format_range, job_seconds
+from runner.durations import expected_seconds, is_timed, total_time
 from runner.keys import files_outside, paths_outside
 from runner.pipeline import SCENE
-from runner.plan import TO_DO, Decision
+from runner.plan import Decision
 from runner.resolve import ResolvedJob
-from runner.text import format_bytes, join_names
+from runner.text import format_bytes, format_seconds, join_names
 
 
 def plan_table(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
@@ -20,12 +20,12 @@ def plan_table(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
     """
     lines = [f"{job.home.name} (profile {job.profile}: {job.why})"]
     for stage, decision in decisions.items():
-        seconds = expected_seconds(job, stage) if decision.status in TO_DO else None
-        time = f"~{seconds:.0f} s" if seconds is not None else ""
+        seconds = expected_seconds(job, stage) if is_timed(job, decision) else None
+        time = f"~{format_seconds(seconds)}" if seconds is not None else ""
         lines.append(f"  {decision.status:<9} {stage:<12} {time:>7}  {decision.reason}".rstrip())
         lines += [f"{'':33}{note}" for note in decision.notes]
-    if total := job_seconds(job, decisions):
-        lines.append(f"  together about {format_range(total)}")
+    if total := total_time(job, decisions):
+        lines.append(f"  together about {total}" + (f"; GPU: {job.gpu}" if job.gpu else ""))
     rest = dict.fromkeys(line for decision in decisions.values() for line in decision.lacks[1:])
     lines += [f"  besides, {line}" for line in rest]
     needs = {need["name"]: need for decision in decisions.values() for need in decision.needed if need["problem"]}

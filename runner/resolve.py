@@ -48,6 +48,7 @@ class Request:
         keep: True accepts artifacts that people changed, and records this in their receipts.
         cuda: whether the cluster has GPUs; None if stages run on this machine, see `has_cuda`.
         compared: True uses the profile that `comparisons` of pipeline.yaml names for the scene's profile, if any.
+        gpu: name of another machine's GPU, for which expected durations are computed; None for this machine's.
     """
 
     root: Path
@@ -61,6 +62,7 @@ class Request:
     keep: bool = False
     cuda: bool | None = None
     compared: bool = False
+    gpu: str | None = None
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class ResolvedJob:
     """A job: one scene, or a variant of it, with all its settings, resolved and checked.
 
     Attributes:
-        root, runs, trust, keep, cuda: as in `Request`.
+        root, runs, trust, keep, cuda, gpu: as in `Request`.
         folder: the scene's folder; the root for a job without a scene.
         home: folder of this run, runs/<scene> or runs/<scene>@<variant>.
         base: folder of the scene's own run, runs/<scene>, whose artifacts variants share.
@@ -119,6 +121,7 @@ class ResolvedJob:
     hashes: Hashes
     keep: bool = False
     cuda: bool | None = None
+    gpu: str | None = None
     stages: dict[str, StageInfo] = field(default_factory=dict)
     broken: dict[str, str] = field(default_factory=dict)
 
@@ -182,6 +185,8 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> ResolvedJob:
     if source and folder and folder != source:
         update_frames(source, folder, root, hashes)
     found = load_scene_file(folder, pipeline) if folder else SceneFile(root / "scene.yaml", None, {}, {})
+    if request.gpu and request.gpu not in pipeline.gpus:
+        raise Refused(f"gpu={request.gpu}: {unknown_name('GPU', request.gpu, pipeline.gpus)}")
     if variant and variant not in pipeline.variants:
         raise Refused(f"{root / 'pipeline.yaml'}: {unknown_name('variant', variant, pipeline.variants)}")
     home = base.with_name(f"{base.name}@{variant}") if variant else base
@@ -194,7 +199,7 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> ResolvedJob:
         origin, text = ("budget", request.budget) if request.budget else (str(found.path), found.budget)
         layers = stack_layers(*layer, split_budget(pipeline, layers.values, parse_duration(text, origin)))
     keys = frozenset(found.brings)
-    folders, options = (root, runs, folder or root, home, base), (request.keep, request.cuda)
+    folders, options = (root, runs, folder or root, home, base), (request.keep, request.cuda, request.gpu)
     return ResolvedJob(*folders, pipeline, layers, profile, why, request.trust, keys, hashes, *options)
 
 

@@ -59,7 +59,6 @@ def describe() -> None:
     - "takes": names of its needs in pipeline.yaml;
     - "scene": folder of the scene;
     - "brings": keys of scene.yaml and names of the scene's folders;
-    - "gpu": name of a GPU, "" for this machine's;
     - "needs": need -> path, or null.
     """
     questions = json.load(sys.stdin)
@@ -77,7 +76,6 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
 
         - "scene" adds "reads" and "facts", see `resolve.StageInfo`;
         - "brings" adds "needed" and "optional", lists of weights, and "lacks", what this machine lacks for CUDA;
-        - "gpu" adds "cost", the cost on this GPU, or "unknown gpu", an error;
         - "needs" adds "notes" of the stage's preview, or its "refusal".
     """
     stage = question["stage"]
@@ -110,11 +108,6 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
         answer["needed"] = [asdict(need) for need in planned.needed_weights(resolved, frozenset(brings))]
     if brings is not None and hasattr(planned, "lacks") and answer["params"].get("device") == "cuda":
         answer["lacks"] = planned.lacks(resolved)
-    if "gpu" in question and hasattr(planned, "cost"):
-        try:
-            answer["cost"] = planned.cost(resolved, question["gpu"])
-        except ValueError as error:
-            answer["unknown gpu"] = format_error(error)
     if scene is not None and hasattr(planned, "scene_files"):
         files = planned.scene_files(resolved, Path(scene), list(list_files(Path(scene))))
         answer["reads"] = sorted(str(path) for path in files)

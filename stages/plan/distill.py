@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
-from reffusion.cost import estimate
 from reffusion.io import machine
 from reffusion.params.distill import Params
 from reffusion.weights import local
 
-__all__ = ["Params", "cost", "lacks", "needed_weights"]
+__all__ = ["Params", "lacks", "needed_weights"]
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
@@ -27,8 +24,3 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
 def lacks(params: Params) -> list[str]:
     """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
     return machine.find_missing(machine.detect(), params.memory_gb, splats=True, memory_param="distill.memory_gb")
-
-
-def cost(params: Params, gpu: str) -> Mapping[str, object] | None:
-    """Estimate the stage's time and memory on a GPU: see `estimate.format_estimate`; "" is this machine's GPU."""
-    return estimate.format_estimate(gpu, params.device, estimate.distill(params))

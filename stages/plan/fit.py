@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
-from reffusion.cost import estimate
 from reffusion.io import machine
 from reffusion.params.fit import Params
 
-__all__ = ["Params", "cost", "lacks", "preview"]
+__all__ = ["Params", "lacks", "preview"]
 
 
 def preview(params: Params, *, poses: Path | None, **_: Path | None) -> list[str]:
@@ -25,8 +23,3 @@ def preview(params: Params, *, poses: Path | None, **_: Path | None) -> list[str
 def lacks(params: Params) -> list[str]:
     """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
     return machine.find_missing(machine.detect())
-
-
-def cost(params: Params, gpu: str) -> Mapping[str, object] | None:
-    """Estimate the stage's time and memory on a GPU: see `estimate.format_estimate`; "" is this machine's GPU."""
-    return estimate.format_estimate(gpu, params.device, estimate.fit(params))

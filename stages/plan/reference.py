@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 from reffusion.capture.views import load_placed_views
-from reffusion.cost import estimate
 from reffusion.io import machine
 from reffusion.params.inpainter import Inpainter
 from reffusion.params.reference import Params, reference_list
@@ -97,8 +95,3 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
 def lacks(params: Params) -> list[str]:
     """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
     return machine.find_missing(machine.detect(), params.memory_gb, splats=False, memory_param="reference.memory_gb")
-
-
-def cost(params: Params, gpu: str) -> Mapping[str, object] | None:
-    """Estimate the stage's time and memory on a GPU: see `estimate.format_estimate`; "" is this machine's GPU."""
-    return estimate.format_estimate(gpu, params.device, estimate.reference(params))
