@@ -22,6 +22,6 @@ RUN useradd --uid 1001 --create-home --home-dir /reffusion reffusion \
 USER 1001
 WORKDIR /reffusion
 # Weights and compiled kernels are in the cache.
-ENV HOME=/reffusion
+ENV HOME=/reffusion USER=reffusion
 VOLUME ["/reffusion/data", "/reffusion/runs", "/reffusion/.cache"]
 ENTRYPOINT ["reffusion"]
