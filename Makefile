@@ -12,7 +12,8 @@
 ## make scene=X turntable         a video around the finished scene: runs/X/turntable.webm
 ## make scene=X patch             fill what was deleted in an editor (scene.yaml: gaussians, cleaned): runs/X/patch/
 ##                                with two files only: reffusion patch before.ply after.ply --out patched.ply
-## make scene=X export            the finished scene for other tools, .ply, cameras, LoRA: runs/X/export/
+## make scene=X export            the finished scene for other tools, .ply, .spz, cameras, LoRA: runs/X/export/
+##                                sog=1: .sog, too, by Node's npm
 ## make scene=X verify            hash all its results: are they as they were made?
 ## make scene=X clean             remove its results
 ## make gc                        list results that no plan uses, with sizes; remove them if you say so, or with yes=1
@@ -35,6 +36,7 @@
 ## make prior [steps=N]           train the embedded prior further (hours)
 ## make prior-report              measure the embedded prior (minutes): runs/prior-report
 ## make setup | test | lint       .venv; the tests, with slow=1 the slow ones too (make fuzz: hours); ruff and mypy
+## make docs                      the documents as a site: build/site
 ## make test-fast                 the tests that start no processes and train nothing (two minutes)
 ## make bench                     work-precision diagrams of the kernels: runs/bench; gate=1: against the baselines
 ## make stability                 stiff and extreme cases, each with its bound (minutes): runs/stability.json
@@ -47,7 +49,7 @@
 # The options. They are set here so that variables of the environment are ignored. Recipes read them as shell variables
 # in double quotes, so that neither the shell nor make expands what was typed.
 given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port gpu \
-	device dtype engine address cores yes cuda
+	device dtype engine address cores yes cuda sog
 $(foreach each,$(given),$(eval $(each) :=))
 data := data
 folder := $(findstring command,$(origin data))
@@ -65,7 +67,7 @@ RUN := $(VENV)/bin/reffusion
 STAGES := $(shell sed -n '/^stages:/,/^[a-z]/s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 
 # $(call flags,a b) is `--a="$a" --b="$b"`, without those that were not given. Their meaning is in `reffusion`.
-switches := trust keep yes offline
+switches := trust keep yes offline sog
 flags = $(foreach each,$1,$(if $($(each)),--$(each)$(if $(filter $(each),$(switches)),,="$$$(each)")))
 where := scene variant runs
 options := $(where) profile budget set trust keep
@@ -73,7 +75,7 @@ cluster := engine address cores
 
 .PHONY: help setup named ready all $(STAGES) plan check compare report study mask view turntable patch export verify \
 	clean gc spinnerf batch weights demo prior prior-report sds-variance adapted sparse test test-fast fuzz bench stability gpu \
-	gpu-check lint
+	gpu-check lint docs
 .DELETE_ON_ERROR:
 
 help:
@@ -182,7 +184,7 @@ patch: ready $(VENV)/.ready-export
 
 export: ready $(VENV)/.ready-export
 	@$(RUN) run all $(call flags,$(options))
-	@$(RUN) export $(call flags,$(where))
+	@$(RUN) export $(call flags,$(where) sog)
 
 verify clean: named setup
 	@$(RUN) $@ $(call flags,$(options))
@@ -256,3 +258,9 @@ gpu: $(VENV)/.ready
 
 gpu-check: $(VENV)/.ready
 	$(PY) -m benchmarks.gpu.check --out="$${runs:-runs}/gpu-check"
+
+# The documents as a site in build/site. They are copied with their paths, so that links between them hold.
+documents := $(wildcard *.md docs/*.md docs/images/* data/*.md priors/tiny/*.md plugins/nerfbaselines/*.md)
+docs: $(VENV)/.ready-docs
+	@rm -rf build/docs && mkdir -p build/docs && cp --parents LICENSE $(documents) build/docs
+	PYTHONPATH=. $(VENV)/bin/zensical build --strict --clean

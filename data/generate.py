@@ -246,7 +246,7 @@ def _write_region(out: Path, region: dict, references: str) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder to write")
+    parser.add_argument("--out", type=Path, default=Path("data/demo"), help="folder to write")
     parser.add_argument("--seed", type=int, default=None, help="default 0; 7 for photos")
     parser.add_argument("--kind", choices=KINDS, default="demo")
     arguments = parser.parse_args()

@@ -11,6 +11,7 @@ from pathlib import Path
 
 # name -> (the module that it runs, help)
 COMMANDS = {
+    "demo": ("generate", "make the demo scene, data/demo (demo --help: others)"),
     "plan": ("runner", "what would run, and why"),
     "run": ("runner", "run the whole job (run all), or one stage and what it needs"),
     "mask": ("report.mask", "make masks from clicks, in a browser"),
@@ -19,7 +20,7 @@ COMMANDS = {
     "view": ("report.view", "view the finished scene in a browser (extra `view`)"),
     "turntable": ("report.turntable", "a video of the finished scene"),
     "sheet": ("report.sheet", "images of test views side by side"),
-    "export": ("report.export", "export the finished scene for other tools: .ply, cameras, LoRA (extra `export`)"),
+    "export": ("report.export", "export the finished scene: .ply, .spz, .sog, cameras, LoRA (extra `export`)"),
     "patch": ("report.patch", "fill what was deleted in a splat editor (extra `export`)"),
     "compare": ("runner", "run the method, ablations and baselines on one scene or a folder of scenes"),
     "compare-page": ("report.compare", "draw the page of a comparison again"),
@@ -116,7 +117,8 @@ def main() -> None:
     module, _ = COMMANDS[name]
     if module != "runner":
         del sys.argv[1]
-    sys.path.insert(0, str(root()))  # not the folder of this file: its `io` and `types` would hide Python's modules
+    # not the folder of this file: its `io` and `types` would hide Python's modules
+    sys.path.insert(0, str(root() / "data" if name == "demo" else root()))
     try:
         runpy.run_module(module, run_name="__main__", alter_sys=True)
     except SystemExit as end:  # print the message of an exit as one line, without a traceback

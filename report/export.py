@@ -7,32 +7,36 @@ from pathlib import Path
 
 from reffusion.io.cameras import save_cameras
 from reffusion.io.compressed import save_compressed
+from reffusion.io.files import BadInput
 from reffusion.io.lora import save_portable
-from reffusion.io.ply import load_ply, save_ply
+from reffusion.io.ply import load_ply, save_ply, save_splats
 from reffusion.io.scene import has_photograph, load_scene
+from reffusion.io.sog import save_sog
 from report import cli
 from report.sheet import stage_folder
 
-PLY, COMPRESSED, WITH_OBJECT = "scene.ply", "scene.compressed.ply", "with_object.ply"
+PLY, COMPRESSED, SPZ, SOG = "scene.ply", "scene.compressed.ply", "scene.spz", "scene.sog"
+WITH_OBJECT = "with_object.ply"
 CAMERAS, IMAGES, LORA = "cameras", "images", "lora"
 HEADER = 1000  # bytes of the header that contain the type of x
 LORA_FILE = "pytorch_lora_weights.safetensors"
 
 
-def make(home: Path) -> list[str]:
+def make(home: Path, sog: bool = False) -> list[str]:
     """Write the Gaussians, cameras, photographs and the LoRA in common formats to `home`/export/.
 
-    Gaussians and cameras are in the scene's own frame. Photographs, the Gaussians of the fit (the scene with the
-    object) and the LoRA are written if they exist.
+    Gaussians and cameras are in the scene's own frame; in a .spz file y points up, as its format says. Photographs, the
+    Gaussians of the fit (the scene with the object) and the LoRA are written if they exist.
 
     Args:
         home: runs/<scene> or runs/<scene>@<variant>, with a finished stage `evaluate`.
+        sog: True also writes a .sog file, which takes Node and minutes.
 
     Returns:
         Lines of text, one for each written file or folder with its path and a description.
 
     Raises:
-        ValueError: the stage `evaluate` has not run, or gsply is not installed.
+        ValueError: the stage `evaluate` has not run, gsply is not installed, or the .sog file cannot be written.
     """
     result, out = home / "evaluate" / PLY, home / "export"
     if not result.exists():
@@ -44,8 +48,18 @@ def make(home: Path) -> list[str]:
     shutil.copyfile(result, out / PLY)
     lines = [f"{out / PLY}: {len(gaussians)} Gaussians of degree {gaussians.sh_degree}, in the scene's own frame"]
     lines[0] += viewer_caveats(result, gaussians.antialiased)
-    smaller = result.stat().st_size / (out / COMPRESSED).stat().st_size
-    lines.append(f"{out / COMPRESSED}: the same, quantised, {smaller:.1f} times smaller, in PlayCanvas's format")
+    smaller = lambda name: f"{result.stat().st_size / (out / name).stat().st_size:.1f} times smaller"
+    lines.append(f"{out / COMPRESSED}: the same, quantised, {smaller(COMPRESSED)}, in PlayCanvas's format")
+    try:
+        save_splats(out / SPZ, gaussians, scene.similarity)
+        lines.append(f"{out / SPZ}: the same, quantised, {smaller(SPZ)}, in Niantic's format")
+    except BadInput as error:  # coordinates too large for the format
+        lines.append(f"not written: {error}")
+    if sog:
+        save_sog(out / SOG, out / PLY)
+        lines.append(f"{out / SOG}: the same, quantised, {smaller(SOG)}, in PlayCanvas's format for the web")
+    else:
+        lines.append(f"{out / SOG}: not written; `--sog` (make: `sog=1`) writes it, with Node, in minutes")
     save_cameras(out / CAMERAS, scene, IMAGES)
     pictured = [name for name in scene.cameras if has_photograph(poses, name)]
     for name in pictured:
@@ -89,9 +103,11 @@ def viewer_caveats(path: Path, antialiased: bool) -> str:
 
 
 def main() -> None:
-    arguments = cli.scene_parser("export", __doc__).parse_args()
+    parser = cli.scene_parser("export", __doc__)
+    parser.add_argument("--sog", action="store_true", help="also write a .sog file, by Node's npm (210 MB, minutes)")
+    arguments = parser.parse_args()
     try:
-        print("\n".join(make(cli.run_folder(arguments))))
+        print("\n".join(make(cli.run_folder(arguments), arguments.sog)))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 

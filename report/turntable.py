@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from reffusion.io.images import to_uint8
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
 from reffusion.splat import rasterizer
+from reffusion.types import Camera, Gaussians
 from report import camera_path, cli
+from report.sheet import stage_folder
 
 FRAMES, RATE = 144, 24  # six seconds
 # Codec of the .webm, which browsers play and OpenCV's wheels write; OpenCV's warning about the tag is harmless.
 CODEC = "VP90"
+WIPE_FRAMES, WIPE_WIDTH, WIPE_MILLISECONDS = 60, 480, 80
 
 
 def make(home: Path, frames: int = FRAMES) -> Path:
@@ -31,15 +36,60 @@ def make(home: Path, frames: int = FRAMES) -> Path:
     Raises:
         ValueError: the stage `evaluate` has not run, or the installed OpenCV cannot write this kind of video.
     """
+    gaussians, cameras = load_result(home, frames)
+    path = home / "turntable.webm"
+    save_video(path, (_picture(gaussians, camera) for camera in cameras))
+    return path
+
+
+def make_wipe(home: Path) -> Path:
+    """Render before and after along the path of the video, write `home`/before_after.webp, and return this path.
+
+    A line moves across the picture, left of which is the scene with the object. The animation is `WIPE_WIDTH` px wide.
+
+    Args:
+        home: as for `make`; the stage `fit` has run, too.
+
+    Raises:
+        ValueError: a stage has not run.
+    """
+    after, cameras = load_result(home, WIPE_FRAMES)
+    fitted = stage_folder(home, "fit") / "gaussians.ply"
+    if not fitted.exists():
+        raise ValueError(f"{fitted} is missing: there are no Gaussians with the object")
+    before, pictures = load_ply(fitted), []
+    for k, camera in enumerate(cameras):
+        zoom = WIPE_WIDTH / camera.width
+        size = {"width": WIPE_WIDTH, "height": round(camera.height * zoom)}
+        wide = replace(camera, **size, **{name: zoom * getattr(camera, name) for name in ("fx", "fy", "cx", "cy")})
+        line = round(WIPE_WIDTH * (0.5 + 0.42 * np.cos(2 * np.pi * k / len(cameras))))
+        picture = _picture(after, wide)
+        picture[:, :line] = _picture(before, wide)[:, :line]
+        picture[:, line - 1 : line + 1] = 255
+        pictures.append(Image.fromarray(picture))
+    path = home / "before_after.webp"
+    rest = {"save_all": True, "append_images": pictures[1:], "duration": WIPE_MILLISECONDS, "loop": 0}
+    pictures[0].save(path, quality=70, method=6, **rest)
+    return path
+
+
+def load_result(home: Path, frames: int) -> tuple[Gaussians, list[Camera]]:
+    """Return the Gaussians of a finished scene, and the cameras of a closed path around it.
+
+    Raises:
+        ValueError: the stage `evaluate` has not run.
+    """
     result = home / "evaluate" / "scene.ply"
     if not result.exists():
         raise ValueError(f"{result} is missing; `make scene={home.name.split('@')[0]} all` makes it")
-    scene = load_scene(home.with_name(home.name.split("@")[0]) / "poses")
-    gaussians = load_ply(result, scene.similarity)
+    scene = load_scene(stage_folder(home, "poses"))
     train = [scene.cameras[name] for name in scene.train]
-    path, cameras = home / "turntable.webm", camera_path.ellipse_path(train, scene.points, frames)
-    save_video(path, (to_uint8(rasterizer.render(gaussians, camera).color.numpy()) for camera in cameras))
-    return path
+    return load_ply(result, scene.similarity), camera_path.ellipse_path(train, scene.points, frames)
+
+
+def _picture(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """Render a picture, uint8 [H, W, 3]."""
+    return to_uint8(rasterizer.render(gaussians, camera).color.numpy())
 
 
 def save_video(path: Path, pictures: Iterable[np.ndarray], rate: int = RATE) -> None:
@@ -67,9 +117,11 @@ def save_video(path: Path, pictures: Iterable[np.ndarray], rate: int = RATE) -> 
 
 
 def main() -> None:
-    arguments = cli.scene_parser("turntable", __doc__).parse_args()
+    parser = cli.scene_parser("turntable", __doc__)
+    parser.add_argument("--before-after", action="store_true", help="an animation (.webp) of before and after instead")
+    arguments = parser.parse_args()
     try:
-        print(make(cli.run_folder(arguments)))
+        print((make_wipe if arguments.before_after else make)(cli.run_folder(arguments)))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 

@@ -336,5 +336,5 @@ def find_scene(text: str, root: Path) -> Path:
     known = sorted(p.name for p in data.glob("[!._]*/")) if data.is_dir() else []
     raise Refused(
         f"unknown scene {text!r}: there is no folder data/{text}, nor one or a video at that path; "
-        f"known: {', '.join(known) or 'none'} (`make demo` makes one, in a checkout)"
+        f"known: {', '.join(known) or 'none'} (`reffusion demo` makes data/demo)"
     )

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from scenes import wall_scene
 from scenes.cameras import make_scene
 
@@ -71,3 +72,12 @@ def test_the_video_shows_the_result_of_a_variant_in_the_scenes_poses(tmp_path):
     first = camera_path.ellipse_path(list(train.values()), points, 6)[0]
     rendering = turntable.rasterizer.render(wall, first).color
     assert (torch.from_numpy(frames[0][..., ::-1].copy()) / 255 - rendering).abs().mean() < 0.03, "but for compression"
+    with pytest.raises(ValueError, match=r"fit/gaussians\.ply is missing"):
+        turntable.make_wipe(tmp_path / "x@no_sds")
+    save_ply(tmp_path / "x" / "fit" / "gaussians.ply", gaussians)
+    with Image.open(turntable.make_wipe(tmp_path / "x@no_sds")) as film:
+        assert film.n_frames == turntable.WIPE_FRAMES and film.width == turntable.WIPE_WIDTH
+        for frame, has_object in ((0, True), (film.n_frames // 2, False)):
+            film.seek(frame)
+            red, green, _ = np.moveaxis(np.asarray(film.convert("RGB"), int), -1, 0)
+            assert ((red > 150) & (green < 100)).any() == has_object, "the line starts on the right, which is before"

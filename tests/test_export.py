@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,10 +20,11 @@ from reffusion.io.cameras import save_cameras
 from reffusion.io.compressed import save_compressed
 from reffusion.io.files import BadInput
 from reffusion.io.images import save_image
-from reffusion.io.ply import load_ply, save_ply
+from reffusion.io.ply import load_ply, save_ply, save_splats
 from reffusion.io.scene import save_scene
+from reffusion.io.sog import PACKAGE, save_sog
 from reffusion.io.splats import summarize_splats
-from reffusion.types import Camera, Similarity
+from reffusion.types import Camera, Gaussians, Similarity
 from report import export
 
 FRAME = Similarity(0.31, np.array([1.5, -20.0, 4.0]))
@@ -142,11 +144,88 @@ def test_export_writes_and_lists_all_files(tmp_path):
     save_ply(home / "evaluate" / "scene.ply", replace(random_gaussians(300, 1), antialiased=True), FRAME)
     lines = export.make(home)
     assert "300 Gaussians of degree 1" in lines[0] and "Mip-Splatting" in lines[0]
-    assert "3 pinholes" in lines[2] and "2 undistorted photographs" in lines[2] and len(lines) == 3
+    assert "3 pinholes" in lines[4] and "2 undistorted photographs" in lines[4] and len(lines) == 5
+    assert load_ply(home / "export/scene.spz", FRAME).antialiased and "scene.sog: not written" in lines[3]
     assert (home / "export/scene.ply").read_bytes() == (home / "evaluate/scene.ply").read_bytes()
     (home / "export/cameras/note.txt").write_text("mine")
     export.make(home)
     assert (home / "export/cameras/note.txt").read_text() == "mine"
+
+
+def write_result(home: Path) -> tuple[Gaussians, Camera]:
+    """Write what `export` reads; return its Gaussians and a camera that sees them, in the normalised frame.
+
+    Their harmonics have a size as in captures: .spz stores values in [-1, 1], and .sog clusters them.
+    """
+    scene = random_scene_in_frame()
+    camera = replace(scene.cameras["a"], width=96, height=64, fx=84.0, fy=90.0, cx=48.8, cy=31.2)
+    made = visible_gaussians(camera, 3)
+    made = replace(made, sh=torch.cat([made.sh[:, :1], 0.1 * made.sh[:, 1:]], 1).clamp(-1, 1))
+    save_scene(home / "poses", scene)
+    save_ply(home / "evaluate" / "scene.ply", made, FRAME)
+    return made, camera
+
+
+def check_reading(path: Path, made: Gaussians, camera: Camera, turn=(1, 1, 1)) -> None:
+    """Check positions, sizes, opacities and colours that another library read, and how they render.
+
+    Args:
+        turn: signs of the axes of the frame in which it gives them.
+    """
+    read, signs = load_ply(path, Similarity(FRAME.scale, FRAME.offset * turn)), torch.tensor(turn)
+    nearest = torch.cdist(made.means * signs, read.means).argmin(1)
+    assert sorted(nearest.tolist()) == list(range(300))
+    back = read.map(lambda values: values[nearest])
+    np.testing.assert_allclose(back.means, made.means * signs, atol=1e-3)
+    np.testing.assert_allclose(back.log_scales, made.log_scales, atol=0.05)
+    np.testing.assert_allclose(back.opacity_logits.sigmoid(), made.opacity_logits.sigmoid(), atol=0.01)
+    np.testing.assert_allclose(back.sh[:, 0], made.sh[:, 0], atol=0.05)
+    turned = replace(camera, world_to_camera=camera.world_to_camera @ np.diag([*turn, 1]))
+    seen, true = np.clip(render_color(back, turned), 0, 1), np.clip(render_color(made, camera), 0, 1)
+    assert true.max() > 0.5 and -10 * np.log10(((true - seen) ** 2).mean()) > 35
+
+
+def test_niantics_library_reads_spz(tmp_path):
+    """It gives the frame of the file, in which y points up and z backwards."""
+    pytest.importorskip("gsply")
+    forge, home = pytest.importorskip("gaussforge").GaussForge(), tmp_path / "s"
+    made, camera = write_result(home)
+    export.make(home)
+    read = forge.convert((home / "export/scene.spz").read_bytes(), "spz", "ply")
+    (tmp_path / "up.ply").write_bytes(read["data"])
+    check_reading(tmp_path / "up.ply", made, camera, (1, -1, -1))
+
+
+@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="asks npm; set REFFUSION_SLOW=1")
+def test_other_libraries_read_sog_and_spz(tmp_path):
+    """GaussForge reads the .sog of splat-transform, which reads the .spz of gsply."""
+    pytest.importorskip("gsply")
+    forge, home = pytest.importorskip("gaussforge").GaussForge(), tmp_path / "s"
+    made, camera = write_result(home)
+    try:
+        export.make(home, sog=True)
+    except BadInput as error:
+        pytest.skip(f"no npm, or no network: {error}")
+    read = forge.convert((home / "export/scene.sog").read_bytes(), "sog", "ply")
+    (tmp_path / "sog.ply").write_bytes(read["data"])
+    command = ["npm", "exec", "--yes", f"--package={PACKAGE}", "--", "splat-transform"]
+    spz = home / "export/scene.spz"
+    subprocess.run([*command, str(spz), str(tmp_path / "spz.ply")], check=True, capture_output=True)
+    for name in ("sog.ply", "spz.ply"):
+        check_reading(tmp_path / name, made, camera)
+
+
+def test_without_node_the_message_says_what_writes_sog(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(BadInput, match=r"scene\.sog: .*splat-transform.* needs Node; install Node 18 or later"):
+        save_sog(tmp_path / "scene.sog", tmp_path / "scene.ply")
+
+
+def test_coordinates_too_large_for_spz_are_refused(tmp_path):
+    pytest.importorskip("gsply")
+    far = Similarity(0.5, np.array([5e6, 0.0, 0.0]))
+    with pytest.raises(BadInput, match=r"s\.spz: a \.spz holds coordinates up to 4194304"):
+        save_splats(tmp_path / "s.spz", random_gaussians(20, 0), far)
 
 
 def test_far_away_positions_stay_exact_and_are_reported(tmp_path):

@@ -33,6 +33,9 @@ def wheel_folder(tmp_path_factory) -> Path:
     )  # a build leaves folders in its source folder
     for name in (*FOLDERS, "priors"):
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+    (copy / "data").mkdir()
+    for path in (ROOT / "data").glob("*.py"):
+        shutil.copy(path, copy / "data")
     for name in ("pyproject.toml", "pipeline.yaml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, copy)
     for name in (
@@ -40,7 +43,7 @@ def wheel_folder(tmp_path_factory) -> Path:
         "tests/test_it.py",
         "runs/mine/note.json",
     ):  # files that the wheel must not contain
-        (copy / name).parent.mkdir(parents=True)
+        (copy / name).parent.mkdir(parents=True, exist_ok=True)
         (copy / name).touch()
     subprocess.run([sys.executable, "-c", BUILD, str(out)], cwd=copy, check=True, capture_output=True)
     (wheel,) = out.glob("*.whl")
@@ -59,7 +62,8 @@ def run_command(wheel_folder: Path, folder: Path, *arguments: str) -> subprocess
 def test_all_is_in_one_package(wheel_folder):
     assert sorted(path.suffix or path.name for path in wheel_folder.iterdir()) == [".dist-info", "reffusion"]
     app = wheel_folder / "reffusion" / "app"
-    assert {path.name for path in app.iterdir()} == {"pipeline.yaml", "priors", *FOLDERS[1:]}
+    assert {path.name for path in app.iterdir()} == {"pipeline.yaml", "priors", "data", *FOLDERS[1:]}
+    assert {path.name for path in (app / "data").iterdir()} == {path.name for path in (ROOT / "data").glob("*.py")}
     ours = [path for name in FOLDERS for path in (ROOT / name).rglob("*") if path.suffix in (".py", ".yaml")]
     ours += [path for path in (ROOT / "priors" / "tiny").rglob("*") if path.suffix in (".json", ".safetensors")]
     for path in ours:
@@ -104,10 +108,12 @@ def test_help_lists_every_command_and_version_says_which(wheel_folder, tmp_path)
     )
 
 
-def test_a_demo_scene_needs_a_checkout(wheel_folder, tmp_path):
+def test_the_message_on_an_unknown_scene_names_the_command_that_makes_one(wheel_folder, tmp_path):
     done = run_command(wheel_folder, tmp_path, "run", "--scene", "demo")
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
-    assert "no folder data/demo" in done.stderr and "`make demo` makes one, in a checkout" in done.stderr
+    assert "no folder data/demo" in done.stderr and "`reffusion demo` makes data/demo" in done.stderr
+    listed = run_command(wheel_folder, tmp_path, "demo", "--help")
+    assert listed.returncode == 0 and "--kind" in listed.stdout
 
 
 def test_reports_are_commands_too(wheel_folder, tmp_path):

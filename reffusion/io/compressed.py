@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 PACKED = "packed_position"  # a vertex property by which a compressed .ply is recognised
 SPZ_HEADER, SPZ_MAGIC = struct.Struct("<IIIBBBB"), 0x5053474E
+SPZ_LIMIT = 2.0**22  # coordinates are below: 24 bits, one of them fractional, one the sign
 SPZ_FLAGS = 14  # index of the byte of flags in the header; its lowest bit means antialiased
 # Sign of each spherical harmonic when y and z change sign, in the order of 3DGS (degree 1 is y, z, x).
 TURNED_SH = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
@@ -113,11 +114,13 @@ def save_spz(path: Path, rows: Rows, antialiased: bool = False) -> None:
         antialiased: True if the splats are to be rendered with Mip-Splatting's 2D filter.
 
     Raises:
-        BadInput: gsply is not installed.
+        BadInput: gsply is not installed, or a coordinate is too large for the format.
     """
     gsply = _import_gsply(path)
     turned = _turn_about_x(rows)
     extent = float(np.abs(turned.means).max(initial=1e-6))
+    if extent >= SPZ_LIMIT:
+        raise BadInput(f"{path}: a .spz holds coordinates up to {SPZ_LIMIT:.0f}, here {extent:.0f}; use a .ply")
     plain = lambda array: np.ascontiguousarray(array, np.float32)
     data = gsply.GSData.from_arrays(
         means=plain(turned.means),
