@@ -400,11 +400,11 @@ def plan_record(job: ResolvedJob, decisions: dict[str, Decision], unset: Resolve
 
     Returns:
         "profile": its name; "stages": stage -> {"word": status, "reason", "notes", "folder": relative to runs/, or
-        None}; "params": stage -> all parameters of `unset`.
+        None, "seconds": see `expected_seconds`}; "params": stage -> all parameters of `unset`.
     """
     folder = lambda path: path and os.path.relpath(path, job.runs)
     entry = lambda d: {"word": d.status, "reason": d.reason, "notes": list(d.notes), "folder": folder(d.path)}
-    stages = {stage: entry(decision) for stage, decision in decisions.items()}
+    stages = {stage: entry(d) | {"seconds": expected_seconds(job, stage)} for stage, d in decisions.items()}
     return {"profile": job.profile, "stages": stages, "params": unset.params}
 
 
