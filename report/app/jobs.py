@@ -296,7 +296,7 @@ class Jobs:
 def find_running_stage(home: Path, began: float) -> tuple[str, float]:
     """Return the stage that runs in a scene's folder, and the time at which it began; ("", 0) between stages.
 
-    A stage writes a first line into <stage>.log when it begins, and a result when it is done.
+    A stage opens <stage>.log when it begins, and its last line there is the result.
 
     Args:
         began: time at which the runner began.
@@ -306,11 +306,11 @@ def find_running_stage(home: Path, began: float) -> tuple[str, float]:
         return "", 0.0
     lines = latest.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     try:
+        ended = "seconds" in json.loads(lines[-1][20:])
         since = time.mktime(time.strptime(lines[0][:19], "%Y-%m-%d %H:%M:%S"))
-        ended = len(lines) > 1 and "seconds" in json.loads(lines[-1][20:])
-    except (IndexError, ValueError, TypeError):
-        ended = False
-    return ("", 0.0) if not lines or ended else (latest.stem, since)
+    except (IndexError, ValueError, TypeError):  # nothing is written yet
+        ended, since = False, latest.stat().st_mtime
+    return ("", 0.0) if ended else (latest.stem, since)
 
 
 def _read_clock(text: str) -> float:

@@ -89,20 +89,23 @@ class App:
             raise LookupError("the mask step is not open")
         return step
 
-    def begin_masks(self, scene: OpenScene) -> None:
-        """Open the mask step of a scene whose stages `poses` and `raw_masks` are done, and fit the scene meanwhile.
+    def begin_masks(self, scene: OpenScene) -> bool:
+        """Run the stages up to `fit` in the background, and open the mask step once `raw_masks` is done.
+
+        Returns:
+            True if the mask step is open.
 
         Raises:
-            ValueError: the stages are not done, or clicks do not suit the scene's masks.
+            ValueError: clicks do not suit the scene's masks.
         """
         if scene.mask_step is not None:
-            return
+            return True
         state = self.jobs.state(scene)
         if state["state"] not in ("running", "elsewhere") and not self.jobs.is_finished(scene, "fit"):
             self.jobs.start(scene, "fit", with_clicks=True)
         poses, fit = (scene.home / stage / "receipt.json" for stage in ("poses", "fit"))
         if not (scene.home / "raw_masks" / "receipt.json").is_file():
-            raise LookupError("waits for the poses")
+            return False
 
         def is_fitted() -> bool:
             done = self.jobs.is_finished(scene, "fit")
@@ -121,6 +124,7 @@ class App:
         scene.mask_step = MaskStep(
             session, is_fitting, progress, scene.name, on_save=lambda: self.jobs.renew_plan(scene)
         )
+        return True
 
     def close(self) -> None:
         """End the viewer, and interrupt the jobs that the page started. A killed server leaves the jobs running."""
@@ -240,8 +244,8 @@ def _make_routes(app: App) -> list[Route]:
     ]
 
 
-def _begin_masks(app: App, scene: OpenScene, content: dict[str, Any]) -> None:
-    app.begin_masks(scene)
+def _begin_masks(app: App, scene: OpenScene, content: dict[str, Any]) -> dict[str, Any]:
+    return {"open": app.begin_masks(scene)}
 
 
 def _start(app: App, scene: OpenScene, content: dict[str, Any]) -> None:

@@ -3,6 +3,14 @@ const $ = id => document.getElementById(id);
 const STEPS = {photographs: 'Photographs', object: 'Object', start: 'Start', live: 'Live 3D', result: 'Result', paint: 'Paint', export: 'Export'};
 let scene = '', step = 'photographs', state = null, source = null, shownView = '', shown = {};
 
+// What a stage does, for people who do not know the method.
+const MEANING = {
+  poses: 'finds where the photographs were taken', raw_masks: 'reads the masks', fit: 'builds the scene in 3D, with the object',
+  masks: 'finds all of the object in 3D, and what is known behind it', reference: 'completes one picture of the hole',
+  lift: 'completes every picture (for comparisons only)', initialize: 'removes the object and fills the hole in 3D',
+  personalize: 'adapts the image model to the scene', distill: 'refines the filling by the image model',
+  finish: 'writes the finished scene', evaluate: 'renders and scores the result',
+};
 const at = path => `scenes/${encodeURIComponent(scene)}/${path}`;
 const picture = (kind, view) => at(`pictures/${kind}/${encodeURIComponent(view)}?${state.version}`);
 const isBusy = () => state && ['running', 'elsewhere'].includes(state.job.state);
@@ -236,8 +244,8 @@ function drawObject() {
   const open = !$('mask').hidden, {job, masks, has_poses: ready} = state;
   const ask_ = $('mask').dataset.wanted === scene;
   $('masked').hidden = open || !masks;
+  $('object').classList.toggle('marking', open);
   if (open) {
-    $('object-lead').textContent = 'Click on the object, look through the views below, correct what is wrong, and save. Then start.';
     $('object-progress').replaceChildren();
     $('object-buttons').replaceChildren();
     return;
@@ -276,22 +284,18 @@ async function wantMasks() {
   asked = Date.now();
   $('mask').dataset.wanted = scene;
   try {
-    await ask(at('do/mask'), {});
-    $('mask').src = at('mask/');
-    $('mask').hidden = false;
+    const {open} = await ask(at('do/mask'), {});
+    if (open) {
+      $('mask').src = at('mask/');
+      $('mask').hidden = false;
+    } else if (state.job.state === 'failed') throw new Error(`The cameras were not found: ${state.job.words}`);
+    draw();
   } catch (error) {
-    if (error.status !== 404) {
-      $('mask').dataset.wanted = '';
-      $('object-lead').textContent = error.message;
-      return;
-    }
-    if (state && state.job.state === 'failed') {
-      $('mask').dataset.wanted = '';
-      $('object-lead').textContent = `The cameras were not found: ${state.job.words}`;
-      return;
-    }
+    $('mask').dataset.wanted = '';
+    shown.object = '';
+    draw();
+    $('object-lead').textContent = error.message;
   }
-  draw();
 }
 
 // ------------------------------------------------------------------------------------------------ start
@@ -307,8 +311,8 @@ function drawStart() {
   if (job.share != null) $('bar').value = job.share; else $('bar').removeAttribute('value');
   let lead = '';
   if (job.state === 'elsewhere') lead = `${job.words}.`;
-  else if (running && job.target !== 'all') lead = `Runs up to the stage ${job.target}: ${job.stage || 'planning'}.`;
-  else if (running) lead = job.stage ? `Runs the stage ${job.stage}${job.reason ? `: ${job.reason}` : ''}.` : 'Plans the next stage.';
+  else if (running && job.target !== 'all') lead = `Prepares the step Object, up to the stage ${job.target}: ${job.stage || 'planning'}.`;
+  else if (running) lead = job.stage ? `Runs the stage ${job.stage}, which ${MEANING[job.stage] || 'is needed'}.` : 'Plans the next stage.';
   else if (job.state === 'failed') lead = `The job failed: ${job.words}`;
   else if (plan.busy) lead = 'Looking at what has to run …';
   else if (state.lacks_masks) lead = 'The object is not marked yet: go to the step Object.';
@@ -325,7 +329,9 @@ function drawStart() {
       const done = ['cached', 'provided'].includes(each.word) || job.done.includes(each.name);
       const kind = each.name === job.stage ? 'running' : done ? 'done' : each.word === 'skip' ? 'skip' : each.word === 'missing' ? 'missing' : '';
       const row = make('tr', '', {className: kind});
-      row.append(make('td', each.name), make('td', done ? '' : each.reason), make('td', done || kind === 'skip' ? '' : duration(each.seconds)));
+      const what = make('td', MEANING[each.name] || '');
+      if (!done) what.append(make('small', each.reason));
+      row.append(make('td', each.name), what, make('td', done || kind === 'skip' ? '' : duration(each.seconds)));
       return row;
     }));
   }
