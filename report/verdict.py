@@ -15,7 +15,7 @@ RANKED = re.compile(r"^\d+\. (.+?)  (\d+)%(  \(painted\))?$", re.MULTILINE)  # a
 
 
 def describe_result(job: JobFiles) -> str:
-    """Return the judgement on a job, e.g. "The object is gone; 10 % of what it hid is made up; ...".
+    """Return the judgement on a job, e.g. "... 10 % of what it hid is made up; painting view a would help most.".
 
     The text is empty if the job has no result yet, or if nothing was to be removed.
     """
@@ -33,12 +33,15 @@ def describe_result(job: JobFiles) -> str:
 
 def describe_removal(job: JobFiles) -> str:
     """Return whether the object is gone, by the parts of it that the stage `masks` found and left in the scene."""
-    left = [each for each in _facts(job, "masks").get("remnants", ()) if not each["removed"]]
+    remnants = _facts(job, "masks").get("remnants")
+    if remnants is None or not job.receipts["masks"]["params"].get("remnants"):
+        return "The object is removed, as far as the masks show it"
+    left = [each for each in remnants if not each["removed"]]
     if not left:
-        return "The object is gone"
+        return "The object is removed, and no part of it was found left"
     largest = max(left, key=lambda each: each["share"])
     parts = "a part" if len(left) == 1 else f"{len(left)} parts"
-    return f"Most of the object is gone, but {parts} may be left (best seen in {largest['view']}; correct the masks)"
+    return f"Most of the object is removed, but {parts} may be left (best seen in {largest['view']}; correct the masks)"
 
 
 def made_up_share(job: JobFiles) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import socket
 import subprocess
 import sys
@@ -19,7 +20,7 @@ FILES = {
     "evaluate/scene.ply": "the scene as Gaussians (.ply), for any 3DGS viewer",
     "export/scene.compressed.ply": "the same, compressed (PlayCanvas, SuperSplat)",
     "export/scene.spz": "the same as .spz (Niantic)",
-    "export/cameras.zip": "cameras: COLMAP model and transforms.json",
+    "export/cameras.zip": "cameras (COLMAP model, transforms.json) and undistorted photographs",
     "turntable.webm": "video around the scene",
     "report.html": "report on the job, one page",
 }
@@ -62,7 +63,7 @@ class Viewer:
                     text=True,
                 )
                 self.scene, self.follows = scene.name, follow
-            for _ in range(600):  # importing takes seconds
+            for _ in range(1800):  # importing and loading take seconds, on a busy machine minutes
                 if self.process.poll() is not None:
                     lines = self.process.stderr.read().strip().splitlines()
                     raise ValueError(lines[-1].removeprefix("error: ") if lines else "the viewer ended")
@@ -98,6 +99,7 @@ class Export:
             threading.Thread(target=self._run, args=(scene,), daemon=True).start()
 
     def _run(self, scene: OpenScene) -> None:
+        cameras = scene.home / "export" / "cameras"
         try:
             for command in EXPORTS:
                 self.busy = command
@@ -106,13 +108,15 @@ class Export:
                 if done.returncode:
                     lines = done.stderr.strip().splitlines() or [f"`{command}` failed"]
                     self.error = lines[-1].removeprefix("error: ")
+            if cameras.is_dir():
+                shutil.make_archive(str(cameras), "zip", cameras)
         finally:
             self.busy = ""
 
 
 def list_exports(scene: OpenScene) -> dict[str, dict[str, object]]:
     """Return the files to download, as name -> {"words", "bytes"}; files older than the result are left out."""
-    found = {}
+    found: dict[str, dict[str, object]] = {}
     for name, words in FILES.items():
         path = scene.home / name
         if path.is_file() and path.stat().st_mtime >= _result_time(scene):

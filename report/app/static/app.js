@@ -308,7 +308,7 @@ function drawStart() {
   $('run').textContent = job.state === 'stopped' || job.state === 'failed' ? 'Go on' : 'Start';
   $('halt').hidden = !running;
   $('bar').hidden = !isBusy();
-  if (job.share != null) $('bar').value = job.share; else $('bar').removeAttribute('value');
+  if (job.left != null && plan.seconds) $('bar').value = Math.max(0, 1 - job.left / plan.seconds); else $('bar').removeAttribute('value');
   let lead = '';
   if (job.state === 'elsewhere') lead = `${job.words}.`;
   else if (running && job.target !== 'all') lead = `Prepares the step Object, up to the stage ${job.target}: ${job.stage || 'planning'}.`;
