@@ -111,7 +111,8 @@ def test_other_pages_and_machines_are_refused(page, scene):
 @pytest.mark.parametrize("path", [
     "/../../etc/passwd", "/app.css/../server.py", "/%2e%2e/server.py", "/static/index.html",
     "/scenes/scene/pictures/photo/..%2f..%2fsecret", "/scenes/scene/pictures/photo/%2fetc%2fpasswd",
-    "/scenes/scene/pictures/secret/v00", "/scenes/scene/export/..%2f..%2fsecret.png", "/scenes/scene/export/receipt.json",
+    "/scenes/scene/pictures/secret/v00", "/scenes/scene/export/..%2f..%2fsecret.png",
+    "/scenes/scene/export/receipt.json",
     "/scenes/scene/paint/..%2f..%2fsecret", "/scenes/..%2fscene/state", "/scenes/none/state", "/scenes/none/events",
     "/scenes/scene/mask/", "/scenes/scene/mask/photo/v00",
 ])  # fmt: skip

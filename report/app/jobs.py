@@ -240,8 +240,8 @@ class Jobs:
         share = left = None
         if stage:
             elapsed, whole = time.time() - since, expected.get(stage)
-            share = min(0.98, elapsed / whole) if whole else None
-            left = max(0.0, whole - elapsed) if whole else None
+            if whole and elapsed < whole:  # else it takes longer than expected, and nobody knows how long
+                share, left = elapsed / whole, whole - elapsed
             bars = [bar for line in lines[-3:] for bar in BAR.findall(line) if bar[0] == stage and int(bar[2])]
             if bars:
                 share, left = int(bars[-1][1]) / int(bars[-1][2]), _read_clock(bars[-1][3])
@@ -252,12 +252,15 @@ class Jobs:
     def expected_seconds(self, scene: OpenScene) -> dict[str, float]:
         """Return stage -> expected seconds, for the stages that the plan would run.
 
-        They are the seconds of the scene's last run. A stage that never ran is estimated from the number of
-        photographs, roughly.
+        They are the seconds of the scene's last run. A stage that never ran is estimated roughly: from the number of
+        photographs, and from how long other stages of the scene took on this machine.
         """
         plan = self.plan(scene)
-        count = len(scene.pictures())
-        rough = {stage: share * SECONDS_PER_PHOTOGRAPH * count for stage, share in SHARES.items()}
+        known = {stage: entry["seconds"] for stage, entry in plan.stages.items() if entry.get("seconds")}
+        typical = {stage: share * SECONDS_PER_PHOTOGRAPH * len(scene.pictures()) for stage, share in SHARES.items()}
+        usual = sum(typical.get(stage, 0.0) for stage in known)
+        pace = sum(known.values()) / usual if usual else 1.0
+        rough = {stage: pace * seconds for stage, seconds in typical.items()}
         due = {stage: entry for stage, entry in plan.stages.items() if entry["word"] not in FINAL}
         return {stage: entry.get("seconds") or rough.get(stage, 0.0) for stage, entry in due.items()}
 

@@ -55,7 +55,7 @@ def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, An
         "has_state": any((scene.home / stage / "receipt.json").is_file() for stage in ("fit", "initialize")),
         "result": describe_result(scene) if finished else None,
         "to_paint": painting.list_views(scene, _load_job(scene.home, _version(scene.home))) if finished else [],
-        "export": {"busy": export.busy, "error": export.error, "files": tasks.list_exports(scene)},
+        "export": {"busy": export.busy, "error": export.error, "files": tasks.list_exports(scene, export.busy)},
     }
 
 

@@ -114,10 +114,14 @@ class Export:
             self.busy = ""
 
 
-def list_exports(scene: OpenScene) -> dict[str, dict[str, object]]:
-    """Return the files to download, as name -> {"words", "bytes"}; files older than the result are left out."""
+def list_exports(scene: OpenScene, busy: str = "") -> dict[str, dict[str, object]]:
+    """Return the files to download, as name -> {"words", "bytes"}; files older than the result are left out.
+
+    Args:
+        busy: command that is writing files now; only the result itself is then returned.
+    """
     found: dict[str, dict[str, object]] = {}
-    for name, words in FILES.items():
+    for name, words in FILES.items() if not busy else [next(iter(FILES.items()))]:
         path = scene.home / name
         if path.is_file() and path.stat().st_mtime >= _result_time(scene):
             found[path.name] = {"words": words, "bytes": path.stat().st_size}
