@@ -1,6 +1,7 @@
 ## make scene=demo all            the whole job; a second call finds everything cached
 ## make scene=X STAGE             one stage and what it needs: the stages of pipeline.yaml
 ## make scene=X plan              what would run, why, and how long; gpu=rtx-4090: on that GPU
+## make app [scene=X]             one page from photographs to the finished scene, in a browser; port=8090
 ## make scene=X mask              make masks from clicks, in a browser; port=8090
 ## make scene=X check             look for problems of photographs, masks and poses; draw each mask over its photograph
 ## make scene=X compare           the full method, ablations and baselines: runs/X/compare.html
@@ -73,7 +74,7 @@ where := scene variant runs
 options := $(where) profile budget set trust keep
 cluster := engine address cores
 
-.PHONY: help setup named ready all $(STAGES) plan check compare report study mask view turntable patch export verify \
+.PHONY: help setup named ready all $(STAGES) plan check compare report study app mask view turntable patch export verify \
 	clean gc spinnerf batch weights demo prior prior-report sds-variance adapted sparse test test-fast fuzz bench stability gpu \
 	gpu-check lint docs
 .DELETE_ON_ERROR:
@@ -165,6 +166,9 @@ report: $(if $(scene),ready,setup)
 
 study: setup
 	@$(RUN) study $(these) $(call flags,runs variants seed)
+
+app: $(if $(scene),ready,setup $(VENV)/.lpips) $(VENV)/.ready-view $(VENV)/.ready-export
+	@$(RUN) app $(call flags,scene runs port)
 
 mask: ready
 	@$(RUN) mask $(call flags,$(where) profile budget set port)

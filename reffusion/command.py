@@ -14,6 +14,7 @@ COMMANDS = {
     "demo": ("generate", "make the demo scene, data/demo (demo --help: others)"),
     "plan": ("runner", "what would run, and why"),
     "run": ("runner", "run the whole job (run all), or one stage and what it needs"),
+    "app": ("report.app", "one page from photographs to the finished scene, in a browser"),
     "mask": ("report.mask", "make masks from clicks, in a browser"),
     "check": ("report.check", "look for problems of photographs, masks and poses; draw each mask over its photograph"),
     "report": ("report.job", "a page on a job: stages, results, errors against time"),

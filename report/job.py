@@ -25,6 +25,7 @@ from report import (
     page,
     scenes_page,
     trace_charts,
+    verdict,
 )
 from report.job_data import JobFiles, load_job
 
@@ -67,6 +68,7 @@ def make(home: Path) -> Path:
     done = f"{page.format_duration(seconds)} in {len(job.receipts)} stages"
     parts = [
         page.heading(title, 1),
+        *([page.paragraph(sentence)] if (sentence := verdict.describe_result(job)) else []),
         page.paragraph(f"{done}. {summarize_result(job)}"),
         *unfinished_note(job),
         *capture_notes(job),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -59,17 +58,15 @@ def make_wipe(home: Path) -> Path:
         raise ValueError(f"{fitted} is missing: there are no Gaussians with the object")
     before, pictures = load_ply(fitted), []
     for k, camera in enumerate(cameras):
-        zoom = WIPE_WIDTH / camera.width
-        size = {"width": WIPE_WIDTH, "height": round(camera.height * zoom)}
-        wide = replace(camera, **size, **{name: zoom * getattr(camera, name) for name in ("fx", "fy", "cx", "cy")})
+        wide = camera.resized(WIPE_WIDTH, round(WIPE_WIDTH * camera.height / camera.width))
         line = round(WIPE_WIDTH * (0.5 + 0.42 * np.cos(2 * np.pi * k / len(cameras))))
         picture = _picture(after, wide)
         picture[:, :line] = _picture(before, wide)[:, :line]
         picture[:, line - 1 : line + 1] = 255
         pictures.append(Image.fromarray(picture))
     path = home / "before_after.webp"
-    rest = {"save_all": True, "append_images": pictures[1:], "duration": WIPE_MILLISECONDS, "loop": 0}
-    pictures[0].save(path, quality=70, method=6, **rest)
+    rest = pictures[1:]
+    pictures[0].save(path, save_all=True, append_images=rest, loop=0, duration=WIPE_MILLISECONDS, quality=70, method=6)
     return path
 
 

@@ -8,6 +8,7 @@ have full size. A *visitor* is a browser window connected to the viewer.
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -81,8 +82,55 @@ def vertical_fov(camera: Camera) -> float:
     return float(2 * np.arctan(camera.height / (2 * camera.fy)))
 
 
+class Visitors:
+    """The visitors of a viewer, each with a thread that renders the visitor's latest camera.
+
+    Args:
+        server: the viser server.
+        render: returns the picture, uint8 [H, W, 3], of a camera and of the visitor's camera in viser.
+    """
+
+    def __init__(self, server: Any, render: Callable[[Camera, Any], np.ndarray]):
+        self.server, self.render, self.open = server, render, True
+        self.requests: dict[int, threading.Event] = {}
+        server.on_client_connect(self.serve)
+        server.on_client_disconnect(lambda client: self._request_picture(client.client_id))
+
+    def serve(self, client: Any) -> None:
+        self.requests[client.client_id] = threading.Event()
+        threading.Thread(target=self._render_loop, args=(client,), daemon=True).start()
+        client.camera.on_update(lambda _: self._request_picture(client.client_id))
+        self._request_picture(client.client_id)
+
+    def refresh(self) -> None:
+        """Render every visitor's picture anew."""
+        for visitor in list(self.requests):
+            self._request_picture(visitor)
+
+    def _request_picture(self, visitor: int) -> None:
+        if visitor in self.requests:
+            self.requests[visitor].set()
+
+    def _render_loop(self, client: Any) -> None:
+        """Render pictures for one visitor until the visitor leaves.
+
+        Each request is answered by a small picture at once. A picture of full size follows unless another request has
+        arrived.
+        """
+        request = self.requests[client.client_id]
+        while self.open and client.client_id in self.server.get_clients():
+            request.wait(1.0)
+            for height in (MOVING, STILL) if request.is_set() else ():
+                request.clear()
+                picture = self.render(visitor_camera(client.camera, height), client.camera)
+                client.scene.set_background_image(picture, format="jpeg", jpeg_quality=90)
+                if request.is_set():
+                    break
+        self.requests.pop(client.client_id, None)
+
+
 class Viewer:
-    """Viewer of one scene: a web server, and a thread per visitor that renders the visitor's latest camera.
+    """Viewer of one scene: a web server that renders the latest camera of each visitor.
 
     The server listens on the loopback interface only, and runs in the background from the construction of the viewer
     until `close`.
@@ -107,13 +155,10 @@ class Viewer:
         self.layers = load_layers(home, scene.similarity)
         self.seen_by = unseen_overlay.load_seen_views(home, scene)
         self.gaussians, self.marks_unseen = next(reversed(self.layers.states.values()))[0], True
-        self.requests: dict[int, threading.Event] = {}
-        self.open = True
         self.server = viser.ViserServer(host="127.0.0.1", port=port, label=home.name, verbose=False)
+        self.visitors = Visitors(self.server, self._render_for)
         self._add_controls()
         self._add_cameras(home, scene)
-        self.server.on_client_connect(self._serve_visitor)
-        self.server.on_client_disconnect(lambda client: self._request_picture(client.client_id))
 
     def _add_controls(self) -> None:
         """Add controls that select the state (from initialization to result) and the layers of Gaussians to show."""
@@ -133,8 +178,7 @@ class Viewer:
             state.content = title if last else ""
             self.gaussians = self.layers.select(title, kept.value, added.value, removed.value)
             self.marks_unseen = note.value and not removed.value and bool(self.seen_by)
-            for visitor in list(self.requests):
-                self._request_picture(visitor)
+            self.visitors.refresh()
 
         for choice in (slider, kept, added, removed, note):
             choice.on_update(changed)
@@ -177,33 +221,6 @@ class Viewer:
         frustum.on_click(lambda event: move_to_view(event.client.camera, camera, target))
         return frustum
 
-    def _serve_visitor(self, client: Any) -> None:
-        self.requests[client.client_id] = threading.Event()
-        threading.Thread(target=self._render_loop, args=(client,), daemon=True).start()
-        client.camera.on_update(lambda _: self._request_picture(client.client_id))
-        self._request_picture(client.client_id)
-
-    def _request_picture(self, visitor: int) -> None:
-        if visitor in self.requests:
-            self.requests[visitor].set()
-
-    def _render_loop(self, client: Any) -> None:
-        """Render pictures for one visitor until the visitor leaves.
-
-        Each request is answered by a small picture at once. A picture of full size follows unless another request has
-        arrived.
-        """
-        request = self.requests[client.client_id]
-        while self.open and client.client_id in self.server.get_clients():
-            request.wait(1.0)
-            for height in (MOVING, STILL) if request.is_set() else ():
-                request.clear()
-                picture = self._render_for(visitor_camera(client.camera, height), client.camera)
-                client.scene.set_background_image(picture, format="jpeg", jpeg_quality=90)
-                if request.is_set():
-                    break
-        self.requests.pop(client.client_id, None)
-
     def _render_for(self, camera: Camera, place: Any) -> np.ndarray:
         """Render a visitor's picture, uint8 [H, W, 3].
 
@@ -222,7 +239,7 @@ class Viewer:
         return picture
 
     def close(self) -> None:
-        self.open = False
+        self.visitors.open = False
         self.server.stop()
 
 

@@ -16,8 +16,8 @@ from runner.execute import Execution, run_scene
 from runner.files import write_json
 from runner.garbage import collect_garbage
 from runner.maintenance import clean, verify
-from runner.plan import plan, plan_record
-from runner.plan_table import plan_table
+from runner.plan import plan
+from runner.plan_table import plan_record, plan_table
 from runner.resolve import Request, resolve
 from runner.results import call_report, show_results
 from runner.text import display_path, format_error

@@ -132,6 +132,24 @@ def _lock(lock: int, name: str, mode: int, wait: bool) -> None:
         raise Refused(f"no locks where results go ({error.strerror}): runs=FOLDER puts them on another disk") from None
 
 
+def lock_holder(runs: Path, name: str) -> tuple[str, str] | None:
+    """Return the process id and the machine that hold the lock `runs/.locks/<name>`; None if nobody holds it.
+
+    Shared holders are not seen, because they do not write into the lock's file.
+    """
+    try:
+        with open(runs / ".locks" / name) as file:
+            holder = _holder(file.fileno())
+            if not holder[0]:
+                return None
+            fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)  # succeeds if the holder was killed
+            return None
+    except BlockingIOError:
+        return holder
+    except OSError:
+        return None
+
+
 def _holder(lock: int) -> tuple[str, str]:
     """Read the process id and the machine that the last holder of a lock wrote into its file.
 

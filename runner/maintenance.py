@@ -26,9 +26,10 @@ PAGES = (*(f"compare.{kind}" for kind in ("json", "csv", "md", "html")), "compar
          "sds-variance/sds_variance.json", "report.html", "report/index.html", "report/*.png",
          "frames/frames.json", "frames/frames.csv", "frames/images/frame_*.jpg",
          "patch/patched.ply", "patch/new.ply",
-         "export/scene.ply", "export/scene.compressed.ply", "export/lora/pytorch_lora_weights.safetensors",
+         "export/scene.ply", "export/scene.compressed.ply", "export/scene.spz", "export/scene.sog",
+         "export/lora/pytorch_lora_weights.safetensors",
          "export/cameras/transforms.json", "export/cameras/sparse_pc.ply", "export/cameras/sparse/0/*.bin",
-         "export/cameras/images/*.png", "**/.*.writing")  # fmt: skip
+         "export/cameras/images/*.png", "export/cameras.zip", "**/.*.writing")  # fmt: skip
 # Folders that a killed runner may leave.
 TEMPORARY = (".partial-*", ".copying-*", ".gone-*")
 

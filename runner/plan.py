@@ -4,7 +4,6 @@ Terms are explained in `runner`. This module imports nothing heavy.
 """
 
 import json
-import os
 import string
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -350,21 +349,3 @@ def _apply_answer(job: ResolvedJob, question: dict[str, Any], decision: Decision
     if "refusal" in answer and (decision.inputs or SCENE in question["takes"]):  # the needs are final
         decision = replace(decision, status="missing", reason=answer["refusal"])
     return replace(decision, notes=notes, needed=needed)
-
-
-def plan_record(job: ResolvedJob, decisions: dict[str, Decision], unset: ResolvedJob) -> dict[str, Any]:
-    """Return the content of plan.json, which the report reads.
-
-    Args:
-        job: the job.
-        decisions: the plan, stage -> decision.
-        unset: the same job without `set=` and `budget=`, whose parameters are recorded.
-
-    Returns:
-        "profile": its name; "stages": stage -> {"word": status, "reason", "notes", "folder": relative to runs/, or
-        None}; "params": stage -> all parameters of `unset`.
-    """
-    folder = lambda path: path and os.path.relpath(path, job.runs)
-    entry = lambda d: {"word": d.status, "reason": d.reason, "notes": list(d.notes), "folder": folder(d.path)}
-    stages = {stage: entry(decision) for stage, decision in decisions.items()}
-    return {"profile": job.profile, "stages": stages, "params": unset.params}

@@ -1,7 +1,9 @@
-"""A plan as text: what the command `plan` prints, and `run` before it starts."""
+"""A plan for readers: the text that `plan` prints, and `run` before it starts, and the record for pages."""
 
+import os
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 from runner.durations import expected_seconds, is_timed, total_time
 from runner.keys import files_outside, paths_outside
@@ -52,3 +54,21 @@ def _paths_outside_scene(job: ResolvedJob, stages: list[str]) -> list[Path]:
         for path in paths_outside(job.params[stage], job.folder)
     ]
     return sorted({*reads, *named})
+
+
+def plan_record(job: ResolvedJob, decisions: dict[str, Decision], unset: ResolvedJob) -> dict[str, Any]:
+    """Return the content of plan.json, which the report reads.
+
+    Args:
+        job: the job.
+        decisions: the plan, stage -> decision.
+        unset: the same job without `set=` and `budget=`, whose parameters are recorded.
+
+    Returns:
+        "profile": its name; "stages": stage -> {"word": status, "reason", "notes", "folder": relative to runs/, or
+        None, "seconds": see `expected_seconds`}; "params": stage -> all parameters of `unset`.
+    """
+    folder = lambda path: path and os.path.relpath(path, job.runs)
+    entry = lambda d: {"word": d.status, "reason": d.reason, "notes": list(d.notes), "folder": folder(d.path)}
+    stages = {stage: entry(d) | {"seconds": expected_seconds(job, stage)} for stage, d in decisions.items()}
+    return {"profile": job.profile, "stages": stages, "params": unset.params}

@@ -178,17 +178,17 @@ def test_command_imports_only_the_standard_library():
 def test_report_reads_through_io(path):
     own = {name for name in imports(path) if name.split(".")[0] in OWN - {"report"}}
     draws = ("camera_path", "turntable", "view", "job_pictures", "gaussian_layers", "unseen_overlay", "study")
-    drawing = (
-        ("reffusion.splat.rasterizer", "reffusion.types", "reffusion.background.training_coverage")
-        if path.stem in draws
-        else ()
-    )
+    drawing_names = ("reffusion.splat.rasterizer", "reffusion.types", "reffusion.background.training_coverage")
+    drawing = drawing_names if path.stem in draws else ()
     places = ("reffusion.command",) if path.stem == "cli" else ()  # for the path of the folder of scenes
     clicked = ("reffusion.clicks", "reffusion.capture", "reffusion.params", "reffusion.command", "reffusion.types")
-    making = clicked if path.stem in ("mask", "mask_session") else ()  # to make masks
+    making = clicked if path.stem == "mask_session" else ()  # to make masks
+    page = ("reffusion.command", "reffusion.capture.load", "reffusion.clicks.local_segmenter", "runner.files")
+    # The page runs the runner, shows captures before any stage has run, and renders views.
+    app = (*page, *drawing_names, "reffusion.fit.exposure") if path.parent.name == "app" else ()
     # For the random order of pairs, and for confidence intervals.
     chance = ("reffusion.seeding",) if path.stem in ("study", "votes") else ()
-    assert all(name.startswith(("reffusion.io", *chance, *drawing, *making, *places)) for name in own), own
+    assert all(name.startswith(("reffusion.io", *chance, *drawing, *making, *places, *app)) for name in own), own
 
 
 @pytest.mark.parametrize("path", sources("reffusion"), ids=relative_path)

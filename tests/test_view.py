@@ -139,7 +139,7 @@ def test_a_visitor_gets_a_small_picture_at_once_then_the_whole_and_another_when_
         client_id=7, camera=camera, scene=SimpleNamespace(set_background_image=lambda image, **_: images.append(image))
     )
     monkeypatch.setattr(viewer.server, "get_clients", lambda: {7: guest})
-    viewer._serve_visitor(guest)
+    viewer.visitors.serve(guest)
     wait_until(lambda: len(images) == 2)
     assert [image.shape[0] for image in images] == [view.MOVING, view.STILL]
     assert np.array_equal(images[-1], viewer._render_for(view.visitor_camera(camera, view.STILL), camera))
@@ -148,7 +148,7 @@ def test_a_visitor_gets_a_small_picture_at_once_then_the_whole_and_another_when_
     wait_until(lambda: len(images) == 4)
     assert images[-1].mean() < images[1].mean(), "the wall is gone"
     monkeypatch.setattr(viewer.server, "get_clients", dict)
-    wait_until(lambda: 7 not in viewer.requests)
+    wait_until(lambda: 7 not in viewer.visitors.requests)
 
 
 @pytest.mark.parametrize("width", [1280, 390])

@@ -1,0 +1,28 @@
+"""One page from photographs to the finished scene: `reffusion app` (`make app`)."""
+
+from __future__ import annotations
+
+from urllib.parse import quote
+
+from report import cli
+from report.app.routes import App
+from report.app.server import PORT, Server, announce
+
+
+def main() -> None:
+    parser = cli.scene_parser("app", __doc__, needs_scene=False)
+    parser.add_argument("--port", type=int, default=PORT, help="if it is in use, the next free one is taken")
+    arguments = parser.parse_args()
+    app = App(arguments.runs.resolve())
+    try:
+        if arguments.scene:
+            app.first = app.open(str(arguments.scene)).name
+        server = Server(app, arguments.port)
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+    announce(server, server.address + (f"#{quote(app.first)}/photographs" if app.first else ""))
+    server.serve()
+
+
+if __name__ == "__main__":
+    main()

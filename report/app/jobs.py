@@ -1,0 +1,308 @@
+"""The runner as a process of its own: plans, start, stop, and the progress of a job whoever started it.
+
+A job that the page starts goes on when the page or its server ends, and a job that a terminal started is shown. The
+files are runs/.app/<scene>.json (process and target) and runs/.app/<scene>.log (what the runner prints).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from reffusion.command import root
+from reffusion.io.arrays import load_json, save_json
+from report.app.scenes import OpenScene
+from runner.files import MACHINE, lock_holder
+
+RECORDS = ".app"  # folder in runs/
+TAIL_BYTES, TAIL_LINES = 20_000, 40
+# A progress bar: its label, steps done, all steps, and the time left.
+BAR = re.compile(r"(\w+):\s+\d+%\|[^|]*\|\s*(\d+)/(\d+) \[[^<\]]*<([\d:]+)")
+FINAL = ("cached", "provided", "skip")  # words of a plan for stages that will not run
+WITHOUT_MASKS = "poses.clicks={}"  # announces masks by clicks, so that stages accept a scene without masks
+
+
+def make_command(*words: str) -> list[str]:
+    """Return the command line of `reffusion` with these arguments."""
+    return [sys.executable, "-m", "reffusion.command", *words]
+
+
+def make_environment() -> dict[str, str]:
+    """Return the environment of the processes that the page starts: they import this project, wherever they run."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(root()), os.environ.get("PYTHONPATH", "")]))}
+
+
+@dataclass
+class Plan:
+    """The runner's plan for a scene, as last computed.
+
+    Attributes:
+        stages: stage -> entry of plan.json.
+        profile: name of the profile.
+        lacks_masks: True if the scene needs masks before the whole job can run.
+        error: why there is no plan; "" if there is one.
+        busy: True while it is being computed.
+    """
+
+    stages: dict[str, dict[str, Any]] = field(default_factory=dict)
+    profile: str = ""
+    lacks_masks: bool = False
+    error: str = ""
+    busy: bool = False
+
+
+class Jobs:
+    """Plans and jobs of all open scenes.
+
+    Args:
+        runs: folder of all results.
+        options: further arguments of the runner, such as --profile.
+    """
+
+    def __init__(self, runs: Path, options: tuple[str, ...] = ()):
+        self.runs, self.options = runs, options
+        self.plans: dict[str, Plan] = {}
+        self.started: dict[str, subprocess.Popen] = {}
+        self.lock = threading.Lock()
+
+    # ------------------------------------------------------------------------------------------------ plans
+
+    def plan(self, scene: OpenScene) -> Plan:
+        """Return the latest plan of a scene; without one, it is computed in the background."""
+        if scene.name not in self.plans:
+            self.renew_plan(scene)
+        return self.plans[scene.name]
+
+    def renew_plan(self, scene: OpenScene) -> None:
+        """Compute the plan of a scene in the background."""
+        with self.lock:
+            plan = self.plans.setdefault(scene.name, Plan())
+            if plan.busy:
+                return
+            plan.busy = True
+        threading.Thread(target=self._compute_plan, args=(scene, plan), daemon=True).start()
+
+    def _compute_plan(self, scene: OpenScene, plan: Plan) -> None:
+        try:
+            lacks_masks, error = False, self._record_plan(scene)
+            stages = self._read_plan(scene)
+            if not error and any(stages[stage]["word"] == "missing" for stage in ("poses", "raw_masks")):
+                if not self._record_plan(scene, "--set", WITHOUT_MASKS):
+                    again = self._read_plan(scene)
+                    lacks_masks = again["poses"]["word"] != "missing"
+                    stages = again if lacks_masks else stages
+            plan.lacks_masks, plan.error, plan.stages = lacks_masks, error, stages
+            wrong = [entry["reason"] for entry in stages.values() if entry["word"] == "missing"]
+            if not error and wrong:
+                plan.error = wrong[0]
+        finally:
+            plan.busy = False
+
+    def _record_plan(self, scene: OpenScene, *more: str) -> str:
+        """Let the runner write plan.json; return its error, or ""."""
+        words = ("plan", "--record", *self._words(scene), *more)
+        done = subprocess.run(make_command(*words), env=make_environment(), capture_output=True, text=True)
+        lines = done.stderr.strip().splitlines() or [f"the plan ended with code {done.returncode}"]
+        return lines[-1].removeprefix("error: ") if done.returncode else ""
+
+    def _read_plan(self, scene: OpenScene) -> dict[str, dict[str, Any]]:
+        path = scene.home / "plan.json"
+        return load_json(path)["stages"] if path.is_file() else {}
+
+    def _words(self, scene: OpenScene) -> tuple[str, ...]:
+        return ("--scene", str(scene.source), "--runs", str(self.runs), *self.options)
+
+    # ------------------------------------------------------------------------------------------------ jobs
+
+    def start(self, scene: OpenScene, target: str, with_clicks: bool = False) -> None:
+        """Start the runner in the background.
+
+        Args:
+            target: a stage, or "all".
+            with_clicks: True if the scene has no masks yet, and gets them by clicks.
+
+        Raises:
+            ValueError: somebody else's runner holds the scene.
+        """
+        with self.lock:
+            state = self.state(scene)
+            if state["state"] in ("running", "elsewhere"):
+                raise ValueError(state["words"])
+            more = ("--set", WITHOUT_MASKS) if with_clicks else ()
+            log = self._log(scene)
+            log.parent.mkdir(parents=True, exist_ok=True)
+            with open(log, "w") as output:
+                process = subprocess.Popen(
+                    make_command("run", target, *self._words(scene), *more),
+                    env=make_environment() | {"PYTHONUNBUFFERED": "1"},
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=subprocess.STDOUT,
+                    start_new_session=True,  # it goes on when the server ends
+                )
+            self.started[scene.name] = process
+            save_json(self._record(scene), {"process": process.pid, "target": target, "since": time.time()})
+        threading.Thread(target=self._await, args=(scene, process), daemon=True).start()
+
+    def _await(self, scene: OpenScene, process: subprocess.Popen) -> None:
+        process.wait()
+        self.renew_plan(scene)
+
+    def stop(self, scene: OpenScene) -> None:
+        """Interrupt the job that the page started; the next start goes on from its last checkpoint.
+
+        Raises:
+            ValueError: there is no such job, or somebody else's runner holds the scene.
+        """
+        process, holder = self.started.get(scene.name), lock_holder(self.runs, scene.name)
+        if process is not None and process.poll() is None:
+            process.terminate()
+        elif holder and holder == (str(self._read_record(scene).get("process")), MACHINE):
+            os.kill(int(holder[0]), signal.SIGTERM)
+        else:
+            raise ValueError(self.state(scene)["words"] or "nothing runs")
+
+    def stop_all(self) -> list[str]:
+        """Interrupt all jobs that this server started and wait for their ends; return the names of their scenes."""
+        running = {name: process for name, process in self.started.items() if process.poll() is None}
+        for process in running.values():
+            process.terminate()
+        for process in running.values():
+            process.wait()
+        return list(running)
+
+    def is_finished(self, scene: OpenScene, target: str) -> bool:
+        """Return whether the last job of the page was for this target and succeeded."""
+        process, record = self.started.get(scene.name), self._read_record(scene)
+        return process is not None and process.poll() == 0 and record.get("target") in (target, "all")
+
+    def state(self, scene: OpenScene) -> dict[str, Any]:
+        """Return what runs, as plain JSON values.
+
+        Returns:
+            "state": idle, running (started by the page), elsewhere (by somebody else), failed, stopped or finished;
+            "words": one sentence on it; "target": what was asked for; "stage": the current stage, its "reason" and
+            "share" done in [0, 1]; "left": expected seconds to the end of the job; "done": stages that this job has
+            done; "log": last lines of the output.
+        """
+        record, holder, process = self._read_record(scene), lock_holder(self.runs, scene.name), None
+        process = self.started.get(scene.name)
+        alive = process is not None and process.poll() is None
+        mine = alive or (holder is not None and holder == (str(record.get("process")), MACHINE))
+        lines = self._tail(scene) if record else []
+        target = record.get("target", "all")
+        found = {"state": "idle", "words": "", "target": target, "stage": "", "reason": "", "done": []}
+        found |= {"share": None, "left": None}
+        if mine or holder:
+            found |= self._progress(scene, target, lines if mine else [])
+            found["state"] = "running" if mine else "elsewhere"
+            if not mine:
+                who = f"process {holder[0]}" + (f" on {holder[1]}" if holder[1] != MACHINE else "")
+                stage = f": stage {found['stage']}" if found["stage"] else ""
+                share = f", {found['share']:.0%}" if found["share"] is not None else ""
+                found["words"] = f"a terminal run ({who}) holds this scene{stage}{share}; stop it there, or wait"
+        elif record:
+            end = next((line for line in reversed(lines) if line.startswith(("error:", "stopped;"))), "")
+            code = process.poll() if process is not None else None
+            if end.startswith("error:"):
+                found |= {"state": "failed", "words": end.removeprefix("error: ")}
+            elif end or code:
+                found |= {"state": "stopped", "words": "Stopped. Start goes on from the last checkpoint."}
+            else:
+                found |= {"state": "finished"}
+        return found | {"log": lines[-TAIL_LINES:]}
+
+    def _progress(self, scene: OpenScene, target: str, lines: list[str]) -> dict[str, Any]:
+        """Return "stage", "reason", "share", "left" and "done" of a running job; see `state`."""
+        lock, stages = self.runs / ".locks" / scene.name, self.plan(scene).stages
+        began = lock.stat().st_mtime if lock.exists() else time.time()
+        stage, since = find_running_stage(scene.home, began)
+        expected = self.expected_seconds(scene)
+        done = {s for s in stages if (r := scene.home / s / "receipt.json").is_file() and r.stat().st_mtime > began}
+        ahead = [s for s in expected if s not in done and s != stage]
+        if target != "all" and target in stages:  # a part of the job: up to its last stage
+            ahead = [s for s in ahead if list(stages).index(s) <= list(stages).index(target)]
+        share = left = None
+        if stage:
+            elapsed, whole = time.time() - since, expected.get(stage)
+            if whole and elapsed < whole:  # else it takes longer than expected, and nobody knows how long
+                share, left = elapsed / whole, whole - elapsed
+            bars = [bar for line in lines[-3:] for bar in BAR.findall(line) if bar[0] == stage and int(bar[2])]
+            if bars:
+                share, left = int(bars[-1][1]) / int(bars[-1][2]), _read_clock(bars[-1][3])
+        total = None if stage and left is None else (left or 0.0) + sum(expected[s] for s in ahead)
+        reason = stages.get(stage, {}).get("reason", "")
+        return {"stage": stage, "reason": reason, "share": share, "left": total, "done": sorted(done)}
+
+    def expected_seconds(self, scene: OpenScene) -> dict[str, float]:
+        """Return stage -> expected seconds of the plan, for the stages that it would run; 0 where they are unknown."""
+        due = {stage: entry for stage, entry in self.plan(scene).stages.items() if entry["word"] not in FINAL}
+        return {stage: entry.get("seconds") or 0.0 for stage, entry in due.items()}
+
+    # ------------------------------------------------------------------------------------------------ files
+
+    def _record(self, scene: OpenScene) -> Path:
+        return self.runs / RECORDS / f"{scene.name}.json"
+
+    def _log(self, scene: OpenScene) -> Path:
+        return self.runs / RECORDS / f"{scene.name}.log"
+
+    def _read_record(self, scene: OpenScene) -> dict[str, Any]:
+        try:
+            return load_json(self._record(scene))
+        except (OSError, ValueError):
+            return {}
+
+    def _tail(self, scene: OpenScene) -> list[str]:
+        """Return the last lines that the job printed; of a progress bar, only its latest state."""
+        log = self._log(scene)
+        if not log.is_file():
+            return []
+        with open(log, "rb") as file:
+            file.seek(max(0, log.stat().st_size - TAIL_BYTES))
+            text = file.read().decode("utf-8", "replace")
+        lines = [line.rsplit("\r", 1)[-1].rstrip() for line in text.replace("\r\n", "\n").split("\n")]
+        kept: list[str] = []
+        for line in filter(None, lines):
+            bar, before = BAR.search(line), BAR.search(kept[-1]) if kept else None
+            if bar and before and bar[1] == before[1]:
+                kept.pop()
+            kept.append(line)
+        return kept
+
+
+def find_running_stage(home: Path, began: float) -> tuple[str, float]:
+    """Return the stage that runs in a scene's folder, and the time at which it began; ("", 0) between stages.
+
+    A stage opens <stage>.log when it begins, and its last line there is the result.
+
+    Args:
+        began: time at which the runner began.
+    """
+    latest = max(home.glob("*.log"), key=lambda path: path.stat().st_mtime, default=None)
+    if latest is None or latest.stat().st_mtime < began - 1:
+        return "", 0.0
+    lines = latest.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    try:
+        ended = "seconds" in json.loads(lines[-1][20:])
+        since = time.mktime(time.strptime(lines[0][:19], "%Y-%m-%d %H:%M:%S"))
+    except (IndexError, ValueError, TypeError):  # nothing is written yet
+        ended, since = False, latest.stat().st_mtime
+    return ("", 0.0) if ended else (latest.stem, since)
+
+
+def _read_clock(text: str) -> float:
+    """Return the seconds of a duration such as 1:02:03 or 02:03."""
+    seconds = 0.0
+    for part in text.split(":"):
+        seconds = 60 * seconds + float(part or 0)
+    return seconds

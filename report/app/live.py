@@ -1,0 +1,105 @@
+"""The 3D viewer of the page, as a process: `python -m report.app.live HOME PORT latest|finished`.
+
+`finished` shows the finished scene, as `reffusion view` does. `latest` shows the latest state of a job, also of one
+that runs, and reloads when there is a newer state. The process ends when its standard input closes.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_scene
+from reffusion.types import Camera, Gaussians
+from report import camera_path, view
+
+PERIOD = 4.0  # seconds between two looks for a newer state
+# Files with Gaussians -> their title. `.partial-*` are the folders of stages that run.
+STATES = {
+    "fit/gaussians.ply": "the scene with the object",
+    ".partial-fit-*/checkpoint.pt": "being fitted",
+    "initialize/gaussians.ply": "filled, before distillation",
+    ".partial-distill-*/checkpoint.pt": "being distilled",
+    "distill/gaussians.ply": "distilled",
+    "finish/scene.ply": "finished",
+}
+OWN_FRAME = "scene.ply"  # the name of files in the scene's own frame
+
+
+def find_latest(home: Path) -> tuple[Path, str, int] | None:
+    """Return the latest state of a job as (file, title, time of change in ns); None if there is none yet."""
+    found = [(path, title, path.stat().st_mtime_ns) for name, title in STATES.items() for path in home.glob(name)]
+    return max(found, key=lambda state: state[2], default=None)
+
+
+class LatestViewer:
+    """Viewer of the latest state of a job, on the loopback interface.
+
+    Args:
+        home: runs/<scene>, in which the stage `poses` is done.
+        port: port to listen on.
+
+    Raises:
+        ValueError: viser is not installed, or the stage `poses` has not run.
+    """
+
+    def __init__(self, home: Path, port: int):
+        try:
+            import viser
+        except ImportError:
+            raise ValueError("the viewer needs viser: `pip install viser`") from None
+        self.home, self.scene = home, load_scene(home / "poses")
+        self.gaussians: Gaussians | None = None
+        self.latest: tuple[Path, str, int] | None = None
+        self.server = viser.ViserServer(host="127.0.0.1", port=port, label=home.name, verbose=False)
+        self.title = self.server.gui.add_markdown("waits for the first state")
+        train = [self.scene.cameras[name] for name in self.scene.train]
+        self.server.scene.set_up_direction(-np.mean([camera.world_to_camera[1, :3] for camera in train], 0))
+        target = camera_path.focus_point(train, self.scene.points)
+        view.move_to_view(self.server.initial_camera, train[len(train) // 2], target)
+        self.visitors = view.Visitors(self.server, self._render)
+        threading.Thread(target=self._follow, daemon=True).start()
+
+    def _render(self, camera: Camera, place: Any) -> np.ndarray:
+        if self.gaussians is None:
+            return np.full((camera.height, camera.width, 3), 230, np.uint8)
+        return view.render_picture(self.gaussians, camera)
+
+    def _follow(self) -> None:
+        """Load the latest state whenever it is a new one."""
+        while True:
+            found = find_latest(self.home)
+            if found and found != self.latest:
+                try:
+                    self.gaussians, self.latest = self._load(found[0]), found
+                    self.title.content = f"{found[1]}: {len(self.gaussians):,} Gaussians"
+                    self.visitors.refresh()
+                except (OSError, ValueError, KeyError, RuntimeError):  # it is being replaced: the next look finds it
+                    pass
+            time.sleep(PERIOD)
+
+    def _load(self, path: Path) -> Gaussians:
+        if path.suffix == ".pt":
+            state = torch.load(path, weights_only=True, map_location="cpu")
+            return Gaussians(**state["optimizer"]["parameters"])
+        return load_ply(path, self.scene.similarity) if path.name == OWN_FRAME else load_ply(path)
+
+
+def main() -> None:
+    home, port, kind = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
+    try:
+        _ = LatestViewer(home, port) if kind == "latest" else view.Viewer(home, port)
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+    sys.stdin.read()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""References: the views worth painting, and pictures that the user completed."""
+
+from __future__ import annotations
+
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from reffusion.io.files import BadInput, check_pixels
+from reffusion.io.images import image_size, replace_image
+from report.app.scenes import OpenScene
+from report.job_data import JobFiles
+from report.verdict import rank_views
+
+PICTURE_BYTES = 60_000_000
+FORMATS = ("PNG", "JPEG", "WEBP")
+PAINTED = "painted"  # folder of the scene
+TO_PAINT = "to_paint"  # folder of the stage `reference`
+TOLERANCE = 0.1  # relative difference of proportions that the stage `reference` accepts
+
+
+def list_views(scene: OpenScene, job: JobFiles) -> list[dict[str, Any]]:
+    """Return the views worth painting, the best first, as {"view", "share" of the hole, "painted"}."""
+    folder = scene.home / TO_PAINT
+    has_template = lambda name: (folder / f"{name}.png").is_file()
+    return [
+        {"view": name, "share": share, "painted": (scene.folder / PAINTED / f"{name}.png").is_file()}
+        for name, share, _ in rank_views(job)
+        if has_template(name)
+    ]
+
+
+def save_painting(scene: OpenScene, view: str, content: bytes, replace: bool) -> None:
+    """Save a completed picture of a view as painted/<view>.png in the scene's folder.
+
+    Args:
+        view: name of a view of `list_views`.
+        content: bytes of a PNG, JPEG or WebP picture of the view's proportions.
+        replace: True overwrites an earlier painting of this view.
+
+    Raises:
+        FileExistsError: there is a painting of this view, and `replace` is False.
+        ValueError: the content is no such picture.
+    """
+    path = scene.folder / PAINTED / f"{view}.png"
+    picture = decode_picture(content)
+    width, height = image_size(scene.home / TO_PAINT / f"{view}.png")
+    ratio = picture.shape[1] / picture.shape[0] / (width / height)
+    if max(ratio, 1 / ratio) > 1 + TOLERANCE:
+        raise ValueError(
+            f"the picture has {picture.shape[1]}x{picture.shape[0]} px, and the view {width}x{height}: keep the framing"
+        )
+    if path.exists() and not replace:
+        raise FileExistsError(f"{path} is there already")
+    path.parent.mkdir(exist_ok=True)
+    replace_image(path, picture)
+
+
+def decode_picture(content: bytes) -> np.ndarray:
+    """Return the picture in the bytes of a PNG, JPEG or WebP file, uint8 [H, W, 3].
+
+    Raises:
+        ValueError: the bytes are no such picture, or it has too many pixels.
+    """
+    try:
+        with Image.open(BytesIO(content), formats=FORMATS) as image:
+            check_pixels("the picture", *image.size)  # type: ignore[arg-type]
+            return np.array(image.convert("RGB"))
+    except BadInput:
+        raise
+    except Exception:
+        raise ValueError(f"this is no picture; {', '.join(FORMATS)} are accepted") from None

@@ -1,0 +1,101 @@
+"""Pictures of a scene for the page: thumbnails, photographs, the result from every view, and where it is unsure."""
+
+from __future__ import annotations
+
+import threading
+from functools import lru_cache
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from reffusion.fit import exposure
+from reffusion.io.images import load_image, load_mask, load_thumbnail, to_uint8
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_scene
+from reffusion.splat import rasterizer
+from reffusion.types import Gaussians, Scene
+from report.app.mask_step import to_jpeg
+from report.app.scenes import OpenScene
+from report.check import overlay_masks
+from report.sheet import stage_folder
+
+SMALL = 240  # longer side of a thumbnail, px
+KEPT = 64  # pictures that stay in memory
+# Origins of pixels (reffusion/initialize/origins.py) that the page marks, by their colour there -> RGBA of the overlay.
+UNSURE = {(60, 120, 255): (60, 120, 255, 110), (255, 170, 0): (255, 170, 0, 130), (220, 30, 50): (220, 30, 50, 170)}
+RENDERING = threading.Lock()  # the rasterizer uses all threads for one picture
+
+
+def draw_thumbnail(scene: OpenScene, view: str) -> bytes:
+    """Return a photograph as a small JPEG; with its masks tinted if the stage `raw_masks` has run.
+
+    Raises:
+        KeyError: there is no such view.
+        ValueError: the file is no picture.
+    """
+    path = scene.pictures()[view]
+    masks = scene.home / "raw_masks"
+    if (masks / "receipt.json").is_file() and path.parent.parent == scene.home / "poses":
+        return to_jpeg(overlay_masks(scene.home / "poses", masks, view), SMALL)
+    return to_jpeg(load_thumbnail(path, SMALL), SMALL)
+
+
+def draw_photograph(scene: OpenScene, view: str) -> bytes:
+    """Return a photograph as a JPEG; errors as for `draw_thumbnail`."""
+    return to_jpeg(load_image(scene.pictures()[view]))
+
+
+def draw_result(scene: OpenScene, view: str) -> bytes:
+    """Return the finished scene from a view as a JPEG: as `evaluate` rendered it, or else rendered now.
+
+    Raises:
+        KeyError: there is no such view.
+    """
+    rendered, result = scene.home / "evaluate" / "renders" / f"{view}.png", scene.home / "evaluate" / "scene.ply"
+    if view in scene.pictures() and rendered.is_file():
+        return to_jpeg(load_image(rendered))
+    return _render(scene.home, view, result.stat().st_mtime_ns)
+
+
+def draw_unsure(scene: OpenScene, view: str) -> bytes:
+    """Return a transparent PNG that tints the pixels of a view which no photograph shows.
+
+    Blue shows a reference, orange patches of photographs, red nothing at all.
+
+    Raises:
+        KeyError: there is no such view.
+    """
+    photo = scene.pictures()[view]
+    origin = stage_folder(scene.home, "initialize") / "origins" / f"{view}.png"
+    invent = stage_folder(scene.home, "masks") / "invent" / f"{view}.png"
+    if origin.is_file():
+        colors = load_image(origin)
+        overlay = np.zeros((*colors.shape[:2], 4), np.uint8)
+        for color, tint in UNSURE.items():
+            overlay[(colors == color).all(-1)] = tint
+    else:
+        mask = load_mask(invent) if invent.is_file() else np.zeros(load_image(photo).shape[:2], bool)
+        overlay = mask[..., None] * np.array(UNSURE[255, 170, 0], np.uint8)
+    file = BytesIO()
+    Image.fromarray(overlay).save(file, "PNG", compress_level=1)
+    return file.getvalue()
+
+
+@lru_cache(KEPT)
+def _render(home: Path, view: str, changed: int) -> bytes:
+    with RENDERING, torch.no_grad():
+        scene, gaussians, exposures = _load_result(home, changed)
+        rendering = rasterizer.render(gaussians, scene.cameras[view])
+        color = exposure.apply_exposure(rendering.color, exposures.get(view)).clamp(0, 1)
+    return to_jpeg(to_uint8(color.numpy()))
+
+
+@lru_cache(1)
+def _load_result(home: Path, changed: int) -> tuple[Scene, Gaussians, dict[str, np.ndarray]]:
+    """Return the scene, the result's Gaussians and the exposures; `changed` is the result's time of change."""
+    scene = load_scene(home / "poses")
+    gaussians = load_ply(home / "evaluate" / "scene.ply", scene.similarity)
+    return scene, gaussians, exposure.view_exposures(stage_folder(home, "fit"), list(scene.cameras.values()))

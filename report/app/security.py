@@ -1,0 +1,74 @@
+"""Checks of every request: it must come from this server's own page, which only this machine can open."""
+
+from __future__ import annotations
+
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+MAX_JSON_BYTES = 2_000_000
+REFUSAL = "this page is for this machine only"
+
+
+class TooLarge(ValueError):
+    """Exception for a request whose body is larger than allowed."""
+
+
+class LocalOnly:
+    """Middleware that refuses requests of other pages and machines, and adds headers that bind the page to this server.
+
+    Other pages in the same browser can send requests to this server too. Their requests have another origin or host
+    name.
+
+    Args:
+        app: the application.
+        port: port of this server.
+        frames: ports of this machine whose pages may be embedded.
+    """
+
+    def __init__(self, app: ASGIApp, port: int, frames: tuple[int, ...] = ()):
+        self.app, self.hosts = app, {f"{name}:{port}" for name in ("127.0.0.1", "localhost")}
+        embedded = " ".join(f"http://{name}:{each}" for each in frames for name in ("127.0.0.1", "localhost"))
+        self.policy = (
+            "default-src 'none'; img-src 'self' data: blob:; media-src 'self'; connect-src 'self'; "
+            "style-src 'self' 'unsafe-inline'; script-src 'self' 'unsafe-inline'; base-uri 'none'; "
+            f"form-action 'none'; frame-ancestors 'self'; frame-src 'self' {embedded}"
+        )
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http" and not self._is_local(Headers(scope=scope)):
+            await JSONResponse({"error": REFUSAL}, 403)(scope, receive, send)
+            return
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                headers["Content-Security-Policy"] = self.policy
+                headers["X-Content-Type-Options"] = "nosniff"
+                headers["Cross-Origin-Resource-Policy"] = "same-origin"
+                headers["Referrer-Policy"] = "no-referrer"
+                headers.setdefault("Cache-Control", "no-store")
+            await send(message)
+
+        await self.app(scope, receive, send_with_headers)
+
+    def _is_local(self, headers: Headers) -> bool:
+        origin = headers.get("origin")
+        return headers.get("host") in self.hosts and (origin is None or urlsplit(origin).netloc in self.hosts)
+
+
+async def read_body(request: Request, limit: int = MAX_JSON_BYTES) -> bytes:
+    """Return the body of a request.
+
+    Raises:
+        TooLarge: it has more than `limit` bytes.
+    """
+    content = bytearray()
+    async for part in request.stream():
+        content += part
+        if len(content) > limit:
+            raise TooLarge(f"larger than {limit // 1_000_000} MB")
+    return bytes(content)

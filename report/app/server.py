@@ -1,0 +1,57 @@
+"""The server of the page, on the loopback interface."""
+
+from __future__ import annotations
+
+import socket
+
+import uvicorn
+
+from report.app.routes import App, make_app
+from report.app.tasks import free_port
+
+PORT = 8090
+
+
+class Server:
+    """Web server of the page.
+
+    Args:
+        app: scenes and jobs that the page shows.
+        port: port to listen on; if it is in use, the next free one of the following 99 is taken.
+
+    Raises:
+        ValueError: none of the 100 ports is free.
+    """
+
+    def __init__(self, app: App, port: int = PORT):
+        self.app, self.port = app, free_port(port)
+        self.socket = socket.socket()
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self.socket.bind(("127.0.0.1", self.port))
+        config = uvicorn.Config(
+            make_app(app, self.port), log_level="error", access_log=False, timeout_graceful_shutdown=1, lifespan="off"
+        )
+        self.server = uvicorn.Server(config)
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self.port}/"
+
+    def serve(self) -> None:
+        """Serve the page until Ctrl-C or `stop`. Jobs that the page started are then interrupted."""
+        try:
+            self.server.run(sockets=[self.socket])
+        except KeyboardInterrupt:
+            pass
+        finally:
+            self.app.close()
+
+    def stop(self) -> None:
+        self.server.should_exit = True
+
+
+def announce(server: Server, address: str) -> None:
+    """Print where the page is, from this machine and from others."""
+    ports = f"{server.port}:localhost:{server.port} -L {server.app.viewer.port}:localhost:{server.app.viewer.port}"
+    print(f"{address}  (Ctrl-C ends)", flush=True)
+    print(f"from another machine: `ssh -L {ports} THIS_MACHINE`, then open this address there", flush=True)

@@ -1,0 +1,106 @@
+"""The state of a scene as the page shows it, read from the files of its job."""
+
+from __future__ import annotations
+
+import importlib.util
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from reffusion.capture.load import detect_layout
+from reffusion.io.arrays import load_json
+from reffusion.io.scene import load_warnings
+from report import verdict
+from report.app import painting, tasks
+from report.app.jobs import FINAL, Jobs
+from report.app.scenes import OpenScene
+from report.job_data import JobFiles, load_job
+
+LAYOUTS = {"llff": "LLFF", "transforms": "nerfstudio (transforms.json)", "colmap": "COLMAP", "photos": "photographs"}
+
+
+def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, Any]:
+    """Return the state of a scene as plain JSON values: what was found, the plan, the job, and the result."""
+    job, plan = jobs.state(scene), jobs.plan(scene)
+    try:
+        pictures, error = list(scene.pictures()), ""
+    except ValueError as failure:
+        pictures, error = [], str(failure)
+    expected = jobs.expected_seconds(scene) if not error else {}
+    is_measured = all(plan.stages[stage].get("seconds") for stage in expected)
+    finished = tasks.has_result(scene)
+    return {
+        "name": scene.name,
+        "source": str(scene.source),
+        "pictures": pictures,
+        "version": _version(scene.home),
+        "found": describe_capture(scene, plan.stages),
+        "doubts": [error] if error else find_doubts(scene.home),
+        "masks": count_masks(scene.home),
+        "lacks_masks": plan.lacks_masks and not count_masks(scene.home),
+        "has_poses": (scene.home / "raw_masks" / "receipt.json").is_file(),
+        "plan": {
+            "busy": plan.busy,
+            "error": plan.error,
+            "stages": [
+                {"name": name, "word": entry["word"], "reason": entry["reason"], "seconds": expected.get(name)}
+                for name, entry in plan.stages.items()
+            ],
+            "seconds": sum(expected.values()),
+            "measured": is_measured,
+            "due": [name for name, entry in plan.stages.items() if entry["word"] not in FINAL],
+        },
+        "job": job,
+        "has_viewer": importlib.util.find_spec("viser") is not None,
+        "has_state": any((scene.home / stage / "receipt.json").is_file() for stage in ("fit", "initialize")),
+        "result": describe_result(scene) if finished else None,
+        "to_paint": painting.list_views(scene, _load_job(scene.home, _version(scene.home))) if finished else [],
+        "export": {"busy": export.busy, "error": export.error, "files": tasks.list_exports(scene, export.busy)},
+    }
+
+
+def describe_capture(scene: OpenScene, stages: dict[str, dict[str, Any]]) -> list[str]:
+    """Return what is known about the capture, a phrase each: layout, the plan's notes, poses, masks, test views."""
+    words = []
+    if scene.folder.is_dir():
+        words.append(f"layout: {LAYOUTS[detect_layout(scene.folder)]}")
+    frames, sfm = scene.home / "frames" / "frames.json", scene.home / "poses" / "sfm.json"
+    words += [load_json(frames)["said"]] if frames.is_file() else []
+    views = scene.views()
+    if views:
+        words.append(f"{len(views['train'])} training and {len(views['test'])} test views")
+        words += [load_json(sfm)["summary"]] if sfm.is_file() else []
+        words.append(f"{count_masks(scene.home)} masks")
+    else:
+        notes = [note for stage in ("poses", "raw_masks") for note in stages.get(stage, {}).get("notes", ())]
+        words += list(dict.fromkeys(notes))
+    return words
+
+
+def find_doubts(home: Path) -> list[str]:
+    """Return the warnings of the stages `poses`, `raw_masks` and `masks`."""
+    return [line for stage in ("poses", "raw_masks", "masks") for line in load_warnings(home / stage)]
+
+
+def count_masks(home: Path) -> int:
+    """Return the number of views that have a mask."""
+    return len({path.stem for path in (home / "raw_masks" / "masks").rglob("*.png")})
+
+
+def describe_result(scene: OpenScene) -> dict[str, Any]:
+    """Return {"verdict": sentence, "views": names of all views, "rendered": those that `evaluate` rendered}."""
+    job = _load_job(scene.home, _version(scene.home))
+    views = scene.views()
+    rendered = sorted(path.stem for path in (scene.home / "evaluate" / "renders").glob("*.png"))
+    names = sorted({*views.get("train", ()), *views.get("test", ())} & {*scene.pictures()})
+    return {"verdict": verdict.describe_result(job), "views": names, "rendered": rendered}
+
+
+def _version(home: Path) -> int:
+    """Return a number that changes whenever a stage finishes."""
+    return max((path.stat().st_mtime_ns // 1000 for path in home.glob("*/receipt.json")), default=0)
+
+
+@lru_cache(4)
+def _load_job(home: Path, version: int) -> JobFiles:
+    return load_job(home)

@@ -1,0 +1,166 @@
+"""Commands of this project that the page runs besides jobs: the viewer, and the export of the result."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+from reffusion.io.arrays import load_json
+from report.app.jobs import make_command, make_environment
+from report.app.scenes import OpenScene
+
+EXPORTS = ("export", "turntable", "report")  # commands, in order
+# file in runs/<scene>/ -> what it is
+FILES = {
+    "evaluate/scene.ply": "the scene as Gaussians (.ply), for any 3DGS viewer",
+    "export/scene.compressed.ply": "the same, compressed (PlayCanvas, SuperSplat)",
+    "export/scene.spz": "the same as .spz (Niantic)",
+    "export/cameras.zip": "cameras (COLMAP model, transforms.json) and undistorted photographs",
+    "turntable.webm": "video around the scene",
+    "report.html": "report on the job, one page",
+}
+VIEWER_PORT = 8080
+
+
+class Viewer:
+    """The 3D viewer (report/view.py) as a process of its own, for one scene at a time.
+
+    Args:
+        runs: folder of all results.
+    """
+
+    def __init__(self, runs: Path):
+        self.runs, self.port = runs, free_port(VIEWER_PORT)
+        self.process: subprocess.Popen | None = None
+        self.scene, self.follows = "", False
+        self.lock = threading.Lock()
+
+    def show(self, scene: OpenScene, follow: bool) -> None:
+        """Start the viewer of a scene, unless it runs already.
+
+        Args:
+            follow: True shows the latest state of an unfinished job, and reloads when there is a newer one.
+
+        Raises:
+            ValueError: it cannot start; the message has the remedy.
+        """
+        with self.lock:
+            alive = self.process is not None and self.process.poll() is None
+            if not (alive and (self.scene, self.follows) == (scene.name, follow)):
+                self._stop()
+                words = ("-m", "report.app.live", str(scene.home), str(self.port), "latest" if follow else "finished")
+                self.process = subprocess.Popen(
+                    [sys.executable, *words],
+                    env=make_environment(),
+                    stdin=subprocess.PIPE,  # closes with this server, and ends the viewer
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.PIPE,
+                    text=True,
+                )
+                self.scene, self.follows = scene.name, follow
+            for _ in range(1800):  # importing and loading take seconds, on a busy machine minutes
+                if self.process.poll() is not None:
+                    lines = self.process.stderr.read().strip().splitlines()
+                    raise ValueError(lines[-1].removeprefix("error: ") if lines else "the viewer ended")
+                if is_open(self.port):
+                    return
+                time.sleep(0.1)
+            raise ValueError("the viewer does not answer")
+
+    def stop(self) -> None:
+        with self.lock:
+            self._stop()
+
+    def _stop(self) -> None:
+        if self.process is not None and self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+
+
+class Export:
+    """The export of one scene: `reffusion export`, `turntable` and `report`, one after the other.
+
+    Args:
+        runs: folder of all results.
+    """
+
+    def __init__(self, runs: Path):
+        self.runs, self.busy, self.error = runs, "", ""
+
+    def start(self, scene: OpenScene) -> None:
+        """Start in the background, unless it runs already."""
+        if not self.busy:
+            self.busy, self.error = EXPORTS[0], ""
+            threading.Thread(target=self._run, args=(scene,), daemon=True).start()
+
+    def _run(self, scene: OpenScene) -> None:
+        cameras = scene.home / "export" / "cameras"
+        try:
+            for command in EXPORTS:
+                self.busy = command
+                words = make_command(command, "--scene", str(scene.source), "--runs", str(self.runs))
+                done = subprocess.run(words, env=make_environment(), capture_output=True, text=True)
+                if done.returncode:
+                    lines = done.stderr.strip().splitlines() or [f"`{command}` failed"]
+                    self.error = lines[-1].removeprefix("error: ")
+            if cameras.is_dir():
+                shutil.make_archive(str(cameras), "zip", cameras)
+        finally:
+            self.busy = ""
+
+
+def list_exports(scene: OpenScene, busy: str = "") -> dict[str, dict[str, object]]:
+    """Return the files to download, as name -> {"words", "bytes"}; files older than the result are left out.
+
+    Args:
+        busy: command that is writing files now; only the result itself is then returned.
+    """
+    found: dict[str, dict[str, object]] = {}
+    for name, words in FILES.items() if not busy else [next(iter(FILES.items()))]:
+        path = scene.home / name
+        if path.is_file() and path.stat().st_mtime >= _result_time(scene):
+            found[path.name] = {"words": words, "bytes": path.stat().st_size}
+    return found
+
+
+def find_export(scene: OpenScene, name: str) -> Path:
+    """Return the path of a file of `list_exports`. Raises LookupError if there is no such file."""
+    if name not in list_exports(scene):
+        raise LookupError(f"{name}: not exported yet")
+    return next(scene.home / path for path in FILES if Path(path).name == name)
+
+
+def _result_time(scene: OpenScene) -> float:
+    """Return the time of change of the finished scene; that of its other files may be earlier only by mistake."""
+    result = scene.home / "evaluate" / "scene.ply"
+    return result.stat().st_mtime if result.is_file() else float("inf")
+
+
+def has_result(scene: OpenScene) -> bool:
+    """Return whether the stage `evaluate` has finished."""
+    receipt = scene.home / "evaluate" / "receipt.json"
+    return receipt.is_file() and bool(load_json(receipt))
+
+
+def free_port(first: int) -> int:
+    """Return the first port of `first` and the 99 after it on which nothing listens; raises ValueError if none."""
+    for port in range(first, first + 100):
+        try:
+            with socket.socket() as each:
+                each.bind(("127.0.0.1", port))
+            return port
+        except OSError:
+            continue
+    raise ValueError(f"no free port from {first} to {first + 99}; choose another with port=")
+
+
+def is_open(port: int) -> bool:
+    """Return whether something listens on a port of this machine."""
+    with socket.socket() as each:
+        each.settimeout(0.2)
+        return each.connect_ex(("127.0.0.1", port)) == 0

@@ -1,0 +1,293 @@
+"""The page `reffusion app`: hostile requests, uploads, jobs of the page and of a terminal, and a walk in a browser."""
+
+import http.client
+import io
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from urllib.parse import quote
+
+import numpy as np
+import pytest
+from PIL import Image
+from scenes import capture as captures
+from scenes.browser import open_page
+from scenes.processes import ROOT, wait_until
+
+from reffusion.io.arrays import save_json, save_text
+from reffusion.io.images import load_image, save_image
+from report import verdict
+from report.app import painting, scenes, uploads
+from report.app.routes import App
+from report.app.scenes import OpenScene
+from report.app.server import Server
+from report.job_data import load_job
+
+pytestmark = pytest.mark.integration
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from runner.files import hold_lock
+with hold_lock(Path(sys.argv[1]), "scene"):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+class Page:
+    """A server in a thread, and requests to it as any program could send them."""
+
+    def __init__(self, runs):
+        self.app = App(runs)
+        self.server = Server(self.app, port=18190)
+        self.thread = threading.Thread(target=self.server.serve, daemon=True)
+        self.thread.start()
+        wait_until(lambda: self.server.server.started)
+
+    def send(self, method, path, body=None, **headers):
+        """Return (status, body) of a request; a body that is no bytes is sent as JSON."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.server.port, timeout=60)
+        content = body if body is None or isinstance(body, bytes) else json.dumps(body).encode()
+        connection.request(method, path, content, headers)
+        answer = connection.getresponse()
+        return answer.status, answer.read()
+
+    def post(self, path, body=None):
+        status, answer = self.send("POST", path, {} if body is None else body)
+        return status, json.loads(answer)
+
+    def state(self):
+        return json.loads(self.send("GET", "/scenes/scene/state")[1])
+
+    def close(self):
+        self.server.stop()
+        self.thread.join()
+
+
+@pytest.fixture
+def page(tmp_path, monkeypatch):
+    for module in (uploads, scenes):
+        monkeypatch.setattr(module, "workplace", lambda root: tmp_path)
+    opened = Page(tmp_path / "runs")
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def scene(page, tmp_path):
+    """An open capture with poses, and without masks."""
+    truth = captures.make_truth()
+    captures.write_pictures(tmp_path / "scene/images", sorted(truth.world_to_camera))
+    captures.write_model(tmp_path / "scene/sparse/0", truth, ending=".png")
+    assert page.post("/scenes", {"path": str(tmp_path / "scene")}) == (200, {"name": "scene"})
+    return tmp_path / "scene"
+
+
+def png(width=40, height=30):
+    file = io.BytesIO()
+    Image.fromarray(np.zeros((height, width, 3), np.uint8)).save(file, "PNG")
+    return file.getvalue()
+
+
+# ------------------------------------------------------------------------------------------------ hostile requests
+
+
+def test_other_pages_and_machines_are_refused(page, scene):
+    own = f"127.0.0.1:{page.server.port}"
+    for path in ("/", "/app.js", "/scenes", "/scenes/scene/state", "/scenes/scene/events", "/scenes/scene/mask/"):
+        assert page.send("GET", path, Host="elsewhere.example")[0] == 403
+        assert page.send("GET", path, Origin="http://elsewhere.example")[0] == 403
+    for path in ("/scenes", "/uploads", "/scenes/scene/do/start", "/scenes/scene/mask/save", "/scenes/scene/paint/v00"):
+        for origin in ("http://elsewhere.example", "null", f"http://{own}.elsewhere.example", "http://127.0.0.1:1"):
+            assert page.send("POST", path, {}, Origin=origin)[0] == 403
+    assert page.send("GET", "/scenes", Origin=f"http://{own}")[0] == 200
+
+
+@pytest.mark.parametrize("path", [
+    "/../../etc/passwd", "/app.css/../server.py", "/%2e%2e/server.py", "/static/index.html",
+    "/scenes/scene/pictures/photo/..%2f..%2fsecret", "/scenes/scene/pictures/photo/%2fetc%2fpasswd",
+    "/scenes/scene/pictures/secret/v00", "/scenes/scene/export/..%2f..%2fsecret.png",
+    "/scenes/scene/export/receipt.json",
+    "/scenes/scene/paint/..%2f..%2fsecret", "/scenes/..%2fscene/state", "/scenes/none/state", "/scenes/none/events",
+    "/scenes/scene/mask/", "/scenes/scene/mask/photo/v00",
+])  # fmt: skip
+def test_no_address_leads_to_another_file(page, scene, tmp_path, path):
+    save_image(tmp_path / "secret.png", np.zeros((4, 4, 3), np.uint8))
+    assert page.send("GET", path)[0] == 404
+    assert page.send("POST", path, {})[0] in (404, 405)
+
+
+def test_wrong_requests_get_one_line(page, scene, tmp_path):
+    assert page.post("/scenes", {"path": str(tmp_path / "none")})[0] == 400
+    assert "no photographs" in page.post("/scenes", {"path": str(tmp_path)})[1]["error"]
+    assert page.post("/scenes", {})[0] == 404 and page.post("/scenes", [])[0] == 400
+    assert page.send("POST", "/scenes", b"[")[0] == 400
+    assert page.send("POST", "/scenes", b" " * 2_000_001)[0] == 413
+    assert page.post("/scenes/scene/do/format-the-disk")[0] == 404
+    other = tmp_path / "other/scene"
+    shutil.copytree(scene, other)
+    status, answer = page.post("/scenes", {"path": str(other)})
+    assert status == 400 and str(scene) in answer["error"]
+
+
+def test_uploads_are_decoded_and_stay_in_their_folder(page, tmp_path, monkeypatch):
+    name = page.post("/uploads", {"name": "../../My photos!"})[1]["name"]
+    assert name == "My_photos"
+    send = lambda file, content: page.send("POST", f"/uploads/{name}/{quote(file, safe='')}", content)
+    assert send("../../a b.png", png())[0] == 404, "a name with a slash is no address"
+    assert send("..\\a b.png", png())[0] == 200
+    for file, content in (
+        ("b.png", b"no picture"),
+        ("c.sh", b"#!/bin/sh"),
+        ("d", png()),
+        ("e.png", png()[:60]),
+        ("f.mp4", png()),
+    ):
+        status, answer = send(file, content)
+        assert status == 400 and file in json.loads(answer)["error"]
+    monkeypatch.setattr(uploads, "PICTURE_BYTES", 50)
+    assert send("g.png", png())[0] == 413
+    assert page.send("POST", "/uploads/other/h.png", png())[0] == 404
+    assert [p.relative_to(tmp_path).as_posix() for p in (tmp_path / "data").rglob("*") if p.is_file()] == [
+        "data/My_photos/images/a_b.png"
+    ]
+    assert page.post("/uploads", {"name": "My photos"})[1]["name"] == "My_photos-2"
+    assert page.post("/uploads", {"name": "../"})[0] == 400
+
+
+def test_a_painting_must_show_its_view_and_replaces_none_unasked(tmp_path):
+    scene = OpenScene("scene", tmp_path / "scene", tmp_path / "runs/scene")
+    scene.source.mkdir()
+    save_image(scene.home / painting.TO_PAINT / "v00.png", np.zeros((30, 40, 3), np.uint8))
+    for content in (b"", b"text", png()[:50], png(30, 40)):
+        with pytest.raises(ValueError):
+            painting.save_painting(scene, "v00", content, replace=False)
+    assert not (scene.source / "painted").exists()
+    painting.save_painting(scene, "v00", png(80, 60), replace=False)
+    with pytest.raises(FileExistsError):
+        painting.save_painting(scene, "v00", png(), replace=False)
+    assert load_image(scene.source / "painted/v00.png").shape == (60, 80, 3)
+    painting.save_painting(scene, "v00", png(), replace=True)
+    assert load_image(scene.source / "painted/v00.png").shape == (30, 40, 3)
+
+
+# ------------------------------------------------------------------------------------------------ state, jobs
+
+
+def test_the_state_says_what_was_found_and_what_is_missing(page, scene):
+    connection = http.client.HTTPConnection("127.0.0.1", page.server.port, timeout=60)
+    connection.request("GET", "/scenes/scene/events")
+    answer = connection.getresponse()
+    assert answer.headers["Content-Type"].startswith("text/event-stream")
+    while True:  # a first state without a plan, then the plan
+        line = answer.readline().decode()
+        if line.startswith("data: ") and (state := json.loads(line[6:]))["plan"]["stages"]:
+            break
+    connection.close()
+    assert state["pictures"] == [f"v{k:02d}" for k in range(6)] and "layout: COLMAP" in state["found"]
+    assert state["lacks_masks"] and state["result"] is None and state["job"]["state"] == "idle"
+    assert state["plan"]["due"][0] == "poses" and state["plan"]["seconds"] > 0
+    status, picture = page.send("GET", "/scenes/scene/pictures/small/v00")
+    assert status == 200 and Image.open(io.BytesIO(picture)).format == "JPEG"
+
+
+def test_a_job_is_started_stopped_and_goes_on(page, scene):
+    assert page.post("/scenes/scene/do/stop")[0] == 400, "nothing runs"
+    assert page.post("/scenes/scene/do/start")[0] == 200
+    wait_until(lambda: page.state()["job"]["state"] == "failed")
+    assert "no mask at all" in page.state()["job"]["words"]
+    assert page.post("/scenes/scene/do/mask") == (200, {"open": False})
+    wait_until(lambda: page.state()["job"]["stage"] == "fit")
+    assert page.post("/scenes/scene/do/start")[0] == 400, "one at a time"
+    assert page.post("/scenes/scene/do/stop")[0] == 200
+    wait_until(lambda: page.state()["job"]["state"] == "stopped")
+    assert page.state()["has_poses"]
+    assert page.post("/scenes/scene/do/mask") == (200, {"open": True})
+    assert page.send("GET", "/scenes/scene/mask/state")[0] == 200
+    wait_until(lambda: page.state()["job"]["stage"] == "fit")
+    assert "poses: " not in "\n".join(page.state()["job"]["log"]), "the poses are not found anew"
+
+
+def test_a_run_in_a_terminal_is_shown_and_left_alone(page, scene, tmp_path):
+    command = [sys.executable, "-c", HOLD, str(tmp_path / "runs")]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    holder = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+    try:
+        assert holder.stdout.readline() == "held\n"
+        save_text(tmp_path / "runs/scene/fit.log", time.strftime("%Y-%m-%d %H:%M:%S fit {}\n"))
+        job = page.state()["job"]
+        assert job["state"] == "elsewhere" and job["stage"] == "fit" and f"process {holder.pid}" in job["words"]
+        for action in ("start", "stop"):
+            status, answer = page.post(f"/scenes/scene/do/{action}")
+            assert status == 400 and "a terminal run" in answer["error"]
+        assert holder.poll() is None
+    finally:
+        holder.kill()
+        holder.wait()
+    wait_until(lambda: page.state()["job"]["state"] == "idle")
+
+
+# ------------------------------------------------------------------------------------------------ judgement
+
+
+def write_job(home, remnants, origins, given=()):
+    for stage, facts in (
+        ("masks", {"remnants": remnants}),
+        ("reference", {"given": list(given)}),
+        ("initialize", {"origins": origins}),
+        ("evaluate", {}),
+    ):
+        save_json(home / stage / "facts.json", facts)
+        save_json(home / stage / "receipt.json", {"params": {"remnants": True}, "seconds": 1.0, "needs": {}})
+    save_text(home / "reference/to_paint/ranked.txt", "# views\n1. IMG_1  40%  (painted)\n2. IMG 2  30%\n")
+
+
+def test_the_judgement_says_what_is_left_and_what_would_help(tmp_path):
+    shares = {"photographs": 0.8, "conflict": 0.0, "reference": 0.1, "patches": 0.06, "nothing": 0.04}
+    write_job(tmp_path / "a", [], shares)
+    said = verdict.describe_result(load_job(tmp_path / "a"))
+    assert "no part of it was found left" in said
+    assert "20 % of what it hid is made up; painting view IMG 2 would help most." in said
+    part = {"removed": False, "share": 0.01, "view": "IMG_7"}
+    write_job(tmp_path / "b", [part, part | {"removed": True}], shares, given=["IMG_1"])
+    said = verdict.describe_result(load_job(tmp_path / "b"))
+    assert "a part may be left (best seen in IMG_7" in said and "10 % of what it hid is made up" in said
+    write_job(tmp_path / "c", [], shares | {"reference": 0.0, "patches": 0.0, "nothing": 0.001})
+    assert "the photographs show all that it hid." in verdict.describe_result(load_job(tmp_path / "c"))
+
+
+# ------------------------------------------------------------------------------------------------ in a browser
+
+
+@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_walk_from_photographs_to_an_export(page, mini_scene, tmp_path, width):
+    shutil.copytree(mini_scene, tmp_path / "mini")
+    save_text(tmp_path / "mini/scene.yaml", (mini_scene / "scene.yaml").read_text() + "\nbudget: 20s\n")
+    with open_page(page.server.address, width) as tab:
+        tab.set_default_timeout(600_000)
+        tab.fill("#path", str(tmp_path / "mini"))
+        tab.click("#open button")
+        tab.click("#next:visible")
+        tab.click("#run:enabled")
+        tab.wait_for_function("state.job.state === 'running' && state.job.stage")
+        tab.reload()  # the job goes on without the page
+        tab.wait_for_function("state && state.result && !isBusy()")
+        tab.evaluate("go('result')")
+        tab.wait_for_function("document.getElementById('after').naturalWidth > 0")
+        assert tab.locator("#verdict").text_content()
+        first = tab.evaluate("shownView")
+        tab.keyboard.press("ArrowRight")
+        assert tab.evaluate("shownView") != first
+        tab.evaluate("go('export')")
+        tab.click("#make:visible")
+        tab.wait_for_function("'turntable.webm' in state.export.files && !state.export.busy")
+        with tab.expect_download() as download:
+            tab.click("text=scene.ply")
+        assert download.value.suggested_filename == "mini-scene.ply"
+        assert tab.evaluate("document.documentElement.scrollWidth") <= width
