@@ -34,7 +34,7 @@ from runner.files import list_files
 from runner.text import format_error
 
 INTERRUPTED = 130  # exit code after Ctrl-C
-THREADS = ("OMP", "MKL", "OPENBLAS", "NUMBA")  # <name>_NUM_THREADS is the number of threads of a library
+THREADS = ("OMP", "MKL", "NUMBA")  # <name>_NUM_THREADS is the number of threads of a library
 
 
 def _description_file(stage: str) -> Path:

@@ -220,9 +220,10 @@ def _observe(plane_map: _PlaneMap, views: Sequence[_View], cameras: Sequence[Cam
     points = plane_map.centers.reshape(-1, 3)
     in_frame, near_frame = np.zeros((2, len(points)), bool)
     for camera in cameras:
-        uv, z = geometry.project(points, camera)
-        in_frame |= geometry.is_in_frame(uv, z, camera)
-        near_frame |= geometry.is_in_frame(uv, z, camera, FRAME_MARGIN)
+        left = np.flatnonzero(~in_frame)
+        uv, z = geometry.project(points[left], camera)
+        in_frame[left] = geometry.is_in_frame(uv, z, camera)
+        near_frame[left] |= geometry.is_in_frame(uv, z, camera, FRAME_MARGIN)
     seen, free = np.zeros(len(points), int), np.zeros(len(points), int)
     best, color = np.zeros(len(points)), np.zeros((len(points), 3))
     for view in views:

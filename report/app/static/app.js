@@ -380,9 +380,11 @@ async function drawLive() {
 
 function drawResult() {
   const {result} = state;
-  $('compare').hidden = !result;
+  $('compare').hidden = $('remedies').hidden = !result;
   if (!result) { $('verdict').textContent = 'The result comes at the end of the job.'; return; }
   $('verdict').textContent = result.verdict || 'The scene is finished.';
+  $('correct').href = `#${encodeURIComponent(scene)}/object`;
+  $('complete').href = `#${encodeURIComponent(scene)}/paint`;
   if (changed('views', result.views)) $('view').replaceChildren(...result.views.map(name => make('option', name)));
   if (!result.views.includes(shownView)) choose(result.views.find(name => result.rendered.includes(name)) || result.views[0]);
   else if (changed('compared', [shownView, state.version])) choose(shownView);
