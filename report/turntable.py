@@ -41,18 +41,19 @@ def make(home: Path, frames: int = FRAMES) -> Path:
     return path
 
 
-def make_wipe(home: Path) -> Path:
+def make_wipe(home: Path, frames: int = WIPE_FRAMES) -> Path:
     """Render before and after along the path of the video, write `home`/before_after.webp, and return this path.
 
     A line moves across the picture, left of which is the scene with the object. The animation is `WIPE_WIDTH` px wide.
 
     Args:
         home: as for `make`; the stage `fit` has run, too.
+        frames: number of frames, `WIPE_MILLISECONDS` each.
 
     Raises:
         ValueError: a stage has not run.
     """
-    after, cameras = load_result(home, WIPE_FRAMES)
+    after, cameras = load_result(home, frames)
     fitted = stage_folder(home, "fit") / "gaussians.ply"
     if not fitted.exists():
         raise ValueError(f"{fitted} is missing: there are no Gaussians with the object")
