@@ -38,7 +38,7 @@ def describe_removal(job: JobFiles) -> str:
         return "The object is removed, as far as the masks show it"
     left = [each for each in remnants if not each["removed"]]
     if not left:
-        return "The object is removed, and no part of it was found left"
+        return "The marked object is removed, and no unmarked part of it was detected"
     largest = max(left, key=lambda each: each["share"])
     parts = "a part" if len(left) == 1 else f"{len(left)} parts"
     return f"Most of the object is removed, but {parts} may be left (best seen in {largest['view']}; correct the masks)"

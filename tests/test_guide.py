@@ -62,7 +62,7 @@ def test_the_mask_page(photo_folder):
     with subprocess.Popen([*make_command(command, photo_folder), "port=18390"], cwd=ROOT, **group) as serving:
         try:
             address = next(found[0] for line in serving.stdout if (found := re.findall(r"http://127\S+", line)))
-            assert "What should be removed?" in urllib.request.urlopen(address, timeout=20).read().decode()
+            assert '<section id="object">' in urllib.request.urlopen(address, timeout=20).read().decode()
         finally:
             os.killpg(serving.pid, signal.SIGTERM)  # not SIGINT, which a test runner may ignore and pass on
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import socket
+import threading
 
 import uvicorn
 
@@ -28,6 +30,7 @@ class Server:
         self.socket = socket.socket()
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(("127.0.0.1", self.port))
+        self.socket.listen()  # a browser may ask before the server runs
         config = uvicorn.Config(
             make_app(app, self.port), log_level="error", access_log=False, timeout_graceful_shutdown=1, lifespan="off"
         )
@@ -38,7 +41,9 @@ class Server:
         return f"http://127.0.0.1:{self.port}/"
 
     def serve(self) -> None:
-        """Serve the page until Ctrl-C or `stop`. Jobs that the page started are then interrupted."""
+        """Serve the page until Ctrl-C, SIGTERM or `stop`. Jobs that the page started are then interrupted."""
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, signal.default_int_handler)  # SIGTERM is handled like Ctrl-C
         try:
             self.server.run(sockets=[self.socket])
         except KeyboardInterrupt:

@@ -152,6 +152,7 @@ def free_port(first: int) -> int:
     for port in range(first, first + 100):
         try:
             with socket.socket() as each:
+                each.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was just left is free
                 each.bind(("127.0.0.1", port))
             return port
         except OSError:
