@@ -270,10 +270,10 @@ def test_a_walk_from_photographs_to_an_export(page, mini_scene, tmp_path, width)
     shutil.copytree(mini_scene, tmp_path / "mini")
     save_text(tmp_path / "mini/scene.yaml", (mini_scene / "scene.yaml").read_text() + "\nbudget: 20s\n")
     with open_page(page.server.address, width) as tab:
-        tab.set_default_timeout(600_000)
+        tab.set_default_timeout(240_000)
         tab.fill("#path", str(tmp_path / "mini"))
         tab.click("#open button")
-        tab.click("#next:visible")
+        tab.click("text=Next: start the job")
         tab.click("#run:enabled")
         tab.wait_for_function("state.job.state === 'running' && state.job.stage")
         tab.reload()  # the job goes on without the page

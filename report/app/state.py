@@ -38,6 +38,7 @@ def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, An
         "doubts": [error] if error else find_doubts(scene.home),
         "masks": count_masks(scene.home),
         "lacks_masks": plan.lacks_masks and not count_masks(scene.home),
+        "brings_masks": bool(plan.stages) and not plan.error and not plan.lacks_masks,
         "has_poses": (scene.home / "raw_masks" / "receipt.json").is_file(),
         "plan": {
             "busy": plan.busy,

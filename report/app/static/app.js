@@ -97,7 +97,7 @@ async function reopen() {
 
 function drawSteps() {
   const done = state ? {
-    photographs: state.pictures.length > 0, object: state.masks > 0, start: Boolean(state.result) && !state.plan.due.length,
+    photographs: state.pictures.length > 0, object: state.masks > 0 || state.brings_masks, start: Boolean(state.result) && !state.plan.due.length,
     result: Boolean(state.result), live: false, paint: state.to_paint.some(each => each.painted), export: Object.keys(state.export.files).length > 1,
   } : {};
   const closed = {object: !state, start: !state, live: !state || !state.has_state, result: !state || !state.result,
@@ -160,7 +160,7 @@ async function open(path) {
 }
 
 function drawPhotographs() {
-  const {pictures, plan, masks} = state;
+  const {pictures, plan} = state, masks = state.masks || state.brings_masks;
   $('captured').textContent = pictures.length ? `${pictures.length} photographs` : 'No photographs yet';
   $('source').textContent = state.source;
   if (changed('found', state.found)) $('found').replaceChildren(...state.found.map(words => make('li', words)));
@@ -250,14 +250,14 @@ function drawObject() {
     $('object-buttons').replaceChildren();
     return;
   }
-  if (masks && !ask_) {
-    $('object-lead').textContent = `${masks} views have a mask. Go on, or change them by clicks.`;
+  if ((masks || state.brings_masks) && !ask_) {
+    $('object-lead').textContent = `${masks ? `${masks} views have a mask` : 'The scene brings masks'}. Go on, or change them by clicks.`;
     if (changed('object', 'masks')) {
       const change = make('button', 'Change the masks');
       change.addEventListener('click', wantMasks);
       $('object-buttons').replaceChildren(make('a', 'Next: start the job', {className: 'button main', href: `#${encodeURIComponent(scene)}/start`}), change);
     }
-    drawThumbnails('masked', state.pictures, true);
+    if (masks) drawThumbnails('masked', state.pictures, true);
     return;
   }
   if (!ask_) {
