@@ -270,7 +270,7 @@ def test_a_walk_from_photographs_to_an_export(page, mini_scene, tmp_path, width)
     shutil.copytree(mini_scene, tmp_path / "mini")
     save_text(tmp_path / "mini/scene.yaml", (mini_scene / "scene.yaml").read_text() + "\nbudget: 20s\n")
     with open_page(page.server.address, width) as tab:
-        tab.set_default_timeout(240_000)
+        tab.set_default_timeout(600_000)
         tab.fill("#path", str(tmp_path / "mini"))
         tab.click("#open button")
         tab.click("text=Next: start the job")
@@ -288,6 +288,6 @@ def test_a_walk_from_photographs_to_an_export(page, mini_scene, tmp_path, width)
         tab.click("#make:visible")
         tab.wait_for_function("'turntable.webm' in state.export.files && !state.export.busy")
         with tab.expect_download() as download:
-            tab.click("text=scene.ply")
+            tab.click("#exports a >> nth=0")
         assert download.value.suggested_filename == "mini-scene.ply"
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
