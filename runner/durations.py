@@ -133,5 +133,7 @@ def total_time(job: ResolvedJob, decisions: Mapping[str, Decision]) -> str:
     if not greatest:
         return ""
     shortest, longest = format_seconds(least), format_seconds(greatest)
-    span = longest if shortest == longest or not least else f"{shortest} to {longest}"
+    if shortest.split()[1] == longest.split()[1]:  # the unit once
+        shortest = shortest.split()[0]
+    span = longest if longest.startswith(f"{shortest} ") or not least else f"{shortest} to {longest}"
     return span + (f" and the time of {', '.join(unknown)}" if unknown else "")
