@@ -9,7 +9,8 @@ from typing import Any
 from reffusion.io.arrays import load_json
 from report.job_data import JobFiles
 
-LEAST_MADE_UP = 0.005  # share of the hole below which nothing counts as made up
+MIN_INVENTION = 0.005  # share of the hole below which nothing counts as invented
+TO_PAINT = "to_paint"  # folder of the stage `reference` with the views worth painting
 LEAST_GAIN = 0.05  # share of the hole that a view must show to be worth painting
 RANKED = re.compile(r"^\d+\. (.+?)  (\d+)%(  \(painted\))?$", re.MULTILINE)  # a line of to_paint/ranked.txt
 
@@ -21,11 +22,11 @@ def describe_result(job: JobFiles) -> str:
     """
     if "evaluate" not in job.folders or "masks" not in job.folders:
         return ""
-    parts, made_up = [describe_removal(job)], made_up_share(job)
-    if made_up is not None and made_up < LEAST_MADE_UP:
+    parts, invention = [describe_removal(job)], measure_invention(job)
+    if invention is not None and invention < MIN_INVENTION:
         parts.append("the photographs show all that it hid")
-    elif made_up is not None:
-        parts.append(f"{made_up:.0%} of what it hid is made up".replace("%", " %"))
+    elif invention is not None:
+        parts.append(f"{invention:.0%} of what it hid is made up".replace("%", " %"))
         if view := view_to_paint(job):
             parts.append(f"painting view {view} would help most")
     return "; ".join(parts) + "."
@@ -44,7 +45,7 @@ def describe_removal(job: JobFiles) -> str:
     return f"Most of the object is removed, but {parts} may be left (best seen in {largest['view']}; correct the masks)"
 
 
-def made_up_share(job: JobFiles) -> float | None:
+def measure_invention(job: JobFiles) -> float | None:
     """Return the share in [0, 1] of the removed region that no photograph and no picture of the user shows.
 
     It is the mean over views; None before the stage `initialize`.
@@ -60,7 +61,7 @@ def made_up_share(job: JobFiles) -> float | None:
 
 def rank_views(job: JobFiles) -> list[tuple[str, float, bool]]:
     """Return the views worth painting as (name, share of the hole that it shows, True if painted), the best first."""
-    path = job.folders.get("reference", Path()) / "to_paint" / "ranked.txt"
+    path = job.folders.get("reference", Path()) / TO_PAINT / "ranked.txt"
     text = path.read_text(encoding="utf-8") if "reference" in job.folders and path.is_file() else ""
     return [(name, int(share) / 100, bool(painted)) for name, share, painted in RANKED.findall(text)]
 

@@ -18,7 +18,7 @@ from runner.files import MACHINE, read_receipt
 from runner.keys import flatten_params
 from runner.plan import FINAL, TO_DO, Decision
 from runner.resolve import ResolvedJob, has_cuda
-from runner.text import format_seconds
+from runner.text import format_range, format_seconds
 
 CORES = 2  # cores on which the table was measured
 PARALLEL_SHARE = 0.75  # share of a stage's time on one core that more cores divide among them
@@ -132,8 +132,5 @@ def total_time(job: ResolvedJob, decisions: Mapping[str, Decision]) -> str:
         least += 0.0 if decision.is_open else seconds
     if not greatest:
         return ""
-    shortest, longest = format_seconds(least), format_seconds(greatest)
-    if shortest.split()[1] == longest.split()[1]:  # the unit once
-        shortest = shortest.split()[0]
-    span = longest if longest.startswith(f"{shortest} ") or not least else f"{shortest} to {longest}"
+    span = format_range(least, greatest) if least else format_seconds(greatest)
     return span + (f" and the time of {', '.join(unknown)}" if unknown else "")

@@ -183,7 +183,8 @@ def test_report_reads_through_io(path):
     places = ("reffusion.command",) if path.stem == "cli" else ()  # for the path of the folder of scenes
     clicked = ("reffusion.clicks", "reffusion.capture", "reffusion.params", "reffusion.command", "reffusion.types")
     making = clicked if path.stem == "mask_session" else ()  # to make masks
-    page = ("reffusion.command", "reffusion.capture.load", "reffusion.clicks.local_segmenter", "runner.files")
+    page = ("reffusion.command", "reffusion.capture.load", "reffusion.clicks.local_segmenter")
+    page += ("reffusion.references.files", "runner.files", "runner.frames", "runner.plan")
     # The page runs the runner, shows captures before any stage has run, and renders views.
     app = (*page, *drawing_names, "reffusion.fit.exposure") if path.parent.name == "app" else ()
     # For the random order of pairs, and for confidence intervals.

@@ -22,12 +22,12 @@ from reffusion.command import root
 from reffusion.io.arrays import load_json, save_json
 from report.app.scenes import OpenScene
 from runner.files import MACHINE, lock_holder
+from runner.plan import FINAL
 
 RECORDS = ".app"  # folder in runs/
 TAIL_BYTES, TAIL_LINES = 20_000, 40
 # A progress bar: its label, steps done, all steps, and the time left.
 BAR = re.compile(r"(\w+):\s+\d+%\|[^|]*\|\s*(\d+)/(\d+) \[[^<\]]*<([\d:]+)")
-FINAL = ("cached", "provided", "skip")  # words of a plan for stages that will not run
 WITHOUT_MASKS = "poses.clicks={}"  # announces masks by clicks, so that stages accept a scene without masks
 
 

@@ -10,15 +10,13 @@ from PIL import Image
 
 from reffusion.io.files import BadInput, check_pixels
 from reffusion.io.images import image_size, replace_image
+from reffusion.references.files import PAINTED, PROPORTION_TOLERANCE
 from report.app.scenes import OpenScene
 from report.job_data import JobFiles
-from report.verdict import rank_views
+from report.verdict import TO_PAINT, rank_views
 
 PICTURE_BYTES = 60_000_000
 FORMATS = ("PNG", "JPEG", "WEBP")
-PAINTED = "painted"  # folder of the scene
-TO_PAINT = "to_paint"  # folder of the stage `reference`
-TOLERANCE = 0.1  # relative difference of proportions that the stage `reference` accepts
 
 
 def list_views(scene: OpenScene, job: JobFiles) -> list[dict[str, Any]]:
@@ -48,7 +46,7 @@ def save_painting(scene: OpenScene, view: str, content: bytes, replace: bool) ->
     picture = decode_picture(content)
     width, height = image_size(scene.home / TO_PAINT / f"{view}.png")
     ratio = picture.shape[1] / picture.shape[0] / (width / height)
-    if max(ratio, 1 / ratio) > 1 + TOLERANCE:
+    if max(ratio, 1 / ratio) > 1 + PROPORTION_TOLERANCE:
         raise ValueError(
             f"the picture has {picture.shape[1]}x{picture.shape[0]} px, and the view {width}x{height}: keep the framing"
         )

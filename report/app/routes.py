@@ -17,6 +17,7 @@ from starlette.responses import FileResponse, JSONResponse, Response, StreamingR
 from starlette.routing import Route
 
 from reffusion.clicks.local_segmenter import load_local_segmenter
+from report import verdict
 from report.app import mask_step, painting, pictures, tasks
 from report.app.jobs import Jobs
 from report.app.mask_step import MaskStep
@@ -205,7 +206,7 @@ def _make_routes(app: App) -> list[Route]:
 
     def template(request: Request) -> Response:
         scene, view = app.scene(request), _paintable(request)
-        return FileResponse(scene.home / painting.TO_PAINT / f"{view}.png", filename=f"{view}.png")
+        return FileResponse(scene.home / verdict.TO_PAINT / f"{view}.png", filename=f"{view}.png")
 
     async def paint(request: Request) -> Response:
         scene, view = app.scene(request), await run_in_threadpool(_paintable, request)

@@ -11,8 +11,8 @@ from reffusion.command import root, scene_name, scene_path, workplace
 from reffusion.io.arrays import load_json
 from reffusion.io.images import ENDINGS
 from report.app.mask_step import MaskStep
+from runner.frames import FRAMES
 
-FRAMES = "frames"  # folder of a video's frames in runs/<video>/
 MAX_RECENT = 12
 VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".m4v", ".avi")
 

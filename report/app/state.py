@@ -12,9 +12,10 @@ from reffusion.io.arrays import load_json
 from reffusion.io.scene import load_warnings
 from report import verdict
 from report.app import painting, tasks
-from report.app.jobs import FINAL, Jobs
+from report.app.jobs import Jobs
 from report.app.scenes import OpenScene
 from report.job_data import JobFiles, load_job
+from runner.plan import FINAL
 
 LAYOUTS = {"llff": "LLFF", "transforms": "nerfstudio (transforms.json)", "colmap": "COLMAP", "photos": "photographs"}
 
@@ -27,7 +28,6 @@ def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, An
     except ValueError as failure:
         pictures, error = [], str(failure)
     expected = jobs.expected_seconds(scene) if not error else {}
-    is_measured = all(plan.stages[stage].get("seconds") for stage in expected)
     finished = tasks.has_result(scene)
     return {
         "name": scene.name,
@@ -48,7 +48,6 @@ def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, An
                 for name, entry in plan.stages.items()
             ],
             "seconds": sum(expected.values()),
-            "measured": is_measured,
             "due": [name for name, entry in plan.stages.items() if entry["word"] not in FINAL],
         },
         "job": job,

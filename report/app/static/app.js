@@ -302,7 +302,6 @@ async function wantMasks() {
 
 function drawStart() {
   const {job, plan} = state, due = plan.due.length, running = job.state === 'running';
-  const about = `${plan.measured ? 'about' : 'roughly'} ${duration(plan.seconds)}`;
   $('run').hidden = isBusy();
   $('run').disabled = plan.busy || Boolean(plan.error) || state.lacks_masks || !due;
   $('run').textContent = job.state === 'stopped' || job.state === 'failed' ? 'Go on' : 'Start';
@@ -323,7 +322,7 @@ function drawStart() {
   $('start-lead').textContent = lead;
   $('start-lead').classList.toggle('wrong', job.state === 'failed' || (Boolean(plan.error) && !plan.busy && !isBusy()));
   $('total').textContent = isBusy() ? (job.left ? `about ${duration(job.left)} left` : '') :
-    due && !plan.busy && !plan.error && plan.seconds ? `${about} in all${plan.measured ? '' : ', by the number of photographs'}` : '';
+    due && !plan.busy && !plan.error && plan.seconds ? `about ${duration(plan.seconds)} in all` : '';
   if (changed('stages', [plan.stages, job.stage, job.done])) {
     $('stages').tBodies[0].replaceChildren(...plan.stages.map(each => {
       const done = ['cached', 'provided'].includes(each.word) || job.done.includes(each.name);
