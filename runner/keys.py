@@ -21,6 +21,7 @@ HASHES = ".hashes.json"  # file in runs/ with the cache of hashes
 # files of an artifact on which other stages do not depend
 NOT_CONTENT = (RECEIPT, "trace.jsonl", "warnings.json", "checkpoint.pt", "checkpoint.pt.writing")
 NOT_WEIGHTS = (".md", ".py", ".png", ".jpg")  # endings of a model's card, pictures and training scripts
+_PARSING = threading.Lock()  # CPython 3.11 raises SystemError where two threads build syntax trees at once
 
 
 def digest(*parts: str) -> str:
@@ -193,7 +194,8 @@ def fingerprint(tree: ast.Module) -> str:
 def _read_module(path: Path) -> list[Any]:
     """Return the names that a Python file imports, and its fingerprint. Raises Refused if it is not valid Python."""
     try:
-        tree = ast.parse(path.read_text(encoding="utf-8"))
+        with _PARSING:
+            tree = ast.parse(path.read_text(encoding="utf-8"))
     except SyntaxError as error:
         raise Refused(f"{path}:{error.lineno}: not valid Python: {error.msg}") from None
     return [sorted(set(_imported(tree))), fingerprint(tree)]  # `fingerprint` changes the tree, so it comes last

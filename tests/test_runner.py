@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ast
+import gc
 import json
 import re
 import shutil
 import signal
 import subprocess
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -283,6 +286,20 @@ def test_fingerprint():
     assert len({fingerprint(ast.parse(text)) for text in same}) == 1
     assert fingerprint(ast.parse("def f(a):\n    return a or 1")) != fingerprint(ast.parse(same[0]))
     assert fingerprint(ast.parse("x = '''a'''")) != fingerprint(ast.parse("x = '''b'''"))
+
+
+def test_scenes_of_a_batch_read_code_at_once(tmp_path):
+    """A garbage collection inside `ast.parse` lets another thread run, which CPython 3.11 does not survive."""
+    threshold, let_others_run = gc.get_threshold(), lambda *_: time.sleep(1e-6)
+    gc.set_threshold(50)
+    gc.callbacks.append(let_others_run)
+    try:
+        with ThreadPoolExecutor(6) as pool:
+            read = lambda n: code_fingerprints(REPO, "evaluate", Hashes(tmp_path / str(n)))
+            assert len({str(sorted(code.items())) for code in pool.map(read, range(6))}) == 1
+    finally:
+        gc.callbacks.remove(let_others_run)
+        gc.set_threshold(*threshold)
 
 
 def test_readmes_and_scripts_in_a_weights_folder_do_not_count(project):
