@@ -21,11 +21,10 @@ MIN_UNCOVERED = 0.01  # a view is listed if a larger share is uncovered or unsee
 
 
 def coverage_section(job: JobFiles) -> list[str]:
-    """Return the section as HTML parts: a summary, a table of the shares of all views, and a note on unseen pixels."""
-    top = page.heading("What was covered")
+    """Return HTML parts: a summary, a table of the shares of all views, and a note on unseen pixels."""
     shares = view_shares(job)
     if not shares:
-        return [top, page.paragraph("Not known yet: the stage `masks` has not run.")]
+        return [page.paragraph("Not known yet: the stage `masks` has not run.")]
     covered = any(open_ is not None for _, _, open_ in shares.values())
     text = (
         f"{_mean([made for _, made, _ in shares.values()]):.0%} of the removed region is made up, averaged over views"
@@ -39,7 +38,7 @@ def coverage_section(job: JobFiles) -> list[str]:
         text += "; what stays uncovered is known after the stage `initialize`"
     rows = sorted(shares.items(), key=lambda each: (-(each[1][2] or 0), -each[1][1]))
     table = _table([(name, values) for name, values in rows])
-    parts = [top, page.paragraph(f"{text}."), f"<details><summary>all {len(rows)} views</summary>{table}</details>"]
+    parts = [page.paragraph(f"{text}."), f"<details><summary>all {len(rows)} views</summary>{table}</details>"]
     return parts + _unseen(job)
 
 

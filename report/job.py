@@ -63,39 +63,34 @@ def make(home: Path) -> Path:
         ValueError: no stage has been done.
     """
     job = load_job(home)
-    title = f"{home.name}: what was done"
-    seconds = sum(receipt["seconds"] for receipt in job.receipts.values())
-    done = f"{page.format_duration(seconds)} in {len(job.receipts)} stages"
-    parts = [
-        page.heading(title, 1),
-        *([page.paragraph(sentence)] if (sentence := verdict.describe_result(job)) else []),
-        page.paragraph(f"{done}. {summarize_result(job)}"),
-        *unfinished_note(job),
-        *capture_notes(job),
-    ]
-    parts += (
-        before_after.before_after_section(job)
-        + job_pictures.masks_section(job)
-        + job_pictures.references_section(job)
-        + job_pictures.depth_section(job)
-        + coverage.coverage_section(job)
-    )
     with TemporaryDirectory() as charts:
-        parts += whole_job_section(job, Path(charts)) + stage_sections(job, Path(charts))
-    parts += (
-        skipped_section(job)
-        + job_parameters.parameters_section(job)
-        + receipts_section(job)
-        + job_parameters.reproduce_section(job)
-        + files_section(job)
-    )
+        curves = whole_job_section(job, Path(charts)) + stage_sections(job, Path(charts))
+    parts = [
+        page.heading(home.name, 1),
+        *([page.paragraph(sentence)] if (sentence := verdict.describe_result(job)) else []),
+        *unfinished_note(job),
+        *before_after.before_after_section(job),
+        *result_section(job),
+        *advice_section(job),
+        *job_pictures.masks_section(job),
+        *job_pictures.references_section(job),
+        *files_section(job),
+        page.folded("Depth, before and after", job_pictures.depth_section(job)),
+        page.folded("What was covered", coverage.coverage_section(job)),
+        page.folded("Errors against seconds", curves),
+        *([page.folded("What was left out or taken over, and why", skipped_section(job))] if job.plan else []),
+        page.folded("Parameters other than their defaults", job_parameters.parameters_section(job)),
+        page.folded("Seconds, memory and machine of each stage", receipts_section(job)),
+        page.folded("To do it again", job_parameters.reproduce_section(job)),
+    ]
     path = home / "report.html"
+    title = f"{home.name}: what was done"
     path.write_text(page.document(title, parts, STYLE + before_after.STYLE, before_after.SCRIPT), encoding="utf-8")
     return path
 
 
 def summarize_result(job: JobFiles) -> str:
-    """Return one sentence on the result: number of Gaussians, mean PSNR and FLIP in the box, as far as known.
+    """Return one sentence on the result: number of Gaussians, mean scores in the box, as far as known.
 
     The sentence also names views that are scored although their photographs contradict their poses.
     """
@@ -127,31 +122,36 @@ def unfinished_note(job: JobFiles) -> list[str]:
     return [page.paragraph(f"Still to run, or to run again: {', '.join(due)}.")] if due else []
 
 
-def capture_notes(job: JobFiles) -> list[str]:
-    """Return HTML parts with a list of notes on the capture; empty if there are none.
+def result_section(job: JobFiles) -> list[str]:
+    """Return HTML parts with the job's time, one sentence on the result, and the scores, if there are any."""
+    seconds = sum(receipt["seconds"] for receipt in job.receipts.values())
+    done = f"{page.format_duration(seconds)} in {len(job.receipts)} stages"
+    return [page.paragraph(f"{done}. {summarize_result(job)}"), *score_table(job)]
 
-    The notes are on the frames selected from a video, on structure from motion, and the warnings of the stages
-    `poses`, `raw_masks` and `masks`.
+
+def advice_section(job: JobFiles) -> list[str]:
+    """Return the section on what would make the result better, and on what the capture lacks; may be empty.
+
+    It holds what the user can paint or mark (`verdict.give_advice`), notes on the frames of a video and on structure
+    from motion, and the warnings of all stages.
     """
     record = job.home.with_name(job.home.name.split("@")[0]) / "frames" / "frames.json"
-    lines = [load_json(record)["said"]] if record.is_file() else []
+    lines = verdict.give_advice(job) + ([load_json(record)["said"]] if record.is_file() else [])
     if "poses" in job.folders:
         sfm = job.folders["poses"] / "sfm.json"
         lines += [load_json(sfm)["summary"]] if sfm.is_file() else []
-    for stage in ("poses", "raw_masks", "masks"):
-        lines += load_warnings(job.folders[stage]) if stage in job.folders else []
-    return [page.bullets(lines)] if lines else []
+    lines += [line for folder in job.folders.values() for line in load_warnings(folder)]
+    return [page.heading("What to know, and what would help"), page.bullets(lines)] if lines else []
 
 
 def whole_job_section(job: JobFiles, out: Path) -> list[str]:
-    """Return the section with the chart of the whole job over time, and the scores of initialization and result.
+    """Return HTML parts with the chart of the whole job over time.
 
     Args:
         out: folder for the chart's file.
     """
     draw_job(job, out / "job.png")
     parts = [
-        page.heading("The whole job"),
         inline_images.chart_element(out / "job.png", "PSNR and stages against seconds"),
     ]
     if any(stage in job.traces for stage in ("fit", "distill")):
@@ -159,7 +159,7 @@ def whole_job_section(job: JobFiles, out: Path) -> list[str]:
             "Curves: each stage's own error, on training views or references. Test views are scored only at the end."
         )
         parts.append(page.paragraph(words, quiet=True))
-    return parts + score_table(job)
+    return parts
 
 
 def draw_job(job: JobFiles, path: Path, ceiling: float | None = None) -> None:
@@ -204,7 +204,7 @@ def stage_sections(job: JobFiles, out: Path) -> list[str]:
         path = out / f"{stage}.png"
         if names := trace_charts.draw_stage_chart(stage, series, path):
             parts += [
-                page.heading(f"{stage}: error against seconds"),
+                page.heading(f"{stage}: error against seconds", 3),
                 inline_images.chart_element(path, ", ".join(names)),
             ]
     parts += [page.paragraph(f"Not drawn: {why}", quiet=True) for why in job.unread]
@@ -212,24 +212,21 @@ def stage_sections(job: JobFiles, out: Path) -> list[str]:
 
 
 def skipped_section(job: JobFiles) -> list[str]:
-    """Return the section with a table of stages and reasons; empty if no plan was recorded.
+    """Return HTML parts with a table of stages and reasons, by the recorded plan.
 
     The stages are those that were skipped, are provided by the scene, or still have to run or cannot run, and finished
     stages with a remark.
     """
-    if not job.plan:
-        return []
     rows = [
         [stage, WORDS.get(entry["word"], entry["word"]), "; ".join([entry["reason"], *entry["notes"]])]
         for stage, entry in job.plan.items()
         if entry["word"] != "cached" or entry["reason"]
     ]
-    parts = [page.heading("What was left out or taken over, and why")]
-    return parts + ([page.table(["stage", "", "reason"], rows, text=(1, 2))] if rows else [page.paragraph("Nothing.")])
+    return [page.table(["stage", "", "reason"], rows, text=(1, 2))] if rows else [page.paragraph("Nothing.")]
 
 
 def receipts_section(job: JobFiles) -> list[str]:
-    """Return the section with a table of seconds, memory and machine of each stage, and the versions of libraries.
+    """Return HTML parts with a table of seconds, memory and machine of each stage, and the versions of libraries.
 
     The seconds of a stage that was resumed are those of its last try only; the table says so.
     """
@@ -244,11 +241,7 @@ def receipts_section(job: JobFiles) -> list[str]:
     versions = {name: v for r in job.receipts.values() for name, v in r.get("versions", {}).items()}
     with_versions = ", ".join(f"{name} {version}" for name, version in versions.items())
     table = page.table(header, rows, text=(4, 5, 6, 7, 8))
-    return [
-        page.heading("Receipts"),
-        table,
-        page.paragraph(f"With {with_versions}.", quiet=True) if with_versions else "",
-    ]
+    return [table, page.paragraph(f"With {with_versions}.", quiet=True) if with_versions else ""]
 
 
 def files_section(job: JobFiles) -> list[str]:

@@ -50,7 +50,7 @@ def command_line_parameters(job: JobFiles) -> dict[str, Any]:
 
 
 def parameters_section(job: JobFiles) -> list[str]:
-    """Return the section with the parameters that differ from their defaults.
+    """Return HTML parts with the parameters that differ from their defaults.
 
     Parameters changed on the command line get a table of their own, which comes first.
     """
@@ -63,9 +63,8 @@ def parameters_section(job: JobFiles) -> list[str]:
             if f"{stage}.{name}" in overrides:
                 instead = dict(flatten_parameters(job.unset[stage])).get(name)
                 override_rows.append([f"{stage}.{name}", _short(value), _short(instead), _short(defaults.get(name))])
-    top = page.heading("Parameters other than their defaults")
     if not rows:
-        return [top, page.paragraph("None.")]
+        return [page.paragraph("None.")]
     parts = (
         [page.table(["set by hand", "value", "instead of", "default"], override_rows, text=(1, 2, 3))]
         if override_rows
@@ -73,7 +72,7 @@ def parameters_section(job: JobFiles) -> list[str]:
     )
     table = page.table(["", "value", "default"], rows, text=(1, 2))
     who = "by profile, scene.yaml, variant or hand"
-    return [top, *parts, f"<details><summary>all {len(rows)}, {who}</summary>{table}</details>"]
+    return [*parts, f"<details><summary>all {len(rows)}, {who}</summary>{table}</details>"]
 
 
 def _short(value: Any) -> str:
@@ -82,7 +81,7 @@ def _short(value: Any) -> str:
 
 
 def reproduce_section(job: JobFiles) -> list[str]:
-    """Return the section with the command that repeats the job."""
+    """Return HTML parts with the command that repeats the job."""
     name, _, variant = job.home.name.partition("@")
     source = job.home.with_name(name) / "source"
     scene = load_scene_argument(source, name)
@@ -92,7 +91,7 @@ def reproduce_section(job: JobFiles) -> list[str]:
         text = " ".join(shlex.quote(f"{key}={json.dumps(value)}") for key, value in overrides.items())
         words.append(f"set={shlex.quote(text)}")
     line = " ".join(["make", *words, "all"])
-    return [page.heading("To do it again"), page.code(line)]
+    return [page.code(line)]
 
 
 def load_scene_argument(path: Path, name: str) -> str:

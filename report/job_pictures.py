@@ -210,14 +210,13 @@ def origins_section(job: JobFiles) -> list[str]:
 
 
 def depth_section(job: JobFiles) -> list[str]:
-    """Return the section on depth: a few views of the fit and of the latest Gaussians, coloured by disparity.
+    """Return HTML parts on depth: a few views of the fit and of the latest Gaussians, coloured by disparity.
 
     The two pictures of a view have the same scale of colours; different views have different scales.
     """
     stages = [s for s in RESULTS if s in job.folders and (job.folders[s] / "gaussians.ply").is_file()]
-    top = page.heading("Depth, before and after")
     if not stages or "fit" not in stages or "poses" not in job.folders:
-        return [top, page.paragraph("None yet: the stage `fit` has not run.")]
+        return [page.paragraph("None yet: the stage `fit` has not run.")]
     scene = load_scene(job.folders["poses"])
     names = pick_evenly(before_after.rendered_views(job) or list(scene.train), DEPTH_VIEWS)
     states = {"with the object": "fit"} | ({f"after {stages[0]}": stages[0]} if len(stages) > 1 else {})
@@ -228,7 +227,7 @@ def depth_section(job: JobFiles) -> list[str]:
         for words, picture in zip(loaded, pictures, strict=True):
             cells.append((inline_images.photo_address(picture, DEPTH_SIDE), f"{name}, {words}"))
     legend = "Bright is near; pairs share a scale; grey is empty."
-    return [top, page.paragraph(legend, quiet=True), inline_images.picture_grid(cells)]
+    return [page.paragraph(legend, quiet=True), inline_images.picture_grid(cells)]
 
 
 def render_depth(gaussians: Gaussians, camera: Camera) -> np.ndarray:

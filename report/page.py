@@ -45,6 +45,16 @@ def heading(text: str, level: int = 2) -> str:
     return f"<h{level}>{escape(text)}</h{level}>"
 
 
+def folded(title: str, parts: Sequence[str]) -> str:
+    """Return a section of a page that is closed until the reader opens it.
+
+    Args:
+        title: plain text, always visible.
+        parts: the content, HTML.
+    """
+    return "\n".join([f"<details><summary><b>{escape(title)}</b></summary>", *parts, "</details>"])
+
+
 def paragraph(text: str, quiet: bool = False) -> str:
     return f'<p class="quiet">{escape(text)}</p>' if quiet else f"<p>{escape(text)}</p>"
 

@@ -11,6 +11,7 @@ from report.job_data import JobFiles
 
 MIN_INVENTION = 0.005  # share of the hole below which nothing counts as invented
 TO_PAINT = "to_paint"  # folder of the stage `reference` with the views worth painting
+MAX_ADVICE = 2  # most views that are named as worth painting
 LEAST_GAIN = 0.05  # share of the hole that a view must show to be worth painting
 RANKED = re.compile(r"^\d+\. (.+?)  (\d+)%(  \(painted\))?$", re.MULTILINE)  # a line of to_paint/ranked.txt
 
@@ -30,6 +31,17 @@ def describe_result(job: JobFiles) -> str:
         if view := view_to_paint(job):
             parts.append(f"painting view {view} would help most")
     return "; ".join(parts) + "."
+
+
+def give_advice(job: JobFiles) -> list[str]:
+    """Return how to make the result better: at most `MAX_ADVICE` views to paint, one sentence each."""
+    folder = job.folders.get("reference", Path()) / TO_PAINT
+    views = [(name, share) for name, share, is_painted in rank_views(job) if share >= LEAST_GAIN and not is_painted]
+    return [
+        f"{view} shows {share:.0%} of what is made up. To decide it yourself, complete {folder / view}.png in any "
+        f"editor where {view}_mask.png is white, save it in the scene's folder as painted/{view}.png, and run again."
+        for view, share in views[:MAX_ADVICE]
+    ]
 
 
 def describe_removal(job: JobFiles) -> str:

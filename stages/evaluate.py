@@ -28,6 +28,7 @@ from reffusion.metrics.view_renders import ViewRenderer, ViewRenders
 from reffusion.params.evaluate import Params
 from reffusion.types import Gaussians, Scene
 
+MAX_UNSCORED = 64  # most training views that are rendered where there are no test views
 FOLDERS = {"fit": "renders_fit", "initialize": "renders_initialize", "distill": "renders"}  # stage -> its renders
 
 
@@ -110,15 +111,15 @@ def run(
 
 
 def views_to_render(scene: Scene) -> tuple[tuple[str, ...], str]:
-    """Return the names of the views to render, and their kind: "test", "training" or "training, every 8th".
+    """Return the names of the views to render, and their kind, e.g. "test", "training" or "training (one in 2)".
 
-    They are the test views. Without test views they are every 8th training view, or all training views if that would
-    give fewer than 8.
+    They are the test views. Without test views they are all training views, or every n-th one if there are more than
+    `MAX_UNSCORED`.
     """
     if scene.test:
         return scene.test, "test"
-    eighth = scene.train[::8]
-    return (eighth, "training, every 8th") if len(eighth) >= 8 else (scene.train, "training")
+    step = -(-len(scene.train) // MAX_UNSCORED)
+    return scene.train[::step], "training" + (f" (one in {step})" if step > 1 else "")
 
 
 def load_stages(finish: Path, folders: dict[str, Path | None], device: str) -> dict[str, Gaussians]:

@@ -410,7 +410,14 @@ def test_report_of_a_job(compared_project, job_folder):
     assert "101 Gaussians; 23.65 dB and FLIP 0.150" in html
     targets = re.findall(r'href="([^"]*)"', html)
     assert len(targets) == 3 and all((path.parent / target).exists() for target in targets)
-    assert "What was left out or taken over, and why" in html
+    assert (
+        html.index('class="compare"')
+        < html.index("23.65 dB")
+        < html.index("Masks")
+        < html.index("<details><summary><b>")
+    )
+    folded = html[html.index("<details><summary><b>") :]
+    assert "What was left out or taken over, and why" in folded and folded.count("data:image/png") == 2
     assert "http" not in re.sub(r'src="[^"]*"', "", html), "whose letters may hold any word"
     assert "make scene=" in html and "profile=laptop all" in html and "set by hand" not in html
     receipt = json.loads((job_folder / "distill/receipt.json").read_text())
@@ -454,6 +461,16 @@ def test_report_of_many_scenes(job_folder):
     assert found["distill", "reference_psnr"] == [3, 26, 29, 29]
     assert found["whole job", "flip_box"] == pytest.approx([3, 0.075, 0.075, 0.1125])
     assert (path.parent / "stages.png").exists() and "29 [26, 29]" in path.read_text()
+
+
+def test_the_report_advises_what_to_paint_and_repeats_the_warnings(job_folder):
+    (job_folder / "reference/to_paint").mkdir(parents=True)
+    (job_folder / "reference/receipt.json").write_text((job_folder / "distill/receipt.json").read_text())
+    (job_folder / "reference/to_paint/ranked.txt").write_text("# views\n1. b  40%\n2. a  30%  (painted)\n3. c  2%\n")
+    (job_folder / "distill/warnings.json").write_text('["the photographs are blurred"]')
+    advice = job.make(job_folder).read_text().partition("what would help</h2>")[2].partition("</ul>")[0]
+    assert "b shows 40% of what is made up" in advice and "to_paint/b.png" in advice and "painted/b.png" in advice
+    assert advice.count("<li>") == 2 and "the photographs are blurred" in advice
 
 
 def test_a_job_that_failed_is_still_reported(job_folder):

@@ -228,10 +228,10 @@ def test_without_test_views_the_training_cameras_are_rendered_and_not_scored(tmp
     assert len((out / "per_view.csv").read_text().splitlines()) == 9
 
 
-def test_of_many_training_views_every_eighth():
+def test_of_many_training_views_every_second():
     names = tuple(f"v{i:03d}" for i in range(70))
     scene = Scene({}, names, (), frozenset(), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), SIMILARITY)
-    assert evaluate.views_to_render(scene) == (names[::8], "training, every 8th")
+    assert evaluate.views_to_render(scene) == (names[::2], "training (one in 2)")
 
 
 def test_a_test_view_without_picture_is_rendered_and_one_of_another_size_refused(tmp_path, stage_folders):

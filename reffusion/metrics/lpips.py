@@ -65,7 +65,8 @@ class Lpips(nn.Module):
         # ImageNet's mean and standard deviation, for inputs in [-1, 1].
         self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1))
         self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1))
-        self.requires_grad_(False).eval()
+        # Channels last takes two thirds of the time on the CPU.
+        self.requires_grad_(False).eval().to(memory_format=torch.channels_last)
 
     def forward(self, first: Tensor, second: Tensor) -> Tensor:
         """Return the LPIPS distance [B] of two batches of images, [B, 3, H, W] in [-1, 1].
@@ -122,7 +123,8 @@ class Lpips(nn.Module):
             raise ValueError(
                 f"LPIPS ({self.net}) needs at least {SMALLEST[self.net]} px a side; the image is {width}x{height} px"
             )
-        x, tapped = (images - self.shift) / self.scale, []
+        x = ((images - self.shift) / self.scale).contiguous(memory_format=torch.channels_last)
+        tapped = []
         for index, layer in enumerate(self.features):
             x = layer(x)
             if index in TAPS[self.net]:
