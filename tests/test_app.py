@@ -15,13 +15,16 @@ import numpy as np
 import pytest
 from PIL import Image
 from scenes import capture as captures
+from scenes import wall_scene
 from scenes.browser import open_page
+from scenes.images import psnr
 from scenes.processes import ROOT, wait_until
+from scenes.references import run_reference_stage
 
 from reffusion.io.arrays import save_json, save_text
 from reffusion.io.images import load_image, save_image
 from report import verdict
-from report.app import painting, scenes, uploads
+from report.app import brush, painting, scenes, uploads
 from report.app.routes import App
 from report.app.scenes import OpenScene
 from report.app.server import Server
@@ -174,6 +177,35 @@ def test_a_painting_must_show_its_view_and_replaces_none_unasked(tmp_path):
     assert load_image(scene.source / "painted/v00.png").shape == (60, 80, 3)
     painting.save_painting(scene, "v00", png(), replace=True)
     assert load_image(scene.source / "painted/v00.png").shape == (30, 40, 3)
+
+
+def transparent_png(image, hole):
+    file = io.BytesIO()
+    Image.fromarray(np.dstack([image, np.where(hole, 0, 255).astype(np.uint8)])).save(file, "PNG")
+    return file.getvalue()
+
+
+def test_a_marked_part_is_filled_with_patches_of_photographs(wall_folders, tmp_path):
+    scene = OpenScene("scene", wall_folders["scene"], tmp_path)
+    for stage in ("poses", "fit", "masks"):
+        save_json(tmp_path / stage / "receipt.json", {})
+    run_reference_stage(wall_folders, tmp_path / "reference")
+    shutil.copytree(tmp_path / "reference/to_paint", tmp_path / painting.TO_PAINT)
+    view = verdict.RANKED.findall((tmp_path / painting.TO_PAINT / "ranked.txt").read_text())[0][0]
+    photo = wall_scene.photo(wall_scene.CAMERAS[view])
+    hole = wall_scene.true_unobserved(wall_scene.CAMERAS[view], 1.6)
+    save_image(tmp_path / f"evaluate/renders/{view}.png", np.full_like(photo, 255))
+    before = np.array(Image.open(io.BytesIO(brush.draw_canvas(scene, view))))
+    assert (before[hole] == 255).all() and not (before[~hole] == 255).all()
+    fill = lambda seed: np.array(Image.open(io.BytesIO(brush.fill(scene, view, transparent_png(before, hole), seed))))
+    filled = fill(0)
+    assert np.array_equal(filled[~hole], before[~hole]) and np.array_equal(fill(0), filled)
+    assert psnr(filled, photo, hole) > psnr(before, photo, hole) + 5
+    for wrong in (before, before[1:]):
+        with pytest.raises(ValueError, match="mark a part|the picture has"):
+            brush.fill(scene, view, transparent_png(wrong, np.zeros(wrong.shape[:2], bool)), 0)
+    with pytest.raises(ValueError, match="at most half of it"):
+        brush.fill(scene, view, transparent_png(before, np.ones_like(hole)), 0)
 
 
 # ------------------------------------------------------------------------------------------------ state, jobs

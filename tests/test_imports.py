@@ -186,6 +186,7 @@ def test_report_reads_through_io(path):
     page = ("reffusion.command", "reffusion.capture.load", "reffusion.clicks.local_segmenter")
     page += ("reffusion.references.files", "runner.files", "runner.frames", "runner.plan")
     # The page runs the runner, shows captures before any stage has run, and renders views.
+    page += ("reffusion.workspace", "reffusion.inpaint.exemplar")  # to fill what a user marks
     app = (*page, *drawing_names, "reffusion.fit.exposure") if path.parent.name == "app" else ()
     # For the random order of pairs, and for confidence intervals.
     chance = ("reffusion.seeding",) if path.stem in ("study", "votes") else ()

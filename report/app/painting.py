@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from io import BytesIO
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from PIL import Image
@@ -56,8 +56,8 @@ def save_painting(scene: OpenScene, view: str, content: bytes, replace: bool) ->
     replace_image(path, picture)
 
 
-def decode_picture(content: bytes) -> np.ndarray:
-    """Return the picture in the bytes of a PNG, JPEG or WebP file, uint8 [H, W, 3].
+def decode_picture(content: bytes, mode: Literal["RGB", "RGBA"] = "RGB") -> np.ndarray:
+    """Return the picture in the bytes of a PNG, JPEG or WebP file, uint8 [H, W, 3], or [H, W, 4] with alpha.
 
     Raises:
         ValueError: the bytes are no such picture, or it has too many pixels.
@@ -65,7 +65,7 @@ def decode_picture(content: bytes) -> np.ndarray:
     try:
         with Image.open(BytesIO(content), formats=FORMATS) as image:
             check_pixels("the picture", *image.size)  # type: ignore[arg-type]
-            return np.array(image.convert("RGB"))
+            return np.array(image.convert(mode))
     except BadInput:
         raise
     except Exception:

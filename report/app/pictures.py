@@ -49,14 +49,19 @@ def draw_photograph(scene: OpenScene, view: str) -> bytes:
 
 
 def draw_result(scene: OpenScene, view: str) -> bytes:
-    """Return the finished scene from a view as a JPEG: as `evaluate` rendered it, or else rendered now.
+    """Return the finished scene from a view as a JPEG; for the errors see `load_result`."""
+    return to_jpeg(load_result(scene, view))
+
+
+def load_result(scene: OpenScene, view: str) -> np.ndarray:
+    """Return the finished scene from a view, uint8 [H, W, 3]: as `evaluate` rendered it, or else rendered now.
 
     Raises:
         KeyError: there is no such view.
     """
     rendered, result = scene.home / "evaluate" / "renders" / f"{view}.png", scene.home / "evaluate" / "scene.ply"
     if view in scene.pictures() and rendered.is_file():
-        return to_jpeg(load_image(rendered))
+        return load_image(rendered)
     return _render(scene.home, view, result.stat().st_mtime_ns)
 
 
@@ -85,16 +90,16 @@ def draw_unsure(scene: OpenScene, view: str) -> bytes:
 
 
 @lru_cache(KEPT)
-def _render(home: Path, view: str, changed: int) -> bytes:
+def _render(home: Path, view: str, changed: int) -> np.ndarray:
     with RENDERING, torch.no_grad():
-        scene, gaussians, exposures = _load_result(home, changed)
+        scene, gaussians, exposures = _load_gaussians(home, changed)
         rendering = rasterizer.render(gaussians, scene.cameras[view])
         color = exposure.apply_exposure(rendering.color, exposures.get(view)).clamp(0, 1)
-    return to_jpeg(to_uint8(color.numpy()))
+    return to_uint8(color.numpy())
 
 
 @lru_cache(1)
-def _load_result(home: Path, changed: int) -> tuple[Scene, Gaussians, dict[str, np.ndarray]]:
+def _load_gaussians(home: Path, changed: int) -> tuple[Scene, Gaussians, dict[str, np.ndarray]]:
     """Return the scene, the result's Gaussians and the exposures; `changed` is the result's time of change."""
     scene = load_scene(home / "poses")
     gaussians = load_ply(home / "evaluate" / "scene.ply", scene.similarity)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -18,7 +19,7 @@ from starlette.routing import Route
 
 from reffusion.clicks.local_segmenter import load_local_segmenter
 from report import verdict
-from report.app import mask_step, painting, pictures, tasks
+from report.app import brush, mask_step, painting, pictures, tasks
 from report.app.jobs import Jobs
 from report.app.mask_step import MaskStep
 from report.app.scenes import OpenScene, find_scene, list_recent
@@ -216,6 +217,18 @@ def _make_routes(app: App) -> list[Route]:
         app.jobs.renew_plan(scene)
         return JSONResponse({})
 
+    def canvas(request: Request) -> Response:
+        scene, view = app.scene(request), _paintable(request)
+        return Response(brush.draw_canvas(scene, view), media_type="image/png")
+
+    async def fill(request: Request) -> Response:
+        scene, view = app.scene(request), await run_in_threadpool(_paintable, request)
+        content, seed = await read_body(request, painting.PICTURE_BYTES), request.query_params.get("seed", "0")
+        if not re.fullmatch(r"\d{1,9}", seed):
+            raise ValueError("seed is a whole number")
+        filled = await run_in_threadpool(brush.fill, scene, view, content, int(seed))
+        return Response(filled, media_type="image/png")
+
     def _paintable(request: Request) -> str:
         scene, view = app.scene(request), request.path_params["view"]
         known = describe(scene, app.jobs, app.exports[scene.name])["to_paint"]
@@ -241,6 +254,8 @@ def _make_routes(app: App) -> list[Route]:
         Route(f"{scene}/pictures/{{kind}}/{{view}}", picture),
         Route(f"{scene}/paint/{{view}}", template),
         Route(f"{scene}/paint/{{view}}", paint, methods=["POST"]),
+        Route(f"{scene}/paint/{{view}}/canvas", canvas),
+        Route(f"{scene}/paint/{{view}}/fill", fill, methods=["POST"]),
         Route(f"{scene}/export/{{file}}", export),
     ]
 

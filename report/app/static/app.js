@@ -422,7 +422,7 @@ addEventListener('keydown', event => {
 function drawPaint() {
   const views = state.to_paint;
   $('paint-lead').textContent = views.length ?
-    'Grey is what no photograph shows. Download a view, complete the grey part with any program, keep the framing, and upload it. Then Start runs what depends on it.' :
+    'Grey is what no photograph shows. Paint a view here; or download it, complete the grey part with any program, keep the framing, and upload it. Then Start runs what depends on it.' :
     'Nothing has to be painted: the photographs show all that the object hid, or scene.yaml names a reference.';
   if (!changed('paint', [views, state.version])) return;
   $('paintings').replaceChildren(...views.map((each, k) => {
@@ -432,7 +432,9 @@ function drawPaint() {
     button.addEventListener('click', () => file.click());
     file.addEventListener('change', () => paint(address, file.files[0]));
     const words = `${each.view}: shows ${Math.round(100 * each.share)} % of the hole${k ? ' beyond the views before' : ''}${each.painted ? '. Painted.' : ''}`;
-    row.append(make('a', 'Download', {className: 'button', href: address, download: `${each.view}.png`}), button, file);
+    const here = make('button', 'Paint here', {className: 'main'});
+    here.addEventListener('click', () => beginPainting(address));
+    row.append(here, make('a', 'Download', {className: 'button', href: address, download: `${each.view}.png`}), button, file);
     figure.append(make('img', '', {src: `${address}?${state.version}`, alt: `${each.view}, to be painted`, loading: 'lazy'}), make('p', words), row);
     return figure;
   }));
@@ -449,6 +451,92 @@ async function paint(address, file, replace = false) {
     else if (error.status !== 409) complain('paint-wrong', error);
   }
 }
+
+// The picture on the easel: its address, earlier pictures for Undo, the last marked part, and the seed of its filling.
+let easel = null;
+const board = $('canvas').getContext('2d'), marks = $('marks').getContext('2d', {willReadFrequently: true});
+
+async function beginPainting(address) {
+  complain('paint-wrong');
+  try {
+    const image = await createImageBitmap(await fetchPicture(`${address}/canvas`));
+    for (const each of [$('canvas'), $('marks')]) { each.width = image.width; each.height = image.height; }
+    board.drawImage(image, 0, 0);
+    $('brush').value = Math.round(image.width / 16);
+    easel = {address, earlier: [], last: null, seed: 0, marked: false};
+    drawEasel();
+  } catch (error) { complain('paint-wrong', error); }
+}
+
+async function fetchPicture(address, body) {
+  const answer = await fetch(address, body ? {method: 'POST', body} : {});
+  if (!answer.ok) throw new Error((await answer.json()).error);
+  return answer.blob();
+}
+
+function drawEasel(busy = false) {
+  $('painter').hidden = !easel;
+  $('paintings').hidden = Boolean(easel);
+  if (!easel) return;
+  $('fill').disabled = busy || !easel.marked;
+  $('again').disabled = busy || !easel.last;
+  $('undo').disabled = busy || !(easel.marked || easel.earlier.length);
+  $('use').disabled = busy || !easel.earlier.length;
+  $('filling').textContent = busy ? 'filling …' : '';
+}
+
+function stroke(event) {
+  if (!easel || !(event.buttons & 1)) return;
+  const box = $('marks').getBoundingClientRect(), scale = $('marks').width / box.width;
+  const [x, y] = [(event.clientX - box.left) * scale, (event.clientY - box.top) * scale];
+  if (event.type === 'pointerdown') { $('marks').setPointerCapture(event.pointerId); easel.at = [x, y]; }
+  Object.assign(marks, {lineWidth: Number($('brush').value), lineCap: 'round', strokeStyle: '#f0f'});
+  marks.beginPath();
+  marks.moveTo(...(easel.at || [x, y]));
+  marks.lineTo(x, y + .01);
+  marks.stroke();
+  Object.assign(easel, {at: [x, y], marked: true});
+  drawEasel();
+}
+
+async function fillMarked() {
+  const {width, height} = $('canvas'), cut = make('canvas', '', {width, height}), pen = cut.getContext('2d');
+  pen.drawImage(easel.last.picture, 0, 0);
+  pen.globalCompositeOperation = 'destination-out';
+  pen.drawImage(easel.last.marks, 0, 0);
+  drawEasel(true);
+  try {
+    const body = await new Promise(done => cut.toBlob(done, 'image/png'));
+    board.drawImage(await createImageBitmap(await fetchPicture(`${easel.address}/fill?seed=${easel.seed}`, body)), 0, 0);
+    marks.clearRect(0, 0, width, height);
+    if (!easel.seed) easel.earlier.push(easel.last.picture);
+    easel.marked = false;
+  } catch (error) { complain('paint-wrong', error); }
+  drawEasel();
+}
+
+async function copyCanvas(id) { return createImageBitmap($(id)); }
+
+for (const name of ['pointerdown', 'pointermove']) $('marks').addEventListener(name, stroke);
+$('marks').addEventListener('pointerup', () => { if (easel) easel.at = null; });
+$('fill').addEventListener('click', async () => {
+  Object.assign(easel, {last: {picture: await copyCanvas('canvas'), marks: await copyCanvas('marks')}, seed: 0});
+  fillMarked();
+});
+$('again').addEventListener('click', () => { easel.seed += 1; fillMarked(); });
+$('undo').addEventListener('click', () => {
+  if (!easel.marked) board.drawImage(easel.earlier.pop(), 0, 0);
+  marks.clearRect(0, 0, $('marks').width, $('marks').height);
+  Object.assign(easel, {marked: false, last: null});
+  drawEasel();
+});
+$('use').addEventListener('click', () => $('canvas').toBlob(content => {
+  const address = easel.address;
+  easel = null;
+  drawEasel();
+  paint(address, content);
+}, 'image/png'));
+$('leave').addEventListener('click', () => { easel = null; drawEasel(); });
 
 // ------------------------------------------------------------------------------------------------ export
 
