@@ -18,7 +18,7 @@ from runner.files import MACHINE, read_receipt
 from runner.keys import flatten_params
 from runner.plan import FINAL, TO_DO, Decision
 from runner.resolve import ResolvedJob, has_cuda
-from runner.text import format_range, format_seconds
+from runner.text import format_seconds
 
 CORES = 2  # cores on which the table was measured
 PARALLEL_SHARE = 0.75  # share of a stage's time on one core that more cores divide among them
@@ -116,21 +116,17 @@ def is_timed(job: ResolvedJob, decision: Decision) -> bool:
 def total_time(job: ResolvedJob, decisions: Mapping[str, Decision]) -> str:
     """Return the expected time of the stages of a plan that are still to run, as text; "" if no stage has one.
 
-    It is a range if ordinary scenes may leave out a stage, which is not known yet. Stages without a known time are
-    named.
+    Stages without a known time are named.
     """
-    least = greatest = 0.0
-    unknown = []
+    total, unknown = 0.0, []
     for stage, decision in decisions.items():
         if not is_timed(job, decision):
             continue
         seconds = expected_seconds(job, stage)
         if seconds is None:
             unknown.append(stage)
-            continue
-        greatest += seconds
-        least += 0.0 if decision.is_open else seconds
-    if not greatest:
+        else:
+            total += seconds
+    if not total:
         return ""
-    span = format_range(least, greatest) if least else format_seconds(greatest)
-    return span + (f" and the time of {', '.join(unknown)}" if unknown else "")
+    return format_seconds(total) + (f" and the time of {', '.join(unknown)}" if unknown else "")

@@ -39,7 +39,6 @@ class Condition(Strict):
         empty: <stage>/<folder>; true if this folder of an earlier stage's artifact has no files.
         unless: the condition is false if scene.yaml has one of these keys.
         only: <stage>.<name> -> value; the condition is false unless each of these parameters has its value.
-        common: whether ordinary scenes meet the condition, so that the expected time of a job is a range.
     """
 
     reason: str
@@ -49,7 +48,6 @@ class Condition(Strict):
     empty: str | None = None
     unless: tuple[str, ...] = ()
     only: dict[str, Any] = {}
-    common: bool = False
 
     @model_validator(mode="after")
     def _has_one_test(self) -> Self:

@@ -54,7 +54,6 @@ class Decision:
         notes: notes of the stage's preview.
         needed: the weights that the stage will use, as fields of reffusion.weights.local.Need.
         lacks: what this machine lacks for CUDA, a line each with the remedy.
-        is_open: True if the stage is pending on a condition that ordinary scenes meet (`pipeline.Condition.common`).
     """
 
     status: str
@@ -65,7 +64,6 @@ class Decision:
     notes: tuple[str, ...] = ()
     needed: tuple[dict[str, Any], ...] = ()
     lacks: tuple[str, ...] = ()
-    is_open: bool = False
 
 
 def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decision:
@@ -86,26 +84,24 @@ def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decisi
     if own and own.by in job.brings and (not own.param or _has_value(job, own.param, own.equals)):
         source = earlier[own.artifact]
         return Decision("provided", f"the scene brings `{own.by}`", source.path, source.is_final)
-    open_questions: dict[str, bool] = {}  # text -> whether the answer is open in ordinary scenes
+    open_questions: list[str] = []
     for condition in spec.skip_if:
         if holds := _is_true(job, condition, earlier):
             return Decision("skip", _format_reason(condition, earlier), is_final=True)
         if holds is None:
-            unknown = f"left out if {condition.reason.split(':')[0]}: known after {condition.names[0]}"
-            open_questions[unknown] = condition.common
+            open_questions.append(f"left out if {condition.reason.split(':')[0]}: known after {condition.names[0]}")
     needs = {need: earlier[need] for need in used_needs(job, stage) if need != SCENE}
     for need in (need for need in spec.needs if need != SCENE):
         if needs[need].status == "skip":
             return Decision("skip", f"needs {need}, which is left out", is_final=True)
         if needs[need].status == "pending":
-            open_questions[f"waits for {need}"] = needs[need].is_open
+            open_questions.append(f"waits for {need}")
     for param, _, folder in _weights(job, stage):
         if folder and not folder.exists():
             return Decision("missing", f"{stage}.{param}: no weights at {folder}; name a folder, a file or owner/model")
     code = code_fingerprints(job.root, stage, job.hashes)
     if open_questions:
-        first, is_open = next(iter(open_questions)), any(open_questions.values())
-        return Decision("pending", first, _existing_artifact(job, stage), is_open=is_open)
+        return Decision("pending", open_questions[0], _existing_artifact(job, stage))
     changing = [need for need, decision in needs.items() if not decision.is_final]
     if changing:
         path = _existing_artifact(job, stage)

@@ -39,14 +39,6 @@ def format_seconds(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def format_range(least: float, greatest: float) -> str:
-    """Format two durations as a range; as one duration if both read the same."""
-    (first, unit), (last, last_unit) = format_seconds(least).split(), format_seconds(greatest).split()
-    if unit != last_unit:
-        return f"{first} {unit} to {last} {last_unit}"
-    return f"{last} {unit}" if first == last else f"{first} to {last} {unit}"
-
-
 def join_names(names: Iterable[str]) -> str:
     """Join the first three names by commas, and say how many more there are."""
     names = list(names)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from reffusion import trace
 from reffusion.distill import depth_estimator, perceptual
-from reffusion.distill.inputs import load_adapted_prior, load_initialization, load_train_views, resolve_sds
+from reffusion.distill.inputs import load_adapted_prior, load_initialization, load_train_views
 from reffusion.distill.loop import distill
 from reffusion.distill.terms.sds import describe_sds_views
 from reffusion.distill.terms.term import TermInputs
@@ -52,7 +52,6 @@ def run(
     """
     rasterizer.prepare(params.device)
     began = time.monotonic()
-    params, sds_decision = resolve_sds(params, initialize)
     space = Workspace(poses, fit, masks)  # on the CPU: it loads photographs and masks only
     initial, masked, references = load_initialization(params, space.scene, reference, initialize)
     prior, text = load_adapted_prior(params, personalize)
@@ -77,5 +76,5 @@ def run(
     save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     save_labels(out / "labels.npy", masked.cpu())
     inpainter = load_json(lift / "facts.json")["inpainter"] if lift else None
-    save_json(out / "facts.json", {"inpainter": inpainter, "perceptual": distance_name, "sds": sds_decision})
+    save_json(out / "facts.json", {"inpainter": inpainter, "perceptual": distance_name})
     trace.clear_checkpoint(out)

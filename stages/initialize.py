@@ -21,7 +21,6 @@ from reffusion.initialize.extra_views import FLOATER_RATIO, complete_extra_views
 from reffusion.initialize.fill import fill_references
 from reffusion.initialize.origins import ORIGINS, OriginMap, find_origins
 from reffusion.initialize.relighting import remove_shadows
-from reffusion.initialize.sds_gain import GainPrediction, predict_gain
 from reffusion.initialize.warped_views import warp_references
 from reffusion.inpaint import feedforward
 from reffusion.io.arrays import load_json, save_json, save_labels
@@ -129,10 +128,10 @@ def summarize(
     trusted: Sequence[Reference],
     photos: Mapping[str, np.ndarray] | None,
 ) -> dict[str, Any]:
-    """Compute the contents of facts.json: counts of Gaussians, uncovered pixels, and whether SDS may help.
+    """Compute the contents of facts.json: counts of Gaussians, uncovered pixels, and where pixels come from.
 
-    A pixel of C is uncovered if the initialization shows no surface there. The names of views with many such pixels,
-    and the prediction about SDS, are printed.
+    A pixel of C is uncovered if the initialization shows no surface there. The names of views with many such pixels are
+    printed.
 
     Args:
         space: results of the stages `poses`, `fit` and `masks`.
@@ -145,7 +144,6 @@ def summarize(
         photos: view name -> uint8 [H, W, 3], the photographs, without the object's shadow if one was found; None for a
             baseline, or if there is no reference.
     """
-    train = [space.scene.cameras[name] for name in space.scene.train]
     uncovered = {name: each.uncovered_share for name, each in origins.items()}
     shown = [each.shares for name, each in origins.items() if sets[name].consistent.any()]
     mean_shares = {key: sum(each[key] for each in shown) / max(len(shown), 1) for key in ORIGINS[1:]}
@@ -153,9 +151,6 @@ def summarize(
     for each in extra:  # a view may have been completed more than once
         patches[each.camera.name] = patches.get(each.camera.name, False) | each.mask
     shares = {name: float(mask.sum() / sets[name].consistent.sum()) for name, mask in patches.items()}
-    gain = GainPrediction(True, f"start is {params.start}", None)
-    if photos is not None:
-        gain = predict_gain(draft.gaussians, train, sets, photos)
     invented_shares = {name: each.shares["patches"] + each.shares["nothing"] for name, each in origins.items()}
     invented_pixels = lambda name: invented_shares[name] * np.count_nonzero(origins[name].classes)
     worst = max(origins, key=invented_pixels, default=None)
@@ -165,7 +160,6 @@ def summarize(
         print(
             f"worth painting next: {worst}; no photograph or reference shows {share:.0%} of what the object hid there"
         )
-    print(f"SDS {'may' if gain.may_gain else 'cannot'} gain: {gain.reason}")
     if named := [f"{name} ({share:.1%})" for name, share in uncovered.items() if share > WARN_SHARE]:
         print(
             f"uncovered in {len(named)} views: {', '.join(named)}: complete another view and add it to the references"
@@ -177,9 +171,6 @@ def summarize(
         "completed": [each.camera.name for each in trusted],
         "uncovered": uncovered,
         "extra_views": shares,
-        "sds_may_gain": gain.may_gain,
-        "sds_reason": gain.reason,
-        "psnr_beside": gain.psnr_beside,
         "origins": mean_shares,
         "invented_shares": invented_shares,
         "uncovered_share": sum(uncovered.values()) / max(len(uncovered), 1),

@@ -202,7 +202,7 @@ def test_a_marked_part_is_filled_with_patches_of_photographs(wall_folders, tmp_p
     assert np.array_equal(filled[~hole], before[~hole]) and np.array_equal(fill(0), filled)
     assert psnr(filled, photo, hole) > psnr(before, photo, hole) + 5
     for wrong in (before, before[1:]):
-        with pytest.raises(ValueError, match="mark a part|the picture has"):
+        with pytest.raises(ValueError, match=r"mark a part|the picture has"):
             brush.fill(scene, view, transparent_png(wrong, np.zeros(wrong.shape[:2], bool)), 0)
     with pytest.raises(ValueError, match="at most half of it"):
         brush.fill(scene, view, transparent_png(before, np.ones_like(hole)), 0)

@@ -16,7 +16,6 @@ from runner.durations import typical_seconds
 from runner.plan import plan
 from runner.plan_table import plan_table
 from runner.resolve import Request, resolve
-from runner.text import format_range
 
 pytestmark = pytest.mark.integration
 
@@ -59,8 +58,3 @@ def test_time_on_a_named_gpu(tmp_path):
     assert 1.8 < longer / fast < 2
     with pytest.raises(Refused, match=r"unknown GPU 'voodoo'; known: rtx-3090, .*h200"):
         resolve_photos(tmp_path, gpu="voodoo")
-
-
-def test_a_range_names_its_unit_once_and_is_none_if_both_ends_read_the_same():
-    assert format_range(180, 240) == "3 to 4 min" and format_range(80, 120) == "80 s to 2 min"
-    assert format_range(185, 188) == "3 min"

@@ -11,13 +11,16 @@ import numpy as np
 import pytest
 import yaml
 from scenes import wall_scene
+from scenes.settings import with_changes
 from scenes.stage_runs import run_masks
 
 from reffusion.capture import image_detail
 from reffusion.fit.preparation import limit_sh_degree
 from reffusion.io.arrays import load_json
 from reffusion.io.scene import load_mask_sets, load_scene
+from reffusion.params.distill import Params
 from stages import fit, masks
+from stages.plan import distill as plan_distill
 
 ROOT = Path(__file__).resolve().parent.parent
 # Libraries for diffusion, structure from motion, the viewer, clusters and LPIPS, which the stages below do not need.
@@ -61,20 +64,14 @@ def test_the_pipeline_leaves_diffusion_out_where_nothing_is_to_be_invented():
         assert "masks.invent_pixels" in facts, name
 
 
-def test_personalization_is_left_out_where_sds_cannot_gain_and_the_profile_asks():
+def test_only_the_profile_laptop_leaves_sds_out():
+    """Personalization follows: a prior that no term asks need not be there."""
     pipeline = yaml.safe_load((ROOT / "pipeline.yaml").read_text())
-    (rule,) = (c for c in pipeline["stages"]["personalize"]["skip_if"] if c.get("fact") == "initialize.sds_may_gain")
-    assert rule["equals"] is False and "{sds_reason}" in rule["reason"]
-    assert rule["only"] == {"distill.sds.run": "auto", "distill.depth.weight": 0}  # the depth term needs the prior, too
     runs = {name: profile["distill"].get("sds", {}).get("run") for name, profile in pipeline["profiles"].items()}
-    assert runs == {
-        "paper": None,
-        "best": None,
-        "fast": None,
-        "laptop": "auto",
-        "laptop-terms": "always",
-        "paper-terms": None,
-    }
+    assert runs == dict.fromkeys(runs) | {"laptop": "never", "laptop-terms": "always"}
+    nothing = with_changes(Params(), sds={"run": "never"}, depth={"weight": 0})
+    assert plan_distill.needed_weights(nothing, frozenset()) == []
+    assert plan_distill.needed_weights(with_changes(nothing, sds={"run": "always"}), frozenset()) != []
 
 
 def test_few_unseen_pixels_are_negligible_and_it_can_be_forced(tmp_path):

@@ -50,7 +50,7 @@ FILLED = ("reference", "personalize", "initialize", "distill")
 PLANS = {
     "no_personalization": (AFTER, ("personalize",)),
     "no_splitting": (AFTER, ()),
-    "no_reference_init": (("initialize", "personalize", *AFTER), ()),  # personalize reads facts of initialize
+    "no_reference_init": (("initialize", *AFTER), ()),
     "no_local_sds": ((), ()),  # the laptop profile lacks these three terms
     "no_adversarial": ((), ()),
     "no_depth": ((), ()),
@@ -69,6 +69,9 @@ PLANS = {
 # ------------------------------------------------------------------------------------------------------- the plans
 
 
+WITH_SDS = "distill.sds.run=always"
+
+
 def decide_stages(job: ResolvedJob) -> dict[str, Decision]:
     decisions: dict[str, Decision] = {}
     for stage in job.pipeline.stages:
@@ -81,14 +84,14 @@ def finished_capture(tmp_path_factory):
     """A small scene, and the folder runs/ after the scene's own run, with the files that the runner reads."""
     home = tmp_path_factory.mktemp("variants")
     scene, runs = write_capture(home / "scene", "llff", make_truth()), home / "runs"
-    job, decisions = resolve(Request(ROOT, runs, str(scene), profile="laptop")), {}
+    job, decisions = resolve(Request(ROOT, runs, str(scene), profile="laptop", set=WITH_SDS)), {}
     for stage in job.pipeline.stages:
         decisions[stage] = decide(job, stage, decisions)
         if decisions[stage].status == "run":
             place = runs / "scene" / stage
             (place / "masks").mkdir(parents=True)
             (place / "masks" / "v00.png").write_text(stage)
-            (place / "facts.json").write_text(json.dumps({"invent_pixels": 7, "sds_may_gain": True}))
+            (place / "facts.json").write_text(json.dumps({"invent_pixels": 7}))
             inputs = decisions[stage].inputs
             receipt = asdict(inputs) | {"key": inputs.key} | hash_contents(place, job.hashes)
             (place / "receipt.json").write_text(json.dumps(receipt))
@@ -107,7 +110,8 @@ def test_every_variant_has_a_plan_here():
 @pytest.mark.parametrize("variant", PLANS)
 def test_a_variant_runs_what_it_changes_and_shares_the_rest(finished_capture, variant):
     scene, runs = finished_capture
-    decisions = decide_stages(resolve(Request(ROOT, runs, str(scene), profile="laptop", variant=variant)))
+    request = Request(ROOT, runs, str(scene), profile="laptop", variant=variant, set=WITH_SDS)
+    decisions = decide_stages(resolve(request))
     runs_here, left_out = PLANS[variant]
     assert {s for s, d in decisions.items() if d.status == "skip"} == {*left_out, *({"lift"} - set(runs_here))}
     assert {s for s, d in decisions.items() if d.status in ("run", "stale", "pending")} == set(runs_here)

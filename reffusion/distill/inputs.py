@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from reffusion.distill.train_view import ReferenceHole, TrainView
-from reffusion.io.arrays import load_json, load_labels
+from reffusion.io.arrays import load_labels
 from reffusion.io.images import load_mask
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_references, load_views
@@ -20,30 +20,6 @@ from reffusion.prior.crops import PROMPTS
 from reffusion.prior.model import Prior, drop_text_encoders, enable_checkpointing, load_prior
 from reffusion.types import Gaussians, Scene
 from reffusion.workspace import Workspace
-
-
-def resolve_sds(params: Params, initialize: Path) -> tuple[Params, str]:
-    """Decide whether SDS runs, and return the resulting parameters and the decision in words.
-
-    SDS with weight 0 does not run. Otherwise `distill.sds.run` decides: "always", "never", or "auto", which takes the
-    decision of the stage `initialize` from its facts.json.
-
-    Args:
-        params: Parameters of the stage `distill`.
-        initialize: The folder of the stage `initialize`.
-
-    Returns:
-        The parameters, in which `sds.weight` is 0 if SDS does not run, and the decision.
-    """
-    if params.sds.weight == 0 or params.sds.run == "always":
-        return params, "runs" if params.sds.weight else "weight 0"
-    never = {"sds_reason": "distill.sds.run is never"}
-    facts = load_json(initialize / "facts.json") if params.sds.run == "auto" else never
-    if facts.get("sds_may_gain"):
-        return params, f"runs: {facts['sds_reason']}"
-    decision = f"left out: {facts['sds_reason']}"
-    print(f"SDS {decision}", flush=True)
-    return params.changed({"sds.weight": 0.0}), decision
 
 
 def load_initialization(

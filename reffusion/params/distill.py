@@ -24,11 +24,8 @@ class SdsTerm(Settings):
     """Settings of multi-scale score distillation, SDS (paper, section 4.2)."""
 
     weight: float = Field(1e-3, ge=0, description="lambda of the SDS term; 0 leaves it out")
-    # The paper always distils. `initialize` estimates what SDS could gain: reffusion.initialize.sds_gain.
-    run: Literal["auto", "always", "never"] = Field(
-        "always",
-        description="whether SDS runs; auto: only if the embedded prior could still improve the initialization",
-    )
+    # The paper always distils. The embedded prior improves no initialization (docs/results.md#score-distillation).
+    run: Literal["always", "never"] = Field("always", description="whether SDS runs")
     patches: int = Field(2, ge=0, description="local patches beside the whole view; 0 leaves the local term out")
     # The paper confines SDS to masked Gaussians. The background around the hole may still be tinted by the object.
     reaches: Literal["masked", "all"] = Field(
@@ -57,7 +54,7 @@ class SdsTerm(Settings):
 
     @property
     def is_on(self) -> bool:
-        """Whether SDS may run. With `run: auto` it does so only if `initialize` finds that it could gain."""
+        """Whether SDS runs."""
         return self.weight > 0 and self.run != "never"
 
 
@@ -203,5 +200,5 @@ class Params(Settings):
 
     @property
     def needs_prior(self) -> bool:
-        """Whether a loss term that may run uses the diffusion prior: SDS or the depth term."""
+        """Whether a loss term uses the diffusion prior: SDS or the depth term."""
         return self.sds.is_on or self.depth.weight > 0
