@@ -22,6 +22,7 @@ from reffusion.background.plane_fit import ransac_plane
 from reffusion.background.visibility import FREE, OPAQUE, SURFACE, smooth_surface
 from reffusion.inpaint.patchmatch.completion import complete
 from reffusion.inpaint.source_image import without_geometry
+from reffusion.kernels.compiled import side_by_side
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
@@ -116,11 +117,12 @@ def extend_planes(gaussians: Gaussians, cameras: Sequence[Camera], seed: int = 0
     maps = _map_planes(_find_planes(samples, INLIER * pixel_size, seed), samples, pixel_size, reach, views, cameras)
     maps = [_mark_targets(each, reach) for each in maps]
     viewpoint = np.mean([camera.center for camera in cameras], axis=0)
-    for each in maps:
-        target = _visible_target(each, [other for other in maps if other is not each], viewpoint)
-        if target.sum() >= MIN_CELLS:
-            disks = _make_disks(each, target, _paint(each, target, seed), gaussians)
-            extension = extension.zip_map(disks, lambda a, b: torch.cat([a, b]))
+    targets = [_visible_target(each, [other for other in maps if other is not each], viewpoint) for each in maps]
+    continued = [(each, target) for each, target in zip(maps, targets, strict=True) if target.sum() >= MIN_CELLS]
+    painted = side_by_side(lambda pair: _paint(*pair, seed), continued)
+    for (each, target), colors in zip(continued, painted, strict=True):
+        disks = _make_disks(each, target, colors, gaussians)
+        extension = extension.zip_map(disks, lambda a, b: torch.cat([a, b]))
     return extension
 
 
@@ -180,10 +182,13 @@ def _map_planes(
         views: some training views, rendered.
         cameras: all training views.
     """
+
+    def observe(plane: tuple[np.ndarray, float]) -> _PlaneMap:
+        near = samples[np.abs(samples @ plane[0] - plane[1]) < INLIER * pixel_size]
+        return _observe(_empty_map(*plane, near, pixel_size, reach), views, cameras)
+
     maps = []
-    for index, (normal, offset) in enumerate(planes):
-        near = samples[np.abs(samples @ normal - offset) < INLIER * pixel_size]
-        plane_map = _observe(_empty_map(normal, offset, near, pixel_size, reach), views, cameras)
+    for index, plane_map in enumerate(side_by_side(observe, planes)):
         for other, distance in planes[:index]:
             apart = np.abs(plane_map.centers @ other - distance) > CROSSING * INLIER * pixel_size
             plane_map = replace(plane_map, seen=plane_map.seen & apart)
@@ -224,6 +229,27 @@ def _observe(plane_map: _PlaneMap, views: Sequence[_View], cameras: Sequence[Cam
         uv, z = geometry.project(points[left], camera)
         in_frame[left] = geometry.is_in_frame(uv, z, camera)
         near_frame[left] |= geometry.is_in_frame(uv, z, camera, FRAME_MARGIN)
+    seen, color = np.zeros(len(points), bool), np.zeros((len(points), 3))
+    seen[in_frame], color[in_frame] = _gather_colors(points[in_frame], normal, views)
+    return replace(
+        plane_map,
+        in_frame=in_frame.reshape(shape),
+        near_frame=near_frame.reshape(shape),
+        seen=seen.reshape(shape),
+        color=color.reshape(*shape, 3),
+    )
+
+
+def _gather_colors(points: np.ndarray, normal: np.ndarray, views: Sequence[_View]) -> tuple[np.ndarray, np.ndarray]:
+    """Return bool [N], which points of a plane more views show than see through, and their colours [N, 3].
+
+    The colour is that of the view which shows the point best: near, and along the normal.
+
+    Args:
+        points: [N, 3].
+        normal: [3], the plane's normal.
+        views: the rendered views.
+    """
     seen, free = np.zeros(len(points), int), np.zeros(len(points), int)
     best, color = np.zeros(len(points)), np.zeros((len(points), 3))
     for view in views:
@@ -240,14 +266,7 @@ def _observe(plane_map: _PlaneMap, views: Sequence[_View], cameras: Sequence[Cam
         at = uv[better, ::-1].T - 0.5
         bilinear = lambda channel, at=at: ndimage.map_coordinates(channel, at, order=1, mode="nearest")
         color[better] = np.stack([bilinear(channel) for channel in np.moveaxis(view.color, -1, 0)], 1)
-    seen = (seen > free) & (best > 0)
-    return replace(
-        plane_map,
-        in_frame=in_frame.reshape(shape),
-        near_frame=near_frame.reshape(shape),
-        seen=seen.reshape(shape),
-        color=color.reshape(*shape, 3),
-    )
+    return (seen > free) & (best > 0), color
 
 
 def _mark_targets(plane_map: _PlaneMap, reach: float) -> _PlaneMap:
