@@ -63,11 +63,12 @@ ATTEMPTS: dict[str, dict] = {
 
 
 def profile_params(overrides: dict) -> Params:
-    """Return the laptop profile's parameters of `distill`, changed by the overrides of an attempt.
+    """Return the laptop profile's parameters of `distill` with SDS, changed by the overrides of an attempt.
 
     An override that is a dictionary changes only the entries that it names. The key `BASE` is no parameter and ignored.
     """
     values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["distill"]
+    values["sds"]["run"] = "always"
     for name, value in overrides.items():
         if name != BASE:
             values[name] = values.get(name, {}) | value if isinstance(value, dict) else value
