@@ -33,7 +33,7 @@ IN_TURN = ("fit", "distill", "personalize", "masks", "evaluate", "initialize", "
 SMALL = (
     "fit.iterations=60 fit.checkpoint_seconds=0.2 personalize.steps=8 personalize.optimizer.batch=2 "
     "personalize.checkpoint_seconds=0.2 distill.iterations=20 distill.checkpoint_seconds=0.2 "
-    "initialize.refit_steps=30 initialize.extra_views=1"
+    "initialize.refit_steps=30 initialize.extra_views=1 distill.sds.run=always"
 )
 
 
