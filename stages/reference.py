@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from reffusion import trace
 from reffusion.capture.views import load_placed_views
 from reffusion.inpaint import exemplar, feedforward
 from reffusion.io.arrays import save_json, save_text
@@ -136,7 +137,8 @@ def inpaint_by_patches(params: Params, out: Path, base: np.ndarray, name: str, s
     camera, masks = space.scene.cameras[name], space.mask_sets[name]
     hole = exemplar.mask_to_paint(masks.consistent, masks.invent)
     seeds = [params.seed + index for index in range(params.candidates)]
-    found = exemplar.complete_view(base, hole, camera, masks.consistent, space.background, seeds)
+    completions = exemplar.complete_view(base, hole, camera, masks.consistent, space.background, seeds)
+    found = [next(completions) for _ in trace.progress(len(seeds), "reference")]
     misfits = [each.misfit for each in found]
     chosen = int(np.argmin(misfits)) if params.choose is None else params.choose
     save_candidates(out, [each.image for each in found], {"view": name, "misfits": misfits, "chosen": chosen})

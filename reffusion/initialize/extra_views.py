@@ -100,4 +100,4 @@ def _complete_view(draft: Draft, camera, hole: np.ndarray, sources: Background, 
         return painter.paint(base, region)
     if coverage.is_narrow(hole):  # a narrow gap shows no texture; continuing the adjacent colours is enough
         return classical.telea(base, region)
-    return exemplar.complete_view(base, region, camera, mask, sources, [SEED])[0].image
+    return next(exemplar.complete_view(base, region, camera, mask, sources, [SEED])).image

@@ -7,7 +7,7 @@ pieces of the view's own photograph, and small patches of all sources. C is the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import cv2
@@ -30,6 +30,7 @@ from reffusion.inpaint.shift_map.photo_offsets import fill_from_photo
 from reffusion.inpaint.shift_map.plane_motions import fill_plane
 from reffusion.inpaint.shift_map.plane_symmetry import MIN_CELLS, PlanePixels, PlaneSymmetry, find_symmetry
 from reffusion.inpaint.source_image import SourceImage
+from reffusion.kernels.compiled import side_by_side
 from reffusion.morphology import convex_hull, dilate, disk, to_pixels
 from reffusion.types import Camera
 
@@ -77,7 +78,7 @@ def add_rim(hole: np.ndarray, hidden: np.ndarray) -> np.ndarray:
 
 def complete_view(
     image: np.ndarray, hole: np.ndarray, camera: Camera, hidden: np.ndarray, around: Background, seeds: Sequence[int]
-) -> list[Completion]:
+) -> Iterator[Completion]:
     """Fill the hole of a training view from its own photograph, other photographs, and views completed before.
 
     Args:
@@ -89,7 +90,7 @@ def complete_view(
             around the object.
         seeds: seeds of the random searches.
 
-    Returns:
+    Yields:
         One completion of the view for each seed, in the order of the seeds. Its misfit counts large pieces and patches,
         each by their share of the pixels that these two steps fill, and serves to compare the completions.
     """
@@ -105,7 +106,7 @@ def complete_view(
         assembly = fill_plane(target, hole, sources, plane, symmetry)
         hole = hole & ~assembly.filled
         target = _with_filled(target, assembly.image, assembly.filled)
-    return [_complete_rest(target, hole, sources, smooth, seed) for seed in seeds]
+    yield from side_by_side(lambda seed: _complete_rest(target, hole, sources, smooth, seed), seeds)
 
 
 def _complete_rest(

@@ -59,7 +59,7 @@ def fill(scene: OpenScene, view: str, content: bytes, seed: int) -> bytes:
     if not 0 < hole.mean() <= MAX_SHARE:
         raise ValueError("mark a part of the picture, at most half of it")
     with pictures.RENDERING:
-        filled = exemplar.complete_view(image, hole, camera, consistent | hole, space.background, [seed])[0].image
+        filled = next(exemplar.complete_view(image, hole, camera, consistent | hole, space.background, [seed])).image
     return _to_png(np.where(hole[..., None], filled, image))
 
 
