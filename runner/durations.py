@@ -64,7 +64,8 @@ def typical_seconds(job: ResolvedJob, stage: str) -> float | None:
         return None
     train, test, *_ = map(len, capture["views"])
     steps = flatten_params(job.params)[f"{stage}.{rates.steps}"] if rates.steps else 0
-    seconds = rates.base + rates.view * train + rates.test * test + rates.step * steps
+    size = capture["megapixels"] / rates.megapixels if rates.megapixels else 1.0
+    seconds = rates.base + rates.test * test + size * (rates.view * train + rates.step * steps)
     return factor * (seconds + (0 if capture["brings_poses"] else rates.placed * train))
 
 

@@ -136,6 +136,8 @@ class Rates(Strict):
     """The expected seconds of a stage: `base`, and those for each training view, test view and step.
 
     Attributes:
+        megapixels: size of the views for which `view` and `step` hold; for other views these two change in proportion.
+            0 if they do not depend on the size.
         device: the device on which they were measured, "cpu" or "cuda".
         placed: seconds for each training view whose pose structure from motion has to find.
         steps: the parameter of the stage that counts its steps; "" if it has none.
@@ -148,6 +150,7 @@ class Rates(Strict):
     step: Annotated[float, Field(ge=0)] = 0
     steps: str = ""
     device: str = "cpu"
+    megapixels: Annotated[float, Field(ge=0)] = 0
 
 
 class Pipeline(Strict):

@@ -22,11 +22,11 @@ pytestmark = pytest.mark.integration
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def resolve_photos(tmp_path: Path, **options):
-    """Resolve a job of four photographs with the profile `paper`."""
+def resolve_photos(tmp_path: Path, profile: str = "paper", **options):
+    """Resolve a job of four photographs."""
     if not (tmp_path / "row").exists():
         write_four_photos(tmp_path / "row")
-    return resolve(Request(ROOT, tmp_path / "runs", str(tmp_path / "row"), profile="paper", **options))
+    return resolve(Request(ROOT, tmp_path / "runs", str(tmp_path / "row"), profile=profile, **options))
 
 
 def test_what_a_machine_with_a_small_gpu_and_an_old_driver_lacks(tmp_path, monkeypatch):
@@ -58,3 +58,14 @@ def test_time_on_a_named_gpu(tmp_path):
     assert 1.8 < longer / fast < 2
     with pytest.raises(Refused, match=r"unknown GPU 'voodoo'; known: rtx-3090, .*h200"):
         resolve_photos(tmp_path, gpu="voodoo")
+
+
+def test_views_of_half_the_side_take_a_quarter_of_the_time_of_steps(tmp_path):
+    """The photographs are 32 px wide, which `poses.longest` reduces."""
+
+    def step_seconds(settings: str) -> float:
+        jobs = (resolve_photos(tmp_path, "laptop", set=f"{settings} fit.iterations={n}") for n in (100_000, 200_000))
+        once, twice = (typical_seconds(job, "fit") for job in jobs)
+        return twice - once
+
+    assert step_seconds("poses.longest=32") == pytest.approx(4 * step_seconds("poses.longest=16"), rel=0.01)

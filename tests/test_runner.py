@@ -107,7 +107,7 @@ def test_first_run_and_receipts(project):
 
 def test_the_expected_time_follows_the_table_then_this_machine_then_the_scene(capsys, empty_project):
     """The laptop's table says 100 s a step; the toy's stages take milliseconds."""
-    facts = "{'views': [['a', 'b'], ['c'], [], []], 'brings_poses': True}"
+    facts = "{'views': [['a', 'b'], ['c'], [], []], 'brings_poses': True, 'megapixels': 0.3}"
     with open(empty_project / "stages/poses.py", "a") as file:
         file.write(f"\ndef scene_facts(params, scene):\n    return {facts}\n")
     rates = "{fit: {base: 0, step: 100, steps: iterations}, distill: {base: 30}, evaluate: {base: 10, test: 5}}"

@@ -47,9 +47,9 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
     """Return facts about the capture; {} without photographs.
 
-    They are "views": [training, test, clean, cameras-only], a list of view names each; and "brings_poses": whether
-    structure from motion is left out. The stage depends on the roles of views, which may depend on the names of masks,
-    while it does not read the masks.
+    They are "views": [training, test, clean, cameras-only], a list of view names each; "brings_poses": whether
+    structure from motion is left out; and "megapixels": the size of the first view, as it will be used. The stage
+    depends on the roles of views, which may depend on the names of masks, while it does not read the masks.
 
     Args:
         scene: folder of the scene.
@@ -61,7 +61,10 @@ def scene_facts(params: Params, scene: Path) -> dict[str, object]:
         return {}
     capture, roles = read_scene(params, scene, params.longest)
     views = [roles.train, roles.test, sorted(roles.clean), roles.blank]
-    return {"views": views, "brings_poses": capture.poses is not None}
+    width, height = capture_views(capture, roles).size_of(next(iter(capture.pictures)))
+    reduced = min(1.0, params.longest / max(width, height))
+    megapixels = round(width * height * reduced**2 / 1e6, 3)
+    return {"views": views, "brings_poses": capture.poses is not None, "megapixels": megapixels}
 
 
 def preview(params: Params, scene: Path) -> list[str]:
