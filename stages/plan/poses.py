@@ -63,7 +63,7 @@ def scene_facts(params: Params, scene: Path) -> dict[str, object]:
     views = [roles.train, roles.test, sorted(roles.clean), roles.blank]
     width, height = capture_views(capture, roles).size_of(next(iter(capture.pictures)))
     reduced = min(1.0, params.longest / max(width, height))
-    megapixels = round(width * height * reduced**2 / 1e6, 3)
+    megapixels = round(width * height * reduced**2 / 1e6, 6)
     return {"views": views, "brings_poses": capture.poses is not None, "megapixels": megapixels}
 
 
