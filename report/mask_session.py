@@ -19,9 +19,11 @@ import numpy as np
 from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points
 from reffusion.capture.lenses import load_lenses, load_photograph_sizes
 from reffusion.capture.scene_folder import read_scene
+from reffusion.clicks.color_evidence import spread_evenly
 from reffusion.clicks.marks import Mark
 from reffusion.clicks.scene_masks import KEPT_VIEWS, load_evidence
 from reffusion.clicks.scene_segmentation import (
+    MAX_ASKED,
     Event,
     FittedViews,
     Masks,
@@ -305,15 +307,15 @@ class Session:
         return encode_image(self.segmenter, self.images[name])
 
     def _encode_all(self) -> None:
-        """Encode the first `KEPT_VIEWS` views with the segmentation network before the user marks them.
+        """Encode the views in which the segmentation network will be asked, before the user marks any.
 
         A background thread does this while the scene is being fitted.
         """
-        for name in self.views[:KEPT_VIEWS]:
+        for name in spread_evenly(sorted(self.views), MAX_ASKED):
             self.features_of(name)
 
     def _load_evidence(self, name: str) -> ViewEvidence:
-        features_of = None if self.segmenter is None else lambda: self.features_of(name)
+        features_of = lambda: self.features_of(name)
         return load_evidence(self.images[name], self.gaussians, self.scene.cameras[name], self.segmenter, features_of)
 
     def _update_masks(self) -> None:

@@ -64,7 +64,9 @@ def test_views_of_half_the_side_take_a_quarter_of_the_time_of_steps(tmp_path):
     """The photographs are 32 px wide, which `poses.longest` reduces."""
 
     def step_seconds(settings: str) -> float:
-        jobs = (resolve_photos(tmp_path, "laptop", set=f"{settings} fit.iterations={n}") for n in (1_000_000, 2_000_000))
+        jobs = (
+            resolve_photos(tmp_path, "laptop", set=f"{settings} fit.iterations={n}") for n in (1_000_000, 2_000_000)
+        )
         once, twice = (typical_seconds(job, "fit") for job in jobs)
         return twice - once
 

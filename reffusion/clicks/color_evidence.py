@@ -8,7 +8,7 @@ the unknown Gaussians.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -91,7 +91,7 @@ def color_votes(
     names = sorted(cameras)
     sums, means = np.zeros((len(gaussians), 2)), gaussians.means
     features = torch.as_tensor(np.stack([known.inside, known.outside], 1)).to(means)
-    chosen = [names[i] for i in np.unique(np.linspace(0, len(names) - 1, min(VIEWS, len(names))).round().astype(int))]
+    chosen = spread_evenly(names, VIEWS)
     for name in chosen:
         width, height = cameras[name].width, cameras[name].height
         factor = min(1.0, LONGEST / max(width, height))
@@ -127,3 +127,8 @@ def color_log_ratio(image: np.ndarray, inside: np.ndarray, outside: np.ndarray) 
     like = color_frequency(lab, inside.ravel().astype(float))
     other = color_frequency(lab, ring.ravel().astype(float))
     return np.log(like / other).clip(-LARGEST_LOG_RATIO, LARGEST_LOG_RATIO).reshape(inside.shape)
+
+
+def spread_evenly(names: Sequence[str], most: int) -> list[str]:
+    """Return at most `most` of the names, at equal steps."""
+    return [names[k] for k in np.unique(np.linspace(0, len(names) - 1, min(most, len(names))).round().astype(int))]

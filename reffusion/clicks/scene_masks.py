@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -112,9 +112,16 @@ def evidence_loader(scene: Scene, gaussians: Gaussians, poses: Path, segmenter: 
         segmenter: the segmentation network; None for none.
     """
 
+    image_of = lambda name: load_views(poses, [name])[name]
+
+    @lru_cache(KEPT_VIEWS)
+    def features_of(name: str) -> ImageFeatures:
+        assert segmenter is not None
+        return encode_image(segmenter, image_of(name))
+
     @lru_cache(KEPT_VIEWS)
     def evidence_of(name: str) -> ViewEvidence:
-        return load_evidence(load_views(poses, [name])[name], gaussians, scene.cameras[name], segmenter)
+        return load_evidence(image_of(name), gaussians, scene.cameras[name], segmenter, lambda: features_of(name))
 
     return evidence_of
 
@@ -124,7 +131,7 @@ def load_evidence(
     gaussians: Gaussians | None,
     camera: Camera,
     segmenter: Segmenter | None,
-    features_of: Callable[[], ImageFeatures] | None = None,
+    features_of: Callable[[], ImageFeatures],
 ) -> ViewEvidence:
     """Build the ViewEvidence of a view: its photograph, its relief, and the segmentation network.
 
@@ -132,11 +139,9 @@ def load_evidence(
         image: uint8 [H, W, 3], the undistorted photograph.
         gaussians: the fitted scene; None if the scene is not fitted yet, which leaves out the relief.
         segmenter: the segmentation network; None for none.
-        features_of: function that returns the network's features of the photograph. By default the network encodes the
-            photograph at the first prompt.
+        features_of: function that returns the network's features of the photograph.
     """
     relief = None if gaussians is None else all_views.surface_relief(gaussians, camera)
     if segmenter is None:
         return ViewEvidence(image, relief)
-    features_of = features_of or cache(lambda: encode_image(segmenter, image))
     return ViewEvidence(image, relief, lambda prompt: predict_masks(segmenter, features_of(), prompt))

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
 from reffusion import geometry
 from reffusion.clicks import all_views
+from reffusion.clicks.color_evidence import spread_evenly
 from reffusion.clicks.corrections import apply_marks
 from reffusion.clicks.marks import OBJECT, OTHER, Clicks, Mark, confirmed_pixels
 from reffusion.clicks.mask_borders import bounding_box
@@ -28,6 +29,7 @@ from reffusion.types import Camera, Gaussians
 
 Masks = Mapping[str, np.ndarray]  # view -> bool [H, W]
 Recall = Callable[[Hashable, Callable[[], Masks]], Masks]  # (key, compute) -> masks, see `segment_scene`
+MAX_ASKED = 64  # most views in which the network is asked; in other views the votes of these decide
 SAME_SURFACE = 0.02  # relative difference of depth below which two views show the same surface point
 SOURCES = 3  # a change is transferred to a view from this many nearest views
 # A region's bounding sphere has this many times the radius that holds this share of the region's pixels. The depth of
@@ -68,6 +70,11 @@ class FittedViews:
     gaussians: Gaussians
     cameras: Mapping[str, Camera]
     evidence_of: Callable[[str], ViewEvidence]
+
+    @cached_property
+    def asked(self) -> frozenset[str]:
+        """The views in which the network is asked for the object that other views show, evenly spread by name."""
+        return frozenset(spread_evenly(sorted(self.cameras), MAX_ASKED))
 
 
 def compute_always(_: Hashable, compute: Callable[[], Masks]) -> Masks:
@@ -147,7 +154,7 @@ def propagate(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
         empty = lambda camera: np.zeros((camera.height, camera.width), bool)
         return {name: empty(camera) for name, camera in views.cameras.items()} | dict(masks)
     if views.evidence_of(next(iter(masks))).ask is not None:
-        return propagate_masks(views.gaussians, views.cameras, views.evidence_of, masks)
+        return propagate_masks(views.gaussians, views.cameras, views.evidence_of, masks, views.asked)
     image_of = lambda name: views.evidence_of(name).image
     near = find_neighbours(views.gaussians)
     labels = all_views.label_gaussians(views.gaussians, near, views.cameras, masks, image_of)
@@ -271,7 +278,9 @@ def transfer_change(
         shown, points = np.zeros_like(near), surface[near]
         if len(points):
             shown[near] = sum(sample_visible(views, source, ballots[source], points) for source in sources) > 0
-        change = shown | _ask_near(views.evidence_of(other), masks[other], shown, near, positive)
+        change = shown
+        if other in views.asked:
+            change = shown | _ask_near(views.evidence_of(other), masks[other], shown, near, positive)
         if change.any():
             changes[other] = change
             ballots[other] = change.astype(np.int8) - (~change & (masks[other] != positive))
@@ -339,7 +348,7 @@ def spread_change(
         return dict(masks)
     apart = mark.positive and not mark.radius and not dilate(before, 1 / before.shape[1])[change].any()
     if apart:  # other views may show parts of the new object that this view hides, so depth alone is not enough
-        regions = propagate_masks(views.gaussians, views.cameras, views.evidence_of, {name: change})
+        regions = propagate_masks(views.gaussians, views.cameras, views.evidence_of, {name: change}, views.asked)
     else:
         regions = transfer_change(views, name, change, masks, given, mark.positive)
     found = dict(masks)
