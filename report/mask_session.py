@@ -28,9 +28,10 @@ from reffusion.clicks.scene_segmentation import (
     FittedViews,
     Masks,
     correct_own_view,
-    count_first,
+    segment_first,
     segment_own_view,
     segment_scene,
+    split_events,
 )
 from reffusion.clicks.segmenter import ImageFeatures, Segmenter, encode_image
 from reffusion.clicks.single_view import ViewEvidence
@@ -143,6 +144,7 @@ class Session:
         self.results: dict[Hashable, Masks] = {}  # keys of `segment_scene` -> masks
         # `revision` grows with each change of the marks. The current masks belong to `solved_revision`.
         self.revision, self.solved_revision = 0, 0
+        self.looked_at: set[str] = set()  # views at which the present computation has looked
         self.error = ""  # reason why the masks of the latest revision could not be computed
         self.lock = threading.Condition(threading.RLock())
         self.features_of = lru_cache(KEPT_VIEWS)(self._encode)
@@ -177,7 +179,7 @@ class Session:
             raise ValueError(f"a mark lies outside {name}, which has {width}x{height} px")
         if not 0 <= radius <= max(height, width):
             raise ValueError(f"a brush of {radius:g} px on a view of {width}x{height} px")
-        event = Event(name, Mark(np.array(points, float), positive, radius))
+        event = Event(name, Mark(np.array(points, float), positive, radius), is_early=self.gaussians is None)
         self._change(lambda events: [*events, event])
 
     def remove(self, index: int) -> None:
@@ -244,7 +246,8 @@ class Session:
         Returns:
             "views": for each view "name", "width" and "height" (undistorted, px), "marks", "mask" (a number that grows
             when the mask changes; None without a mask) and "given" (True if the mask is given); "fit": True once the
-            fit is loaded; "busy": True while the masks do not yet follow the latest marks; "error": reason why the
+            fit is loaded; "busy": True while the masks do not yet follow the latest marks; "looked_at": number of views
+            at which this computation has looked; "error": reason why the
             masks could not be computed, or ""; "unsaved": True if marks have changed since the last save; "folder":
             folder of the masks. A mark has "index" (for `remove`), "points", "sign" ("+" on the object, "-" on the
             background) and "radius".
@@ -274,6 +277,7 @@ class Session:
                 "views": views,
                 "fit": self.gaussians is not None,
                 "busy": self.solved_revision < self.revision,
+                "looked_at": len(self.looked_at),
                 "error": self.error,
                 "unsaved": self.unsaved,
                 "folder": str(self.capture.masks),
@@ -289,14 +293,16 @@ class Session:
         """Return the mark of an entry of clicks.json, whose points are pixels of the distorted photograph."""
         name = saved["view"]
         points = undistort_points(np.array(saved["points"], float).reshape(-1, 2), self.lenses[name], self.sizes[name])
-        return Event(name, Mark(points, saved["sign"] == "+", saved["radius"] / self._photograph_scale(name)))
+        mark = Mark(points, saved["sign"] == "+", saved["radius"] / self._photograph_scale(name))
+        return Event(name, mark, saved.get("early", False))
 
     def _to_photograph(self, event: Event) -> dict:
         """Return a mark's entry for clicks.json, the inverse of `_from_photograph`."""
         name, mark = event.view, event.mark
         points = distort_points(mark.points, self.lenses[name], self.sizes[name]).round(1).tolist()
         radius = round(mark.radius * self._photograph_scale(name), 2)
-        return {"view": name, "points": points, "sign": "+" if mark.positive else "-", "radius": radius}
+        sign = "+" if mark.positive else "-"
+        return {"view": name, "points": points, "sign": sign, "radius": radius, "early": event.is_early}
 
     def _photograph_scale(self, name: str) -> float:
         """Return the scale of a view: the number of pixels of the photograph per pixel of the undistorted view."""
@@ -364,21 +370,26 @@ class Session:
         def evidence_of(name: str) -> ViewEvidence:
             if revision != self.revision:
                 raise Superseded
+            self.looked_at.add(name)
             return self.evidence_of(name)
+
+        self.looked_at = set()
 
         given, masks = self.capture.given, dict(self.capture.given)
         if self.gaussians is None:
             for name in dict.fromkeys(event.view for event in events):
                 masks |= segment_own_view(evidence_of, [event for event in events if event.view == name], self._recall)
         elif events:
-            if not given:  # show the marked view's mask early, because the masks of all views take longer
-                first = segment_own_view(evidence_of, events[: count_first(events)], self._recall)
-                self._show(self.masks | first, revision)
             cameras = {name: self.scene.cameras[name] for name in {*self.views, *given}}
             views = FittedViews(self.gaussians, cameras, evidence_of)
-            if len(events) > (0 if given else count_first(events)):  # likewise the correction of the last mark's view
-                masks = segment_scene(views, events[:-1], given, self._recall)
-                self._show(masks | correct_own_view(views, events, masks, self._recall), revision)
+            first, groups = split_events(events, given)  # each marked view is shown before all views follow
+            if not groups:
+                self._show(self.masks | segment_first(evidence_of, first, self._recall), revision)
+            else:
+                count = len(groups[-1])
+                in_order = [event for group in (*first.values(), *groups) for event in group]
+                masks = segment_scene(views, in_order[:-count], given, self._recall)
+                self._show(masks | correct_own_view(views, in_order, count, masks, self._recall), revision)
             masks = segment_scene(views, events, given, self._recall)
         self._show(masks, revision)
 

@@ -51,7 +51,7 @@ def describe_removal(job: JobFiles) -> str:
         return "The object is removed, as far as the masks show it"
     left = [each for each in remnants if not each["removed"]]
     if not left:
-        return "The marked object is removed, and no unmarked part of it was detected"
+        return "What the masks show is removed; look whether they left out a part of the object"
     largest = max(left, key=lambda each: each["share"])
     parts = "a part" if len(left) == 1 else f"{len(left)} parts"
     return f"Most of the object is removed, but {parts} may be left (best seen in {largest['view']}; correct the masks)"

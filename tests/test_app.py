@@ -283,7 +283,7 @@ def test_the_judgement_says_what_is_left_and_what_would_help(tmp_path):
     shares = {"photographs": 0.8, "conflict": 0.0, "reference": 0.1, "patches": 0.06, "nothing": 0.04}
     write_job(tmp_path / "a", [], shares)
     said = verdict.describe_result(load_job(tmp_path / "a"))
-    assert "no unmarked part of it was detected" in said
+    assert "look whether they left out a part" in said
     assert "20 % of what it hid is made up; painting view IMG 2 would help most." in said
     part = {"removed": False, "share": 0.01, "view": "IMG_7"}
     write_job(tmp_path / "b", [part, part | {"removed": True}], shares, given=["IMG_1"])

@@ -16,11 +16,11 @@ from scenes.stage_runs import run_masks
 from scipy import ndimage
 
 from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points
-from reffusion.clicks import all_views
+from reffusion.clicks import all_views, scene_segmentation
 from reffusion.clicks.corrections import apply_marks
 from reffusion.clicks.marks import Mark, confirmed_pixels, stroke_pixels
 from reffusion.clicks.refinement import redraw_masks
-from reffusion.clicks.scene_segmentation import Event, FittedViews, correct_scene, segment_scene
+from reffusion.clicks.scene_segmentation import Event, FittedViews, correct_scene, segment_own_view, segment_scene
 from reffusion.clicks.segmenter import Candidate
 from reffusion.clicks.single_view import ViewEvidence
 from reffusion.gaussians.neighbours import find_neighbours
@@ -256,6 +256,33 @@ def test_a_mask_in_one_view_stays_as_it_was_given():
     assert wall_scene.iou(found["a4"], square_mask("a4")) > 0.9
 
 
+def middle_mark(name, positive=True, radius=0.0, above=0.0):
+    row, column = np.argwhere(square_mask(name)).mean(0) + 0.5
+    return Mark(np.array([[column, row - above]]), positive, radius)
+
+
+def test_views_that_are_marked_before_all_have_masks_stay_as_their_own_marks_made_them():
+    """A notch is erased in each of two views; only a later mark in the same view changes it."""
+    views = fitted_views()
+    events = [Event(name, mark, is_early=True) for name in ("a0", "a4") for mark in (
+        middle_mark(name), middle_mark(name, False, radius=2.0))]  # fmt: skip
+    own = {name: segment_own_view(views.evidence_of, events[k : k + 2])[name] for k, name in ((0, "a0"), (2, "a4"))}
+    found = segment_scene(views, events, {})
+    assert (
+        all((found[name] == own[name]).all() for name in own)
+    )
+    added = Event("a4", middle_mark("a4", radius=2.0))
+    assert segment_scene(views, [*events, added], {})["a4"].sum() > own["a4"].sum()
+
+
+def test_marks_that_follow_each_other_in_a_view_are_spread_together(monkeypatch):
+    spread = []
+    monkeypatch.setattr(scene_segmentation, "transfer_change", lambda *a: spread.append(a[1]) or {})
+    strokes = [Event("a4", middle_mark("a4", False, 2.0, above=k)) for k in (0, 2, 4)]
+    segment_scene(fitted_views(), [Event("a0", middle_mark("a0")), *strokes], {})
+    assert spread == ["a4"]
+
+
 def test_a_network_that_knows_the_object_in_parts_gives_the_whole_in_all_views():
     """The network knows the upper and the lower half of the square as two separate objects."""
 
@@ -309,11 +336,11 @@ def test_a_stroke_in_one_view_corrects_the_others():
     masks = {name: mask & lower[name] for name, mask in whole.items()}
     row, column = np.argwhere(whole["a0"] & ~lower["a0"]).mean(0) + 0.5
     stroke = Event("a0", Mark(np.array([[column - 5, row], [column + 5, row]]), True, 2.0))
-    found = correct_scene(views, [stroke], masks, {})
+    found = correct_scene(views, [stroke], 1, masks, {})
     gain = {name: wall_scene.iou(found[name], whole[name]) - wall_scene.iou(masks[name], whole[name]) for name in whole}
     assert gain["a0"] > 0.05
     assert min(gain.values()) > 0.5 * gain["a0"]
-    back = correct_scene(views, [stroke, Event("a4", Mark(stroke.mark.points, False, 40.0))], found, {})
+    back = correct_scene(views, [stroke, Event("a4", Mark(stroke.mark.points, False, 40.0))], 1, found, {})
     assert back["a0"].sum() < found["a0"].sum()
     kept = confirmed_pixels([stroke.mark], whole["a0"].shape) == 1
     assert back["a0"][kept].all(), "what is confirmed in a view survives corrections in others"
@@ -381,7 +408,7 @@ def test_a_stroke_reaches_sides_that_its_view_does_not_show(knows):
     radius = (columns.max() - columns.min()) / 2
     path = np.stack([np.full(2, columns.mean()), [rows.min() + radius, rows.max() - radius]], 1) + 0.5
     stroke = Event("middle", Mark(path, True, radius))
-    found = correct_scene(FittedViews(scene, cameras, evidence_of), [stroke], masks, {})
+    found = correct_scene(FittedViews(scene, cameras, evidence_of), [stroke], 1, masks, {})
     gained = {name: found[name] & ~masks[name] for name in found}
     assert all((gained[name] & ~whole[name]).sum() < 0.03 * whole[name].sum() for name in gained)
     shares = {name: (gained[name] & lost[name]).sum() / lost[name].sum() for name in gained}

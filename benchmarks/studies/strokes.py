@@ -97,7 +97,7 @@ def main() -> None:
             if iou(true[name], masks[name]) > RIGHT:
                 continue  # nothing stands around this end of the object
             stroke = paint_stroke(true[name] ^ masks[name], not arguments.erase)
-            after = correct_scene(views, [Event(name, stroke)], masks, {})
+            after = correct_scene(views, [Event(name, stroke)], 1, masks, {})
             gains = {view: iou(after[view], true[view]) - iou(masks[view], true[view]) for view in true}
             shown = [view for view in true if view != name and iou(masks[view], true[view]) < RIGHT]
             others = np.array([gains[view] for view in shown])

@@ -1,9 +1,9 @@
 """Masks of all views from marks (clicks and brush strokes) in some views.
 
-The view of the first mark is segmented, and its mask is propagated to all views. Each later mark is a correction. A
-correction adds a region to the mask of its own view, or removes one. In each other view it changes the pixels that show
-the surface of this region, and pixels near it by the segmentation network, without pixels that earlier marks confirm to
-be the opposite. A click on another object adds that object to all views.
+The first marks segment the object in their own views, and these masks are propagated to all views. Later marks are
+corrections. A correction adds a region to the mask of its own view, or removes one. In each other view it changes the
+pixels that show the surface of this region, and pixels near it by the segmentation network, without pixels that earlier
+marks confirm to be the opposite. A click on another object adds that object to all views.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import groupby
 
 import numpy as np
 
@@ -46,15 +47,18 @@ class Event:
 
     Attributes:
         view: name of the view.
+        is_early: True if it was made before there were masks of all views. The person then saw the mask of this view
+            alone, as its own marks make it.
     """
 
     view: str
     mark: Mark
+    is_early: bool = False
 
     @property
-    def key(self) -> tuple[str, bool, float, bytes]:
+    def key(self) -> tuple[str, bool, float, bytes, bool]:
         """A hashable key, which is equal for equal events."""
-        return self.view, self.mark.positive, self.mark.radius, self.mark.points.tobytes()
+        return self.view, self.mark.positive, self.mark.radius, self.mark.points.tobytes(), self.is_early
 
 
 @dataclass(frozen=True)
@@ -87,26 +91,66 @@ def segment_scene(
 ) -> dict[str, np.ndarray]:
     """Return the object's mask in every view, view -> bool [H, W].
 
-    Without given masks, the first clicks select the object in their own view (see `count_first`), this mask is
-    propagated, and later events are corrections. All masks are False if no mark is on the object. With given masks,
-    these are propagated, and all events are corrections.
+    The first events select the object in their own views (see `split_events`). These masks and the given ones are
+    propagated, and stay as they are. Later events are corrections; those that follow each other in one view are made
+    together. All masks are False if no mark is on the object and none is given.
 
     Args:
         events: the marks, in the order in which they were made.
         given: view -> bool [H, W], masks that the scene provides. Only an event in the same view changes such a mask.
-        recall: cache of the results after each event, so that a further event does not repeat the work for the earlier
-            events. It maps (key, compute) to the stored masks for this key, or else to the result of compute(). The key
-            holds the events only, so different scenes or given masks must not share a cache.
+        recall: cache of the results after each group of events, so that further events do not repeat the work for the
+            earlier ones. It maps (key, compute) to the stored masks for this key, or else to the result of compute().
+            The key holds the events only, so different scenes or given masks must not share a cache.
     """
-    count = 0 if given else count_first(events)
-    masks = given
-    if count:
-        masks = segment_own_view(views.evidence_of, events[:count], recall)
-    for k in range(count, len(events) + 1):
-        correct = partial(correct_scene, views, events[:k], masks, given, recall)
-        step = correct if k > count else partial(propagate, views, masks)
-        masks = recall(("all views", *(event.key for event in events[:k])), step)
+    first, groups = split_events(events, given)
+    masks = dict(given) | segment_first(views.evidence_of, first, recall)
+    done = [event for own in first.values() for event in own]
+    masks = recall(("all views", *(event.key for event in done)), partial(propagate, views, masks))
+    for group in groups:
+        done = [*done, *group]
+        step = partial(correct_scene, views, done, len(group), masks, given, recall)
+        masks = recall(("all views", *(event.key for event in done)), step)
     return dict(masks)
+
+
+def split_events(events: Sequence[Event], given: Masks) -> tuple[dict[str, list[Event]], list[list[Event]]]:
+    """Return the events that select the object, view -> events, and the corrections in groups of one view each.
+
+    The object is selected by the early events in views that have no given mask and a positive early event. If there are
+    neither such events nor given masks, it is selected by the first event and the clicks in the same view that directly
+    follow it.
+
+    Args:
+        events: the marks, in the order in which they were made.
+        given: view -> bool [H, W], masks that the scene provides.
+    """
+    marked = {event.view for event in events if event.is_early and event.mark.positive and event.view not in given}
+    selects = [event.is_early and event.view in marked for event in events]
+    if not given and not marked:
+        apart = lambda event: event.view != events[0].view or event.mark.radius > 0
+        count = next((k for k, event in enumerate(events) if k and apart(event)), len(events))
+        selects = [k < count for k in range(len(events))]
+    first: dict[str, list[Event]] = {}
+    rest = []
+    for event, is_first in zip(events, selects, strict=True):
+        (first.setdefault(event.view, []) if is_first else rest).append(event)
+    return first, [list(group) for _, group in groupby(rest, key=lambda event: event.view)]
+
+
+def segment_first(
+    evidence_of: Callable[[str], ViewEvidence], first: Mapping[str, Sequence[Event]], recall: Recall = compute_always
+) -> dict[str, np.ndarray]:
+    """Return the masks of the views in which the object is selected, view -> bool [H, W].
+
+    Args:
+        evidence_of: function from a view's name to its photograph, relief and segmentation network.
+        first: view -> its events, from `split_events`.
+        recall: cache of results, as for `segment_scene`.
+    """
+    found: dict[str, np.ndarray] = {}
+    for events in first.values():
+        found |= segment_own_view(evidence_of, events, recall)
+    return found
 
 
 def segment_own_view(
@@ -133,16 +177,6 @@ def _apply_last_mark(
     return {name: apply_marks(evidence_of(name), marks, before, first=len(marks) - 1)}
 
 
-def count_first(events: Sequence[Event]) -> int:
-    """Return how many events, from the first on, make the mask of the first event's view before it is propagated.
-
-    These are the first event (a click or a stroke) and the clicks in the same view that directly follow it. The first
-    later stroke, or event in another view, ends the count and is not included.
-    """
-    apart = lambda event: event.view != events[0].view or event.mark.radius > 0
-    return next((k for k, event in enumerate(events) if k and apart(event)), len(events))
-
-
 def propagate(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
     """Propagate masks to all views: view -> bool [H, W], by the segmentation network if there is one.
 
@@ -166,34 +200,46 @@ def propagate(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
 
 
 def correct_scene(
-    views: FittedViews, events: Sequence[Event], masks: Masks, given: Masks, recall: Recall = compute_always
+    views: FittedViews, events: Sequence[Event], count: int, masks: Masks, given: Masks, recall: Recall = compute_always
 ) -> dict[str, np.ndarray]:
-    """Return the masks of all views after the last event, view -> bool [H, W].
+    """Return the masks of all views after the last `count` events, which are in one view, view -> bool [H, W].
 
     Args:
-        events: all marks so far; the last one is applied.
-        masks: view -> bool [H, W], the masks of all views before the last event.
+        events: all marks so far.
+        count: number of events to apply.
+        masks: view -> bool [H, W], the masks of all views before these events.
         given: view -> bool [H, W], masks that the scene provides; they do not change by events in other views.
         recall: cache of results, as for `segment_scene`.
     """
     name = events[-1].view
-    own = correct_own_view(views, events, masks, recall)
-    return spread_change(views, events, dict(masks) | own, masks[name], given)
+    own = correct_own_view(views, events, count, masks, recall)
+    before, after, found = masks[name], own[name], dict(masks) | own
+    for change, positive in ((after & ~before, True), (before & ~after, False)):
+        found = spread_change(views, events, count, found, before, change, positive, given)
+    return found
 
 
 def correct_own_view(
-    views: FittedViews, events: Sequence[Event], masks: Masks, recall: Recall = compute_always
-) -> Masks:
-    """Return the mask of the last event's view after this event, as {view: bool [H, W]}.
+    views: FittedViews, events: Sequence[Event], count: int, masks: Masks, recall: Recall = compute_always
+) -> dict[str, np.ndarray]:
+    """Return the mask of the last event's view after the last `count` events, as {view: bool [H, W]}.
 
     Args:
-        events: all marks so far; the last one is applied.
-        masks: view -> bool [H, W], the masks of all views before the last event.
+        events: all marks so far; the last `count` ones are in one view.
+        count: number of events to apply.
+        masks: view -> bool [H, W], the masks of all views before these events.
         recall: cache of results, as for `segment_scene`.
     """
     name = events[-1].view
-    step = lambda: {name: correct_view(views, events, masks[name])}
-    return recall(("corrected view", *(event.key for event in events)), step)
+    found: Masks = {name: masks[name]}
+    for k in range(len(events) - count + 1, len(events) + 1):
+        step = partial(_correct_view, views, events[:k], found[name])
+        found = recall(("corrected view", *(event.key for event in events[:k])), step)
+    return dict(found)
+
+
+def _correct_view(views: FittedViews, events: Sequence[Event], before: np.ndarray) -> Masks:
+    return {events[-1].view: correct_view(views, events, before)}
 
 
 def correct_view(views: FittedViews, events: Sequence[Event], before: np.ndarray) -> np.ndarray:
@@ -326,36 +372,42 @@ def _depth(view: ViewEvidence, camera: Camera) -> np.ndarray:
 def spread_change(
     views: FittedViews,
     events: Sequence[Event],
+    count: int,
     masks: Masks,
     before: np.ndarray,
+    change: np.ndarray,
+    positive: bool,
     given: Masks,
 ) -> dict[str, np.ndarray]:
-    """Return the masks of all views, view -> bool [H, W], after the last event's change is made in all other views.
+    """Return the masks of all views, view -> bool [H, W], after a change in one view is made in all others.
 
-    If a click on the object added a region that does not touch the mask before, the region is another object. Its mask
+    If clicks on the object added a region that does not touch the mask before, the region is another object. Its mask
     is propagated to all views. Otherwise the change is transferred (see `transfer_change`). Pixels that marks of a view
     confirm to be the opposite do not change.
 
     Args:
-        events: all marks so far; the last one made the change.
-        masks: view -> bool [H, W], all views; the mask of the last event's view is changed already.
-        before: bool [H, W], the mask of the last event's view before the event.
+        events: all marks so far.
+        count: number of the last events, all in one view, which made the change.
+        masks: view -> bool [H, W], all views; the mask of that view is changed already.
+        before: bool [H, W], the mask of that view before these events.
+        change: bool [H, W], the pixels of that view that were added (`positive`) or removed.
+        positive: True if the pixels were added.
         given: view -> bool [H, W], masks that the scene provides; they do not change by events in other views.
     """
-    name, mark = events[-1].view, events[-1].mark
-    change = masks[name] != before
+    name = events[-1].view
     if not change.any():
         return dict(masks)
-    apart = mark.positive and not mark.radius and not dilate(before, 1 / before.shape[1])[change].any()
-    if apart:  # other views may show parts of the new object that this view hides, so depth alone is not enough
+    by_clicks = not any(event.mark.radius for event in events[-count:])
+    if positive and by_clicks and not dilate(before, 1 / before.shape[1])[change].any():
+        # Other views may show parts of the new object that this view hides, so depth alone is not enough.
         regions = propagate_masks(views.gaussians, views.cameras, views.evidence_of, {name: change}, views.asked)
     else:
-        regions = transfer_change(views, name, change, masks, given, mark.positive)
+        regions = transfer_change(views, name, change, masks, given, positive)
     found = dict(masks)
     for other, region in regions.items():
         if other == name or other in given or not region.any():
             continue
         marks = [event.mark for event in events if event.view == other]
-        region = region & (confirmed_pixels(marks, region.shape) != (OTHER if mark.positive else OBJECT))
-        found[other] = masks[other] | region if mark.positive else masks[other] & ~region
+        region = region & (confirmed_pixels(marks, region.shape) != (OTHER if positive else OBJECT))
+        found[other] = masks[other] | region if positive else masks[other] & ~region
     return found

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from urllib.parse import quote
 
 from report import cli
@@ -22,6 +24,8 @@ def main() -> None:
         raise SystemExit(f"error: {error}") from None
     announce(server, server.address + (f"#{quote(app.first)}/photographs" if app.first else ""))
     server.serve()
+    sys.stdout.flush()
+    os._exit(0)  # threads of onnxruntime may still compute, and abort the interpreter's usual end
 
 
 if __name__ == "__main__":

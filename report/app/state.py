@@ -39,6 +39,7 @@ def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, An
         "masks": count_masks(scene.home),
         "lacks_masks": plan.lacks_masks and not count_masks(scene.home),
         "brings_masks": bool(plan.stages) and not plan.error and not plan.lacks_masks,
+        "has_unsaved_marks": scene.mask_step is not None and scene.mask_step.session.unsaved,
         "has_poses": (scene.home / "raw_masks" / "receipt.json").is_file(),
         "plan": {
             "busy": plan.busy,

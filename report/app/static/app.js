@@ -8,7 +8,7 @@ const MEANING = {
   poses: 'finds where the photographs were taken', raw_masks: 'reads the masks', fit: 'builds the scene in 3D, with the object',
   masks: 'finds all of the object in 3D, and what is known behind it', reference: 'completes one picture of the hole',
   lift: 'completes every picture (for comparisons only)', initialize: 'removes the object and fills the hole in 3D',
-  personalize: 'adapts the image model to the scene', distill: 'refines the filling by the image model',
+  personalize: 'adapts the image model to the scene', distill: 'refines the filling',
   finish: 'writes the finished scene', evaluate: 'renders and scores the result',
 };
 const at = path => `scenes/${encodeURIComponent(scene)}/${path}`;
@@ -343,7 +343,11 @@ function drawStart() {
 }
 
 const act = (name, id = 'start-lead') => ask(at(`do/${name}`), {}).catch(error => { $(id).textContent = error.message; });
-$('run').addEventListener('click', () => { $('run').disabled = true; act('start'); });
+$('run').addEventListener('click', () => {
+  if (state.has_unsaved_marks && !confirm('Your last marks are not in the saved masks. Start without them? (To use them, save the masks in the step Object.)')) return;
+  $('run').disabled = true;
+  act('start');
+});
 $('halt').addEventListener('click', async () => {
   $('halt').disabled = true;
   $('start-lead').textContent = 'Stopping …';
