@@ -200,16 +200,19 @@ def fetch() -> int:
     Reads a JSON object: stage -> {"params", "brings"}, see `describe`.
 
     Returns:
-        Number of failed downloads. Their errors are printed to the standard error.
+        Number of failed downloads of weights that stages need. Errors are printed to the standard error; for weights
+        that stages only could use they are warnings.
     """
-    downloads = {}
+    downloads, optional = {}, set()
     for stage, question in json.load(sys.stdin).items():
         planned = _import_file(_description_file(stage))
         params, needs = planned.Params(**question["params"]), []
         if hasattr(planned, "needed_weights"):
             needs += planned.needed_weights(params, frozenset(question["brings"]))
         if hasattr(planned, "optional_weights"):
-            needs += planned.optional_weights(params)
+            more = planned.optional_weights(params)
+            optional |= {need.name for need in more} - {need.name for need in needs}
+            needs += more
         downloads |= {need.name: need for need in needs if need.problem and need.fetched}
     failed = 0
     for need in downloads.values():
@@ -217,8 +220,9 @@ def fetch() -> int:
             need.fetch()
             print(f"{need.name}: fetched", flush=True)
         except ValueError as error:
-            failed += 1
-            print(f"error: {format_error(error)}", file=sys.stderr, flush=True)
+            failed += need.name not in optional
+            words = ("warning", "; the job runs without it") if need.name in optional else ("error", "")
+            print(f"{words[0]}: {format_error(error)}{words[1]}", file=sys.stderr, flush=True)
     return failed
 
 

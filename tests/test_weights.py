@@ -385,7 +385,8 @@ def test_weights_of_the_laptop_are_fetched_killed_resumed_and_checked(tmp_path, 
     handler.spoilt.add(migan.file)
     process = begin()
     out, errors = process.communicate(timeout=120)
-    assert process.returncode == 1 and f"{migan.file} arrived damaged" in errors, errors
+    assert process.returncode == 0 and f"{migan.file} arrived damaged" in errors, errors
+    assert "the job runs without it" in errors, "stages could use it, and do not need it"
     assert re.search(r"to fetch +208 MB +Carve/LaMa-ONNX", out) and out.index("to fetch: about 3") < out.index(
         "fetched"
     )
