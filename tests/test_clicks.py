@@ -268,9 +268,7 @@ def test_views_that_are_marked_before_all_have_masks_stay_as_their_own_marks_mad
         middle_mark(name), middle_mark(name, False, radius=2.0))]  # fmt: skip
     own = {name: segment_own_view(views.evidence_of, events[k : k + 2])[name] for k, name in ((0, "a0"), (2, "a4"))}
     found = segment_scene(views, events, {})
-    assert (
-        all((found[name] == own[name]).all() for name in own)
-    )
+    assert all((found[name] == own[name]).all() for name in own)
     added = Event("a4", middle_mark("a4", radius=2.0))
     assert segment_scene(views, [*events, added], {})["a4"].sum() > own["a4"].sum()
 

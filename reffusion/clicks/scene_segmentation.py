@@ -9,7 +9,7 @@ marks confirm to be the opposite. A click on another object adds that object to 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import groupby
 
@@ -158,23 +158,29 @@ def segment_own_view(
 ) -> Masks:
     """Return the mask of one view from its own marks alone, as {view name: bool [H, W]}.
 
+    Early events give the mask that the person saw, which a fit does not change: without the view's relief.
+
     Args:
         evidence_of: function from the view's name to its photograph, relief and segmentation network.
         events: the marks in this view, at least one, in the order in which they were made.
         recall: cache of results, as for `segment_scene`.
     """
-    name, marks = events[0].view, [event.mark for event in events]
+    name = events[0].view
     masks: Masks = {}
     for k in range(1, len(events) + 1):
-        step = partial(_apply_last_mark, evidence_of, name, marks[:k], masks.get(name))
+        step = partial(_apply_last_event, evidence_of, events[:k], masks.get(name))
         masks = recall(("own view", *(event.key for event in events[:k])), step)
     return masks
 
 
-def _apply_last_mark(
-    evidence_of: Callable[[str], ViewEvidence], name: str, marks: Sequence[Mark], before: np.ndarray | None
+def _apply_last_event(
+    evidence_of: Callable[[str], ViewEvidence], events: Sequence[Event], before: np.ndarray | None
 ) -> Masks:
-    return {name: apply_marks(evidence_of(name), marks, before, first=len(marks) - 1)}
+    last = events[-1]
+    view = evidence_of(last.view)
+    if last.is_early:
+        view = replace(view, relief=None)
+    return {last.view: apply_marks(view, [event.mark for event in events], before, first=len(events) - 1)}
 
 
 def propagate(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
