@@ -105,7 +105,14 @@ def test_other_pages_and_machines_are_refused(page, scene):
     for path in ("/", "/app.js", "/scenes", "/scenes/scene/state", "/scenes/scene/events", "/scenes/scene/mask/"):
         assert page.send("GET", path, Host="elsewhere.example")[0] == 403
         assert page.send("GET", path, Origin="http://elsewhere.example")[0] == 403
-    for path in ("/scenes", "/uploads", "/scenes/scene/do/start", "/scenes/scene/mask/save", "/scenes/scene/paint/v00"):
+    for path in (
+        "/scenes",
+        "/uploads",
+        "/scenes/scene/do/start",
+        "/scenes/scene/mask/save",
+        "/scenes/scene/paint/v00",
+        "/scenes/scene/paint/v00/fill",
+    ):
         for origin in ("http://elsewhere.example", "null", f"http://{own}.elsewhere.example", "http://127.0.0.1:1"):
             assert page.send("POST", path, {}, Origin=origin)[0] == 403
     assert page.send("GET", "/scenes", Origin=f"http://{own}")[0] == 200
@@ -116,7 +123,8 @@ def test_other_pages_and_machines_are_refused(page, scene):
     "/scenes/scene/pictures/photo/..%2f..%2fsecret", "/scenes/scene/pictures/photo/%2fetc%2fpasswd",
     "/scenes/scene/pictures/secret/v00", "/scenes/scene/export/..%2f..%2fsecret.png",
     "/scenes/scene/export/receipt.json",
-    "/scenes/scene/paint/..%2f..%2fsecret", "/scenes/..%2fscene/state", "/scenes/none/state", "/scenes/none/events",
+    "/scenes/scene/paint/..%2f..%2fsecret", "/scenes/scene/paint/..%2f..%2fsecret/canvas",
+    "/scenes/scene/paint/v00/canvas", "/scenes/..%2fscene/state", "/scenes/none/state", "/scenes/none/events",
     "/scenes/scene/mask/", "/scenes/scene/mask/photo/v00",
 ])  # fmt: skip
 def test_no_address_leads_to_another_file(page, scene, tmp_path, path):
