@@ -23,7 +23,7 @@ from reffusion.clicks.color_evidence import spread_evenly
 from reffusion.clicks.marks import Mark
 from reffusion.clicks.scene_masks import KEPT_VIEWS, load_evidence
 from reffusion.clicks.scene_segmentation import (
-    MAX_ASKED,
+    MAX_NETWORK_VIEWS,
     Event,
     FittedViews,
     Masks,
@@ -144,7 +144,7 @@ class Session:
         self.results: dict[Hashable, Masks] = {}  # keys of `segment_scene` -> masks
         # `revision` grows with each change of the marks. The current masks belong to `solved_revision`.
         self.revision, self.solved_revision = 0, 0
-        self.looked_at: set[str] = set()  # views at which the present computation has looked
+        self.views_in_work: set[str] = set()  # views that the present computation has used so far
         self.error = ""  # reason why the masks of the latest revision could not be computed
         self.lock = threading.Condition(threading.RLock())
         self.features_of = lru_cache(KEPT_VIEWS)(self._encode)
@@ -246,8 +246,8 @@ class Session:
         Returns:
             "views": for each view "name", "width" and "height" (undistorted, px), "marks", "mask" (a number that grows
             when the mask changes; None without a mask) and "given" (True if the mask is given); "fit": True once the
-            fit is loaded; "busy": True while the masks do not yet follow the latest marks; "looked_at": number of views
-            at which this computation has looked; "error": reason why the
+            fit is loaded; "busy": True while the masks do not yet follow the latest marks; "progress": number of views
+            that this computation has used so far; "error": reason why the
             masks could not be computed, or ""; "unsaved": True if marks have changed since the last save; "folder":
             folder of the masks. A mark has "index" (for `remove`), "points", "sign" ("+" on the object, "-" on the
             background) and "radius".
@@ -277,7 +277,7 @@ class Session:
                 "views": views,
                 "fit": self.gaussians is not None,
                 "busy": self.solved_revision < self.revision,
-                "looked_at": len(self.looked_at),
+                "progress": len(self.views_in_work),
                 "error": self.error,
                 "unsaved": self.unsaved,
                 "folder": str(self.capture.masks),
@@ -317,7 +317,7 @@ class Session:
 
         A background thread does this while the scene is being fitted.
         """
-        for name in spread_evenly(sorted(self.views), MAX_ASKED):
+        for name in spread_evenly(sorted(self.views), MAX_NETWORK_VIEWS):
             self.features_of(name)
 
     def _load_evidence(self, name: str) -> ViewEvidence:
@@ -370,10 +370,10 @@ class Session:
         def evidence_of(name: str) -> ViewEvidence:
             if revision != self.revision:
                 raise Superseded
-            self.looked_at.add(name)
+            self.views_in_work.add(name)
             return self.evidence_of(name)
 
-        self.looked_at = set()
+        self.views_in_work = set()
 
         given, masks = self.capture.given, dict(self.capture.given)
         if self.gaussians is None:

@@ -95,7 +95,7 @@ def propagate_masks(
     cameras: Mapping[str, Camera],
     evidence_of: Callable[[str], ViewEvidence],
     masks: Mapping[str, np.ndarray],
-    asked: Collection[str],
+    network_views: Collection[str],
 ) -> dict[str, np.ndarray]:
     """Return the object's mask in every view, view -> bool [H, W].
 
@@ -103,15 +103,15 @@ def propagate_masks(
         cameras: view -> Camera, all views.
         evidence_of: function from a view to its photograph and segmentation network.
         masks: view -> bool [H, W], the known masks, at least one. They are returned unchanged.
-        asked: the views in which the network is asked. In other views, and in those without a network (`ask` is None),
-            the mask is the projection of the votes.
+        network_views: the views in which the network is asked. In other views, and in those without a network (`ask`
+            is None), the mask is the projection of the votes.
     """
     drawn, votes = dict(masks), count_all_votes(gaussians, cameras, masks)
     order = order_by_distance(cameras, masks)
     for k in trace.progress(len(order), "masks from view to view"):
         name = order[k]
         view, projection = evidence_of(name), project_votes(gaussians, cameras[name], assume_supports(gaussians, votes))
-        if name not in asked or view.ask is None or projection.silhouette.sum() < MIN_PIXELS:
+        if name not in network_views or view.ask is None or projection.silhouette.sum() < MIN_PIXELS:
             continue
         drawn[name] = mask = draw_mask(view, projection)
         if agreement(mask, projection) > MIN_AGREEMENT:

@@ -30,7 +30,7 @@ from reffusion.types import Camera, Gaussians
 
 Masks = Mapping[str, np.ndarray]  # view -> bool [H, W]
 Recall = Callable[[Hashable, Callable[[], Masks]], Masks]  # (key, compute) -> masks, see `segment_scene`
-MAX_ASKED = 64  # most views in which the network is asked; in other views the votes of these decide
+MAX_NETWORK_VIEWS = 64  # most views in which the network is asked; in other views the votes of these decide
 SAME_SURFACE = 0.02  # relative difference of depth below which two views show the same surface point
 SOURCES = 3  # a change is transferred to a view from this many nearest views
 # A region's bounding sphere has this many times the radius that holds this share of the region's pixels. The depth of
@@ -76,9 +76,9 @@ class FittedViews:
     evidence_of: Callable[[str], ViewEvidence]
 
     @cached_property
-    def asked(self) -> frozenset[str]:
+    def network_views(self) -> frozenset[str]:
         """The views in which the network is asked for the object that other views show, evenly spread by name."""
-        return frozenset(spread_evenly(sorted(self.cameras), MAX_ASKED))
+        return frozenset(spread_evenly(sorted(self.cameras), MAX_NETWORK_VIEWS))
 
 
 def compute_always(_: Hashable, compute: Callable[[], Masks]) -> Masks:
@@ -124,15 +124,15 @@ def split_events(events: Sequence[Event], given: Masks) -> tuple[dict[str, list[
         events: the marks, in the order in which they were made.
         given: view -> bool [H, W], masks that the scene provides.
     """
-    marked = {event.view for event in events if event.is_early and event.mark.positive and event.view not in given}
-    selects = [event.is_early and event.view in marked for event in events]
-    if not given and not marked:
+    early_views = {event.view for event in events if event.is_early and event.mark.positive} - {*given}
+    selection = [event.is_early and event.view in early_views for event in events]
+    if not given and not early_views:
         apart = lambda event: event.view != events[0].view or event.mark.radius > 0
         count = next((k for k, event in enumerate(events) if k and apart(event)), len(events))
-        selects = [k < count for k in range(len(events))]
+        selection = [k < count for k in range(len(events))]
     first: dict[str, list[Event]] = {}
     rest = []
-    for event, is_first in zip(events, selects, strict=True):
+    for event, is_first in zip(events, selection, strict=True):
         (first.setdefault(event.view, []) if is_first else rest).append(event)
     return first, [list(group) for _, group in groupby(rest, key=lambda event: event.view)]
 
@@ -194,7 +194,7 @@ def propagate(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
         empty = lambda camera: np.zeros((camera.height, camera.width), bool)
         return {name: empty(camera) for name, camera in views.cameras.items()} | dict(masks)
     if views.evidence_of(next(iter(masks))).ask is not None:
-        return propagate_masks(views.gaussians, views.cameras, views.evidence_of, masks, views.asked)
+        return _propagate_by_network(views, masks)
     image_of = lambda name: views.evidence_of(name).image
     near = find_neighbours(views.gaussians)
     labels = all_views.label_gaussians(views.gaussians, near, views.cameras, masks, image_of)
@@ -203,6 +203,10 @@ def propagate(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
         for name, camera in views.cameras.items()
         if name not in masks
     }
+
+
+def _propagate_by_network(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
+    return propagate_masks(views.gaussians, views.cameras, views.evidence_of, masks, views.network_views)
 
 
 def correct_scene(
@@ -331,7 +335,7 @@ def transfer_change(
         if len(points):
             shown[near] = sum(sample_visible(views, source, ballots[source], points) for source in sources) > 0
         change = shown
-        if other in views.asked:
+        if other in views.network_views:
             change = shown | _ask_near(views.evidence_of(other), masks[other], shown, near, positive)
         if change.any():
             changes[other] = change
@@ -406,7 +410,7 @@ def spread_change(
     by_clicks = not any(event.mark.radius for event in events[-count:])
     if positive and by_clicks and not dilate(before, 1 / before.shape[1])[change].any():
         # Other views may show parts of the new object that this view hides, so depth alone is not enough.
-        regions = propagate_masks(views.gaussians, views.cameras, views.evidence_of, {name: change}, views.asked)
+        regions = _propagate_by_network(views, {name: change})
     else:
         regions = transfer_change(views, name, change, masks, given, positive)
     found = dict(masks)
