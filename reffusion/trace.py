@@ -219,7 +219,8 @@ def steps_within_budget(
 def progress(total: int, label: str, start: int = 0) -> Iterator[int]:
     """Yield `range(start, total)`, and show a progress bar with the remaining time on stderr.
 
-    If stderr is not a terminal, one line is printed at most every ten seconds instead.
+    The remaining time follows from all steps but the first, which may compile kernels. If stderr is not a terminal, one
+    line is printed at most every ten seconds instead.
 
     Args:
         label: text before the bar.
@@ -227,8 +228,7 @@ def progress(total: int, label: str, start: int = 0) -> Iterator[int]:
     from tqdm import tqdm
 
     watched = sys.stderr.isatty()
-    yield from tqdm(
-        range(start, total),
+    with tqdm(
         desc=label,
         initial=start,
         total=total,
@@ -236,4 +236,11 @@ def progress(total: int, label: str, start: int = 0) -> Iterator[int]:
         mininterval=0.2 if watched else 10.0,
         ascii=not watched,
         file=sys.stderr,
-    )
+    ) as bar:
+        for step in range(start, total):
+            yield step
+            if step == start:
+                bar.unpause()
+                bar.n = bar.initial = start + 1
+            else:
+                bar.update()

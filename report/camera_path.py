@@ -62,6 +62,23 @@ def focus_point(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
     return np.linalg.solve(matrix, right)
 
 
+def find_central_view(cameras: Sequence[Camera], points: np.ndarray) -> Camera:
+    """Return the camera that shows the focus point nearest to its optical axis and at a usual distance.
+
+    It probably shows all of what the photographs were taken for. A deviation of 20 degrees counts as much as a distance
+    that is e times the median.
+
+    Args:
+        cameras: cameras of the capture, at least one.
+        points: [P, 3] sparse points of the scene, see `focus_point`.
+    """
+    toward = focus_point(cameras, points) - np.stack([camera.center for camera in cameras])
+    distance = np.maximum(np.linalg.norm(toward, axis=1), 1e-12)
+    cosine = np.sum(toward * np.stack([camera.world_to_camera[2, :3] for camera in cameras]), 1) / distance
+    cost = np.degrees(np.arccos(np.clip(cosine, -1, 1))) / 20 + np.abs(np.log(distance / np.median(distance)))
+    return cameras[int(np.argmin(cost))]
+
+
 def look_at(center: np.ndarray, target: np.ndarray, down: np.ndarray) -> np.ndarray:
     """Return the world-to-camera pose [4, 4] of a camera at `center` [3] that looks at `target` [3].
 

@@ -44,7 +44,7 @@ from reffusion.io.scene import list_objects, load_raw_masks, load_scene, load_vi
 from reffusion.params.clicks import CLICKS
 from reffusion.params.raw_masks import Params
 from reffusion.types import Gaussians
-from report import sheet
+from report import camera_path, sheet
 
 KEPT_RESULTS = 64  # number of intermediate results (masks after some of the marks) that stay in memory
 
@@ -138,6 +138,8 @@ class Session:
         self.views = [name for name in self.scene.train if name not in self.scene.clean]
         self.lenses, self.sizes = load_lenses(capture.poses)[0], load_photograph_sizes(capture.poses)
         self.images = load_views(capture.poses, self.views)
+        cameras = [self.scene.cameras[name] for name in self.views]
+        self.first_view = camera_path.find_central_view(cameras, self.scene.points).name if cameras else ""
         self.events: list[Event] = []
         self.masks, self.versions = dict(capture.given), dict.fromkeys(self.views, 0)
         self.gaussians: Gaussians | None = None
@@ -245,12 +247,12 @@ class Session:
 
         Returns:
             "views": for each view "name", "width" and "height" (undistorted, px), "marks", "mask" (a number that grows
-            when the mask changes; None without a mask) and "given" (True if the mask is given); "fit": True once the
-            fit is loaded; "busy": True while the masks do not yet follow the latest marks; "progress": number of views
-            that this computation has used so far; "error": reason why the
-            masks could not be computed, or ""; "unsaved": True if marks have changed since the last save; "folder":
-            folder of the masks. A mark has "index" (for `remove`), "points", "sign" ("+" on the object, "-" on the
-            background) and "radius".
+            when the mask changes; None without a mask) and "given" (True if the mask is given); "first_view": the view
+            in which the object is probably easy to mark; "fit": True once the fit is loaded; "busy": True while the
+            masks do not yet follow the latest marks; "progress": number of views that this computation has used so far;
+            "error": reason why the masks could not be computed, or ""; "unsaved": True if marks have changed since the
+            last save; "folder": folder of the masks. A mark has "index" (for `remove`), "points", "sign" ("+" on the
+            object, "-" on the background) and "radius".
         """
         with self.lock:
             views = [
@@ -281,6 +283,7 @@ class Session:
                 "error": self.error,
                 "unsaved": self.unsaved,
                 "folder": str(self.capture.masks),
+                "first_view": self.first_view,
             }
 
     def _change(self, change: Callable[[list[Event]], list[Event]]) -> None:

@@ -191,7 +191,7 @@ class Viewer:
         photos = {name: photographed.get(name) for name in scene.train}
         target = camera_path.focus_point(train, scene.points)
         self.server.scene.set_up_direction(-np.mean([camera.world_to_camera[1, :3] for camera in train], 0))
-        move_to_view(self.server.initial_camera, train[len(train) // 2], target)
+        move_to_view(self.server.initial_camera, camera_path.find_central_view(train, scene.points), target)
         folder = stage_folder(home, "reference") / "references"
         references = {
             path.stem: load_image(path) for path in sorted(folder.glob("*.png")) if path.stem in scene.cameras

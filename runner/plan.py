@@ -107,7 +107,7 @@ def decide(job: ResolvedJob, stage: str, earlier: dict[str, Decision]) -> Decisi
         path = _existing_artifact(job, stage)
         found = path and read_receipt(path)
         if not path or not found:
-            return Decision("run", "no artifact yet")
+            return Decision("run", "not run yet")
         info = job.stages[stage]
         same_needs = Inputs(info.params, found["needs"], found["weights"], code, info.unkeyed, info.unavailable)
         differences = [] if job.trust else list_changes(found, same_needs)
@@ -240,7 +240,7 @@ def _compare_receipts(job: ResolvedJob, stage: str, inputs: Inputs) -> Decision:
             notes = [f"trusted although {join_names(differs)}"] if differs else notes
             return Decision("cached", "; ".join([*notes, *diff.describe()]), place, True, inputs)
     resumes = "; goes on where it stopped" if partial_folder(job, stage, inputs.key).exists() else ""
-    why = join_names(reasons[0]) if reasons else "no artifact yet"
+    why = join_names(reasons[0]) if reasons else "not run yet"
     return Decision("run", why + resumes, receipts[0][0] if receipts else None, False, inputs)
 
 

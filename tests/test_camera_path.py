@@ -1,5 +1,7 @@
 """The camera path around a capture, and the video along this path."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -30,6 +32,21 @@ def test_a_ring_of_cameras_gives_the_ring_back():
     steps = np.linalg.norm(np.diff(centers, axis=0, append=centers[:1]), axis=1)
     assert np.allclose(steps, steps[0]), "closed, and even"
     assert np.allclose(camera_path.focus_point(ring_cameras(9, 2.0), np.zeros((0, 3))), 0, atol=0.02)
+
+
+def test_the_central_view_looks_at_the_middle_of_the_capture():
+    ring = ring_cameras(8, 2.0)
+    aside = [replace(camera, world_to_camera=turn(20.0) @ camera.world_to_camera) for camera in ring[:3]]
+    near = [camera for camera in ring_cameras(8, 0.5) if camera.name == "5"]
+    found = camera_path.find_central_view([*aside, *near, *ring[3:5], *aside], np.zeros((0, 3)))
+    assert found in ring[3:5]
+
+
+def turn(degrees: float) -> np.ndarray:
+    """Return the pose [4, 4] of a camera that is turned to its side."""
+    pose, angle = np.eye(4), np.radians(degrees)
+    pose[np.ix_([0, 2], [0, 2])] = [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+    return pose
 
 
 def test_every_camera_looks_at_the_focus_upright():

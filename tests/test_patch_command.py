@@ -257,6 +257,6 @@ def test_the_command_fills_a_hole_and_goes_on(tmp_path):
     assert f"{tmp_path / 'out.ply'}: the whole scene" in first.stdout and "painted" in first.stdout
     assert len(load_ply(tmp_path / "out.ply")) > np.count_nonzero(~deleted)
     again = run_module("reffusion.command", "patch", *words)
-    assert again.returncode == 0 and "no artifact yet" not in again.stdout
+    assert again.returncode == 0 and "not run yet" not in again.stdout
     with pytest.raises(BadInput):
         load_ply(tmp_path)

@@ -123,7 +123,7 @@ def test_the_expected_time_follows_the_table_then_this_machine_then_the_scene(ca
     assert f"together about {format_seconds(total)}" in plan_text
     capsys.readouterr()
     run_scene(make_request(empty_project), "fit")
-    assert re.search(r"\nfit: no artifact yet; about \d min\n", capsys.readouterr().out)
+    assert re.search(r"\nfit: not run yet; about \d min\n", capsys.readouterr().out)
     job = resolve(make_request(empty_project))
     taken = [json.loads((empty_project / f"runs/toy/{stage}/receipt.json").read_text()) for stage in ("poses", "fit")]
     assert 3 * factor < expected_seconds(job, "distill") < 8 * factor, "faster than 30 s, as the stages before"
@@ -132,7 +132,7 @@ def test_the_expected_time_follows_the_table_then_this_machine_then_the_scene(ca
 
 def test_fresh_plan(empty_project):
     states = statuses(empty_project)
-    assert states["poses"] == states["fit"] == "run no artifact yet"
+    assert states["poses"] == states["fit"] == "run not run yet"
     assert states["masks"].startswith("pending left out if the scene has no masks")
     assert states["distill"].startswith("pending") and states["evaluate"].startswith("run")
     job = resolve(make_request(empty_project))

@@ -1,5 +1,7 @@
 """The viewer: cameras, layers of the result, and the pictures that a visitor receives."""
 
+import os
+import shutil
 import urllib.request
 from types import SimpleNamespace
 
@@ -20,6 +22,7 @@ from reffusion.io.scene import load_scene, save_scene
 from reffusion.splat import rasterizer
 from reffusion.types import Similarity
 from report import gaussian_layers, unseen_overlay, view
+from report.app import live
 
 pytestmark = pytest.mark.integration
 
@@ -109,6 +112,29 @@ def test_unobserved_pixels_are_hatched(tmp_path):
     changed = (noted != picture).any(-1)
     assert changed[camera.height // 2 :, :8].mean() > 0.15 and not changed[camera.height // 2 :, -20:].any()
     assert unseen_overlay.load_seen_views(tmp_path / "y", scene) == []
+
+
+def test_the_live_view_follows_a_job_from_stage_to_stage(tmp_path):
+    """A state replaces an earlier one as soon as the job has written it, also one without the object."""
+    home = tmp_path / "x"
+    gaussians, labels = write_finished_job(home, NEEDS)
+    for stage in ("initialize", "distill", "evaluate"):
+        shutil.rmtree(home / stage)
+    (home / "masks/labels.npy").rename(tmp_path / "labels.npy")
+    opened = live.LatestViewer(home, port=8350)
+    try:
+        wait_until(lambda: opened.gaussians is not None)
+        assert len(opened.gaussians) == len(gaussians) and "with the object" in opened.title.content
+        (tmp_path / "labels.npy").rename(home / "masks/labels.npy")
+        os.utime(home / "masks/labels.npy")
+        wait_until(lambda: "without the object" in opened.title.content)
+        assert len(opened.gaussians) == int((~labels).sum())
+        save_ply(home / "initialize/gaussians.ply", gaussians.map(lambda p: p[:5]))
+        wait_until(lambda: "before distillation" in opened.title.content)
+        assert len(opened.gaussians) == 5
+    finally:
+        opened.visitors.open = False
+        opened.server.stop()
 
 
 def test_a_missing_scene_is_not_served(tmp_path):

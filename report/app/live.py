@@ -18,13 +18,17 @@ import torch
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
 from reffusion.types import Camera, Gaussians
+from reffusion.workspace import Workspace
 from report import camera_path, view
 
 PERIOD = 4.0  # seconds between two looks for a newer state
+LABELS = "labels.npy"  # of the stage `masks`: which Gaussians of the fit are removed
 # Files with Gaussians -> their title. `.partial-*` are the folders of stages that run.
 STATES = {
     "fit/gaussians.ply": "the scene with the object",
     ".partial-fit-*/checkpoint.pt": "being fitted",
+    f"masks/{LABELS}": "without the object, not filled yet",
+    ".partial-initialize-*/.refit/checkpoint.pt": "filled, being refitted",
     "initialize/gaussians.ply": "filled, before distillation",
     ".partial-distill-*/checkpoint.pt": "being distilled",
     "distill/gaussians.ply": "distilled",
@@ -59,11 +63,11 @@ class LatestViewer:
         self.gaussians: Gaussians | None = None
         self.latest: tuple[Path, str, int] | None = None
         self.server = viser.ViserServer(host="127.0.0.1", port=port, label=home.name, verbose=False)
-        self.title = self.server.gui.add_markdown("waits for the first state")
+        self.title = self.server.gui.add_markdown("The latest state is being loaded.")
         train = [self.scene.cameras[name] for name in self.scene.train]
         self.server.scene.set_up_direction(-np.mean([camera.world_to_camera[1, :3] for camera in train], 0))
         target = camera_path.focus_point(train, self.scene.points)
-        view.move_to_view(self.server.initial_camera, train[len(train) // 2], target)
+        view.move_to_view(self.server.initial_camera, camera_path.find_central_view(train, self.scene.points), target)
         self.visitors = view.Visitors(self.server, self._render)
         threading.Thread(target=self._follow, daemon=True).start()
 
@@ -89,6 +93,8 @@ class LatestViewer:
         if path.suffix == ".pt":
             state = torch.load(path, weights_only=True, map_location="cpu")
             return Gaussians(**state["optimizer"]["parameters"])
+        if path.name == LABELS:
+            return Workspace(self.home / "poses", self.home / "fit", self.home / "masks").remaining
         return load_ply(path, self.scene.similarity) if path.name == OWN_FRAME else load_ply(path)
 
 

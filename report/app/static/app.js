@@ -261,9 +261,9 @@ function drawObject() {
     return;
   }
   if (!ask_) {
-    $('object-lead').textContent = 'First the cameras are found and the scene is fitted; meanwhile you mark the object. Poses take a minute or two.';
+    $('object-lead').textContent = 'The photographs are prepared first; then you mark the object here, while the scene is fitted.';
     if (changed('object', 'begin')) {
-      const begin = make('button', 'Find the cameras', {className: 'main'});
+      const begin = make('button', 'Mark the object', {className: 'main'});
       begin.addEventListener('click', wantMasks);
       $('object-buttons').replaceChildren(begin);
     }
@@ -274,7 +274,7 @@ function drawObject() {
     if (Date.now() - asked > 3000) wantMasks();
   }
   if (isBusy()) {
-    $('object-lead').textContent = job.state === 'elsewhere' ? `${job.words}.` : 'Finding the cameras. The page for clicks opens by itself.';
+    $('object-lead').textContent = job.state === 'elsewhere' ? `${job.words}.` : 'Preparing the photographs. The page for clicks opens by itself.';
     const bar = $('object-progress').firstChild || $('object-progress').appendChild(make('progress', '', {max: 1}));
     if (job.share != null) bar.value = job.share; else bar.removeAttribute('value');
   }
@@ -329,7 +329,7 @@ function drawStart() {
       const kind = each.name === job.stage ? 'running' : done ? 'done' : each.word === 'skip' ? 'skip' : each.word === 'missing' ? 'missing' : '';
       const row = make('tr', '', {className: kind});
       const what = make('td', MEANING[each.name] || '');
-      if (!done) what.append(make('small', each.reason));
+      if (!done && !/^(not run yet|waits for|left out if)/.test(each.reason)) what.append(make('small', each.reason));
       row.append(make('td', each.name), what, make('td', done || kind === 'skip' ? '' : duration(each.seconds)));
       return row;
     }));
