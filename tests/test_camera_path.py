@@ -38,8 +38,8 @@ def test_the_central_view_looks_at_the_middle_of_the_capture():
     ring = ring_cameras(8, 2.0)
     aside = [replace(camera, world_to_camera=turn(20.0) @ camera.world_to_camera) for camera in ring[:3]]
     near = [camera for camera in ring_cameras(8, 0.5) if camera.name == "5"]
-    found = camera_path.find_central_view([*aside, *near, *ring[3:5], *aside], np.zeros((0, 3)))
-    assert found in ring[3:5]
+    found = camera_path.find_central_view([*aside, *near, *ring], np.zeros((0, 3)))
+    assert any(found is camera for camera in ring)
 
 
 def turn(degrees: float) -> np.ndarray:
