@@ -26,7 +26,7 @@
 ## make weights [profile=paper]   fetch the weights of a profile; offline=1: only list what is missing
 ## make demo [seed=N]             make the demo scene, or data/demo-N; others are made when they are named: demo-wide,
 ##                                -360, -seen, -photos, -behind, -beside, -table, -corner, -grass, -insert, -outpaint,
-##                                -pair, -sparse, each also with -N
+##                                -pair, -past, -sparse, each also with -N
 ## make scene=X adapted           views painted by the adapted prior and the unadapted one: runs/X/adapted/sheet.png
 ## make scene=X sds-variance      variance of the SDS gradient before and after personalization
 ##                                both: device=cuda dtype=float16
@@ -43,7 +43,7 @@
 ## make stability                 stiff and extreme cases, each with its bound (minutes): runs/stability.json
 ##
 ## scene=  a name under data/, or a path
-## profile=auto|laptop|paper|best|fast|paper-terms  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER
+## profile=auto|laptop|laptop-terms|paper|best|fast|paper-terms  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER
 ## budget=5m  time for the whole job: sets the number of steps of fit, personalize and distill
 ## trust=1  accept results of older code; keep=1  accept results that you changed by hand
 
@@ -170,7 +170,7 @@ study: setup
 app: $(if $(scene),ready,setup $(VENV)/.lpips) $(VENV)/.ready-view $(VENV)/.ready-export
 	@$(RUN) app $(call flags,scene runs port)
 
-mask: ready
+mask: ready $(VENV)/.ready-view $(VENV)/.ready-export
 	@$(RUN) mask $(call flags,$(where) profile budget set port)
 
 view: named $(VENV)/.ready-view

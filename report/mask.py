@@ -11,8 +11,8 @@ import subprocess
 from urllib.parse import quote
 
 from report import cli
+from report.app.app import App
 from report.app.jobs import WITHOUT_MASKS, make_command
-from report.app.routes import App
 from report.app.server import PORT, Server, announce
 
 

@@ -20,19 +20,11 @@ from reffusion.capture.click_coordinates import distort_mask, distort_points, un
 from reffusion.capture.lenses import load_lenses, load_photograph_sizes
 from reffusion.capture.scene_folder import read_scene
 from reffusion.clicks.color_evidence import spread_evenly
+from reffusion.clicks.events import Event, Masks, split_events
+from reffusion.clicks.fitted_views import MAX_NETWORK_VIEWS, FittedViews
 from reffusion.clicks.marks import Mark
 from reffusion.clicks.scene_masks import KEPT_VIEWS, load_evidence
-from reffusion.clicks.scene_segmentation import (
-    MAX_NETWORK_VIEWS,
-    Event,
-    FittedViews,
-    Masks,
-    correct_own_view,
-    segment_first,
-    segment_own_view,
-    segment_scene,
-    split_events,
-)
+from reffusion.clicks.scene_segmentation import correct_own_view, segment_first, segment_own_view, segment_scene
 from reffusion.clicks.segmenter import ImageFeatures, Segmenter, encode_image
 from reffusion.clicks.single_view import ViewEvidence
 from reffusion.command import root

@@ -337,7 +337,7 @@ def make_engine(name: str | None, address: str | None, root: Path, runs: Path) -
     except ImportError as error:
         if error.name != library:
             raise
-        raise Refused(f"engine={name}: {library} is not installed; `pip install 'reffusion[cluster]'`") from None
+        raise Refused(f"engine={name}: {library} is not installed; `pip install '.[cluster]'`") from None
     engine: Engine = getattr(module, kind)(address, root, runs)
     say(f"engine {name}: {engine.cores} cores")
     return engine

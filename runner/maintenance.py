@@ -19,7 +19,7 @@ from runner.resolve import Request, check_unique_name
 from runner.text import display_path, join_names
 
 # Files that the runner and report/ write to runs/<scene>/ besides artifacts.
-RECORDS = ("profile", "source", "plan.json", "output.log", "turntable.webm", "check.png")
+RECORDS = ("profile", "source", "plan.json", "output.log", "turntable.webm", "before_after.webp", "check.png")
 PAGES = (*(f"compare.{kind}" for kind in ("json", "csv", "md", "html")), "compare-runs.csv", "compare-runs.md",
          "compare/*.png", "study/index.html", "study/clips/*.webm", "study/clips/*.png", "study-key.json",
          "adapted/sheet.png", "adapted/*/*.png", "adapted/adapted.json",
@@ -27,7 +27,7 @@ PAGES = (*(f"compare.{kind}" for kind in ("json", "csv", "md", "html")), "compar
          "frames/frames.json", "frames/frames.csv", "frames/images/frame_*.jpg",
          "patch/patched.ply", "patch/new.ply",
          "export/scene.ply", "export/scene.compressed.ply", "export/scene.spz", "export/scene.sog",
-         "export/lora/pytorch_lora_weights.safetensors",
+         "export/with_object.ply", "export/lora/pytorch_lora_weights.safetensors",
          "export/cameras/transforms.json", "export/cameras/sparse_pc.ply", "export/cameras/sparse/0/*.bin",
          "export/cameras/images/*.png", "export/cameras.zip", "**/.*.writing")  # fmt: skip
 # Folders that a killed runner may leave.

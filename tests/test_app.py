@@ -25,8 +25,8 @@ from reffusion.io.arrays import save_json, save_text
 from reffusion.io.images import load_image, save_image
 from report import verdict
 from report.app import brush, painting, scenes, uploads
-from report.app.jobs import estimate_remaining
-from report.app.routes import App
+from report.app.app import App
+from report.app.job_progress import estimate_remaining
 from report.app.scenes import OpenScene
 from report.app.server import Server
 from report.job_data import load_job

@@ -18,9 +18,11 @@ from scipy import ndimage
 from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points
 from reffusion.clicks import all_views, scene_segmentation
 from reffusion.clicks.corrections import apply_marks
+from reffusion.clicks.events import Event
+from reffusion.clicks.fitted_views import FittedViews
 from reffusion.clicks.marks import Mark, confirmed_pixels, stroke_pixels
 from reffusion.clicks.refinement import redraw_masks
-from reffusion.clicks.scene_segmentation import Event, FittedViews, correct_scene, segment_own_view, segment_scene
+from reffusion.clicks.scene_segmentation import correct_scene, segment_own_view, segment_scene
 from reffusion.clicks.segmenter import Candidate
 from reffusion.clicks.single_view import ViewEvidence
 from reffusion.gaussians.neighbours import find_neighbours
@@ -33,8 +35,8 @@ from reffusion.morphology import dilate
 from reffusion.params.poses import Params as Poses
 from reffusion.splat import rasterizer
 from report import mask
+from report.app.app import App
 from report.app.mask_step import MaskStep
-from report.app.routes import App
 from report.app.scenes import OpenScene
 from report.app.server import Server
 from report.mask_session import Capture, Session

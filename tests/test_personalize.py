@@ -10,6 +10,7 @@ from scenes.networks import small_prior
 from scenes.settings import with_changes
 
 from reffusion import trace
+from reffusion.io.traces import load_trace
 from reffusion.params.personalize import Params, TrainingSamples
 from reffusion.prior import crops, denoising, diffusion, lora, validation
 from reffusion.prior import personalize as P
@@ -240,7 +241,7 @@ def test_training_that_gains_little_more_ends_and_resumes_to_the_same_end(tmp_pa
         trained = lora.attach(prior, 4, 8, 0.1, "attention", 0)
         training = with_changes(TRAINING, steps=steps, least_gain=least_gain, checkpoint_seconds=1e-9)
         P.personalize(prior, trained, [striped_reference()], training, folder)
-        return lora.state(prior), read_trace(folder / "trace.jsonl")[-1]
+        return lora.state(prior), load_trace(folder / "trace.jsonl", "personalize")[""][-1]
 
     whole, end = train(tmp_path / "whole")
     assert end["reason"] == "settled" and end["iteration"] == 8, "from 4 to 8 steps the error does not fall to a tenth"

@@ -20,11 +20,13 @@ import numpy as np
 from scipy import ndimage
 
 from reffusion.clicks.corrections import apply_marks
+from reffusion.clicks.events import Event
+from reffusion.clicks.fitted_views import FittedViews
 from reffusion.clicks.local_segmenter import load_local_segmenter
 from reffusion.clicks.marks import Mark
 from reffusion.clicks.propagation import iou
 from reffusion.clicks.scene_masks import evidence_loader
-from reffusion.clicks.scene_segmentation import Event, FittedViews, segment_scene
+from reffusion.clicks.scene_segmentation import segment_scene
 from reffusion.clicks.segmenter import Segmenter
 from reffusion.clicks.single_view import ViewEvidence
 from reffusion.io.arrays import load_json

@@ -18,11 +18,13 @@ from scipy import ndimage
 
 from benchmarks.studies.clicks import overlay_mask
 from reffusion import seeding
+from reffusion.clicks.events import Event
+from reffusion.clicks.fitted_views import FittedViews
 from reffusion.clicks.local_segmenter import load_local_segmenter
 from reffusion.clicks.marks import Mark
 from reffusion.clicks.propagation import count_all_votes, iou
 from reffusion.clicks.scene_masks import evidence_loader
-from reffusion.clicks.scene_segmentation import Event, FittedViews, correct_scene
+from reffusion.clicks.scene_segmentation import correct_scene
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_raw_masks, load_scene

@@ -11,8 +11,8 @@ import numpy as np
 
 from reffusion import trace
 from reffusion.clicks import all_views
+from reffusion.clicks.fitted_views import FittedViews
 from reffusion.clicks.propagation import combine, count_all_votes, draw_mask, project_votes
-from reffusion.clicks.scene_segmentation import FittedViews
 from reffusion.gaussians.neighbours import find_neighbours
 
 ROUGH_RIM = 0.02  # share of the larger image side: pixels this near to a rough mask's border do not vote

@@ -11,10 +11,12 @@ import numpy as np
 from reffusion.capture.click_coordinates import undistort_clicks
 from reffusion.capture.views import check_outliers
 from reffusion.clicks import all_views
+from reffusion.clicks.events import Event
+from reffusion.clicks.fitted_views import FittedViews
 from reffusion.clicks.marks import Mark
 from reffusion.clicks.propagation import count_all_votes, draw_view, project_votes
 from reffusion.clicks.refinement import redraw_masks
-from reffusion.clicks.scene_segmentation import Event, FittedViews, segment_scene
+from reffusion.clicks.scene_segmentation import segment_scene
 from reffusion.clicks.segmenter import ImageFeatures, Segmenter, encode_image, predict_masks
 from reffusion.clicks.single_view import ViewEvidence
 from reffusion.io.scene import load_views

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-REASONS = ("finished", "converged")  # values of "reason", which the last line of a series may have
+REASONS = ("finished", "converged", "settled")  # values of "reason", which the last line of a series may have
 
 
 @dataclass(frozen=True)

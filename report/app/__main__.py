@@ -7,7 +7,7 @@ import sys
 from urllib.parse import quote
 
 from report import cli
-from report.app.routes import App
+from report.app.app import App
 from report.app.server import PORT, Server, announce
 
 

@@ -17,16 +17,12 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from reffusion.clicks.local_segmenter import load_local_segmenter
 from report import verdict
 from report.app import brush, mask_step, painting, pictures, tasks
-from report.app.jobs import Jobs
-from report.app.mask_step import MaskStep
-from report.app.scenes import OpenScene, find_scene, list_recent
+from report.app.app import App
+from report.app.scenes import OpenScene, list_recent
 from report.app.security import LocalOnly, TooLarge, read_body
-from report.app.state import describe
 from report.app.uploads import Upload
-from report.mask_session import Session, load_capture
 
 STATIC = Path(__file__).with_name("static")
 # address -> (file, type)
@@ -44,107 +40,17 @@ PICTURES: dict[str, Callable[[OpenScene, str], bytes]] = {
 PERIOD, SILENCE = 1.0, 15.0  # seconds between two looks at the files, and longest time without an event
 
 
-class App:
-    """The scenes, jobs and processes behind the page.
-
-    Args:
-        runs: folder of all results, absolute.
-        options: further arguments of the runner.
-    """
-
-    def __init__(self, runs: Path, options: tuple[str, ...] = ()):
-        self.jobs, self.viewer = Jobs(runs, options), tasks.Viewer(runs)
-        self.scenes: dict[str, OpenScene] = {}
-        self.exports: dict[str, tasks.Export] = {}
-        self.uploads: dict[str, Upload] = {}
-        self.first = ""  # scene that the page shows at first
-
-    def open(self, text: str) -> OpenScene:
-        """Open the scene that a name or a path means.
-
-        Raises:
-            ValueError: there is none, or another scene of this name is open.
-        """
-        found = find_scene(text, self.jobs.runs)
-        scene = self.scenes.setdefault(found.name, found)
-        if scene.source != found.source:
-            raise ValueError(f"another scene named {found.name} is open: {scene.source}; rename one folder")
-        self.exports.setdefault(scene.name, tasks.Export(self.jobs.runs))
-        self.jobs.renew_plan(scene)
-        return scene
-
-    def add(self, scene: OpenScene) -> None:
-        """Add a scene that is ready to be shown."""
-        self.scenes[scene.name], self.exports[scene.name] = scene, tasks.Export(self.jobs.runs)
-
-    def scene(self, request: Request) -> OpenScene:
-        """Return the open scene of a request. Raises LookupError if there is none of this name."""
-        name = request.path_params["scene"]
-        if name not in self.scenes:
-            raise LookupError(f"the scene {name!r} is not open; go back to the start and choose it")
-        return self.scenes[name]
-
-    def mask_step(self, request: Request) -> MaskStep:
-        """Return the mask step of a request's scene. Raises LookupError if it was not begun."""
-        step = self.scene(request).mask_step
-        if step is None:
-            raise LookupError("the mask step is not open")
-        return step
-
-    def begin_masks(self, scene: OpenScene) -> bool:
-        """Run the stages up to `fit` in the background, and open the mask step once `raw_masks` is done.
-
-        Returns:
-            True if the mask step is open.
-
-        Raises:
-            ValueError: clicks do not suit the scene's masks.
-        """
-        if scene.mask_step is not None:
-            return True
-        state = self.jobs.state(scene)
-        if state["state"] not in ("running", "elsewhere") and not self.jobs.is_finished(scene, "fit"):
-            self.jobs.start(scene, "fit", with_clicks=True)
-        poses, fit = (scene.home / stage / "receipt.json" for stage in ("poses", "fit"))
-        if not (scene.home / "raw_masks" / "receipt.json").is_file():
-            return False
-
-        def is_fitted() -> bool:
-            done = self.jobs.is_finished(scene, "fit")
-            return fit.is_file() and (done or fit.stat().st_mtime > poses.stat().st_mtime)
-
-        def is_fitting() -> bool:
-            return self.jobs.state(scene)["state"] in ("running", "elsewhere")
-
-        def progress() -> dict[str, object] | None:
-            state = self.jobs.state(scene)
-            share, left = state["share"], state["left"]
-            known = state["stage"] == "fit" and share is not None and left is not None
-            return {"share": share, "left": time.strftime("%M:%S", time.gmtime(left))} if known else None
-
-        session = Session(load_capture(scene.home), is_fitted, load_local_segmenter())
-        scene.mask_step = MaskStep(
-            session, is_fitting, progress, scene.name, on_save=lambda: self.jobs.renew_plan(scene)
-        )
-        return True
-
-    def close(self) -> None:
-        """End the viewer, and interrupt the jobs that the page started. A killed server leaves the jobs running."""
-        self.viewer.stop()
-        for name in self.jobs.stop_all():
-            print(f"the job of {name} is interrupted; the next start goes on from its last checkpoint", flush=True)
-
-
 def make_app(app: App, port: int) -> Starlette:
     """Return the web application.
 
     Args:
         port: port of the server.
     """
+    find_step = lambda request: app.mask_step(request.path_params["scene"])
     handlers: dict[Any, Any] = dict.fromkeys((ValueError, TypeError, OSError), _refuse(400))
     handlers |= {LookupError: _refuse(404), TooLarge: _refuse(413), FileExistsError: _refuse(409)}
     return Starlette(
-        routes=_make_routes(app),
+        routes=[*mask_step.make_routes("/scenes/{scene}/mask", find_step), *_Addresses(app).routes()],
         middleware=[Middleware(LocalOnly, port=port, frames=(app.viewer.port,))],
         exception_handlers=handlers,
     )
@@ -158,106 +64,118 @@ def _refuse(status: int) -> Callable[[Request, Exception], Response]:
     return answer
 
 
-def _make_routes(app: App) -> list[Route]:
-    def static(request: Request) -> Response:
+class _Addresses:
+    """What the page is answered at each address, by one method each.
+
+    Args:
+        app: the scenes, jobs and processes behind the page.
+    """
+
+    def __init__(self, app: App):
+        self.app = app
+
+    def routes(self) -> list[Route]:
+        """Return all routes, except those of the mask step."""
+        scene = "/scenes/{scene}"
+        return [
+            *(Route(address, self.send_file) for address in FILES),
+            Route("/scenes", self.list_scenes),
+            Route("/scenes", self.open_scene, methods=["POST"]),
+            Route("/uploads", self.begin_upload, methods=["POST"]),
+            Route("/uploads/{upload}/{file}", self.receive_file, methods=["POST"]),
+            Route(f"{scene}/state", self.send_state),
+            Route(f"{scene}/events", self.send_events),
+            Route(f"{scene}/do/{{action}}", self.act, methods=["POST"]),
+            Route(f"{scene}/pictures/{{kind}}/{{view}}", self.send_picture),
+            Route(f"{scene}/paint/{{view}}", self.send_template),
+            Route(f"{scene}/paint/{{view}}", self.receive_painting, methods=["POST"]),
+            Route(f"{scene}/paint/{{view}}/canvas", self.send_canvas),
+            Route(f"{scene}/paint/{{view}}/fill", self.fill, methods=["POST"]),
+            Route(f"{scene}/export/{{file}}", self.send_export),
+        ]
+
+    def send_file(self, request: Request) -> Response:
         name, kind = FILES[request.url.path]
         return FileResponse(STATIC / name, media_type=kind)
 
-    def recent(request: Request) -> Response:
-        return JSONResponse({"first": app.first, "scenes": list_recent(app.jobs.runs)})
+    def list_scenes(self, request: Request) -> Response:
+        return JSONResponse({"first": self.app.first, "scenes": list_recent(self.app.jobs.runs)})
 
-    async def open_scene(request: Request) -> Response:
+    async def open_scene(self, request: Request) -> Response:
         content = await _read_json(request)
-        scene = await run_in_threadpool(app.open, str(content["path"]))
+        scene = await run_in_threadpool(self.app.open, str(content["path"]))
         return JSONResponse({"name": scene.name})
 
-    async def begin_upload(request: Request) -> Response:
+    async def begin_upload(self, request: Request) -> Response:
         upload = Upload(str((await _read_json(request))["name"]))
-        app.uploads[upload.name] = upload
+        self.app.uploads[upload.name] = upload
         return JSONResponse({"name": upload.name})
 
-    async def receive(request: Request) -> Response:
+    async def receive_file(self, request: Request) -> Response:
         name = request.path_params["upload"]
-        if name not in app.uploads:
+        if name not in self.app.uploads:
             raise LookupError("no such upload")
-        await app.uploads[name].receive(request.path_params["file"], request.stream())
-        return JSONResponse({"path": str(app.uploads[name].scene)})
+        await self.app.uploads[name].receive(request.path_params["file"], request.stream())
+        return JSONResponse({"path": str(self.app.uploads[name].scene)})
 
-    def state(request: Request) -> Response:
-        scene = app.scene(request)
-        return JSONResponse(describe(scene, app.jobs, app.exports[scene.name]))
+    def send_state(self, request: Request) -> Response:
+        return JSONResponse(self.app.describe(self._scene(request)))
 
-    def events(request: Request) -> Response:
-        return StreamingResponse(_follow(app, app.scene(request)), media_type="text/event-stream")
+    def send_events(self, request: Request) -> Response:
+        return StreamingResponse(_follow(self.app, self._scene(request)), media_type="text/event-stream")
 
-    async def act(request: Request) -> Response:
-        scene, content = app.scene(request), await _read_json(request)
+    async def act(self, request: Request) -> Response:
+        scene, content = self._scene(request), await _read_json(request)
         action = ACTIONS.get(request.path_params["action"])
         if action is None:
             raise LookupError("no such action")
-        return JSONResponse(await run_in_threadpool(action, app, scene, content) or {})
+        return JSONResponse(await run_in_threadpool(action, self.app, scene, content) or {})
 
-    def picture(request: Request) -> Response:
-        scene, kind, view = app.scene(request), request.path_params["kind"], request.path_params["view"]
+    def send_picture(self, request: Request) -> Response:
+        scene, kind, view = self._scene(request), request.path_params["kind"], request.path_params["view"]
         if kind not in PICTURES or view not in scene.pictures():
             raise LookupError("no such picture")
         content = PICTURES[kind](scene, view)
         headers = {"Cache-Control": "private, max-age=3600"} if request.url.query else {}
         return Response(content, media_type="image/png" if content[:4] == b"\x89PNG" else "image/jpeg", headers=headers)
 
-    def template(request: Request) -> Response:
-        scene, view = app.scene(request), _paintable(request)
+    def send_template(self, request: Request) -> Response:
+        scene, view = self._scene(request), self._view_to_paint(request)
         return FileResponse(scene.home / verdict.TO_PAINT / f"{view}.png", filename=f"{view}.png")
 
-    async def paint(request: Request) -> Response:
-        scene, view = app.scene(request), await run_in_threadpool(_paintable, request)
+    async def receive_painting(self, request: Request) -> Response:
+        scene, view = self._scene(request), await run_in_threadpool(self._view_to_paint, request)
         content = await read_body(request, painting.PICTURE_BYTES)
         replace = request.query_params.get("replace") == "1"
         await run_in_threadpool(painting.save_painting, scene, view, content, replace)
-        app.jobs.renew_plan(scene)
+        self.app.jobs.renew_plan(scene)
         return JSONResponse({})
 
-    def canvas(request: Request) -> Response:
-        scene, view = app.scene(request), _paintable(request)
+    def send_canvas(self, request: Request) -> Response:
+        scene, view = self._scene(request), self._view_to_paint(request)
         return Response(brush.draw_canvas(scene, view), media_type="image/png")
 
-    async def fill(request: Request) -> Response:
-        scene, view = app.scene(request), await run_in_threadpool(_paintable, request)
+    async def fill(self, request: Request) -> Response:
+        scene, view = self._scene(request), await run_in_threadpool(self._view_to_paint, request)
         content, seed = await read_body(request, painting.PICTURE_BYTES), request.query_params.get("seed", "0")
         if not re.fullmatch(r"\d{1,9}", seed):
             raise ValueError("seed is a whole number")
         filled = await run_in_threadpool(brush.fill, scene, view, content, int(seed))
         return Response(filled, media_type="image/png")
 
-    def _paintable(request: Request) -> str:
-        scene, view = app.scene(request), request.path_params["view"]
-        known = describe(scene, app.jobs, app.exports[scene.name])["to_paint"]
-        if view not in [each["view"] for each in known]:
+    def send_export(self, request: Request) -> Response:
+        scene = self._scene(request)
+        path = tasks.find_export(scene, request.path_params["file"])
+        return FileResponse(path, filename=f"{scene.name}-{path.name}")
+
+    def _scene(self, request: Request) -> OpenScene:
+        return self.app.scene(request.path_params["scene"])
+
+    def _view_to_paint(self, request: Request) -> str:
+        view = request.path_params["view"]
+        if view not in [each["view"] for each in self.app.describe(self._scene(request))["to_paint"]]:
             raise LookupError("no such view to paint")
         return view
-
-    def export(request: Request) -> Response:
-        path = tasks.find_export(app.scene(request), request.path_params["file"])
-        return FileResponse(path, filename=f"{app.scene(request).name}-{path.name}")
-
-    scene = "/scenes/{scene}"
-    return [
-        *(Route(address, static) for address in FILES),
-        Route("/scenes", recent),
-        Route("/scenes", open_scene, methods=["POST"]),
-        Route("/uploads", begin_upload, methods=["POST"]),
-        Route("/uploads/{upload}/{file}", receive, methods=["POST"]),
-        *mask_step.make_routes(f"{scene}/mask", app.mask_step),
-        Route(f"{scene}/state", state),
-        Route(f"{scene}/events", events),
-        Route(f"{scene}/do/{{action}}", act, methods=["POST"]),
-        Route(f"{scene}/pictures/{{kind}}/{{view}}", picture),
-        Route(f"{scene}/paint/{{view}}", template),
-        Route(f"{scene}/paint/{{view}}", paint, methods=["POST"]),
-        Route(f"{scene}/paint/{{view}}/canvas", canvas),
-        Route(f"{scene}/paint/{{view}}/fill", fill, methods=["POST"]),
-        Route(f"{scene}/export/{{file}}", export),
-    ]
 
 
 def _begin_masks(app: App, scene: OpenScene, content: dict[str, Any]) -> dict[str, Any]:
@@ -302,7 +220,7 @@ async def _follow(app: App, scene: OpenScene) -> AsyncIterator[str]:
     """Yield the state of a scene as server-sent events, whenever it has changed."""
     last, since = "", 0.0
     while True:
-        found = await run_in_threadpool(describe, scene, app.jobs, app.exports[scene.name])
+        found = await run_in_threadpool(app.describe, scene)
         text = json.dumps(found)
         if text != last:
             yield f"data: {text}\n\n"

@@ -8,7 +8,8 @@ import threading
 
 import uvicorn
 
-from report.app.routes import App, make_app
+from report.app.app import App
+from report.app.routes import make_app
 from report.app.tasks import free_port
 
 PORT = 8090
