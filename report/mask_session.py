@@ -133,6 +133,7 @@ class Session:
         cameras = [self.scene.cameras[name] for name in self.views]
         self.first_view = camera_path.find_central_view(cameras, self.scene.points).name if cameras else ""
         self.events: list[Event] = []
+        self.earlier: list[list[Event]] = []  # the marks before each change, for `undo`
         self.masks, self.versions = dict(capture.given), dict.fromkeys(self.views, 0)
         self.gaussians: Gaussians | None = None
         self.results: dict[Hashable, Masks] = {}  # keys of `segment_scene` -> masks
@@ -192,6 +193,20 @@ class Session:
         """Remove all marks of a view."""
         self._change(lambda events: [event for event in events if event.view != name])
 
+    def undo(self) -> str:
+        """Take back the last change, also a removal; return a view whose marks have changed, "" if there is none.
+
+        The marks that were saved earlier are taken back one by one.
+        """
+        with self.lock:
+            if not (self.earlier or self.events):
+                return ""
+            before, now = self.earlier.pop() if self.earlier else self.events[:-1], self.events
+            self._replace(before)
+            either = [*before, *now]
+            changed = [event for event in either if sum(event is each for each in either) == 1]
+            return changed[-1].view if changed else ""
+
     def save(self) -> dict[str, int]:
         """Wait for the masks of the latest marks, then write all masks, and the marks to clicks.json.
 
@@ -240,11 +255,11 @@ class Session:
         Returns:
             "views": for each view "name", "width" and "height" (undistorted, px), "marks", "mask" (a number that grows
             when the mask changes; None without a mask) and "given" (True if the mask is given); "first_view": the view
-            in which the object is probably easy to mark; "fit": True once the fit is loaded; "busy": True while the
-            masks do not yet follow the latest marks; "progress": number of views that this computation has used so far;
-            "error": reason why the masks could not be computed, or ""; "unsaved": True if marks have changed since the
-            last save; "folder": folder of the masks. A mark has "index" (for `remove`), "points", "sign" ("+" on the
-            object, "-" on the background) and "radius".
+            in which the object is probably easy to mark; "fit": True once the fit is loaded; "can_undo": True if there
+            is something to undo; "busy": True while the masks do not yet follow the latest marks; "progress": number of
+            views that this computation has used so far; "error": reason why the masks could not be computed, or "";
+            "unsaved": True if marks have changed since the last save; "folder": folder of the masks. A mark has "index"
+            (for `remove`), "points", "sign" ("+" on the object, "-" on the background) and "radius".
         """
         with self.lock:
             views = [
@@ -270,6 +285,7 @@ class Session:
             return {
                 "views": views,
                 "fit": self.gaussians is not None,
+                "can_undo": bool(self.earlier or self.events),
                 "busy": self.solved_revision < self.revision,
                 "progress": len(self.views_in_work),
                 "error": self.error,
@@ -280,7 +296,12 @@ class Session:
 
     def _change(self, change: Callable[[list[Event]], list[Event]]) -> None:
         with self.lock:
-            self.events, self.unsaved, self.error = change(self.events), True, ""
+            self.earlier.append(self.events)
+            self._replace(change(self.events))
+
+    def _replace(self, events: list[Event]) -> None:
+        with self.lock:
+            self.events, self.unsaved, self.error = events, True, ""
             self.revision += 1
             self.lock.notify_all()
 

@@ -276,11 +276,13 @@ def test_views_that_are_marked_before_all_have_masks_stay_as_their_own_marks_mad
 
 
 def test_marks_that_follow_each_other_in_a_view_are_spread_together(monkeypatch):
-    spread = []
-    monkeypatch.setattr(scene_segmentation, "transfer_change", lambda *a: spread.append(a[1]) or {})
+    spread, propagate = [], scene_segmentation.propagate
+    monkeypatch.setattr(
+        scene_segmentation, "propagate", lambda views, masks: spread.append({*masks}) or propagate(views, masks)
+    )
     strokes = [Event("a4", middle_mark("a4", False, 2.0, above=k)) for k in (0, 2, 4)]
     segment_scene(fitted_views(), [Event("a0", middle_mark("a0")), *strokes], {})
-    assert spread == ["a4"]
+    assert spread == [{"a0"}, {"a0", "a4"}]
 
 
 def test_a_network_that_knows_the_object_in_parts_gives_the_whole_in_all_views():
@@ -336,11 +338,13 @@ def test_a_stroke_in_one_view_corrects_the_others():
     masks = {name: mask & lower[name] for name, mask in whole.items()}
     row, column = np.argwhere(whole["a0"] & ~lower["a0"]).mean(0) + 0.5
     stroke = Event("a0", Mark(np.array([[column - 5, row], [column + 5, row]]), True, 2.0))
-    found = correct_scene(views, [stroke], 1, masks, {})
+    found = correct_scene(views, [stroke], 1, masks, masks.keys(), {})
     gain = {name: wall_scene.iou(found[name], whole[name]) - wall_scene.iou(masks[name], whole[name]) for name in whole}
     assert gain["a0"] > 0.05
     assert min(gain.values()) > 0.5 * gain["a0"]
-    back = correct_scene(views, [stroke, Event("a4", Mark(stroke.mark.points, False, 40.0))], 1, found, {})
+    back = correct_scene(
+        views, [stroke, Event("a4", Mark(stroke.mark.points, False, 40.0))], 1, found, masks.keys(), {}
+    )
     assert back["a0"].sum() < found["a0"].sum()
     kept = confirmed_pixels([stroke.mark], whole["a0"].shape) == 1
     assert back["a0"][kept].all(), "what is confirmed in a view survives corrections in others"
@@ -390,8 +394,8 @@ def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
 def test_a_stroke_reaches_sides_that_its_view_does_not_show(knows):
     """All masks lack the right quarter of the box. A stroke is made in the middle view, which shows the front alone.
 
-    In the right view, the network adds the side of the box near the stroke. If the network takes the whole photograph
-    for the object, only the pixels of the stroke are added.
+    In the right view, the network adds the side of the box. If that view has marks of its own, only the surface that
+    the stroke covers is added.
     """
     scene, cameras, images, box = box_scene()
     right = scene.means[:, 0] > 0.25
@@ -408,9 +412,10 @@ def test_a_stroke_reaches_sides_that_its_view_does_not_show(knows):
     radius = (columns.max() - columns.min()) / 2
     path = np.stack([np.full(2, columns.mean()), [rows.min() + radius, rows.max() - radius]], 1) + 0.5
     stroke = Event("middle", Mark(path, True, radius))
-    found = correct_scene(FittedViews(scene, cameras, evidence_of), [stroke], 1, masks, {})
+    known = () if knows else masks.keys()  # the network finds the rest of the other views, or their masks are known
+    found = correct_scene(FittedViews(scene, cameras, evidence_of), [stroke], 1, masks, known, {})
     gained = {name: found[name] & ~masks[name] for name in found}
-    assert all((gained[name] & ~whole[name]).sum() < 0.03 * whole[name].sum() for name in gained)
+    assert all((gained[name] & ~whole[name]).sum() < 0.05 * whole[name].sum() for name in gained)
     shares = {name: (gained[name] & lost[name]).sum() / lost[name].sum() for name in gained}
     assert shares["right"] > 0.85 if knows else 0.4 < shares["right"] < 0.75, shares
 

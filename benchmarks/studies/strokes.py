@@ -3,8 +3,9 @@
 Each run needs the stages `poses`, `raw_masks` with true masks, and `fit`. Every mask loses the fifth of the object that
 lies farthest in a random direction, `--trials` directions for each run. With --erase, every mask contains the
 surroundings near the object's end in this direction instead. In the view that shows the largest wrong region, a
-straight stroke of 40 px is painted along this region. The study prints the gain of IoU in this view, the mean and the
-least gain in the other views that show the wrong part, and the ratio of mean and own gain.
+straight stroke of 40 px is painted along this region, and this view's mask is propagated to the others. The study
+prints the gain of IoU in this view, the mean and the least gain in the other views that show the wrong part, the ratio
+of mean and own gain, and the least IoU of all other views.
 """
 
 from __future__ import annotations
@@ -99,13 +100,14 @@ def main() -> None:
             if iou(true[name], masks[name]) > RIGHT:
                 continue  # nothing stands around this end of the object
             stroke = paint_stroke(true[name] ^ masks[name], not arguments.erase)
-            after = correct_scene(views, [Event(name, stroke)], 1, masks, {})
+            after = correct_scene(views, [Event(name, stroke)], 1, masks, (), {})
             gains = {view: iou(after[view], true[view]) - iou(masks[view], true[view]) for view in true}
             shown = [view for view in true if view != name and iou(masks[view], true[view]) < RIGHT]
             others = np.array([gains[view] for view in shown])
             ratios.append(others.mean() / gains[name])
             text = f"own {gains[name]:+.3f}, others {others.mean():+.3f} ({others.min():+.3f} and more)"
-            print(f"{run.name} {trial}: {text}, ratio {ratios[-1]:.2f}", flush=True)
+            least = min(iou(after[view], true[view]) for view in true if view != name)
+            print(f"{run.name} {trial}: {text}, ratio {ratios[-1]:.2f}, least IoU {least:.3f}", flush=True)
             if arguments.sheets:
                 some = [name, *sorted(shown, key=gains.__getitem__)[:: max(1, len(shown) // 4)][:5]]
                 rows = [

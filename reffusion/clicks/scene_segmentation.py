@@ -1,24 +1,23 @@
 """Masks of all views from marks (clicks and brush strokes) in some views.
 
 The first marks segment the object in their own views, and these masks are propagated to all views. Later marks are
-corrections. A correction adds a region to the mask of its own view, or removes one. In each other view it changes the
-pixels that show the surface of this region, and pixels near it by the segmentation network, without pixels that earlier
-marks confirm to be the opposite. A click on another object adds that object to all views.
+corrections. A correction adds a region to the mask of its own view, or removes one. The other views with marks change
+where they show the surface of this region; then the masks of all views with marks are propagated anew. A click on
+another object adds that object to all views.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from reffusion.clicks import all_views
-from reffusion.clicks.change_transfer import transfer_change
 from reffusion.clicks.corrections import apply_marks
 from reffusion.clicks.events import Event, Masks, split_events
-from reffusion.clicks.fitted_views import FittedViews, transfer_marks
+from reffusion.clicks.fitted_views import FittedViews, transfer_marks, transfer_region
 from reffusion.clicks.marks import OBJECT, OTHER, confirmed_pixels
 from reffusion.clicks.propagation import propagate_masks
 from reffusion.clicks.single_view import ViewEvidence
@@ -50,13 +49,14 @@ def segment_scene(
             The key holds the events only, so different scenes or given masks must not share a cache.
     """
     first, groups = split_events(events, given)
-    masks = dict(given) | segment_first(views.evidence_of, first, recall)
+    known = dict(given) | segment_first(views.evidence_of, first, recall)
     done = [event for own in first.values() for event in own]
-    masks = recall(("all views", *(event.key for event in done)), partial(propagate, views, masks))
+    masks = recall(("all views", *(event.key for event in done)), partial(propagate, views, known))
     for group in groups:
         done = [*done, *group]
-        step = partial(correct_scene, views, done, len(group), masks, given, recall)
+        step = partial(correct_scene, views, done, len(group), masks, frozenset(known), given, recall)
         masks = recall(("all views", *(event.key for event in done)), step)
+        known = {name: masks[name] for name in {*known, group[0].view}}
     return dict(masks)
 
 
@@ -117,7 +117,7 @@ def propagate(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
         empty = lambda camera: np.zeros((camera.height, camera.width), bool)
         return {name: empty(camera) for name, camera in views.cameras.items()} | dict(masks)
     if views.evidence_of(next(iter(masks))).ask is not None:
-        return _propagate_by_network(views, masks)
+        return propagate_masks(views.gaussians, views.cameras, views.evidence_of, masks, views.network_views)
     image_of = lambda name: views.evidence_of(name).image
     near = find_neighbours(views.gaussians)
     labels = all_views.label_gaussians(views.gaussians, near, views.cameras, masks, image_of)
@@ -128,28 +128,52 @@ def propagate(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
     }
 
 
-def _propagate_by_network(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
-    return propagate_masks(views.gaussians, views.cameras, views.evidence_of, masks, views.network_views)
-
-
 def correct_scene(
-    views: FittedViews, events: Sequence[Event], count: int, masks: Masks, given: Masks, recall: Recall = compute_always
+    views: FittedViews,
+    events: Sequence[Event],
+    count: int,
+    masks: Masks,
+    known: Collection[str],
+    given: Masks,
+    recall: Recall = compute_always,
 ) -> dict[str, np.ndarray]:
     """Return the masks of all views after the last `count` events, which are in one view, view -> bool [H, W].
+
+    This view becomes a known one. The correction is made in the other known views, and all known masks are propagated
+    to the remaining views. If clicks on the object added a region that does not touch the mask before, the region is
+    another object: its mask is propagated alone, and added to all views.
 
     Args:
         events: all marks so far.
         count: number of events to apply.
         masks: view -> bool [H, W], the masks of all views before these events.
+        known: the views whose masks were propagated to the others: given ones, and those in which marks were made.
         given: view -> bool [H, W], masks that the scene provides; they do not change by events in other views.
         recall: cache of results, as for `segment_scene`.
     """
     name = events[-1].view
     own = correct_own_view(views, events, count, masks, recall)
-    before, after, found = masks[name], own[name], dict(masks) | own
-    for change, positive in ((after & ~before, True), (before & ~after, False)):
-        found = spread_change(views, events, count, found, before, change, positive, given)
-    return found
+    added, removed = own[name] & ~masks[name], masks[name] & ~own[name]
+    by_clicks = not any(event.mark.radius for event in events[-count:])
+    touches = bool(dilate(masks[name], 1 / masks[name].shape[1])[added].any())
+    if by_clicks and added.any() and not touches:
+        # Other views may show parts of the new object that this view hides, so its visible surface is not enough.
+        regions = propagate(views, {name: added})
+        return (
+            {other: masks[other] | _allowed(events, other, regions[other], True) for other in masks} | dict(given) | own
+        )
+    found = {other: masks[other] for other in known} | own
+    for other in {*known} - {*given, name}:
+        for region, positive in ((added, True), (removed, False)):
+            changed = _allowed(events, other, transfer_region(views, name, region, other), positive)
+            found[other] = found[other] | changed if positive else found[other] & ~changed
+    return propagate(views, found)
+
+
+def _allowed(events: Sequence[Event], name: str, region: np.ndarray, positive: bool) -> np.ndarray:
+    """Return the pixels of a region that no mark of the view confirms to be the opposite, bool [H, W]."""
+    marks = [event.mark for event in events if event.view == name]
+    return region & (confirmed_pixels(marks, region.shape) != (OTHER if positive else OBJECT))
 
 
 def correct_own_view(
@@ -186,47 +210,3 @@ def correct_view(views: FittedViews, events: Sequence[Event], before: np.ndarray
     marks = [event.mark for event in events if event.view == name]
     marks = [*transfer_marks(views, events, name), *marks]
     return apply_marks(views.evidence_of(name), marks, before, first=len(marks) - 1)
-
-
-def spread_change(
-    views: FittedViews,
-    events: Sequence[Event],
-    count: int,
-    masks: Masks,
-    before: np.ndarray,
-    change: np.ndarray,
-    positive: bool,
-    given: Masks,
-) -> dict[str, np.ndarray]:
-    """Return the masks of all views, view -> bool [H, W], after a change in one view is made in all others.
-
-    If clicks on the object added a region that does not touch the mask before, the region is another object. Its mask
-    is propagated to all views. Otherwise the change is transferred (see `transfer_change`). Pixels that marks of a view
-    confirm to be the opposite do not change.
-
-    Args:
-        events: all marks so far.
-        count: number of the last events, all in one view, which made the change.
-        masks: view -> bool [H, W], all views; the mask of that view is changed already.
-        before: bool [H, W], the mask of that view before these events.
-        change: bool [H, W], the pixels of that view that were added (`positive`) or removed.
-        positive: True if the pixels were added.
-        given: view -> bool [H, W], masks that the scene provides; they do not change by events in other views.
-    """
-    name = events[-1].view
-    if not change.any():
-        return dict(masks)
-    by_clicks = not any(event.mark.radius for event in events[-count:])
-    if positive and by_clicks and not dilate(before, 1 / before.shape[1])[change].any():
-        # Other views may show parts of the new object that this view hides, so depth alone is not enough.
-        regions = _propagate_by_network(views, {name: change})
-    else:
-        regions = transfer_change(views, name, change, masks, given, positive)
-    found = dict(masks)
-    for other, region in regions.items():
-        if other == name or other in given or not region.any():
-            continue
-        marks = [event.mark for event in events if event.view == other]
-        region = region & (confirmed_pixels(marks, region.shape) != (OTHER if positive else OBJECT))
-        found[other] = masks[other] | region if positive else masks[other] & ~region
-    return found

@@ -35,7 +35,7 @@ def find_running_stage(home: Path, began: float) -> tuple[str, float]:
 def estimate_remaining(
     elapsed: float, expected: float | None, bar: tuple[float, float] | None
 ) -> tuple[float | None, float | None]:
-    """Return the share of a stage that is done and the seconds left; (None, None) if both are unknown.
+    """Return the share of a stage's seconds that is over and the seconds left; (None, None) if both are unknown.
 
     The seconds that a progress bar predicts count the more the further it is: first steps tell little.
 
@@ -44,14 +44,13 @@ def estimate_remaining(
         expected: its expected seconds; None or 0 if they are unknown.
         bar: share done and seconds left of its progress bar; None without one.
     """
-    if bar and expected:
-        share = bar[0]
-        return share, (1 - share) ** 2 * expected + share * bar[1]
-    if bar:
+    if bar and not expected:
         return bar
     if not expected:
         return None, None
     left = max(expected - elapsed, OVERDUE_SHARE * elapsed)
+    if bar:
+        left = (1 - bar[0]) ** 2 * expected + bar[0] * bar[1]
     return elapsed / (elapsed + left), left
 
 

@@ -23,7 +23,7 @@ from report.mask_session import Session
 PAGE = Path(__file__).parent.with_name("mask.html")
 THUMBNAIL = 160  # longer side, px
 TINT = (255, 0, 160)
-ACTIONS = ("mark", "remove", "clear", "save")
+ACTIONS = ("mark", "remove", "clear", "undo", "save")
 
 
 @dataclass
@@ -51,7 +51,9 @@ class MaskStep:
         return self.session.state() | {"fitting": fitting, "fit_progress": progress, "scene": quote(self.scene)}
 
     def change(self, action: str, request: dict[str, Any]) -> dict[str, Any]:
-        """Apply a request of the page ("mark", "remove", "clear" or "save") and return the answer.
+        """Apply a request of the page, one of `ACTIONS`, and return the answer.
+
+        That of "undo" has "changed" beside the state: a view whose marks have changed.
 
         Raises:
             ValueError, LookupError, TypeError: the request is wrong, see `Session`.
@@ -64,6 +66,9 @@ class MaskStep:
         if action == "mark":
             points = [(float(x), float(y)) for x, y in request["points"]]
             session.mark(str(request["view"]), points, request["sign"] == "+", float(request["radius"]))
+        elif action == "undo":
+            changed = session.undo()
+            return self.state() | {"changed": changed}
         elif action == "remove":
             session.remove(int(request["index"]))
         else:
