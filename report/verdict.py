@@ -17,7 +17,8 @@ RANKED = re.compile(r"^\d+\. (.+?)  (\d+)%(  \(painted\))?$", re.MULTILINE)  # a
 
 
 def describe_result(job: JobFiles) -> str:
-    """Return the judgement on a job, e.g. "... 10 % of what it hid is made up; painting view a would help most.".
+    """Return the judgement on a job, e.g. "... 10 % of what it hid is made up; a completed picture of a would help
+    most.".
 
     The text is empty if the job has no result yet, or if nothing was to be removed.
     """
@@ -29,7 +30,7 @@ def describe_result(job: JobFiles) -> str:
     elif invention is not None:
         parts.append(f"{invention:.0%} of what it hid is made up".replace("%", " %"))
         if view := view_to_paint(job):
-            parts.append(f"painting view {view} would help most")
+            parts.append(f"a completed picture of {view} would help most")
     return "; ".join(parts) + "."
 
 

@@ -170,8 +170,8 @@ class Viewer:
         state = gui.add_markdown("")
         kept, added = (gui.add_checkbox(f"what was {kind}", True) for kind in ("kept", "added"))
         removed = gui.add_checkbox("what was removed", False, visible=len(self.layers.removed) > 0)
-        words = "hatch what no photograph shows, when the camera is at rest"
-        note = gui.add_checkbox("never seen", True, hint=words, visible=len(self.seen_by) > 0)
+        words = "no photograph shows it; when the camera is at rest"
+        note = gui.add_checkbox("hatch what was never seen", False, hint=words, visible=len(self.seen_by) > 0)
 
         def changed(_: Any = None) -> None:
             title = titles[min(int(slider.value), last)]

@@ -330,10 +330,19 @@ def list_changes(old: dict[str, Any], new: Inputs) -> list[str]:
             found.append(f"param {name} is new")
         elif before[name] != after[name]:
             found.append(f"param {name} {_short(before[name])} -> {_short(after[name])}")
-    for kind, then, now in (("need", old["needs"], new.needs), ("weights", old["weights"], new.weights)):
-        found += [f"{kind} {name} changed" for name in sorted({*then, *now}) if then.get(name) != now.get(name)]
+    needs = [name for name in sorted({*old["needs"], *new.needs}) if old["needs"].get(name) != new.needs.get(name)]
+    weights = [
+        name for name in sorted({*old["weights"], *new.weights}) if old["weights"].get(name) != new.weights.get(name)
+    ]
+    found += [f"{_name_need(need)} changed" for need in needs] + [f"weights {name} changed" for name in weights]
     found += [f"{name} is on this machine now" for name in old.get("unavailable", ()) if name not in new.unavailable]
     return found + list_code_changes(old, new)
+
+
+def _name_need(need: str) -> str:
+    """Return the name of a need for people: of a stage, "scene" or "scene: <part>"."""
+    whole, _, part = need.partition(": ")
+    return f"the scene's {part or 'files'}" if whole == "scene" else f"the result of {need}"
 
 
 def list_code_changes(old: dict[str, Any], new: Inputs) -> list[str]:

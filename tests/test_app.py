@@ -293,7 +293,7 @@ def test_the_judgement_says_what_is_left_and_what_would_help(tmp_path):
     write_job(tmp_path / "a", [], shares)
     said = verdict.describe_result(load_job(tmp_path / "a"))
     assert "look whether they left out a part" in said
-    assert "20 % of what it hid is made up; painting view IMG 2 would help most." in said
+    assert "20 % of what it hid is made up; a completed picture of IMG 2 would help most." in said
     part = {"removed": False, "share": 0.01, "view": "IMG_7"}
     write_job(tmp_path / "b", [part, part | {"removed": True}], shares, given=["IMG_1"])
     said = verdict.describe_result(load_job(tmp_path / "b"))

@@ -572,6 +572,26 @@ def test_a_mask_is_gone_after_its_marks_are_cleared(clicked_scene, tmp_path):
     assert [path.name for path in (tmp_path / "masks").iterdir()] == ["a2.png"]
 
 
+def test_undo_takes_back_every_change_also_a_removal(clicked_scene, tmp_path):
+    _, placed, fit = clicked_scene
+    capture = Capture(tmp_path, tmp_path / "masks", placed, fit, {})
+    session = Session(capture, lambda: False)
+    for x in (40.0, 48.0):
+        session.mark("a2", [(x, 36.0)], True)
+    session.mark("a3", [(48.0, 36.0)], True)
+    marks = lambda: [(event.view, event.mark.points[0, 0]) for event in session.events]
+    three = marks()
+    session.clear("a2")
+    assert session.undo() == "a2" and marks() == three
+    session.remove(0)
+    assert session.undo() == "a2" and marks() == three
+    assert session.undo() == "a3" and marks() == three[:2]
+    session.save()
+    session = Session(capture, lambda: False)
+    assert session.undo() == "a2" and marks() == three[:1], "marks that were saved earlier"
+    assert session.undo() == "a2" and marks() == [] and session.undo() == "" and not session.state()["can_undo"]
+
+
 def test_masks_of_others_are_never_overwritten(page_server, tmp_path):
     save_mask(tmp_path / "masks/a3.png", square_mask("a3"))
     before = load_image(tmp_path / "masks/a3.png")

@@ -159,7 +159,7 @@ def test_identical_output_stops_a_rerun(project, capsys):
     """`masks` reruns and its output is the same as before, so `distill` and `evaluate` do not rerun."""
     assert run_project(capsys, project, set="masks.threshold=99") == ["masks"]
     (project / "data/toy/number.txt").write_text("-4")  # the stage writes the absolute value
-    assert statuses(project, set="masks.threshold=99")["poses"] == "run need scene changed"
+    assert statuses(project, set="masks.threshold=99")["poses"] == "run the scene's files changed"
     assert run_project(capsys, project, set="masks.threshold=99") == ["poses"]
 
 
@@ -176,7 +176,7 @@ def preview(""",
     write_files(project, {"data/toy/drafts/idea.txt": "?"})
     assert set(statuses(project).values()) == {"cached"}
     write_files(project, {"data/toy/notes/idea.txt": "?"})
-    assert statuses(project)["poses"] == "run need scene changed"
+    assert statuses(project)["poses"] == "run the scene's files changed"
 
 
 def test_a_stage_depends_on_facts_that_it_takes_from_other_files(project, capsys):
@@ -193,7 +193,7 @@ def preview(""",
     )
     run_project(capsys, project)
     write_files(project, {"data/toy/drafts/idea.txt": "?"})
-    assert statuses(project)["poses"] == "run need scene: drafts changed"
+    assert statuses(project)["poses"] == "run the scene's drafts changed"
     run_project(capsys, project)
     write_files(project, {"data/toy/drafts/idea.txt": "!"})
     assert set(statuses(project).values()) == {"cached"}
@@ -898,7 +898,8 @@ def test_which_files_a_stage_reads_is_asked_again_only_where_something_changed(p
     assert (project / "asked.txt").read_text() == "x"
     write_files(project, {"data/toy/new.txt": ""})
     assert (
-        statuses(project)["poses"].startswith("run need scene changed") and (project / "asked.txt").read_text() == "xx"
+        statuses(project)["poses"].startswith("run the scene's files changed")
+        and (project / "asked.txt").read_text() == "xx"
     )
     replace_text(project / "stages/poses.py", "return files", "return files[:1]")
     statuses(project)

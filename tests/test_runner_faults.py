@@ -219,7 +219,7 @@ def test_verify_hashes_everything(project, capsys):
     assert all(f"toy/{path.parent.name}: {path.name} changed" in output for path in files)
     assert "data/toy/number.txt: its content changed, its size and time did not" in output and "keep=1" in output
     assert (
-        statuses(project)["poses"].startswith("run need scene changed")
+        statuses(project)["poses"].startswith("run the scene's files changed")
         and "gaussians.ply changed" in statuses(project)["fit"]
     )
     for spoiled in ("{", "[]", "{}"):

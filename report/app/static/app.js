@@ -175,6 +175,7 @@ function drawPhotographs() {
   $('next').hidden = !pictures.length;
   $('next').textContent = masks ? 'Next: start the job' : 'Next: mark the object';
   $('next').href = `#${encodeURIComponent(scene)}/${masks ? 'start' : 'object'}`;
+  $('next').onclick = masks ? null : wantMasks;
   drawThumbnails('thumbnails', pictures, true);
 }
 
@@ -435,7 +436,7 @@ function drawPaint() {
     const button = make('button', each.painted ? 'Upload another' : 'Upload completed');
     button.addEventListener('click', () => file.click());
     file.addEventListener('change', () => paint(address, file.files[0]));
-    const words = `${each.view}: shows ${Math.round(100 * each.share)} % of the hole${k ? ' beyond the views before' : ''}${each.painted ? '. Painted.' : ''}`;
+    const words = `${each.view}: shows ${Math.round(100 * each.share)} % of the hole${k ? ' that the views before do not show' : ''}${each.painted ? '. Painted.' : ''}`;
     const here = make('button', 'Paint here', {className: 'main'});
     here.addEventListener('click', () => beginPainting(address));
     row.append(here, make('a', 'Download', {className: 'button', href: address, download: `${each.view}.png`}), button, file);
@@ -546,9 +547,9 @@ $('leave').addEventListener('click', () => { easel = null; drawEasel(); });
 
 function drawExport() {
   const {busy, error, files} = state.export, made = Object.keys(files).length > 1;
-  $('export-lead').textContent = 'Files for other tools, in the frame of the capture.';
+  $('export-lead').textContent = 'Files for other tools, in the coordinates of the capture.';
   $('make').disabled = Boolean(busy) || isBusy();
-  $('make').textContent = made ? 'Export again' : 'Export all';
+  $('make').textContent = made ? 'Make all formats again' : 'Make all formats';
   $('making').textContent = busy ? `making: ${busy} …` : error;
   $('making').classList.toggle('wrong', Boolean(error) && !busy);
   if (!changed('exports', files)) return;
