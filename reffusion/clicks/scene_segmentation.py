@@ -159,21 +159,29 @@ def correct_scene(
     if by_clicks and added.any() and not touches:
         # Other views may show parts of the new object that this view hides, so its visible surface is not enough.
         regions = propagate(views, {name: added})
-        return (
-            {other: masks[other] | _allowed(events, other, regions[other], True) for other in masks} | dict(given) | own
-        )
+        found = {other: _change_mask(mask, regions[other], True, events, other) for other, mask in masks.items()}
+        return found | dict(given) | own
     found = {other: masks[other] for other in known} | own
     for other in {*known} - {*given, name}:
         for region, positive in ((added, True), (removed, False)):
-            changed = _allowed(events, other, transfer_region(views, name, region, other), positive)
-            found[other] = found[other] | changed if positive else found[other] & ~changed
+            shown = transfer_region(views, name, region, other)
+            found[other] = _change_mask(found[other], shown, positive, events, other)
     return propagate(views, found)
 
 
-def _allowed(events: Sequence[Event], name: str, region: np.ndarray, positive: bool) -> np.ndarray:
-    """Return the pixels of a region that no mark of the view confirms to be the opposite, bool [H, W]."""
+def _change_mask(
+    mask: np.ndarray, region: np.ndarray, positive: bool, events: Sequence[Event], name: str
+) -> np.ndarray:
+    """Return a view's mask with a region added or removed, without pixels that marks confirm to be the opposite.
+
+    Args:
+        mask, region: bool [H, W], of the view `name`.
+        positive: True to add the region, False to remove it.
+        events: all marks so far; those in this view count.
+    """
     marks = [event.mark for event in events if event.view == name]
-    return region & (confirmed_pixels(marks, region.shape) != (OTHER if positive else OBJECT))
+    changed = region & (confirmed_pixels(marks, region.shape) != (OTHER if positive else OBJECT))
+    return mask | changed if positive else mask & ~changed
 
 
 def correct_own_view(
