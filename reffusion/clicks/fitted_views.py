@@ -1,4 +1,4 @@
-"""A fitted scene with its views, and the transfer of marks and values from view to view by the surface."""
+"""A fitted scene with its views, and the transfer of marks from view to view by the surface."""
 
 from __future__ import annotations
 
@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
 
 from reffusion import geometry
 from reffusion.clicks.color_evidence import spread_evenly
 from reffusion.clicks.events import Event
 from reffusion.clicks.marks import Mark
-from reffusion.clicks.propagation import SHOWN, count_votes
 from reffusion.clicks.single_view import ViewEvidence
-from reffusion.masks import voting
 from reffusion.types import Camera, Gaussians
 
 MAX_NETWORK_VIEWS = 64  # most views in which the network is asked; in other views the votes of these decide
@@ -72,22 +69,3 @@ def transfer_marks(views: FittedViews, events: Sequence[Event], name: str) -> li
         visible = inside & (z > 0) & (np.abs(here - z) < SAME_SURFACE * z)
         found += [Mark(at[None], event.mark.positive) for at in uv[visible]]
     return found
-
-
-@torch.no_grad()
-def transfer_region(views: FittedViews, name: str, region: np.ndarray, other: str) -> np.ndarray:
-    """Return the pixels of another view that show the surface inside a region of one view, bool [H, W].
-
-    They show mostly Gaussians of which the first view sees more inside the region than outside.
-
-    Args:
-        name: the view of the region.
-        region: bool [H, W].
-        other: the other view.
-    """
-    gaussians, camera = views.gaussians, views.cameras[other]
-    inside, outside = count_votes(gaussians, views.cameras[name], region).T
-    chosen = torch.as_tensor(inside > np.maximum(outside, SHOWN), device=gaussians.means.device)
-    if not chosen.any():
-        return np.zeros((camera.height, camera.width), bool)
-    return voting.render_labels(gaussians, chosen, camera) > 0.5

@@ -1,9 +1,8 @@
 """Masks of all views from marks (clicks and brush strokes) in some views.
 
 The first marks segment the object in their own views, and these masks are propagated to all views. Later marks are
-corrections. A correction adds a region to the mask of its own view, or removes one. The other views with marks change
-where they show the surface of this region; then the masks of all views with marks are propagated anew. A click on
-another object adds that object to all views.
+corrections. A correction adds a region to the mask of its own view, or removes one. Then the masks of all views with
+marks are propagated anew; they stay as their marks made them. A click on another object adds that object to all views.
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ import numpy as np
 from reffusion.clicks import all_views
 from reffusion.clicks.corrections import apply_marks
 from reffusion.clicks.events import Event, Masks, split_events
-from reffusion.clicks.fitted_views import FittedViews, transfer_marks, transfer_region
-from reffusion.clicks.marks import OBJECT, OTHER, confirmed_pixels
+from reffusion.clicks.fitted_views import FittedViews, transfer_marks
+from reffusion.clicks.marks import OTHER, confirmed_pixels
 from reffusion.clicks.propagation import propagate_masks
 from reffusion.clicks.single_view import ViewEvidence
 from reffusion.gaussians.neighbours import find_neighbours
@@ -139,9 +138,9 @@ def correct_scene(
 ) -> dict[str, np.ndarray]:
     """Return the masks of all views after the last `count` events, which are in one view, view -> bool [H, W].
 
-    This view becomes a known one. The correction is made in the other known views, and all known masks are propagated
-    to the remaining views. If clicks on the object added a region that does not touch the mask before, the region is
-    another object: its mask is propagated alone, and added to all views.
+    This view becomes a known one, and all known masks are propagated to the remaining views. If clicks on the object
+    added a region that does not touch the mask before, the region is another object: its mask is propagated alone, and
+    added to all views, except where marks of a view are against it.
 
     Args:
         events: all marks so far.
@@ -153,35 +152,20 @@ def correct_scene(
     """
     name = events[-1].view
     own = correct_own_view(views, events, count, masks, recall)
-    added, removed = own[name] & ~masks[name], masks[name] & ~own[name]
+    added = own[name] & ~masks[name]
     by_clicks = not any(event.mark.radius for event in events[-count:])
     touches = bool(dilate(masks[name], 1 / masks[name].shape[1])[added].any())
     if by_clicks and added.any() and not touches:
-        # Other views may show parts of the new object that this view hides, so its visible surface is not enough.
+        # Views that became known before do not have the new object, and would vote against it.
         regions = propagate(views, {name: added})
-        found = {other: _change_mask(mask, regions[other], True, events, other) for other, mask in masks.items()}
+        found = {other: mask | (regions[other] & _is_allowed(events, other, mask)) for other, mask in masks.items()}
         return found | dict(given) | own
-    found = {other: masks[other] for other in known} | own
-    for other in {*known} - {*given, name}:
-        for region, positive in ((added, True), (removed, False)):
-            shown = transfer_region(views, name, region, other)
-            found[other] = _change_mask(found[other], shown, positive, events, other)
-    return propagate(views, found)
+    return propagate(views, {other: masks[other] for other in known} | own)
 
 
-def _change_mask(
-    mask: np.ndarray, region: np.ndarray, positive: bool, events: Sequence[Event], name: str
-) -> np.ndarray:
-    """Return a view's mask with a region added or removed, without pixels that marks confirm to be the opposite.
-
-    Args:
-        mask, region: bool [H, W], of the view `name`.
-        positive: True to add the region, False to remove it.
-        events: all marks so far; those in this view count.
-    """
-    marks = [event.mark for event in events if event.view == name]
-    changed = region & (confirmed_pixels(marks, region.shape) != (OTHER if positive else OBJECT))
-    return mask | changed if positive else mask & ~changed
+def _is_allowed(events: Sequence[Event], name: str, mask: np.ndarray) -> np.ndarray:
+    """Return bool [H, W], False for the pixels of a view that its marks confirm not to be the object."""
+    return confirmed_pixels([event.mark for event in events if event.view == name], mask.shape) != OTHER
 
 
 def correct_own_view(
