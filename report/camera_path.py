@@ -8,6 +8,8 @@ import numpy as np
 
 from reffusion.types import Camera
 
+# Points count as around the focus point within this share of the usual distance of cameras, if there are so many.
+AROUND, MIN_AROUND = 0.35, 10
 POINT_WEIGHT = 1e-2  # weight of the points' median in the focus point; the optical axis of a camera has weight 1
 
 
@@ -63,20 +65,31 @@ def focus_point(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
 
 
 def find_central_view(cameras: Sequence[Camera], points: np.ndarray) -> Camera:
-    """Return the camera that shows the focus point nearest to its optical axis and at a usual distance.
+    """Return the camera that shows best what the photographs were taken for: probably whole, and from its broad side.
 
-    It probably shows all of what the photographs were taken for. A deviation of 20 degrees counts as much as a distance
-    that is e times the median.
+    The focus point is near the optical axis and at a usual distance, and the sparse points around it spread widely. A
+    deviation of 20 degrees counts as much as a distance that is e times the median, or as a spread that is e^-.5 times.
 
     Args:
         cameras: cameras of the capture, at least one.
         points: [P, 3] sparse points of the scene, see `focus_point`.
     """
-    toward = focus_point(cameras, points) - np.stack([camera.center for camera in cameras])
+    target = focus_point(cameras, points)
+    toward = target - np.stack([camera.center for camera in cameras])
     distance = np.maximum(np.linalg.norm(toward, axis=1), 1e-12)
     cosine = np.sum(toward * np.stack([camera.world_to_camera[2, :3] for camera in cameras]), 1) / distance
-    cost = np.degrees(np.arccos(np.clip(cosine, -1, 1))) / 20 + np.abs(np.log(distance / np.median(distance)))
+    usual = float(np.median(distance))
+    cost = np.degrees(np.arccos(np.clip(cosine, -1, 1))) / 20 + np.abs(np.log(distance / usual))
+    around = points[np.linalg.norm(points - target, axis=1) < AROUND * usual] if len(points) else points
+    if len(around) >= MIN_AROUND:
+        cost -= 2 * np.log(np.maximum([_spread(camera, around) for camera in cameras], 1e-12))
     return cameras[int(np.argmin(cost))]
+
+
+def _spread(camera: Camera, points: np.ndarray) -> float:
+    """Return the area over which points [P, 3] spread across a camera's view: in world units, but for a factor."""
+    across = (points - points.mean(0)) @ camera.world_to_camera[:2, :3].T
+    return float(np.sqrt(np.linalg.det(np.cov(across.T))))
 
 
 def look_at(center: np.ndarray, target: np.ndarray, down: np.ndarray) -> np.ndarray:

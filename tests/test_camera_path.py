@@ -42,6 +42,12 @@ def test_the_central_view_looks_at_the_middle_of_the_capture():
     assert any(found is camera for camera in ring)
 
 
+def test_of_central_views_the_one_at_the_broad_side_is_found():
+    points = np.random.default_rng(0).normal(0, 1, (200, 3)) * (0.3, 0.1, 0.02)  # a flat thing across z
+    found = camera_path.find_central_view(ring_cameras(8, 2.0), points)
+    assert abs(found.center[2]) > 1.9
+
+
 def turn(degrees: float) -> np.ndarray:
     """Return the pose [4, 4] of a camera that is turned to its side."""
     pose, angle = np.eye(4), np.radians(degrees)
