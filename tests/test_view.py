@@ -114,8 +114,11 @@ def test_unobserved_pixels_are_hatched(tmp_path):
     assert unseen_overlay.load_seen_views(tmp_path / "y", scene) == []
 
 
-def test_the_live_view_follows_a_job_from_stage_to_stage(tmp_path):
-    """A state replaces an earlier one as soon as the job has written it, also one without the object."""
+def test_the_live_view_follows_a_job_from_stage_to_stage(tmp_path, monkeypatch):
+    """A state replaces an earlier one as soon as the job has written it, also one without the object.
+
+    A file that vanishes between two steps of a look does not end this.
+    """
     home = tmp_path / "x"
     gaussians, labels = write_finished_job(home, NEEDS)
     for stage in ("initialize", "distill", "evaluate"):
@@ -129,12 +132,20 @@ def test_the_live_view_follows_a_job_from_stage_to_stage(tmp_path):
         os.utime(home / "masks/labels.npy")
         wait_until(lambda: "without the object" in opened.title.content)
         assert len(opened.gaussians) == int((~labels).sum())
+        find, vanished = live.find_latest, iter([FileNotFoundError(), FileNotFoundError()])
+        monkeypatch.setattr(live, "find_latest", lambda home: raise_next(vanished) or find(home))
         save_ply(home / "initialize/gaussians.ply", gaussians.map(lambda p: p[:5]))
         wait_until(lambda: "before distillation" in opened.title.content)
         assert len(opened.gaussians) == 5
     finally:
         opened.visitors.open = False
         opened.server.stop()
+
+
+def raise_next(errors):
+    """Raise the next of these errors; return None when there is none left."""
+    if error := next(errors, None):
+        raise error
 
 
 def test_a_missing_scene_is_not_served(tmp_path):

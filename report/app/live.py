@@ -6,9 +6,11 @@ that runs, and reloads when there is a newer state. The process ends when its st
 
 from __future__ import annotations
 
+import pickle
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -79,14 +81,13 @@ class LatestViewer:
     def _follow(self) -> None:
         """Load the latest state whenever it is a new one."""
         while True:
-            found = find_latest(self.home)
-            if found and found != self.latest:
-                try:
+            # A running stage replaces and moves its files: what is not found or not whole is read at the next look.
+            with suppress(OSError, ValueError, KeyError, RuntimeError, EOFError, pickle.UnpicklingError):
+                found = find_latest(self.home)
+                if found and found != self.latest:
                     self.gaussians, self.latest = self._load(found[0]), found
                     self.title.content = f"{found[1]}: {len(self.gaussians):,} Gaussians"
                     self.visitors.refresh()
-                except (OSError, ValueError, KeyError, RuntimeError):  # it is being replaced: the next look finds it
-                    pass
             time.sleep(PERIOD)
 
     def _load(self, path: Path) -> Gaussians:
