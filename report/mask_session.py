@@ -133,7 +133,7 @@ class Session:
         cameras = [self.scene.cameras[name] for name in self.views]
         self.first_view = camera_path.find_central_view(cameras, self.scene.points).name if cameras else ""
         self.events: list[Event] = []
-        self.earlier: list[list[Event]] = []  # the marks before each change, for `undo`
+        self.history: list[list[Event]] = []  # the marks before each change, for `undo`
         self.masks, self.versions = dict(capture.given), dict.fromkeys(self.views, 0)
         self.gaussians: Gaussians | None = None
         self.results: dict[Hashable, Masks] = {}  # keys of `segment_scene` -> masks
@@ -199,9 +199,9 @@ class Session:
         The marks that were saved earlier are taken back one by one.
         """
         with self.lock:
-            if not (self.earlier or self.events):
+            if not (self.history or self.events):
                 return ""
-            before, now = self.earlier.pop() if self.earlier else self.events[:-1], self.events
+            before, now = self.history.pop() if self.history else self.events[:-1], self.events
             self._replace(before)
             either = [*before, *now]
             changed = [event for event in either if sum(event is each for each in either) == 1]
@@ -285,7 +285,7 @@ class Session:
             return {
                 "views": views,
                 "fit": self.gaussians is not None,
-                "can_undo": bool(self.earlier or self.events),
+                "can_undo": bool(self.history or self.events),
                 "busy": self.solved_revision < self.revision,
                 "progress": len(self.views_in_work),
                 "error": self.error,
@@ -296,7 +296,7 @@ class Session:
 
     def _change(self, change: Callable[[list[Event]], list[Event]]) -> None:
         with self.lock:
-            self.earlier.append(self.events)
+            self.history.append(self.events)
             self._replace(change(self.events))
 
     def _replace(self, events: list[Event]) -> None:
