@@ -23,7 +23,7 @@ from reffusion.prior.model import load_prior
 from reffusion.types import Reference
 from reffusion.workspace import Workspace
 
-GUIDANCE, SEED = 0.0, 0  # GUIDANCE is the paper's a; the guidance scale of libraries is 1 + a
+SEED = 0
 DTYPE = torch.float32
 
 
@@ -77,7 +77,7 @@ def load_painter(params: Params) -> tuple[str, Callable[[np.ndarray, np.ndarray,
             prompt=params.prompt,
             seeds=[seeding.seed_for(SEED, "lift", name)],
             steps=params.steps,
-            guidance=GUIDANCE,
+            guidance=params.guidance,
             start=1.0,
             finest=REFINED_FROM,
         )

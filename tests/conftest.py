@@ -46,11 +46,11 @@ def text(prior):
     """The text encoder's hidden states [3, L, D] of the global, the local and the empty prompt."""
     import torch
 
-    from reffusion.prior.crops import PROMPTS
+    from reffusion.params.base import Prompts
     from reffusion.prior.diffusion import embed_text
 
     with torch.no_grad():
-        return embed_text(prior, list(PROMPTS))
+        return embed_text(prior, Prompts().texts)
 
 
 @pytest.fixture

@@ -66,7 +66,6 @@ FIXED = {
     "distill.sds.weight": 1e-3,
     "distill.sds.patches": 2,
     "distill.sds.reaches": "masked",
-    "distill.sds.antialias": False,
     "distill.depth.weight": 0.0625,
     "distill.depth.every": 8,
     "distill.adversarial.weight": 0.03,
@@ -234,9 +233,10 @@ def test_constants_of_the_library():
     from benchmarks.gpu import full_size
     from reffusion.gaussians.optimize import reconstruction_loss
     from reffusion.metrics import image_metrics
-    from reffusion.prior import crops, lora
+    from reffusion.params.base import Prompts
+    from reffusion.prior import lora
 
-    assert crops.PROMPTS == ("A photo of sks", "A photo of sks, cropped", "")
+    assert Prompts().texts == ["A photo of sks", "A photo of sks, cropped", ""]
     assert image_metrics.BOX_DILATION == 0.1
     assert 8 * full_size.SD2.unet["sample_size"] == 512
     assert set(lora.TEXT_ATTENTION) == {"q_proj", "k_proj", "v_proj", "out_proj"}

@@ -37,6 +37,7 @@ from reffusion.io.arrays import load_labels
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_references, load_scene, save_mask_sets
 from reffusion.masks.consolidation import clean_mask
+from reffusion.params.base import Prompts
 from reffusion.params.distill import Params, SdsTerm
 from reffusion.params.fit import LearningRates
 from reffusion.params.personalize import TrainingSamples
@@ -226,7 +227,7 @@ def test_without_personalization_only_the_lora_is_missing():
 def test_prompts_of_the_prior(prior, monkeypatch):
     monkeypatch.setattr(inputs, "load_prior", lambda *_, **__: prior)
     _, embeddings = inputs.load_adapted_prior(Params(), None)
-    assert torch.equal(embeddings, diffusion.embed_text(prior, list(crops.PROMPTS)))
+    assert torch.equal(embeddings, diffusion.embed_text(prior, Prompts().texts))
 
 
 def test_guidance_of_the_empty_prompt_changes_nothing_and_costs_nothing(prior, monkeypatch):
@@ -259,7 +260,7 @@ def test_no_term_shows_a_prior_or_a_critic_colours_above_1(prior, monkeypatch):
     watched = lambda image, *rest: seen.append(float(image.max()) * 2 - 1) or patches(image, *rest)
     monkeypatch.setattr(adversarial, "draw_patches", watched)
     with torch.no_grad():
-        text = diffusion.embed_text(prior, list(crops.PROMPTS))
+        text = diffusion.embed_text(prior, Prompts().texts)
     sds.evaluate_sds(bright, masked, train_view(), prior, text, SdsTerm(guidance=0), generator(0, "bright"))
     critic = Params(adversarial={"patches": 4, "size": 8, "width": 4}).adversarial
     adversary = Adversary(critic, 0)

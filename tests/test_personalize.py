@@ -11,6 +11,7 @@ from scenes.settings import with_changes
 
 from reffusion import trace
 from reffusion.io.traces import load_trace
+from reffusion.params.base import Prompts
 from reffusion.params.personalize import Params, TrainingSamples
 from reffusion.prior import crops, denoising, diffusion, lora, validation
 from reffusion.prior import personalize as P
@@ -122,7 +123,7 @@ def test_loss_is_the_priors_own_and_its_clean_latent_error_is_predicts(fresh_pri
     samples = crops.draw_samples([striped_reference()], NATIVE, SIZE, 3, TrainingSamples(), draw)
     t, noise = torch.tensor([10, 500, 950]), torch.randn(3, 4, SIZE, SIZE, generator=draw)
     with torch.no_grad():
-        words = diffusion.embed_text(prior, list(crops.PROMPTS))
+        words = diffusion.embed_text(prior, Prompts().texts)
         error, clean = denoising.denoising_error(prior, samples, words, t, noise)
         latents = diffusion.encode(prior, samples.images)
         noisy = diffusion.add_noise(prior, latents, noise, t)
@@ -141,7 +142,7 @@ def test_what_a_mask_leaves_to_be_seen_counts_by_its_weight(fresh_prior):
         latents = diffusion.encode(fresh_prior, samples.images)
         condition = diffusion.conditioning(fresh_prior, samples.images, samples.masks)
         noisy = diffusion.add_noise(fresh_prior, latents, noise, t)
-        words = diffusion.embed_text(fresh_prior, list(crops.PROMPTS))
+        words = diffusion.embed_text(fresh_prior, Prompts().texts)
         wrong = diffusion.raw_prediction(fresh_prior, noisy, t, condition, words[samples.prompts])
         wrong = (wrong - diffusion.training_target(fresh_prior, latents, noise, t)).square().mean(1, keepdim=True)
         for weight in (1.0, 0.2, 1e-6):

@@ -18,7 +18,8 @@ from benchmarks.gpu import check as gpu_check
 from benchmarks.gpu import exact as gpu_exact
 from benchmarks.gpu import full_size as F
 from benchmarks.gpu import steps as gpu_steps
-from reffusion.prior import crops, denoising, diffusion, inpaint, lora, memory
+from reffusion.params.base import Prompts
+from reffusion.prior import denoising, diffusion, inpaint, lora, memory
 from reffusion.prior.model import drop_text_encoders, enable_checkpointing, load_prior, pipeline
 from reffusion.prior.personalize import train_step
 from reffusion.seeding import generator
@@ -90,7 +91,7 @@ def test_sdxl_is_refused_where_it_cannot_work(sdxl_prior):
 def test_a_batch_in_parts_gives_the_same_values_and_gradients(sd2_prior):
     images = draw_normal(3, 3, 32, 32).requires_grad_()
     noisy, condition, at = draw_normal(3, 4, 16, 16), draw_normal(3, 5, 16, 16), torch.tensor([10, 500, 900])
-    text = diffusion.embed_text(sd2_prior, list(crops.PROMPTS)).detach()
+    text = diffusion.embed_text(sd2_prior, Prompts().texts).detach()
     found = []
     for prior in (sd2_prior, replace(sd2_prior, rows=1, rows_with_grad=2), enable_checkpointing(sd2_prior)):
         latents = diffusion.encode(prior, images)
@@ -176,14 +177,14 @@ def test_a_lora_loads_into_diffusers_own_pipeline_of_sd2(sd2_prior, tmp_path):
     noise = generator(0, "lora")
     for parameter in found["unet"] + found["text"]:
         parameter.data += 0.1 * torch.randn(parameter.shape, generator=noise)
-    trained, words = F.epsilon(sd2_prior), diffusion.embed_text(sd2_prior, [crops.PROMPTS[0]])
+    trained, words = F.epsilon(sd2_prior), diffusion.embed_text(sd2_prior, [Prompts().whole])
     lora.save(sd2_prior, tmp_path)
     fresh = F.build_prior(F.shrink(F.SD2), torch.float32)
     pipe = pipeline(fresh)
     pipe.load_lora_weights(tmp_path)
     lora.set_dropout(fresh, False)  # turn dropout off, as new layers are in training mode
     assert (F.epsilon(fresh) - trained).abs().max() < 1e-5 < (trained - before).abs().max()
-    assert (diffusion.embed_text(fresh, [crops.PROMPTS[0]]) - words).abs().max() < 1e-5
+    assert (diffusion.embed_text(fresh, [Prompts().whole]) - words).abs().max() < 1e-5
 
 
 def test_the_order_of_weights_in_memory_changes_nothing(sd2_prior, tmp_path):
@@ -205,7 +206,7 @@ def test_the_order_of_weights_in_memory_changes_nothing(sd2_prior, tmp_path):
 def test_the_text_encoder_is_let_go():
     prior = F.build_prior(F.shrink(F.SD2), torch.float32)
     whole, encoder = prior.bytes, weakref.ref(prior.text_encoder)
-    text = diffusion.embed_text(prior, list(crops.PROMPTS)).detach()
+    text = diffusion.embed_text(prior, Prompts().texts).detach()
     prior = drop_text_encoders(prior)
     gc.collect()
     assert encoder() is None and prior.bytes < whole

@@ -4,7 +4,9 @@ import pytest
 import torch
 
 from reffusion.distill.sds import anneal, draw_timesteps, match_contrast, sds_gradient, sds_loss
-from reffusion.prior.windows import enlarge_to_fit, two_scale_masks, two_scales, window_around
+from reffusion.prior.crops import Picture
+from reffusion.prior.denoising import held_out_samples
+from reffusion.prior.windows import enlarge_to_fit, resize, two_scale_masks, two_scales, window_around
 from reffusion.seeding import generator
 
 ABAR = torch.cos(torch.linspace(0.05, 1.5, 100, dtype=torch.float64)) ** 2
@@ -179,14 +181,6 @@ def test_two_scales_gradient_reaches_every_pixel_and_matches_differences():
         torch.testing.assert_close(gradient[0, row, column], numeric.detach(), rtol=1e-6, atol=1e-9)
 
 
-def test_plain_bilinear_reduction_is_that_of_torch_and_skips_pixels():
-    image = torch.rand(1, 40, 60, generator=generator(6), dtype=torch.float64, requires_grad=True)
-    reduced = two_scales(image, [], 8, antialias=False)
-    expected = torch.nn.functional.interpolate(image[None], size=(8, 8), mode="bilinear", align_corners=False)
-    (gradient,) = torch.autograd.grad(reduced.sum(), image)
-    assert torch.equal(reduced, expected) and (gradient != 0).sum() <= 4 * 64
-
-
 def test_a_mask_keeps_the_gradient_inside_it_and_drops_the_rest():
     t, draw = torch.tensor([5, 90]), generator(3)
     latents, noise = torch.randn(2, 2, 4, 6, 6, generator=draw, dtype=torch.float64)
@@ -232,6 +226,25 @@ def test_windows_show_the_mask_and_stay_inside():
         window_around(torch.zeros(30, 50, dtype=torch.bool), 12, generator(0))
     with pytest.raises(ValueError, match="does not fit"):
         window_around(mask, 31, generator(0))
+
+
+def test_a_window_always_shows_a_known_pixel():
+    hole = torch.zeros(40, 60, dtype=torch.bool)
+    hole[5:35, 10:50] = True  # most windows of 12 px inside it show nothing else
+    for seed in range(60):
+        top, left = window_around(hole, 12, generator(12, seed))
+        shown = hole[top : top + 12, left : left + 12]
+        assert shown.any() and not shown.all()
+    with pytest.raises(ValueError, match="the mask covers the whole view; leave this view out"):
+        window_around(torch.ones(30, 50, dtype=torch.bool), 12, generator(0))
+
+
+def test_personalization_distillation_and_sampler_reduce_a_view_alike():
+    image = torch.rand(3, 48, 80, generator=generator(13)) * 2 - 1
+    reduced = resize(image[None], 16, 16)[0]
+    assert torch.equal(two_scales(image, [], 16)[0], reduced)
+    picture = Picture(image, torch.zeros(48, 80, dtype=torch.bool))
+    assert torch.equal(held_out_samples([picture], 16, 0).images[0], reduced)
 
 
 def test_small_views_are_enlarged_until_a_window_fits():

@@ -23,6 +23,7 @@ import torch
 
 from reffusion.distill.terms.sds import evaluate_sds
 from reffusion.distill.train_view import TrainView
+from reffusion.params.base import Prompts
 from reffusion.params.distill import SdsTerm
 from reffusion.params.personalize import Optimizer, Params
 from reffusion.prior import crops, denoising, diffusion, lora, memory
@@ -262,7 +263,7 @@ def epsilon(prior: Prior) -> torch.Tensor:
     noisy, blanked = (torch.randn(1, channels, side, side, generator=draw).to(prior.device) for _ in range(2))
     condition = torch.cat([torch.ones_like(noisy[:, :1]), blanked], 1)
     at = torch.tensor([500], device=prior.device)
-    return diffusion.raw_prediction(prior, noisy, at, condition, diffusion.embed_text(prior, [crops.PROMPTS[0]])).cpu()
+    return diffusion.raw_prediction(prior, noisy, at, condition, diffusion.embed_text(prior, [Prompts().whole])).cpu()
 
 
 def train_view(size: int, device: str) -> TrainView:
@@ -374,7 +375,7 @@ def run(shape: Shape, dtype: torch.dtype, options: argparse.Namespace) -> dict[s
     report["epsilon difference"] = float((after - before).abs().max())
     report["epsilon size"] = float(before.abs().max())
     with torch.no_grad():
-        text = record_time(report, "embed prompts", lambda: diffusion.embed_text(prior, list(crops.PROMPTS)))
+        text = record_time(report, "embed prompts", lambda: diffusion.embed_text(prior, Prompts().texts))
     prior = drop_text_encoders(prior)
     gc.collect()
     sds, scene = SdsTerm(patches=options.patches), gaussians(options.gaussians, "cpu")

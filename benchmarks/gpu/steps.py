@@ -28,9 +28,10 @@ from reffusion.distill.terms.reconstruction import evaluate_reconstruction
 from reffusion.distill.terms.reference import evaluate_reference
 from reffusion.fit.reconstruction import fit
 from reffusion.geometry import Degenerate
+from reffusion.params.base import Prompts
 from reffusion.params.distill import DepthTerm, SdsTerm
 from reffusion.params.fit import Densify, Params, SphericalHarmonics
-from reffusion.prior import crops, denoising, diffusion, memory
+from reffusion.prior import denoising, diffusion, memory
 from reffusion.prior.model import Prior, drop_text_encoders
 from reffusion.prior.personalize import train_step
 from reffusion.seeding import generator
@@ -81,7 +82,7 @@ def prior_and_prompts(bench: Bench) -> tuple[Prior, Tensor, str]:
     """Return the prior without its text encoder, the embedded prompts, and the source of the weights."""
     prior, source = bench.prior("float16")
     with torch.no_grad():
-        return drop_text_encoders(prior), diffusion.embed_text(prior, list(crops.PROMPTS)), source
+        return drop_text_encoders(prior), diffusion.embed_text(prior, Prompts().texts), source
 
 
 def distillation(bench: Bench) -> dict[str, Any]:

@@ -23,9 +23,8 @@ from reffusion.io.arrays import load_labels
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_references, load_scene
-from reffusion.params.base import Sampler
+from reffusion.params.base import Prompts, Sampler
 from reffusion.prior import diffusion, inpaint
-from reffusion.prior.crops import PROMPTS
 from reffusion.prior.model import Prior
 from reffusion.references import view_ranking
 from report.sheet import compose_sheet, enlarge, pick_evenly
@@ -35,8 +34,8 @@ SEED = 0
 WIDTH = 400  # approximate width of a picture on the sheet, px
 COLUMNS = {  # column -> prior ("before" or "after" personalization), prompt
     "as it is, no prompt": ("before", ""),
-    "as it is": ("before", PROMPTS[0]),
-    "adapted": ("after", PROMPTS[0]),
+    "as it is": ("before", Prompts().whole),
+    "adapted": ("after", Prompts().whole),
 }
 
 

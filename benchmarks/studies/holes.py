@@ -52,10 +52,11 @@ def make_cases(count: int, seed: int = SEED) -> list[Case]:
     """Make held-out pictures of `SIDE` px, each with a random silhouette as its hole, whose size is within `COVER`."""
     cases = []
     for index in range(count):
-        picture, caption = images.image(seed, index, held_out=True)
+        picture, subject = images.image(seed, index, held_out=True)
         truth = cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
         rng = np.random.default_rng(seeding.seed_for(seed, "hole", index))
-        kind = "photograph" if caption.split()[-1] in images.HELD_OUT_PHOTOS else "procedural"
+        is_photograph = subject in {images.SUBJECTS[name] for name in images.HELD_OUT_PHOTOS}
+        kind = "photograph" if is_photograph else "procedural"
         cases.append(Case(truth, _draw_hole(rng), kind))
     return cases
 

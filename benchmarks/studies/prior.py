@@ -54,6 +54,7 @@ from reffusion.io.arrays import load_json, save_json
 from reffusion.io.ground_truth import load_ground_truth, load_object_mask
 from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import load_references, load_scene
+from reffusion.params.base import Prompts
 from reffusion.prior import diffusion, lora
 from reffusion.prior.model import Prior, load_prior
 from reffusion.prior.windows import window_around
@@ -67,7 +68,7 @@ NOISES = 4  # draws for the variance of the SDS gradient
 VIEWS = 6  # number of unseen views
 SHOWN = 12  # held-out pictures on the sheet
 PHOTOGRAPH_CASES = 36  # pictures of each kind from held-out photographs
-PROMPTS = {"reference": "A photo of sks", "whole": "A photo of sks", "window": "A photo of sks, cropped"}
+PROMPTS = {"reference": Prompts().whole, "whole": Prompts().whole, "window": Prompts().crop}
 LEARNS = ("poses", "raw_masks", "reference")  # stages that personalization needs of a run
 
 # ---------------------------------------------------------------------------------------------- inpainting

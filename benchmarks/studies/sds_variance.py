@@ -29,8 +29,8 @@ from benchmarks.studies import scene_priors
 from reffusion import seeding
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_scene
+from reffusion.params.base import Prompts
 from reffusion.prior import diffusion, windows
-from reffusion.prior.crops import PROMPTS
 from reffusion.prior.model import Prior
 from reffusion.splat import rasterizer
 
@@ -123,7 +123,7 @@ def measure(models: dict[str, Prior], run: Path) -> dict[str, dict[str, dict]]:
     inputs = load_inputs(run, next(iter(models.values())))
     return {
         scale: {when: variances(sds_gradients(model, *inputs[scale], prompt)) for when, model in models.items()}
-        for scale, prompt in zip(SCALES, PROMPTS, strict=False)
+        for scale, prompt in zip(SCALES, Prompts().texts, strict=False)
     }
 
 

@@ -31,6 +31,7 @@ from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_references
 from reffusion.metrics import lpips
+from reffusion.params.base import Prompts
 from reffusion.params.personalize import Params
 from reffusion.prior import crops, diffusion, inpaint, lora
 from reffusion.prior.model import Prior, load_prior
@@ -202,7 +203,7 @@ def study_run(
             model = load_prior(prior)
             if training != "base":
                 model = adapt_prior(run, params, training == "photographs", folder)
-            prompts = ("", "", "") if training == "base" else crops.PROMPTS
+            prompts = ("", "", "") if training == "base" else Prompts().texts
             for way in ways:
                 pictures = {view.name: paint(model, view, way, prompts, seed) for view in views}
                 method = f"{training}, {way}"

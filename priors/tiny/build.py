@@ -16,11 +16,19 @@ from torch.nn.functional import conv2d
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
 NATIVE = 64  # px
-WORDS = ("a", "photo", "of", "sks", "cropped", ",")
+# The words of the prompts and of the training captions, each of which is one token.
+WORDS = (
+    *("a", "photo", "of", "sks", "cropped", ",", "scene", "and"),
+    *("brick", "planks", "plaster", "tiles", "stripes", "fabric", "dots"),
+    *("room", "corner", "table", "bedroom", "garden"),
+    *("flowers", "leaves", "grass", "water", "sky", "wood", "hills", "forest", "things", "person", "stone"),
+)
 TEXT_LENGTH = 24
-# Opponent colours of (r, g, b) in [-1, 1], scaled to deviation about 1 over the training images, so that one noise
-# schedule serves light and colour alike. Diffusers' inpainting pipeline wants four latents; the fourth is empty.
-LIGHT, WARM, GREEN = 1.9, 5.0, 9.0
+# Opponent colours of (r, g, b) in [-1, 1]. Their rows in `analysis` are orthogonal and of equal length, so that an
+# error of the latents weighs the same in every direction of colour. Diffusers' inpainting pipeline wants four latents;
+# the fourth is empty.
+LIGHT = 1.9
+WARM, GREEN = LIGHT * (2 / 3) ** 0.5, LIGHT * (8 / 9) ** 0.5
 # At full resolution the content of a hole is decided at strong noise, since neighbours average weak noise away. So the
 # schedule spends most timesteps between a log signal-to-noise ratio of 0 and -7, and ends where even a hole's mean
 # colour is hidden (with SD's schedule, which ends at -5.4, 1.1 dB of a hole's PSNR came from what showed through).

@@ -1,8 +1,8 @@
-"""Training images of the embedded prior: procedural surfaces, corners of rooms, photographs; and their masks.
+"""Training images of the embedded prior: procedural surfaces, corners of rooms, photographs, made rooms; their masks.
 
 Image number k of a seed is a pure function of (seed, k) and the photographs, so training resumes to the same pictures.
 The patterns are made here. Photographs come with scikit-image, and from `photographs` (the model card lists them with
-their licences).
+their licences); pictures of rooms come from `rooms`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,29 @@ SIZE = 128  # px, side of one training image; crops are taken from it
 SUPERSAMPLE = 2
 PHOTOS = ("astronaut", "chelsea", "coffee", "rocket", "brick", "grass", "gravel", "camera", "coins")
 HELD_OUT_PHOTOS = ("chelsea", "gravel")
+SUBJECTS = {  # of scikit-image's photographs, in the words of `build.WORDS`
+    "astronaut": "a person",
+    "brick": "brick",
+    "camera": "a person",
+    "chelsea": "things",
+    "coffee": "things",
+    "coins": "things",
+    "grass": "grass",
+    "gravel": "stone",
+    "rocket": "sky",
+}
+LARGE_SHARE, LARGE_HOLE = 1 / 3, 0.7  # share of masks that cover this share of the picture
 
-Photographs: TypeAlias = Sequence[tuple[str, np.ndarray]]  # names, and pictures uint8 [H, W, 3]
+Photographs: TypeAlias = Sequence[tuple[str, np.ndarray]]  # subjects, and pictures uint8 [H, W, 3]
+
+
+def caption(subject: str, cropped: bool) -> str:
+    """Return the caption of a picture of a subject, shown as a whole or as a crop."""
+    return f"A photo of {subject}{', cropped' if cropped else ''}"
 
 
 def image(
-    seed: int, index: int, photographs: Photographs | None = None, held_out: bool = False
+    seed: int, index: int, photographs: Photographs | None = None, held_out: bool = False, rooms: Photographs = ()
 ) -> tuple[np.ndarray, str]:
     """Make an image.
 
@@ -34,20 +51,23 @@ def image(
         seed, index: seed and number of the image.
         photographs: the photographs to crop; None for those of scikit-image.
         held_out: make an image that training never sees. Fewer of these are photographs.
+        rooms: pictures of made rooms. Two thirds of the images that would be corners show one of them.
 
     Returns:
-        The image, uint8 [SIZE, SIZE, 3], and a caption.
+        The image, uint8 [SIZE, SIZE, 3], and its subject: a material, several materials or a kind of place.
     """
     rng = np.random.default_rng(seed_for(seed, "held-out" if held_out else "train", index))
-    shares = [0.35, 0.45, 0.2] if held_out else [0.2, 0.25, 0.55]
+    shares = [0.35, 0.45, 0.2] if held_out else [0.2, 0.3, 0.5]
     kind = rng.choice(["surface", "corner", "photo"], p=shares)
     if kind == "photo":
         return photo_crop(rng, bundled_photographs(held_out) if photographs is None else photographs)
-    picture, caption = surface(rng) if kind == "surface" else corner(rng)
+    if kind == "corner" and rooms and rng.random() < 2 / 3:
+        return room_view(rng, rooms)
+    picture, subject = surface(rng) if kind == "surface" else corner(rng)
     if rng.random() < 0.5:
         picture = with_props(rng, picture)
     picture = cv2.resize(picture, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
-    return np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8), caption
+    return np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8), subject
 
 
 # ---------------------------------------------------------------------------------------------- procedural
@@ -65,7 +85,7 @@ def surface(rng: np.random.Generator) -> tuple[np.ndarray, str]:
     x, y = pixels()
     tilt = rng.normal(0, 0.002, 2) if rng.random() < 0.7 else np.zeros(2)
     w = np.maximum(1 + tilt[0] * x + tilt[1] * y, 0.35)
-    return shaded(rng, texture(x / w, y / w), x, y), f"A photo of {name}"
+    return shaded(rng, texture(x / w, y / w), x, y), name
 
 
 def shaded(rng: np.random.Generator, picture: np.ndarray, x: Field, y: Field) -> np.ndarray:
@@ -98,7 +118,7 @@ def corner(rng: np.random.Generator) -> tuple[np.ndarray, str]:
             names.append(name)
             picture[inside] = (texture(u, v) * light[plane])[inside]
     fade = rng.uniform(0, 0.12)
-    return shaded(rng, picture * np.exp(-fade * t)[..., None], x, y), f"A photo of {names[0]}"
+    return shaded(rng, picture * np.exp(-fade * t)[..., None], x, y), " and ".join(dict.fromkeys(names))
 
 
 def with_props(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
@@ -133,31 +153,42 @@ def bundled_photographs(held_out: bool = False) -> Photographs:
     for name in HELD_OUT_PHOTOS if held_out else [each for each in PHOTOS if each not in HELD_OUT_PHOTOS]:
         path = next((folder / f"{name}{end}" for end in (".png", ".jpg") if (folder / f"{name}{end}").exists()), None)
         if path is not None:
-            found.append((name, cv2.imread(str(path), cv2.IMREAD_COLOR)[..., ::-1].copy()))
+            found.append((SUBJECTS[name], cv2.imread(str(path), cv2.IMREAD_COLOR)[..., ::-1].copy()))
     return found
 
 
 def photo_crop(rng: np.random.Generator, photographs: Photographs) -> tuple[np.ndarray, str]:
     """A crop of a photograph at a random scale, flipped, with its colours shifted."""
-    name, photo = photographs[rng.integers(len(photographs))]
+    subject, photo = photographs[rng.integers(len(photographs))]
     side = int(SIZE * np.exp(rng.uniform(0, np.log(max(min(photo.shape[:2]) / SIZE, 1.01)))))
     top, left = rng.integers(photo.shape[0] - side + 1), rng.integers(photo.shape[1] - side + 1)
     crop = cv2.resize(photo[top : top + side, left : left + side], (SIZE, SIZE), interpolation=cv2.INTER_AREA)
     crop = crop[:, ::-1] if rng.random() < 0.5 else crop
     tint = rng.uniform(0.75, 1.2, 3) if rng.random() < 0.5 else rng.uniform(0.8, 1.2)
-    return np.clip(np.round(crop * tint), 0, 255).astype(np.uint8), f"A photo of {name}"
+    return np.clip(np.round(crop * tint), 0, 255).astype(np.uint8), subject
+
+
+def room_view(rng: np.random.Generator, rooms: Photographs) -> tuple[np.ndarray, str]:
+    """A picture of a room, mirrored or not: all of it, squeezed to a square as whole views are, or a square part."""
+    place, room = rooms[rng.integers(len(rooms))]
+    if rng.random() < 0.5:
+        side = int(rng.integers(SIZE, min(room.shape[:2]) + 1))
+        top, left = (rng.integers(length - side + 1) for length in room.shape[:2])
+        room = room[top : top + side, left : left + side]
+    picture = cv2.resize(room, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(picture[:, ::-1] if rng.random() < 0.5 else picture), place
 
 
 # ---------------------------------------------------------------------------------------------- masks
 
 
 def mask(rng: np.random.Generator, size: int) -> np.ndarray:
-    """bool [size, size]: a mask as in the method: a silhouette, a half plane, rectangles or everything."""
-    kind = rng.choice(["silhouette", "halfplane", "rectangles", "all"], p=[0.55, 0.2, 0.17, 0.08])
+    """bool [size, size], not all True: a mask as in the method (silhouettes, a half plane, rectangles), or large."""
+    if rng.random() < LARGE_SHARE:
+        return large_hole(rng, size)
+    kind = rng.choice(["silhouette", "halfplane", "rectangles"], p=[0.6, 0.22, 0.18])
     canvas = np.zeros((size, size), np.uint8)
-    if kind == "all":
-        canvas[:] = 1
-    elif kind == "rectangles":
+    if kind == "rectangles":
         for _ in range(rng.integers(1, 5)):
             w, h = (size * rng.uniform(0.1, 0.7, 2)).astype(int) + 1
             cx, cy = rng.integers(0, size, 2)
@@ -169,8 +200,18 @@ def mask(rng: np.random.Generator, size: int) -> np.ndarray:
         line = np.interp(np.arange(size), np.linspace(0, size, 64), wave) * size * rng.uniform(0, 0.08)
         canvas[(np.cos(angle) * ticks[None] + np.sin(angle) * ticks[:, None] + line[None]) > offset] = 1
     else:
-        return silhouettes(rng, size)
-    return canvas.astype(bool)
+        canvas = silhouettes(rng, size)
+    return large_hole(rng, size) if canvas.all() else canvas.astype(bool)
+
+
+def large_hole(rng: np.random.Generator, size: int) -> np.ndarray:
+    """bool [size, size]: a hole that covers `LARGE_HOLE` of the picture: around a point or beyond a line, wavy."""
+    ticks = (np.arange(size) + 0.5) / size
+    (x, y), angle = rng.uniform(0.2, 0.8, 2), rng.uniform(0, 2 * np.pi)
+    round_field = np.hypot(ticks[None] - x, ticks[:, None] - y)
+    field = round_field if rng.random() < 0.6 else np.cos(angle) * ticks[None] + np.sin(angle) * ticks[:, None]
+    field = field + rng.uniform(0, 0.15) * noise_tile(rng, 3.0, size=128)[:size, :size]
+    return field < np.quantile(field, LARGE_HOLE)
 
 
 def silhouettes(rng: np.random.Generator, size: int) -> np.ndarray:

@@ -35,50 +35,52 @@ class Photograph(NamedTuple):
     Attributes:
         file: path below /usr/share/backgrounds or /usr/share/wallpapers.
         author, licence: as stated in the package's copyright file or in the photograph's metadata.
+        subject: what captions name, in the words of `build.WORDS`.
     """
 
     file: str
     author: str
     licence: str
+    subject: str
 
 
 PHOTOGRAPHS = (
-    Photograph("Bridge_by_Sander_Klootwijk.jpg", "Sander Klootwijk", "CC BY-SA 4.0"),
-    Photograph("Dragonfly_by_Bolly.jpg", "Bolly", "CC BY-SA 4.0"),
-    Photograph("Picture_0B_by_freespace.jpg", "Trevor 'Freespace'", "CC BY 4.0"),
-    Photograph("Picture_1A_by_freespace.jpg", "Trevor 'Freespace'", "CC BY 4.0"),
-    Photograph("Wine_by_Jakkub_Mede.jpg", "Jakub Mede", "CC BY 4.0"),
-    Photograph("aitzgorri_by_Aitzol_Berasategi.jpg", "Aitzol Berasategi", "CC BY 4.0"),
-    Photograph("free_by_Peter_Nerlich.jpg", "Peter Nerlich", "CC BY-SA 4.0"),
-    Photograph("friends_by_Aitzol_Berasategi.jpg", "Aitzol Berasategi", "CC BY 4.0"),
-    Photograph("greentock_by_Peter_Nerlich.jpg", "Peter Nerlich", "CC BY-SA 4.0"),
-    Photograph("life_by_Aitzol_Berasategi.jpg", "Aitzol Berasategi", "CC BY 4.0"),
-    Photograph("picosdeeuropa_by_Aitzol_Berasategi.jpg", "Aitzol Berasategi", "CC BY 4.0"),
-    Photograph("seeding_by_Clements_Engelhardt.jpg", "Clemens Engelhardt", "CC0 1.0"),
-    Photograph("sunset_by_Aitzol_Berasategi.jpg", "Aitzol Berasategi", "CC BY 4.0"),
-    Photograph("Kleiber_by_Lukas_Baubkus.jpg", "Lukas Baubkus", "CC BY-SA 3.0"),
-    Photograph("mate/nature/Aqua.jpg", "Charles Barbin", "GPL 2+"),
-    Photograph("mate/nature/Blinds.jpg", "Lennart Poettering, Andrea Cimitan", "GPL 2+"),
-    Photograph("mate/nature/Dune.jpg", "Marco Cogoni, Hylke Bons", "GPL 2+"),
-    Photograph("mate/nature/FreshFlower.jpg", "Jens Ansorg", "GPL 2+"),
-    Photograph("mate/nature/Garden.jpg", "Charles Barbin", "GPL 2+"),
-    Photograph("mate/nature/GreenMeadow.jpg", "Timothy Schellhase, Lapo Calamandrei", "GPL 2+"),
-    Photograph("mate/nature/LadyBird.jpg", "Charles Barbin", "GPL 2+"),
-    Photograph("mate/nature/RainDrops.jpg", "blackcombwhistler07", "GPL 2+"),
-    Photograph("mate/nature/Storm.jpg", "Sergey Nazarov", "GPL 2+"),
-    Photograph("mate/nature/TwoWings.jpg", "Charles Barbin, Hylke Bons", "GPL 2+"),
-    Photograph("mate/nature/Wood.jpg", "Jean-François Fortin Tam", "GPL 2+"),
-    Photograph("mate/nature/YellowFlower.jpg", "Charles Barbin", "GPL 2+"),
-    Photograph("BytheWater/contents/images/2560x1600.jpg", "Maciej Wiklo", "LGPL 3"),
-    Photograph("ColdRipple/contents/images/2560x1600.jpg", "Risto Saukonpää", "LGPL 3"),
-    Photograph("ColorfulCups/contents/images/2560x1600.jpg", "Dmitri Popov", "LGPL 3"),
-    Photograph("DarkestHour/contents/images/2560x1600.jpg", "Risto Saukonpää", "LGPL 3"),
-    Photograph("EveningGlow/contents/images/2560x1600.jpg", "Ian Hex", "LGPL 3"),
-    Photograph("FallenLeaf/contents/images/2560x1600.jpg", "Martin Klapetek", "LGPL 3"),
-    Photograph("Kite/contents/images/2560x1600.jpg", "Risto Saukonpää", "LGPL 3"),
-    Photograph("OneStandsOut/contents/images/2560x1600.jpg", "Risto Saukonpää", "LGPL 3"),
-    Photograph("Path/contents/images/2560x1600.jpg", "Risto Saukonpää", "LGPL 3"),
-    Photograph("summer_1am/contents/images/2560x1600.jpg", "Risto Saukonpää", "LGPL 3"),
+    Photograph("Bridge_by_Sander_Klootwijk.jpg", "Sander Klootwijk", "CC BY-SA 4.0", "sky"),
+    Photograph("Dragonfly_by_Bolly.jpg", "Bolly", "CC BY-SA 4.0", "leaves"),
+    Photograph("Picture_0B_by_freespace.jpg", "Trevor 'Freespace'", "CC BY 4.0", "things"),
+    Photograph("Picture_1A_by_freespace.jpg", "Trevor 'Freespace'", "CC BY 4.0", "things"),
+    Photograph("Wine_by_Jakkub_Mede.jpg", "Jakub Mede", "CC BY 4.0", "a room"),
+    Photograph("aitzgorri_by_Aitzol_Berasategi.jpg", "Aitzol Berasategi", "CC BY 4.0", "hills"),
+    Photograph("free_by_Peter_Nerlich.jpg", "Peter Nerlich", "CC BY-SA 4.0", "a room"),
+    Photograph("friends_by_Aitzol_Berasategi.jpg", "Aitzol Berasategi", "CC BY 4.0", "wood"),
+    Photograph("greentock_by_Peter_Nerlich.jpg", "Peter Nerlich", "CC BY-SA 4.0", "things"),
+    Photograph("life_by_Aitzol_Berasategi.jpg", "Aitzol Berasategi", "CC BY 4.0", "a forest"),
+    Photograph("picosdeeuropa_by_Aitzol_Berasategi.jpg", "Aitzol Berasategi", "CC BY 4.0", "hills"),
+    Photograph("seeding_by_Clements_Engelhardt.jpg", "Clemens Engelhardt", "CC0 1.0", "flowers"),
+    Photograph("sunset_by_Aitzol_Berasategi.jpg", "Aitzol Berasategi", "CC BY 4.0", "hills"),
+    Photograph("Kleiber_by_Lukas_Baubkus.jpg", "Lukas Baubkus", "CC BY-SA 3.0", "wood"),
+    Photograph("mate/nature/Aqua.jpg", "Charles Barbin", "GPL 2+", "water"),
+    Photograph("mate/nature/Blinds.jpg", "Lennart Poettering, Andrea Cimitan", "GPL 2+", "leaves"),
+    Photograph("mate/nature/Dune.jpg", "Marco Cogoni, Hylke Bons", "GPL 2+", "grass"),
+    Photograph("mate/nature/FreshFlower.jpg", "Jens Ansorg", "GPL 2+", "flowers"),
+    Photograph("mate/nature/Garden.jpg", "Charles Barbin", "GPL 2+", "flowers"),
+    Photograph("mate/nature/GreenMeadow.jpg", "Timothy Schellhase, Lapo Calamandrei", "GPL 2+", "grass"),
+    Photograph("mate/nature/LadyBird.jpg", "Charles Barbin", "GPL 2+", "flowers"),
+    Photograph("mate/nature/RainDrops.jpg", "blackcombwhistler07", "GPL 2+", "leaves"),
+    Photograph("mate/nature/Storm.jpg", "Sergey Nazarov", "GPL 2+", "sky"),
+    Photograph("mate/nature/TwoWings.jpg", "Charles Barbin, Hylke Bons", "GPL 2+", "flowers"),
+    Photograph("mate/nature/Wood.jpg", "Jean-François Fortin Tam", "GPL 2+", "wood"),
+    Photograph("mate/nature/YellowFlower.jpg", "Charles Barbin", "GPL 2+", "flowers"),
+    Photograph("BytheWater/contents/images/2560x1600.jpg", "Maciej Wiklo", "LGPL 3", "water"),
+    Photograph("ColdRipple/contents/images/2560x1600.jpg", "Risto Saukonpää", "LGPL 3", "water"),
+    Photograph("ColorfulCups/contents/images/2560x1600.jpg", "Dmitri Popov", "LGPL 3", "things"),
+    Photograph("DarkestHour/contents/images/2560x1600.jpg", "Risto Saukonpää", "LGPL 3", "sky"),
+    Photograph("EveningGlow/contents/images/2560x1600.jpg", "Ian Hex", "LGPL 3", "water"),
+    Photograph("FallenLeaf/contents/images/2560x1600.jpg", "Martin Klapetek", "LGPL 3", "leaves"),
+    Photograph("Kite/contents/images/2560x1600.jpg", "Risto Saukonpää", "LGPL 3", "sky"),
+    Photograph("OneStandsOut/contents/images/2560x1600.jpg", "Risto Saukonpää", "LGPL 3", "leaves"),
+    Photograph("Path/contents/images/2560x1600.jpg", "Risto Saukonpää", "LGPL 3", "a forest"),
+    Photograph("summer_1am/contents/images/2560x1600.jpg", "Risto Saukonpää", "LGPL 3", "sky"),
 )
 
 
@@ -96,17 +98,18 @@ def load_photographs(folder: Path, held_out: bool) -> list[tuple[str, np.ndarray
         held_out: load those that training never sees, instead of those that it sees.
 
     Returns:
-        The names, and the photographs as uint8 [H, W, 3]; sorted by name.
+        The subjects, and the photographs as uint8 [H, W, 3]; sorted by name.
 
     Raises:
         ValueError: the folder lacks a photograph.
     """
-    names = sorted(short_name(each) for each in PHOTOGRAPHS)
-    chosen = [name for index, name in enumerate(names) if (index % HELD_OUT_EVERY == 0) == held_out]
+    subjects = dict(sorted((short_name(each), each.subject) for each in PHOTOGRAPHS))
+    chosen = [name for index, name in enumerate(subjects) if (index % HELD_OUT_EVERY == 0) == held_out]
     missing = [name for name in chosen if not (folder / f"{name}.jpg").is_file()]
     if missing:
         raise ValueError(f"{folder}: {', '.join(missing)} missing; run python -m priors.tiny.photographs {folder}")
-    return [(name, cv2.imread(str(folder / f"{name}.jpg"), cv2.IMREAD_COLOR)[..., ::-1].copy()) for name in chosen]
+    load = lambda name: cv2.imread(str(folder / f"{name}.jpg"), cv2.IMREAD_COLOR)[..., ::-1].copy()
+    return [(subjects[name], load(name)) for name in chosen]
 
 
 def collect_photographs(folder: Path) -> None:

@@ -22,6 +22,7 @@ from transformers import CLIPTextModel
 
 from priors.tiny import build, images
 from priors.tiny.photographs import load_photographs
+from priors.tiny.rooms import load_rooms
 from reffusion.io.arrays import save_json
 from reffusion.prior import harmonic_fill
 from reffusion.prior.denoising import spread_timesteps
@@ -38,46 +39,68 @@ SMALL, LARGE = (
     (32, 24),
     (64, 8),
 )  # (crop side in px, batch): small crops three steps of four, whole native ones the fourth
-PEAK_RATE, WARMUP, DECAY_SHARE, EMA = 6e-4, 200, 0.7, 0.999  # DECAY_SHARE: last part of the run, with a falling rate
+PEAK_RATE, WARMUP, DECAY_SHARE, EMA = 6e-4, 100, 0.7, 0.998  # DECAY_SHARE: last part of the run, with a falling rate
 HAS_BFLOAT16 = torch.ops.mkldnn._is_mkldnn_bf16_supported()  # then a step on the CPU takes .75 of its time
 OUTSIDE_WEIGHT = 0.2  # weight of the loss outside the mask
 FILLED_SHARE = 0.8  # of samples have the hole filled as in conditioning.json; the others a grey hole
 NOISY_SHARE = 0.15  # noisy end of the schedule, from which every fourth timestep is sampled
-LATENT_WEIGHTS = (1.0, 1.0, 1.0, 0.02)  # of each latent; the fourth is empty, and only has to stay close to 0
+# Of each latent: light varies three and five times as much as the two opponent colours; the fourth is empty, and only
+# has to stay close to 0.
+LATENT_WEIGHTS = (1.0, 3.0, 5.0, 0.02)
+EMPTY_SHARE, VAGUE_SHARE = 0.1, 0.15  # of captions are empty; of the others say "sks" or "a scene" for the subject
+USUAL_ENERGY = 0.35  # mean square of the latents, above which a sample's loss is divided by it
 CONTRAST = 0.5  # standard deviation at which the model sees the known pixels of a sample (`reffusion.prior.levels`)
 VALIDATION_CROPS = 32  # held-out crops
-CHECKPOINT_STEPS = 100  # steps between checkpoints
+CHECKPOINT_STEPS = 50  # steps between checkpoints
 
 
 class Pool:
     """The last `size` images of a seed; `advance` replaces the oldest by image number `index`."""
 
-    def __init__(self, seed: int, step: int, size: int, photographs: images.Photographs, held_out: bool = False):
-        self.seed, self.photographs, self.held_out = seed, photographs, held_out
+    def __init__(
+        self,
+        seed: int,
+        step: int,
+        size: int,
+        photographs: images.Photographs,
+        rooms: images.Photographs = (),
+        held_out: bool = False,
+    ):
+        self.seed, self.photographs, self.rooms, self.held_out = seed, photographs, rooms, held_out
         self.items: list[np.ndarray | None] = [None] * size
-        self.captions = [""] * size
+        self.subjects = [""] * size
         for index in range(step, step + size):
             self.advance(index)
 
     def advance(self, index: int) -> None:
         slot = index % len(self.items)
-        self.items[slot], self.captions[slot] = images.image(self.seed, index, self.photographs, self.held_out)
+        self.items[slot], self.subjects[slot] = images.image(
+            self.seed, index, self.photographs, self.held_out, self.rooms
+        )
 
     def batch(self, rng: np.random.Generator, side: int, count: int) -> tuple[Tensor, Tensor, list[str]]:
         """Crops [B, 3, side, side] in [-1, 1], masks [B, 1, side, side] (1 = repaint), captions."""
         crops, masks, captions = [], [], []
         for index in rng.integers(0, len(self.items), count):
-            picture = self.items[index]
-            if side == build.NATIVE and rng.random() < 0.5:  # the whole view at native size
-                crop = picture.reshape(side, 2, side, 2, 3).mean((1, 3))
-            else:
-                top, left = rng.integers(0, images.SIZE - side + 1, 2)
-                crop = picture[top : top + side, left : left + side]
+            picture, cropped = self.items[index], rng.random() < 0.5
+            if not cropped:  # at the scale of a whole view at native size, of which a small crop is a part
+                picture = picture.reshape(build.NATIVE, 2, build.NATIVE, 2, 3).mean((1, 3))
+            top, left = rng.integers(0, len(picture) - side + 1, 2)
+            crop = picture[top : top + side, left : left + side]
             crops.append(crop[:, ::-1] if rng.random() < 0.5 else crop)
             masks.append(images.mask(rng, side))
-            captions.append(self.captions[index] if rng.random() < 0.5 else "")
+            captions.append(draw_caption(rng, self.subjects[index], cropped))
         pixels = torch.from_numpy(np.stack(crops).astype(np.float32) / 127.5 - 1).permute(0, 3, 1, 2)
         return pixels, torch.from_numpy(np.stack(masks)[:, None].astype(np.float32)), captions
+
+
+def draw_caption(rng: np.random.Generator, subject: str, cropped: bool) -> str:
+    """Return the caption of a training sample: of its subject, or vague, or empty."""
+    if rng.random() < EMPTY_SHARE:
+        return ""
+    if rng.random() < VAGUE_SHARE:
+        subject = str(rng.choice(["sks", "a scene"]))
+    return images.caption(subject, cropped)
 
 
 class Model(nn.Module):
@@ -106,8 +129,8 @@ def noisy_quarter(t: Tensor, steps: int) -> Tensor:
     return torch.where(torch.arange(len(t)) % 4 == 0, moved, t)
 
 
-def loss(model: Model, alphas: Tensor, batch: tuple[Tensor, Tensor, list[str]], random: torch.Generator) -> Tensor:
-    """Mean squared error of v = sqrt(a) eps - sqrt(1 - a) z, weighted by OUTSIDE_WEIGHT and LATENT_WEIGHTS."""
+def losses(model: Model, alphas: Tensor, batch: tuple[Tensor, Tensor, list[str]], random: torch.Generator) -> Tensor:
+    """Mean squared errors [B] of v = sqrt(a) eps - sqrt(1 - a) z, weighted by OUTSIDE_WEIGHT and LATENT_WEIGHTS."""
     device = alphas.device
     pixels, masks, captions = batch[0].to(device), batch[1].to(device), batch[2]
     pixels = measure_levels(pixels, masks, CONTRAST).normalize(pixels)
@@ -123,7 +146,7 @@ def loss(model: Model, alphas: Tensor, batch: tuple[Tensor, Tensor, list[str]], 
     weight = (OUTSIDE_WEIGHT + (1 - OUTSIDE_WEIGHT) * masks) * torch.tensor(LATENT_WEIGHTS).to(device).view(-1, 1, 1)
     error = (weight * (predicted - target) ** 2).sum((1, 2, 3)) / weight.sum((1, 2, 3))
     # A hole that shows more contrast than its surroundings has high values, and would outweigh all other samples.
-    return (error / clean.square().mean((1, 2, 3)).clamp(min=1)).mean()
+    return error / clean.square().mean((1, 2, 3)).clamp(min=USUAL_ENERGY)
 
 
 def make_optimiser(model: Model) -> torch.optim.Optimizer:
@@ -141,7 +164,7 @@ def validation(model: Model, alphas: Tensor, pool: Pool) -> float:
     rng = np.random.default_rng(seed_for(pool.seed, "validation"))
     with torch.no_grad():
         batch = pool.batch(rng, build.NATIVE, VALIDATION_CROPS)
-        return float(loss(model, alphas, batch, generator(pool.seed, "validation noise")))
+        return float(losses(model, alphas, batch, generator(pool.seed, "validation noise")).mean())
 
 
 def step_once(
@@ -152,7 +175,7 @@ def step_once(
     side, count = LARGE if step % 4 == 3 else SMALL
     for group in optimiser.param_groups:
         group["lr"] = rate(step, steps)
-    error = loss(model, alphas, pool.batch(rng, side, count), generator(pool.seed, "noise", step))
+    error = losses(model, alphas, pool.batch(rng, side, count), generator(pool.seed, "noise", step)).mean()
     if not torch.isfinite(error):
         raise FloatingPointError(f"training loss is {error.item()} at step {step}")
     optimiser.zero_grad(set_to_none=True)
@@ -217,6 +240,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--work", type=Path, default=HERE.parent.parent / "runs" / "prior", help="checkpoint and log")
     parser.add_argument("--start", type=Path, help="an exported folder whose weights a new run begins with")
     parser.add_argument("--photographs", type=Path, required=True, help="the output of `priors.tiny.photographs`")
+    parser.add_argument("--rooms", type=Path, required=True, help="the output of `priors.tiny.rooms`")
     parser.add_argument("--out", type=Path, default=HERE, help="the folder to export to")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--export-every", type=int, default=500, help="steps between exports")
@@ -240,8 +264,10 @@ def main() -> None:
         optimiser.load_state_dict(state["optimiser"])
         average, start = state["average"], state["step"]
     photographs = [*images.bundled_photographs(), *load_photographs(options.photographs, held_out=False)]
-    pool = Pool(options.seed, start // STEPS_PER_IMAGE, POOL, photographs)
-    held_out = Pool(0, 0, VALIDATION_CROPS, load_photographs(options.photographs, held_out=True), held_out=True)
+    rooms, other_rooms = load_rooms(options.rooms, held_out=False), load_rooms(options.rooms, held_out=True)
+    others = load_photographs(options.photographs, held_out=True)
+    pool = Pool(options.seed, start // STEPS_PER_IMAGE, POOL, photographs, rooms)
+    held_out = Pool(0, 0, VALIDATION_CROPS, others, other_rooms, held_out=True)
     began = time.time()
     for step in range(start, options.steps):
         error = step_once(model, alphas, optimiser, pool, step, options.steps)

@@ -16,7 +16,6 @@ from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_references, load_views
 from reffusion.params.distill import Params
 from reffusion.prior import diffusion, lora
-from reffusion.prior.crops import PROMPTS
 from reffusion.prior.model import Prior, drop_text_encoders, enable_checkpointing, load_prior
 from reffusion.types import Gaussians, Scene
 from reffusion.workspace import Workspace
@@ -61,7 +60,7 @@ def load_adapted_prior(params: Params, personalize: Path | None) -> tuple[Prior 
     prior = load_prior(params.prior, params.device, params.dtype)
     prior = prior if personalize is None else lora.merge(prior, personalize)
     with torch.no_grad():
-        text = diffusion.embed_text(prior, list(PROMPTS))
+        text = diffusion.embed_text(prior, params.prompts.texts)
     prior = drop_text_encoders(prior)
     return enable_checkpointing(prior) if params.checkpointing else prior, text
 

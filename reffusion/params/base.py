@@ -95,6 +95,21 @@ def checkpoint_field() -> Any:
     return Field(10.0, gt=0, description="seconds of work between checkpoints", json_schema_extra=UNKEYED)
 
 
+class Prompts(Settings):
+    """The prompts with which a prior is adapted to a reference, and with which it then repaints views (section 4).
+
+    They stand for the reference only after an adaptation. A variant without one names what a scene is in plain words.
+    """
+
+    whole: str = Field("A photo of sks", description="prompt of whole views")
+    crop: str = Field("A photo of sks, cropped", description="prompt of windows")
+
+    @property
+    def texts(self) -> list[str]:
+        """The prompts of whole views and of windows, and the empty prompt, in the order of `crops.GLOBAL` and so on."""
+        return [self.whole, self.crop, ""]
+
+
 # PAPER leaves open: the noise level at which the refinement of a finer level starts; 1 = pure noise.
 REFINED_FROM = 0.6
 

@@ -10,6 +10,7 @@ from reffusion.params.base import (
     Device,
     Dtype,
     MeansUnit,
+    Prompts,
     Settings,
     checkpoint_field,
     depth_model_field,
@@ -36,7 +37,7 @@ class SdsTerm(Settings):
         180, gt=0, le=180, description="degrees; views farther than this from every reference are not distilled"
     )
     # PAPER leaves open: timesteps, w(t), normalisation, guidance, reduction (see `distill.sds`). The values are those
-    # of threestudio, except guidance: its scale of 100 suits a prior that was not adapted.
+    # of threestudio, except guidance, which is RealFill's: a scale of 100 suits a prior that was not adapted.
     t_high: float = Field(0.98, ge=0, le=1, description="highest timestep")
     # Not in the paper: high timesteps decide the layout, which is settled first.
     t_high_last: float | None = Field(
@@ -45,11 +46,10 @@ class SdsTerm(Settings):
     weighting: Literal["sigma2", "alpha_sigma2", "x0", "one"] = Field(
         "sigma2", description="w(t) of the SDS gradient, see `distill.sds.sds_gradient`"
     )
-    antialias: bool = Field(False, description="average over all pixels when a whole view is reduced, or skip pixels")
     hole_only: bool = Field(False, description="drop the gradient at latents that are not repainted")
     # Not in the paper: the predictions of a small prior have too little contrast, and fade a correct rendering.
     keep_contrast: bool = Field(False, description="raise the prediction's contrast to that of the rendered hole")
-    guidance: float = Field(6.5, ge=0, description="the paper's a; libraries' guidance scale is 1 + a")
+    guidance: float = Field(4.0, ge=0, description="the paper's a; libraries' guidance scale is 1 + a")
     reduction: Literal["sum", "mean"] = Field("sum", description="over a latent's elements")
 
     @property
@@ -172,6 +172,7 @@ class Densify(Settings):
 
 class Params(Settings):
     prior: str = prior_field()
+    prompts: Prompts = Prompts()  # as in `personalize`, which teaches the prior what they mean
     # PAPER leaves open: the number of iterations; 3DGS's own, less the fit's, is of this size.
     iterations: int = Field(5000, ge=1, description="optimisation steps")
     sds: SdsTerm = SdsTerm()

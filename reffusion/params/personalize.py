@@ -10,6 +10,7 @@ from reffusion.params.base import (
     Decay,
     Device,
     Dtype,
+    Prompts,
     Settings,
     checkpoint_field,
     memory_field,
@@ -70,6 +71,7 @@ class TrainingSamples(Settings):
 
 class Params(Settings):
     prior: str = prior_field()
+    prompts: Prompts = Prompts()
     steps: int = Field(2000, ge=0, description="optimiser steps; 0 skips the stage: the prior is not adapted")
     # Not in the paper. Its 2,000 steps suit no reference in particular.
     least_gain: float = Field(

@@ -16,8 +16,7 @@ from torch import Tensor
 from reffusion.params.personalize import TrainingSamples
 from reffusion.prior.windows import enlarge_to_fit, two_scale_masks, two_scales, window_around
 
-PROMPTS = ("A photo of sks", "A photo of sks, cropped", "")
-GLOBAL, LOCAL, EMPTY = 0, 1, 2
+GLOBAL, LOCAL, EMPTY = 0, 1, 2  # indices into `params.base.Prompts.texts`
 
 # PAPER leaves open: all of these values. Those of rectangles and empty prompts are RealFill's.
 EMPTY_SHARE = 0.1  # of samples get the empty prompt, so that classifier-free guidance stays meaningful
@@ -47,7 +46,7 @@ class Batch(NamedTuple):
     Attributes:
         images: [B, 3, n, n] in [-1, 1].
         masks: [B, 1, n, n], 1 = repaint.
-        prompts: [B] long, indices into PROMPTS.
+        prompts: [B] long, `GLOBAL`, `LOCAL` or `EMPTY`.
     """
 
     images: Tensor
@@ -129,7 +128,7 @@ def draw_samples(
         source = references[int(torch.randint(len(references), (), generator=generator))]
         image, hole, prompt = _sample_of_reference(source, native, size, samples.local_share, generator)
         images.append(image)
-        use_hole = hole.any() and _uniform(0, 1, generator) < samples.hole_share
+        use_hole = hole.any() and not hole.all() and _uniform(0, 1, generator) < samples.hole_share
         masks.append(hole if use_hole else random_mask(samples, size, generator))
         prompts.append(EMPTY if _uniform(0, 1, generator) < EMPTY_SHARE else prompt)
     return Batch(torch.stack(images), torch.stack(masks), torch.tensor(prompts))
@@ -151,7 +150,8 @@ def _sample_of_reference(
         prompt = GLOBAL
     if hole.shape[-2:] == (size, size):
         return image, hole, prompt
-    window = window_around if hole.any() else _window_anywhere  # cropping may have removed the hole
+    # Cropping may have removed the hole, or all that was known beside it.
+    window = window_around if hole.any() and not hole.all() else _window_anywhere
     top, left = window(hole[0] > 0, size, generator)
     return image[:, top : top + size, left : left + size], hole[:, top : top + size, left : left + size], prompt
 

@@ -8,8 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from reffusion.params.base import Prompts
 from reffusion.prior import diffusion
-from reffusion.prior.crops import GLOBAL, LOCAL, PROMPTS, Batch, Picture
+from reffusion.prior.crops import GLOBAL, LOCAL, Batch, Picture
 from reffusion.prior.model import Prior
 from reffusion.prior.windows import two_scale_masks, two_scales, window_around
 from reffusion.seeding import generator as seeded
@@ -52,7 +53,7 @@ def denoising_error(
     Args:
         prior: The diffusion prior.
         samples: The training samples.
-        text: [3, L, D], the embeddings of PROMPTS.
+        text: [3, L, D], the embeddings of the global, the local and the empty prompt.
         timesteps: [B] long.
         noise: [B, C, h, w] standard normal, in the shape of the latents.
         outside_weight: Weight of latents outside the mask in the means. Latents to repaint have weight 1. With 0 the
@@ -78,7 +79,8 @@ def denoising_error(
 def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Batch:
     """Return two fixed samples of the first reference, first the whole view and then a crop, with its hole as mask.
 
-    These samples measure the error of the prior. If the reference has no hole, the mask covers everything.
+    These samples measure the error of the prior. If the reference has no hole, or nothing but a hole, the mask covers
+    its middle, half as wide and half as high.
 
     Args:
         references: The references, of which the first is used.
@@ -87,7 +89,11 @@ def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Bat
     """
     generator = seeded(seed, "personalize", "held out")
     reference = references[0]
-    region = reference.region if reference.region.any() else torch.ones_like(reference.region)
+    region = reference.region
+    if not region.any() or region.all():
+        height, width = region.shape
+        region = torch.zeros_like(region)
+        region[height // 4 : height - height // 4, width // 4 : width - width // 4] = True
     windows = [window_around(region, size, generator)]
     masks = two_scale_masks(region, windows, size)
     return Batch(two_scales(reference.image, windows, size), masks, torch.tensor([GLOBAL, LOCAL]))
@@ -100,5 +106,5 @@ def backward_one_sample(prior: Prior, references: Sequence[Picture], seed: int) 
     """
     sample = Batch(*(tensor[:1] for tensor in held_out_samples(references, prior.native_size, seed)))
     noise = torch.zeros(1, *latent_shape(prior, prior.native_size))
-    text = diffusion.embed_text(prior, list(PROMPTS))
+    text = diffusion.embed_text(prior, Prompts().texts)
     denoising_error(prior, sample, text, torch.zeros(1, dtype=torch.long), noise)[0].sum().backward()

@@ -7,12 +7,12 @@ from functools import partial
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from reffusion.io.images import to_uint8
 from reffusion.prior import diffusion, harmonic_fill
 from reffusion.prior.model import Prior
+from reffusion.prior.windows import resize
 from reffusion.seeding import generator as seeded
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
@@ -44,11 +44,6 @@ def to_input(picture: np.ndarray) -> Tensor:
 def to_picture(painted: Tensor) -> np.ndarray:
     """Convert an output of `paint`, [3, H, W] in [-1, 1], to a picture, uint8 [H, W, 3]."""
     return to_uint8((painted.permute(1, 2, 0).cpu().numpy() + 1) / 2)
-
-
-def resize(image: Tensor, height: int, width: int) -> Tensor:
-    """Resize an image [B, C, H, W] to [B, C, height, width]: bilinear, antialiased when shrinking."""
-    return F.interpolate(image, size=(height, width), mode="bilinear", align_corners=False, antialias=True)
 
 
 def level_sizes(height: int, width: int, size: int) -> list[tuple[int, int]]:

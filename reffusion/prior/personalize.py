@@ -12,7 +12,7 @@ import torch
 from reffusion import trace
 from reffusion.params.personalize import Params
 from reffusion.prior import diffusion, lora
-from reffusion.prior.crops import PROMPTS, Batch, Picture, draw_samples
+from reffusion.prior.crops import Batch, Picture, draw_samples
 from reffusion.prior.denoising import denoising_error, latent_shape, spread_timesteps
 from reffusion.prior.model import Prior
 from reffusion.prior.threads import Threads
@@ -86,7 +86,7 @@ def personalize(
 
     def measure(step: int, previous: float = inf) -> tuple[float, bool]:
         with log.paused():
-            errors = measure_errors(prior, validation_set, settings.seed, threads.map)
+            errors = measure_errors(prior, validation_set, settings.prompts.texts, settings.seed, threads.map)
             error = errors["clean_latent_mse"]
             is_settled = step < steps and error > (1 - settings.least_gain) * previous and settings.least_gain > 0
             reason = "settled" if is_settled else "finished" if step == steps else ""
@@ -159,7 +159,7 @@ def train_step(
     torch.manual_seed(int(torch.randint(2**62, (), generator=generator)))
     executor = threads if threads is not None and not settings.lora.dropout else None
     unet_parameters, text_parameters = (group["params"] for group in optimizer.param_groups)
-    text = diffusion.embed_text(prior, list(PROMPTS))
+    text = diffusion.embed_text(prior, settings.prompts.texts)
     detached_text = text.detach().requires_grad_()
 
     def loss_and_gradients(rows: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor | None, ...]]:

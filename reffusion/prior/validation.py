@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from reffusion.prior import diffusion, lora
-from reffusion.prior.crops import GLOBAL, PROMPTS, Batch, Picture
+from reffusion.prior.crops import GLOBAL, Batch, Picture
 from reffusion.prior.denoising import denoising_error, held_out_samples, latent_shape
 from reffusion.prior.model import Prior
 from reffusion.prior.windows import two_scale_masks, two_scales
@@ -75,7 +75,7 @@ def make_held_out(
 
 
 def measure_errors(
-    prior: Prior, held: HeldOut, seed: int, map_parts: Callable[..., Iterable] = map
+    prior: Prior, held: HeldOut, prompts: list[str], seed: int, map_parts: Callable[..., Iterable] = map
 ) -> dict[str, float]:
     """Return the errors for the trace of personalization, by their key.
 
@@ -91,12 +91,15 @@ def measure_errors(
     Args:
         prior: The prior with LoRA layers attached.
         held: The samples.
+        prompts: The global, the local and the empty prompt.
         seed: Seed of the noise.
         map_parts: Function like `map`, which may run several calls at the same time.
     """
     lora.set_dropout(prior, False)
-    parts = [partial(_hole_errors, prior, held, seed, level) for level in NOISE_LEVELS] + [
-        partial(_one_step_psnr, prior, held, seed)
+    with torch.no_grad():
+        text = diffusion.embed_text(prior, prompts)
+    parts = [partial(_hole_errors, prior, held, text, seed, level) for level in NOISE_LEVELS] + [
+        partial(_one_step_psnr, prior, held, text, seed)
     ]
     *errors, psnr = map_parts(lambda part: part(), parts)
     target, clean = torch.stack(errors).mean(0)
@@ -105,7 +108,7 @@ def measure_errors(
 
 
 @torch.no_grad()
-def _hole_errors(prior: Prior, held_out: HeldOut, seed: int, level: float) -> Tensor:
+def _hole_errors(prior: Prior, held_out: HeldOut, text: Tensor, seed: int, level: float) -> Tensor:
     """Return both errors of `denoising_error` in the hole of the reference at one noise level, [2, 2].
 
     The rows are the error of the target and the error of the clean latent; the columns are the whole view and the crop.
@@ -114,17 +117,16 @@ def _hole_errors(prior: Prior, held_out: HeldOut, seed: int, level: float) -> Te
     timesteps = torch.full((len(samples.prompts),), round(level * (prior.timesteps - 1)))
     generator = seeded(seed, "personalize", "held out", level)
     noise = torch.randn(len(samples.prompts), *latent_shape(prior, samples.images.shape[-1]), generator=generator)
-    text = diffusion.embed_text(prior, list(PROMPTS))
     return torch.stack(denoising_error(prior, samples, text, timesteps, noise, outside_weight=0))
 
 
 @torch.no_grad()
-def _one_step_psnr(prior: Prior, held_out: HeldOut, seed: int) -> dict[str, float]:
+def _one_step_psnr(prior: Prior, held_out: HeldOut, text: Tensor, seed: int) -> dict[str, float]:
     """Return the PSNR in the holes of the reference and of photographs, for one denoising step from pure noise.
 
     One step predicts the mean of the pictures that the prior would paint.
     """
-    text = diffusion.embed_text(prior, [PROMPTS[GLOBAL]]).expand(len(held_out.pictures), -1, -1)
+    text = text[GLOBAL].expand(len(held_out.pictures), -1, -1)
     images, repaint, holes = (each.to(prior.device) for each in (held_out.pictures, held_out.repaint, held_out.holes))
     generator = seeded(seed, "personalize", "expected")
     sampled = diffusion.sample(prior, images, repaint, text, steps=1, random=generator)

@@ -1,4 +1,4 @@
-"""Windows around masked pixels, and views at two scales: the inputs of SDS and of personalization."""
+"""Windows around masked pixels, and views at two scales: the inputs of SDS, of personalization and of the sampler."""
 
 from __future__ import annotations
 
@@ -8,25 +8,43 @@ from torch import Tensor
 
 
 def window_around(mask: Tensor, size: int, generator: torch.Generator) -> tuple[int, int]:
-    """Draw a size x size window around a random masked pixel, and return its upper left corner (top, left).
+    """Draw a size x size window that shows masked and other pixels, and return its upper left corner (top, left).
 
     PAPER leaves open: how a patch is sampled from the bounding box of the mask. The centre of the window is a masked
     pixel, because the box may be mostly unmasked (a ring, two objects). A window that extends beyond the view is moved
-    inside.
+    inside. A window that is masked entirely is not drawn, because a prior is not adapted to pictures without any
+    known pixel.
 
     Args:
-        mask: bool [H, W] with at least one True pixel.
-        size: Side of the window in pixels, at most min(H, W).
+        mask: bool [H, W] with at least one True and one False pixel.
+        size: Side of the window in pixels, at least 2 and at most min(H, W).
         generator: The source of randomness, on the CPU.
 
     Raises:
-        ValueError: The window does not fit into the view, or the mask is empty.
+        ValueError: The window does not fit into the view, or the mask is empty or covers the whole view.
     """
-    return tuple(windows_around(mask, size, 1, generator)[0].tolist())
+    corners = _corners(mask, size)
+    for index in torch.randperm(len(corners), generator=generator):
+        top, left = corners[index].tolist()
+        if not mask[top : top + size, left : left + size].all():
+            return top, left
+    raise ValueError("no window shows a known pixel, since the mask covers the whole view; leave this view out")
 
 
 def windows_around(mask: Tensor, size: int, count: int, generator: torch.Generator) -> Tensor:
-    """Draw `count` independent windows like `window_around`, and return their corners (top, left), long [count, 2].
+    """Draw `count` independent windows around masked pixels, and return their corners (top, left), long [count, 2].
+
+    In contrast to `window_around`, a window may be masked entirely.
+
+    Raises:
+        ValueError: A window does not fit into the view, or the mask is empty.
+    """
+    corners = _corners(mask, size)
+    return corners[torch.randint(len(corners), (count,), generator=generator)]
+
+
+def _corners(mask: Tensor, size: int) -> Tensor:
+    """Return the corners (top, left) of the windows around all masked pixels, long [P, 2].
 
     Raises:
         ValueError: A window does not fit into the view, or the mask is empty.
@@ -37,8 +55,15 @@ def windows_around(mask: Tensor, size: int, count: int, generator: torch.Generat
     pixels = torch.nonzero(mask)
     if len(pixels) == 0:
         raise ValueError("no window can be drawn around an empty mask; leave this view out")
-    corners = pixels[torch.randint(len(pixels), (count,), generator=generator)] - size // 2
-    return torch.minimum(corners.clamp(min=0), torch.tensor([height - size, width - size]))
+    return torch.minimum((pixels - size // 2).clamp(min=0), torch.tensor([height - size, width - size]))
+
+
+def resize(images: Tensor, height: int, width: int) -> Tensor:
+    """Resize images [B, C, H, W] to [B, C, height, width]: bilinear, and antialiased when shrinking.
+
+    Every picture that a prior sees is resized by this function, in its adaptation, in distillation and in the sampler.
+    """
+    return F.interpolate(images, size=(height, width), mode="bilinear", align_corners=False, antialias=True)
 
 
 def enlarge_to_fit(image: Tensor, size: int) -> Tensor:
@@ -52,10 +77,10 @@ def enlarge_to_fit(image: Tensor, size: int) -> Tensor:
     if factor <= 1:
         return image
     shape = (max(size, round(height * factor)), max(size, round(width * factor)))
-    return F.interpolate(image[None], size=shape, mode="bilinear", align_corners=False)[0]
+    return resize(image[None], *shape)[0]
 
 
-def two_scales(image: Tensor, windows: list[tuple[int, int]], size: int, *, antialias: bool = True) -> Tensor:
+def two_scales(image: Tensor, windows: list[tuple[int, int]], size: int) -> Tensor:
     """Return an image at two scales: the whole view resized to a square, and patches at full resolution (section 4.2).
 
     The proportions of the whole view are not kept.
@@ -64,12 +89,11 @@ def two_scales(image: Tensor, windows: list[tuple[int, int]], size: int, *, anti
         image: [C, H, W].
         windows: (top, left) of each patch.
         size: Side of the square and of the patches in pixels.
-        antialias: Whether the bilinear reduction averages over all pixels, or skips those between its samples.
 
     Returns:
         [1 + len(windows), C, size, size], the whole view first; differentiable in `image`.
     """
-    whole = F.interpolate(image[None], size=(size, size), mode="bilinear", align_corners=False, antialias=antialias)
+    whole = resize(image[None], size, size)
     patches = [image[None, :, top : top + size, left : left + size] for top, left in windows]
     return torch.cat([whole, *patches])
 

@@ -66,7 +66,7 @@ def evaluate_adversarial(
 ) -> tuple[Tensor, Rendering, dict[str, float]]:
     """Train the critic for one step, then evaluate the adversarial loss of patches of one view.
 
-    PAPER leaves open: how the patches are drawn. A masked pixel is drawn first, as for SDS (`windows.window_around`).
+    PAPER leaves open: how the patches are drawn. A masked pixel is drawn first, as for SDS.
     All fake patches of a step come from one training view, and all real ones from one reference. A view or reference
     that is smaller than a patch is enlarged until a patch fits.
 

@@ -11,7 +11,7 @@ from reffusion.distill.terms.term import Term, TermInputs, TermValue, cycle_thro
 from reffusion.distill.train_view import TrainView
 from reffusion.gaussians.optimize import confine
 from reffusion.params.distill import LiftTerm, Params
-from reffusion.prior.windows import enlarge_to_fit, window_around
+from reffusion.prior.windows import enlarge_to_fit, windows_around
 from reffusion.splat.rasterizer import render
 from reffusion.types import Gaussians, Rendering
 
@@ -78,6 +78,6 @@ def evaluate_lift(
         return (rendering.color - view.lifted)[view.repaint].square().mean(), rendering
     planes = (t.permute(2, 0, 1) for t in (rendering.color, view.lifted, view.repaint[..., None].float()))
     rendered, target, hole = (enlarge_to_fit(plane, lift.patch) for plane in planes)
-    top, left = window_around((hole[0] > 1e-4).cpu(), lift.patch, generator)
+    top, left = windows_around((hole[0] > 1e-4).cpu(), lift.patch, 1, generator)[0].tolist()
     crop = lambda plane: plane[:, top : top + lift.patch, left : left + lift.patch].permute(1, 2, 0)
     return distance(crop(rendered), crop(target)), rendering

@@ -27,18 +27,21 @@ T_LOW = 0.02  # PAPER leaves open: the lowest timestep of SDS, as a fraction of 
 def build(inputs: TermInputs, settings: Params) -> Term | None:
     """Build the SDS term. Return None if SDS is off, or if no view has a hole and is near enough to a reference.
 
-    All views with a hole take turns. A view that is too far from every reference is left out in its turn. The gradient
+    All views with a hole and with known pixels beside it take turns. A view that is too far from every reference is
+    left out in its turn. The gradient
     reaches the masked Gaussians, or with `sds.reaches: all` or `confined: false` all that show in the view.
 
     Raises:
         ValueError: There is no prior, or its prompts are not embedded.
     """
-    sds, views = settings.sds, inputs.hole_views
-    if not sds.is_on or not views:
+    sds = settings.sds
+    if not sds.is_on or not inputs.hole_views:
         return None
     prior, text = inputs.prior, inputs.text
     if prior is None or text is None:
         raise ValueError("distillation with sds.weight > 0 needs a prior and its prompts' embeddings")
+    shows_known = lambda view: not two_scale_masks(view.repaint, [], prior.native_size).all()
+    views = [view for view in inputs.hole_views if shows_known(view)]
     cameras = [reference.camera for reference in inputs.references]
     near = views_near_references(views, cameras, inputs.masked_means, sds.max_angle)
     if not near:
@@ -128,7 +131,7 @@ def evaluate_sds(
     Args:
         gaussians: All Gaussians of the scene.
         reached: bool [N], True for the Gaussians that get a gradient.
-        view: A training view with at least one pixel to repaint.
+        view: A training view with at least one pixel to repaint, and at least one other pixel.
         prior: The adapted prior.
         text: [3, L, D], the embeddings of the global, the local and the empty prompt.
         sds: Parameters of the SDS term.
@@ -151,7 +154,7 @@ def evaluate_sds(
 
     windows = [window_around(hole.cpu(), size, generator) for _ in range(sds.patches)]
     masks = two_scale_masks(hole, windows, size)
-    reduce = lambda image: two_scales(image, windows, size, antialias=sds.antialias)
+    reduce = lambda image: two_scales(image, windows, size)
     pictures = reduce(known)
     levels = diffusion.measure_levels(prior, pictures, masks)
     latents = diffusion.encode(prior, levels.normalize(reduce(rendered)))
