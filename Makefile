@@ -203,8 +203,11 @@ spinnerf batch: setup $(if $(engine),$(VENV)/.ready-cluster)
 weights: setup
 	@$(RUN) weights $(call flags,$(options) offline)
 
-prior: runs/prior/photographs
-	$(PY) -m priors.tiny.train --start priors/tiny --photographs runs/prior/photographs $(call flags,steps)
+prior: runs/prior/photographs runs/prior/rooms
+	$(PY) -m priors.tiny.train --start priors/tiny --photographs runs/prior/photographs --rooms runs/prior/rooms $(call flags,steps)
+
+runs/prior/rooms: | setup
+	$(PY) -m priors.tiny.rooms $@
 
 runs/prior/photographs: | setup
 	$(PY) -m priors.tiny.photographs $@

@@ -23,6 +23,7 @@ from report.results import (
     FULL,
     OUTSIDE_SCORES,
     SCORES,
+    START,
     Comparison,
     Run,
     differences_to_full,
@@ -104,7 +105,8 @@ def save_tradeoff(table: list[dict[str, Any]], path: Path) -> Path | None:
         rows = [row for row in table if row[name] is not None]
         if rows and not (name == "consistency" and errors):
             errors[title] = {row["method"]: 1 - row[name] if name == "ssim_box" else row[name] for row in rows}
-    common = [row for row in table if errors and all(row["method"] in values for values in errors.values())]
+    timed = [row for row in table if row["seconds"] is not None]
+    common = [row for row in timed if errors and all(row["method"] in values for values in errors.values())]
     if not common:
         return None
     names, seconds = [row["method"] for row in common], [row["seconds"] for row in common]
@@ -222,7 +224,7 @@ def summary(comparison: Comparison, table: list[dict[str, Any]]) -> str:
     """
     done = sum(run.state == "done" for run in comparison.runs.values())
     place = f"{len(comparison.scenes)} scenes ({', '.join(comparison.scenes)})"
-    parts = [f"{len(table)} methods on {place if len(comparison.scenes) > 1 else comparison.scenes[0]}"]
+    parts = [f"{len(comparison.methods)} methods on {place if len(comparison.scenes) > 1 else comparison.scenes[0]}"]
     parts[0] += "" if done == len(comparison.runs) else f", {done} of {len(comparison.runs)} runs done"
     boxed = any(row["psnr_box"] is not None for row in table)
     most = max(row["scenes"] for row in table)
@@ -245,6 +247,7 @@ def table_notes(comparison: Comparison, table: list[dict[str, Any]]) -> list[str
         *(f"Scored: {words}." for words in compare_tables.describe_protocol(done)),
         "seconds: all stages of the method, evaluation included, from their receipts. own seconds: the stages that it "
         "does not share with the full method. peak MB: the stage that takes most memory.",
+        *([f"{START}: the scene before distillation."] if any(row["method"] == START for row in table) else []),
     ]
     if not any(run.metrics.get("mean", {}).get("psnr_box") is not None for run in done):
         lines.append("No box metrics: the scene has no ground truth.")

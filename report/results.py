@@ -19,6 +19,7 @@ from reffusion.io.arrays import load_json
 from report.paired_statistics import Difference, confidence_half_width, paired_difference
 
 FULL = "full"
+START = "start of full"  # row of the full method's initialization: what distillation begins with
 FOLDER_COMPARISON = "compare"  # folder in runs/ of a comparison over a folder of scenes
 MAIN = "lpips_vgg_box"  # the score that orders the methods
 BOX_SCORES = {
@@ -205,19 +206,23 @@ def _number(column: str, text: str | None) -> float | None:
 
 
 def summarize_methods(comparison: Comparison) -> list[dict[str, Any]]:
-    """Return the table of all methods: one dictionary per method with the keys `COLUMNS`.
+    """Return the table of all methods: one dictionary per method with the keys `COLUMNS`, and one for `START`.
 
     Scores, "consistency", seconds and number of Gaussians are means over the method's finished scenes, None where
     unknown; a scene's score is its mean over test views. "<score>_interval" is half the width of the score's confidence
     interval over scenes (`mean_interval`). "peak_memory_mb" is the maximum over stages and scenes, and "scenes" the
     number of finished scenes. "stand_ins" names the stand-ins (`is_stand_in`) among the method's tools. Differences to
-    the full method are means over views, see `Difference`.
+    the full method are means over views, see `Difference`. The row `START` has the scores of the full method before
+    `distill`, if they were measured; a method that is better than the full one may still be worse than the start.
 
     Of a method that computes the same as an earlier method, only "method", "state", "scenes" and "same_as" are filled.
     The methods are sorted by the score `MAIN`, the best first. Methods without this score come next in their order,
     then the duplicates of earlier methods.
     """
     table = [_row(comparison, method) for method in comparison.methods]
+    start = dict.fromkeys(COLUMNS) | {"method": START, "state": "done"}
+    start |= _mean_scores(comparison.finished_runs(FULL), "initialize")
+    table += [start] if any(start[name] is not None for name in SCORES) else []
     table.sort(key=lambda row: (row["same_as"] is not None, row[MAIN] is None, row[MAIN] or 0.0))
     for metric in SCORES:
         differences = differences_to_full(comparison, metric)
@@ -239,9 +244,7 @@ def _row(comparison: Comparison, method: str) -> dict[str, Any]:
         return row
     tools = dict.fromkeys(name for run in done for name in used_tools(run).values())
     row["stand_ins"] = "; ".join(name for name in tools if is_stand_in(name)) or None
-    for name in SCORES:
-        values = [run.metrics.get("mean", {}).get(name) for run in done]
-        row |= {name: finite_mean(values), f"{name}_interval": mean_interval(values)}
+    row |= _mean_scores(done, "mean")
     row["consistency"] = finite_mean([view_consistency(run) for run in done])
     row["seconds"] = finite_mean([total_seconds(run) for run in done])
     row["own_seconds"] = finite_mean([own_seconds(run, comparison.runs[FULL, run.scene]) for run in done])
@@ -250,6 +253,15 @@ def _row(comparison: Comparison, method: str) -> dict[str, Any]:
     counts = finite_mean([run.metrics.get("gaussians", {}).get(run.metrics.get("result")) for run in done])
     row["gaussians"] = None if counts is None else round(counts)
     return row
+
+
+def _mean_scores(done: list[Run], key: str) -> dict[str, Any]:
+    """Return the number of finished runs, and the means and intervals of the scores under a key of metrics.json."""
+    found: dict[str, Any] = {"scenes": len(done)}
+    for name in SCORES:
+        values = [run.metrics.get(key, {}).get(name) for run in done]
+        found |= {name: finite_mean(values), f"{name}_interval": mean_interval(values)}
+    return found
 
 
 def used_tools(run: Run) -> dict[str, str]:
@@ -327,17 +339,16 @@ def differences_to_full(comparison: Comparison, metric: str) -> dict[str, Differ
     """Return {method: `Difference` of its scores to the full method's (method minus full)} in one metric.
 
     Scores are paired over the test views that both methods have. The full method, methods without common views, and
-    methods that compute the same as an earlier one are omitted.
+    methods that compute the same as an earlier one are omitted. `START` is among the methods.
     """
     differences = {}
-    for method in comparison.distinct_methods:
-        if method == FULL:
-            continue
+    compared = {method: (method, metric) for method in comparison.distinct_methods if method != FULL}
+    for name, (method, column) in {START: (FULL, f"initialize_{metric}"), **compared}.items():
         scenes = []
         for run in comparison.finished_runs(method):
             full = comparison.runs[FULL, run.scene]
-            both = [v for v in run.views if metric in run.views[v] and metric in full.views.get(v, {})]
-            scenes.append(np.array([run.views[v][metric] - full.views[v][metric] for v in both]))
+            both = [v for v in run.views if column in run.views[v] and metric in full.views.get(v, {})]
+            scenes.append(np.array([run.views[v][column] - full.views[v][metric] for v in both]))
         if difference := paired_difference(scenes):
-            differences[method] = difference
+            differences[name] = difference
     return differences

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -70,51 +70,98 @@ def run(
         draft = draft.drop(voting.find_floaters(draft.gaussians, train, unobserved, FLOATER_RATIO))
     floaters = len(space.remaining) - len(draft.gaussians)
     is_method = bool(references) and params.start == "reference"  # else this is a baseline, or nothing is invented
-    extra: list[Reference] = []
-    trusted: list[Reference] = []
+    filled = Filling(draft)
     if references:
-        background = space.background if params.uses_surfaces else space.background_views
-        network = monocular.load_network(params.depth.model, params.device) if params.depth.model else None
-        best = space.facts["best_reference"]
-        draft, depths = fill_references(params, draft, references, best, background, network, Trace(out))
-        save_depths(out, depths)
-    if is_method:
-        restricted = restrict_invent_masks(draft, sets, background)
-        sets = sets | restricted
-        for name, pixels in restricted.items():
-            save_mask(out / "invent" / f"{name}.png", pixels.invent)
-        assert reference is not None
-        trusted = trusted_references(reference, references, background)
-        if params.refit_steps:
-            trusted, background, shadows = remove_shadows(trusted, draft.gaussians, background)
-            for name, mask in shadows.items():
-                save_mask(out / "shadows" / f"{name}.png", mask)
-        if params.extra_views:
-            painter = feedforward.load_inpainter(params.inpainter, params.device)
-            draft, extra, extra_depths = complete_extra_views(params, draft, background, trusted, painter)
-            save_depths(out, extra_depths)
-            for each in extra:
-                save_image(out / "extra_views" / f"{each.camera.name}.png", each.image)
-            trusted = [*trusted, *extra]
-    if params.start == "random" and any(each.invent.any() for each in sets.values()):
-        draft = add_random(draft, space)
+        filled = fill_hole(params, draft, space, references, reference if params.start != "lift" else None, Trace(out))
+    if params.start == "random":
+        draft = add_random(draft, space, int(filled.draft.is_new.sum())) if references else draft
+    else:
+        draft, sets = filled.draft, sets | filled.restricted
+        save_filling(out, filled)
     if is_method and params.refit_steps:
         work = out / ".refit"  # a hidden folder, because its trace holds run times, which must not enter the hash
         work.mkdir(exist_ok=True)
         has_exact_depth = all(each.depth is not None for each in references)
-        completed = [*trusted, *warp_references(draft, trusted, depths, background.cameras)]
-        draft = refit_draft(draft, params.refit_steps, scene, background, completed, sets, has_exact_depth, work)
+        warped = warp_references(draft, filled.trusted, filled.depths, filled.background.cameras)
+        completed = [*filled.trusted, *warped]
+        draft = refit_draft(draft, params.refit_steps, scene, filled.background, completed, sets, has_exact_depth, work)
         shutil.rmtree(work)
 
     save_ply(out / "gaussians.ply", draft.gaussians)
     save_labels(out / "labels.npy", draft.is_new.cpu())
-    photos = background.photos if is_method else None
-    compared = background if is_method else None
+    compared = filled.background if is_method else None
+    photos = compared.photos if compared else None
+    extra, trusted = (filled.extra, filled.trusted) if is_method else ([], [])
     find = lambda name: find_origins(draft, scene.cameras[name], sets[name], compared)
     origins = dict(zip(scene.train, side_by_side(find, scene.train, views_at_once(params.device)), strict=True))
     for name, origin in origins.items():
         save_image(out / "origins" / f"{name}.png", origin.picture)
     save_json(out / "facts.json", summarize(params, space, draft, floaters, sets, origins, extra, trusted, photos))
+
+
+@dataclass(frozen=True)
+class Filling:
+    """A draft that the references have filled, and what is known of it.
+
+    Attributes:
+        draft: the draft with the new Gaussians; of the start "random" only their number is used.
+        depths, extra_depths: view name -> [H, W], the depth at which each reference and each extra view was added.
+        restricted: view name -> pixel classes with a restricted invent mask, see `restrict_invent_masks`.
+        shadows: view name -> bool [H, W], the object's shadow.
+        extra: the views that were completed besides the references.
+        trusted: all completed views that supervise a refit.
+        background: the surfaces around the object, without its shadow; None if there is no reference.
+    """
+
+    draft: Draft
+    depths: Mapping[str, np.ndarray] = field(default_factory=dict)
+    extra_depths: Mapping[str, np.ndarray] = field(default_factory=dict)
+    restricted: Mapping[str, MaskSet] = field(default_factory=dict)
+    shadows: Mapping[str, np.ndarray] = field(default_factory=dict)
+    extra: Sequence[Reference] = ()
+    trusted: Sequence[Reference] = ()
+    background: Background | None = None
+
+
+def fill_hole(
+    params: Params, draft: Draft, space: Workspace, references: list[Reference], folder: Path | None, log: Trace
+) -> Filling:
+    """Fill the hole from the references, and from extra views where these leave gaps.
+
+    Args:
+        draft: the scene without the object.
+        space: results of the stages `poses`, `fit` and `masks`.
+        references: the completed views.
+        folder: folder of the stage `reference`; None for a picture of the stage `lift`, which is unprojected only.
+        log: receives the traces of the depth solvers.
+    """
+    background = space.background if params.uses_surfaces else space.background_views
+    network = monocular.load_network(params.depth.model, params.device) if params.depth.model else None
+    best = space.facts["best_reference"]
+    draft, depths = fill_references(params, draft, references, best, background, network, log)
+    if folder is None:
+        return Filling(draft, depths, background=background)
+    restricted = restrict_invent_masks(draft, space.mask_sets, background)
+    trusted, shadows = trusted_references(folder, references, background), {}
+    if params.refit_steps:
+        trusted, background, shadows = remove_shadows(trusted, draft.gaussians, background)
+    extra, extra_depths = [], {}
+    if params.extra_views:
+        painter = feedforward.load_inpainter(params.inpainter, params.device)
+        draft, extra, extra_depths = complete_extra_views(params, draft, background, trusted, painter)
+    return Filling(draft, depths, extra_depths, restricted, shadows, extra, [*trusted, *extra], background)
+
+
+def save_filling(out: Path, filled: Filling) -> None:
+    """Write the depths, restricted invent masks, shadows and extra views of a filling."""
+    save_depths(out, filled.depths)
+    save_depths(out, filled.extra_depths)
+    for name, pixels in filled.restricted.items():
+        save_mask(out / "invent" / f"{name}.png", pixels.invent)
+    for name, mask in filled.shadows.items():
+        save_mask(out / "shadows" / f"{name}.png", mask)
+    for each in filled.extra:
+        save_image(out / "extra_views" / f"{each.camera.name}.png", each.image)
 
 
 def summarize(
@@ -182,18 +229,19 @@ def load_completed(params: Params, space: Workspace, reference: Path | None, lif
 
     Args:
         space: results of the stages `poses`, `fit` and `masks`.
-        reference: folder of the stage `reference`, for start "reference"; None if it was skipped.
+        reference: folder of the stage `reference`, for the starts "reference" and "random" (which adds as many
+            Gaussians as the references would); None if it was skipped.
         lift: folder of the stage `lift`, for the baseline with start "lift"; None if it was skipped.
 
     Returns:
-        The references; empty for any other start.
+        The references; empty for the start "nothing".
 
     Raises:
         ValueError: start is "lift" and that stage was skipped.
     """
     if params.start == "lift" and lift is None:
         raise ValueError("initialize.start is 'lift', but the stage lift was left out: set distill.lift.weight")
-    folder = {"reference": reference, "lift": lift}.get(params.start)
+    folder = {"reference": reference, "random": reference, "lift": lift}.get(params.start)
     return load_references(folder, space.scene) if folder else []
 
 
@@ -213,7 +261,7 @@ def trusted_references(reference: Path, references: list[Reference], background:
     return [extend(each) if each.camera.name in given else each for each in references]
 
 
-def save_depths(out: Path, depths: dict[str, np.ndarray]) -> None:
+def save_depths(out: Path, depths: Mapping[str, np.ndarray]) -> None:
     """Write depth maps, view name -> [H, W] camera z, as out/depth/<view>.exr in float32."""
     for name, depth in depths.items():
         save_exr(out / "depth" / f"{name}.exr", depth.astype("float32"))

@@ -13,6 +13,7 @@ from scenes.networks import save_small_prior
 
 from priors.tiny import build, images, train
 from priors.tiny.photographs import PHOTOGRAPHS, load_photographs, short_name
+from priors.tiny.rooms import load_rooms
 
 pytestmark = pytest.mark.integration
 
@@ -51,13 +52,42 @@ def test_a_missing_photograph_is_named(photographs, tmp_path):
 def test_images_are_cropped_from_the_given_photographs():
     plain = [("plain", np.full((200, 300, 3), 90, np.uint8))]
     found = [images.image(0, index, plain) for index in range(20)]
-    crops = [picture for picture, caption in found if caption == "A photo of plain"]
+    crops = [picture for picture, subject in found if subject == "plain"]
     assert len(crops) > 5 and all(crop.std(axis=(0, 1)).max() == 0 for crop in crops)
 
 
 def test_masks_cover_between_nothing_and_everything():
-    shares = [images.mask(np.random.default_rng(k), 64).mean() for k in range(60)]
-    assert min(shares) < 0.2 and max(shares) == 1.0
+    shares = np.array([images.mask(np.random.default_rng(k), 64).mean() for k in range(60)])
+    assert shares.min() < 0.2 and shares.max() < 1
+    assert 12 <= (np.abs(shares - images.LARGE_HOLE) < 0.001).sum() <= 28  # a third of them
+
+
+def test_captions_name_subject_and_scale_or_nothing():
+    drawn = [train.draw_caption(np.random.default_rng(k), "brick", cropped=k % 2 == 1) for k in range(1000)]
+    counts = {caption: drawn.count(caption) for caption in set(drawn)}
+    assert 70 < counts.pop("") < 130
+    subjects = {"brick": 0, "sks": 0, "a scene": 0}
+    for caption, count in counts.items():
+        subjects[caption.removeprefix("A photo of ").removesuffix(", cropped")] += count
+    assert set(subjects) == {"brick", "sks", "a scene"} and 100 < subjects["sks"] + subjects["a scene"] < 170
+
+
+def test_rooms_that_are_held_out_never_train(rooms):
+    train_rooms, held_out_rooms = (load_rooms(rooms, held_out) for held_out in (False, True))
+    assert [place for place, _ in held_out_rooms] == ["a room"] and len(train_rooms) == 2
+    assert {place for place, _ in train_rooms} == {"a corner", "a table"}
+
+
+def test_a_folder_without_rooms_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"no picture of a room; run python -m priors\.tiny\.rooms"):
+        load_rooms(tmp_path, held_out=False)
+
+
+def test_an_error_of_the_latents_weighs_the_same_in_every_colour():
+    """The gradient A^T (z - x0) of the pixels points where the pixels differ: A^T A is a multiple of the identity."""
+    kernel = build.analysis()[:3, :, 1, 1]
+    product = kernel.T @ kernel
+    assert torch.allclose(product, product[0, 0] * torch.eye(3), atol=1e-5)
 
 
 def test_the_linear_vae_is_linear_in_half_precision_too():
@@ -89,6 +119,16 @@ def photographs(tmp_path_factory):
     for number, each in enumerate(PHOTOGRAPHS):
         picture = np.random.default_rng(number).integers(0, 256, (140, 180, 3), np.uint8)
         cv2.imwrite(str(folder / f"{short_name(each)}.jpg"), picture)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    """Return a folder with a picture of each of three rooms, of which the first is held out."""
+    folder = tmp_path_factory.mktemp("rooms")
+    for number, name in enumerate(("demo-100-0", "corner-101-0", "table-103-0")):
+        picture = np.random.default_rng(number).integers(0, 256, (150, 200, 3), np.uint8)
+        cv2.imwrite(str(folder / f"{name}.png"), picture)
     return folder
 
 
@@ -126,7 +166,7 @@ def load_weights(folder):
 
 
 @pytest.fixture
-def train_command(monkeypatch, tmp_path, photographs):
+def train_command(monkeypatch, tmp_path, photographs, rooms):
     """Return a function that runs `train.py` with small batches and returns the exported weights."""
     for name, value in (
         ("POOL", 6),
@@ -140,7 +180,7 @@ def train_command(monkeypatch, tmp_path, photographs):
     def run(work, count, *more):
         out = tmp_path / f"{work}-{count}"
         options = ["--steps", str(count), "--threads", "1", "--work", str(tmp_path / work), "--out", str(out), *more]
-        options += ["--photographs", str(photographs)]
+        options += ["--photographs", str(photographs), "--rooms", str(rooms)]
         monkeypatch.setattr(sys, "argv", ["train.py", *options])
         train.main()
         return load_weights(out)

@@ -317,16 +317,20 @@ def test_initialize_by_nothing_adds_no_gaussians(masked_scene, tmp_path):
     assert (gaussians.means == load_ply(masked_scene["fit"] / "gaussians.ply").means[~labels]).all()
 
 
-def test_random_gaussians_fill_the_region_of_the_hole_by_their_seed(masked_scene, tmp_path):
-    gaussians, new = run_initialize(masked_scene, tmp_path / "random", "random")
-    removed = load_json(tmp_path / "random" / "facts.json")["removed_gaussians"]
-    debris = int(load_labels(masked_scene["masks"] / "debris.npy").sum())
-    assert int(new.sum()) == max(removed - debris, random_init.MIN_GAUSSIANS)
+def test_as_many_random_gaussians_as_the_reference_has_fill_the_hole_by_their_seed(
+    masked_scene, lifted_views, tmp_path
+):
+    shutil.copytree(lifted_views, tmp_path / "reference")
+    save_json(tmp_path / "reference/facts.json", {"given": []})
+    needs = {"reference": tmp_path / "reference"}
+    _, filled = run_initialize(masked_scene, tmp_path / "filled", "reference", **needs)
+    gaussians, new = run_initialize(masked_scene, tmp_path / "random", "random", **needs)
+    assert new.sum() == filled.sum() and not (tmp_path / "random" / "depth").exists()
     at = gaussians.means[new]
     # The square, and the part of the wall that it hides from all views, were removed.
     assert (at[:, :2].abs() < 1.3 * wall_scene.HALF).all()
     assert (at[:, 2] > NEAR - 0.1).all() and (at[:, 2] < wall_scene.WALL + 0.1).all()
-    again, _ = run_initialize(masked_scene, tmp_path / "again", "random")
+    again, _ = run_initialize(masked_scene, tmp_path / "again", "random", **needs)
     assert (again.means == gaussians.means).all() and (again.sh == gaussians.sh).all()
 
 

@@ -47,11 +47,10 @@ def restrict_invent_masks(draft: Draft, sets: Mapping[str, MaskSet], background:
     return restricted
 
 
-def add_random(draft: Draft, space: Workspace) -> Draft:
-    """Return the draft with random Gaussians added in the region of the hole.
+def add_random(draft: Draft, space: Workspace, count: int) -> Draft:
+    """Return the draft with `count` random Gaussians added in the region of the hole.
 
-    The region is the box that scene.yaml names (`region`), or else the bounding box of the object's Gaussians. As many
-    Gaussians are added as the object has, but at least `MIN_GAUSSIANS` of `random_init`.
+    The region is the box that scene.yaml names (`region`), or else the bounding box of the object's Gaussians.
 
     Raises:
         ValueError: there is neither a region nor an object, or the region does not meet the invent masks.
@@ -66,7 +65,6 @@ def add_random(draft: Draft, space: Workspace) -> Draft:
         raise ValueError("initialize.start is 'random', but no Gaussian was removed: nothing says where the hole is")
     train = [scene.cameras[name] for name in scene.train]
     holes = {name: space.mask_sets[name].invent for name in scene.train if space.mask_sets[name].invent.any()}
-    count = max(len(removed), random_init.MIN_GAUSSIANS)
     places = seeding.generator(SEED, "initialize", "random")
     points = random_init.sample_points(box, count, train, holes, places)
     colors = seeding.generator(SEED, "initialize", "random colours")

@@ -12,7 +12,6 @@ from reffusion.fit.start import initial_gaussians
 from reffusion.masks.voting import points_inside
 from reffusion.types import Camera, Gaussians
 
-MIN_GAUSSIANS = 1000
 TRIM = 0.02  # share of the removed Gaussians that are ignored at each end of an axis: strays must not stretch the box
 MARGIN = 0.1  # share of the box's extent that is added on each side: the surface to be found lies behind the object
 MAX_ROUNDS = 200  # rounds of sampling; after the last one, fewer points than asked for are accepted

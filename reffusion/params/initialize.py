@@ -27,8 +27,8 @@ class Depth(Settings):
 class Params(Settings):
     start: Literal["reference", "lift", "random", "nothing"] = Field(
         "reference",
-        description="content of the hole: the reference on its depth; or (baselines) the picture of the best view "
-        "painted by the stage lift, random Gaussians, or nothing: the object is only removed",
+        description="content of the hole: the reference on its depth; or (baselines) the picture of the best "
+        "view of the stage lift, random Gaussians, as many as the reference gives, or nothing: the object is removed",
     )
     depth: Depth = Depth()
     # Not in the paper: it closes the seam around the hole, where photographs supervise these Gaussians, too.

@@ -24,7 +24,7 @@ def window_around(mask: Tensor, size: int, generator: torch.Generator) -> tuple[
         ValueError: The window does not fit into the view, or the mask is empty or covers the whole view.
     """
     corners = _corners(mask, size)
-    for index in torch.randperm(len(corners), generator=generator):
+    for index in torch.randperm(len(corners), generator=generator).tolist():
         top, left = corners[index].tolist()
         if not mask[top : top + size, left : left + size].all():
             return top, left
