@@ -214,7 +214,7 @@ def load_weights(model: Model, folder: Path) -> None:
         model.unet.load_state_dict(weights)
     except (OSError, RuntimeError) as error:
         raise ValueError(f"--start {folder}: {str(error).splitlines()[0]}") from error
-    lengths = [kernel[:3].norm(dim=(1, 2, 3)) for kernel in (build.analysis(), vae.encoder.conv_in.weight)]
+    lengths = [kernel[:3].flatten(1).norm(dim=1) for kernel in (build.analysis(), vae.encoder.conv_in.weight)]
     ratio = lengths[0] / lengths[1]
     if (ratio - 1).abs().max() > 0.01:
         rescale_latents(model.unet, torch.cat([ratio, torch.ones(1)]))
