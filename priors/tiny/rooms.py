@@ -82,7 +82,7 @@ def load_rooms(folder: Path, held_out: bool) -> list[tuple[str, np.ndarray]]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path, help="folder for the pictures")
-    parser.add_argument("--count", type=int, default=30, help="number of rooms")
+    parser.add_argument("--count", type=int, default=12, help="number of rooms")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     for each_seed, each_kind in list_rooms(options.count):
