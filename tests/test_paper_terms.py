@@ -217,11 +217,14 @@ def test_a_hidden_pixel_is_not_examined_where_all_of_c_is_invented(tmp_path):
 # ---------------------------------------------------------------------------------------------------- input of a prior
 
 
-def test_without_personalization_only_the_lora_is_missing():
+def test_without_personalization_the_lora_is_missing_and_the_prompts_are_plain_words():
     requests = [Request(ROOT, ROOT / "runs", "", profile="paper", variant=v) for v in (None, "no_personalization")]
     full, ablated = resolve_all(requests, Hashes(ROOT / "runs" / HASHES), scene=False)
     changed = [stage for stage in full.params if full.params[stage] != ablated.params[stage]]
-    assert changed == ["personalize"] and ablated.params["personalize"] == full.params["personalize"] | {"steps": 0}
+    assert changed == ["personalize", "distill"]
+    assert ablated.params["personalize"] == full.params["personalize"] | {"steps": 0}
+    plain = {"whole": "A photo of a scene", "crop": "A photo of a scene, cropped"}
+    assert ablated.params["distill"] == full.params["distill"] | {"prompts": plain}
 
 
 def test_prompts_of_the_prior(prior, monkeypatch):
