@@ -15,6 +15,7 @@ import torch
 from reffusion import seeding, trace
 from reffusion.capture import frame, image_detail, sfm, stereo
 from reffusion.capture.checks import sanity
+from reffusion.capture.checks.agreement import judge_poses
 from reffusion.capture.checks.pose_check import check_poses, judge
 from reffusion.capture.layouts import cameras, ring
 from reffusion.capture.layouts.capture import Capture
@@ -69,7 +70,14 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         _save_gaussians_only(params, out, scene, own_splats)
         return
     capture, roles = read_scene(params, scene, params.longest)
-    messages = [*capture.warnings, *(own_splats.notes if own_splats else ())]
+    corrections = []
+    if capture.poses is not None and not params.trust:
+        agreement = judge_poses(capture)
+        print(agreement.summary, flush=True)
+        if agreement.correction is not None:
+            corrections = [agreement.describe(capture.pose_source)]
+            capture, roles = read_scene(params, scene, params.longest, agreement.correction)
+    messages = [*corrections, *capture.warnings, *(own_splats.notes if own_splats else ())]
     sizes = {name: image_size(path, upright=capture.upright) for name, path in capture.pictures.items()}
     if capture.poses is None:
         everyone, capture = sorted(capture.pictures), _run_sfm(params, out, capture)

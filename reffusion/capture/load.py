@@ -8,11 +8,14 @@ the sparse points.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from reffusion.capture.layouts import colmap, llff, photos, transforms
-from reffusion.capture.layouts.capture import Capture
+from reffusion.capture.layouts.capture import AS_GIVEN, Capture, Correction
+from reffusion.capture.lens import Lens
 from reffusion.io.files import BadInput, as_bad_input, is_file
+from reffusion.io.images import image_size
 
 LAYOUTS = ("llff", "colmap", "transforms", "photos")
 LONGEST = 1600  # px, longer side of the pictures in the paper
@@ -24,6 +27,7 @@ def load_capture(
     images: str | None = None,
     longest: int = LONGEST,
     references: frozenset[Path] = frozenset(),
+    correction: Correction = AS_GIVEN,
 ) -> Capture:
     """Read a scene folder: its pictures and, if it holds poses, its cameras and sparse points.
 
@@ -33,6 +37,7 @@ def load_capture(
         longest: requested longer side of the pictures in pixels. The layout "llff" may hold the same pictures in
             several sizes; the smallest size that is large enough is taken, else the largest size.
         references: files of references (inpainted views). They may lie among the photographs, but are not views.
+        correction: what is changed in the poses. Views whose pose is lost are left out.
 
     Raises:
         BadInput: the folder is no capture, two pictures share a view name, a picture is unreadable, a pose is not
@@ -47,11 +52,22 @@ def load_capture(
     if images is not None and not (folder / images).is_dir():
         raise BadInput(f"{folder / images}: no such folder; correct `images` in scene.yaml")
     with as_bad_input(_source(folder, layout), "a capture that can be read"):
+        if layout == "photos":
+            return photos.read(folder, images, references)
         if layout == "llff":
-            return llff.read(folder, images, longest, references)
-        if layout == "transforms":
-            return transforms.read(folder, images)
-        return colmap.read(folder, images) if layout == "colmap" else photos.read(folder, images, references)
+            capture = llff.read(folder, images, longest, references, correction)
+        else:
+            reader = transforms if layout == "transforms" else colmap
+            capture = reader.read(folder, images, correction)
+    pictures = {name: path for name, path in capture.pictures.items() if name in capture.poses.lenses}
+    turned = any(_fits_turned_only(path, capture.poses.lenses[name]) for name, path in pictures.items())
+    return replace(capture, pictures=pictures, upright=turned or correction.upright)
+
+
+def _fits_turned_only(picture: Path, lens: Lens) -> bool:
+    """Return whether a lens has the size of the picture turned by its EXIF orientation, and not of the stored one."""
+    size = lens.width, lens.height
+    return image_size(picture) != size and image_size(picture, upright=True) == size
 
 
 def _source(folder: Path, layout: str) -> Path:

@@ -73,8 +73,36 @@ def image_size(path: Path, upright: bool = False) -> tuple[int, int]:
     """
     with open_image(path) as image:
         width, height = image.size
-        turned = upright and image.getexif().get(0x0112, 1) in (5, 6, 7, 8)
+        turned = upright and _orientation(image) in (5, 6, 7, 8)
         return (height, width) if turned else (width, height)
+
+
+def orientation_matrix(path: Path) -> np.ndarray:
+    """Return [2, 3], the affine map from places in a stored picture to those in the picture turned by its EXIF tag.
+
+    Places are (x, y) as shares of the picture's width and height. Only the file's header is read.
+    """
+    with open_image(path) as image:
+        return np.array(_TURNS[_orientation(image)], float)
+
+
+# EXIF orientation tag -> rows (x by x, x by y, shift of x) and the same for y
+_TURNS = {
+    1: ((1, 0, 0), (0, 1, 0)),
+    2: ((-1, 0, 1), (0, 1, 0)),
+    3: ((-1, 0, 1), (0, -1, 1)),
+    4: ((1, 0, 0), (0, -1, 1)),
+    5: ((0, 1, 0), (1, 0, 0)),
+    6: ((0, -1, 1), (1, 0, 0)),
+    7: ((0, -1, 1), (-1, 0, 1)),
+    8: ((0, 1, 0), (-1, 0, 1)),
+}
+
+
+def _orientation(image: Image.Image) -> int:
+    """Return the EXIF orientation tag of a picture; 1, upright, where it has none or an undefined one."""
+    tag = image.getexif().get(0x0112, 1)
+    return tag if tag in _TURNS else 1
 
 
 def load_image(path: Path, upright: bool = False) -> np.ndarray:

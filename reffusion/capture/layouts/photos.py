@@ -26,4 +26,4 @@ def read(folder: Path, images: str | None, references: frozenset[Path] = frozens
     for path in pictures.values():
         image_size(path)  # raises BadInput for an unreadable picture now, before long computations
     paths = relative_paths(image_folder, pictures)
-    return Capture("photos", pictures, paths, None, None, image_folder, ())
+    return Capture("photos", pictures, paths, None, None, image_folder, (), upright=True)

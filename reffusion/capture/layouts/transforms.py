@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 
 from reffusion.capture.layouts.capture import (
+    AS_GIVEN,
     NO_POINTS,
     Capture,
+    Correction,
     PointCloud,
     Poses,
     count_message,
@@ -67,7 +69,7 @@ def split_files(folder: Path) -> dict[str, Path]:
     return found if "train" in found else {}
 
 
-def read(folder: Path, images: str | None) -> Capture:
+def read(folder: Path, images: str | None, correction: Correction = AS_GIVEN) -> Capture:
     """Read a scene folder with transforms files.
 
     The test views of Blender's files are the frames of transforms_test.json, or without that file those of
@@ -77,6 +79,7 @@ def read(folder: Path, images: str | None) -> Capture:
     Args:
         images: folder of pictures, relative to the scene. None to use the paths in the frames, or the usual folders if
             no frame's path leads to a picture.
+        correction: what is changed in the poses.
 
     Raises:
         BadInput: a file or frame is wrong; no frame has a picture; or two frames have the same picture.
@@ -98,7 +101,7 @@ def read(folder: Path, images: str | None) -> Capture:
     placed = {view: of_path[path] for view, path in views.items()}
     lenses = {view: load_frame_lens(each.values, pictures[view], each.source) for view, each in placed.items()}
     poses = {view: _frame_pose(each.values, view, each.source) for view, each in placed.items()}
-    found = Poses(lenses, poses, *NO_POINTS, {})
+    found = correction.apply(Poses(lenses, poses, *NO_POINTS, {}))
     points, messages = _points(folder, source, frames[0].values, placed, found, pictures)
     paths = relative_paths(root, pictures)
     warnings = (
