@@ -31,7 +31,7 @@ from reffusion.io.images import load_thumbnail, orientation_matrix
 SIDE = 480  # px, longer side of the reduced photographs in which features are sought
 VIEWS = 20  # photographs, spread evenly over the capture, that are compared with each other
 FEATURES, PROBED = 1000, 250  # features of a photograph; and how many of them rank the pairs before they are matched
-QUICK, MOST = 12, 24  # pairs that confirm right poses; and pairs with which corrections are compared
+TRIED, QUICK, MOST = 60, 14, 24  # pairs that are tried; that confirm right poses; that compare corrections
 LEAST_PAIRS = 5  # pairs below which poses are not judged
 LEAST_MATCHES = 20  # matches that a pair needs
 RATIO = 0.8  # largest ratio of the distances to the best and to the second best feature (Lowe 2004)
@@ -94,7 +94,7 @@ def judge_poses(capture: Capture) -> Agreement:
     upright = {name: view.turned_upright() for name, view in stored.items()}
     views = upright if capture.upright else stored
     pairs: list[_Pair] = []
-    for pair in filter(None, (_match(views, *names) for names in _rank_pairs(views))):
+    for pair in filter(None, (_match(views, *each) for each in _rank_pairs(views)[:TRIED])):
         pairs.append(pair)
         if len(pairs) == MOST or (len(pairs) == QUICK and sum(_explain(pairs, views, given)) >= SURE * QUICK):
             break
@@ -168,12 +168,12 @@ class _Pair:
 
 
 def _rank_pairs(views: Mapping[str, _View]) -> list[tuple[str, str]]:
-    """Return all pairs of views, those whose strongest features match best first."""
+    """Return all pairs of views: first each view with the one whose strongest features match it best, and so on."""
     strong = {name: view.descriptors[:PROBED] for name, view in views.items()}
-    counts = {
-        pair: len(_mutual_matches(*(strong[name] for name in pair))[0]) for pair in itertools.combinations(views, 2)
-    }
-    return sorted(counts, key=lambda pair: -counts[pair])
+    pairs = list(itertools.combinations(views, 2))
+    counts = {pair: len(_mutual_matches(*(strong[name] for name in pair))[0]) for pair in pairs}
+    by_view = [sorted((p for p in pairs if name in p), key=lambda pair: -counts[pair]) for name in views]
+    return list(dict.fromkeys(itertools.chain.from_iterable(zip(*by_view, strict=True))))
 
 
 def _match(views: Mapping[str, _View], one: str, other: str) -> _Pair | None:
@@ -182,7 +182,7 @@ def _match(views: Mapping[str, _View], one: str, other: str) -> _Pair | None:
     if len(first) < LEAST_MATCHES:
         return None
     at = [views[name].at[chosen] * views[name].size for name, chosen in ((one, first), (other, second))]
-    mask = cv2.findFundamentalMat(*at, cv2.USAC_MAGSAC, LOOSE, 0.999, 2000)[1]
+    mask = cv2.findFundamentalMat(*at, cv2.FM_RANSAC, LOOSE, 0.999, 2000)[1]
     if mask is None or mask.sum() < LEAST_MATCHES:
         return None
     right = mask.ravel().astype(bool)
