@@ -30,15 +30,15 @@ from reffusion.io.images import load_thumbnail, orientation_matrix
 
 SIDE = 480  # px, longer side of the reduced photographs in which features are sought
 VIEWS = 20  # photographs, spread evenly over the capture, that are compared with each other
-FEATURES, PROBED = 1000, 250  # features of a photograph; and how many of them rank the pairs before they are matched
-TRIED, QUICK, MOST = 60, 14, 24  # pairs that are tried; that confirm right poses; that compare corrections
+FEATURES = 1000  # of a photograph
+QUICK, MOST = 14, 24  # pairs that confirm right poses; and pairs with which corrections are compared
 LEAST_PAIRS = 5  # pairs below which poses are not judged
-LEAST_MATCHES = 20  # matches that a pair needs
+LEAST_MATCHES, LEAST_SHARE = 30, 0.7  # matches that a pair needs, and share of them that one matrix must explain
 RATIO = 0.8  # largest ratio of the distances to the best and to the second best feature (Lowe 2004)
 LOOSE = 1.0  # px of the reduced photographs: largest distance of a match from its epipolar line
-# Largest distance of a match from the epipolar line of the poses, in units of the focal length: about one degree, which
-# phones' own poses keep.
-CLOSE = 0.02
+# Largest distance of a match from the epipolar line of the poses, in units of the focal length (.01: half a degree), and
+# relative to the distance that the match moved between the photographs. Matches that moved less than `STILL` tell nothing.
+CLOSE, ALONG, STILL = 0.01, 0.3, 0.006
 EXPLAINED = 0.5  # share of a pair's matches that poses must explain, to explain the pair
 # Share of the pairs that given poses, and that corrected poses, must explain; and the share of the first `QUICK` pairs
 # that makes more pairs needless.
@@ -94,22 +94,22 @@ def judge_poses(capture: Capture) -> Agreement:
     upright = {name: view.turned_upright() for name, view in stored.items()}
     views = upright if capture.upright else stored
     pairs: list[_Pair] = []
-    for pair in filter(None, (_match(views, *each) for each in _rank_pairs(views)[:TRIED])):
+    for pair in _match_views(views):
         pairs.append(pair)
         if len(pairs) == MOST or (len(pairs) == QUICK and sum(_explain(pairs, views, given)) >= SURE * QUICK):
             break
-    known = sum(_explain(pairs, views, given))
-    if len(pairs) < LEAST_PAIRS or known >= RIGHT * len(pairs):
-        return Agreement(len(pairs), known, len(pairs), known)
-    best = Agreement(len(pairs), known, len(pairs), known)
+    known = _explain(pairs, views, given)
+    best = Agreement(len(known), sum(known), len(known), sum(known))
+    if len(known) < LEAST_PAIRS or sum(known) >= RIGHT * len(known):
+        return best
     for correction in _corrections(capture):
         found = _explain(pairs, upright if correction.upright else views, correction.poses(given))
-        if len(found) >= LEAST_PAIRS and sum(found) / len(found) > best.explained / best.placed:
-            best = Agreement(len(pairs), known, len(found), sum(found), correction)
+        if len(found) >= max(LEAST_PAIRS, len(pairs) / 3) and sum(found) / len(found) > best.explained / best.placed:
+            best = Agreement(len(known), sum(known), len(found), sum(found), correction)
     if best.explained < TAKEN * best.placed:
         raise BadInput(
-            f"{capture.pose_source}: its poses are not those of the photographs: of {len(pairs)} pairs of photographs "
-            f"that match, the poses explain {known}; with other axes, with inverted or transposed matrices, in another "
+            f"{capture.pose_source}: its poses are not those of the photographs: of {len(known)} pairs of photographs "
+            f"that match, the poses explain {sum(known)}; with other axes, with inverted or transposed matrices, in another "
             f"order, shifted, and with EXIF orientation obeyed at most {best.explained}. Solve the poses again, or "
             "remove the file to have them estimated; poses.trust=true uses them as they are"
         )
@@ -167,26 +167,27 @@ class _Pair:
     features: tuple[np.ndarray, np.ndarray]
 
 
-def _rank_pairs(views: Mapping[str, _View]) -> list[tuple[str, str]]:
-    """Return all pairs of views: first each view with the one whose strongest features match it best, and so on."""
-    strong = {name: view.descriptors[:PROBED] for name, view in views.items()}
+def _match_views(views: Mapping[str, _View]) -> Iterator[_Pair]:
+    """Yield pairs of views with the matches that one fundamental matrix explains.
+
+    First comes, for each view, a pair with a middling number of matches: the most similar photographs hardly differ in
+    place, and the least similar ones share little. Pairs of which the fundamental matrix explains few matches, or a
+    small share of them, are left out: repeated patterns look so.
+    """
     pairs = list(itertools.combinations(views, 2))
-    counts = {pair: len(_mutual_matches(*(strong[name] for name in pair))[0]) for pair in pairs}
-    by_view = [sorted((p for p in pairs if name in p), key=lambda pair: -counts[pair]) for name in views]
-    return list(dict.fromkeys(itertools.chain.from_iterable(zip(*by_view, strict=True))))
-
-
-def _match(views: Mapping[str, _View], one: str, other: str) -> _Pair | None:
-    """Return the matches of two views that one fundamental matrix explains; None for fewer than `LEAST_MATCHES`."""
-    first, second = _mutual_matches(views[one].descriptors, views[other].descriptors)
-    if len(first) < LEAST_MATCHES:
-        return None
-    at = [views[name].at[chosen] * views[name].size for name, chosen in ((one, first), (other, second))]
-    mask = cv2.findFundamentalMat(*at, cv2.FM_RANSAC, LOOSE, 0.999, 2000)[1]
-    if mask is None or mask.sum() < LEAST_MATCHES:
-        return None
-    right = mask.ravel().astype(bool)
-    return _Pair((one, other), (first[right], second[right]))
+    matches = {pair: _mutual_matches(*(views[name].descriptors for name in pair)) for pair in pairs}
+    likely = [pair for pair in pairs if len(matches[pair][0]) >= LEAST_MATCHES]
+    by_view = []
+    for name in views:
+        own = sorted((pair for pair in likely if name in pair), key=lambda pair: -len(matches[pair][0]))
+        by_view.append(sorted(own, key=lambda pair, own=own: abs(own.index(pair) - len(own) // 2)))
+    ranked = dict.fromkeys(filter(None, itertools.chain.from_iterable(itertools.zip_longest(*by_view))))
+    for pair in ranked:
+        at = [views[name].at[chosen] * views[name].size for name, chosen in zip(pair, matches[pair], strict=True)]
+        mask = cv2.findFundamentalMat(*at, cv2.FM_RANSAC, LOOSE, 0.999, 2000)[1]
+        if mask is not None and mask.sum() >= max(LEAST_MATCHES, LEAST_SHARE * len(mask)):
+            right = mask.ravel().astype(bool)
+            yield _Pair(pair, tuple(chosen[right] for chosen in matches[pair]))
 
 
 def _mutual_matches(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -207,7 +208,9 @@ def _mutual_matches(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _explain(pairs: Sequence[_Pair], views: Mapping[str, _View], poses: Mapping[str, np.ndarray]) -> list[bool]:
-    """Return, for each pair whose views both have a pose, whether the poses explain the pair (`EXPLAINED`).
+    """Return, for each pair that the poses can be judged by, whether they explain it (`EXPLAINED`).
+
+    Pairs with a view without a pose, and pairs with too little parallax at these poses, are left out.
 
     Args:
         poses: view name -> world-to-camera pose [4, 4].
@@ -216,16 +219,24 @@ def _explain(pairs: Sequence[_Pair], views: Mapping[str, _View], poses: Mapping[
     for pair in pairs:
         if all(name in poses for name in pair.names):
             rays = (views[name].directions[k] for name, k in zip(pair.names, pair.features, strict=True))
-            found.append(_explained_share(*rays, *(poses[name] for name in pair.names)) >= EXPLAINED)
+            explained, moved = _explained_matches(*rays, *(poses[name] for name in pair.names))
+            if moved.sum() >= LEAST_MATCHES / 2:
+                found.append(bool(explained[moved].mean() >= EXPLAINED))
     return found
 
 
-def _explained_share(one: np.ndarray, other: np.ndarray, pose: np.ndarray, other_pose: np.ndarray) -> float:
-    """Return the share of matches that two poses explain: the rays meet within `CLOSE`, in front of both cameras.
+def _explained_matches(
+    one: np.ndarray, other: np.ndarray, pose: np.ndarray, other_pose: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the matches that two poses explain: their rays meet, in front of both cameras.
 
     Args:
         one, other: [K, 2], directions of the matches in each view; a match with a NaN is not explained.
         pose, other_pose: [4, 4], world to camera.
+
+    Returns:
+        bool [K], True for matches that are explained; and bool [K], True for those that moved between the photographs
+        by more than the rotation between the poses, so that the poses can be judged by them.
     """
     rays, other_rays = (np.concatenate([each, np.ones((len(each), 1))], axis=1) for each in (one, other))
     turn = other_pose[:3, :3] @ pose[:3, :3].T
@@ -238,11 +249,11 @@ def _explained_share(one: np.ndarray, other: np.ndarray, pose: np.ndarray, other
     slope = np.sqrt((normal[:, :2] ** 2).sum(1) + (other_normal[:, :2] ** 2).sum(1))
     # depths a, b of the nearest points of both rays: a turned + shift = b other_rays
     aa, bb, ab = (turned**2).sum(1), (other_rays**2).sum(1), (turned * other_rays).sum(1)
-    with np.errstate(invalid="ignore"):
-        depth = (other_rays @ shift) * ab - (turned @ shift) * bb
-        other_depth = (other_rays @ shift) * aa - (turned @ shift) * ab
-        parallel = (aa * bb - ab**2 < 1e-5 * aa * bb) & (ab > 0)
-        return float(((miss < CLOSE * slope) & (parallel | ((depth > 0) & (other_depth > 0)))).mean())
+    depth = (other_rays @ shift) * ab - (turned @ shift) * bb
+    other_depth = (other_rays @ shift) * aa - (turned @ shift) * ab
+    moved = np.linalg.norm(turned / np.sqrt(aa)[:, None] - other_rays / np.sqrt(bb)[:, None], axis=1)
+    close = miss < np.minimum(CLOSE, ALONG * moved) * slope
+    return close & (depth > 0) & (other_depth > 0), ~(moved < STILL)
 
 
 # ---------------------------------------------------------------------------------------------- corrections
