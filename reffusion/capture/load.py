@@ -1,20 +1,39 @@
-"""Reads a scene folder in one of four layouts: SPIn-NeRF/LLFF, COLMAP, nerfstudio's transforms.json, or photographs
-only.
+"""Reads a scene folder in one of several layouts, such as SPIn-NeRF/LLFF, COLMAP, nerfstudio's transforms.json, or
+photographs only.
 
 Every layout is read into a `Capture`: pictures by view name and, if the folder holds poses, lenses and poses in the
 scene's own frame. Of pictures only headers are read, except for a few, whose colours are compared with the colours of
-the sparse points.
+the sparse points, and pictures twice as wide as high.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from reffusion.capture.layouts import colmap, llff, photos, transforms
+from reffusion.capture.layouts import (
+    bundler,
+    colmap,
+    llff,
+    opensfm,
+    photos,
+    polycam,
+    realitycapture,
+    splat_cameras,
+    transforms,
+    unread,
+)
 from reffusion.capture.layouts.capture import Capture
 from reffusion.io.files import BadInput, as_bad_input, is_file
 
-LAYOUTS = ("llff", "colmap", "transforms", "photos")
+# layouts of other programs -> (finds the file with the poses in a scene folder, reads the scene)
+PROGRAMS = {
+    "polycam": (polycam.find, polycam.read),
+    "realitycapture": (realitycapture.find, realitycapture.read),
+    "opensfm": (opensfm.find, opensfm.read),
+    "bundler": (bundler.find, bundler.read),
+    "3dgs": (splat_cameras.find, splat_cameras.read),
+}
+LAYOUTS = ("llff", "colmap", "transforms", *PROGRAMS, "photos")
 LONGEST = 1600  # px, longer side of the pictures in the paper
 
 
@@ -47,11 +66,21 @@ def load_capture(
     if images is not None and not (folder / images).is_dir():
         raise BadInput(f"{folder / images}: no such folder; correct `images` in scene.yaml")
     with as_bad_input(_source(folder, layout), "a capture that can be read"):
-        if layout == "llff":
-            return llff.read(folder, images, longest, references)
-        if layout == "transforms":
-            return transforms.read(folder, images)
-        return colmap.read(folder, images) if layout == "colmap" else photos.read(folder, images, references)
+        return unread.add_warnings(folder, _read(folder, layout, images, longest, references))
+
+
+def _read(folder: Path, layout: str, images: str | None, longest: int, references: frozenset[Path]) -> Capture:
+    if layout == "llff":
+        return llff.read(folder, images, longest, references)
+    if layout == "photos":
+        return photos.read(folder, images, references)
+    if layout not in PROGRAMS:
+        return (colmap if layout == "colmap" else transforms).read(folder, images)
+    find, read = PROGRAMS[layout]
+    source = find(folder)
+    if source is None:
+        raise BadInput(f"{folder}: no file with poses of the layout {layout}; correct `layout` in scene.yaml")
+    return read(folder, source, images)
 
 
 def _source(folder: Path, layout: str) -> Path:
@@ -65,7 +94,7 @@ def detect_layout(folder: Path) -> str:
 
     The first match decides: "llff" for poses_bounds.npy, or for a COLMAP model with masks in images_4/label (a scene of
     SPIn-NeRF without its poses_bounds.npy); "transforms" for transforms.json or Blender's transforms_train.json;
-    "colmap" for a COLMAP model; else "photos".
+    "colmap" for a COLMAP model; a layout of another program (`PROGRAMS`) for its file; else "photos".
     """
     if is_file(folder / "poses_bounds.npy"):
         return "llff"
@@ -73,4 +102,6 @@ def detect_layout(folder: Path) -> str:
         return "llff"
     if transforms.split_files(folder):
         return "transforms"
-    return "colmap" if colmap.find_model(folder) is not None else "photos"
+    if colmap.find_model(folder) or colmap.find_workspace(folder):
+        return "colmap"
+    return next((layout for layout, (find, _) in PROGRAMS.items() if find(folder) is not None), "photos")

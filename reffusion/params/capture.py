@@ -55,7 +55,10 @@ class SceneKeys(Settings):
     these keys select do enter the hash (`scene_facts` in `stages.plan`).
     """
 
-    layout: Literal["llff", "colmap", "transforms", "photos"] | None = Field(None, description="None: detected")
+    layout: (
+        Literal["llff", "colmap", "transforms", "polycam", "realitycapture", "opensfm", "bundler", "3dgs", "photos"]
+        | None
+    ) = Field(None, description="None: detected")
     images: str | None = Field(None, description="folder of pictures, relative to the scene; None: the usual folders")
     masks: str | MaskSpec | None = Field(
         None,
