@@ -36,8 +36,8 @@ def refuse_panoramas(pictures: Mapping[str, Path]) -> None:
         found = wide if 2 * sum(_is_closed(pictures[name]) for name in some) > len(some) else []
     if found:
         raise BadInput(
-            f"{next(iter(pictures.values())).parent}: {len(found)} of {len(pictures)} pictures are 360-degree panoramas "
-            f"({', '.join(found[:3])}{', ...' if len(found) > 3 else ''}); cut them into perspective pictures"
+            f"{next(iter(pictures.values())).parent}: {len(found)} of {len(pictures)} pictures are 360-degree "
+            f"panoramas ({', '.join(found[:3])}{', ...' if len(found) > 3 else ''}); cut them into perspective pictures"
         )
 
 

@@ -106,7 +106,7 @@ def read_placed(
 
 
 def _check_lens(placed: Placed, picture: Path, source: Path) -> Lens:
-    """Return the lens of a picture. Raises BadInput if its size or a focal length is not positive, or a number infinite."""
+    """Return the lens of a picture. Raises BadInput if a size or focal length is not positive, or a number infinite."""
     lens = placed.lens(image_size(picture))
     numbers = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.radial, *lens.tangential)
     if not np.isfinite(numbers).all() or min(lens.fx, lens.fy, lens.width, lens.height) <= 0:

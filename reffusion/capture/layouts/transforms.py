@@ -1,7 +1,8 @@
 """Reads a capture in the layout "transforms": nerfstudio's transforms.json, or Blender's transforms_<split>.json.
 
 Blender's files are transforms_train.json and optionally transforms_test.json and transforms_val.json. `ns-export
-cameras` writes transforms_train.json and transforms_eval.json as lists of frames; it is read if they have focal lengths.
+cameras` writes transforms_train.json and transforms_eval.json as lists of frames; both are read if they have focal
+lengths.
 """
 
 from __future__ import annotations

@@ -96,15 +96,15 @@ def add_warnings(folder: Path, capture: Capture) -> Capture:
 
 
 def describe_poses(folder: Path, places: Sequence[Path]) -> list[str]:
-    """Return a sentence for each kind of file with poses that lies in the scene's folder or in `places` and is not read."""
+    """Return a sentence for each kind of file with poses that is not read, in the scene's folder and in `places`."""
     sentences = []
     for kind in POSE_FILES:
         files = [path for place in dict.fromkeys((folder, *places)) for path in sorted(place.glob(kind.pattern))]
         path = next((path for path in files[:MOST] if path.is_file() and _begins_with(path, kind.word)), None)
         if path is not None:
             sentences.append(
-                f"{_relative(path, folder)} ({kind.program}) is not read; {kind.remedy}; without that, poses are solved "
-                "anew, in another frame"
+                f"{_relative(path, folder)} ({kind.program}) is not read; {kind.remedy}; without that, poses are "
+                "solved anew, in another frame"
             )
     return sentences
 
