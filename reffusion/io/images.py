@@ -19,11 +19,11 @@ HEIC = (".heic", ".heif")  # endings of the pictures that phones write
 # endings of pictures, in lower case
 ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".tif", ".tiff", ".bmp", ".webp", ".avif", *HEIC)
 
-FLOATS = 3  # value of TIFF's tag SampleFormat
 DARK = 8  # grey level up to which an area of a mask counts as background
 FLAT = 0.002  # share of a mask that a value must fill to count as an area, not as part of a soft edge
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "HEIF", "AVIF")
 _SINCE = ("HEIF", "AVIF")  # formats that Pillow reads only with a plugin, or in newer versions
+_FLOATS = 3  # value of TIFF's tag SampleFormat
 _HEIC_BRANDS = tuple(
     b"ftyp" + brand for brand in (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"hevc", b"hevx")
 )
@@ -90,7 +90,7 @@ def _refuse_float_colors(path: Path) -> None:
         file.seek(tags.next)
         tags.load(file)
     kinds = tags.get(TiffImagePlugin.SAMPLEFORMAT, ())
-    if FLOATS in kinds and len(kinds) > 1:
+    if _FLOATS in kinds and len(kinds) > 1:
         raise BadInput(f"{path}: float pixels; save it as a picture of 8 or 16 bits")
 
 

@@ -87,12 +87,11 @@ def add_warnings(folder: Path, capture: Capture) -> Capture:
     known = {strip_ending(path) for paths in capture.paths.values() for path in paths}
     known |= {strip_ending(path.name) for path in capture.pictures.values()}
     found = {place: [path for path in _unread_pictures(place) if path.stem not in known] for place in places}
-    lost = [path.name for paths in found.values() for path in paths]
+    lost = {path.name: (path.stem, path.name) for paths in found.values() for path in paths}
     warnings = [each for place, paths in found.items() for each in _describe_pictures(folder, place, paths)]
     if capture.poses is None:
         warnings += describe_poses(folder, places)
-    paths = {name: (name,) for name in lost} | capture.paths
-    return replace(capture, paths=paths, warnings=(*capture.warnings, *warnings))
+    return replace(capture, paths=lost | capture.paths, warnings=(*capture.warnings, *warnings))
 
 
 def describe_poses(folder: Path, places: Sequence[Path]) -> list[str]:

@@ -114,7 +114,9 @@ def _refuse_other_files(path: Path) -> None:
     """Raise BadInput if a file, given in place of a scene's folder, is an archive, Gaussians or a picture."""
     name = path.name.lower()
     if name.endswith(ARCHIVES):
-        raise BadInput(f"{path}: an archive; unpack it, and give the folder: scene={path.with_suffix('')}")
+        raise BadInput(
+            f"{path}: an archive; unpack it, and give the folder: scene={path.parent / path.name.split('.')[0]}"
+        )
     if name.endswith((*FORMATS, ".ksplat", ".sog")):
         raise BadInput(
             f"{path}: a file of splats or points, and a scene has photographs; to fill what was deleted in an editor: "
