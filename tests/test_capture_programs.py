@@ -364,7 +364,7 @@ def test_lines_of_points_may_be_missing(tmp_path, lines):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("4 1 0 0 0 0 0 0 1", "line 5: cannot read the image '4 1 0 0 0 0 0 0 1' (10 fields are expected)"),
+        ("\n4 1 0 0 0 0 0 0 1", "line 6: cannot read the image '4 1 0 0 0 0 0 0 1' (10 fields are expected)"),
         (f"{POINT_LINE}\n{POINT_LINE}", "line 6: cannot read the image '1.5 2.5 -1 20.0 3e1 7 1.5"),
         ("4 one 0 0 0 0 0 0 1 d.png", "line 5: cannot read the image '4 one 0 0"),
     ],

@@ -201,12 +201,11 @@ def _images_binary(path: Path) -> dict[int, ModelImage]:
 
 
 def _images_text(path: Path) -> dict[int, ModelImage]:
-    """Read images.txt. The line of an image may be followed by a line with the points that it observes."""
+    """Read images.txt. The next line after that of an image may hold the points that the image observes."""
     images: dict[int, ModelImage] = {}
-    may_be_points = False
+    points_at = 0
     for number, line in _lines(path):
-        if may_be_points and OBSERVATIONS.fullmatch(line) and len(line.split()) % 3 == 0:
-            may_be_points = False
+        if number == points_at and OBSERVATIONS.fullmatch(line) and len(line.split()) % 3 == 0:
             continue
         with _line_errors(path, number, "image", line):
             fields = line.split(maxsplit=9)
@@ -215,7 +214,7 @@ def _images_text(path: Path) -> dict[int, ModelImage]:
             pose = [float(f) for f in fields[1:8]]
             image = ModelImage(_check_name(fields[9], path), int(fields[8]), quaternion_to_pose(pose[:4], pose[4:]))
             _add(images, int(fields[0]), image, path)
-        may_be_points = True
+        points_at = number + 1
     return images
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
+from reffusion.capture.layouts.unread import VIDEOS
 from reffusion.capture.load import detect_layout, load_capture
 from reffusion.command import root, scene_name, scene_path, workplace
 from reffusion.io.arrays import load_json
@@ -14,7 +15,6 @@ from report.app.mask_step import MaskStep
 from runner.frames import FRAMES
 
 MAX_RECENT = 12
-VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".m4v", ".avi")
 
 
 @dataclass

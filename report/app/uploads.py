@@ -14,9 +14,9 @@ from uuid import uuid4
 import cv2
 from starlette.concurrency import run_in_threadpool
 
+from reffusion.capture.layouts.unread import VIDEOS
 from reffusion.command import root, workplace
 from reffusion.io.images import ENDINGS, load_thumbnail
-from report.app.scenes import VIDEOS
 from report.app.security import TooLarge
 
 PICTURE_BYTES, VIDEO_BYTES = 100_000_000, 4_000_000_000
