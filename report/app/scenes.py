@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
-from reffusion.capture.layouts.unread import VIDEOS
 from reffusion.capture.load import detect_layout, load_capture
 from reffusion.command import root, scene_name, scene_path, workplace
 from reffusion.io.arrays import load_json
+from reffusion.io.files import VIDEOS
 from reffusion.io.images import ENDINGS
 from report.app.mask_step import MaskStep
 from runner.frames import FRAMES

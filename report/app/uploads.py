@@ -14,8 +14,8 @@ from uuid import uuid4
 import cv2
 from starlette.concurrency import run_in_threadpool
 
-from reffusion.capture.layouts.unread import VIDEOS
 from reffusion.command import root, workplace
+from reffusion.io.files import VIDEOS
 from reffusion.io.images import ENDINGS, load_thumbnail
 from report.app.security import TooLarge
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from reffusion.capture.names import list_pictures, strip_ending
-from reffusion.io.files import BadInput
+from reffusion.io.files import VIDEOS, BadInput
 
 if TYPE_CHECKING:
     from reffusion.capture.layouts.capture import Capture
@@ -22,7 +22,6 @@ PICTURES = {  # ending -> (kind of picture, what to do)
     **dict.fromkeys(RAW, ("camera raw", "develop them to JPEG")),
     **dict.fromkeys((".jxl", ".jp2", ".gif", ".psd"), ("a format of pictures that is not read", "save them as JPEG")),
 }
-VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp", ".insv")
 ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".gz", ".r3d")
 HEAD = 4000  # bytes at the beginning of a file in which `PoseFile.word` is looked for
 MOST = 20  # files of one pattern that are looked at
