@@ -29,9 +29,10 @@ def refuse_panoramas(pictures: Mapping[str, Path]) -> None:
     Args:
         pictures: view name -> picture file.
     """
-    found = [name for name, path in pictures.items() if _is_declared(path)]
+    heads = {name: _read_head(path) for name, path in pictures.items()}
+    found = [name for name, (declared, _) in heads.items() if declared]
     if not found:
-        wide = [name for name, path in pictures.items() if _is_twice_as_wide(path)]
+        wide = [name for name, (_, is_wide) in heads.items() if is_wide]
         some = wide[:: -(-len(wide) // LOOKED_AT)] if 2 * len(wide) > len(pictures) else []
         found = wide if 2 * sum(_is_closed(pictures[name]) for name in some) > len(some) else []
     if found:
@@ -41,16 +42,12 @@ def refuse_panoramas(pictures: Mapping[str, Path]) -> None:
         )
 
 
-def _is_declared(path: Path) -> bool:
-    """Return whether the metadata of a picture call it a panorama."""
+def _read_head(path: Path) -> tuple[bool, bool]:
+    """Return whether the metadata of a picture call it a panorama, and whether it is twice as wide as high."""
     with open_image(path) as image:
         xmp = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
-    return bool(PROJECTION.search(xmp if isinstance(xmp, bytes) else xmp.encode()))
-
-
-def _is_twice_as_wide(path: Path) -> bool:
-    with open_image(path) as image:
-        return image.width == 2 * image.height
+        declared = PROJECTION.search(xmp if isinstance(xmp, bytes) else xmp.encode())
+        return declared is not None, image.width == 2 * image.height
 
 
 def _is_closed(path: Path) -> bool:
