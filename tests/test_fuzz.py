@@ -110,6 +110,35 @@ TRANSFORMS = json.dumps(
         ],
     }
 ).encode()
+CSV = b"#name,x,y,alt,heading,pitch,roll,f,px,py,k1\n" + b"".join(
+    b"v%d.png,1,2,%d,9,80,1,36,0,0,0.1\n" % (k, k) for k in (1, 2, 3)
+)
+BUNDLE = b"# Bundle file v0.3\n3 1\n" + b"9.5 0.1 0\n1 0 0\n0 1 0\n0 0 1\n0.5 0 1\n" * 3 + b"0 0 -9\n1 2 3\n1 0 0 1 1\n"
+SPLAT_CAMERAS = json.dumps(
+    [
+        {
+            "img_name": f"v{k}",
+            "width": 12,
+            "height": 9,
+            "fx": 9,
+            "fy": 9,
+            "position": [k, 0, 0],
+            "rotation": np.eye(3).tolist(),
+        }
+        for k in (1, 2, 3)
+    ]
+).encode()
+OPENSFM = json.dumps(
+    [
+        {
+            "cameras": {"c": {"projection_type": "perspective", "width": 12, "height": 9, "focal": 0.8, "k1": 0.1}},
+            "shots": {
+                f"v{k}.png": {"rotation": [0, 0.1, 0], "translation": [k, 0, 0], "camera": "c"} for k in (1, 2, 3)
+            },
+            "points": {"7": {"coordinates": [0, 0, 5], "color": [1, 2, 3]}},
+        }
+    ]
+).encode()
 SCENE = b"""layout: transforms
 train: [v1, 20220819_104425, 2022-08-19]
 test: every 8
@@ -126,7 +155,7 @@ stages:
 
 
 def capture_reader(name: str, others: dict[str, bytes]) -> Callable[[Path], object]:
-    """Return a function that adds three pictures beside a file, and reads the file's folder as a capture.
+    """Return a function that adds three pictures and their list beside a file, and reads its folder as a capture.
 
     Args:
         name: Layout of the capture.
@@ -138,6 +167,7 @@ def capture_reader(name: str, others: dict[str, bytes]) -> Callable[[Path], obje
         (folder / "images").mkdir(exist_ok=True)
         for k in (1, 2, 3):
             (folder / "images" / f"v{k}.png").write_bytes(others["p.png"])
+        (folder / "list.txt").write_text("v1.png\nv2.png\nv3.png\n")
         return load_capture(folder, name)
 
     return read
@@ -181,6 +211,10 @@ def readers() -> list[Reader]:
         Reader("points3D.txt", load_model_points, (POINTS_TXT,)),
         Reader("transforms.json", capture_reader("transforms", made), (TRANSFORMS,)),
         Reader("poses_bounds.npy", capture_reader("llff", made), of("poses_bounds.npy")),
+        Reader("cameras.csv", capture_reader("realitycapture", made), (CSV,)),
+        Reader("bundle.out", capture_reader("bundler", made), (BUNDLE,)),
+        Reader("cameras.json", capture_reader("3dgs", made), (SPLAT_CAMERAS,)),
+        Reader("reconstruction.json", capture_reader("opensfm", made), (OPENSFM,)),
         Reader("scene.yaml", lambda path: read_user_yaml(path, ("stages",)), (SCENE,)),
         Reader(
             "g.ply",

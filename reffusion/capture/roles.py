@@ -104,8 +104,9 @@ def load_roles(
       mask; or, if some training masks are missing too, to the first views of the capture;
     - the views that the layout itself holds out (`Capture.test`), except those that `train` names.
 
-    Training views are the views that `train` names, else all views that are neither test nor camera-only views. All
-    other views are left out of the scene, unless they are camera-only views.
+    Training views are the views that `train` names, else all views that are neither test nor camera-only views, without
+    those in neither list of the layout's own (`Capture.unused`). All other views are left out of the scene, unless they
+    are camera-only views.
 
     Args:
         folder: the scene's folder.
@@ -220,7 +221,7 @@ def _split_views(
     """
     test_views = test if test is not None else (labelled or [*capture.test])
     if train is None:
-        train = [name for name in capture.pictures if name not in {*test_views, *blank}]
+        train = [name for name in capture.pictures if name not in {*test_views, *blank, *capture.unused}]
     elif test is None:
         test_views = [name for name in test_views if name not in set(train)]
     both = sorted(set(train) & set(test_views))

@@ -11,16 +11,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, TiffImagePlugin
 
 from reffusion.io.files import BadInput, check_pixels, reading, shorten
 
 HEIC = (".heic", ".heif")  # endings of the pictures that phones write
-ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", *HEIC)  # endings of pictures, in lower case
+# endings of pictures, in lower case
+ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".tif", ".tiff", ".bmp", ".webp", ".avif", *HEIC)
 
 DARK = 8  # grey level up to which an area of a mask counts as background
 FLAT = 0.002  # share of a mask that a value must fill to count as an area, not as part of a soft edge
-_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "HEIF")
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "HEIF", "AVIF")
+_SINCE = ("HEIF", "AVIF")  # formats that Pillow reads only with a plugin, or in newer versions
+_FLOATS = 3  # value of TIFF's tag SampleFormat
 _HEIC_BRANDS = tuple(
     b"ftyp" + brand for brand in (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"hevc", b"hevx")
 )
@@ -41,9 +44,14 @@ def open_image(path: Path, what: str = "a readable image") -> Iterator[Image.Ima
     """
     with reading(path, what):
         with open(path, "rb") as file:
-            if file.read(12)[4:12] in _HEIC_BRANDS:  # the ending of the file's name may be another one
-                _register_heic(path)
-        known = [each for each in _FORMATS if each != "HEIF" or each in Image.OPEN]
+            start = file.read(12)  # the ending of the file's name may be another one
+        if start[4:12] in _HEIC_BRANDS:
+            _register_heic(path)
+        if start[4:12] in (b"ftypavif", b"ftypavis"):
+            _register_avif(path)
+        if start[:4] in (b"II*\0", b"MM\0*"):
+            _refuse_float_colors(path)
+        known = [each for each in _FORMATS if each not in _SINCE or each in Image.OPEN]
     with reading(path, what), Image.open(path, formats=known) as image:
         check_pixels(path, *image.size)
         yield image
@@ -63,6 +71,27 @@ def _register_heic(path: Path) -> None:
     except ImportError:
         raise BadInput(f"{path}: HEIC pictures need pi-heif: `pip install pi-heif`, or save them as JPEG") from None
     pi_heif.register_heif_opener()
+
+
+def _register_avif(path: Path) -> None:
+    """Enable Pillow to read AVIF pictures. Raises BadInput if the installed Pillow cannot."""
+    try:
+        from PIL.AvifImagePlugin import SUPPORTED
+    except ImportError:
+        SUPPORTED = False
+    if not SUPPORTED:
+        raise BadInput(f"{path}: AVIF pictures need Pillow 11.3: `pip install -U pillow`, or save them as JPEG")
+
+
+def _refuse_float_colors(path: Path) -> None:
+    """Raise BadInput if a TIFF picture has several channels of floats, which Pillow does not read."""
+    with open(path, "rb") as file:
+        tags = TiffImagePlugin.ImageFileDirectory_v2(file.read(8))
+        file.seek(tags.next)
+        tags.load(file)
+    kinds = tags.get(TiffImagePlugin.SAMPLEFORMAT, ())
+    if _FLOATS in kinds and len(kinds) > 1:
+        raise BadInput(f"{path}: float pixels; save it as a picture of 8 or 16 bits")
 
 
 def image_size(path: Path, upright: bool = False) -> tuple[int, int]:

@@ -63,6 +63,13 @@ class Settings(BaseModel):
         return type(self).model_validate(nested)
 
 
+def to_slashes(value: Any) -> Any:
+    """Return a path, or a list of paths, with slashes for the backslashes of Windows. Other values stay as they are."""
+    if isinstance(value, list):
+        return [to_slashes(each) for each in value]
+    return value.replace("\\", "/") if isinstance(value, str) else value
+
+
 def prior_field() -> Any:
     return Field(PRIOR, description="inpainting prior: a diffusers folder or a hub id", json_schema_extra=WEIGHTS)
 

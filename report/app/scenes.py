@@ -9,12 +9,12 @@ from pathlib import Path
 from reffusion.capture.load import detect_layout, load_capture
 from reffusion.command import root, scene_name, scene_path, workplace
 from reffusion.io.arrays import load_json
+from reffusion.io.files import VIDEOS
 from reffusion.io.images import ENDINGS
 from report.app.mask_step import MaskStep
 from runner.frames import FRAMES
 
 MAX_RECENT = 12
-VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".m4v", ".avi")
 
 
 @dataclass

@@ -17,7 +17,17 @@ from report.app.scenes import OpenScene
 from report.job_data import JobFiles, load_job
 from runner.plan import FINAL
 
-LAYOUTS = {"llff": "LLFF", "transforms": "nerfstudio (transforms.json)", "colmap": "COLMAP", "photos": "photographs"}
+LAYOUTS = {
+    "llff": "LLFF",
+    "transforms": "nerfstudio (transforms.json)",
+    "colmap": "COLMAP",
+    "polycam": "Polycam",
+    "realitycapture": "RealityCapture",
+    "opensfm": "OpenSfM",
+    "bundler": "Bundler",
+    "3dgs": "3D Gaussian Splatting (cameras.json)",
+    "photos": "photographs",
+}
 
 
 def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, Any]:

@@ -9,13 +9,14 @@ from reffusion.capture.layouts import cameras
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.roles import capture_views
 from reffusion.capture.scene_folder import check_gaussian_files, is_gaussians_only, read_scene
+from reffusion.io.images import ENDINGS
 from reffusion.params.clicks import CLICKS
 from reffusion.params.poses import Params
 from reffusion.references.files import PAINTED, describe_references, load_reference_files
 
 # Endings of pictures and depth maps. Of such files the stage reads only those of the capture; others are masks or
 # references, which later stages read.
-NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".npy", ".exr")
+NOT_READ = (*ENDINGS, ".npy", ".exr")
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:

@@ -36,9 +36,9 @@ LEAST_PAIRS = 5  # pairs below which poses are not judged
 LEAST_MATCHES, LEAST_SHARE = 30, 0.7  # matches that a pair needs, and share of them that one matrix must explain
 RATIO = 0.8  # largest ratio of the distances to the best and to the second best feature (Lowe 2004)
 LOOSE = 1.0  # px of the reduced photographs: largest distance of a match from its epipolar line
-# Largest distance of a match from the epipolar line of the poses, in units of the focal length (.01: half a degree), and
-# relative to the distance by which the match moved between the photographs. Matches that moved less than `STILL` are
-# ignored.
+# Largest distance of a match from the epipolar line of the poses, in units of the focal length (.01: half a degree),
+# and relative to the distance by which the match moved between the photographs. Matches that moved less than `STILL`
+# are ignored.
 CLOSE, ALONG, STILL = 0.01, 0.3, 0.006
 EXPLAINED = 0.5  # share of a pair's matches that poses must explain, to explain the pair
 # Share of the pairs that given poses, and that corrected poses, must explain; and the share of the first `QUICK` pairs
@@ -111,8 +111,8 @@ def judge_poses(capture: Capture) -> Agreement:
         raise BadInput(
             f"{capture.pose_source}: its poses are not those of the photographs: of {len(known)} pairs of photographs "
             f"that match, the poses explain {sum(known)}; with other axes, with inverted or transposed matrices, in "
-            f"another order, shifted, and with EXIF orientation obeyed at most {best.explained}. Solve the poses again, "
-            "or remove the file to have them estimated; poses.trust=true uses them as they are"
+            f"another order, shifted, and with EXIF orientation obeyed at most {best.explained}. Solve the poses "
+            "again, or remove the file to have them estimated; poses.trust=true uses them as they are"
         )
     return best
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from reffusion.capture.layouts.unread import refuse_without_pictures
 from reffusion.capture.lens import Lens, from_colmap
 from reffusion.capture.names import list_pictures, name_views, normalize_path
 from reffusion.io.colmap import ModelCamera
@@ -42,7 +43,7 @@ class Capture:
     """The contents of a scene folder.
 
     Attributes:
-        layout: "llff", "colmap", "transforms" or "photos".
+        layout: one of `load.LAYOUTS`.
         pictures: view name -> picture file, sorted by path. Either all of them have poses, or none.
         paths: name of a view, or path of a picture that is left out -> the paths by which its mask file may be named.
             Pictures that are left out are listed so that their masks are not refused.
@@ -51,7 +52,8 @@ class Capture:
         label_folder: the folder whose sub-folders `label` and `test_label` are searched for masks and test masks. It is
             the folder of the pictures, or of the same pictures at another size.
         warnings: sentences for the user.
-        test: names of the views that the layout itself holds out (Blender's transforms_test.json).
+        test: names of the views that the layout itself holds out (Blender's transforms_test.json, or `test_filenames`).
+        unused: names of the views that are in neither of the layout's own lists of training and test views.
         ignore_masks: view name -> the mask file that the layout names for the view. Such a mask is black where training
             should ignore the picture.
         depth_maps: files of depth maps from which points may be made.
@@ -67,6 +69,7 @@ class Capture:
     label_folder: Path
     warnings: tuple[str, ...]
     test: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
     ignore_masks: dict[str, Path] = field(default_factory=dict)
     depth_maps: tuple[Path, ...] = ()
     upright: bool = False
@@ -147,7 +150,7 @@ def find_image_folder(folder: Path, images: str | None, usual: tuple[str, ...]) 
         return folder / images
     folders = [folder / name for name in usual if has_pictures(folder / name, nested=name != ".")]
     if not folders:
-        raise BadInput(f"{folder}: no pictures in {', '.join(usual)}; name their folder as `images` in scene.yaml")
+        raise refuse_without_pictures(folder, usual)
     return next((path for path in folders if (path / "label").is_dir()), folders[0])
 
 

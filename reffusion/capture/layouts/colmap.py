@@ -15,6 +15,7 @@ from reffusion.capture.layouts.capture import (
     Poses,
     count_message,
     find_image_folder,
+    has_pictures,
     lens_from_model,
     relative_paths,
     resize_lens,
@@ -25,6 +26,7 @@ from reffusion.io.colmap import ModelImage, is_model, load_cameras, load_images,
 from reffusion.io.files import BadInput
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap", ".")
+USUAL = ("images", "images_2", "images_4", ".")  # usual folders of pictures
 RENAMED = re.compile(r"image\d+")  # names of LLFF's reduced copies, numbered in the order of the originals' names
 
 
@@ -33,11 +35,28 @@ def find_model(folder: Path) -> Path | None:
     return max(found, key=found.__getitem__) if (found := _count_images(folder)) else None
 
 
+def find_workspace(folder: Path) -> Path | None:
+    """Return the folder in which COLMAP put undistorted pictures with their model; None without one.
+
+    The folder has sub-folders `images` and `sparse`, as dense/0 of an automatic reconstruction. It counts if the scene
+    has no other model, or no pictures in the usual folders. Of several folders the one with most pictures is returned.
+    """
+    found = [
+        path for path in (folder / "dense", *sorted((folder / "dense").glob("[0-9]*"))) if is_model(path / "sparse")
+    ]
+    sizes = {path: len(list_pictures(path / "images", nested=True)) for path in found}
+    if not any(sizes.values()):
+        return None
+    if find_model(folder) is not None and any(has_pictures(folder / name) for name in USUAL):
+        return None
+    return max(sizes, key=sizes.__getitem__)
+
+
 def other_models(folder: Path, model: Path) -> str | None:
     """Return a message to the user about the COLMAP models that are not used; None if `model` is the only one."""
     found = _count_images(folder)
     others = [f"{_relative(folder, path)} ({count})" for path, count in found.items() if path != model]
-    if not others:
+    if not others or model not in found:
         return None
     return f"{_relative(folder, model)} is taken, which has most images ({found[model]}); not {', '.join(others)}"
 
@@ -77,10 +96,13 @@ def read(folder: Path, images: str | None, correction: Correction = AS_GIVEN) ->
     Raises:
         BadInput: there is no model; the usual folders hold no pictures; or as for `capture_from_model`.
     """
-    model = find_model(folder)
+    model, workspace = find_model(folder), find_workspace(folder)
+    if workspace is not None and images is None:
+        pictures = workspace / "images"
+        return capture_from_model(folder, workspace / "sparse", pictures, "colmap", pictures, correction)
     if model is None:
         raise BadInput(f"{folder}: no COLMAP model (cameras and images, .bin or .txt) in {', '.join(MODEL_FOLDERS)}")
-    image_folder = find_image_folder(folder, images, ("images", "images_2", "images_4", "."))
+    image_folder = find_image_folder(folder, images, USUAL)
     return capture_from_model(folder, model, image_folder, "colmap", image_folder, correction)
 
 
