@@ -37,14 +37,6 @@ def test_io_costs_no_torch():
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_a_ply_says_how_it_is_meant_to_be_drawn(tmp_path, antialiased):
-    save_ply(tmp_path / "g.ply", replace(random_gaussians(3, 1), antialiased=antialiased))
-    assert load_ply(tmp_path / "g.ply").antialiased == antialiased
-    header = (tmp_path / "g.ply").read_bytes().split(b"end_header")[0]
-    assert (b"comment antialiased" in header) == antialiased
-
-
 def test_images_round_trip_and_floats_are_rounded(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (5, 9, 3)).astype(np.uint8)
     save_image(tmp_path / "deep" / "x.png", pixels)
