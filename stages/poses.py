@@ -155,9 +155,7 @@ def _load_positions(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     return splats.rows.means, splats.notes
 
 
-def _find_deleted(
-    files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _find_deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the Gaussians that the user deleted, by matching positions. The counts are printed.
 
     Args:

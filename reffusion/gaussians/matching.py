@@ -22,9 +22,9 @@ MIN_SPACING = 0.1
 SAMPLE_SIZE = 5000  # Gaussians of the cleaned scene by which axis flips and different scenes are detected
 QUERY_SIZE = 100_000  # points per query of neighbours
 MIN_MATCHED_SHARE = 0.95  # share of the cleaned scene's Gaussians that must be matched for both files to be one scene
-# A deleted Gaussian is a core if so large a share of its NEIGHBORS nearest Gaussians was deleted, too. Cores that are
-# neighbours of each other form a hole if there are at least LEAST_CORES. All that was deleted at most REACH times as far
-# from a core as its farthest neighbour belongs to the hole.
+# A deleted Gaussian is a core if so large a share of its NEIGHBORS nearest Gaussians was deleted, too. Connected cores
+# form a hole if there are at least LEAST_CORES. A deleted Gaussian belongs to the hole if it is at most REACH times as
+# far from the nearest core as that core's farthest neighbour is.
 NEIGHBORS, CORE_SHARE, LEAST_CORES, REACH = 16, 1 / 3, 16, 2.0
 # Signs of x, y and z: unchanged, or rotated by 180 degrees about x, y or z, as editors do with scenes that have y down.
 AXIS_FLIPS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))

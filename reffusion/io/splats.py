@@ -29,8 +29,8 @@ SCALES = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 RED_GREEN_BLUE = ("red", "green", "blue")
 FILTER = "filter_3D"  # property of Mip-Splatting: the standard deviation of the 3D filter of each Gaussian
-# Comments of a .ply that say whether the Gaussians are to be rendered with Mip-Splatting's 2D filter: those of Brush and
-# splat-transform, then those of Postshot and, without a number, of earlier versions of this program.
+# Comments of a .ply that say whether the Gaussians are to be rendered with Mip-Splatting's 2D filter: first those of
+# Brush and splat-transform, then those of Postshot and, without a number, of earlier versions of this program.
 RENDERING = re.compile(r"splatrendermode: ?(\w+)|antialiased(?: ([01]))?", re.IGNORECASE)
 FORMATS = (".ply", ".compressed.ply", ".spz", ".splat")  # endings of the files that are read and written
 BY_PROGRAM = "save the scene as .ply in the program that wrote it"
