@@ -55,6 +55,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     - refine.json, if cameras are compared with optical flow and adjusted to it where needed;
     - gaussians.ply (normalised frame), if the scene brings Gaussians;
     - deleted.npy, bool [N], if it also brings a file from which a user deleted some of them: True for the deleted ones;
+    - scattered.npy, bool [N], if some of the deleted ones stood alone and leave no hole: True for these;
     - warnings.json, if something looks wrong.
 
     Args:
@@ -119,12 +120,15 @@ class OwnSplats:
         properties: names of the properties of the .ply, in order; empty for other formats.
         deleted: bool [N], True for Gaussians that are missing from the file that the parameter `cleaned` names. None if
             the scene has no such file.
+        scattered: bool [N], True for deleted Gaussians that leave no hole to fill (`matching.find_scattered`); None if
+            `deleted` is None.
         notes: sentences about both files, for the user.
     """
 
     splats: Splats
     properties: tuple[str, ...]
     deleted: np.ndarray | None
+    scattered: np.ndarray | None
     notes: tuple[str, ...]
 
 
@@ -141,13 +145,13 @@ def _load_own_splats(params: Params, scene: Path) -> OwnSplats | None:
     if params.gaussians is None:
         return None
     path = scene / params.gaussians
-    splats, deleted = load_splats(path), None
+    splats, deleted, scattered = load_splats(path), None, None
     notes = [f"{path.name}: {note}" for note in splats.notes]
     if params.cleaned is not None:
         cleaned, messages = _load_positions(scene / params.cleaned)
         notes += [f"{params.cleaned}: {note}" for note in messages]
-        deleted = _find_deleted((path, scene / params.cleaned), splats.rows.means, cleaned)
-    return OwnSplats(splats, load_property_names(path), deleted, tuple(notes))
+        deleted, scattered = _find_deleted((path, scene / params.cleaned), splats.rows.means, cleaned)
+    return OwnSplats(splats, load_property_names(path), deleted, scattered, tuple(notes))
 
 
 def _load_positions(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -159,7 +163,7 @@ def _load_positions(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     return splats.rows.means, splats.notes
 
 
-def _find_deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -> np.ndarray:
+def _find_deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the Gaussians that the user deleted, by matching positions. The counts are printed.
 
     Args:
@@ -168,10 +172,11 @@ def _find_deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarr
         cleaned: [M, 3] positions of the cleaned scene.
 
     Returns:
-        bool [N], True for Gaussians of the whole scene that are missing from the cleaned one.
+        deleted: bool [N], True for Gaussians of the whole scene that are missing from the cleaned one.
+        scattered: bool [N], True for those of them that leave no hole to fill.
 
     Raises:
-        BadInput: the files are of different scenes, or nothing was deleted.
+        BadInput: the files are of different scenes, or nothing was deleted, or only scattered Gaussians.
     """
     match = matching.match_gaussians(whole, cleaned)
     if match.found < matching.MIN_MATCHED_SHARE:
@@ -181,17 +186,25 @@ def _find_deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarr
         )
     if not match.deleted.any():
         raise BadInput(f"{files[1]}: nothing was deleted: all splats of {files[0].name} are there")
+    count, scattered = np.count_nonzero(match.deleted), matching.find_scattered(whole, match.deleted)
+    alone = np.count_nonzero(scattered)
+    if alone == count:
+        raise BadInput(
+            f"{files[1]}: {count} scattered splats were deleted; no region to fill: each stood among splats that stay. "
+            f"Delete a whole object, or use {files[1].name} as it is"
+        )
+    dust = f", {alone} of them scattered: they leave no region to fill" if alone else ""
     turned = "" if min(match.turn) > 0 else ", and it was turned by 180 degrees"
     strange = "" if match.found == 1 else f", and {1 - match.found:.1%} of its splats are new and left out"
-    print(f"{files[1].name}: {match.deleted.sum()} of {len(whole)} splats were deleted{turned}{strange}", flush=True)
-    return match.deleted
+    print(f"{files[1].name}: {count} of {len(whole)} splats were deleted{dust}{turned}{strange}", flush=True)
+    return match.deleted, scattered
 
 
 def _save_own_splats(out: Path, placed: Scene, own_splats: OwnSplats) -> None:
-    """Write the Gaussians that the scene brings: gaussians.ply in the normalised frame, and deleted.npy.
+    """Write the Gaussians that the scene brings: gaussians.ply in the normalised frame, deleted.npy and scattered.npy.
 
-    The properties of gaussians.ply have the order of the scene's file. deleted.npy is written if Gaussians were
-    deleted.
+    The properties of gaussians.ply have the order of the scene's file. The other two files are written if Gaussians
+    were deleted, scattered.npy only if some of them were scattered.
 
     Args:
         placed: the scene in the normalised frame.
@@ -199,6 +212,8 @@ def _save_own_splats(out: Path, placed: Scene, own_splats: OwnSplats) -> None:
     save_ply(out / "gaussians.ply", own_splats.splats.gaussians(placed.similarity), properties=own_splats.properties)
     if own_splats.deleted is not None:
         save_labels(out / "deleted.npy", own_splats.deleted)
+    if own_splats.scattered is not None and own_splats.scattered.any():
+        save_labels(out / "scattered.npy", own_splats.scattered)
 
 
 def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: OwnSplats) -> None:
@@ -212,9 +227,10 @@ def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: Own
         scene: folder of the scene.
     """
     rows, found = own_splats.splats.rows, cameras.read(scene)
-    assert own_splats.deleted is not None
+    assert own_splats.deleted is not None and own_splats.scattered is not None
+    hole = own_splats.deleted & ~own_splats.scattered
     means, opaque, sizes = rows.means, rows.opacity_logits > 0, np.exp(np.median(rows.log_scales, axis=1))
-    poses, source = found or (ring.place_cameras(means, sizes, opaque, own_splats.deleted, params.longest), None)
+    poses, source = found or (ring.place_cameras(means, sizes, opaque, hole, params.longest), None)
     some = np.flatnonzero(opaque)
     draws = seeding.generator(SEED, "poses", "points of Gaussians")
     some = some[torch.randperm(len(some), generator=draws)[:MORE_POINTS].numpy()]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -35,14 +34,6 @@ from reffusion.types import MaskSet, Reference, Similarity
 def test_io_costs_no_torch():
     code = "import sys, reffusion.io; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
-
-
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_a_ply_says_how_it_is_meant_to_be_drawn(tmp_path, antialiased):
-    save_ply(tmp_path / "g.ply", replace(random_gaussians(3, 1), antialiased=antialiased))
-    assert load_ply(tmp_path / "g.ply").antialiased == antialiased
-    header = (tmp_path / "g.ply").read_bytes().split(b"end_header")[0]
-    assert (b"comment antialiased" in header) == antialiased
 
 
 def test_images_round_trip_and_floats_are_rounded(tmp_path):

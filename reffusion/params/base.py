@@ -111,7 +111,9 @@ class Sampler(Settings):
 
     steps: int = Field(50, ge=1, description="sampler steps from pure noise")
     guidance: float = Field(
-        0.0, ge=0, description="a of the paper; the guidance scale of libraries is 1 + a; no effect without a prompt"
+        0.0,
+        ge=0,
+        description="γ of (1 + γ) ε(cond) - γ ε(empty); libraries' scale is 1 + γ; no effect without a prompt",
     )
     # PAPER leaves open: the noise level. SDXL's authors advise against pure noise: diffusers starts just below it.
     start: float = Field(
