@@ -54,7 +54,7 @@ def serve(app: App, scene: str, port: int) -> None:
     app.first = scene
     app.begin_masks(app.scenes[scene])
     server = Server(app, port)
-    announce(server, f"{server.address}#{quote(scene)}/object")
+    announce(server, server.link(fragment=f"{quote(scene)}/object"))
     step = app.scenes[scene].mask_step
     if step is not None and step.session.segmenter is None:
         print("clicks are segmented by colours and surfaces; with the network of `make weights` (37 MB) fewer suffice")

@@ -24,6 +24,7 @@ from scenes.references import run_reference_stage
 from reffusion.io.arrays import save_json, save_text
 from reffusion.io.images import load_image, save_image
 from report import verdict
+from report.access import REFUSAL, Access
 from report.app import brush, painting, scenes, uploads
 from report.app.app import App
 from report.app.job_progress import estimate_remaining
@@ -54,7 +55,11 @@ class Page:
         wait_until(lambda: self.server.server.started)
 
     def send(self, method, path, body=None, **headers):
-        """Return (status, body) of a request; a body that is no bytes is sent as JSON."""
+        """Return (status, body) of a request; a body that is no bytes is sent as JSON.
+
+        Cookie="" sends it without the token.
+        """
+        headers = {"Cookie": f"reffusion_{self.server.port}={self.server.access.token}"} | headers
         connection = http.client.HTTPConnection("127.0.0.1", self.server.port, timeout=60)
         content = body if body is None or isinstance(body, bytes) else json.dumps(body).encode()
         connection.request(method, path, content, headers)
@@ -117,6 +122,46 @@ def test_other_pages_and_machines_are_refused(page, scene):
         for origin in ("http://elsewhere.example", "null", f"http://{own}.elsewhere.example", "http://127.0.0.1:1"):
             assert page.send("POST", path, {}, Origin=origin)[0] == 403
     assert page.send("GET", "/scenes", Origin=f"http://{own}")[0] == 200
+
+
+EVERY_ADDRESS = {
+    "GET": (
+        "/", "/app.css", "/app.js", "/scenes", "/scenes/scene/state", "/scenes/scene/events",
+        "/scenes/scene/pictures/photo/v00", "/scenes/scene/paint/v00", "/scenes/scene/paint/v00/canvas",
+        "/scenes/scene/export/scene.ply", "/scenes/scene/mask/", "/scenes/scene/mask/state",
+        "/scenes/scene/mask/photo/v00", "/none",
+    ),
+    "POST": (
+        "/scenes", "/uploads", "/uploads/x/a.png", "/scenes/scene/do/start", "/scenes/scene/live",
+        "/scenes/scene/mask/mark", "/scenes/scene/mask/save", "/scenes/scene/paint/v00",
+        "/scenes/scene/paint/v00/fill",
+    ),
+}  # fmt: skip
+
+
+def test_every_address_asks_for_the_token(page, scene):
+    """It may come with the address, whose answer sets a cookie, or with the cookie; the brush and uploads too."""
+    token, port = page.server.access.token, page.server.port
+    wrong = ("", f"reffusion_{port}=", f"reffusion_{port}={token}x", f"other={token}", f"reffusion_{port}=é")
+    for method, paths in EVERY_ADDRESS.items():
+        for path in paths:
+            for cookie in wrong:
+                status, answer = page.send(method, path, {} if method == "POST" else None, Cookie=cookie)
+                assert (status, json.loads(answer)) == (403, {"error": REFUSAL}), (method, path, cookie)
+            assert page.send(method, f"{path}?token={token[:-1]}", Cookie="")[0] == 403
+    assert page.send("GET", "/", Cookie="", Accept="text/html")[1] == REFUSAL.encode(), "one line for a person"
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    connection.request("GET", f"/?token={token}")
+    cookie = connection.getresponse().headers["Set-Cookie"]
+    assert cookie == f"reffusion_{port}={token}; Path=/; Max-Age=604800; HttpOnly; SameSite=Strict"
+    assert page.send("GET", "/scenes", Cookie=f"a=b; {cookie.split(';')[0]}")[0] == 200
+    assert page.send("POST", f"/uploads?token={token}", {"name": "x"}, Cookie="")[0] == 200
+    assert page.send("GET", f"/scenes?token={token}", Cookie="", Host="elsewhere.example")[0] == 403
+
+
+def test_two_servers_have_two_tokens_of_256_bits():
+    one, other = Access(1), Access(1)
+    assert one.token != other.token and len(one.token) == 43 and one.token not in repr(one)
 
 
 @pytest.mark.parametrize("path", [
@@ -222,7 +267,7 @@ def test_a_marked_part_is_filled_with_patches_of_photographs(wall_folders, tmp_p
 
 def test_the_state_says_what_was_found_and_what_is_missing(page, scene):
     connection = http.client.HTTPConnection("127.0.0.1", page.server.port, timeout=60)
-    connection.request("GET", "/scenes/scene/events")
+    connection.request("GET", page.server.access.link("/scenes/scene/events"))
     answer = connection.getresponse()
     assert answer.headers["Content-Type"].startswith("text/event-stream")
     while True:  # a first state without a plan, then the plan
@@ -321,7 +366,7 @@ def test_the_time_left_does_not_jump_with_the_first_steps_of_a_bar():
 def test_a_walk_from_photographs_to_an_export(page, mini_scene, tmp_path, width):
     shutil.copytree(mini_scene, tmp_path / "mini")
     save_text(tmp_path / "mini/scene.yaml", (mini_scene / "scene.yaml").read_text() + "\nbudget: 20s\n")
-    with open_page(page.server.address, width) as tab:
+    with open_page(page.server.link(), width) as tab:
         tab.set_default_timeout(600_000)
         tab.fill("#path", str(tmp_path / "mini"))
         tab.click("#open button")

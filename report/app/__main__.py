@@ -22,7 +22,7 @@ def main() -> None:
         server = Server(app, arguments.port)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
-    announce(server, server.address + (f"#{quote(app.first)}/photographs" if app.first else ""))
+    announce(server, server.link(fragment=f"{quote(app.first)}/photographs" if app.first else ""))
     server.serve()
     sys.stdout.flush()
     os._exit(0)  # threads of onnxruntime may still compute, and abort the interpreter's usual end

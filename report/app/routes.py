@@ -18,10 +18,11 @@ from starlette.responses import FileResponse, JSONResponse, Response, StreamingR
 from starlette.routing import Route
 
 from report import verdict
+from report.access import Access
 from report.app import brush, mask_step, painting, pictures, tasks
 from report.app.app import App
 from report.app.scenes import OpenScene, list_recent
-from report.app.security import LocalOnly, TooLarge, read_body
+from report.app.security import OwnPageOnly, TooLarge, read_body
 from report.app.uploads import Upload
 
 STATIC = Path(__file__).with_name("static")
@@ -40,18 +41,18 @@ PICTURES: dict[str, Callable[[OpenScene, str], bytes]] = {
 PERIOD, SILENCE = 1.0, 15.0  # seconds between two looks at the files, and longest time without an event
 
 
-def make_app(app: App, port: int) -> Starlette:
+def make_app(app: App, access: Access) -> Starlette:
     """Return the web application.
 
     Args:
-        port: port of the server.
+        access: the token that every request must bring, and the port of the server.
     """
     find_step = lambda request: app.mask_step(request.path_params["scene"])
     handlers: dict[Any, Any] = dict.fromkeys((ValueError, TypeError, OSError), _refuse(400))
     handlers |= {LookupError: _refuse(404), TooLarge: _refuse(413), FileExistsError: _refuse(409)}
     return Starlette(
-        routes=[*mask_step.make_routes("/scenes/{scene}/mask", find_step), *_Addresses(app).routes()],
-        middleware=[Middleware(LocalOnly, port=port, frames=(app.viewer.port,))],
+        routes=[*mask_step.make_routes("/scenes/{scene}/mask", find_step), *_Addresses(app, access).routes()],
+        middleware=[Middleware(OwnPageOnly, access=access, frames=(app.viewer.port,))],
         exception_handlers=handlers,
     )
 
@@ -69,10 +70,11 @@ class _Addresses:
 
     Args:
         app: the scenes, jobs and processes behind the page.
+        access: the token of the page, for the viewer.
     """
 
-    def __init__(self, app: App):
-        self.app = app
+    def __init__(self, app: App, access: Access):
+        self.app, self.access = app, access
 
     def routes(self) -> list[Route]:
         """Return all routes, except those of the mask step."""
@@ -85,6 +87,7 @@ class _Addresses:
             Route("/uploads/{upload}/{file}", self.receive_file, methods=["POST"]),
             Route(f"{scene}/state", self.send_state),
             Route(f"{scene}/events", self.send_events),
+            Route(f"{scene}/live", self.show_live, methods=["POST"]),
             Route(f"{scene}/do/{{action}}", self.act, methods=["POST"]),
             Route(f"{scene}/pictures/{{kind}}/{{view}}", self.send_picture),
             Route(f"{scene}/paint/{{view}}", self.send_template),
@@ -130,6 +133,13 @@ class _Addresses:
         if action is None:
             raise LookupError("no such action")
         return JSONResponse(await run_in_threadpool(action, self.app, scene, content) or {})
+
+    async def show_live(self, request: Request) -> Response:
+        scene, viewer = self._scene(request), self.app.viewer
+        running = self.app.jobs.state(scene)["state"] in ("running", "elsewhere")
+        follow = running or not tasks.has_result(scene)
+        await run_in_threadpool(viewer.show, scene, follow, self.access)
+        return JSONResponse({"port": viewer.port})
 
     def send_picture(self, request: Request) -> Response:
         scene, kind, view = self._scene(request), request.path_params["kind"], request.path_params["view"]
@@ -190,12 +200,6 @@ def _stop(app: App, scene: OpenScene, content: dict[str, Any]) -> None:
     app.jobs.stop(scene)
 
 
-def _show_live(app: App, scene: OpenScene, content: dict[str, Any]) -> dict[str, Any]:
-    running = app.jobs.state(scene)["state"] in ("running", "elsewhere")
-    app.viewer.show(scene, follow=running or not tasks.has_result(scene))
-    return {"port": app.viewer.port}
-
-
 def _export(app: App, scene: OpenScene, content: dict[str, Any]) -> None:
     app.exports[scene.name].start(scene)
 
@@ -204,7 +208,6 @@ ACTIONS: dict[str, Callable[[App, OpenScene, dict[str, Any]], dict[str, Any] | N
     "mask": _begin_masks,
     "start": _start,
     "stop": _stop,
-    "live": _show_live,
     "export": _export,
 }
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import select
 import shutil
 import socket
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 from reffusion.io.arrays import load_json
+from report.access import Access
 from report.app.jobs import make_command, make_environment
 from report.app.scenes import OpenScene
 
@@ -24,14 +25,18 @@ FILES = {
     "turntable.webm": "video around the scene",
     "report.html": "report on the job, one page",
 }
-VIEWER_PORT = 8080
+VIEWER_PORT, START_SECONDS = 8080, 180
+READY = "ready"  # the line that the process of the viewer prints when it listens
 
 
 class Viewer:
-    """The 3D viewer (report/view.py) as a process of its own, for one scene at a time.
+    """The 3D viewer (report/app/live.py) as a process of its own, for one scene at a time.
 
     Args:
         runs: folder of all results.
+
+    Attributes:
+        port: port of the viewer.
     """
 
     def __init__(self, runs: Path):
@@ -40,10 +45,11 @@ class Viewer:
         self.scene, self.follows = "", False
         self.lock = threading.Lock()
 
-    def show(self, scene: OpenScene, follow: bool) -> None:
+    def show(self, scene: OpenScene, follow: bool, access: Access) -> None:
         """Start the viewer of a scene, unless it runs already.
 
         Args:
+            access: the token of the page, which the viewer asks for, too.
             follow: True shows the latest state of an unfinished job, and reloads when there is a newer one.
 
         Raises:
@@ -58,19 +64,23 @@ class Viewer:
                     [sys.executable, *words],
                     env=make_environment(),
                     stdin=subprocess.PIPE,  # closes with this server, and ends the viewer
-                    stdout=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
                     stderr=subprocess.PIPE,
                     text=True,
                 )
+                self.process.stdin.write(f"{access.port} {access.token}\n")
+                self.process.stdin.flush()
                 self.scene, self.follows = scene.name, follow
-            for _ in range(1800):  # importing and loading take seconds, on a busy machine minutes
-                if self.process.poll() is not None:
-                    lines = self.process.stderr.read().strip().splitlines()
-                    raise ValueError(lines[-1].removeprefix("error: ") if lines else "the viewer ended")
-                if is_open(self.port):
-                    return
-                time.sleep(0.1)
+                self._await_start(self.process)
+
+    def _await_start(self, process: subprocess.Popen) -> None:
+        """Wait until the viewer listens. Importing and loading take seconds, on a busy machine minutes."""
+        if not select.select([process.stdout], [], [], START_SECONDS)[0]:
+            self._stop()
             raise ValueError("the viewer does not answer")
+        if process.stdout.readline() != f"{READY}\n":
+            lines = process.stderr.read().strip().splitlines()
+            raise ValueError(lines[-1].removeprefix("error: ") if lines else "the viewer ended")
 
     def stop(self) -> None:
         with self.lock:
@@ -158,10 +168,3 @@ def free_port(first: int) -> int:
         except OSError:
             continue
     raise ValueError(f"no free port from {first} to {first + 99}; choose another with port=")
-
-
-def is_open(port: int) -> bool:
-    """Return whether something listens on a port of this machine."""
-    with socket.socket() as each:
-        each.settimeout(0.2)
-        return each.connect_ex(("127.0.0.1", port)) == 0

@@ -373,7 +373,7 @@ async function drawLive() {
   if (!changed('live', follows)) return;
   $('live-lead').textContent = 'The viewer starts …';
   try {
-    const {port} = await ask(at('do/live'), {});
+    const {port} = await ask(at('live'), {});
     $('viewer').src = `http://${location.hostname}:${port}/`;
     $('viewer').hidden = false;
     $('live-lead').textContent = follows ? 'The scene as it is now; it reloads when there is a newer state. Drag to turn, wheel to zoom.' : 'The finished scene. Drag to turn, wheel to zoom.';
