@@ -52,7 +52,7 @@ class Access:
         return any(self._is_token(value) for name, _, value in pairs if name == self.cookie)
 
     def make_cookie(self) -> str:
-        """Return the `Set-Cookie` header that keeps the token. Scripts cannot read it, and other sites cannot send it."""
+        """Return the `Set-Cookie` header that keeps the token, hidden from scripts and not sent for other sites."""
         return f"{self.cookie}={self.token}; Path=/; Max-Age={COOKIE_SECONDS}; HttpOnly; SameSite=Strict"
 
     def _is_token(self, given: str) -> bool:

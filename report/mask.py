@@ -34,7 +34,7 @@ def main() -> None:
     words = ("run", "raw_masks", "--scene", str(arguments.scene), "--runs", str(arguments.runs), *options)
     if status := subprocess.run(make_command(*words, "--set", WITHOUT_MASKS)).returncode:
         raise SystemExit(status)
-    app = App(arguments.runs.resolve(), options)
+    app = App(arguments.runs.resolve(), options, cli.typed_command("mask", arguments.scene))
     try:
         serve(app, app.open(str(arguments.scene)).name, arguments.port)
     except ValueError as error:

@@ -15,7 +15,7 @@ def main() -> None:
     parser = cli.scene_parser("app", __doc__, needs_scene=False)
     parser.add_argument("--port", type=int, default=PORT, help="if it is in use, the next free one is taken")
     arguments = parser.parse_args()
-    app = App(arguments.runs.resolve())
+    app = App(arguments.runs.resolve(), command=cli.typed_command("app", arguments.scene))
     try:
         if arguments.scene:
             app.first = app.open(str(arguments.scene)).name

@@ -25,6 +25,7 @@ from reffusion.types import Camera, Gaussians
 from reffusion.workspace import Workspace
 from report import camera_path, view
 from report.access import Access
+from report.app.pictures import OWN_FRAME
 from report.app.tasks import READY
 from report.viewer_server import start_viewer_server
 
@@ -41,7 +42,6 @@ STATES = {
     "distill/gaussians.ply": "distilled",
     "finish/scene.ply": "finished",
 }
-OWN_FRAME = "scene.ply"  # the name of files in the scene's own frame
 
 
 def find_latest(home: Path) -> tuple[Path, str, int] | None:

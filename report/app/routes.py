@@ -35,6 +35,7 @@ FILES = {
 PICTURES: dict[str, Callable[[OpenScene, str], bytes]] = {
     "small": pictures.draw_thumbnail,
     "photo": pictures.draw_photograph,
+    "fit": pictures.draw_fit,
     "result": pictures.draw_result,
     "unsure": pictures.draw_unsure,
 }
@@ -92,6 +93,7 @@ class _Addresses:
             Route(f"{scene}/pictures/{{kind}}/{{view}}", self.send_picture),
             Route(f"{scene}/paint/{{view}}", self.send_template),
             Route(f"{scene}/paint/{{view}}", self.receive_painting, methods=["POST"]),
+            Route(f"{scene}/paint/{{view}}/painted", self.send_painting),
             Route(f"{scene}/paint/{{view}}/canvas", self.send_canvas),
             Route(f"{scene}/paint/{{view}}/fill", self.fill, methods=["POST"]),
             Route(f"{scene}/export/{{file}}", self.send_export),
@@ -102,7 +104,9 @@ class _Addresses:
         return FileResponse(STATIC / name, media_type=kind)
 
     def list_scenes(self, request: Request) -> Response:
-        return JSONResponse({"first": self.app.first, "scenes": list_recent(self.app.jobs.runs)})
+        return JSONResponse(
+            {"first": self.app.first, "scenes": list_recent(self.app.jobs.runs), "command": self.app.command}
+        )
 
     async def open_scene(self, request: Request) -> Response:
         content = await _read_json(request)
@@ -161,6 +165,13 @@ class _Addresses:
         self.app.jobs.renew_plan(scene)
         return JSONResponse({})
 
+    def send_painting(self, request: Request) -> Response:
+        scene, view = self._scene(request), self._view_to_paint(request)
+        path = painting.painting_path(scene, view)
+        if not path.is_file():
+            raise LookupError("not painted yet")
+        return FileResponse(path)
+
     def send_canvas(self, request: Request) -> Response:
         scene, view = self._scene(request), self._view_to_paint(request)
         return Response(brush.draw_canvas(scene, view), media_type="image/png")
@@ -201,7 +212,7 @@ def _stop(app: App, scene: OpenScene, content: dict[str, Any]) -> None:
 
 
 def _export(app: App, scene: OpenScene, content: dict[str, Any]) -> None:
-    app.exports[scene.name].start(scene)
+    app.exports[scene.name].start(scene, content.get("sog") is True)
 
 
 ACTIONS: dict[str, Callable[[App, OpenScene, dict[str, Any]], dict[str, Any] | None]] = {
