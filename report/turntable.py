@@ -64,7 +64,7 @@ def make_wipe(home: Path, frames: int = WIPE_FRAMES) -> Path:
     if not fitted.exists():
         raise ValueError(f"{fitted} is missing: there are no Gaussians with the object")
     before, pictures = load_ply(fitted), []
-    width = min(FILM_WIDTH, cameras[0].width)
+    width = max(WIPE_WIDTH, min(FILM_WIDTH, cameras[0].width))
     for k in trace.progress(len(cameras), "before_after"):
         camera = cameras[k].resized(width, round(width * cameras[k].height / cameras[k].width))
         line = round(width * (0.5 + 0.42 * np.cos(2 * np.pi * k / len(cameras))))
@@ -76,7 +76,7 @@ def make_wipe(home: Path, frames: int = WIPE_FRAMES) -> Path:
     save_video(path.with_suffix(".webm"), pictures, round(1000 / WIPE_MILLISECONDS))
     size = (WIPE_WIDTH, round(WIPE_WIDTH * pictures[0].shape[0] / width))
     first, *rest = [Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS) for picture in pictures]
-    first.save(path, save_all=True, append_images=rest, loop=0, duration=WIPE_MILLISECONDS, quality=70, method=6)
+    first.save(path, save_all=True, append_images=rest, loop=0, duration=WIPE_MILLISECONDS, quality=70, method=4)
     return path
 
 

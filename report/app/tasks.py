@@ -30,7 +30,7 @@ FILES = {
     "export/scene.compressed.ply": "the same, compressed (PlayCanvas, SuperSplat)",
     "export/scene.spz": "the same as .spz (Niantic)",
     "export/scene.sog": "the same as .sog, small, for the web (PlayCanvas)",
-    "export/with_object.ply": "the scene with the object, for an editor; `reffusion patch` fills what you delete there",
+    "export/with_object.ply": "the scene with the object, for an editor: reffusion patch fills what you delete there",
     "export/cameras.zip": "cameras (COLMAP model, transforms.json) and undistorted photographs",
     "turntable.webm": "video around the scene",
     "before_after.webm": "video of before and after: a line moves across",

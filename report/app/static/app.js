@@ -432,7 +432,7 @@ function drawResult() {
   $('complete').href = `#${encodeURIComponent(scene)}/paint`;
   $('against').parentElement.hidden = !result.has_fit;
   if (!result.has_fit) $('against').value = 'photo';
-  $('filled').textContent = result.is_painted ? 'from the picture that you painted' : 'made up in one picture, and used for all views';
+  $('filled').textContent = result.is_painted ? 'from the picture that you gave' : 'made up in one picture, and used for all views';
   if (changed('views', result.views)) $('view').replaceChildren(...result.views.map(name => make('option', name)));
   if (!result.views.includes(shownView)) choose(result.views.find(name => result.rendered.includes(name)) || result.views[0]);
   else if (changed('compared', [shownView, state.version])) choose(shownView);
