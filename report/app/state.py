@@ -107,8 +107,8 @@ def describe_result(scene: OpenScene) -> dict[str, Any]:
     """Return what the page shows of a finished scene.
 
     Returns:
-        "verdict": sentences; "views": names of all views; "rendered": those that `evaluate` rendered; "has_fit": True if
-        the scene with the object can be shown; "is_painted": True if the user gave the picture that fills the hole.
+        "verdict": sentences; "views": names of all views; "rendered": those that `evaluate` rendered; "has_fit": True
+        if the scene with the object can be shown; "is_painted": True if the user gave the picture that fills the hole.
     """
     job = _load_job(scene.home, _version(scene.home))
     views, evaluate = scene.views(), scene.home / "evaluate"
