@@ -433,10 +433,10 @@ def test_preview_is_fast_and_describes_the_run(tmp_path):
     write_spin_nerf(tmp_path / "s", full=False)
     notes = plan.preview(poses.Params(), tmp_path / "s")
     assert notes[0] == "4 photographs build the scene; 2 are kept to test it"
-    assert notes[1] == f"SfM left out: {Path('sparse/0/images.bin')} brings poses"
+    assert notes[1] == f"the poses come from {Path('sparse/0/images.bin')}"
     assert notes[2].startswith("undistortion: SIMPLE_RADIAL k1=0.05 moves the border by up to ")
     write_capture(tmp_path / "t", "transforms", make_truth())
-    assert "undistortion left out: the lens is a pinhole" in plan.preview(poses.Params(), tmp_path / "t")
+    assert "the photographs need no undistortion: the lens is a pinhole" in plan.preview(poses.Params(), tmp_path / "t")
     write_pictures(tmp_path / "p", ["a", "b", "c"])
     write_masks(tmp_path / "p" / "masks", ["a", "b", "c"])
     assert "the poses of 3 photographs are computed from the pictures (structure from motion)" in plan.preview(

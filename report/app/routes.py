@@ -23,6 +23,7 @@ from report.app import brush, mask_step, painting, pictures, tasks
 from report.app.app import App
 from report.app.scenes import OpenScene, list_recent
 from report.app.security import OwnPageOnly, TooLarge, read_body
+from report.app.state import list_views_to_paint
 from report.app.uploads import Upload
 
 STATIC = Path(__file__).with_name("static")
@@ -194,7 +195,7 @@ class _Addresses:
 
     def _view_to_paint(self, request: Request) -> str:
         view = request.path_params["view"]
-        if view not in [each["view"] for each in self.app.describe(self._scene(request))["to_paint"]]:
+        if view not in [each["view"] for each in list_views_to_paint(self._scene(request))]:
             raise LookupError("no such view to paint")
         return view
 

@@ -32,7 +32,6 @@ def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, An
     except ValueError as failure:
         pictures, error = [], str(failure)
     expected = jobs.expected_seconds(scene) if not error else {}
-    finished = tasks.has_result(scene)
     return {
         "name": scene.name,
         "source": str(scene.source),
@@ -61,8 +60,8 @@ def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, An
         "job": job,
         "has_viewer": importlib.util.find_spec("viser") is not None,
         "has_state": any((scene.home / stage / "receipt.json").is_file() for stage in ("fit", "initialize")),
-        "result": describe_result(scene) if finished else None,
-        "to_paint": painting.list_views(scene, _load_job(scene.home, _version(scene.home))) if finished else [],
+        "result": describe_result(scene) if tasks.has_result(scene) else None,
+        "to_paint": list_views_to_paint(scene),
         "export": export.describe() | {"files": tasks.list_exports(scene, bool(export.work))},
     }
 
@@ -120,6 +119,11 @@ def describe_result(scene: OpenScene) -> dict[str, Any]:
         "has_fit": (stage_folder(scene.home, "fit") / "gaussians.ply").is_file(),
         "is_painted": verdict.is_reference_given(job),
     }
+
+
+def list_views_to_paint(scene: OpenScene) -> list[dict[str, Any]]:
+    """Return the views worth painting, see `painting.list_views`; none before the scene is finished."""
+    return painting.list_views(scene, _load_job(scene.home, _version(scene.home))) if tasks.has_result(scene) else []
 
 
 def _version(home: Path) -> int:

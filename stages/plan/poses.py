@@ -102,6 +102,6 @@ def _describe_poses(capture: Capture, scene: Path) -> list[str]:
     moved = f"{worst.coefficients()} moves the border by up to {shifts[worst]:.1f} px"
     pinhole = shifts[worst] <= lens.PINHOLE_ENOUGH
     return [
-        f"SfM left out: {capture.pose_source.relative_to(scene)} brings poses",
-        "undistortion left out: the lens is a pinhole" if pinhole else f"undistortion: {moved}",
+        f"the poses come from {capture.pose_source.relative_to(scene)}",
+        "the photographs need no undistortion: the lens is a pinhole" if pinhole else f"undistortion: {moved}",
     ]
