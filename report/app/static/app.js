@@ -563,7 +563,7 @@ function drawPaint() {
     button.addEventListener('click', () => file.click());
     file.addEventListener('change', () => paint(address, file.files[0]));
     const share = `${Math.round(100 * each.share)} %`, picture_ = each.painted ? `${address}/painted?${each.painted}` : `${address}?${state.version}`;
-    const words = `${each.view} shows ${k ? `another ${share} of it` : `${share} of what no photograph shows`}.${each.painted ? ' You painted it.' : ''}`;
+    const words = `${each.view}: ${k ? 'another ' : ''}${share} of the missing part can be painted in this view.${each.painted ? ' You painted it.' : ''}`;
     const here = make('button', 'Paint here', {className: 'main'});
     here.addEventListener('click', () => beginPainting(address));
     row.append(here, make('a', 'Download', {className: 'button', href: address, download: `${each.view}.png`}), button, file);
