@@ -364,6 +364,9 @@ def test_a_result_is_reached_though_its_photographs_were_moved_away(page, tmp_pa
     assert done == {"poses": "cached", "fit": "run", "evaluate": "cached"}
     assert page.send("GET", "/scenes/scene/pictures/photo/v00")[0] == 200
     assert page.post("/scenes", {"path": str(tmp_path / "moved/other")})[0] == 400
+    source.mkdir(parents=True)
+    wait_until(lambda: "no longer" not in page.state()["plan"]["error"])
+    assert not page.state()["lost"], "moved back"
 
 
 @pytest.mark.parametrize(("level", "scene", "expected"), [

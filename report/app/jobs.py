@@ -54,6 +54,7 @@ class Plan:
         profile: name of the profile.
         lacks_masks: True if the scene needs masks before the whole job can run.
         error: why there is no plan; "" if there is one.
+        is_lost: True if the scene's folder or video was not there.
         busy: True while it is being computed.
     """
 
@@ -61,6 +62,7 @@ class Plan:
     profile: str = ""
     lacks_masks: bool = False
     error: str = ""
+    is_lost: bool = False
     busy: bool = False
 
 
@@ -82,8 +84,12 @@ class Jobs:
     # ------------------------------------------------------------------------------------------------ plans
 
     def plan(self, scene: OpenScene) -> Plan:
-        """Return the latest plan of a scene; without one, it is computed in the background."""
-        if scene.name not in self.plans:
+        """Return the latest plan of a scene.
+
+        It is computed in the background if there is none, or if the scene was moved away or back since.
+        """
+        plan = self.plans.get(scene.name)
+        if plan is None or plan.is_lost == scene.source.exists():
             self.renew_plan(scene)
         return self.plans[scene.name]
 
@@ -97,7 +103,8 @@ class Jobs:
         threading.Thread(target=self._compute_plan, args=(scene, plan), daemon=True).start()
 
     def _compute_plan(self, scene: OpenScene, plan: Plan) -> None:
-        if not scene.source.exists():
+        plan.is_lost = not scene.source.exists()
+        if plan.is_lost:
             plan.lacks_masks, plan.error, plan.stages = False, describe_loss(scene), self._read_finished(scene)
             plan.busy = False
             return

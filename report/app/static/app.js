@@ -388,7 +388,7 @@ $('run').addEventListener('click', () => {
   $('run').disabled = true;
   act('start');
 });
-$('resume').addEventListener('click', () => act('mask', 'halted'));
+$('resume').addEventListener('click', () => act('mask', 'method'));
 $('halt').addEventListener('click', async () => {
   $('halt').disabled = true;
   $('start-lead').textContent = 'Stopping …';
