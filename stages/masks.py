@@ -203,7 +203,8 @@ def report_remnants(remnants: Sequence[Remnant], out: Path, photo_of: Callable[[
         photo[remnant.mask] = photo[remnant.mask] // 2 + np.array(TINT) // 2
         save_image(out / picture, photo)
         outcome = (
-            "a part that the masks leave out would float in the air and is removed too (masks.remnants=false keeps it)"
+            "a part of the object that no mask covers is removed, too, because it would float in the air (to keep it: "
+            "`--set masks.remnants=false`)"
             if remnant.would_float
             else "part of the object seems to be left; if so, mark it in that view and run again"
         )

@@ -114,9 +114,9 @@ def test_reference_and_its_depth_among_photographs_of_input(tmp_path):
     write_masks(folder / "masks", names)
     reference = {"view": "IMG_2", "image": "input/clean plate.jpg", "depth": "input/clean plate depth.png"}
     notes = preview_stages(folder, reference=reference)
-    assert_message(notes, "6 training")
+    assert_message(notes, "6 photographs build the scene")
     assert_message(notes, "6 masks")
-    assert_message(notes, "6 photos bring no poses")
+    assert_message(notes, "the poses of 6 photographs are computed")
 
 
 def test_two_references_beside_pictures_of_llff(tmp_path):

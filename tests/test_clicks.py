@@ -488,7 +488,7 @@ class MaskPage:
         self.session, app = session, App(folder / "runs")
         app.add(OpenScene("scene", folder, folder / "runs/scene", MaskStep(session, scene="scene")))
         self.server = Server(app, port=18090)
-        self.address = f"{self.server.address}scenes/scene/mask/"
+        self.address = self.server.link("scenes/scene/mask/")
         self.thread = threading.Thread(target=self.server.serve, daemon=True)
         self.thread.start()
 

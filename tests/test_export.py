@@ -145,8 +145,8 @@ def test_export_writes_and_lists_all_files(tmp_path):
     save_ply(home / "evaluate" / "scene.ply", replace(random_gaussians(300, 1), antialiased=True), FRAME)
     lines = export.make(home)
     assert "300 Gaussians of degree 1" in lines[0] and "Mip-Splatting" in lines[0]
-    assert "3 pinholes" in lines[4] and "2 undistorted photographs" in lines[4] and len(lines) == 5
-    assert load_ply(home / "export/scene.spz", FRAME).antialiased and "scene.sog: not written" in lines[3]
+    assert "3 pinholes" in lines[3] and "2 undistorted photographs" in lines[3] and len(lines) == 5
+    assert load_ply(home / "export/scene.spz", FRAME).antialiased and "scene.sog: not written" in lines[4]
     assert (home / "export/scene.ply").read_bytes() == (home / "evaluate/scene.ply").read_bytes()
     (home / "export/cameras/note.txt").write_text("mine")
     export.make(home)

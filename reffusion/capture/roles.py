@@ -160,6 +160,16 @@ def load_roles(
     )
 
 
+def describe_split(train: int, test: int) -> str:
+    """Return in words what photographs are for, e.g. "20 photographs build the scene; 3 are kept to test it".
+
+    Args:
+        train, test: numbers of training views and of test views.
+    """
+    words = f"{train} photograph{' builds' if train == 1 else 's build'} the scene"
+    return words + (f"; {test} {'is' if test == 1 else 'are'} kept to test it" if test else "")
+
+
 def _clean_views(clean: Sequence[str], train: list[str], capture: Capture) -> frozenset[str]:
     """Return the clean views (training views without the object). Raises BadInput if one is not in `train`."""
     views = frozenset(resolve_view(name, capture.pictures, "clean") for name in clean)

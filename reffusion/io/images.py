@@ -157,18 +157,21 @@ def load_image(path: Path, upright: bool = False) -> np.ndarray:
         return np.repeat(np.round(levels / 257).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def load_thumbnail(path: Path, side: int) -> np.ndarray:
+def load_thumbnail(path: Path, side: int, upright: bool = False) -> np.ndarray:
     """Read a picture, reduced so that its longer side is at most `side` px, as uint8 [h, w, 3].
 
-    The orientation tag is ignored. OpenCV is not imported.
+    OpenCV is not imported.
+
+    Args:
+        upright: True applies the orientation tag, as in `load_image`.
     """
     with open_image(path) as image:
         if image.mode[0] not in "IF":
             image.draft("RGB", (2 * side, 2 * side))  # JPEGs are decoded at a fraction of their size
             image = image.convert("RGB")
             image.thumbnail((side, side), Image.Resampling.BOX)
-            return np.array(image)
-    whole = load_image(path)
+            return np.array(ImageOps.exif_transpose(image) if upright else image)
+    whole = load_image(path, upright)
     step = max(1, -(-max(whole.shape[:2]) // side))
     return np.ascontiguousarray(whole[::step, ::step])
 

@@ -65,4 +65,5 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None) -> list[s
     check_masks(roles.fill)
     count = sum(len(files) for files in roles.masks.values())
     apart = f" of {', '.join(roles.masks)}" if len(roles.masks) > 1 else ""
-    return [f"{count} masks{apart}", *roles.warnings]
+    words = f"{count} mask{'' if count == 1 else 's'}{apart}" if count else "no masks"
+    return [words, *roles.warnings]
