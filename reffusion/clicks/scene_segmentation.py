@@ -8,14 +8,14 @@ marks are propagated anew; they stay as their marks made them. A click on anothe
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from reffusion.clicks import all_views
 from reffusion.clicks.corrections import apply_marks
-from reffusion.clicks.events import Event, Masks, split_events
+from reffusion.clicks.events import Event, Masks, group_by_view, split_events
 from reffusion.clicks.fitted_views import FittedViews, transfer_marks
 from reffusion.clicks.marks import OTHER, confirmed_pixels
 from reffusion.clicks.propagation import propagate_masks
@@ -26,13 +26,30 @@ from reffusion.morphology import dilate
 Recall = Callable[[Hashable, Callable[[], Masks]], Masks]  # (key, compute) -> masks, see `segment_scene`
 
 
+@dataclass(frozen=True)
+class Settled:
+    """Masks that were saved after some marks.
+
+    Attributes:
+        events: the marks, in the order in which they were made.
+        masks: view -> bool [H, W], the masks of all views after these marks.
+    """
+
+    events: Sequence[Event]
+    masks: Masks
+
+
 def compute_always(_: Hashable, compute: Callable[[], Masks]) -> Masks:
     """Compute the masks without a cache: the default `recall` of `segment_scene`."""
     return compute()
 
 
 def segment_scene(
-    views: FittedViews, events: Sequence[Event], given: Masks, recall: Recall = compute_always
+    views: FittedViews,
+    events: Sequence[Event],
+    given: Masks,
+    recall: Recall = compute_always,
+    settled: Settled | None = None,
 ) -> dict[str, np.ndarray]:
     """Return the object's mask in every view, view -> bool [H, W].
 
@@ -46,11 +63,17 @@ def segment_scene(
         recall: cache of the results after each group of events, so that further events do not repeat the work for the
             earlier ones. It maps (key, compute) to the stored masks for this key, or else to the result of compute().
             The key holds the events only, so different scenes or given masks must not share a cache.
+        settled: the masks after the first of the events, which are then not computed anew; None for none.
     """
-    first, groups = split_events(events, given)
-    known = dict(given) | segment_first(views.evidence_of, first, recall)
-    done = [event for own in first.values() for event in own]
-    masks = recall(("all views", *(event.key for event in done)), partial(propagate, views, known))
+    if settled is not None:
+        done, masks = list(settled.events), settled.masks
+        known = {name: masks[name] for name in {*given, *(event.view for event in done)}}
+        groups = group_by_view(events[len(done) :])
+    else:
+        first, groups = split_events(events, given)
+        known = dict(given) | segment_first(views.evidence_of, first, recall)
+        done = [event for own in first.values() for event in own]
+        masks = recall(("all views", *(event.key for event in done)), partial(propagate, views, known))
     for group in groups:
         done = [*done, *group]
         step = partial(correct_scene, views, done, len(group), masks, frozenset(known), given, recall)
