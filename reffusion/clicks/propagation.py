@@ -6,6 +6,10 @@ the object's Gaussians in the next view gives the prompt for the network: a box,
 network's mask votes in turn. The next view is the one whose camera is nearest to a view with a mask, so that both views
 show mostly the same surfaces. At the end each view gets the network's mask or the projected labels, whichever agrees
 better with all votes.
+
+A brush stroke or a mask that is a few pixels too large covers a border of what lies behind or before the object. Pixels
+of such a border, beyond a step in depth, do not vote. After a correction, a view's former mask changes only where the
+votes contradict it.
 """
 
 from __future__ import annotations
@@ -21,6 +25,7 @@ from reffusion import trace
 from reffusion.clicks.all_views import remove_rim
 from reffusion.clicks.marks import UNKNOWN, Clicks
 from reffusion.clicks.mask_borders import bounding_box, erode, refine_edges
+from reffusion.clicks.pixel_grid import DEPTH_SLOPE
 from reffusion.clicks.segmenter import Candidate, Prompt
 from reffusion.clicks.single_view import ViewEvidence
 from reffusion.clicks.supports import find_support_gaussians
@@ -38,6 +43,8 @@ MIN_REST = 0.01  # share of the visible silhouette; the network gets a further p
 # Votes exclude a pixel whose `Projection.outside` is above MIN_AGAINST and whose `Projection.inside` is below MAX_FOR.
 MIN_AGAINST, MAX_FOR = 0.5, 0.2
 MIN_WIDTH = 0.004  # share of the image's width: radius of the narrowest part that votes take from a network's mask
+BORDER = 0.015  # share of the larger image side: how far a mask may reach beyond a step in depth
+RIDGE = 0.7  # share of the largest distance from a mask's border nearby, from which on a pixel is in the mask's middle
 # Points of a prompt are at least this far from the mask's border: as a share of the largest such distance, and in px.
 MIN_DEPTH = 0.3
 MIN_DEPTH_PX = 1.5
@@ -96,6 +103,7 @@ def propagate_masks(
     evidence_of: Callable[[str], ViewEvidence],
     masks: Mapping[str, np.ndarray],
     network_views: Collection[str],
+    former: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:
     """Return the object's mask in every view, view -> bool [H, W].
 
@@ -105,8 +113,11 @@ def propagate_masks(
         masks: view -> bool [H, W], the known masks, at least one. They are returned unchanged.
         network_views: the views in which the network is asked. In other views, and in those without a network (`ask`
             is None), the mask is the projection of the votes.
+        former: view -> bool [H, W], the masks of all views before a correction; None if there are none. They change
+            only where the votes contradict them.
     """
-    drawn, votes = dict(masks), count_all_votes(gaussians, cameras, masks)
+    ballots = {name: find_voting_pixels(mask, evidence_of(name).relief) for name, mask in masks.items()}
+    drawn, votes = dict(masks), count_all_votes(gaussians, cameras, masks, ballots)
     order = order_by_distance(cameras, masks)
     for k in trace.progress(len(order), "masks from view to view"):
         name = order[k]
@@ -116,35 +127,79 @@ def propagate_masks(
         drawn[name] = mask = draw_mask(view, projection)
         if agreement(mask, projection) > MIN_AGREEMENT:
             votes = votes.plus(count_votes(gaussians, cameras[name], mask))
-    votes = assume_supports(gaussians, votes)
-    return dict(masks) | {
-        name: combine(evidence_of(name).image, project_votes(gaussians, cameras[name], votes), drawn.get(name))
-        for name in order
-    }
+    votes, found = assume_supports(gaussians, votes), dict(masks)
+    for name in order:
+        projection = project_votes(gaussians, cameras[name], votes)
+        found[name] = combine(evidence_of(name).image, projection, drawn.get(name))
+        if former is not None:
+            found[name] = change_where_votes_agree(former[name], found[name], projection)
+    return found
 
 
-def count_all_votes(gaussians: Gaussians, cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray]) -> Votes:
+def find_voting_pixels(mask: np.ndarray, relief: np.ndarray | None) -> np.ndarray:
+    """Return bool [H, W], the pixels of a mask that vote: those on the surfaces that the middle of the mask shows.
+
+    Pixels at most the share `BORDER` of the larger side from the mask's border vote only if no step in depth separates
+    them from the middle of the mask, or from the middle of a thin part.
+
+    Args:
+        mask: bool [H, W], True = the object.
+        relief: float [H, W] as in `ViewEvidence`; None if depth is unknown, so that the whole mask votes.
+    """
+    if relief is None or not mask.any():
+        return mask
+    width = max(2, round(BORDER * max(mask.shape)))
+    depth = ndimage.distance_transform_edt(mask)
+    middle = mask & (depth >= np.minimum(width, RIDGE * ndimage.maximum_filter(depth, 2 * width + 1)))
+    smooth = ndimage.median_filter(relief, 3)
+    slope = np.hypot(ndimage.sobel(smooth, 0), ndimage.sobel(smooth, 1)) / 8
+    reached = ndimage.binary_dilation(middle, np.ones((3, 3)), round(1.5 * width), mask=mask & (slope < DEPTH_SLOPE[0]))
+    return middle | reached
+
+
+def change_where_votes_agree(former: np.ndarray, new: np.ndarray, projection: Projection) -> np.ndarray:
+    """Return bool [H, W], the former mask of a view, changed in the connected regions where the votes are for it.
+
+    Args:
+        former, new: bool [H, W], the masks before and after a correction.
+        projection: the votes after the correction.
+    """
+    regions, count = ndimage.label(former ^ new, np.ones((3, 3)))
+    gain = np.where(new, 1, -1) * (projection.inside - projection.outside)
+    sums = ndimage.sum_labels(gain, regions, np.arange(count + 1))
+    return former ^ ((regions > 0) & (sums > 0)[regions])
+
+
+def count_all_votes(
+    gaussians: Gaussians,
+    cameras: Mapping[str, Camera],
+    masks: Mapping[str, np.ndarray],
+    voting: Mapping[str, np.ndarray] | None = None,
+) -> Votes:
     """Sum the votes of all masks on the N Gaussians.
 
     Args:
         masks: view -> bool [H, W], True = the object; at least one view.
+        voting: view -> bool [H, W], the pixels inside each mask that vote; None for all.
     """
-    counts = [count_votes(gaussians, cameras[name], mask) for name, mask in masks.items()]
+    counts = [count_votes(gaussians, cameras[name], mask, voting and voting[name]) for name, mask in masks.items()]
     weights = np.concatenate([each.sum(1) for each in counts])
     shown = weights[weights > SHOWN]
     return Votes(np.sum(counts, 0), LEAST_WEIGHT * float(shown.mean()) if len(shown) else SHOWN)
 
 
 @torch.no_grad()
-def count_votes(gaussians: Gaussians, camera: Camera, mask: np.ndarray) -> np.ndarray:
+def count_votes(gaussians: Gaussians, camera: Camera, mask: np.ndarray, voting: np.ndarray | None = None) -> np.ndarray:
     """Return [N, 2], each Gaussian's blending weight summed over the pixels inside and outside a mask, in px.
 
     Pixels at the mask's border do not count.
 
     Args:
         mask: bool [H, W], True = the object.
+        voting: bool [H, W], the pixels inside the mask that vote; None for all.
     """
-    ballots = torch.as_tensor(np.stack([remove_rim(mask), remove_rim(~mask)], -1), dtype=gaussians.means.dtype)
+    inside = remove_rim(mask) if voting is None else remove_rim(mask) & voting
+    ballots = torch.as_tensor(np.stack([inside, remove_rim(~mask)], -1), dtype=gaussians.means.dtype)
     return rasterizer.accumulate(gaussians, camera, ballots.to(gaussians.means.device)).cpu().numpy()
 
 

@@ -128,18 +128,19 @@ def _apply_last_event(
     return {last.view: apply_marks(view, [event.mark for event in events], before, first=len(events) - 1)}
 
 
-def propagate(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
+def propagate(views: FittedViews, masks: Masks, former: Masks | None = None) -> dict[str, np.ndarray]:
     """Propagate masks to all views: view -> bool [H, W], by the segmentation network if there is one.
 
     Args:
         masks: view -> bool [H, W], the known masks, which are returned unchanged. If all are empty or there are none,
             the masks of all other views are all False.
+        former: view -> bool [H, W], the masks of all views before a correction; see `propagate_masks`.
     """
     if not any(mask.any() for mask in masks.values()):
         empty = lambda camera: np.zeros((camera.height, camera.width), bool)
         return {name: empty(camera) for name, camera in views.cameras.items()} | dict(masks)
     if views.evidence_of(next(iter(masks))).ask is not None:
-        return propagate_masks(views.gaussians, views.cameras, views.evidence_of, masks, views.network_views)
+        return propagate_masks(views.gaussians, views.cameras, views.evidence_of, masks, views.network_views, former)
     image_of = lambda name: views.evidence_of(name).image
     near = find_neighbours(views.gaussians)
     labels = all_views.label_gaussians(views.gaussians, near, views.cameras, masks, image_of)
@@ -183,7 +184,7 @@ def correct_scene(
         regions = propagate(views, {name: added})
         found = {other: mask | (regions[other] & _is_allowed(events, other, mask)) for other, mask in masks.items()}
         return found | dict(given) | own
-    return propagate(views, {other: masks[other] for other in known} | own)
+    return propagate(views, {other: masks[other] for other in known} | own, masks)
 
 
 def _is_allowed(events: Sequence[Event], name: str, mask: np.ndarray) -> np.ndarray:
