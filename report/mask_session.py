@@ -148,6 +148,7 @@ class Session:
         self.events: list[Event] = []
         self.history: list[list[Event]] = []  # the marks before each change, for `undo`
         self.masks: Masks = capture.saved | capture.given
+        self.solved_masks = self.masks  # the masks before the marks that are not yet solved
         self.versions = dict.fromkeys(self.views, 0)
         self.gaussians: Gaussians | None = None
         self.results: dict[Hashable, Masks] = {}  # keys of `segment_scene` -> masks
@@ -165,7 +166,6 @@ class Session:
                 self.events.append(self._from_photograph(saved))
         complete = {*self.views} <= {*self.masks}
         self.settled = Settled(self.events, self.masks) if self.events and complete else None
-        self.shown = self._keys()  # the marks of the masks that the page shows
         self.saved = self._keys(), complete  # the marks of the saved masks; whether these are the masks of all views
         threading.Thread(target=self._update_masks, daemon=True).start()
         if segmenter is not None:
@@ -415,7 +415,6 @@ class Session:
                 continue
             if self.solved_revision == revision:
                 continue
-            before = dict(self.masks)
             try:
                 self._solve(events, revision)
                 error = ""
@@ -426,7 +425,7 @@ class Session:
                 error = f"no masks: {failure}"
             with self.lock:
                 if revision == self.revision:
-                    self.changes = _compare_masks(before, self.masks)
+                    self.changes, self.solved_masks = _compare_masks(self.solved_masks, self.masks), self.masks
                     self.solved_revision, self.error = revision, error
                     self.lock.notify_all()
 
@@ -455,11 +454,19 @@ class Session:
             self.uses[name] += 1
             return self.evidence_of(name)
 
+        def note_effect(before: Masks, after: Masks) -> None:
+            view = events[-1].view
+            empty = np.zeros(self.images[view].shape[:2], bool)
+            self.effects[events[-1].key] = float((before.get(view, empty) ^ after.get(view, empty)).mean())
+
         self.uses = Counter()
         given, masks = self.capture.given, dict(self.capture.given)
         if self.gaussians is None:
             for name in dict.fromkeys(event.view for event in events):
-                masks |= segment_own_view(evidence_of, [event for event in events if event.view == name], self._recall)
+                own = [event for event in events if event.view == name]
+                masks |= segment_own_view(evidence_of, own, self._recall)
+                if own[-1] is events[-1]:
+                    note_effect(segment_own_view(evidence_of, own[:-1], self._recall) if own[:-1] else {}, masks)
         elif events:
             cameras = {name: self.scene.cameras[name] for name in {*self.views, *given}}
             views = FittedViews(self.gaussians, cameras, evidence_of)
@@ -468,12 +475,19 @@ class Session:
             if settled is not None:
                 first, groups = {"": [*settled.events]}, group_by_view(events[len(settled.events) :])
             elif not groups:
-                self._show({**self.masks, **segment_first(evidence_of, first, self._recall)}, revision)
+                masks |= segment_first(evidence_of, first, self._recall)
+                own = first.get(events[-1].view, [])[:-1]
+                note_effect(segment_own_view(evidence_of, own, self._recall) if own else {}, masks)
+                self._show({**self.masks, **masks}, revision)
             if groups:
                 count = len(groups[-1])
                 in_order = [event for group in (*first.values(), *groups) for event in group]
                 masks = segment_scene(views, in_order[:-count], given, self._recall, settled)
-                self._show({**masks, **correct_own_view(views, in_order, count, masks, self._recall)}, revision)
+                corrected = correct_own_view(views, in_order, count, masks, self._recall)
+                if in_order[-1] is events[-1]:
+                    previous = in_order[:-1], count - 1, masks, self._recall
+                    note_effect(correct_own_view(views, *previous) if count > 1 else masks, corrected)
+                self._show({**masks, **corrected}, revision)
             masks = segment_scene(views, events, given, self._recall, settled)
         self._show(masks, revision)
 
@@ -497,12 +511,6 @@ class Session:
         with self.lock:
             if revision != self.revision:
                 raise Superseded
-            keys = self._keys()
-            if keys and self.shown == keys[:-1]:
-                view = self.events[-1].view
-                after = masks.get(view, np.zeros(self.images[view].shape[:2], bool))
-                self.effects[keys[-1]] = float((after ^ self.masks.get(view, after & False)).mean())
-            self.shown = keys
             for name in self.views:
                 if masks.get(name) is not self.masks.get(name):
                     self.versions[name] += 1
@@ -513,7 +521,6 @@ def _compare_masks(before: Masks, after: Masks) -> dict[str, float]:
     """Return view -> share of the larger mask's pixels that differ, for the views in which pixels differ."""
     shares = {}
     for name in before.keys() & after.keys():
-        pixels = max(int(before[name].sum()), int(after[name].sum()))
         if changed := int((before[name] ^ after[name]).sum()):
-            shares[name] = changed / pixels
+            shares[name] = changed / max(int(before[name].sum()), int(after[name].sum()))
     return shares

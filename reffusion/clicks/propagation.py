@@ -8,7 +8,8 @@ show mostly the same surfaces. At the end each view gets the network's mask or t
 better with all votes.
 
 A brush stroke or a mask that is a few pixels too large covers a border of what lies behind or before the object. Pixels
-of such a border, beyond a step in depth, do not vote. After a correction, a view's former mask changes only where the
+of such a border, beyond a step in depth, do not vote. The network is not asked for thin things: its masks are too
+coarse, and take in what the thing hides. After a correction, a view's former mask changes only where the
 votes contradict it.
 """
 
@@ -44,6 +45,7 @@ MIN_REST = 0.01  # share of the visible silhouette; the network gets a further p
 MIN_AGAINST, MAX_FOR = 0.5, 0.2
 MIN_WIDTH = 0.004  # share of the image's width: radius of the narrowest part that votes take from a network's mask
 BORDER = 0.015  # share of the larger image side: how far a mask may reach beyond a step in depth
+THIN = 0.035  # share of the larger image side: a thing is thin if no disk with a larger radius fits into its masks
 RIDGE = 0.7  # share of the largest distance from a mask's border nearby, from which on a pixel is in the mask's middle
 # Points of a prompt are at least this far from the mask's border: as a share of the largest such distance, and in px.
 MIN_DEPTH = 0.3
@@ -112,21 +114,21 @@ def propagate_masks(
         evidence_of: function from a view to its photograph and segmentation network.
         masks: view -> bool [H, W], the known masks, at least one. They are returned unchanged.
         network_views: the views in which the network is asked. In other views, and in those without a network (`ask`
-            is None), the mask is the projection of the votes.
+            is None), and in all views if the masks show a thin thing, the mask is the projection of the votes.
         former: view -> bool [H, W], the masks of all views before a correction; None if there are none. They change
             only where the votes contradict them.
     """
     ballots = {name: find_voting_pixels(mask, evidence_of(name).relief) for name, mask in masks.items()}
     drawn, votes = dict(masks), count_all_votes(gaussians, cameras, masks, ballots)
-    order = order_by_distance(cameras, masks)
+    order, thin = order_by_distance(cameras, masks), all(is_thin(mask) for mask in masks.values())
     for k in trace.progress(len(order), "masks from view to view"):
         name = order[k]
         view, projection = evidence_of(name), project_votes(gaussians, cameras[name], assume_supports(gaussians, votes))
-        if name not in network_views or view.ask is None or projection.silhouette.sum() < MIN_PIXELS:
+        if thin or name not in network_views or view.ask is None or projection.silhouette.sum() < MIN_PIXELS:
             continue
         drawn[name] = mask = draw_mask(view, projection)
         if agreement(mask, projection) > MIN_AGREEMENT:
-            votes = votes.plus(count_votes(gaussians, cameras[name], mask))
+            votes = votes.plus(count_votes(gaussians, cameras[name], mask, find_voting_pixels(mask, view.relief)))
     votes, found = assume_supports(gaussians, votes), dict(masks)
     for name in order:
         projection = project_votes(gaussians, cameras[name], votes)
@@ -136,11 +138,16 @@ def propagate_masks(
     return found
 
 
+def is_thin(mask: np.ndarray) -> bool:
+    """Return True if no disk fits into a mask, bool [H, W], with a radius above the share `THIN` of the larger side."""
+    return bool(ndimage.distance_transform_edt(mask).max() < THIN * max(mask.shape))
+
+
 def find_voting_pixels(mask: np.ndarray, relief: np.ndarray | None) -> np.ndarray:
     """Return bool [H, W], the pixels of a mask that vote: those on the surfaces that the middle of the mask shows.
 
     Pixels at most the share `BORDER` of the larger side from the mask's border vote only if no step in depth separates
-    them from the middle of the mask, or from the middle of a thin part.
+    them from the middle of the mask, or from the middle of a thin part. Small pieces between steps do not vote.
 
     Args:
         mask: bool [H, W], True = the object.
@@ -148,13 +155,16 @@ def find_voting_pixels(mask: np.ndarray, relief: np.ndarray | None) -> np.ndarra
     """
     if relief is None or not mask.any():
         return mask
-    width = max(2, round(BORDER * max(mask.shape)))
-    depth = ndimage.distance_transform_edt(mask)
-    middle = mask & (depth >= np.minimum(width, RIDGE * ndimage.maximum_filter(depth, 2 * width + 1)))
+    width, around = max(2, round(BORDER * max(mask.shape))), np.ones((3, 3))
+    distance = ndimage.distance_transform_edt(mask)
+    middle = mask & (distance >= np.minimum(width, RIDGE * ndimage.maximum_filter(distance, 2 * width + 1)))
     smooth = ndimage.median_filter(relief, 3)
-    slope = np.hypot(ndimage.sobel(smooth, 0), ndimage.sobel(smooth, 1)) / 8
-    reached = ndimage.binary_dilation(middle, np.ones((3, 3)), round(1.5 * width), mask=mask & (slope < DEPTH_SLOPE[0]))
-    return middle | reached
+    level = mask & (np.hypot(ndimage.sobel(smooth, 0), ndimage.sobel(smooth, 1)) / 8 < DEPTH_SLOPE[0])
+    reached = ndimage.binary_dilation(middle & level, around, round(1.5 * width), mask=level)
+    parts, _ = ndimage.label(reached, around)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    return reached & (sizes >= min(4 * width**2, MIN_PART * sizes.max()))[parts]
 
 
 def change_where_votes_agree(former: np.ndarray, new: np.ndarray, projection: Projection) -> np.ndarray:
