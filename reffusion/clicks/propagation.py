@@ -164,7 +164,12 @@ def find_voting_pixels(mask: np.ndarray, relief: np.ndarray | None) -> np.ndarra
     parts, _ = ndimage.label(reached, around)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    return reached & (sizes >= min(4 * width**2, MIN_PART * sizes.max()))[parts]
+    voting = reached & (sizes >= min(4 * width**2, MIN_PART * sizes.max()))[parts]
+    if not voting.any():
+        return mask
+    # The slope is also large at the last pixels before a step, which are as near as the pixels beside them.
+    far, at = ndimage.distance_transform_edt(~voting, return_indices=True)
+    return voting | (mask & (far <= 2) & (np.abs(smooth - smooth[tuple(at)]) < DEPTH_SLOPE[0] * far))
 
 
 def change_where_votes_agree(former: np.ndarray, new: np.ndarray, projection: Projection) -> np.ndarray:
