@@ -89,8 +89,20 @@ def save_undistorted_masks(out: Path, name: str, roles: Roles, lens: Lens) -> No
     for folder, files in roles.mask_files.items():
         if name in files:
             values = roles.values if files[name] in own else WHITE
-            mask, where = load_mask(files[name], (lens.height, lens.width), values), undistortion_map(lens)[1]
-            save_mask(out / folder / f"{name}.png", mask if where is None else undistort_mask(mask, where))
+            save_mask(out / folder / f"{name}.png", load_undistorted_mask(files[name], lens, values))
+
+
+def load_undistorted_mask(path: Path, lens: Lens, values: MaskValues = WHITE) -> np.ndarray:
+    """Read the mask file of a photograph and undistort it, bool [H, W], at the size of `lens`.
+
+    Args:
+        values: the pixel values that mark the object.
+
+    Raises:
+        BadInput: the file is unreadable; the message names it.
+    """
+    mask, where = load_mask(path, (lens.height, lens.width), values), undistortion_map(lens)[1]
+    return mask if where is None else undistort_mask(mask, where)
 
 
 def check_masks(masks: Mapping[str, Path], values: MaskValues = WHITE) -> None:
