@@ -197,7 +197,8 @@ def count_all_votes(
         masks: view -> bool [H, W], True = the object; at least one view.
         voting: view -> bool [H, W], the pixels inside each mask that vote; None for all.
     """
-    counts = [count_votes(gaussians, cameras[name], mask, voting and voting[name]) for name, mask in masks.items()]
+    voters = lambda name: voting[name] if voting else None
+    counts = [count_votes(gaussians, cameras[name], mask, voters(name)) for name, mask in masks.items()]
     weights = np.concatenate([each.sum(1) for each in counts])
     shown = weights[weights > SHOWN]
     return Votes(np.sum(counts, 0), LEAST_WEIGHT * float(shown.mean()) if len(shown) else SHOWN)

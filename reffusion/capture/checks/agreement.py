@@ -15,8 +15,10 @@ PAPER leaves open: it takes the poses as given.
 from __future__ import annotations
 
 import itertools
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -73,7 +75,7 @@ class Agreement:
             return f"poses not checked: only {self.pairs} pairs of photographs match"
         return f"poses as given explain {self.given} of {self.pairs} pairs of photographs that match"
 
-    def describe(self, source: Path) -> str:
+    def describe(self, source: Path | None) -> str:
         """Return the warning that tells the correction. `source`: the file of the poses."""
         assert self.correction is not None
         return (
@@ -91,7 +93,9 @@ def judge_poses(capture: Capture) -> Agreement:
     assert capture.poses is not None
     given, names = capture.poses.world_to_camera, list(capture.pictures)
     chosen = np.unique(np.linspace(0, len(names) - 1, min(VIEWS, len(names))).round().astype(int))
-    stored = {names[k]: _View.load(capture.pictures[names[k]], capture.poses.lenses[names[k]]) for k in chosen}
+    sources = {names[k]: (capture.pictures[names[k]], capture.poses.lenses[names[k]]) for k in chosen}
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        stored = dict(zip(sources, pool.map(_View.load, *zip(*sources.values(), strict=True)), strict=True))
     upright = {name: view.turned_upright() for name, view in stored.items()}
     views = upright if capture.upright else stored
     pairs: list[_Pair] = []

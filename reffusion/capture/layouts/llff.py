@@ -90,11 +90,11 @@ def read(
         bounds[name] = float(row[15]), float(row[16])
     partial = folder / "sparse" / "0"
     lenses = _lens_of_partial_model(partial, lenses, pictures, warnings)
-    found = correction.apply(Poses(lenses, poses, *NO_POINTS, bounds))
-    points = _points_of_partial_model(partial, found.lenses, found.world_to_camera, found.bounds, warnings)
-    found = replace(found, points=points[0], colors=points[1])
+    right = correction.apply(Poses(lenses, poses, *NO_POINTS, bounds))
+    points = _points_of_partial_model(partial, right.lenses, right.world_to_camera, right.bounds, warnings)
+    right = replace(right, points=points[0], colors=points[1])
     paths = relative_paths(image_folder, pictures)
-    return Capture("llff", pictures, paths, found, source, label_folder, tuple(warnings))
+    return Capture("llff", pictures, paths, right, source, label_folder, tuple(warnings))
 
 
 def _label_folder(folder: Path, images: str | None) -> Path:
