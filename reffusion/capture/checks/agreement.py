@@ -15,7 +15,6 @@ PAPER leaves open: it takes the poses as given.
 from __future__ import annotations
 
 import itertools
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -24,6 +23,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 from reffusion.capture.layouts.capture import Capture, Correction, invert_pose
 from reffusion.capture.lens import Lens, to_directions
@@ -94,7 +94,7 @@ def judge_poses(capture: Capture) -> Agreement:
     given, names = capture.poses.world_to_camera, list(capture.pictures)
     chosen = np.unique(np.linspace(0, len(names) - 1, min(VIEWS, len(names))).round().astype(int))
     sources = {names[k]: (capture.pictures[names[k]], capture.poses.lenses[names[k]]) for k in chosen}
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         stored = dict(zip(sources, pool.map(_View.load, *zip(*sources.values(), strict=True)), strict=True))
     upright = {name: view.turned_upright() for name, view in stored.items()}
     views = upright if capture.upright else stored
