@@ -1,0 +1,272 @@
+"""Reading of masks that come with a scene: pictures of many kinds, cut-outs, arrays, and annotations of outlines.
+
+The brightness of a pixel is its largest channel, scaled to [0, 255].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from reffusion.io.annotations import annotation_size, is_annotation, load_annotation
+from reffusion.io.arrays import load_array
+from reffusion.io.files import BadInput, as_bad_input, check_pixels
+from reffusion.io.images import image_size, open_image, resize_nearest
+
+DARK = 8  # brightness up to which an area of a mask counts as background
+FLAT = 0.002  # share of a mask that a value must fill to count as an area, not as part of a soft edge
+SAMPLES = 500_000  # number of pixels from which the levels of a mask are estimated
+SLACK = 0.1  # of the difference of two levels: a pixel that is this close to a level has it
+TWO_LEVELS = 0.6  # least share of the pixels of a soft mask that have one of its two levels; photographs have up to 0.5
+# Least share of the marked pixels that have the upper level, if it is white, and if it is another colour. Photographs
+# cut out on black have up to 0.5, and are seldom white.
+WHITE_SHARE, COLOR_SHARE = 0.2, 0.8
+SPECKS = 0.05  # of a cut-out's pixels: largest area of dots in it and around it; photographs of the night have more
+
+
+@dataclass(frozen=True)
+class MaskValues:
+    """The pixel values of a mask file that mark the object.
+
+    Attributes:
+        ids: grey levels, entries of a palette, or categories of a COCO file that mark the object. If empty, white
+            pixels mark it, as `load_given_mask` describes.
+        inverted: True if the object is all other pixels instead.
+    """
+
+    ids: tuple[int, ...] = ()
+    inverted: bool = False
+
+
+WHITE = MaskValues()  # the object is white
+
+
+def given_mask_size(path: Path) -> tuple[int, int]:
+    """Return the (width, height) of a mask in pixels. The file may be of any kind that `load_given_mask` reads."""
+    if is_annotation(path):
+        return annotation_size(path)
+    if path.suffix.lower() == ".npy":
+        height, width = _load_array(path).shape
+        return width, height
+    return image_size(path)
+
+
+def load_given_mask(path: Path, size: tuple[int, int] | None = None, values: MaskValues = WHITE) -> np.ndarray:
+    """Read a mask as bool [H, W], True = masked.
+
+    A mask is one of these:
+
+    - a picture with two levels: {0, 1}, {0, 255}, one bit per pixel, a palette or one colour on black, of 8 or 16 bits
+      or floats. The threshold lies between the two levels, so lossy compression and soft edges do not matter;
+    - a photograph whose alpha varies: opaque pixels are the object. In other pictures transparent pixels are not;
+    - a photograph cut out on black, if more than half of it is black: every pixel but black is the object;
+    - labelme's outlines, or COCO's of one picture (`reffusion.io.annotations`);
+    - an array, [H, W] or [1, H, W].
+
+    Args:
+        size: (height, width) to which the mask is resized by nearest neighbour; None keeps the file's size.
+        values: which pixel values mark the object.
+
+    Raises:
+        BadInput: the file is unreadable, or has colours while `values` has `ids`. Without `ids`: the file is another
+            photograph; its alpha varies and its colours do not, because tools disagree whether transparent or opaque
+            pixels are the object; it has areas of several values or colours (such as numbers of objects); or its levels
+            are too dark to tell. The message names the file.
+    """
+    if is_annotation(path):
+        mask = load_annotation(path, values.ids)
+    elif path.suffix.lower() == ".npy":
+        array = _load_array(path)
+        with as_bad_input(path, "a readable mask"):
+            mask = np.isin(array, values.ids) if values.ids else _marked_pixels(path, array[..., None], True)
+    else:
+        with open_image(path, "a readable mask") as image:
+            mask = _numbered_pixels(path, image, values.ids) if values.ids else _drawn_pixels(path, image)
+    mask = mask ^ values.inverted
+    return mask if size is None else resize_nearest(mask, size)
+
+
+def _load_array(path: Path) -> np.ndarray:
+    """Read the array [H, W] or [1, H, W] in a .npy file, as [H, W]. Raises BadInput for any other array."""
+    array = load_array(path, "a readable mask")
+    single = array[0] if array.ndim == 3 and len(array) == 1 else array
+    if single.ndim != 2 or single.dtype.kind not in "biuf" or not single.size:
+        shape = " x ".join(map(str, array.shape))
+        raise BadInput(f"{path}: an array of {shape} {array.dtype}; save one mask, as high and wide as its picture")
+    check_pixels(path, *single.shape[::-1])
+    return single
+
+
+def _numbered_pixels(path: Path, image: Image.Image, ids: tuple[int, ...]) -> np.ndarray:
+    """Return the pixels, bool [H, W], whose object number (grey level, or entry of the palette) is one of `ids`.
+
+    Raises:
+        BadInput: the pixels have colours.
+    """
+    array = np.array(image)
+    opaque = array[..., -1] > 0 if image.mode in ("RGBA", "LA") and array[..., -1].any() else np.True_
+    if array.ndim == 3 and (array[..., :1] == array[..., : min(3, array.shape[2])]).all():
+        array = array[..., 0]
+    if array.ndim != 2:
+        raise BadInput(f"{path}: {image.mode} colours are no object numbers; save grey levels or a palette, or no `id`")
+    return np.isin(array, ids) & opaque
+
+
+def _drawn_pixels(path: Path, image: Image.Image) -> np.ndarray:
+    """Return the pixels, bool [H, W], that a picture marks by its alpha or by its colours.
+
+    Raises:
+        BadInput: as for `load_given_mask` without `ids`.
+    """
+    lossless, palette = image.format != "JPEG", image.mode in ("P", "PA")
+    if image.mode[0] in "IF" or not image.has_transparency_data:
+        array = np.array(image if image.mode[0] in "IF1L" and image.mode != "LAB" else image.convert("RGB"))
+        return _marked_pixels(path, array.reshape(*array.shape[:2], -1), lossless, palette)
+    array = np.array(image.convert("RGBA"))
+    colors, opaque = array[..., :3], array[..., 3] >= 128
+    if not np.ptp(array[..., 3]):
+        return _marked_pixels(path, colors, lossless, palette)
+    if (colors == colors[0, 0]).all():
+        raise BadInput(f"{path}: its alpha differs, its colours do not; write 255 where the object is, 0 elsewhere")
+    if opaque.any() and not _is_drawing(colors[opaque], lossless):
+        return opaque
+    return _marked_pixels(path, colors * opaque[..., None], lossless, palette)
+
+
+def _is_drawing(colors: np.ndarray, lossless: bool) -> bool:
+    """Return whether the opaque pixels of a picture, [N, 3], are of one colour, or black and one colour."""
+    if np.ptp(colors, axis=0).max() <= 2 * DARK:
+        return True
+    levels = _find_levels(colors[:: -(-len(colors) // SAMPLES)], lossless)
+    return levels.low <= 2 * DARK and levels.share >= 0.9 and levels.is_one_color
+
+
+def _marked_pixels(path: Path, colors: np.ndarray, lossless: bool, palette: bool = False) -> np.ndarray:
+    """Return the pixels, bool [H, W], that the colours of a mask mark.
+
+    Args:
+        path: the file, for messages.
+        colors: [H, W, C] of any type, C = 1 or 3.
+        lossless: False for JPEG, whose colours are not exact.
+        palette: True if the file has a palette, whose entries may be named as `masks: {id: ...}`.
+
+    Raises:
+        BadInput: the colours are those of several objects, or of a photograph.
+    """
+    is_gray = not np.ptp(colors, axis=2).any()
+    colors, numbers = _scale(colors), colors[..., 0] if is_gray else colors.astype(np.int32) @ (65536, 256, 1)
+    brightness = colors.max(2)
+    low, high = float(brightness.min()), float(brightness.max())
+    if low >= 255 - 2 * DARK or 0 <= low <= high <= (0 if lossless else 2 * DARK):  # a full or an empty mask
+        return brightness > 128
+    areas = [number for number in _flat_areas(numbers) if number > (DARK if is_gray else 0)] if lossless else []
+    if is_map := bool(areas) and np.isin(numbers[brightness > DARK], areas).mean() >= 0.5:
+        low, high = 0.0, float(brightness.flat[np.argmax(numbers == areas[0])])
+    if len(areas) > 1 and is_map and not is_gray:
+        numbered = ", or name the object's entries in scene.yaml: `masks: {id: ...}`" if palette else ""
+        raise BadInput(
+            f"{path}: {len(areas)} colours beside black; write white where the object is, black elsewhere{numbered}"
+        )
+    if is_gray and (low < 0 or high < 128 or (len(areas) > 1 and is_map)):
+        found = ", ".join(f"{number:g}" for number in (areas or [numbers.max()])[:6])
+        raise BadInput(
+            f"{path}: its values ({found}) are neither 0/1 nor 0/255; write 255 where the object is, 0 elsewhere, or "
+            "name the object's numbers in scene.yaml: `masks: {id: ...}`"
+        )
+    if is_map:
+        return brightness > high / 2
+    every = int(np.ceil((brightness.size / SAMPLES) ** 0.5))
+    levels = _find_levels(colors[::every, ::every].reshape(-1, colors.shape[2]), lossless)
+    if levels.are_a_mask:
+        return brightness > (levels.low + levels.high) / 2
+    if (cut_out := _cut_out(brightness > (DARK if lossless else 2 * DARK))) is not None:
+        return cut_out
+    raise BadInput(f"{path}: a photograph, not a mask; save white where the object is, black elsewhere")
+
+
+def _scale(colors: np.ndarray) -> np.ndarray:
+    """Return the colours of a mask scaled to [0, 255]: from [0, 1], [0, 255] or 16 bits, which their maximum tells."""
+    if colors.dtype == np.uint8 and colors.max() > 1:
+        return colors
+    colors = np.nan_to_num(colors.astype(np.float32))
+    return colors * 255 if colors.max() <= 1 else colors / 257 if colors.max() > 255 else colors
+
+
+def _flat_areas(numbers: np.ndarray) -> list:
+    """Return the values of an array [H, W] that fill areas, ascending.
+
+    A pixel lies in an area if its upper, left and upper left neighbours have the same value. Values that only occur
+    along soft edges are thereby left out. The areas of a value must cover more than the share `FLAT` of the pixels.
+    """
+    same = np.ones(numbers.shape, bool)
+    same[1:] &= numbers[1:] == numbers[:-1]
+    same[:, 1:] &= numbers[:, 1:] == numbers[:, :-1]
+    same[1:, 1:] &= numbers[1:, 1:] == numbers[:-1, :-1]
+    levels, counts = np.unique(numbers[same], return_counts=True)
+    return levels[counts > FLAT * numbers.size].tolist()
+
+
+@dataclass(frozen=True)
+class _Levels:
+    """How much a picture looks like a mask of two levels of brightness.
+
+    Attributes:
+        low, high: the two levels.
+        share: share of all pixels that have one of them.
+        high_share: share of the pixels above the lower level that have the upper one.
+        is_white: True if the upper level is white or a light grey.
+        is_one_color: True if nearly all of the pixels above the lower level have the same hue.
+    """
+
+    low: float
+    high: float
+    share: float
+    high_share: float
+    is_white: bool
+    is_one_color: bool
+
+    @property
+    def are_a_mask(self) -> bool:
+        least = WHITE_SHARE if self.is_white else COLOR_SHARE
+        return self.share >= TWO_LEVELS and self.is_one_color and self.high_share >= least
+
+
+def _find_levels(colors: np.ndarray, lossless: bool) -> _Levels:
+    """Return the two levels of pixels [N, C]: the medians of those darker and lighter than the middle of the range."""
+    colors = colors.astype(np.float32)
+    brightness = colors.max(1)
+    middle = (brightness.min() + brightness.max()) / 2
+    low, high = np.median(brightness[brightness <= middle]), np.median(brightness[brightness >= middle])
+    slack = SLACK * (high - low)
+    has_low, has_high = np.abs(brightness - low) <= slack, np.abs(brightness - high) <= slack
+    color, above = np.median(colors[has_high], axis=0), brightness > low + slack
+    if not above.any():
+        return _Levels(low, high, 1.0, 0.0, False, True)
+    is_gray = np.ptp(color) <= 4
+    # JPEG keeps grey exactly, but halves the resolution of hues.
+    tolerance = 4 if lossless or is_gray else 40
+    other_hue = np.abs(colors[above] - brightness[above, None] * (color / color.max())).max(1) > tolerance
+    share, high_share = float((has_low | has_high).mean()), float(has_high[above].mean())
+    return _Levels(low, high, share, high_share, bool(is_gray and high >= 200), other_hue.mean() <= 0.1)
+
+
+def _cut_out(drawn: np.ndarray) -> np.ndarray | None:
+    """Return the object, bool [H, W], in a photograph that was cut out on black; None if that is ambiguous.
+
+    Dots of at most 1 % of the drawn pixels are removed outside the object and filled inside. In a photograph of the
+    night, as opposed to a cut-out, such dots are many.
+
+    Args:
+        drawn: bool [H, W], the pixels that are not black.
+    """
+    from reffusion.morphology import remove_small_parts  # imports scipy, which `plan` should not wait for
+
+    count = int(drawn.sum())
+    if not 0 < count <= drawn.size / 2:
+        return None
+    diameter = (0.01 * count * 4 / np.pi) ** 0.5
+    mask = remove_small_parts(drawn, diameter, diameter)
+    return mask if (mask ^ drawn).sum() <= SPECKS * count else None
