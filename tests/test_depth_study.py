@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.studies import depth as study
 from reffusion.io import colmap
-from reffusion.io.images import load_mask
+from reffusion.io.given_masks import load_given_mask
 
 pytestmark = pytest.mark.integration
 
@@ -25,7 +25,7 @@ def test_truth_is_where_sparse_points_are(generate, tmp_path):
     points = colmap.load_model_points(folder / "sparse/0/points3D.bin").positions
     agreeing, hidden = [], []
     for label in sorted((folder / "images_4/label").glob("*.png")):
-        mask, pose = load_mask(label), np.array(truth["world_to_camera"][label.stem])
+        mask, pose = load_given_mask(label), np.array(truth["world_to_camera"][label.stem])
         x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).T
         rays = np.stack([x / z, y / z], 1)
         bent = truth["f"] * (1 + truth["k1"] * (rays**2).sum(1, keepdims=True)) * rays

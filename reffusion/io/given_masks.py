@@ -16,14 +16,16 @@ from reffusion.io.arrays import load_array
 from reffusion.io.files import BadInput, as_bad_input, check_pixels
 from reffusion.io.images import image_size, open_image, resize_nearest
 
-DARK = 8  # brightness up to which an area of a mask counts as background
+DARK, LIGHT = 8, 200  # brightness up to which an area counts as background, and from which as a light grey
 FLAT = 0.002  # share of a mask that a value must fill to count as an area, not as part of a soft edge
 SAMPLES = 500_000  # number of pixels from which the levels of a mask are estimated
 SLACK = 0.1  # of the difference of two levels: a pixel that is this close to a level has it
-TWO_LEVELS = 0.6  # least share of the pixels of a soft mask that have one of its two levels; photographs have up to 0.5
-# Least share of the marked pixels that have the upper level, if it is white, and if it is another colour. Photographs
-# cut out on black have up to 0.5, and are seldom white.
-WHITE_SHARE, COLOR_SHARE = 0.2, 0.8
+# A mask of two areas: least share of the pixels above the lower level that are even and have the upper one, and least
+# share of all pixels that are even and have the lower one. Photographs cut out on black have up to 0.02 of the former.
+EVEN_HIGH, EVEN_LOW = 0.1, 0.05
+# A mask of thin white parts: least share of all pixels that have one of the levels (photographs have up to 0.5), and of
+# the pixels above the lower level that have the upper one.
+THIN, THIN_HIGH = 0.6, 0.2
 SPECKS = 0.05  # of a cut-out's pixels: largest area of dots in it and around it; photographs of the night have more
 
 
@@ -107,8 +109,10 @@ def _numbered_pixels(path: Path, image: Image.Image, ids: tuple[int, ...]) -> np
         BadInput: the pixels have colours.
     """
     array = np.array(image)
-    opaque = array[..., -1] > 0 if image.mode in ("RGBA", "LA") and array[..., -1].any() else np.True_
-    if array.ndim == 3 and (array[..., :1] == array[..., : min(3, array.shape[2])]).all():
+    opaque: np.ndarray | bool = True
+    if image.mode in ("RGBA", "LA"):
+        array, opaque = array[..., :-1], array[..., -1] > 0
+    if array.ndim == 3 and (array[..., :1] == array).all():
         array = array[..., 0]
     if array.ndim != 2:
         raise BadInput(f"{path}: {image.mode} colours are no object numbers; save grey levels or a palette, or no `id`")
@@ -140,7 +144,8 @@ def _is_drawing(colors: np.ndarray, lossless: bool) -> bool:
     """Return whether the opaque pixels of a picture, [N, 3], are of one colour, or black and one colour."""
     if np.ptp(colors, axis=0).max() <= 2 * DARK:
         return True
-    levels = _find_levels(colors[:: -(-len(colors) // SAMPLES)], lossless)
+    some = colors[:: -(-len(colors) // SAMPLES)]
+    levels = _find_levels(some, np.ones(len(some), bool), lossless)
     return levels.low <= 2 * DARK and levels.share >= 0.9 and levels.is_one_color
 
 
@@ -156,13 +161,15 @@ def _marked_pixels(path: Path, colors: np.ndarray, lossless: bool, palette: bool
     Raises:
         BadInput: the colours are those of several objects, or of a photograph.
     """
+    colors = colors.astype(np.uint8) if colors.dtype == bool else colors
     is_gray = not np.ptp(colors, axis=2).any()
     colors, numbers = _scale(colors), colors[..., 0] if is_gray else colors.astype(np.int32) @ (65536, 256, 1)
     brightness = colors.max(2)
     low, high = float(brightness.min()), float(brightness.max())
     if low >= 255 - 2 * DARK or 0 <= low <= high <= (0 if lossless else 2 * DARK):  # a full or an empty mask
         return brightness > 128
-    areas = [number for number in _flat_areas(numbers) if number > (DARK if is_gray else 0)] if lossless else []
+    even = _even_pixels(numbers)
+    areas = [number for number in _flat_areas(numbers, even) if number > (DARK if is_gray else 0)] if lossless else []
     if is_map := bool(areas) and np.isin(numbers[brightness > DARK], areas).mean() >= 0.5:
         low, high = 0.0, float(brightness.flat[np.argmax(numbers == areas[0])])
     if len(areas) > 1 and is_map and not is_gray:
@@ -179,8 +186,9 @@ def _marked_pixels(path: Path, colors: np.ndarray, lossless: bool, palette: bool
     if is_map:
         return brightness > high / 2
     every = int(np.ceil((brightness.size / SAMPLES) ** 0.5))
-    levels = _find_levels(colors[::every, ::every].reshape(-1, colors.shape[2]), lossless)
-    if levels.are_a_mask:
+    some = colors[::every, ::every].reshape(-1, colors.shape[2])
+    levels = _find_levels(some, even[::every, ::every].ravel(), lossless)
+    if levels.has_two and levels.is_one_color:
         return brightness > (levels.low + levels.high) / 2
     if (cut_out := _cut_out(brightness > (DARK if lossless else 2 * DARK))) is not None:
         return cut_out
@@ -195,17 +203,21 @@ def _scale(colors: np.ndarray) -> np.ndarray:
     return colors * 255 if colors.max() <= 1 else colors / 257 if colors.max() > 255 else colors
 
 
-def _flat_areas(numbers: np.ndarray) -> list:
-    """Return the values of an array [H, W] that fill areas, ascending.
-
-    A pixel lies in an area if its upper, left and upper left neighbours have the same value. Values that only occur
-    along soft edges are thereby left out. The areas of a value must cover more than the share `FLAT` of the pixels.
-    """
+def _even_pixels(numbers: np.ndarray) -> np.ndarray:
+    """Return the pixels of an array, bool [H, W], whose upper, left and upper left neighbours have the same value."""
     same = np.ones(numbers.shape, bool)
     same[1:] &= numbers[1:] == numbers[:-1]
     same[:, 1:] &= numbers[:, 1:] == numbers[:, :-1]
     same[1:, 1:] &= numbers[1:, 1:] == numbers[:-1, :-1]
-    levels, counts = np.unique(numbers[same], return_counts=True)
+    return same
+
+
+def _flat_areas(numbers: np.ndarray, even: np.ndarray) -> list:
+    """Return the values of an array [H, W] whose even pixels are more than the share `FLAT` of all pixels, ascending.
+
+    Values that only occur along soft edges are thereby left out.
+    """
+    levels, counts = np.unique(numbers[even], return_counts=True)
     return levels[counts > FLAT * numbers.size].tolist()
 
 
@@ -215,42 +227,49 @@ class _Levels:
 
     Attributes:
         low, high: the two levels.
-        share: share of all pixels that have one of them.
-        high_share: share of the pixels above the lower level that have the upper one.
-        is_white: True if the upper level is white or a light grey.
+        has_two: True if there are two even areas of these levels, or thin white parts on the lower level.
+        share: share of all pixels that have one of the levels.
         is_one_color: True if nearly all of the pixels above the lower level have the same hue.
     """
 
     low: float
     high: float
+    has_two: bool
     share: float
-    high_share: float
-    is_white: bool
     is_one_color: bool
 
-    @property
-    def are_a_mask(self) -> bool:
-        least = WHITE_SHARE if self.is_white else COLOR_SHARE
-        return self.share >= TWO_LEVELS and self.is_one_color and self.high_share >= least
 
+def _find_levels(colors: np.ndarray, even: np.ndarray, lossless: bool) -> _Levels:
+    """Return the two levels of pixels [N, C]: the medians of those darker and lighter than the middle of the range.
 
-def _find_levels(colors: np.ndarray, lossless: bool) -> _Levels:
-    """Return the two levels of pixels [N, C]: the medians of those darker and lighter than the middle of the range."""
+    The upper level of a grey picture that reaches a light grey is its maximum instead, because soft edges may be wider
+    than what they surround.
+
+    Args:
+        even: bool [N], the pixels that equal their neighbours.
+        lossless: False for JPEG.
+    """
     colors = colors.astype(np.float32)
     brightness = colors.max(1)
-    middle = (brightness.min() + brightness.max()) / 2
-    low, high = np.median(brightness[brightness <= middle]), np.median(brightness[brightness >= middle])
+    bottom, top = float(brightness.min()), float(brightness.max())
+    light = brightness >= (bottom + top) / 2
+    low, high = float(np.median(brightness[brightness <= (bottom + top) / 2])), float(np.median(brightness[light]))
     slack = SLACK * (high - low)
-    has_low, has_high = np.abs(brightness - low) <= slack, np.abs(brightness - high) <= slack
-    color, above = np.median(colors[has_high], axis=0), brightness > low + slack
+    above, has_low = brightness > low + slack, np.abs(brightness - low) <= slack
     if not above.any():
-        return _Levels(low, high, 1.0, 0.0, False, True)
+        return _Levels(low, high, False, 1.0, True)
+    has_high = np.abs(brightness - high) <= slack
+    color = np.median(colors[has_high], axis=0)
     is_gray = np.ptp(color) <= 4
     # JPEG keeps grey exactly, but halves the resolution of hues.
     tolerance = 4 if lossless or is_gray else 40
     other_hue = np.abs(colors[above] - brightness[above, None] * (color / color.max())).max(1) > tolerance
-    share, high_share = float((has_low | has_high).mean()), float(has_high[above].mean())
-    return _Levels(low, high, share, high_share, bool(is_gray and high >= 200), other_hue.mean() <= 0.1)
+    share = float((has_low | has_high).mean())
+    is_thin = is_gray and high >= LIGHT and share >= THIN and has_high[above].mean() >= THIN_HIGH
+    if is_gray and top >= LIGHT:
+        high, has_high = top, top - brightness <= slack
+    areas = (has_high & even)[above].mean() >= EVEN_HIGH and (has_low & even).mean() >= EVEN_LOW
+    return _Levels(low, high, bool(is_thin or areas), share, bool(other_hue.mean() <= 0.1))
 
 
 def _cut_out(drawn: np.ndarray) -> np.ndarray | None:

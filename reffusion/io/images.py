@@ -194,10 +194,13 @@ def load_mask(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
         size: (height, width) to which the mask is resized by nearest neighbour; None keeps the file's size.
 
     Raises:
-        BadInput: the file is unreadable; the message names it.
+        BadInput: the file is unreadable, or has other values than 0 and 255; the message names it.
     """
     with open_image(path, "a readable mask") as image:
-        mask = np.array(image.convert("L")) >= 128
+        levels = np.array(image.convert("L"))
+    mask = levels == 255
+    if not (mask | (levels == 0)).all():
+        raise BadInput(f"{path}: its values are not only 0 and 255; it is no mask that a stage wrote")
     return mask if size is None else resize_nearest(mask, size)
 
 

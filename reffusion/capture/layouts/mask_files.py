@@ -136,14 +136,12 @@ def _visible_files(place: Path, endings: Collection[str] = ()) -> list[str]:
     """Return the paths of the files in a folder and its sub-folders, sorted, relative to it, but no hidden files.
 
     Args:
-        endings: the endings, in lower case, of the files that are returned; all files if empty.
+        endings: the endings, in lower case, of the paths that are returned, also of folders and broken links, which
+            readers refuse; if empty, all files.
     """
-    paths = ((path, path.relative_to(place)) for path in place.rglob("*") if path.is_file())
-    return sorted(
-        relative.as_posix()
-        for path, relative in paths
-        if (not endings or path.suffix.lower() in endings) and not any(part.startswith(".") for part in relative.parts)
-    )
+    paths = [path for path in place.rglob("*") if (path.suffix.lower() in endings if endings else path.is_file())]
+    relative = [path.relative_to(place) for path in paths]
+    return sorted(each.as_posix() for each in relative if not any(part.startswith(".") for part in each.parts))
 
 
 def _unread(place: Path) -> str:
