@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -92,6 +93,12 @@ def test_unreadable_pictures_are_named(tmp_path):
             load_image(tmp_path / name)
     with pytest.raises(ValueError, match="not finite"):
         save_image(tmp_path / "nan.png", np.full((2, 2, 3), np.nan))
+
+
+def test_a_tiff_of_float_colors_is_named(tmp_path):
+    cv2.imwrite(str(tmp_path / "x.tif"), np.zeros((4, 5, 3), np.float32))
+    with pytest.raises(ValueError, match=r"x\.tif: a TIFF of pixels that are not read.*8 or 16 bits"):
+        load_image(tmp_path / "x.tif")
 
 
 def test_own_masks_come_back_as_they_were(tmp_path):

@@ -74,9 +74,8 @@ def describe_transparency(names: Collection[str], capture: Capture) -> list[str]
     if not found:
         return []
     named = ", ".join(found[:4]) + (f" and {len(found) - 4} more" if len(found) > 4 else "")
-    return [
-        f"{len(found)} photographs have transparent pixels, which are shown over black and trained on as black: {named}"
-    ]
+    count = "1 photograph has" if len(found) == 1 else f"{len(found)} photographs have"
+    return [f"{count} transparent pixels, which are trained on as black: {named}"]
 
 
 def save_undistorted_masks(out: Path, name: str, roles: Roles, lens: Lens) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, UnidentifiedImageError
 
 from reffusion.io.files import BadInput, check_pixels, reading, shorten
 
@@ -21,6 +21,7 @@ _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "HEIF")
 _HEIC_BRANDS = tuple(
     b"ftyp" + brand for brand in (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"hevc", b"hevx")
 )
+_TIFF = (b"II*\0", b"MM\0*")  # first bytes of a TIFF file
 logging.getLogger("PIL").addHandler(logging.NullHandler())  # errors here say the same in one line
 Image.MAX_IMAGE_PIXELS = None  # `open_image` checks the size: Pillow would warn from half of its own limit on
 
@@ -41,9 +42,18 @@ def open_image(path: Path, what: str = "a readable image") -> Iterator[Image.Ima
             if file.read(12)[4:12] in _HEIC_BRANDS:  # the ending of the file's name may be another one
                 _register_heic(path)
         known = [each for each in _FORMATS if each != "HEIF" or each in Image.OPEN]
-    with reading(path, what), Image.open(path, formats=known) as image:
-        check_pixels(path, *image.size)
-        yield image
+    with reading(path, what):
+        try:
+            image = Image.open(path, formats=known)
+        except UnidentifiedImageError:
+            if Path(path).read_bytes()[:4] in _TIFF:
+                raise BadInput(
+                    f"{path}: a TIFF of pixels that are not read, such as colours as floats; save it with 8 or 16 bits"
+                ) from None
+            raise
+        with image:
+            check_pixels(path, *image.size)
+            yield image
 
 
 def _register_heic(path: Path) -> None:
