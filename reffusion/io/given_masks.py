@@ -162,16 +162,18 @@ def _marked_pixels(path: Path, colors: np.ndarray, lossless: bool, palette: bool
         BadInput: the colours are those of several objects, or of a photograph.
     """
     colors = colors.astype(np.uint8) if colors.dtype == bool else colors
-    is_gray = not np.ptp(colors, axis=2).any()
-    colors, numbers = _scale(colors), colors[..., 0] if is_gray else colors.astype(np.int32) @ (65536, 256, 1)
-    brightness = colors.max(2)
-    low, high = float(brightness.min()), float(brightness.max())
+    is_gray = all((colors[..., :1] == colors[..., k : k + 1]).all() for k in range(1, colors.shape[2]))
+    colors = colors[..., :1] if is_gray else colors
+    some, even = _sample(colors)
+    numbers = some[:, 0] if is_gray else some.astype(np.int32) @ (65536, 256, 1)
+    scale = _scale_of(colors)
+    brightness, some = _brightness(colors) * scale, some * scale
+    low, high = float(np.nanmin(brightness)), float(np.nanmax(brightness))
     if low >= 255 - 2 * DARK or 0 <= low <= high <= (0 if lossless else 2 * DARK):  # a full or an empty mask
         return brightness > 128
-    even = _even_pixels(numbers)
     areas = [number for number in _flat_areas(numbers, even) if number > (DARK if is_gray else 0)] if lossless else []
-    if is_map := bool(areas) and np.isin(numbers[brightness > DARK], areas).mean() >= 0.5:
-        low, high = 0.0, float(brightness.flat[np.argmax(numbers == areas[0])])
+    if is_map := bool(areas) and np.isin(numbers[some.max(1) > DARK], areas).mean() >= 0.5:
+        low, high = 0.0, float(some[np.argmax(numbers == areas[0])].max())
     if len(areas) > 1 and is_map and not is_gray:
         numbered = ", or name the object's entries in scene.yaml: `masks: {id: ...}`" if palette else ""
         raise BadInput(
@@ -185,9 +187,7 @@ def _marked_pixels(path: Path, colors: np.ndarray, lossless: bool, palette: bool
         )
     if is_map:
         return brightness > high / 2
-    every = int(np.ceil((brightness.size / SAMPLES) ** 0.5))
-    some = colors[::every, ::every].reshape(-1, colors.shape[2])
-    levels = _find_levels(some, even[::every, ::every].ravel(), lossless)
+    levels = _find_levels(some, even, lossless)
     if levels.has_two and levels.is_one_color:
         return brightness > (levels.low + levels.high) / 2
     if (cut_out := _cut_out(brightness > (DARK if lossless else 2 * DARK))) is not None:
@@ -195,25 +195,39 @@ def _marked_pixels(path: Path, colors: np.ndarray, lossless: bool, palette: bool
     raise BadInput(f"{path}: a photograph, not a mask; save white where the object is, black elsewhere")
 
 
-def _scale(colors: np.ndarray) -> np.ndarray:
-    """Return the colours of a mask scaled to [0, 255]: from [0, 1], [0, 255] or 16 bits, which their maximum tells."""
-    if colors.dtype == np.uint8 and colors.max() > 1:
-        return colors
-    colors = np.nan_to_num(colors.astype(np.float32))
-    return colors * 255 if colors.max() <= 1 else colors / 257 if colors.max() > 255 else colors
+def _brightness(colors: np.ndarray) -> np.ndarray:
+    """Return the largest channel of colours [H, W, C], as [H, W]. `max` over a short last axis is ten times slower."""
+    return (
+        colors[..., 0]
+        if colors.shape[2] == 1
+        else np.maximum(np.maximum(*np.moveaxis(colors[..., :2], 2, 0)), colors[..., 2])
+    )
 
 
-def _even_pixels(numbers: np.ndarray) -> np.ndarray:
-    """Return the pixels of an array, bool [H, W], whose upper, left and upper left neighbours have the same value."""
-    same = np.ones(numbers.shape, bool)
-    same[1:] &= numbers[1:] == numbers[:-1]
-    same[:, 1:] &= numbers[:, 1:] == numbers[:, :-1]
-    same[1:, 1:] &= numbers[1:, 1:] == numbers[:-1, :-1]
-    return same
+def _scale_of(colors: np.ndarray) -> float | int:
+    """Return the factor to [0, 255] of colours in [0, 1], [0, 255] or 16 bits, which their maximum tells."""
+    top = np.nanmax(colors)
+    if top <= 1:
+        return np.float32(255) if colors.dtype.kind == "f" else np.uint8(255)
+    return np.float32(1 / 257) if top > 255 else np.uint8(1)
+
+
+def _sample(colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return about `SAMPLES` pixels of colours [H, W, C], evenly spaced, as [N, C], and which are even, bool [N].
+
+    An even pixel has the same colour as its upper, left and upper left neighbours.
+    """
+    every = int(np.ceil((colors.shape[0] * colors.shape[1] / SAMPLES) ** 0.5))
+    if every == 1:  # a small picture, of which borders count too
+        colors = np.pad(colors, ((1, 0), (1, 0), (0, 0)), mode="edge")
+    here, before = slice(1, None, every), slice(0, -1, every)
+    some = colors[here, here]
+    even = np.all([(some == colors[r, c]).all(2) for r, c in ((before, here), (here, before), (before, before))], 0)
+    return some.reshape(-1, colors.shape[2]), even.ravel()
 
 
 def _flat_areas(numbers: np.ndarray, even: np.ndarray) -> list:
-    """Return the values of an array [H, W] whose even pixels are more than the share `FLAT` of all pixels, ascending.
+    """Return the values of an array [N] whose even pixels are more than the share `FLAT` of all pixels, ascending.
 
     Values that only occur along soft edges are thereby left out.
     """
