@@ -38,7 +38,8 @@ from reffusion.clicks.single_view import ViewEvidence
 from reffusion.command import root
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.files import BadInput
-from reffusion.io.images import WHITE, replace_image, to_uint8
+from reffusion.io.given_masks import WHITE
+from reffusion.io.images import replace_image, to_uint8
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import list_objects, load_raw_masks, load_scene, load_views
 from reffusion.params.clicks import CLICKS

@@ -24,7 +24,13 @@ from reffusion.capture.lenses import save_lenses
 from reffusion.capture.refine import refine_cameras
 from reffusion.capture.roles import Roles
 from reffusion.capture.scene_folder import check_gaussian_files, is_gaussians_only, read_scene
-from reffusion.capture.undistort import fitting_size, load_resized, resized_lens, save_undistorted_view
+from reffusion.capture.undistort import (
+    describe_transparency,
+    fitting_size,
+    load_resized,
+    resized_lens,
+    save_undistorted_view,
+)
 from reffusion.capture.views import check_outliers
 from reffusion.gaussians import matching
 from reffusion.io.arrays import save_json, save_labels
@@ -79,6 +85,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
             corrections = [agreement.describe(capture.pose_source)]
             capture, roles = read_scene(params, scene, params.longest, agreement.correction)
     messages = [*corrections, *capture.warnings, *(own_splats.notes if own_splats else ())]
+    messages += describe_transparency([*roles.train, *roles.test], capture)
     sizes = {name: image_size(path, upright=capture.upright) for name, path in capture.pictures.items()}
     if capture.poses is None:
         everyone, capture = sorted(capture.pictures), _run_sfm(params, out, capture)

@@ -34,6 +34,7 @@ from reffusion.capture.scene_folder import read_scene
 from reffusion.io import colmap
 from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput
+from reffusion.io.given_masks import load_given_mask
 from reffusion.io.images import load_mask
 from reffusion.io.ply import save_points
 from reffusion.io.scene import list_objects, load_raw_masks, load_views
@@ -239,11 +240,11 @@ def test_soft_edges_and_grey_objects_are_no_object_numbers(tmp_path):
     rows, columns = np.mgrid[:100, :150]
     soft = np.clip(400 - 8 * np.hypot(rows - 50, columns - 70), 0, 255).astype(np.uint8)
     Image.fromarray(soft).save(tmp_path / "soft.png")
-    assert np.array_equal(load_mask(tmp_path / "soft.png"), soft >= 128)
+    assert np.array_equal(load_given_mask(tmp_path / "soft.png"), soft >= 128)
     Image.fromarray(np.where(soft >= 128, np.uint8(200), np.uint8(0))).save(tmp_path / "grey.png")
-    assert np.array_equal(load_mask(tmp_path / "grey.png"), soft >= 128)
+    assert np.array_equal(load_given_mask(tmp_path / "grey.png"), soft >= 128)
     Image.fromarray(soft).save(tmp_path / "lossy.jpg", quality=40)
-    assert (load_mask(tmp_path / "lossy.jpg") != (soft >= 128)).mean() < 0.01
+    assert (load_given_mask(tmp_path / "lossy.jpg") != (soft >= 128)).mean() < 0.01
 
 
 # -------------------------------------------------------------------------- references and masks beside photographs

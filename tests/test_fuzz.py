@@ -30,7 +30,8 @@ from reffusion.io.colmap import ModelCamera, ModelImage, load_cameras, load_imag
 from reffusion.io.compressed import save_spz
 from reffusion.io.depth_maps import load_depth
 from reffusion.io.files import BadInput
-from reffusion.io.images import image_size, load_exr, load_image, load_mask, save_exr
+from reffusion.io.given_masks import load_given_mask
+from reffusion.io.images import image_size, load_alpha, load_exr, load_image, load_mask, save_exr
 from reffusion.io.ply import load_ply, load_points, save_ply, save_points
 from reffusion.io.quantized import save_splat
 from reffusion.io.splats import load_splats, summarize_splats
@@ -97,6 +98,9 @@ IMAGES_TXT = b"""# ids
 
 """
 POINTS_TXT = b"# ids\n1 0.5 1 2 255 0 9 0.3 1 0 2 1\n2 -1 1e3 0 1 2 3 0.1\n"
+LABELME = json.dumps(
+    {"imageWidth": 12, "imageHeight": 9, "shapes": [{"label": "a", "points": [[1, 1], [9, 2], [5, 7]]}]}
+).encode()
 TRANSFORMS = json.dumps(
     {
         "w": 12,
@@ -199,7 +203,8 @@ def readers() -> list[Reader]:
             try_read(read, path)
 
     def any_picture(path: Path) -> None:
-        for read in (image_size, load_image, load_mask, lambda p: image_size(p, True), lambda p: load_image(p, True)):
+        upright = (lambda p: image_size(p, True), lambda p: load_image(p, True))
+        for read in (image_size, load_image, load_alpha, load_mask, load_given_mask, *upright):
             try_read(read, path)
 
     return [
@@ -227,6 +232,8 @@ def readers() -> list[Reader]:
         Reader("d.exr", load_depth, of("d.exr")),
         Reader("d.npy", load_depth, of("d.npy")),
         Reader("d.png", load_depth, of("deep.png", "p.tif", "p.png")),
+        Reader("mask.npy", load_given_mask, of("d.npy")),
+        Reader("mask.json", load_given_mask, (LABELME,)),
         Reader("array.npy", load_array, of("d.npy", "poses_bounds.npy")),
         Reader("any.json", load_json, (TRANSFORMS,)),
         Reader("any.exr", load_exr, (*of("d.exr"), *pictures)),

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -16,7 +17,17 @@ from scenes.random_scene import random_gaussians, random_rotation, random_scene
 
 from reffusion.io import rotations
 from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
-from reffusion.io.images import image_size, load_exr, load_image, load_mask, save_exr, save_image, save_mask
+from reffusion.io.images import (
+    image_size,
+    load_alpha,
+    load_exr,
+    load_image,
+    load_mask,
+    load_thumbnail,
+    save_exr,
+    save_image,
+    save_mask,
+)
 from reffusion.io.ply import load_ply, load_points, save_ply, save_points
 from reffusion.io.scene import (
     load_mask_sets,
@@ -75,37 +86,39 @@ def test_unreadable_pictures_are_named(tmp_path):
         save_image(tmp_path / "nan.png", np.full((2, 2, 3), np.nan))
 
 
-def test_masks_of_every_kind(tmp_path):
+def test_a_tiff_of_float_colors_is_named(tmp_path):
+    cv2.imwrite(str(tmp_path / "x.tif"), np.zeros((4, 5, 3), np.float32))
+    with pytest.raises(ValueError, match=r"x\.tif: a TIFF of pixels that are not read.*8 or 16 bits"):
+        load_image(tmp_path / "x.tif")
+
+
+def test_own_masks_come_back_as_they_were(tmp_path):
     truth = np.random.default_rng(0).random((6, 8)) < 0.5
-    one, full = truth.astype(np.uint8), truth.astype(np.uint8) * 255
-    Image.fromarray(one).save(tmp_path / "one.png")
-    Image.fromarray(full).save(tmp_path / "full.png")
-    Image.fromarray(truth).save(tmp_path / "bit.png")
-    Image.fromarray(np.dstack([full, full, full])).save(tmp_path / "rgb.png")
-    Image.fromarray(np.dstack([one, one, one, np.full_like(one, 255)])).save(tmp_path / "rgba.png")
-    palette = Image.fromarray(one * 3, mode="P")
-    palette.putpalette([0, 0, 0] * 3 + [200, 0, 0])
-    palette.save(tmp_path / "palette.png")
-    Image.fromarray(one.astype(np.uint16) * 65535).save(tmp_path / "deep.png")
-    save_mask(tmp_path / "ours.png", truth)
-    for path in tmp_path.glob("*.png"):
-        assert np.array_equal(load_mask(path), truth), path.name
-    save_mask(tmp_path / "empty.png", np.zeros((3, 3), bool))
-    assert not load_mask(tmp_path / "empty.png").any()
-
-
-def test_mask_with_other_values_is_refused(tmp_path):
-    Image.fromarray(np.array([[0, 1, 7]], np.uint8)).save(tmp_path / "odd.png")
-    with pytest.raises(ValueError, match=r"odd\.png.*7"):
-        load_mask(tmp_path / "odd.png")
-
-
-def test_masks_are_resized_by_nearest_neighbour(tmp_path):
-    truth = np.zeros((8, 8), bool)
-    truth[2:4, 4:8] = True
     save_mask(tmp_path / "x.png", truth)
-    assert np.array_equal(load_mask(tmp_path / "x.png", (16, 24)), truth.repeat(2, 0).repeat(3, 1))
-    assert np.array_equal(load_mask(tmp_path / "x.png", (4, 4)), truth[::2, ::2])
+    assert np.array_equal(load_mask(tmp_path / "x.png"), truth)
+    assert np.array_equal(load_mask(tmp_path / "x.png", (3, 4)), truth[1::2, 1::2])
+    Image.fromarray(truth.astype(np.uint8)).save(tmp_path / "ones.png")
+    with pytest.raises(ValueError, match=r"ones\.png.*0 and 255"):
+        load_mask(tmp_path / "ones.png")
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA", "P"])
+def test_transparent_pixels_are_shown_over_black(tmp_path, mode):
+    """Alpha is straight. The palette has one transparent entry, as in a GIF or an 8-bit PNG."""
+    color = np.array([[[200, 200, 200], [200, 200, 200], [90, 90, 90]]], np.uint8)
+    alpha = np.array([[255, 0 if mode == "P" else 51, 255]], np.uint8)
+    options = {"transparency": 1} if mode == "P" else {}
+    if mode == "P":
+        picture = Image.fromarray(np.array([[0, 1, 2]], np.uint8), "P")
+        picture.putpalette([200, 200, 200, 200, 200, 200, 90, 90, 90])
+    else:
+        picture = Image.fromarray(np.dstack([color, alpha])).convert(mode)
+    picture.save(tmp_path / "x.png", **options)
+    assert load_image(tmp_path / "x.png")[0, :, 0].tolist() == [200, 0 if mode == "P" else 40, 90]
+    assert load_thumbnail(tmp_path / "x.png", 3)[0, :, 1].tolist() == [200, 0 if mode == "P" else 40, 90]
+    assert load_alpha(tmp_path / "x.png").tolist() == alpha.tolist()
+    picture.convert("RGB").convert("RGBA").save(tmp_path / "opaque.png")
+    assert load_alpha(tmp_path / "opaque.png") is None
 
 
 def test_exr_keeps_every_bit(tmp_path):

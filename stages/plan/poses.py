@@ -9,6 +9,7 @@ from reffusion.capture.layouts import cameras
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.roles import capture_views, describe_split
 from reffusion.capture.scene_folder import check_gaussian_files, is_gaussians_only, read_scene
+from reffusion.io.annotations import file_of
 from reffusion.io.images import ENDINGS
 from reffusion.params.clicks import CLICKS
 from reffusion.params.poses import Params
@@ -41,8 +42,9 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
         return others
     shown = {path for name, path in capture.pictures.items() if name not in roles.blank}
     read = shown | brought | set(capture.depth_maps)
+    masks = {file_of(path) for files in roles.mask_files.values() for path in files.values()}
     kept = [path for path in others if path.suffix.lower() not in NOT_READ or path.name == "poses_bounds.npy"]
-    return sorted(read | {path for path in kept if path.parent != scene / PAINTED})
+    return sorted(read | {path for path in kept if path.parent != scene / PAINTED and path not in masks})
 
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
