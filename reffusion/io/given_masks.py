@@ -204,7 +204,7 @@ def _brightness(colors: np.ndarray) -> np.ndarray:
     )
 
 
-def _scale_of(colors: np.ndarray) -> float | int:
+def _scale_of(colors: np.ndarray) -> np.float32 | np.uint8:
     """Return the factor to [0, 255] of colours in [0, 1], [0, 255] or 16 bits, which their maximum tells."""
     top = np.nanmax(colors)
     if top <= 1:
