@@ -692,7 +692,7 @@ def test_marks_that_do_not_fit_the_scene_are_refused(page_server):
         (b"[", "400"),
         (b" " * 2_000_001, "413"),
     ):
-        request = urllib.request.Request(page_server.address + "mark", content)
+        request = urllib.request.Request(page_server.server.link("scenes/scene/mask/mark"), content)
         with pytest.raises(urllib.error.HTTPError, match=status):
             urllib.request.urlopen(request)
     assert not page_server.session.events

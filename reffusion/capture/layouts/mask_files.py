@@ -6,12 +6,12 @@ Masks may distinguish between several objects: each object then has a folder of 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.names import MASK_ENDINGS, is_mask_of_another, mask_stems, pair_masks, strip_ending
+from reffusion.capture.names import MASK_ENDINGS, is_mask_of_another, pair_masks, strip_ending
 from reffusion.io.annotations import annotated_pictures, is_labelme
 from reffusion.io.files import BadInput
 from reffusion.io.given_masks import WHITE, MaskValues
@@ -216,22 +216,8 @@ def match_masks(place: Path, files: Collection[str], capture: Capture, strict: b
             raise BadInput(
                 f"{place / lone[0]}: {' and '.join(several)} are called so; put masks into folders as pictures are"
             )
-        if picture := _unread_picture(lone[0], capture):
-            raise BadInput(
-                f"{picture}: the picture of the mask {place / lone[0]}; {picture.suffix} is not read, save it "
-                "as .jpg or .png"
-            )
         raise BadInput(f"{place / lone[0]}: a mask for no picture; name it like its picture, or remove it")
     return found
-
-
-def _unread_picture(mask: str, capture: Capture) -> Path | None:
-    """Return the file that lies among the capture's pictures, and is named like a mask, but has an unknown ending."""
-    stems = {PurePosixPath(stem).name for stem in mask_stems(mask)}
-    folders = sorted({path.parent for path in capture.pictures.values()})
-    files: Iterable[Path] = (path for folder in folders for path in sorted(folder.iterdir()) if path.is_file())
-    known = (*ENDINGS, *MASK_ENDINGS, *COMPANIONS)
-    return next((each for each in files if each.stem in stems and each.suffix.lower() not in known), None)
 
 
 def _assign_masks(place: Path, views: Mapping[str, str], capture: Capture) -> dict[str, Path]:
