@@ -72,7 +72,7 @@ def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, An
         "has_state": any((scene.home / stage / "receipt.json").is_file() for stage in ("fit", "initialize")),
         "result": describe_result(scene) if tasks.has_result(scene) else None,
         "to_paint": list_views_to_paint(scene),
-        "export": export.describe() | {"files": tasks.list_exports(scene, bool(export.work))},
+        "export": export.describe() | {"files": tasks.list_exports(scene, export.unfinished)},
     }
 
 

@@ -8,6 +8,8 @@ import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,26 +19,46 @@ from report.app.job_progress import BAR
 from report.app.jobs import make_command, make_environment
 from report.app.scenes import OpenScene
 
-# what is made -> command of `reffusion` and its options, in order
+
+@dataclass(frozen=True)
+class Work:
+    """A part of the export.
+
+    Attributes:
+        command: a command of `reffusion` and its options.
+        files: file in runs/<scene>/ that it makes -> what the file is.
+    """
+
+    command: tuple[str, ...]
+    files: dict[str, str]
+
+
+# what is made -> the work, in order: the slowest last
 EXPORTS = {
-    "files for other programs": ("export",),
-    "the video around the scene": ("turntable",),
-    "the video of before and after": ("turntable", "--before-after"),
-    "the report": ("report",),
+    "files for other programs": Work(
+        ("export",),
+        {
+            "export/scene.compressed.ply": "the same, compressed (PlayCanvas, SuperSplat)",
+            "export/scene.spz": "the same as .spz (Niantic)",
+            "export/scene.sog": "the same as .sog, small, for the web (PlayCanvas)",
+            "export/with_object.ply": "the scene with the object, for an editor: reffusion patch fills what you delete "
+            "there",
+            "export/cameras.zip": "cameras (COLMAP model, transforms.json) and undistorted photographs",
+        },
+    ),
+    "the video of before and after": Work(
+        ("turntable", "--before-after"),
+        {
+            "before_after.webm": "video of before and after: a line moves across",
+            "before_after.webp": "the same as a small animated picture, for messages and web pages",
+        },
+    ),
+    "the report": Work(("report",), {"report.html": "report on the job, one page"}),
+    "the video around the scene": Work(("turntable",), {"turntable.webm": "video around the scene"}),
 }
 # file in runs/<scene>/ -> what it is
-FILES = {
-    "evaluate/scene.ply": "the scene as Gaussians (.ply), for any 3DGS viewer",
-    "export/scene.compressed.ply": "the same, compressed (PlayCanvas, SuperSplat)",
-    "export/scene.spz": "the same as .spz (Niantic)",
-    "export/scene.sog": "the same as .sog, small, for the web (PlayCanvas)",
-    "export/with_object.ply": "the scene with the object, for an editor: reffusion patch fills what you delete there",
-    "export/cameras.zip": "cameras (COLMAP model, transforms.json) and undistorted photographs",
-    "turntable.webm": "video around the scene",
-    "before_after.webm": "video of before and after: a line moves across",
-    "before_after.webp": "the same as a small animated picture, for messages and web pages",
-    "report.html": "report on the job, one page",
-}
+FILES = {"evaluate/scene.ply": "the scene as Gaussians (.ply), for any 3DGS viewer"}
+FILES |= {file: words for work in EXPORTS.values() for file, words in work.files.items()}
 VIEWER_PORT, START_SECONDS = 8080, 180
 READY = "ready"  # the line that the process of the viewer prints when it listens
 
@@ -113,12 +135,14 @@ class Export:
     Attributes:
         work: what is being made now, and which of how many works it is; "" if nothing is.
         share: share of this work that is done; None if it is unknown.
+        unfinished: the files of `FILES` that this work and those after it will write.
         error: why a work failed, or "".
     """
 
     def __init__(self, runs: Path):
         self.runs, self.work, self.error = runs, "", ""
         self.share: float | None = None
+        self.unfinished: frozenset[str] = frozenset()
 
     def start(self, scene: OpenScene, sog: bool) -> None:
         """Start in the background, unless it runs already.
@@ -128,6 +152,7 @@ class Export:
         """
         if not self.work:
             self.work, self.error = "begins", ""
+            self.unfinished = frozenset(file for work in EXPORTS.values() for file in work.files)
             threading.Thread(target=self._run, args=(scene, sog), daemon=True).start()
 
     def describe(self) -> dict[str, Any]:
@@ -138,14 +163,16 @@ class Export:
     def _run(self, scene: OpenScene, sog: bool) -> None:
         cameras = scene.home / "export" / "cameras"
         try:
-            for k, (words, (command, *options)) in enumerate(EXPORTS.items(), start=1):
+            for k, (words, work) in enumerate(EXPORTS.items(), start=1):
                 self.work, self.share = f"{k} of {len(EXPORTS)}: {words}", None
+                command, *options = work.command
                 more = ["--sog"] if sog and command == "export" else []
                 self._do(make_command(command, "--scene", str(scene.source), "--runs", str(self.runs), *options, *more))
-            if cameras.is_dir():
-                shutil.make_archive(str(cameras), "zip", cameras)
+                if command == "export" and cameras.is_dir():
+                    shutil.make_archive(str(cameras), "zip", cameras)
+                self.unfinished -= work.files.keys()
         finally:
-            self.work = ""
+            self.work, self.unfinished = "", frozenset()
 
     def _do(self, command: list[str]) -> None:
         """Run a command, read its progress, and keep the last line that it prints if it fails."""
@@ -161,16 +188,16 @@ class Export:
             self.error = last.removeprefix("error: ") or f"`{' '.join(command[3:])}` failed"
 
 
-def list_exports(scene: OpenScene, is_busy: bool = False) -> dict[str, dict[str, object]]:
+def list_exports(scene: OpenScene, unfinished: Collection[str] = ()) -> dict[str, dict[str, object]]:
     """Return the files to download, as name -> {"words", "bytes"}; files older than the result are left out.
 
     Args:
-        is_busy: True if files are being written now; only the result itself is then returned.
+        unfinished: files of `FILES` that are being written, which are left out, too.
     """
     found: dict[str, dict[str, object]] = {}
-    for name, words in FILES.items() if not is_busy else [next(iter(FILES.items()))]:
+    for name, words in FILES.items():
         path = scene.home / name
-        if path.is_file() and path.stat().st_mtime >= _result_time(scene):
+        if name not in unfinished and path.is_file() and path.stat().st_mtime >= _result_time(scene):
             found[path.name] = {"words": words, "bytes": path.stat().st_size}
     return found
 

@@ -119,7 +119,7 @@ async function reopen() {
 function drawSteps() {
   const done = state ? {
     photographs: state.pictures.length > 0, object: state.masks > 0 || state.brings_masks, start: Boolean(state.result) && state.plan.stages.length > 0 && !state.plan.due.length,
-    result: Boolean(state.result), live: false, paint: state.to_paint.some(each => each.painted), export: Object.keys(state.export.files).length > 1,
+    result: Boolean(state.result), live: false, paint: state.to_paint.some(each => each.painted), export: !state.export.work && Object.keys(state.export.files).length > 1,
   } : {};
   const closed = {object: !state, start: !state, live: !state || !state.has_state, result: !state || !state.result,
     paint: !state || !state.result, export: !state || !state.result};
