@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageOps
 from plyfile import PlyData
 from scenes.capture import load_test_masks
 from scenes.random_scene import random_gaussians, random_rotation, random_scene
@@ -24,6 +24,7 @@ from reffusion.io.images import (
     load_image,
     load_mask,
     load_thumbnail,
+    orientation_matrix,
     save_exr,
     save_image,
     save_mask,
@@ -288,3 +289,25 @@ def test_views_and_masks_of_a_poses_folder(tmp_path):
     save_mask(tmp_path / "test_masks" / "t.png", mask)
     assert np.array_equal(load_views(tmp_path, ["a"])["a"], image)
     assert list(load_raw_masks(tmp_path, ["a", "b"])) == ["a"] and list(load_test_masks(tmp_path)) == ["t"]
+
+
+@pytest.mark.parametrize("ending", ["jpg", "png", "tif"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_orientation_tags_of_every_format(tmp_path, ending, orientation):
+    """The stored pixels are those of the file, and the upright ones those that a viewer shows."""
+    stored = np.kron(np.random.default_rng(0).integers(0, 256, (3, 5, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+    path, exif = tmp_path / f"x.{ending}", Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(stored).save(path, exif=exif, **({"quality": 100, "subsampling": 0} if ending == "jpg" else {}))
+    reference = Image.fromarray(stored)
+    reference.getexif()[0x0112] = orientation
+    shown = np.array(ImageOps.exif_transpose(reference))
+    for upright, right in ((False, stored), (True, shown)):
+        assert image_size(path, upright) == right.shape[1::-1]
+        assert np.abs(load_image(path, upright).astype(int) - right).max() <= 4
+        assert np.abs(load_thumbnail(path, 40, upright).astype(int) - right).max() <= 4
+    matrix = orientation_matrix(path)
+    rows, columns = np.mgrid[: stored.shape[0], : stored.shape[1]]
+    places = np.stack([(columns + 0.5) / stored.shape[1], (rows + 0.5) / stored.shape[0], np.ones(rows.shape)], -1)
+    at = (places @ matrix.T * shown.shape[1::-1]).astype(int)
+    assert np.array_equal(shown[at[..., 1], at[..., 0]], stored)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps, TiffImagePlugin
+from PIL import Image, TiffImagePlugin
 
 from reffusion.io.files import BadInput, check_pixels, reading, shorten
 
@@ -99,7 +99,7 @@ def image_size(path: Path, upright: bool = False) -> tuple[int, int]:
     """
     with open_image(path) as image:
         width, height = image.size
-        turned = upright and _orientation(image) in (5, 6, 7, 8)
+        turned = _orientation(image) in (5, 6, 7, 8) and upright != _is_turned(image)
         return (height, width) if turned else (width, height)
 
 
@@ -125,6 +125,35 @@ _TURNS = {
 }
 
 
+def _is_turned(image: Image.Image) -> bool:
+    """Return whether Pillow itself turns a picture by its orientation tag while it decodes the pixels."""
+    return image.format == "TIFF"
+
+
+def _turn(pixels: Image.Image, tag: int, is_turned: bool, upright: bool) -> Image.Image:
+    """Return pixels as the orientation `tag` shows them if `upright`, else as they are stored.
+
+    Args:
+        is_turned: True if they are already as the tag shows them (`_is_turned`).
+    """
+    if upright == is_turned or tag == 1:
+        return pixels
+    turn, back = _TRANSPOSES[tag]
+    return pixels.transpose(turn if upright else back)
+
+
+# EXIF orientation tag -> the operation that shows the stored pixels upright, and its inverse
+_TRANSPOSES = {
+    2: (Image.Transpose.FLIP_LEFT_RIGHT,) * 2,
+    3: (Image.Transpose.ROTATE_180,) * 2,
+    4: (Image.Transpose.FLIP_TOP_BOTTOM,) * 2,
+    5: (Image.Transpose.TRANSPOSE,) * 2,
+    6: (Image.Transpose.ROTATE_270, Image.Transpose.ROTATE_90),
+    7: (Image.Transpose.TRANSVERSE,) * 2,
+    8: (Image.Transpose.ROTATE_90, Image.Transpose.ROTATE_270),
+}
+
+
 def _orientation(image: Image.Image) -> int:
     """Return the EXIF orientation tag of a picture; 1, upright, where it has none or an undefined one."""
     tag = image.getexif().get(0x0112, 1)
@@ -147,7 +176,9 @@ def load_image(path: Path, upright: bool = False) -> np.ndarray:
             names the file.
     """
     with open_image(path) as image:
-        turned = ImageOps.exif_transpose(image) if upright else image
+        tag, is_turned = _orientation(image), _is_turned(image)
+        image.load()  # before the size is used, which changes where Pillow turns the pixels
+        turned = _turn(image, tag, is_turned, upright)
         if image.mode[0] not in "IF":
             return np.array(_to_rgb(turned))
         levels = np.array(turned)
@@ -172,7 +203,9 @@ def load_alpha(path: Path, upright: bool = False) -> np.ndarray | None:
     with open_image(path) as image:
         if image.mode[0] in "IF" or not image.has_transparency_data:
             return None
-        turned = ImageOps.exif_transpose(image) if upright else image
+        tag, is_turned = _orientation(image), _is_turned(image)
+        image.load()
+        turned = _turn(image, tag, is_turned, upright)
         alpha = np.array(turned.convert("RGBA").getchannel("A"))
         return None if alpha.min() == 255 else alpha
 
@@ -187,10 +220,11 @@ def load_thumbnail(path: Path, side: int, upright: bool = False) -> np.ndarray:
     """
     with open_image(path) as image:
         if image.mode[0] not in "IF":
+            tag, is_turned = _orientation(image), _is_turned(image)
             image.draft("RGB", (2 * side, 2 * side))  # JPEGs are decoded at a fraction of their size
             image = _to_rgb(image)
             image.thumbnail((side, side), Image.Resampling.BOX)
-            return np.array(ImageOps.exif_transpose(image) if upright else image)
+            return np.array(_turn(image, tag, is_turned, upright))
     whole = load_image(path, upright)
     step = max(1, -(-max(whole.shape[:2]) // side))
     return np.ascontiguousarray(whole[::step, ::step])
