@@ -17,7 +17,7 @@ from reffusion.capture.scene_folder import is_gaussians_only, read_scene
 from reffusion.capture.undistort import save_undistorted_masks
 from reffusion.capture.views import check_outliers, resolve_view
 from reffusion.io.arrays import save_json
-from reffusion.io.given_masks import given_mask_size
+from reffusion.io.given_masks import mask_file_size
 from reffusion.io.images import save_mask
 from reffusion.io.scene import WARNINGS, load_raw_masks, load_scene
 from reffusion.masks import regions
@@ -54,7 +54,7 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
         notes = roles.warnings
         if roles.test_masks:
             save_json(
-                out / FACTS, {"test_masks_longest": max(max(given_mask_size(p)) for p in roles.test_masks.values())}
+                out / FACTS, {"test_masks_longest": max(max(mask_file_size(p)) for p in roles.test_masks.values())}
             )
     if params.region is not None:
         _save_region(params, out, placed)

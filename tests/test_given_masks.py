@@ -12,7 +12,7 @@ from PIL import Image
 
 from reffusion.io.annotations import annotated_pictures
 from reffusion.io.files import BadInput
-from reffusion.io.given_masks import MaskValues, given_mask_size, load_given_mask
+from reffusion.io.given_masks import MaskValues, mask_file_size, load_given_mask
 
 WIDTH, HEIGHT = 96, 72
 OBJECT = np.zeros((HEIGHT, WIDTH), bool)
@@ -72,7 +72,7 @@ def test_masks_of_every_kind(tmp_path):
         path = tmp_path / f"{name}.{'tif' if name in ('cmyk', 'float', 'float to 255') else 'png'}"
         picture.save(path)
         assert np.array_equal(load_given_mask(path), truth), name
-        assert given_mask_size(path) == (8, 6)
+        assert mask_file_size(path) == (8, 6)
     assert np.array_equal(load_given_mask(tmp_path / "one.png", (3, 4)), truth[1::2, 1::2])
 
 
@@ -194,7 +194,7 @@ def test_a_cut_out_that_is_mostly_object_is_ambiguous(tmp_path):
 @pytest.mark.parametrize("array", [OBJECT, OBJECT[None], FULL, OBJECT.astype(np.float32)])
 def test_arrays(tmp_path, array):
     np.save(tmp_path / "x.npy", array)
-    assert share_wrong(tmp_path / "x.npy") == 0 and given_mask_size(tmp_path / "x.npy") == (WIDTH, HEIGHT)
+    assert share_wrong(tmp_path / "x.npy") == 0 and mask_file_size(tmp_path / "x.npy") == (WIDTH, HEIGHT)
 
 
 def test_arrays_of_several_masks_are_refused(tmp_path):
@@ -217,7 +217,7 @@ def test_outlines_of_labelme(tmp_path):
     for shape in (polygon, rectangle):
         write_labelme(tmp_path / "x.json", shape)
         assert share_wrong(tmp_path / "x.json") == 0
-    assert given_mask_size(tmp_path / "x.json") == (WIDTH, HEIGHT)
+    assert mask_file_size(tmp_path / "x.json") == (WIDTH, HEIGHT)
     write_labelme(tmp_path / "x.json", {"label": "box", "shape_type": "circle", "points": [[40, 36], [50, 36]]})
     assert load_given_mask(tmp_path / "x.json").sum() == pytest.approx(np.pi * 10.5**2, rel=0.05)
     write_labelme(tmp_path / "x.json")
@@ -260,7 +260,7 @@ def test_outlines_of_coco(tmp_path, change):
     file = tmp_path / "instances.json"
     write_coco(file, change)
     assert annotated_pictures(file) == ["day/IMG_5.jpg"]
-    assert share_wrong(file / "day/IMG_5.jpg") == 0 and given_mask_size(file / "day/IMG_5.jpg") == (WIDTH, HEIGHT)
+    assert share_wrong(file / "day/IMG_5.jpg") == 0 and mask_file_size(file / "day/IMG_5.jpg") == (WIDTH, HEIGHT)
 
 
 def test_categories_of_coco_are_chosen_by_number(tmp_path):

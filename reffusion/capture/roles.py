@@ -16,7 +16,7 @@ from reffusion.capture.layouts.mask_files import NONE, find_masks, match_masks
 from reffusion.capture.names import list_pictures
 from reffusion.capture.views import ViewTable, check_proportions, resolve_view
 from reffusion.io.files import BadInput
-from reffusion.io.given_masks import WHITE, MaskValues, given_mask_size
+from reffusion.io.given_masks import WHITE, MaskValues, mask_file_size
 from reffusion.io.images import image_size
 from reffusion.params.capture import MaskSpec
 
@@ -152,7 +152,7 @@ def load_roles(
     kept = {name: path for name, path in mask_files.items() if name in set(train_named)}
     training_masks = {thing: _restrict_files(files, {*kept, *held_out}) for thing, files in of_objects.items()}
     for name, path in (*(item for files in training_masks.values() for item in files.items()), *test_files.items()):
-        check_proportions(path, given_mask_size(path), name, _size_of(name, capture), 0.10, "mask")
+        check_proportions(path, mask_file_size(path), name, _size_of(name, capture), 0.10, "mask")
     unmasked = [name for name in train_named if name not in kept and name not in clean_views]
     warning = f"{len(unmasked)} training views have no mask: {', '.join(unmasked)}" if kept and unmasked else None
     messages = tuple(filter(None, (found.warning, warning)))

@@ -46,7 +46,7 @@ class MaskValues:
 WHITE = MaskValues()  # the object is white
 
 
-def given_mask_size(path: Path) -> tuple[int, int]:
+def mask_file_size(path: Path) -> tuple[int, int]:
     """Return the (width, height) of a mask in pixels. The file may be of any kind that `load_given_mask` reads."""
     if is_annotation(path):
         return annotation_size(path)
@@ -86,7 +86,7 @@ def load_given_mask(path: Path, size: tuple[int, int] | None = None, values: Mas
             mask = np.isin(array, values.ids) if values.ids else _marked_pixels(path, array[..., None], True)
     else:
         with open_image(path, "a readable mask") as image:
-            mask = _numbered_pixels(path, image, values.ids) if values.ids else _drawn_pixels(path, image)
+            mask = _numbered_pixels(path, image, values.ids) if values.ids else _find_marked_pixels(path, image)
     mask = mask ^ values.inverted
     return mask if size is None else resize_nearest(mask, size)
 
@@ -119,7 +119,7 @@ def _numbered_pixels(path: Path, image: Image.Image, ids: tuple[int, ...]) -> np
     return np.isin(array, ids) & opaque
 
 
-def _drawn_pixels(path: Path, image: Image.Image) -> np.ndarray:
+def _find_marked_pixels(path: Path, image: Image.Image) -> np.ndarray:
     """Return the pixels, bool [H, W], that a picture marks by its alpha or by its colours.
 
     Raises:
