@@ -12,7 +12,7 @@ from PIL import Image
 
 from reffusion.io.annotations import annotated_pictures
 from reffusion.io.files import BadInput
-from reffusion.io.given_masks import MaskValues, mask_file_size, load_given_mask
+from reffusion.io.given_masks import MaskValues, load_given_mask, mask_file_size
 
 WIDTH, HEIGHT = 96, 72
 OBJECT = np.zeros((HEIGHT, WIDTH), bool)

@@ -2,8 +2,8 @@
 
 Pictures alone tell which points two photographs share: SIFT features that match, and that one fundamental matrix
 explains. The given poses must explain the same matches: both rays of a match meet, in front of both cameras. Right
-poses explain nearly all pairs of photographs, wrong ones few (.93 to 1 on nine captures, and 0 to .23 on seven). Neither
-sparse points nor masks are needed.
+poses explain nearly all pairs of photographs, wrong ones few (.93 to 1 on nine captures, and 0 to .23 on seven).
+Neither sparse points nor masks are needed.
 
 Where the poses explain less than half of the pairs, the usual mistakes are undone one at a time: EXIF orientation,
 camera axes, inverted matrices, transposed rotations, and the order of the photographs. The correction that explains
