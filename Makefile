@@ -249,7 +249,7 @@ lint: $(VENV)/.ready-dev
 	$(PY) -m ruff format --check --quiet .
 	$(PY) -m mypy
 
-# slow=1 adds the rendering of 100,000 Gaussians and more, and personalization (an hour).
+# slow=1 adds the rendering of 100,000 Gaussians and more.
 bench: $(VENV)/.ready
 	$(PY) -m benchmarks.bench --out="$${runs:-runs}/bench" $(if $(gate),--gate) $(if $(slow),--slow)
 	$(if $(slow),$(PY) -m benchmarks.bench.large)

@@ -19,7 +19,7 @@ MEGABYTES = 3.0  # approximate size of all pictures together
 MIN_SIDE, MAX_SIDE = 320, 960  # longer side of a picture, px
 TITLES = {
     "photograph": "photograph",
-    "renders_fit": "with the object, as fitted",
+    "renders_fit": "with the object",
     "truth": "ground truth",
     "renders_initialize": "initialization",
     "renders": "result",
@@ -138,8 +138,11 @@ def find_pictures(job: JobFiles, name: str) -> dict[str, Path]:
 
 
 def _left(kinds: list[str]) -> str:
-    """Return the kind of picture that the left side shows at first: photograph, fit or ground truth, if available."""
-    return next((kind for kind in ("photograph", "renders_fit", "truth") if kind in kinds), kinds[0])
+    """Return the kind of picture that the left side shows at first: fit, photograph or ground truth, if available.
+
+    A photograph is sharper than any render, so beside one the result looks worse than the removal left it.
+    """
+    return next((kind for kind in ("renders_fit", "photograph", "truth") if kind in kinds), kinds[0])
 
 
 def _select(options: dict[str, str | None], chosen: str = "") -> str:

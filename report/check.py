@@ -112,8 +112,9 @@ def main() -> None:
     if (sfm := sheet.stage_folder(home, "poses") / "sfm.json").is_file():
         print(load_json(sfm)["summary"])
     for line in warnings:
-        print(f"odd: {line}")
-    print(f"{len(warnings) or 'nothing'} odd; every mask over its photograph: {path}")
+        print(f"warning: {line}")
+    count = f"{len(warnings) or 'no'} warning{'' if len(warnings) == 1 else 's'}"
+    print(f"{count}; masks drawn over the photographs: {path}")
 
 
 if __name__ == "__main__":

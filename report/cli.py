@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 
 from reffusion.command import root, scene_name, scene_path
@@ -21,6 +22,18 @@ def scene_parser(name: str, description: str, needs_scene: bool = True) -> argpa
     parser.add_argument("--variant", default="", help="variant of the scene")
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     return parser
+
+
+def typed_command(name: str, scene: Path | None) -> str:
+    """Return the command that the user typed, by `make` or `reffusion`, without options other than the scene.
+
+    Args:
+        name: name of the command, as in `reffusion NAME`.
+        scene: the scene as typed; None if none was named.
+    """
+    if "MAKELEVEL" in os.environ:
+        return f"make scene={scene} {name}" if scene else f"make {name}"
+    return f"reffusion {name} --scene {scene}" if scene else f"reffusion {name}"
 
 
 def run_folder(arguments: argparse.Namespace) -> Path:

@@ -55,11 +55,6 @@ def make(home: Path, sog: bool = False) -> list[str]:
         lines.append(f"{out / SPZ}: the same, quantised, {smaller(SPZ)}, in Niantic's format")
     except BadInput as error:  # coordinates too large for the format
         lines.append(f"not written: {error}")
-    if sog:
-        save_sog(out / SOG, out / PLY)
-        lines.append(f"{out / SOG}: the same, quantised, {smaller(SOG)}, in PlayCanvas's format for the web")
-    else:
-        lines.append(f"{out / SOG}: not written; `--sog` (make: `sog=1`) writes it, with Node, in minutes")
     save_cameras(out / CAMERAS, scene, IMAGES)
     pictured = [name for name in scene.cameras if has_photograph(poses, name)]
     for name in pictured:
@@ -79,6 +74,11 @@ def make(home: Path, sog: bool = False) -> list[str]:
     if adapted.exists():
         save_portable(adapted, out / LORA / LORA_FILE)
         lines.append(f"{out / LORA / LORA_FILE}: the prior's LoRA, as diffusers' load_lora_weights reads it")
+    if sog:  # last, since it may fail
+        save_sog(out / SOG, out / PLY)
+        lines.append(f"{out / SOG}: the same, quantised, {smaller(SOG)}, in PlayCanvas's format for the web")
+    else:
+        lines.append(f"{out / SOG}: not written; `--sog` (make: `sog=1`) writes it, with Node, in minutes")
     return lines
 
 

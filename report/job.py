@@ -67,7 +67,7 @@ def make(home: Path) -> Path:
         curves = whole_job_section(job, Path(charts)) + stage_sections(job, Path(charts))
     parts = [
         page.heading(home.name, 1),
-        *([page.paragraph(sentence)] if (sentence := verdict.describe_result(job)) else []),
+        *([page.paragraph(" ".join(sentences))] if (sentences := verdict.describe_result(job)) else []),
         *unfinished_note(job),
         *before_after.before_after_section(job),
         *result_section(job),

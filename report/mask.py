@@ -34,7 +34,7 @@ def main() -> None:
     words = ("run", "raw_masks", "--scene", str(arguments.scene), "--runs", str(arguments.runs), *options)
     if status := subprocess.run(make_command(*words, "--set", WITHOUT_MASKS)).returncode:
         raise SystemExit(status)
-    app = App(arguments.runs.resolve(), options)
+    app = App(arguments.runs.resolve(), options, cli.typed_command("mask", arguments.scene))
     try:
         serve(app, app.open(str(arguments.scene)).name, arguments.port)
     except ValueError as error:
@@ -54,7 +54,7 @@ def serve(app: App, scene: str, port: int) -> None:
     app.first = scene
     app.begin_masks(app.scenes[scene])
     server = Server(app, port)
-    announce(server, f"{server.address}#{quote(scene)}/object")
+    announce(server, server.link(fragment=f"{quote(scene)}/object"))
     step = app.scenes[scene].mask_step
     if step is not None and step.session.segmenter is None:
         print("clicks are segmented by colours and surfaces; with the network of `make weights` (37 MB) fewer suffice")

@@ -1,7 +1,7 @@
 """State of the mask page: the user's marks, the masks computed from the marks, and the files to which both are saved.
 
-A *mark* is a click or a brush stroke in one view, on the object or on the background. A *given* mask is one that the
-user put into the scene's folder; the page never changes it.
+A *mark* is a click, a box or a brush stroke in one view, on the object or on the background. A *given* mask is one that
+the user put into the scene's folder; the page never changes it.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ from __future__ import annotations
 import hashlib
 import threading
 import traceback
+from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -19,18 +20,26 @@ import numpy as np
 from reffusion.capture.click_coordinates import distort_mask, distort_points, undistort_points
 from reffusion.capture.lenses import load_lenses, load_photograph_sizes
 from reffusion.capture.scene_folder import read_scene
+from reffusion.capture.undistort import load_undistorted_mask
 from reffusion.clicks.color_evidence import spread_evenly
-from reffusion.clicks.events import Event, Masks, split_events
+from reffusion.clicks.events import Event, Masks, group_by_view, split_events
 from reffusion.clicks.fitted_views import MAX_NETWORK_VIEWS, FittedViews
-from reffusion.clicks.marks import Mark
+from reffusion.clicks.marks import SIZES, Mark
 from reffusion.clicks.scene_masks import KEPT_VIEWS, load_evidence
-from reffusion.clicks.scene_segmentation import correct_own_view, segment_first, segment_own_view, segment_scene
+from reffusion.clicks.scene_segmentation import (
+    Settled,
+    correct_own_view,
+    segment_first,
+    segment_own_view,
+    segment_scene,
+)
 from reffusion.clicks.segmenter import ImageFeatures, Segmenter, encode_image
 from reffusion.clicks.single_view import ViewEvidence
 from reffusion.command import root
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.files import BadInput
-from reffusion.io.images import WHITE, replace_image, to_uint8
+from reffusion.io.given_masks import WHITE
+from reffusion.io.images import replace_image, to_uint8
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import list_objects, load_raw_masks, load_scene, load_views
 from reffusion.params.clicks import CLICKS
@@ -51,6 +60,7 @@ class Capture:
         poses: folder of the stage `poses`.
         fit: folder of the stage `fit`; may not exist yet.
         given: view -> bool [H, W], True on the object: the masks that the page did not write.
+        saved: view -> bool [H, W], the masks that the page wrote, undistorted.
     """
 
     folder: Path
@@ -58,6 +68,7 @@ class Capture:
     poses: Path
     fit: Path
     given: dict[str, np.ndarray]
+    saved: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def load_capture(home: Path) -> Capture:
@@ -84,9 +95,11 @@ def load_capture(home: Path) -> Capture:
         raise BadInput(f"{folder}: its masks hold object numbers or are inverted; remove them: clicks write white ones")
     files = roles.masks.get("", {})
     written = _saved_marks(folder)["written"]
-    foreign = [name for name, path in files.items() if written.get(_relative_path(path, folder)) != file_digest(path)]
+    own = {name for name, path in files.items() if written.get(_relative_path(path, folder)) == file_digest(path)}
     place = next((path.parent for path in files.values()), folder / (params.mask_folder or "masks"))
-    return Capture(folder, place, poses, sheet.stage_folder(home, "fit"), load_raw_masks(raw_masks, foreign))
+    given, lenses = load_raw_masks(raw_masks, [name for name in files if name not in own]), load_lenses(poses)[0]
+    saved = {name: load_undistorted_mask(files[name], lenses[name]) for name in sorted(own & lenses.keys())}
+    return Capture(folder, place, poses, sheet.stage_folder(home, "fit"), given, saved)
 
 
 def file_digest(path: Path) -> str:
@@ -114,7 +127,8 @@ class Session:
     each mark stay in memory, so that adding a mark, or removing the last one, takes little computation. The methods
     that change marks return before the masks are computed; `state` says when the masks are up to date.
 
-    The views are the training views that show the object. The session begins with the marks saved in clicks.json.
+    The views are the training views that show the object. The session begins with the marks saved in clicks.json and
+    the masks saved with them.
 
     Args:
         capture: folders and given masks of the scene.
@@ -124,7 +138,7 @@ class Session:
 
     def __init__(self, capture: Capture, is_fitted: Callable[[], bool], segmenter: Segmenter | None = None):
         self.capture, self.scene = capture, load_scene(capture.poses)
-        self.segmenter, self.unsaved = segmenter, False
+        self.segmenter = segmenter
         # A callback, because the folder of the fit may still contain a fit to earlier poses.
         self.is_fitted = is_fitted
         self.views = [name for name in self.scene.train if name not in self.scene.clean]
@@ -134,12 +148,16 @@ class Session:
         self.first_view = camera_path.find_central_view(cameras, self.scene.points).name if cameras else ""
         self.events: list[Event] = []
         self.history: list[list[Event]] = []  # the marks before each change, for `undo`
-        self.masks, self.versions = dict(capture.given), dict.fromkeys(self.views, 0)
+        self.masks: Masks = capture.saved | capture.given
+        self.solved_masks = self.masks  # the masks before the marks that are not yet solved
+        self.versions = dict.fromkeys(self.views, 0)
         self.gaussians: Gaussians | None = None
         self.results: dict[Hashable, Masks] = {}  # keys of `segment_scene` -> masks
         # `revision` grows with each change of the marks. The current masks belong to `solved_revision`.
         self.revision, self.solved_revision = 0, 0
-        self.views_in_work: set[str] = set()  # views that the present computation has used so far
+        self.uses: Counter[str] = Counter()  # view -> how often the present computation has used it so far
+        self.changes: dict[str, float] = {}  # view -> share of the mask's pixels that the last mark changed
+        self.effects: dict[Hashable, float] = {}  # key of a mark -> share of its picture's pixels that it changed
         self.error = ""  # reason why the masks of the latest revision could not be computed
         self.lock = threading.Condition(threading.RLock())
         self.features_of = lru_cache(KEPT_VIEWS)(self._encode)
@@ -147,23 +165,33 @@ class Session:
         for saved in _saved_marks(capture.folder)["marks"]:
             if saved["view"] in self.images and saved["view"] not in capture.given:
                 self.events.append(self._from_photograph(saved))
-        self.revision += bool(self.events)
+        complete = {*self.views} <= {*self.masks}
+        self.settled = Settled(self.events, self.masks) if self.events and complete else None
+        self.saved = self._keys(), complete  # the marks of the saved masks; whether these are the masks of all views
         threading.Thread(target=self._update_masks, daemon=True).start()
         if segmenter is not None:
             threading.Thread(target=self._encode_all, daemon=True).start()
 
+    @property
+    def unsaved(self) -> bool:
+        """Whether the saved masks are not those of the present marks, or lack views that have a mask by now."""
+        with self.lock:
+            keys, complete = self.saved
+            return keys != self._keys() or bool(keys and not complete and {*self.views} <= {*self.masks})
+
     def mark(self, name: str, points: Sequence[tuple[float, float]], positive: bool, radius: float = 0.0) -> None:
-        """Add a click or a brush stroke.
+        """Add a click, a box or a brush stroke.
 
         Args:
             name: name of the view.
-            points: (x, y) in pixels of the undistorted view; one point of a click, the path of a stroke.
+            points: (x, y) in pixels of the undistorted view; one point of a click, two opposite corners of a box, the
+                path of a stroke.
             positive: True = on the object, False = on the background.
-            radius: radius of the brush, px; 0 for a click.
+            radius: radius of the brush, px; 0 for a click and a box.
 
         Raises:
-            ValueError: the view is unknown or has a given mask, there is no point or one lies outside the view, or the
-                radius is negative or larger than the view.
+            ValueError: the view is unknown or has a given mask, there is no point or one lies outside the view, there
+                are more than two points without a radius, or the radius is negative or larger than the view.
         """
         if name not in self.images:
             raise ValueError(f"there is no view '{name}'")
@@ -172,6 +200,8 @@ class Session:
         height, width = self.images[name].shape[:2]
         if not points or any(not (0 <= x <= width and 0 <= y <= height) for x, y in points):
             raise ValueError(f"a mark lies outside {name}, which has {width}x{height} px")
+        if not radius and len(points) > 2:
+            raise ValueError(f"a mark of {len(points)} points in {name} has no brush; a click has 1 point, a box has 2")
         if not 0 <= radius <= max(height, width):
             raise ValueError(f"a brush of {radius:g} px on a view of {width}x{height} px")
         event = Event(name, Mark(np.array(points, float), positive, radius), is_early=self.gaussians is None)
@@ -188,6 +218,24 @@ class Session:
         with self.lock:
             removed = self.events[index]
             self._change(lambda events: [event for event in events if event is not removed])
+
+    def resize(self, index: int, size: str) -> None:
+        """Let a click or a box take another one of the proposed regions.
+
+        Args:
+            index: index of the mark among all current marks.
+            size: as for `Mark.size`.
+
+        Raises:
+            IndexError: there is no such mark.
+            ValueError: the mark is a stroke, or there is no such size.
+        """
+        with self.lock:
+            event = self.events[index]
+            if event.mark.radius or size not in ("", *SIZES):
+                raise ValueError(f"size {size!r}: a click or a box has the size {', '.join(SIZES)} or none")
+            resized = replace(event, mark=replace(event.mark, size=size))
+            self._change(lambda events: [resized if each is event else each for each in events])
 
     def clear(self, name: str) -> None:
         """Remove all marks of a view."""
@@ -246,7 +294,7 @@ class Session:
             save_json(
                 folder / CLICKS, {"marks": [self._to_photograph(each) for each in self.events], "written": written}
             )
-            self.unsaved = False
+            self.saved = self._keys(), {*self.views} <= {*self.masks}
             return {"written": len(masks), "kept": len(self.capture.given)}
 
     def state(self) -> dict:
@@ -255,11 +303,14 @@ class Session:
         Returns:
             "views": for each view "name", "width" and "height" (undistorted, px), "marks", "mask" (a number that grows
             when the mask changes; None without a mask) and "given" (True if the mask is given); "first_view": the view
-            in which the object is probably easy to mark; "fit": True once the fit is loaded; "can_undo": True if there
-            is something to undo; "busy": True while the masks do not yet follow the latest marks; "progress": number of
-            views that this computation has used so far; "error": reason why the masks could not be computed, or "";
-            "unsaved": True if marks have changed since the last save; "folder": folder of the masks. A mark has "index"
-            (for `remove`), "points", "sign" ("+" on the object, "-" on the background) and "radius".
+            in which the object is probably easy to mark; "fit": True once the fit is loaded; "loading": True
+            if there is a fit that is not loaded yet; "can_undo": True if there
+            is something to undo; "busy": True while the masks do not yet follow the latest marks; "progress": share of
+            this computation that is done; "changes": views whose masks the last mark changed, as pairs of name and
+            share of the mask's pixels, the most changed first; "error": reason why the masks could not be computed, or
+            ""; "unsaved": as the property; "folder": folder of the masks; "network": name of the segmentation network,
+            or "". A mark has "index" (for `remove`), "points", "sign" ("+" on the object, "-" on the background),
+            "radius", "size" and "effect" (share of its picture's pixels that it changed; None if that is not known).
         """
         with self.lock:
             views = [
@@ -273,6 +324,8 @@ class Session:
                             "points": event.mark.points.tolist(),
                             "sign": "+" if event.mark.positive else "-",
                             "radius": event.mark.radius,
+                            "size": event.mark.size,
+                            "effect": self.effects.get(event.key),
                         }
                         for k, event in enumerate(self.events)
                         if event.view == name
@@ -285,12 +338,15 @@ class Session:
             return {
                 "views": views,
                 "fit": self.gaussians is not None,
+                "loading": self.gaussians is None and self.is_fitted(),
                 "can_undo": bool(self.history or self.events),
                 "busy": self.solved_revision < self.revision,
-                "progress": len(self.views_in_work),
+                "progress": self._progress(),
+                "changes": sorted(self.changes.items(), key=lambda pair: -pair[1]),
                 "error": self.error,
                 "unsaved": self.unsaved,
                 "folder": str(self.capture.masks),
+                "network": "" if self.segmenter is None else self.segmenter.name,
                 "first_view": self.first_view,
             }
 
@@ -301,15 +357,24 @@ class Session:
 
     def _replace(self, events: list[Event]) -> None:
         with self.lock:
-            self.events, self.unsaved, self.error = events, True, ""
+            self.events, self.error = events, ""
             self.revision += 1
             self.lock.notify_all()
+
+    def _keys(self) -> list[Hashable]:
+        return [event.key for event in self.events]
+
+    def _progress(self) -> float:
+        """Return the share of the present computation that is done: masks use each view without marks twice."""
+        marked = {event.view for event in self.events}
+        uses = [min(self.uses[name], 2) / 2 for name in self.views if name not in marked]
+        return sum(uses) / max(len(uses), 1)
 
     def _from_photograph(self, saved: dict) -> Event:
         """Return the mark of an entry of clicks.json, whose points are pixels of the distorted photograph."""
         name = saved["view"]
         points = undistort_points(np.array(saved["points"], float).reshape(-1, 2), self.lenses[name], self.sizes[name])
-        mark = Mark(points, saved["sign"] == "+", saved["radius"] / self._photograph_scale(name))
+        mark = Mark(points, saved["sign"] == "+", saved["radius"] / self._photograph_scale(name), saved.get("size", ""))
         return Event(name, mark, saved.get("early", False))
 
     def _to_photograph(self, event: Event) -> dict:
@@ -317,8 +382,8 @@ class Session:
         name, mark = event.view, event.mark
         points = distort_points(mark.points, self.lenses[name], self.sizes[name]).round(1).tolist()
         radius = round(mark.radius * self._photograph_scale(name), 2)
-        sign = "+" if mark.positive else "-"
-        return {"view": name, "points": points, "sign": sign, "radius": radius, "early": event.is_early}
+        place = {"view": name, "points": points, "sign": "+" if mark.positive else "-", "radius": radius}
+        return place | {"size": mark.size, "early": event.is_early}
 
     def _photograph_scale(self, name: str) -> float:
         """Return the scale of a view: the number of pixels of the photograph per pixel of the undistorted view."""
@@ -361,6 +426,7 @@ class Session:
                 error = f"no masks: {failure}"
             with self.lock:
                 if revision == self.revision:
+                    self.changes, self.solved_masks = _compare_masks(self.solved_masks, self.masks), self.masks
                     self.solved_revision, self.error = revision, error
                     self.lock.notify_all()
 
@@ -386,28 +452,52 @@ class Session:
         def evidence_of(name: str) -> ViewEvidence:
             if revision != self.revision:
                 raise Superseded
-            self.views_in_work.add(name)
+            self.uses[name] += 1
             return self.evidence_of(name)
 
-        self.views_in_work = set()
+        def note_effect(before: Masks, after: Masks) -> None:
+            view = events[-1].view
+            empty = np.zeros(self.images[view].shape[:2], bool)
+            self.effects[events[-1].key] = float((before.get(view, empty) ^ after.get(view, empty)).mean())
 
+        self.uses = Counter()
         given, masks = self.capture.given, dict(self.capture.given)
         if self.gaussians is None:
             for name in dict.fromkeys(event.view for event in events):
-                masks |= segment_own_view(evidence_of, [event for event in events if event.view == name], self._recall)
+                own = [event for event in events if event.view == name]
+                masks |= segment_own_view(evidence_of, own, self._recall)
+                if own[-1] is events[-1]:
+                    note_effect(segment_own_view(evidence_of, own[:-1], self._recall) if own[:-1] else {}, masks)
         elif events:
             cameras = {name: self.scene.cameras[name] for name in {*self.views, *given}}
             views = FittedViews(self.gaussians, cameras, evidence_of)
+            settled = self._settled_part(events)
             first, groups = split_events(events, given)  # each marked view is shown before all views follow
-            if not groups:
-                self._show(self.masks | segment_first(evidence_of, first, self._recall), revision)
-            else:
+            if settled is not None:
+                first, groups = {"": [*settled.events]}, group_by_view(events[len(settled.events) :])
+            elif not groups:
+                masks |= segment_first(evidence_of, first, self._recall)
+                own = first.get(events[-1].view, [])[:-1]
+                note_effect(segment_own_view(evidence_of, own, self._recall) if own else {}, masks)
+                self._show({**self.masks, **masks}, revision)
+            if groups:
                 count = len(groups[-1])
                 in_order = [event for group in (*first.values(), *groups) for event in group]
-                masks = segment_scene(views, in_order[:-count], given, self._recall)
-                self._show(masks | correct_own_view(views, in_order, count, masks, self._recall), revision)
-            masks = segment_scene(views, events, given, self._recall)
+                masks = segment_scene(views, in_order[:-count], given, self._recall, settled)
+                corrected = correct_own_view(views, in_order, count, masks, self._recall)
+                if in_order[-1] is events[-1]:
+                    previous = in_order[:-1], count - 1, masks, self._recall
+                    note_effect(correct_own_view(views, *previous) if count > 1 else masks, corrected)
+                self._show({**masks, **corrected}, revision)
+            masks = segment_scene(views, events, given, self._recall, settled)
         self._show(masks, revision)
+
+    def _settled_part(self, events: Sequence[Event]) -> Settled | None:
+        """Return the saved masks if the marks of these are the first of `events`, else None."""
+        settled = self.settled
+        if settled is None or [event.key for event in settled.events] != [e.key for e in events[: len(settled.events)]]:
+            return None
+        return settled
 
     def _recall(self, key: Hashable, compute: Callable[[], Masks]) -> Masks:
         """Return the remembered result for a key, or call `compute` and remember its result."""
@@ -417,7 +507,7 @@ class Session:
                 del self.results[next(iter(self.results))]
         return self.results[key]
 
-    def _show(self, masks: dict[str, np.ndarray], revision: int) -> None:
+    def _show(self, masks: Masks, revision: int) -> None:
         """Replace the shown masks; raises Superseded if they do not belong to the latest revision of the marks."""
         with self.lock:
             if revision != self.revision:
@@ -426,3 +516,12 @@ class Session:
                 if masks.get(name) is not self.masks.get(name):
                     self.versions[name] += 1
             self.masks = dict(masks)
+
+
+def _compare_masks(before: Masks, after: Masks) -> dict[str, float]:
+    """Return view -> share of the larger mask's pixels that differ, for the views in which pixels differ."""
+    shares = {}
+    for name in before.keys() & after.keys():
+        if changed := int((before[name] ^ after[name]).sum()):
+            shares[name] = changed / max(int(before[name].sum()), int(after[name].sum()))
+    return shares

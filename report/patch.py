@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from reffusion.io.arrays import load_labels
 from reffusion.io.ply import load_property_names, save_ply
 from reffusion.io.scene import load_scene
 from report import cli, patch_files
@@ -33,12 +32,9 @@ def make(home: Path) -> str:
     result, new, out = patch.gaussians, patch.new, home / "patch"
     save_ply(out / WHOLE, result, similarity, properties)
     save_ply(out / NEW, result.map(lambda parameter: parameter[new]), similarity, properties)
-    kept, stayed = int((~load_labels(patch.poses / "deleted.npy")).sum()), len(result) - int(new.sum())
-    more = kept - stayed
-    note = f"; {more} more than you deleted are gone: haze and floaters behind the object" if more > 0 else ""
     return (
-        f"{out / WHOLE}: the whole scene, {len(result)} splats{note}\n"
-        f"{out / NEW}: the {int(new.sum())} new ones alone, which the whole scene contains too"
+        f"{out / WHOLE}: the whole scene, {len(result)} splats\n"
+        f"{out / NEW}: the {int(new.sum())} new splats alone, which the whole scene contains too\n{patch.describe()}"
     )
 
 

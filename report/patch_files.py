@@ -99,8 +99,10 @@ def make(arguments: argparse.Namespace) -> str:
     result = load_result(home)
     similarity = load_scene(result.poses).similarity
     save_splats(arguments.out, result.gaussians, similarity, load_property_names(arguments.files[0]))
+    lost = result.gaussians.antialiased and arguments.out.suffix.lower() == ".splat"
+    note = "; .splat cannot say that it is antialiased, as the scene before is: set that in the viewer" if lost else ""
     return (
-        f"{arguments.out}: the whole scene, {len(result.gaussians)} splats, {int(result.new.sum())} of them new\n"
+        f"{arguments.out}: the whole scene, {len(result.gaussians)} splats{note}\n{result.describe()}\n"
         f"for another filling, paint one of {home / 'to_paint'}, save it as {folder / 'painted'}/<view>.png, and "
         "repeat the command"
     )

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from reffusion.types import Gaussians
 
 
+MOST_NEW = 100  # new Gaussians for each deleted one, above which a warning is given; an object takes about 30
+
+
 @dataclass(frozen=True)
 class PatchResult:
     """Scene of Gaussians whose hole is filled.
@@ -25,12 +28,27 @@ class PatchResult:
     Attributes:
         gaussians: all N Gaussians of the result, in the normalised frame.
         new: bool [N], True for the Gaussians that fill the hole.
+        deleted: bool [M], True for those of the M Gaussians of the scene before that the user deleted.
         poses: folder of the stage `poses`.
     """
 
     gaussians: Gaussians
     new: Tensor
+    deleted: Tensor
     poses: Path
+
+    def describe(self) -> str:
+        """Return how many Gaussians were removed and added, with a warning if suspiciously many were added."""
+        before, deleted, new = len(self.deleted), int(self.deleted.sum()), int(self.new.sum())
+        more = before - deleted - (len(self.gaussians) - new)
+        others = f"and {more} more, haze and floaters inside or behind the hole" if more > 0 else "and no others"
+        text = f"removed: the {deleted} splats that you deleted, {others}; added: {new} new splats"
+        if new <= MOST_NEW * deleted:
+            return text
+        return (
+            f"{text}\nwarning: that is more than {MOST_NEW} new splats for each deleted one: unless these were large, "
+            "the hole reaches far beyond them; look at the result, and delete whole objects only"
+        )
 
 
 def load_result(home: Path) -> PatchResult:
@@ -43,8 +61,9 @@ def load_result(home: Path) -> PatchResult:
     poses, result = stage_folder(home, "poses"), home / "evaluate" / "scene.ply"
     if not result.exists():
         raise ValueError(f"{result} is missing; `make scene={home.name.split('@')[0]} patch` makes it")
+    gaussians = load_ply(result, load_scene(poses).similarity)
     return PatchResult(
-        load_ply(result, load_scene(poses).similarity), load_labels(result_stage_folder(home) / "labels.npy"), poses
+        gaussians, load_labels(result_stage_folder(home) / "labels.npy"), load_labels(poses / "deleted.npy"), poses
     )
 
 

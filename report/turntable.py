@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from reffusion import trace
 from reffusion.io.images import to_uint8
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
@@ -21,6 +22,7 @@ FRAMES, RATE = 144, 24  # six seconds
 # Codec of the .webm, which browsers play and OpenCV's wheels write; OpenCV's warning about the tag is harmless.
 CODEC = "VP90"
 WIPE_FRAMES, WIPE_WIDTH, WIPE_MILLISECONDS = 60, 480, 80
+FILM_WIDTH = 960  # px
 
 
 def make(home: Path, frames: int = FRAMES) -> Path:
@@ -37,37 +39,44 @@ def make(home: Path, frames: int = FRAMES) -> Path:
     """
     gaussians, cameras = load_result(home, frames)
     path = home / "turntable.webm"
-    save_video(path, (_picture(gaussians, camera) for camera in cameras))
+    save_video(path, (_picture(gaussians, cameras[k]) for k in trace.progress(len(cameras), "turntable")))
     return path
 
 
 def make_wipe(home: Path, frames: int = WIPE_FRAMES) -> Path:
-    """Render before and after along the path of the video, write `home`/before_after.webp, and return this path.
+    """Render before and after along the path of the video, and write `home`/before_after.webm and .webp.
 
-    A line moves across the picture, left of which is the scene with the object. The animation is `WIPE_WIDTH` px wide.
+    A line moves across the picture, left of which is the scene with the object. The video is as large as the
+    photographs, but at most `FILM_WIDTH` px wide; the animated picture (.webp) is `WIPE_WIDTH` px wide.
 
     Args:
         home: as for `make`; the stage `fit` has run, too.
         frames: number of frames, `WIPE_MILLISECONDS` each.
 
+    Returns:
+        The path of the .webp.
+
     Raises:
-        ValueError: a stage has not run.
+        ValueError: a stage has not run, or the installed OpenCV cannot write this kind of video.
     """
     after, cameras = load_result(home, frames)
     fitted = stage_folder(home, "fit") / "gaussians.ply"
     if not fitted.exists():
         raise ValueError(f"{fitted} is missing: there are no Gaussians with the object")
     before, pictures = load_ply(fitted), []
-    for k, camera in enumerate(cameras):
-        wide = camera.resized(WIPE_WIDTH, round(WIPE_WIDTH * camera.height / camera.width))
-        line = round(WIPE_WIDTH * (0.5 + 0.42 * np.cos(2 * np.pi * k / len(cameras))))
-        picture = _picture(after, wide)
-        picture[:, :line] = _picture(before, wide)[:, :line]
+    width = max(WIPE_WIDTH, min(FILM_WIDTH, cameras[0].width))
+    for k in trace.progress(len(cameras), "before_after"):
+        camera = cameras[k].resized(width, round(width * cameras[k].height / cameras[k].width))
+        line = round(width * (0.5 + 0.42 * np.cos(2 * np.pi * k / len(cameras))))
+        picture = _picture(after, camera)
+        picture[:, :line] = _picture(before, camera)[:, :line]
         picture[:, line - 1 : line + 1] = 255
-        pictures.append(Image.fromarray(picture))
+        pictures.append(picture)
     path = home / "before_after.webp"
-    rest = pictures[1:]
-    pictures[0].save(path, save_all=True, append_images=rest, loop=0, duration=WIPE_MILLISECONDS, quality=70, method=6)
+    save_video(path.with_suffix(".webm"), pictures, round(1000 / WIPE_MILLISECONDS))
+    size = (WIPE_WIDTH, round(WIPE_WIDTH * pictures[0].shape[0] / width))
+    first, *rest = [Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS) for picture in pictures]
+    first.save(path, save_all=True, append_images=rest, loop=0, duration=WIPE_MILLISECONDS, quality=70, method=4)
     return path
 
 
@@ -116,7 +125,9 @@ def save_video(path: Path, pictures: Iterable[np.ndarray], rate: int = RATE) -> 
 
 def main() -> None:
     parser = cli.scene_parser("turntable", __doc__)
-    parser.add_argument("--before-after", action="store_true", help="an animation (.webp) of before and after instead")
+    parser.add_argument(
+        "--before-after", action="store_true", help="a video and an animated picture of before and after"
+    )
     arguments = parser.parse_args()
     try:
         print((make_wipe if arguments.before_after else make)(cli.run_folder(arguments)))

@@ -1,4 +1,4 @@
-"""One sentence of judgement on a finished job: is the object gone, how much is made up, and what would help most."""
+"""The judgement on a finished job: is the object gone, how much is made up, and what would help most."""
 
 from __future__ import annotations
 
@@ -16,22 +16,33 @@ LEAST_GAIN = 0.05  # share of the hole that a view must show to be worth paintin
 RANKED = re.compile(r"^\d+\. (.+?)  (\d+)%(  \(painted\))?$", re.MULTILINE)  # a line of to_paint/ranked.txt
 
 
-def describe_result(job: JobFiles) -> str:
-    """Return the judgement on a job, e.g. "... 10 % of what it hid is made up; a completed picture of a would help
-    most.".
+def describe_result(job: JobFiles) -> list[str]:
+    """Return the judgement on a job as sentences: is the object gone, what was filled in, and what would help most.
 
-    The text is empty if the job has no result yet, or if nothing was to be removed.
+    The list is empty if the job has no result yet, or if nothing was to be removed. While a new run changes the job,
+    the numbers on disk are not all of the result; the judgement then says so and has no numbers.
     """
     if "evaluate" not in job.folders or "masks" not in job.folders:
-        return ""
-    parts, invention = [describe_removal(job)], measure_invention(job)
+        return []
+    if not is_of_one_run(job):
+        return ["The pictures below are of the earlier result. The judgement follows when the new run is done."]
+    sentences, invention = [describe_removal(job)], measure_invention(job)
     if invention is not None and invention < MIN_INVENTION:
-        parts.append("the photographs show all that it hid")
+        sentences.append("The photographs show everything that was behind the object.")
     elif invention is not None:
-        parts.append(f"{invention:.0%} of what it hid is made up".replace("%", " %"))
+        sentences.append(f"No photograph shows {100 * invention:.0f} % of what was behind it: that part is made up.")
         if view := view_to_paint(job):
-            parts.append(f"a completed picture of {view} would help most")
-    return "; ".join(parts) + "."
+            sentences.append(f"To improve it most, paint the view {view}.")
+    return sentences
+
+
+def is_of_one_run(job: JobFiles) -> bool:
+    """Return whether the result and the filling were made from the stages that are on disk now."""
+    return all(
+        content is None or job.receipts.get(need, {}).get("output", content) == content
+        for stage in ("evaluate", "initialize")
+        for need, content in job.receipts.get(stage, {}).get("needs", {}).items()
+    )
 
 
 def give_advice(job: JobFiles) -> list[str]:
@@ -39,8 +50,9 @@ def give_advice(job: JobFiles) -> list[str]:
     folder = job.folders.get("reference", Path()) / TO_PAINT
     views = [(name, share) for name, share, is_painted in rank_views(job) if share >= LEAST_GAIN and not is_painted]
     return [
-        f"{view} shows {share:.0%} of what is made up. To decide it yourself, complete {folder / view}.png in any "
-        f"editor where {view}_mask.png is white, save it in the scene's folder as painted/{view}.png, and run again."
+        f"The view {view} shows {100 * share:.0f} % of the part that is made up. To decide yourself what is there, "
+        f"paint {folder / view}.png in any editor where {view}_mask.png is white, save it in the scene's folder as "
+        f"painted/{view}.png, and run again."
         for view, share in views[:MAX_ADVICE]
     ]
 
@@ -49,13 +61,13 @@ def describe_removal(job: JobFiles) -> str:
     """Return whether the object is gone, by the parts of it that the stage `masks` found and left in the scene."""
     remnants = _facts(job, "masks").get("remnants")
     if remnants is None or not job.receipts["masks"]["params"].get("remnants"):
-        return "The object is removed, as far as the masks show it"
+        return "What the masks cover is removed."
     left = [each for each in remnants if not each["removed"]]
     if not left:
-        return "What the masks show is removed; look whether they left out a part of the object"
+        return "What the masks cover is removed, and no other part of the object was found."
     largest = max(left, key=lambda each: each["share"])
-    parts = "a part" if len(left) == 1 else f"{len(left)} parts"
-    return f"Most of the object is removed, but {parts} may be left (best seen in {largest['view']}; correct the masks)"
+    parts = "1 part of it seems" if len(left) == 1 else f"{len(left)} parts of it seem"
+    return f"The object is removed, but {parts} to be left. Look at the view {largest['view']}, and mark it there."
 
 
 def measure_invention(job: JobFiles) -> float | None:
@@ -68,8 +80,12 @@ def measure_invention(job: JobFiles) -> float | None:
     origins = _facts(job, "initialize").get("origins")
     if origins is None:
         return None
-    is_given = bool(_facts(job, "reference").get("given"))
-    return origins["patches"] + origins["nothing"] + (0.0 if is_given else origins["reference"])
+    return origins["patches"] + origins["nothing"] + (0.0 if is_reference_given(job) else origins["reference"])
+
+
+def is_reference_given(job: JobFiles) -> bool:
+    """Return whether the user gave a picture of what is behind the object."""
+    return bool(_facts(job, "reference").get("given"))
 
 
 def rank_views(job: JobFiles) -> list[tuple[str, float, bool]]:

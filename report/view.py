@@ -19,8 +19,10 @@ from reffusion.io.scene import has_photograph, load_scene, load_views
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
 from report import camera_path, cli, unseen_overlay
+from report.access import Access
 from report.gaussian_layers import finish_command, load_layers
 from report.sheet import stage_folder
+from report.viewer_server import start_viewer_server
 
 PORT = 8080
 MOVING, STILL = 180, 480  # picture heights in px while the camera moves, and at rest
@@ -138,16 +140,13 @@ class Viewer:
     Args:
         home: runs/<scene> or runs/<scene>@<variant>, finished.
         port: port to listen on; if it is in use, the next free one is taken.
+        access: the token that requests must bring.
 
     Raises:
         ValueError: viser is not installed, or the scene is not finished.
     """
 
-    def __init__(self, home: Path, port: int = PORT):
-        try:
-            import viser
-        except ImportError:
-            raise ValueError("the viewer needs viser: `make scene=X view`, or `pip install viser`") from None
+    def __init__(self, home: Path, port: int, access: Access):
         poses = scene_home(home) / "poses"
         if not poses.is_dir():
             raise ValueError(f"{poses} is missing; {finish_command(home)} makes it")
@@ -155,7 +154,7 @@ class Viewer:
         self.layers = load_layers(home, scene.similarity)
         self.seen_by = unseen_overlay.load_seen_views(home, scene)
         self.gaussians, self.marks_unseen = next(reversed(self.layers.states.values()))[0], True
-        self.server = viser.ViserServer(host="127.0.0.1", port=port, label=home.name, verbose=False)
+        self.server = start_viewer_server(home.name, port, access)
         self.visitors = Visitors(self.server, self._render_for)
         self._add_controls()
         self._add_cameras(home, scene)
@@ -259,11 +258,12 @@ def main() -> None:
     parser = cli.scene_parser("view", __doc__)
     parser.add_argument("--port", type=int, default=PORT, help="if it is in use, the next free one is taken")
     arguments = parser.parse_args()
+    access = Access(arguments.port)
     try:
-        window = Viewer(cli.run_folder(arguments), arguments.port)
+        window = Viewer(cli.run_folder(arguments), arguments.port, access)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
-    print(f"http://127.0.0.1:{window.server.get_port()}  (Ctrl-C ends)", flush=True)
+    print(f"{access.link(f'http://127.0.0.1:{window.server.get_port()}/')}  (Ctrl-C ends)", flush=True)
     try:
         window.server.sleep_forever()
     except KeyboardInterrupt:

@@ -109,7 +109,7 @@ _COMMANDS = {
 
 def _execution(request: Request, arguments: argparse.Namespace) -> Execution:
     if arguments.cores is not None and arguments.cores < 1:
-        raise Refused(f"cores={arguments.cores}: of each stage; 1 or more")
+        raise Refused(f"cores={arguments.cores}: cores must be at least 1; it is the number of cores of each stage")
     engine = make_engine(arguments.engine, arguments.address, request.root, request.runs)
     return Execution(engine, arguments.cores)
 
@@ -120,7 +120,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("stage", nargs="?", default="all", help="run this stage and what it needs; default: all")
     parser.add_argument("--scene", default="", help="a name under data/, or a path")
     parser.add_argument("--data", type=Path, help="batch, compare: a folder of scenes; default of batch: data/")
-    parser.add_argument("--profile", help="auto, or a profile of pipeline.yaml: laptop, paper, best, paper-terms")
+    names = "laptop, laptop-terms, paper, paper-terms, best, fast"
+    parser.add_argument("--profile", help=f"auto, or a profile of pipeline.yaml: {names}")
     parser.add_argument("--variant", help="a variant of pipeline.yaml")
     parser.add_argument("--variants", default="", help="compare: only these, separated by commas")
     parser.add_argument("--seeds", type=int, default=1, help="compare: number of scenes: X, X-1, X-2 ...")

@@ -149,7 +149,7 @@ def _scenes(request: Request, seeds: int, data: Path | None) -> dict[str, str]:
         Refused: a scene does not exist, or the options contradict each other.
     """
     if seeds < 1:
-        raise Refused(f"seeds={seeds}: on how many scenes; 1 or more")
+        raise Refused(f"seeds={seeds}: seeds must be at least 1; it is the number of scenes")
     if data:
         if request.scene or seeds > 1:
             raise Refused(f"data={data}: all scenes of a folder, without scene={request.scene} and seeds={seeds}")

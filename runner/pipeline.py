@@ -335,7 +335,12 @@ def find_scene(text: str, root: Path) -> Path:
         return scene
     data = workplace(root) / "data"
     known = sorted(p.name for p in data.glob("[!._]*/")) if data.is_dir() else []
+    here = (
+        "no folder or video at that path"
+        if Path(text).is_absolute()
+        else f"no folder data/{text}, nor one or a video at that path"
+    )
     raise Refused(
-        f"unknown scene {text!r}: there is no folder data/{text}, nor one or a video at that path; "
+        f"unknown scene {text!r}: there is {here}; "
         f"known: {', '.join(known) or 'none'} (`reffusion demo` makes data/demo)"
     )

@@ -3,6 +3,7 @@
 Names of views stay text even if they look like numbers or dates. Size, depth and number of values are limited.
 """
 
+import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -39,8 +40,9 @@ def read_user_yaml(path: Path, typed: tuple[str, ...]) -> dict[str, Any]:
         typed: the top-level keys below which scalars are read with YAML's types.
 
     Raises:
-        Refused: the path is no regular file; the file is not UTF-8 text, valid YAML or a mapping; a key occurs twice;
-            or a limit of this module is exceeded. The message names the file and, where known, the line.
+        Refused: the path is no regular file; the file is not text in UTF-8 or UTF-16, valid YAML or a mapping; a key
+            occurs twice; a list of names has an empty entry; or a limit of this module is exceeded. The message names
+            the file and, where known, the line.
     """
     if not path.is_file():
         if path.exists() or path.is_symlink():
@@ -49,13 +51,20 @@ def read_user_yaml(path: Path, typed: tuple[str, ...]) -> dict[str, Any]:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise Refused(f"{path}: larger than {MAX_BYTES // 10**6} MB; a scene needs some lines")
-        node, loader = _tree(path.read_bytes().decode("utf-8-sig"))
+        content = path.read_bytes()
+        text = content.decode(json.detect_encoding(content))
+    except (OSError, UnicodeDecodeError) as error:
+        raise Refused(f"{path}: not readable text: {error}; save it as UTF-8") from None
+    try:
+        node, loader = _tree(text)
         if node is None or _is_null(node):
             return {}
         if not isinstance(node, yaml.MappingNode):
             raise Refused(f"{path}: expected `key: value` lines, found a {node.id}")
         return {key: _value(loader, value, key not in typed) for key, value in _pairs(loader, node)}
-    except (yaml.YAMLError, ValueError, OSError) as error:
+    except (yaml.YAMLError, ValueError) as error:
+        if line := _line_with_tab(text, error):
+            raise Refused(f"{path}: line {line}: a tab; YAML indents by blanks only") from None
         raise Refused(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
 
 
@@ -74,6 +83,12 @@ def parse_value(text: str, is_text: bool) -> Any:
     except yaml.YAMLError as error:
         raise ValueError(" ".join(str(error).split())) from None
     return None if node is None else _value(loader, node, is_text)
+
+
+def _line_with_tab(text: str, error: Exception) -> int | None:
+    """Return the number of the line at which YAML failed if this line has a tab, else None."""
+    mark, lines = getattr(error, "problem_mark", None), text.splitlines()
+    return mark.line + 1 if mark and mark.line < len(lines) and "\t" in lines[mark.line] else None
 
 
 def _tree(text: str) -> tuple[Any, Any]:
@@ -131,8 +146,19 @@ def _is_null(node: Any) -> bool:
 
 
 def _value(loader: Any, node: Any, is_text: bool) -> Any:
-    """Construct the value of a node; with `is_text` scalars stay text as written, or None."""
+    """Construct the value of a node; with `is_text` scalars stay text as written, or None.
+
+    Raises:
+        ValueError: with `is_text`, a list has an entry that YAML reads as nothing, such as `~` and `null`.
+    """
     if isinstance(node, yaml.SequenceNode):
+        if is_text and (empty := [each for each in node.value if _is_null(each)]):
+            what = (
+                f"`{empty[0].value}` in a list means nothing; put it in quotes if it is a name"
+                if empty[0].value
+                else ("an empty entry in a list; name something, or remove it")
+            )
+            raise ValueError(f"line {empty[0].start_mark.line + 1}: {what}")
         return [_value(loader, each, is_text) for each in node.value]
     if isinstance(node, yaml.MappingNode):
         return {key: _value(loader, value, is_text) for key, value in _pairs(loader, node)}

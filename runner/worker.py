@@ -4,8 +4,8 @@ The command is `describe` (answers questions about stages), `fetch` (downloads t
 (extracts the frames of a video) or `run` (runs a stage). Input is read from the standard input.
 
 The description of a stage is a module with the class Params and optional functions (needed_weights, lacks, unavailable,
-optional_weights, cost, preview, scene_files, scene_facts, machine_facts). It is stages/plan/<stage>.py, which imports
-nothing heavy, or else stages/<stage>.py.
+optional_weights, preview, scene_files, scene_facts, machine_facts). It is stages/plan/<stage>.py, which imports nothing
+heavy, or else stages/<stage>.py.
 """
 
 import ast

@@ -31,6 +31,7 @@ from reffusion.io.scene import (
     load_raw_masks,
     load_scene,
     load_views,
+    load_warnings,
     save_mask_sets,
 )  # fmt: skip
 from reffusion.masks import consolidation, frame_check, voting
@@ -52,7 +53,8 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     Writes:
 
     - labels.npy, bool [N]: the Gaussians to remove, which are the object's and debris;
-    - debris.npy, bool [N], if debris is searched: Gaussians that the object had hidden and that no photograph supports;
+    - debris.npy, bool [N]: Gaussians that the object had hidden and that no photograph supports (all False unless
+      debris is searched), and scattered ones that a user deleted in an editor;
     - background.npz: planes and mirror planes around the object if the classes depend on them, and its soft shadow if
       one is found;
     - raw/, consistent/, unobserved/ and invent/<view>.png: the pixel classes;
@@ -69,7 +71,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply", device=params.device)
     train = [scene.cameras[name] for name in scene.train]
     check_frame(poses, fit, gaussians, train)
-    region, deleted = load_region(raw_masks), load_deleted(poses, params.device)
+    region, (deleted, scattered) = load_region(raw_masks), load_deleted(poses, params.device)
     raw = {} if deleted is not None else collect_raw_masks(params, scene, gaussians, poses, raw_masks)
     fill = FillRequest(region, load_fill_masks(raw_masks)) if params.invent != "unobserved" else FillRequest(None, {})
     if deleted is None and not raw and region is None and not fill.masks and not scene.blank:
@@ -81,6 +83,8 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     labels = deleted if deleted is not None else consolidation.label_object(params, gaussians, train, ballots, region)
     photo_of = lambda name: load_views(poses, [name])[name]
     labels, consistent, remnants = complete_object(params, scene, gaussians, labels, out, photo_of, bool(raw))
+    if deleted is not None:
+        labels = deleted | limit_extras(labels & ~deleted, deleted, "inside", out)
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
 
     background = Background(render_depth_views(gaussians, train, hidden), {}, points=scene.points)
@@ -90,10 +94,12 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     if background.planes or params.debris:
         background = replace(background, photos=exposure.load_normalized_views(poses, fit, scene.train))
     shadow = find_shadow(params, background, gaussians.means[labels], scene)
+    debris = torch.zeros_like(labels) if scattered is None else scattered
     if params.debris and (raw or deleted is not None):
-        debris = find_debris(gaussians, labels, background.views, hidden, background.photos)
-        save_labels(out / "debris.npy", debris.cpu())
-        labels = labels | debris
+        found = find_debris(gaussians, labels, background.views, hidden, background.photos) & ~debris
+        debris = debris | (found if deleted is None else limit_extras(found, deleted, "behind", out))
+    save_labels(out / "debris.npy", debris.cpu())
+    labels = labels | debris
     remaining = gaussians.map(lambda p: p[~labels])
     if needs_surfaces:
         background = background.with_mirrors(remaining)
@@ -197,7 +203,8 @@ def report_remnants(remnants: Sequence[Remnant], out: Path, photo_of: Callable[[
         photo[remnant.mask] = photo[remnant.mask] // 2 + np.array(TINT) // 2
         save_image(out / picture, photo)
         outcome = (
-            "a part that the masks leave out would float in the air and is removed too (masks.remnants=false keeps it)"
+            "a part of the object that no mask covers is removed, too, because it would float in the air (to keep it: "
+            "`--set masks.remnants=false`)"
             if remnant.would_float
             else "part of the object seems to be left; if so, mark it in that view and run again"
         )
@@ -213,20 +220,47 @@ def load_region(raw_masks: Path) -> Region | None:
     return Region(**load_json(path)) if path.exists() else None
 
 
-def load_deleted(poses: Path, device: str) -> Tensor | None:
-    """Read which of the Gaussians that the scene brings were deleted by the user in a splat editor, as bool [N].
-
-    These deletions are taken as the object's labels instead of votes.
+def load_deleted(poses: Path, device: str) -> tuple[Tensor | None, Tensor | None]:
+    """Read which of the Gaussians that the scene brings were deleted by the user in a splat editor.
 
     Args:
         poses: folder of the stage `poses`.
         device: device of the result.
 
     Returns:
-        bool [N], True = deleted; None if the scene has no such file.
+        deleted: bool [N], True for deleted Gaussians that leave a hole. They are the object's labels instead of votes.
+        scattered: bool [N], True for deleted Gaussians that stood alone: they are removed, and leave no hole.
+        Both are None if the scene has no such file.
     """
-    path = poses / "deleted.npy"
-    return load_labels(path).to(device) if path.exists() else None
+    if not (poses / "deleted.npy").exists():
+        return None, None
+    deleted, path = load_labels(poses / "deleted.npy").to(device), poses / "scattered.npy"
+    scattered = load_labels(path).to(device) if path.exists() else torch.zeros_like(deleted)
+    return deleted & ~scattered, scattered
+
+
+def limit_extras(extras: Tensor, deleted: Tensor, where: str, out: Path) -> Tensor:
+    """Return the Gaussians to remove besides those that a user deleted in an editor, or none if they outnumber these.
+
+    An object may hide some Gaussians, which an editor does not show. If they outnumber the object's own, the hole is
+    probably no object's, and what the user left in the scene stays. A warning then goes to warnings.json.
+
+    Args:
+        extras: bool [N], True for Gaussians to remove that the user did not delete.
+        deleted: bool [N], True for Gaussians that the user deleted.
+        where: where the extras are, "inside" or "behind" the hole, for the warning.
+        out: folder of this stage.
+    """
+    if (count := int(extras.sum())) <= int(deleted.sum()):
+        return extras
+    lines = [
+        *load_warnings(out),
+        f"{count} splats {where} the hole stay, because they are more than the {int(deleted.sum())} that were deleted "
+        "there; if they belong to the object, delete them too",
+    ]
+    warnings.warn(lines[-1], stacklevel=1)
+    save_json(out / WARNINGS, lines)
+    return torch.zeros_like(extras)
 
 
 def collect_raw_masks(

@@ -15,6 +15,7 @@ import torch
 from reffusion import seeding, trace
 from reffusion.capture import frame, image_detail, sfm, stereo
 from reffusion.capture.checks import sanity
+from reffusion.capture.checks.agreement import judge_poses
 from reffusion.capture.checks.pose_check import check_poses, judge
 from reffusion.capture.layouts import cameras, ring
 from reffusion.capture.layouts.capture import Capture
@@ -23,7 +24,13 @@ from reffusion.capture.lenses import save_lenses
 from reffusion.capture.refine import refine_cameras
 from reffusion.capture.roles import Roles
 from reffusion.capture.scene_folder import check_gaussian_files, is_gaussians_only, read_scene
-from reffusion.capture.undistort import fitting_size, load_resized, resized_lens, save_undistorted_view
+from reffusion.capture.undistort import (
+    describe_transparency,
+    fitting_size,
+    load_resized,
+    resized_lens,
+    save_undistorted_view,
+)
 from reffusion.capture.views import check_outliers
 from reffusion.gaussians import matching
 from reffusion.io.arrays import save_json, save_labels
@@ -54,6 +61,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     - refine.json, if cameras are compared with optical flow and adjusted to it where needed;
     - gaussians.ply (normalised frame), if the scene brings Gaussians;
     - deleted.npy, bool [N], if it also brings a file from which a user deleted some of them: True for the deleted ones;
+    - scattered.npy, bool [N], if some of the deleted ones stood alone and leave no hole: True for these;
     - warnings.json, if something looks wrong.
 
     Args:
@@ -69,7 +77,15 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         _save_gaussians_only(params, out, scene, own_splats)
         return
     capture, roles = read_scene(params, scene, params.longest)
-    messages = [*capture.warnings, *(own_splats.notes if own_splats else ())]
+    corrections = []
+    if capture.poses is not None and not params.trust:
+        agreement = judge_poses(capture)
+        print(agreement.summary, flush=True)
+        if agreement.correction is not None:
+            corrections = [agreement.describe(capture.pose_source)]
+            capture, roles = read_scene(params, scene, params.longest, agreement.correction)
+    messages = [*corrections, *capture.warnings, *(own_splats.notes if own_splats else ())]
+    messages += describe_transparency([*roles.train, *roles.test], capture)
     sizes = {name: image_size(path, upright=capture.upright) for name, path in capture.pictures.items()}
     if capture.poses is None:
         everyone, capture = sorted(capture.pictures), _run_sfm(params, out, capture)
@@ -111,12 +127,15 @@ class OwnSplats:
         properties: names of the properties of the .ply, in order; empty for other formats.
         deleted: bool [N], True for Gaussians that are missing from the file that the parameter `cleaned` names. None if
             the scene has no such file.
+        scattered: bool [N], True for deleted Gaussians that leave no hole to fill (`matching.find_scattered`); None if
+            `deleted` is None.
         notes: sentences about both files, for the user.
     """
 
     splats: Splats
     properties: tuple[str, ...]
     deleted: np.ndarray | None
+    scattered: np.ndarray | None
     notes: tuple[str, ...]
 
 
@@ -133,13 +152,13 @@ def _load_own_splats(params: Params, scene: Path) -> OwnSplats | None:
     if params.gaussians is None:
         return None
     path = scene / params.gaussians
-    splats, deleted = load_splats(path), None
+    splats, deleted, scattered = load_splats(path), None, None
     notes = [f"{path.name}: {note}" for note in splats.notes]
     if params.cleaned is not None:
         cleaned, messages = _load_positions(scene / params.cleaned)
         notes += [f"{params.cleaned}: {note}" for note in messages]
-        deleted = _find_deleted((path, scene / params.cleaned), splats.rows.means, cleaned)
-    return OwnSplats(splats, load_property_names(path), deleted, tuple(notes))
+        deleted, scattered = _find_deleted((path, scene / params.cleaned), splats.rows.means, cleaned)
+    return OwnSplats(splats, load_property_names(path), deleted, scattered, tuple(notes))
 
 
 def _load_positions(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -151,7 +170,7 @@ def _load_positions(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     return splats.rows.means, splats.notes
 
 
-def _find_deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -> np.ndarray:
+def _find_deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the Gaussians that the user deleted, by matching positions. The counts are printed.
 
     Args:
@@ -160,10 +179,11 @@ def _find_deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarr
         cleaned: [M, 3] positions of the cleaned scene.
 
     Returns:
-        bool [N], True for Gaussians of the whole scene that are missing from the cleaned one.
+        deleted: bool [N], True for Gaussians of the whole scene that are missing from the cleaned one.
+        scattered: bool [N], True for those of them that leave no hole to fill.
 
     Raises:
-        BadInput: the files are of different scenes, or nothing was deleted.
+        BadInput: the files are of different scenes, or nothing was deleted, or only scattered Gaussians.
     """
     match = matching.match_gaussians(whole, cleaned)
     if match.found < matching.MIN_MATCHED_SHARE:
@@ -173,17 +193,25 @@ def _find_deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarr
         )
     if not match.deleted.any():
         raise BadInput(f"{files[1]}: nothing was deleted: all splats of {files[0].name} are there")
+    count, scattered = np.count_nonzero(match.deleted), matching.find_scattered(whole, match.deleted)
+    alone = np.count_nonzero(scattered)
+    if alone == count:
+        raise BadInput(
+            f"{files[1]}: {count} scattered splats were deleted; no region to fill: each stood among splats that stay. "
+            f"Delete a whole object, or use {files[1].name} as it is"
+        )
+    dust = f", {alone} of them scattered: they leave no region to fill" if alone else ""
     turned = "" if min(match.turn) > 0 else ", and it was turned by 180 degrees"
     strange = "" if match.found == 1 else f", and {1 - match.found:.1%} of its splats are new and left out"
-    print(f"{files[1].name}: {match.deleted.sum()} of {len(whole)} splats were deleted{turned}{strange}", flush=True)
-    return match.deleted
+    print(f"{files[1].name}: {count} of {len(whole)} splats were deleted{dust}{turned}{strange}", flush=True)
+    return match.deleted, scattered
 
 
 def _save_own_splats(out: Path, placed: Scene, own_splats: OwnSplats) -> None:
-    """Write the Gaussians that the scene brings: gaussians.ply in the normalised frame, and deleted.npy.
+    """Write the Gaussians that the scene brings: gaussians.ply in the normalised frame, deleted.npy and scattered.npy.
 
-    The properties of gaussians.ply have the order of the scene's file. deleted.npy is written if Gaussians were
-    deleted.
+    The properties of gaussians.ply have the order of the scene's file. The other two files are written if Gaussians
+    were deleted, scattered.npy only if some of them were scattered.
 
     Args:
         placed: the scene in the normalised frame.
@@ -191,6 +219,8 @@ def _save_own_splats(out: Path, placed: Scene, own_splats: OwnSplats) -> None:
     save_ply(out / "gaussians.ply", own_splats.splats.gaussians(placed.similarity), properties=own_splats.properties)
     if own_splats.deleted is not None:
         save_labels(out / "deleted.npy", own_splats.deleted)
+    if own_splats.scattered is not None and own_splats.scattered.any():
+        save_labels(out / "scattered.npy", own_splats.scattered)
 
 
 def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: OwnSplats) -> None:
@@ -204,9 +234,10 @@ def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: Own
         scene: folder of the scene.
     """
     rows, found = own_splats.splats.rows, cameras.read(scene)
-    assert own_splats.deleted is not None
+    assert own_splats.deleted is not None and own_splats.scattered is not None
+    hole = own_splats.deleted & ~own_splats.scattered
     means, opaque, sizes = rows.means, rows.opacity_logits > 0, np.exp(np.median(rows.log_scales, axis=1))
-    poses, source = found or (ring.place_cameras(means, sizes, opaque, own_splats.deleted, params.longest), None)
+    poses, source = found or (ring.place_cameras(means, sizes, opaque, hole, params.longest), None)
     some = np.flatnonzero(opaque)
     draws = seeding.generator(SEED, "poses", "points of Gaussians")
     some = some[torch.randperm(len(some), generator=draws)[:MORE_POINTS].numpy()]

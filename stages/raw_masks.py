@@ -17,7 +17,8 @@ from reffusion.capture.scene_folder import is_gaussians_only, read_scene
 from reffusion.capture.undistort import save_undistorted_masks
 from reffusion.capture.views import check_outliers, resolve_view
 from reffusion.io.arrays import save_json
-from reffusion.io.images import image_size, save_mask
+from reffusion.io.given_masks import mask_file_size
+from reffusion.io.images import save_mask
 from reffusion.io.scene import WARNINGS, load_raw_masks, load_scene
 from reffusion.masks import regions
 from reffusion.params.raw_masks import Params
@@ -52,7 +53,9 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
             save_undistorted_masks(out, names[k], roles, lenses[names[k]])
         notes = roles.warnings
         if roles.test_masks:
-            save_json(out / FACTS, {"test_masks_longest": max(max(image_size(p)) for p in roles.test_masks.values())})
+            save_json(
+                out / FACTS, {"test_masks_longest": max(max(mask_file_size(p)) for p in roles.test_masks.values())}
+            )
     if params.region is not None:
         _save_region(params, out, placed)
     notes = (*notes, *find_odd_masks(placed, load_raw_masks(out, placed.train)))

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
@@ -23,10 +24,11 @@ from scenes.references import run_reference_stage
 
 from reffusion.io.arrays import save_json, save_text
 from reffusion.io.images import load_image, save_image
-from report import verdict
-from report.app import brush, painting, scenes, uploads
+from report import cli, verdict
+from report.access import REFUSAL, Access
+from report.app import brush, painting, pictures, scenes, uploads
 from report.app.app import App
-from report.app.job_progress import estimate_remaining
+from report.app.job_progress import ShownProgress, estimate_remaining
 from report.app.scenes import OpenScene
 from report.app.server import Server
 from report.job_data import load_job
@@ -54,7 +56,11 @@ class Page:
         wait_until(lambda: self.server.server.started)
 
     def send(self, method, path, body=None, **headers):
-        """Return (status, body) of a request; a body that is no bytes is sent as JSON."""
+        """Return (status, body) of a request; a body that is no bytes is sent as JSON.
+
+        Cookie="" sends it without the token.
+        """
+        headers = {"Cookie": f"reffusion_{self.server.port}={self.server.access.token}"} | headers
         connection = http.client.HTTPConnection("127.0.0.1", self.server.port, timeout=60)
         content = body if body is None or isinstance(body, bytes) else json.dumps(body).encode()
         connection.request(method, path, content, headers)
@@ -117,6 +123,46 @@ def test_other_pages_and_machines_are_refused(page, scene):
         for origin in ("http://elsewhere.example", "null", f"http://{own}.elsewhere.example", "http://127.0.0.1:1"):
             assert page.send("POST", path, {}, Origin=origin)[0] == 403
     assert page.send("GET", "/scenes", Origin=f"http://{own}")[0] == 200
+
+
+EVERY_ADDRESS = {
+    "GET": (
+        "/", "/app.css", "/app.js", "/scenes", "/scenes/scene/state", "/scenes/scene/events",
+        "/scenes/scene/pictures/photo/v00", "/scenes/scene/paint/v00", "/scenes/scene/paint/v00/canvas",
+        "/scenes/scene/export/scene.ply", "/scenes/scene/mask/", "/scenes/scene/mask/state",
+        "/scenes/scene/mask/photo/v00", "/none",
+    ),
+    "POST": (
+        "/scenes", "/uploads", "/uploads/x/a.png", "/scenes/scene/do/start", "/scenes/scene/live",
+        "/scenes/scene/mask/mark", "/scenes/scene/mask/save", "/scenes/scene/paint/v00",
+        "/scenes/scene/paint/v00/fill",
+    ),
+}  # fmt: skip
+
+
+def test_every_address_asks_for_the_token(page, scene):
+    """It may come with the address, whose answer sets a cookie, or with the cookie; the brush and uploads too."""
+    token, port = page.server.access.token, page.server.port
+    wrong = ("", f"reffusion_{port}=", f"reffusion_{port}={token}x", f"other={token}", f"reffusion_{port}=é")
+    for method, paths in EVERY_ADDRESS.items():
+        for path in paths:
+            for cookie in wrong:
+                status, answer = page.send(method, path, {} if method == "POST" else None, Cookie=cookie)
+                assert (status, json.loads(answer)) == (403, {"error": REFUSAL}), (method, path, cookie)
+            assert page.send(method, f"{path}?token={token[:-1]}", Cookie="")[0] == 403
+    assert page.send("GET", "/", Cookie="", Accept="text/html")[1] == REFUSAL.encode(), "one line for a person"
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    connection.request("GET", f"/?token={token}")
+    cookie = connection.getresponse().headers["Set-Cookie"]
+    assert cookie == f"reffusion_{port}={token}; Path=/; Max-Age=604800; HttpOnly; SameSite=Strict"
+    assert page.send("GET", "/scenes", Cookie=f"a=b; {cookie.split(';')[0]}")[0] == 200
+    assert page.send("POST", f"/uploads?token={token}", {"name": "x"}, Cookie="")[0] == 200
+    assert page.send("GET", f"/scenes?token={token}", Cookie="", Host="elsewhere.example")[0] == 403
+
+
+def test_two_servers_have_two_tokens_of_256_bits():
+    one, other = Access(1), Access(1)
+    assert one.token != other.token and len(one.token) == 43 and one.token not in repr(one)
 
 
 @pytest.mark.parametrize("path", [
@@ -188,6 +234,25 @@ def test_a_painting_must_show_its_view_and_replaces_none_unasked(tmp_path):
     assert load_image(scene.source / "painted/v00.png").shape == (30, 40, 3)
 
 
+def turned_jpeg(width=40, height=30):
+    """Return a JPEG as phones save an upright picture: pixels on their side, and a tag that says how to turn them."""
+    picture, tag, file = Image.new("RGB", (height, width)), Image.Exif(), io.BytesIO()
+    tag[0x0112] = 6
+    picture.save(file, "JPEG", exif=tag)
+    return file.getvalue()
+
+
+def test_the_orientation_tag_of_paintings_and_photographs_is_obeyed(tmp_path):
+    scene = OpenScene("scene", tmp_path / "scene", tmp_path / "runs/scene")
+    save_image(scene.home / painting.TO_PAINT / "v00.png", np.zeros((30, 40, 3), np.uint8))
+    for k in range(3):
+        (tmp_path / "scene/images").mkdir(parents=True, exist_ok=True)
+        (tmp_path / f"scene/images/v0{k}.jpg").write_bytes(turned_jpeg())
+    painting.save_painting(scene, "v00", turned_jpeg(), replace=False)
+    assert load_image(scene.source / "painted/v00.png").shape == (30, 40, 3)
+    assert Image.open(io.BytesIO(pictures.draw_thumbnail(scene, "v00"))).size == (40, 30)
+
+
 def transparent_png(image, hole):
     file = io.BytesIO()
     Image.fromarray(np.dstack([image, np.where(hole, 0, 255).astype(np.uint8)])).save(file, "PNG")
@@ -222,7 +287,7 @@ def test_a_marked_part_is_filled_with_patches_of_photographs(wall_folders, tmp_p
 
 def test_the_state_says_what_was_found_and_what_is_missing(page, scene):
     connection = http.client.HTTPConnection("127.0.0.1", page.server.port, timeout=60)
-    connection.request("GET", "/scenes/scene/events")
+    connection.request("GET", page.server.access.link("/scenes/scene/events"))
     answer = connection.getresponse()
     assert answer.headers["Content-Type"].startswith("text/event-stream")
     while True:  # a first state without a plan, then the plan
@@ -251,6 +316,11 @@ def test_a_job_is_started_stopped_and_goes_on(page, scene):
     assert page.post("/scenes/scene/do/mask") == (200, {"open": True})
     assert page.send("GET", "/scenes/scene/mask/state")[0] == 200
     wait_until(lambda: page.state()["job"]["stage"] == "fit")
+    assert page.post("/scenes/scene/do/stop")[0] == 200, "the mask page is open now"
+    wait_until(lambda: page.state()["job"]["state"] == "stopped")
+    assert page.state()["awaits_fit"] and page.state()["job"]["target"] == "fit"
+    assert page.post("/scenes/scene/do/mask") == (200, {"open": True})
+    wait_until(lambda: page.state()["job"]["stage"] == "fit")
     assert "poses: " not in "\n".join(page.state()["job"]["log"]), "the poses are not found anew"
 
 
@@ -273,6 +343,44 @@ def test_a_run_in_a_terminal_is_shown_and_left_alone(page, scene, tmp_path):
     wait_until(lambda: page.state()["job"]["state"] == "idle")
 
 
+def test_a_result_is_reached_though_its_photographs_were_moved_away(page, tmp_path):
+    """The plan was recorded before the stages `poses` and `evaluate` were done."""
+    home, source = tmp_path / "runs/scene", tmp_path / "moved/scene"
+    save_text(home / "source", str(source))
+    entry = {"word": "run", "reason": "not run yet", "notes": [], "folder": None}
+    save_json(home / "plan.json", {"stages": {stage: entry for stage in ("poses", "fit", "evaluate")}})
+    for stage in ("poses", "evaluate"):
+        save_json(home / stage / "receipt.json", {"params": {}, "seconds": 1.0, "needs": {}})
+    save_image(home / "poses/images/v00.png", np.zeros((30, 40, 3), np.uint8))
+    save_json(home / "poses/views.json", {"train": ["v00"], "test": []})
+    recent = json.loads(page.send("GET", "/scenes")[1])["scenes"]
+    assert recent == [{"name": "scene", "path": str(source), "state": "finished", "lost": True}]
+    assert page.post("/scenes", {"path": str(source)}) == (200, {"name": "scene"})
+    wait_until(lambda: not page.state()["plan"]["busy"])
+    state = page.state()
+    words = f"The photographs are no longer at {source}. Move them back to run stages again; finished results stay."
+    assert state["lost"] == state["plan"]["error"] == words and state["result"]["views"] == ["v00"]
+    done = {each["name"]: each["word"] for each in state["plan"]["stages"]}
+    assert done == {"poses": "cached", "fit": "run", "evaluate": "cached"}
+    assert page.send("GET", "/scenes/scene/pictures/photo/v00")[0] == 200
+    assert page.post("/scenes", {"path": str(tmp_path / "moved/other")})[0] == 400
+    source.mkdir(parents=True)
+    wait_until(lambda: "no longer" not in page.state()["plan"]["error"])
+    assert not page.state()["lost"], "moved back"
+
+
+@pytest.mark.parametrize(("level", "scene", "expected"), [
+    ("1", "garden", "make scene=garden app"), ("1", None, "make app"),
+    (None, "garden", "reffusion app --scene garden"), (None, None, "reffusion app"),
+])  # fmt: skip
+def test_the_page_names_the_command_that_was_typed(monkeypatch, level, scene, expected):
+    if level is None:
+        monkeypatch.delenv("MAKELEVEL", raising=False)
+    else:
+        monkeypatch.setenv("MAKELEVEL", level)
+    assert cli.typed_command("app", scene and Path(scene)) == expected
+
+
 # ------------------------------------------------------------------------------------------------ judgement
 
 
@@ -292,14 +400,35 @@ def test_the_judgement_says_what_is_left_and_what_would_help(tmp_path):
     shares = {"photographs": 0.8, "conflict": 0.0, "reference": 0.1, "patches": 0.06, "nothing": 0.04}
     write_job(tmp_path / "a", [], shares)
     said = verdict.describe_result(load_job(tmp_path / "a"))
-    assert "look whether they left out a part" in said
-    assert "20 % of what it hid is made up; a completed picture of IMG 2 would help most." in said
+    assert said == [
+        "What the masks cover is removed, and no other part of the object was found.",
+        "No photograph shows 20 % of what was behind it: that part is made up.",
+        "To improve it most, paint the view IMG 2.",
+    ]
     part = {"removed": False, "share": 0.01, "view": "IMG_7"}
     write_job(tmp_path / "b", [part, part | {"removed": True}], shares, given=["IMG_1"])
     said = verdict.describe_result(load_job(tmp_path / "b"))
-    assert "a part may be left (best seen in IMG_7" in said and "10 % of what it hid is made up" in said
+    left = "The object is removed, but 1 part of it seems to be left. Look at the view IMG_7, and mark it there."
+    assert said[:2] == [left, "No photograph shows 10 % of what was behind it: that part is made up."]
     write_job(tmp_path / "c", [], shares | {"reference": 0.0, "patches": 0.0, "nothing": 0.001})
-    assert "the photographs show all that it hid." in verdict.describe_result(load_job(tmp_path / "c"))
+    assert "The photographs show everything that was behind the object." in verdict.describe_result(
+        load_job(tmp_path / "c")
+    )
+
+
+def test_the_judgement_waits_for_a_second_run(tmp_path):
+    """The stage `masks` has run again; the pictures and other numbers are of the first run."""
+    write_job(
+        tmp_path / "a", [], {"photographs": 1.0, "conflict": 0.0, "reference": 0.0, "patches": 0.0, "nothing": 0.0}
+    )
+    receipt = {"params": {"remnants": True}, "seconds": 1.0, "needs": {"masks": "first"}}
+    save_json(tmp_path / "a/evaluate/receipt.json", receipt)
+    for output, is_judged in (("first", True), ("second", False)):
+        save_json(tmp_path / "a/masks/receipt.json", receipt | {"needs": {}, "output": output})
+        assert (len(verdict.describe_result(load_job(tmp_path / "a"))) == 2) == is_judged
+    assert verdict.describe_result(load_job(tmp_path / "a")) == [
+        "The pictures below are of the earlier result. The judgement follows when the new run is done."
+    ]
 
 
 # ------------------------------------------------------------------------------------------------ in a browser
@@ -316,12 +445,22 @@ def test_the_time_left_does_not_jump_with_the_first_steps_of_a_bar():
     assert estimate_remaining(20, None, (0.5, 20)) == (0.5, 20) and estimate_remaining(20, None, None) == (None, None)
 
 
+def test_shown_progress_never_runs_back_and_its_end_stays():
+    shown = ShownProgress(began=0)
+    assert shown.update(40, "fit", 0.5, 60) == {"share": 0.5, "left": 60, "whole": 0.4}
+    assert shown.update(50, "fit", 0.4, 62) == {"share": 0.5, "left": 50, "whole": pytest.approx(50 / 112)}
+    slower = shown.update(60, "fit", 0.4, 300)
+    assert slower == {"share": 0.5, "left": 300, "whole": pytest.approx(50 / 112)}, "a large error is corrected"
+    assert shown.update(70, "masks", 0.0, None) == {"share": 0.0, "left": None, "whole": None}
+    assert shown.update(80, "masks", None, 20) == {"share": None, "left": 20, "whole": 0.8}
+
+
 @pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
 @pytest.mark.parametrize("width", [1280, 390])
 def test_a_walk_from_photographs_to_an_export(page, mini_scene, tmp_path, width):
     shutil.copytree(mini_scene, tmp_path / "mini")
     save_text(tmp_path / "mini/scene.yaml", (mini_scene / "scene.yaml").read_text() + "\nbudget: 20s\n")
-    with open_page(page.server.address, width) as tab:
+    with open_page(page.server.link(), width) as tab:
         tab.set_default_timeout(600_000)
         tab.fill("#path", str(tmp_path / "mini"))
         tab.click("#open button")
@@ -338,7 +477,7 @@ def test_a_walk_from_photographs_to_an_export(page, mini_scene, tmp_path, width)
         assert tab.evaluate("shownView") != first
         tab.evaluate("go('export')")
         tab.click("#make:visible")
-        tab.wait_for_function("'turntable.webm' in state.export.files && !state.export.busy")
+        tab.wait_for_function("'before_after.webm' in state.export.files && !state.export.work")
         with tab.expect_download() as download:
             tab.click("#exports a >> nth=0")
         assert download.value.suggested_filename == "mini-scene.ply"

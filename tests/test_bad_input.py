@@ -26,12 +26,15 @@ from reffusion.io.depth_maps import load_depth
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, save_exr, save_image
 from reffusion.io.ply import save_ply
+from reffusion.params.capture import MaskSpec, SceneKeys
+from reffusion.params.reference import ReferenceSpec
 from reffusion.references.files import ReferenceFile, load_reference_files
 from reffusion.types import Gaussians
 from runner import Refused, worker
 from runner.parameters import parse_duration, parse_set, stack_layers
 from runner.pipeline import load_pipeline, load_scene_file
 from runner.resolve import choose_profile
+from runner.user_yaml import read_user_yaml
 from stages import poses, raw_masks
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -892,6 +895,40 @@ def test_names_that_look_like_numbers_or_dates_are_names(good_captures, tmp_path
     shutil.rmtree(out)
     assert first_message(folder, out, "poses.test=[1e3]") is None
     assert json.loads((out / "views.json").read_text())["test"] == ["1e3"]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"])
+def test_encodings_of_scene_yaml(tmp_path, encoding):
+    file = tmp_path / "scene.yaml"
+    file.write_bytes("masks: Maß\r\ntest: [images\\a.png]\r\n".encode(encoding))
+    assert read_user_yaml(file, ()) == {"masks": "Maß", "test": ["images\\a.png"]}
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"stages:\n\tfit: {iterations: 200}\n", "line 2: a tab; YAML indents by blanks only"),
+        (b"test:\n  - a\n\t- b\n", "line 3: a tab; YAML indents by blanks only"),
+        (b"train: [a]\ntest: [~, b]", "line 2: `~` in a list means nothing; put it in quotes if it is a name"),
+        (b"test:\n- a\n- null\n", "line 3: `null` in a list means nothing; put it in quotes if it is a name"),
+        (b"test:\n- a\n-\n", "line 3: an empty entry in a list; name something, or remove it"),
+        (b"images: \xe4\xf6", "save it as UTF-8"),
+    ],
+)
+def test_messages_about_scene_yaml(tmp_path, content, message):
+    (tmp_path / "scene.yaml").write_bytes(content)
+    with pytest.raises(Refused) as error:
+        read_user_yaml(tmp_path / "scene.yaml", ("stages",))
+    assert str(error.value).endswith(message)
+
+
+def test_backslashes_of_windows_in_scene_yaml():
+    keys = SceneKeys.model_validate(
+        {"images": ".\\a", "masks": {"folder": "m\\n"}, "reference": {"view": "v", "image": "p\\v.png"}}
+    )
+    assert isinstance(keys.masks, MaskSpec) and isinstance(keys.reference, ReferenceSpec)
+    assert (keys.images, keys.masks.folder, keys.reference.image) == ("./a", "m/n", "p/v.png")
+    assert SceneKeys(masks=".\\masks").mask_folder == "./masks"
 
 
 # ---------------------------------------------------------------------------------------------- the command itself

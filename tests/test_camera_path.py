@@ -100,6 +100,8 @@ def test_the_video_shows_the_result_of_a_variant_in_the_scenes_poses(tmp_path):
     save_ply(tmp_path / "x" / "fit" / "gaussians.ply", gaussians)
     with Image.open(turntable.make_wipe(tmp_path / "x@no_sds", frames=4)) as film:
         assert film.n_frames == 4 and film.width == turntable.WIPE_WIDTH
+        video = cv2.VideoCapture(str(tmp_path / "x@no_sds/before_after.webm"))
+        assert video.get(cv2.CAP_PROP_FRAME_WIDTH) == turntable.WIPE_WIDTH, "small photographs are enlarged"
         for frame, has_object in ((0, True), (2, False)):
             film.seek(frame)
             red, green, _ = np.moveaxis(np.asarray(film.convert("RGB"), int), -1, 0)

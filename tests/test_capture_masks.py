@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 from pathlib import Path
 
 import cv2
@@ -34,7 +36,11 @@ from scenes.capture_checks import (
 )
 from scenes.room import render_room_corner, room_walk, speckle_texture
 
+from reffusion.capture.scene_folder import read_scene
 from reffusion.io.images import save_image
+from reffusion.params.poses import Params
+from stages import raw_masks
+from stages.plan import raw_masks as raw_masks_plan
 
 # ------------------------------------------------------------------------------------------- uncommon kinds of masks
 
@@ -104,6 +110,104 @@ def test_antialiased_outlines_are_no_object_numbers(tmp_path):
     assert [masked_share(out, v) for v in truth.world_to_camera] == pytest.approx([SHARE] * 6, abs=0.003)
 
 
+# ------------------------------------------------------------------------- masks that are no pictures, or lie beside
+
+
+def write_capture_without_masks(folder: Path) -> list[str]:
+    """Write a COLMAP capture without masks; return the names of its views."""
+    truth = make_truth()
+    write_capture(folder, "colmap", truth)
+    shutil.rmtree(folder / "masks")
+    return sorted(truth.world_to_camera)
+
+
+OUTLINE = [[24, 18], [47, 18], [47, 35], [24, 35]]  # of `OBJECT`, through the centers of its outer pixels
+
+
+def labelme_record() -> dict:
+    shape = {"label": "box", "shape_type": "polygon", "points": OUTLINE}
+    return {"imageWidth": WIDTH, "imageHeight": HEIGHT, "shapes": [shape]}
+
+
+def coco_record(names: list[str]) -> dict:
+    size = {"width": WIDTH, "height": HEIGHT}
+    outline = [[number for point in OUTLINE for number in point]]
+    pictures = [{"id": k, "file_name": f"{name}.png", **size} for k, name in enumerate(names)]
+    annotations = [{"image_id": k, "category_id": 1, "segmentation": outline} for k in range(len(names))]
+    return {"images": pictures, "annotations": annotations, "categories": [{"id": 1, "name": "box"}]}
+
+
+@pytest.mark.parametrize("place", ["masks", "images"])
+def test_outlines_of_labelme_in_a_folder_or_beside_pictures(tmp_path, place):
+    names = write_capture_without_masks(tmp_path / "s")
+    for name in names:
+        (tmp_path / "s" / place).mkdir(exist_ok=True)
+        (tmp_path / "s" / place / f"{name}.json").write_text(json.dumps(labelme_record()))
+    roles = read_scene(Params(), tmp_path / "s")[1]
+    assert {name: path.name for name, path in roles.masks[""].items()} == {name: f"{name}.json" for name in names}
+    _, out, _ = run_with_messages(tmp_path / "s")
+    assert_masked_views(out, names)
+
+
+@pytest.mark.parametrize("spec", [None, "annotations/instances.json"])
+def test_outlines_of_coco(tmp_path, spec):
+    names, file = write_capture_without_masks(tmp_path / "s"), tmp_path / "s/annotations/instances.json"
+    file.parent.mkdir()
+    file.write_text(json.dumps(coco_record(names)))
+    _, out, _ = run_with_messages(tmp_path / "s", masks=spec)
+    assert_masked_views(out, names)
+    read = raw_masks_plan.scene_files(raw_masks.Params(masks=spec), tmp_path / "s", [])
+    assert read == [file]
+
+
+def test_arrays_of_one_mask(tmp_path):
+    names = write_capture_without_masks(tmp_path / "s")
+    (tmp_path / "s/masks").mkdir()
+    for name in names:
+        np.save(tmp_path / f"s/masks/{name}.npy", OBJECT[None])
+    _, out, _ = run_with_messages(tmp_path / "s")
+    assert_masked_views(out, names)
+
+
+@pytest.mark.parametrize("name", ["mask_{}", "dynamic_mask_{}", "{}_mask", "{}-mask", "{}_seg"])
+def test_masks_beside_pictures_are_no_photographs(tmp_path, name):
+    """`mask_of_gold` has no partner, so it is a photograph."""
+    views = ["v00", "v01", "v02", "mask_of_gold"]
+    write_pictures(tmp_path / "images", views)
+    write_masks(tmp_path / "images", [name.format(view) for view in views])
+    capture, roles = read_scene(Params(), tmp_path)
+    assert sorted(capture.pictures) == sorted(views)
+    assert {view: path.stem for view, path in roles.masks[""].items()} == {view: name.format(view) for view in views}
+
+
+def test_files_that_are_not_read_as_masks_are_counted(tmp_path):
+    names = write_capture_without_masks(tmp_path / "s")
+    (tmp_path / "s/masks").mkdir()
+    for name in names:
+        np.savez(tmp_path / f"s/masks/{name}.npz", OBJECT)
+    assert "; masks holds 6 .npz, not read as masks" in refusal_message(tmp_path / "s")
+
+
+def test_pictures_that_are_not_read_are_named_and_their_masks_are_no_mistake(tmp_path):
+    write_capture(tmp_path / "s", "colmap", make_truth())
+    (tmp_path / "s/images/v99.jxl").write_bytes(b"x")
+    write_masks(tmp_path / "s/masks", ["v99"])
+    _, _, sentences = run_with_messages(tmp_path / "s")
+    assert any("images holds 1 .jxl pictures" in each for each in sentences), sentences
+
+
+def test_photographs_with_transparent_pixels_are_named(tmp_path):
+    truth = make_truth()
+    write_capture(tmp_path / "s", "colmap", truth)
+    picture = np.full((HEIGHT, WIDTH, 4), 90, np.uint8)
+    picture[..., 3], picture[60:, :, 3] = 255, 0
+    Image.fromarray(picture).save(tmp_path / "s/images/v01.png")
+    _, out, sentences = run_with_messages(tmp_path / "s")
+    assert_message(sentences, "1 photograph has transparent pixels, which are trained on as black: v01")
+    trained = np.array(Image.open(out / "images/v01.png"))
+    assert (trained[:50] == 90).all() and not trained[65:].any()
+
+
 # ------------------------------------------------------------------------------------------------- references
 
 
@@ -114,9 +218,9 @@ def test_reference_and_its_depth_among_photographs_of_input(tmp_path):
     write_masks(folder / "masks", names)
     reference = {"view": "IMG_2", "image": "input/clean plate.jpg", "depth": "input/clean plate depth.png"}
     notes = preview_stages(folder, reference=reference)
-    assert_message(notes, "6 training")
+    assert_message(notes, "6 photographs build the scene")
     assert_message(notes, "6 masks")
-    assert_message(notes, "6 photos bring no poses")
+    assert_message(notes, "the poses of 6 photographs are computed")
 
 
 def test_two_references_beside_pictures_of_llff(tmp_path):
@@ -185,8 +289,3 @@ def test_renamed_copies_follow_the_order_of_file_names(tmp_path):
     scene, _, sentences = run_with_messages(tmp_path / "s")
     assert_cameras(scene, truth)
     assert_message(sentences, "order")
-
-
-def test_renamed_copies_that_points_contradict_are_refused(tmp_path):
-    write_corner_capture(tmp_path / "s", [0, 3, 5, 1, 4, 2])
-    assert_message([refusal_before_writing(tmp_path / "s")], "images")

@@ -3,6 +3,7 @@
 import itertools
 import threading
 import time
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -21,10 +22,11 @@ from reffusion.clicks.corrections import apply_marks
 from reffusion.clicks.events import Event
 from reffusion.clicks.fitted_views import FittedViews
 from reffusion.clicks.marks import Mark, confirmed_pixels, stroke_pixels
+from reffusion.clicks.propagation import Projection, change_where_votes_agree, find_voting_pixels
 from reffusion.clicks.refinement import redraw_masks
 from reffusion.clicks.scene_segmentation import correct_scene, segment_own_view, segment_scene
 from reffusion.clicks.segmenter import Candidate
-from reffusion.clicks.single_view import ViewEvidence
+from reffusion.clicks.single_view import ViewEvidence, pick_by_size
 from reffusion.gaussians.neighbours import find_neighbours
 from reffusion.graph_cut import min_cut
 from reffusion.io.files import BadInput
@@ -278,7 +280,9 @@ def test_views_that_are_marked_before_all_have_masks_stay_as_their_own_marks_mad
 def test_marks_that_follow_each_other_in_a_view_are_spread_together(monkeypatch):
     spread, propagate = [], scene_segmentation.propagate
     monkeypatch.setattr(
-        scene_segmentation, "propagate", lambda views, masks: spread.append({*masks}) or propagate(views, masks)
+        scene_segmentation,
+        "propagate",
+        lambda views, masks, *former: spread.append({*masks}) or propagate(views, masks, *former),
     )
     strokes = [Event("a4", middle_mark("a4", False, 2.0, above=k)) for k in (0, 2, 4)]
     segment_scene(fitted_views(), [Event("a0", middle_mark("a0")), *strokes], {})
@@ -415,6 +419,48 @@ def test_a_stroke_reaches_sides_that_its_view_does_not_show():
     assert (gained["right"] & lost["right"]).sum() > 0.85 * lost["right"].sum()
 
 
+def test_a_border_of_a_mask_beyond_a_step_in_depth_does_not_vote():
+    """A vertical bar, 10 px wide and 60 px before a wall, is covered by a stroke that is 3 px too wide on each side."""
+    relief, mask = np.full((300, 300), 60.0), np.zeros((300, 300), bool)
+    relief[:, 140:150] = 0
+    mask[60:240, 137:153] = True
+    found = find_voting_pixels(mask, relief)
+    assert not found[:, :139].any() and not found[:, 151:].any() and found[60:240, 142:148].all()
+    assert (find_voting_pixels(mask, relief * 0) == mask).all(), "without a step, all pixels vote"
+
+
+def test_a_former_mask_changes_only_in_regions_that_votes_are_for():
+    former, new, votes = np.zeros((3, 20, 20))
+    former[5:10, 5:10] = new[5:10, 5:10] = votes[5:10, 5:10] = 1
+    new[5:10, 10:13] = votes[5:10, 10:13] = 1  # the votes are for this part,
+    new[15:18, 2:5] = 1  # nobody votes on this part,
+    new[5, 5] = 0  # and the votes are against this removal
+    found = change_where_votes_agree(former > 0, new > 0, Projection(votes > 0, votes, np.zeros((20, 20))))
+    assert (found == (votes > 0)).all()
+
+
+@pytest.mark.parametrize(("size", "pixels"), [("small", 10), ("middle", 90), ("large", 1000)])
+def test_the_middle_size_is_the_geometric_mean_of_the_others(size, pixels):
+    masks = [np.arange(1000) < count for count in (10, 40, 90, 700, 1000)]
+    assert pick_by_size(masks, size).sum() == pixels
+
+
+@pytest.mark.parametrize("has_network", [True, False])
+def test_a_box_adds_and_removes_the_thing_inside_it(has_network):
+    """A red disk, 12 px in radius, is on grey ground; the network also knows the whole picture."""
+    rows, columns = np.mgrid[:80, :100]
+    disk = np.hypot(rows - 39.5, columns - 49.5) < 12
+    picture = np.random.default_rng(0).integers(100, 140, (80, 100, 3)).astype(np.uint8)
+    picture[disk] = (200, 30, 30)
+    ask = lambda prompt: [Candidate(disk, 0.9), Candidate(disk | True, 0.5)]
+    view, corners = ViewEvidence(picture, None, ask if has_network else None), np.array([[64.0, 54.0], [36.0, 26.0]])
+    added = apply_marks(view, [Mark(corners, True)])
+    assert wall_scene.iou(added, disk) > 0.95
+    assert not apply_marks(view, [Mark(corners, True), Mark(corners, False)], added, first=1)[disk].any()
+    large = apply_marks(view, [Mark(corners, True, size="large")])
+    assert large.sum() == 28 * 28, "the whole box"
+
+
 # ---------------------------------------------------------------------------------------- clicks that a scene gives
 
 
@@ -488,7 +534,7 @@ class MaskPage:
         self.session, app = session, App(folder / "runs")
         app.add(OpenScene("scene", folder, folder / "runs/scene", MaskStep(session, scene="scene")))
         self.server = Server(app, port=18090)
-        self.address = f"{self.server.address}scenes/scene/mask/"
+        self.address = self.server.link("scenes/scene/mask/")
         self.thread = threading.Thread(target=self.server.serve, daemon=True)
         self.thread.start()
 
@@ -548,10 +594,47 @@ def test_clicks_in_a_browser_make_masks_that_are_saved(page_server, tmp_path, wi
 def test_clicks_are_restored_the_next_time(page_server, tmp_path):
     page_server.session.mark("a2", [(48.0, 36.0)], True)
     page_server.session.save()
-    again = Session(page_server.session.capture, lambda: True)
+    before, capture = page_server.session, page_server.session.capture
+    saved = {name: load_mask(tmp_path / "masks" / f"{name}.png") for name in wall_scene.TRAIN}
+    again = Session(replace(capture, saved=saved), lambda: False)
     (event,) = again.events
     assert event.view == "a2" and event.mark.points.tolist() == [[48.0, 36.0]] and event.mark.positive
+    state = again.state()
+    assert not state["unsaved"] and all(view["mask"] is not None for view in state["views"]), "before any computation"
+    assert all((again.masks[name] == before.masks[name]).all() for name in saved)
     again.save()  # the page may overwrite files that it wrote
+
+
+def test_only_marks_that_differ_from_the_saved_ones_are_unsaved(clicked_scene, tmp_path):
+    _, placed, fit = clicked_scene
+    session = Session(Capture(tmp_path, tmp_path / "masks", placed, fit, {}), lambda: False)
+    session.mark("a2", [(48.0, 36.0)], True)
+    assert session.unsaved
+    session.undo()
+    assert not session.unsaved, "there are no marks, as in the beginning"
+    session.mark("a2", [(48.0, 36.0)], True)
+    session.save()
+    session.clear("a2")
+    assert session.unsaved
+    session.undo()
+    assert not session.unsaved
+
+
+def test_the_page_says_what_a_mark_changed_and_takes_another_size(clicked_scene, tmp_path):
+    _, placed, fit = clicked_scene
+    session = Session(Capture(tmp_path, tmp_path / "masks", placed, fit, {}), lambda: False)
+    session.mark("a2", [(48.0, 36.0)], True)
+    session.save()  # waits for the masks
+    area = session.masks["a2"].mean()
+    assert session.state()["views"][2]["marks"][0]["effect"] == area
+    session.mark("a2", [(2.0, 2.0)], True, radius=4.0)
+    session.save()
+    ((name, share),) = session.state()["changes"]
+    assert name == "a2" and share == pytest.approx(1 - area / session.masks["a2"].mean())
+    with pytest.raises(ValueError, match="a click or a box has the size small, middle, large or none"):
+        session.resize(1, "small")
+    session.resize(0, "large")
+    assert session.events[0].mark.size == "large" and session.undo() == "a2" and session.events[0].mark.size == ""
 
 
 def test_a_mask_is_gone_after_its_marks_are_cleared(clicked_scene, tmp_path):
@@ -604,11 +687,12 @@ def test_marks_that_do_not_fit_the_scene_are_refused(page_server):
     for content, status in (
         (b'{"view": "a9", "points": [[1, 1]], "sign": "+", "radius": 0}', "400"),
         (b'{"view": "a2", "points": [[1, 1e9]], "sign": "+", "radius": 0}', "400"),
+        (b'{"view": "a2", "points": [[1, 1], [2, 2], [3, 3]], "sign": "+", "radius": 0}', "400"),
         (b'{"view": "a2"}', "404"),
         (b"[", "400"),
         (b" " * 2_000_001, "413"),
     ):
-        request = urllib.request.Request(page_server.address + "mark", content)
+        request = urllib.request.Request(page_server.server.link("scenes/scene/mask/mark"), content)
         with pytest.raises(urllib.error.HTTPError, match=status):
             urllib.request.urlopen(request)
     assert not page_server.session.events

@@ -28,10 +28,12 @@ def test_one_click_finds_a_chequered_thing_on_rough_ground():
 
 
 def test_a_further_click_never_loses_what_was_clicked_before():
-    """A mark has clicks on two parts. The mask holds both whole parts, not just the second and a pixel of the first."""
+    """Two clicks are on two parts. The mask holds both whole parts, not just the second and a pixel of the first."""
     picture, relief, disk = checkered_disk_on_gravel()
     rows, columns = np.mgrid[:256, :256]
     other = np.hypot(rows - 80, columns - 200) < 20
     picture[other], relief[other] = (200, 40, 40), 0
-    found = apply_marks(ViewEvidence(picture, relief), [Mark(np.array([[110.5, 150.5], [200.5, 80.5]]), True)])
+    found = apply_marks(
+        ViewEvidence(picture, relief), [Mark(np.array([at]), True) for at in ((110.5, 150.5), (200.5, 80.5))]
+    )
     assert wall_scene.iou(found & disk, disk) > 0.9 and wall_scene.iou(found & other, other) > 0.9

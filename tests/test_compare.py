@@ -20,7 +20,8 @@ from scenes.browser import open_page
 from scenes.processes import run_module
 from scenes.toy_projects import COMPARE_FILES, make_request, write_files, write_project
 
-from reffusion.io.images import save_mask
+from reffusion.io.arrays import save_json, save_text
+from reffusion.io.images import save_image, save_mask
 from report import before_after, charts, compare_pictures, job, job_data, results, scenes_page, trace_charts
 from report import compare as page
 from report.paired_statistics import confidence_half_width, paired_difference, pareto_front
@@ -318,6 +319,24 @@ def test_a_photograph_with_the_object_is_no_ground_truth(job_folder):
     assert "photograph" in found and "truth" not in found
 
 
+def test_the_slider_compares_renders_first(tmp_path):
+    """A photograph is sharper than any render, so it is the third choice."""
+    for name, kinds in (("x", ("renders_fit", "renders")), ("y", ("renders",))):
+        write_receipt = lambda stage, home=tmp_path / name: save_json(
+            home / stage / "receipt.json", {"params": {}, "needs": {}, "seconds": 1.0}
+        )
+        for stage in ("poses", "raw_masks", "evaluate"):
+            write_receipt(stage)
+        save_json(tmp_path / name / "poses/views.json", {"train": ["a"], "test": []})
+        for path in ("poses/images", *(f"evaluate/{kind}" for kind in kinds)):
+            save_image(tmp_path / name / path / "a.png", np.zeros((30, 40, 3), np.uint8))
+        save_text(tmp_path / name / "evaluate/per_view.csv", "view\n")
+    section = lambda name: "".join(before_after.before_after_section(job_data.load_job(tmp_path / name)))
+    assert '<b class="l">with the object</b><b class="r">result</b>' in section("x")
+    assert ">photograph</option>" in section("x")
+    assert '<b class="l">photograph</b><b class="r">result</b>' in section("y")
+
+
 def test_several_scenes(job_folder):
     """`better` gains 2.0, 2.2, 2.4 and 2.6 dB in the views of one scene, and 1 dB more in those of the other."""
     for name in ("toy", "toy@better"):
@@ -469,7 +488,11 @@ def test_the_report_advises_what_to_paint_and_repeats_the_warnings(job_folder):
     (job_folder / "reference/to_paint/ranked.txt").write_text("# views\n1. b  40%\n2. a  30%  (painted)\n3. c  2%\n")
     (job_folder / "distill/warnings.json").write_text('["the photographs are blurred"]')
     advice = job.make(job_folder).read_text().partition("what would help</h2>")[2].partition("</ul>")[0]
-    assert "b shows 40% of what is made up" in advice and "to_paint/b.png" in advice and "painted/b.png" in advice
+    assert (
+        "The view b shows 40 % of the part that is made up." in advice
+        and "to_paint/b.png" in advice
+        and "painted/b.png" in advice
+    )
     assert advice.count("<li>") == 2 and "the photographs are blurred" in advice
 
 

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from scenes.cameras import rotation_along
 
-from benchmarks.studies import composites, compositing, placement, scoring
+from benchmarks.studies import composites, compositing, holes, placement, scoring
 from reffusion.capture import lens
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import save_points
@@ -202,3 +202,14 @@ def test_the_table_has_a_row_a_place():
         .splitlines()[-1]
         .endswith("| 0.80 | - | 0.10 | 1.25 | 62 | 0.400 / 21.23 / 0.600 / - | 0.75 |")
     )
+
+
+def test_energy_counts_steps_whose_ends_both_lie_in_the_mask():
+    picture, mask = np.zeros((4, 6, 3), np.uint8), np.zeros((4, 6), bool)
+    picture[:, 3:] = 255  # one edge, between columns 2 and 3
+    mask[1:3, 1:3] = True
+    assert holes.gradient_energy(picture, mask) == 0  # the step crosses the border of the mask
+    mask[1:3, 3] = True
+    assert holes.gradient_energy(picture, mask) == pytest.approx(
+        2 / 7
+    )  # 2 of the 7 steps (4 horizontal, 3 vertical) in the mask

@@ -13,7 +13,8 @@ import pytest
 import yaml
 
 from reffusion.io import colmap
-from reffusion.io.images import load_image, load_mask
+from reffusion.io.given_masks import load_given_mask
+from reffusion.io.images import load_image
 
 pytestmark = pytest.mark.integration
 
@@ -119,7 +120,7 @@ def test_sparse_points_lie_on_what_the_training_views_show(mini_scene):
 def test_only_masked_pixels_change_when_the_object_goes(generate, mini_scene):
     view = yaml.safe_load((mini_scene / "scene.yaml").read_text())["reference"]["view"]
     photo, reference = load_image(mini_scene / f"images_4/{view}.png"), load_image(mini_scene / "reference.png")
-    mask = load_mask(mini_scene / f"images_4/label/{view}.png")
+    mask = load_given_mask(mini_scene / f"images_4/label/{view}.png")
     assert np.array_equal(photo[~mask], reference[~mask])
     assert (photo[mask] != reference[mask]).any(1).mean() > 0.9
 
@@ -138,7 +139,7 @@ def test_test_views_are_without_the_object(generate, mini_scene):
     world = photographs.set_exposure(world, train[middle], kind)
     for k, name in enumerate(png_stems(mini_scene / "images_4")[: kind.test]):
         photo = load_image(mini_scene / f"images_4/{name}.png")
-        mask = load_mask(mini_scene / f"images_4/test_label/out_{k:05d}.png")
+        mask = load_given_mask(mini_scene / f"images_4/test_label/out_{k:05d}.png")
         with_object, _ = photographs.shoot(world, test[k], kind, True)
         assert np.array_equal(photo[~mask], with_object[~mask])
         assert (photo[mask] != with_object[mask]).any(1).mean() > 0.9
@@ -158,11 +159,12 @@ def test_never_seen_pixels_are_never_seen(generate, mini_scene):
     world, frame = generate.bake(furniture, 0, kind), generate.scene_frame(0)
     cameras = photographs.path(0, kind, target, kind.test, "test")
     training = {
-        name: load_mask(mini_scene / f"images_4/label/{name}.png") for name in png_stems(mini_scene / "images_4/label")
+        name: load_given_mask(mini_scene / f"images_4/label/{name}.png")
+        for name in png_stems(mini_scene / "images_4/label")
     }
     for k, name in enumerate(png_stems(mini_scene / "images_4")[: kind.test]):
-        mask = load_mask(mini_scene / f"images_4/test_label/out_{k:05d}.png")
-        never = load_mask(mini_scene / f"truth/never_seen/{name}.png")
+        mask = load_given_mask(mini_scene / f"images_4/test_label/out_{k:05d}.png")
+        never = load_given_mask(mini_scene / f"truth/never_seen/{name}.png")
         assert not (never & ~mask).any()
         points, _ = raycast.surface_points(world.solids, cameras[k], photographs.pixel_centers(mask), False)
         back, _ = project_by_truth(truth, name, frame.points(points))
@@ -220,7 +222,7 @@ def test_insertion_and_outpainting_are_asked_for_by_scene_files(generate, tmp_pa
     depth, differs = np.load(folder / reference["depth"]), (photo != picture).any(-1)
     assert 0.02 < differs.mean() < 0.25 and scenes["insert"]["region"]["radius"] > 0
     assert np.median(depth[differs]) < 0.9 * np.median(depth[~differs])
-    mask = load_mask(tmp_path / "outpaint/images_4/test_label/out_00000.png")
+    mask = load_given_mask(tmp_path / "outpaint/images_4/test_label/out_00000.png")
     assert not mask[24, 32] and mask[0, 0] and 3 <= len(scenes["outpaint"]["reference"]) <= 9
     assert scenes["outpaint"]["region"]["outside"]
 

@@ -27,6 +27,7 @@ from reffusion.io.splats import summarize_splats
 from reffusion.types import Camera, Gaussians, Similarity
 from report import export
 
+KNOWS_ANTIALIASED = "@playcanvas/splat-transform@3.7.0"  # `PACKAGE` neither reads nor writes this flag
 FRAME = Similarity(0.31, np.array([1.5, -20.0, 4.0]))
 
 
@@ -144,8 +145,8 @@ def test_export_writes_and_lists_all_files(tmp_path):
     save_ply(home / "evaluate" / "scene.ply", replace(random_gaussians(300, 1), antialiased=True), FRAME)
     lines = export.make(home)
     assert "300 Gaussians of degree 1" in lines[0] and "Mip-Splatting" in lines[0]
-    assert "3 pinholes" in lines[4] and "2 undistorted photographs" in lines[4] and len(lines) == 5
-    assert load_ply(home / "export/scene.spz", FRAME).antialiased and "scene.sog: not written" in lines[3]
+    assert "3 pinholes" in lines[3] and "2 undistorted photographs" in lines[3] and len(lines) == 5
+    assert load_ply(home / "export/scene.spz", FRAME).antialiased and "scene.sog: not written" in lines[4]
     assert (home / "export/scene.ply").read_bytes() == (home / "evaluate/scene.ply").read_bytes()
     (home / "export/cameras/note.txt").write_text("mine")
     export.make(home)
@@ -213,6 +214,34 @@ def test_other_libraries_read_sog_and_spz(tmp_path):
     subprocess.run([*command, str(spz), str(tmp_path / "spz.ply")], check=True, capture_output=True)
     for name in ("sog.ply", "spz.ply"):
         check_reading(tmp_path / name, made, camera)
+
+
+@pytest.mark.integration
+@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="asks npm; set REFFUSION_SLOW=1")
+def test_splat_transform_and_we_keep_that_splats_are_antialiased(tmp_path):
+    pytest.importorskip("gsply")
+    if not shutil.which("npm"):
+        pytest.skip("there is no npm")
+    made = replace(random_gaussians(300, 1), antialiased=True)
+    for ending in (".ply", ".compressed.ply", ".spz"):
+        save_splats(tmp_path / f"ours{ending}", made, FRAME)
+    try:
+        save_sog(tmp_path / "ours.sog", tmp_path / "ours.ply")
+    except BadInput as error:
+        pytest.skip(f"npm cannot fetch splat-transform: {error}")
+    ours, theirs = (".ply", ".compressed.ply", ".spz", ".sog"), (".compressed.ply", ".spz")
+    convert = "splat-transform --quiet --overwrite --gpu cpu"
+    lines = [f"{convert} ours{each} from{each.replace('.', '_')}.ply" for each in ours]
+    lines += [f"{convert} ours.ply theirs{each}" for each in theirs]
+    command = ["npm", "exec", "--yes", "--fetch-retries=0", f"--package={KNOWS_ANTIALIASED}", "-c", " && ".join(lines)]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    if ended.returncode and not (tmp_path / "from_ply.ply").exists():
+        pytest.skip(f"npm cannot fetch or start {KNOWS_ANTIALIASED}: {ended.stderr[-200:]}")
+    assert ended.returncode == 0, ended.stderr
+    for path in [tmp_path / f"from{each.replace('.', '_')}.ply" for each in ours]:
+        assert b"\ncomment SplatRenderMode: mip\n" in path.read_bytes(), path.name
+    for each in theirs:
+        assert summarize_splats(tmp_path / f"theirs{each}").antialiased, each
 
 
 def test_without_node_the_message_says_what_writes_sog(tmp_path, monkeypatch):

@@ -30,7 +30,8 @@ from reffusion.io.colmap import ModelCamera, ModelImage, load_cameras, load_imag
 from reffusion.io.compressed import save_spz
 from reffusion.io.depth_maps import load_depth
 from reffusion.io.files import BadInput
-from reffusion.io.images import image_size, load_exr, load_image, load_mask, save_exr
+from reffusion.io.given_masks import load_given_mask
+from reffusion.io.images import image_size, load_alpha, load_exr, load_image, load_mask, save_exr
 from reffusion.io.ply import load_ply, load_points, save_ply, save_points
 from reffusion.io.quantized import save_splat
 from reffusion.io.splats import load_splats, summarize_splats
@@ -97,6 +98,9 @@ IMAGES_TXT = b"""# ids
 
 """
 POINTS_TXT = b"# ids\n1 0.5 1 2 255 0 9 0.3 1 0 2 1\n2 -1 1e3 0 1 2 3 0.1\n"
+LABELME = json.dumps(
+    {"imageWidth": 12, "imageHeight": 9, "shapes": [{"label": "a", "points": [[1, 1], [9, 2], [5, 7]]}]}
+).encode()
 TRANSFORMS = json.dumps(
     {
         "w": 12,
@@ -109,6 +113,35 @@ TRANSFORMS = json.dumps(
             {"file_path": f"images/v{k}.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 9} for k in (1, 2, 3)
         ],
     }
+).encode()
+CSV = b"#name,x,y,alt,heading,pitch,roll,f,px,py,k1\n" + b"".join(
+    b"v%d.png,1,2,%d,9,80,1,36,0,0,0.1\n" % (k, k) for k in (1, 2, 3)
+)
+BUNDLE = b"# Bundle file v0.3\n3 1\n" + b"9.5 0.1 0\n1 0 0\n0 1 0\n0 0 1\n0.5 0 1\n" * 3 + b"0 0 -9\n1 2 3\n1 0 0 1 1\n"
+SPLAT_CAMERAS = json.dumps(
+    [
+        {
+            "img_name": f"v{k}",
+            "width": 12,
+            "height": 9,
+            "fx": 9,
+            "fy": 9,
+            "position": [k, 0, 0],
+            "rotation": np.eye(3).tolist(),
+        }
+        for k in (1, 2, 3)
+    ]
+).encode()
+OPENSFM = json.dumps(
+    [
+        {
+            "cameras": {"c": {"projection_type": "perspective", "width": 12, "height": 9, "focal": 0.8, "k1": 0.1}},
+            "shots": {
+                f"v{k}.png": {"rotation": [0, 0.1, 0], "translation": [k, 0, 0], "camera": "c"} for k in (1, 2, 3)
+            },
+            "points": {"7": {"coordinates": [0, 0, 5], "color": [1, 2, 3]}},
+        }
+    ]
 ).encode()
 SCENE = b"""layout: transforms
 train: [v1, 20220819_104425, 2022-08-19]
@@ -126,7 +159,7 @@ stages:
 
 
 def capture_reader(name: str, others: dict[str, bytes]) -> Callable[[Path], object]:
-    """Return a function that adds three pictures beside a file, and reads the file's folder as a capture.
+    """Return a function that adds three pictures and their list beside a file, and reads its folder as a capture.
 
     Args:
         name: Layout of the capture.
@@ -138,6 +171,7 @@ def capture_reader(name: str, others: dict[str, bytes]) -> Callable[[Path], obje
         (folder / "images").mkdir(exist_ok=True)
         for k in (1, 2, 3):
             (folder / "images" / f"v{k}.png").write_bytes(others["p.png"])
+        (folder / "list.txt").write_text("v1.png\nv2.png\nv3.png\n")
         return load_capture(folder, name)
 
     return read
@@ -169,7 +203,8 @@ def readers() -> list[Reader]:
             try_read(read, path)
 
     def any_picture(path: Path) -> None:
-        for read in (image_size, load_image, load_mask, lambda p: image_size(p, True), lambda p: load_image(p, True)):
+        upright = (lambda p: image_size(p, True), lambda p: load_image(p, True))
+        for read in (image_size, load_image, load_alpha, load_mask, load_given_mask, *upright):
             try_read(read, path)
 
     return [
@@ -181,6 +216,10 @@ def readers() -> list[Reader]:
         Reader("points3D.txt", load_model_points, (POINTS_TXT,)),
         Reader("transforms.json", capture_reader("transforms", made), (TRANSFORMS,)),
         Reader("poses_bounds.npy", capture_reader("llff", made), of("poses_bounds.npy")),
+        Reader("cameras.csv", capture_reader("realitycapture", made), (CSV,)),
+        Reader("bundle.out", capture_reader("bundler", made), (BUNDLE,)),
+        Reader("cameras.json", capture_reader("3dgs", made), (SPLAT_CAMERAS,)),
+        Reader("reconstruction.json", capture_reader("opensfm", made), (OPENSFM,)),
         Reader("scene.yaml", lambda path: read_user_yaml(path, ("stages",)), (SCENE,)),
         Reader(
             "g.ply",
@@ -193,6 +232,8 @@ def readers() -> list[Reader]:
         Reader("d.exr", load_depth, of("d.exr")),
         Reader("d.npy", load_depth, of("d.npy")),
         Reader("d.png", load_depth, of("deep.png", "p.tif", "p.png")),
+        Reader("mask.npy", load_given_mask, of("d.npy")),
+        Reader("mask.json", load_given_mask, (LABELME,)),
         Reader("array.npy", load_array, of("d.npy", "poses_bounds.npy")),
         Reader("any.json", load_json, (TRANSFORMS,)),
         Reader("any.exr", load_exr, (*of("d.exr"), *pictures)),

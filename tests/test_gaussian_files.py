@@ -119,6 +119,8 @@ def test_deleted_splats_are_those_of_the_rows_that_stay(tmp_path):
     before[[17, 18]] = 0
     before["opacity"][100:140] = np.inf
     gone = np.arange(200, 230)
+    for axis in "xyz":
+        before[axis][gone] *= 0.01  # together, as the splats of an object
     write_rows(folder / "before.ply", before)
     write_rows(folder / "after.ply", np.delete(before, gone))
     columns, _ = load_written_gaussians(folder, "before.ply", cleaned="after.ply")

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import urllib.request
 from pathlib import Path
-from urllib.parse import urljoin
+from urllib.parse import urljoin, urlsplit
 
 import pytest
 
@@ -63,7 +63,7 @@ def test_the_mask_page(photo_folder):
     with subprocess.Popen([*make_command(command, photo_folder), "port=18390"], cwd=ROOT, **group) as serving:
         try:
             address = next(found[0] for line in serving.stdout if (found := re.findall(r"http://127\S+", line)))
-            page = urljoin(address, "/scenes/my-photos/mask/")
+            page = urljoin(address, f"/scenes/my-photos/mask/?{urlsplit(address).query}")
             assert address.endswith("#my-photos/object")
             assert "What should be removed?" in urllib.request.urlopen(page, timeout=20).read().decode()
         finally:

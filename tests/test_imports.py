@@ -180,10 +180,12 @@ def test_report_reads_through_io(path):
     draws = ("camera_path", "turntable", "view", "job_pictures", "gaussian_layers", "unseen_overlay", "study")
     drawing_names = ("reffusion.splat.rasterizer", "reffusion.types", "reffusion.background.training_coverage")
     drawing = drawing_names if path.stem in draws else ()
+    drawing += ("reffusion.trace",) if path.stem == "turntable" else ()  # for the progress bar
     places = ("reffusion.command",) if path.stem == "cli" else ()  # for the path of the folder of scenes
     clicked = ("reffusion.clicks", "reffusion.capture", "reffusion.params", "reffusion.command", "reffusion.types")
     making = clicked if path.stem == "mask_session" else ()  # to make masks
-    page = ("reffusion.command", "reffusion.capture.load", "reffusion.clicks.local_segmenter")
+    page = ("reffusion.command", "reffusion.capture.load", "reffusion.capture.roles")
+    page += ("reffusion.clicks.local_segmenter", "reffusion.weights")
     page += ("reffusion.references.files", "runner.files", "runner.frames", "runner.plan")
     # The page runs the runner, shows captures before any stage has run, and renders views.
     page += ("reffusion.workspace", "reffusion.inpaint.exemplar")  # to fill what a user marks

@@ -5,19 +5,30 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageOps
 from plyfile import PlyData
 from scenes.capture import load_test_masks
 from scenes.random_scene import random_gaussians, random_rotation, random_scene
 
 from reffusion.io import rotations
 from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
-from reffusion.io.images import image_size, load_exr, load_image, load_mask, save_exr, save_image, save_mask
+from reffusion.io.images import (
+    image_size,
+    load_alpha,
+    load_exr,
+    load_image,
+    load_mask,
+    load_thumbnail,
+    orientation_matrix,
+    save_exr,
+    save_image,
+    save_mask,
+)
 from reffusion.io.ply import load_ply, load_points, save_ply, save_points
 from reffusion.io.scene import (
     load_mask_sets,
@@ -35,14 +46,6 @@ from reffusion.types import MaskSet, Reference, Similarity
 def test_io_costs_no_torch():
     code = "import sys, reffusion.io; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
-
-
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_a_ply_says_how_it_is_meant_to_be_drawn(tmp_path, antialiased):
-    save_ply(tmp_path / "g.ply", replace(random_gaussians(3, 1), antialiased=antialiased))
-    assert load_ply(tmp_path / "g.ply").antialiased == antialiased
-    header = (tmp_path / "g.ply").read_bytes().split(b"end_header")[0]
-    assert (b"comment antialiased" in header) == antialiased
 
 
 def test_images_round_trip_and_floats_are_rounded(tmp_path):
@@ -84,37 +87,39 @@ def test_unreadable_pictures_are_named(tmp_path):
         save_image(tmp_path / "nan.png", np.full((2, 2, 3), np.nan))
 
 
-def test_masks_of_every_kind(tmp_path):
+def test_a_tiff_of_float_colors_is_named(tmp_path):
+    cv2.imwrite(str(tmp_path / "x.tif"), np.zeros((4, 5, 3), np.float32))
+    with pytest.raises(ValueError, match=r"x\.tif: float pixels; save it as a picture of 8 or 16 bits"):
+        load_image(tmp_path / "x.tif")
+
+
+def test_own_masks_come_back_as_they_were(tmp_path):
     truth = np.random.default_rng(0).random((6, 8)) < 0.5
-    one, full = truth.astype(np.uint8), truth.astype(np.uint8) * 255
-    Image.fromarray(one).save(tmp_path / "one.png")
-    Image.fromarray(full).save(tmp_path / "full.png")
-    Image.fromarray(truth).save(tmp_path / "bit.png")
-    Image.fromarray(np.dstack([full, full, full])).save(tmp_path / "rgb.png")
-    Image.fromarray(np.dstack([one, one, one, np.full_like(one, 255)])).save(tmp_path / "rgba.png")
-    palette = Image.fromarray(one * 3, mode="P")
-    palette.putpalette([0, 0, 0] * 3 + [200, 0, 0])
-    palette.save(tmp_path / "palette.png")
-    Image.fromarray(one.astype(np.uint16) * 65535).save(tmp_path / "deep.png")
-    save_mask(tmp_path / "ours.png", truth)
-    for path in tmp_path.glob("*.png"):
-        assert np.array_equal(load_mask(path), truth), path.name
-    save_mask(tmp_path / "empty.png", np.zeros((3, 3), bool))
-    assert not load_mask(tmp_path / "empty.png").any()
-
-
-def test_mask_with_other_values_is_refused(tmp_path):
-    Image.fromarray(np.array([[0, 1, 7]], np.uint8)).save(tmp_path / "odd.png")
-    with pytest.raises(ValueError, match=r"odd\.png.*7"):
-        load_mask(tmp_path / "odd.png")
-
-
-def test_masks_are_resized_by_nearest_neighbour(tmp_path):
-    truth = np.zeros((8, 8), bool)
-    truth[2:4, 4:8] = True
     save_mask(tmp_path / "x.png", truth)
-    assert np.array_equal(load_mask(tmp_path / "x.png", (16, 24)), truth.repeat(2, 0).repeat(3, 1))
-    assert np.array_equal(load_mask(tmp_path / "x.png", (4, 4)), truth[::2, ::2])
+    assert np.array_equal(load_mask(tmp_path / "x.png"), truth)
+    assert np.array_equal(load_mask(tmp_path / "x.png", (3, 4)), truth[1::2, 1::2])
+    Image.fromarray(truth.astype(np.uint8)).save(tmp_path / "ones.png")
+    with pytest.raises(ValueError, match=r"ones\.png.*0 and 255"):
+        load_mask(tmp_path / "ones.png")
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA", "P"])
+def test_transparent_pixels_are_shown_over_black(tmp_path, mode):
+    """Alpha is straight. The palette has one transparent entry, as in a GIF or an 8-bit PNG."""
+    color = np.array([[[200, 200, 200], [200, 200, 200], [90, 90, 90]]], np.uint8)
+    alpha = np.array([[255, 0 if mode == "P" else 51, 255]], np.uint8)
+    options = {"transparency": 1} if mode == "P" else {}
+    if mode == "P":
+        picture = Image.fromarray(np.array([[0, 1, 2]], np.uint8), "P")
+        picture.putpalette([200, 200, 200, 200, 200, 200, 90, 90, 90])
+    else:
+        picture = Image.fromarray(np.dstack([color, alpha])).convert(mode)
+    picture.save(tmp_path / "x.png", **options)
+    assert load_image(tmp_path / "x.png")[0, :, 0].tolist() == [200, 0 if mode == "P" else 40, 90]
+    assert load_thumbnail(tmp_path / "x.png", 3)[0, :, 1].tolist() == [200, 0 if mode == "P" else 40, 90]
+    assert load_alpha(tmp_path / "x.png").tolist() == alpha.tolist()
+    picture.convert("RGB").convert("RGBA").save(tmp_path / "opaque.png")
+    assert load_alpha(tmp_path / "opaque.png") is None
 
 
 def test_exr_keeps_every_bit(tmp_path):
@@ -284,3 +289,25 @@ def test_views_and_masks_of_a_poses_folder(tmp_path):
     save_mask(tmp_path / "test_masks" / "t.png", mask)
     assert np.array_equal(load_views(tmp_path, ["a"])["a"], image)
     assert list(load_raw_masks(tmp_path, ["a", "b"])) == ["a"] and list(load_test_masks(tmp_path)) == ["t"]
+
+
+@pytest.mark.parametrize("ending", ["jpg", "png", "tif"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_orientation_tags_of_every_format(tmp_path, ending, orientation):
+    """The stored pixels are those of the file, and the upright ones those that a viewer shows."""
+    stored = np.kron(np.random.default_rng(0).integers(0, 256, (3, 5, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+    path, exif = tmp_path / f"x.{ending}", Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(stored).save(path, exif=exif, **({"quality": 100, "subsampling": 0} if ending == "jpg" else {}))
+    reference = Image.fromarray(stored)
+    reference.getexif()[0x0112] = orientation
+    shown = np.array(ImageOps.exif_transpose(reference))
+    for upright, right in ((False, stored), (True, shown)):
+        assert image_size(path, upright) == right.shape[1::-1]
+        assert np.abs(load_image(path, upright).astype(int) - right).max() <= 4
+        assert np.abs(load_thumbnail(path, 40, upright).astype(int) - right).max() <= 4
+    matrix = orientation_matrix(path)
+    rows, columns = np.mgrid[: stored.shape[0], : stored.shape[1]]
+    places = np.stack([(columns + 0.5) / stored.shape[1], (rows + 0.5) / stored.shape[0], np.ones(rows.shape)], -1)
+    at = (places @ matrix.T * shown.shape[1::-1]).astype(int)
+    assert np.array_equal(shown[at[..., 1], at[..., 0]], stored)

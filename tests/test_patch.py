@@ -6,6 +6,7 @@ The deleted splats are detected and take the place of masks, and the filled scen
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ from reffusion.io.scene import load_mask_sets, load_scene
 from reffusion.splat import rasterizer
 from reffusion.types import Gaussians, Similarity
 from report import patch
-from stages import poses
+from stages import masks, poses
 from stages.plan import poses as planned
 
 pytestmark = pytest.mark.integration
@@ -59,6 +60,27 @@ def test_splats_with_changed_pose_or_size_are_not_matched(moved):
     assert matching.match_gaussians(points, moved(points[~deleted])).found < matching.MIN_MATCHED_SHARE
 
 
+def test_splats_that_were_deleted_alone_are_scattered():
+    points, ball = plane_with_ball()
+    draws = np.random.default_rng(2)
+    alone, away = np.zeros(len(points), bool), np.linalg.norm(points - (0.2, 0.1, 0.5), axis=1) > 1
+    alone[draws.choice(np.flatnonzero(away), 60, replace=False)] = True
+    slab = np.zeros(len(points), bool)
+    slab[np.argsort(np.abs(points[:, 1] - 0.7))[:40]] = True
+    assert not matching.find_scattered(points, ball).any()
+    for deleted in (alone, slab, points[:, 0] == points[7, 0]):
+        np.testing.assert_array_equal(matching.find_scattered(points, deleted), deleted)
+    np.testing.assert_array_equal(matching.find_scattered(points, ball | alone), alone)
+    np.testing.assert_array_equal(matching.find_scattered(1e4 * points, ball | alone), alone)
+
+
+def test_one_layer_of_splats_on_a_wall_is_an_object():
+    grid = np.stack([*np.meshgrid(np.linspace(-1, 1, 60), np.linspace(-1, 1, 60)), np.zeros((60, 60))], -1)
+    poster = grid[20:30, 20:30] + (0.01, 0.01, 0.005)
+    points = np.concatenate([grid.reshape(-1, 3), poster.reshape(-1, 3)])
+    assert not matching.find_scattered(points, np.arange(len(points)) >= 3600).any()
+
+
 # ---------------------------------------------------------------------------------------------- the stage `poses`
 
 
@@ -87,6 +109,19 @@ def test_poses_says_which_splats_were_deleted(tmp_path, compressed, capsys):
     assert load_property_names(out / "gaussians.ply")[: len(EDITOR)] == EDITOR
 
 
+def test_scattered_splats_leave_the_place_of_the_hole(tmp_path, capsys):
+    whole, deleted = write_edited_capture(tmp_path / "s")
+    away = np.linalg.norm(plane_with_ball()[0] - (0.2, 0.1, 0.5), axis=1) > 1
+    alone = away & (np.cumsum(away) % 50 == 3)
+    save_ply(tmp_path / "s" / "cleaned.ply", whole.map(lambda p: p[torch.from_numpy(~(deleted | alone))]))
+    out = run_poses_after_edit(tmp_path / "s", masks="none")
+    np.testing.assert_array_equal(load_labels(out / "deleted.npy"), deleted | alone)
+    np.testing.assert_array_equal(load_labels(out / "scattered.npy"), alone)
+    count = np.count_nonzero(deleted | alone)
+    said, scattered = capsys.readouterr().out, f"{alone.sum()} of them scattered: they leave no region to fill"
+    assert f"cleaned.ply: {count} of 4000 splats were deleted, {scattered}\n" in said
+
+
 def assert_refusal(folder, message, **params):
     with pytest.raises(ValueError, match=message) as error:
         run_poses_after_edit(folder, **params)
@@ -108,6 +143,11 @@ def test_refusals_say_what_is_wrong_with_the_cleaned_scene(tmp_path):
     save_ply(folder / "scene.ply", twice)
     (folder / "cleaned.ply").unlink()
     assert_refusal(folder, r"cleaned\.ply: no such file; correct `cleaned`")
+    alone = torch.arange(len(whole)) % 50 == 7
+    save_ply(folder / "scene.ply", whole)
+    change(whole.map(lambda p: p[~alone]))
+    assert_refusal(folder, r"cleaned\.ply: 80 scattered splats were deleted; no region to fill: each stood among "
+                           r"splats that stay\. Delete a whole object, or use cleaned\.ply as it is$")  # fmt: skip
     change(rest)
     with pytest.raises(ValueError, match="cleaned: name the scene before"):
         planned.preview(poses.Params(cleaned="cleaned.ply"), folder)
@@ -116,9 +156,11 @@ def test_refusals_say_what_is_wrong_with_the_cleaned_scene(tmp_path):
 # ---------------------------------------------------------------------------------------------- without photographs
 
 
-def test_cameras_of_a_capture_look_at_renders(tmp_path):
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_cameras_of_a_capture_look_at_renders(tmp_path, antialiased):
     folder = tmp_path / "s"
-    write_edited_capture(folder)
+    whole, _ = write_edited_capture(folder)
+    save_ply(folder / "scene.ply", replace(whole, antialiased=antialiased))
     remove_pictures(folder)
     with pytest.warns(UserWarning, match=r"no photographs: the 6 cameras of .*transforms\.json look at"):
         out = run_poses_after_edit(folder)
@@ -130,8 +172,11 @@ def test_cameras_of_a_capture_look_at_renders(tmp_path):
         np.testing.assert_allclose(scene.cameras[name].center, center, atol=1e-9)
         np.testing.assert_allclose(mine[:3, :3], pose[:3, :3], atol=1e-9)
     seen = exposure.load_normalized_views(out, out, ["v02"])["v02"]
-    rendering = rasterizer.render(load_ply(out / "gaussians.ply"), scene.cameras["v02"]).color.numpy()
-    np.testing.assert_allclose(seen / 255, rendering.clip(0, 1), atol=0.5 / 255 + 1e-6)
+    gaussians = load_ply(out / "gaussians.ply")
+    renders = {flag: rasterizer.render(replace(gaussians, antialiased=flag), scene.cameras["v02"]).color.numpy()
+               for flag in (False, True)}  # fmt: skip
+    np.testing.assert_allclose(seen / 255, renders[antialiased].clip(0, 1), atol=0.5 / 255 + 1e-6)
+    assert gaussians.antialiased == antialiased and np.abs(renders[True] - renders[False]).max() > 0.01
     assert_refusal(folder, "scene.yaml: test: the scene has no photographs", test="every 8")
     record = json.loads((folder / "transforms.json").read_text())
     del record["w"]
@@ -182,6 +227,35 @@ def test_deleted_splats_replace_votes(tmp_path):
     assert load_json(out / "facts.json")["best_reference"] in wall_scene.TRAIN
 
 
+def test_scattered_splats_are_removed_and_leave_no_hole(tmp_path):
+    folder, fit, labels = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})
+    alone = ~labels & (torch.arange(len(labels)) % 400 == 0)
+    save_labels(folder / "deleted.npy", labels)
+    without = run_masks(folder, fit, tmp_path / "without")
+    save_labels(folder / "deleted.npy", labels | alone)
+    save_labels(folder / "scattered.npy", alone)
+    out = run_masks(folder, fit, tmp_path / "masks")
+    removed, debris = load_labels(out / "labels.npy"), load_labels(out / "debris.npy")
+    assert alone.sum() > 10 and (removed | ~(labels | alone)).all() and (debris | ~alone).all()
+    for name, found in load_mask_sets(out, wall_scene.CAMERAS).items():
+        np.testing.assert_array_equal(found.consistent, load_mask_sets(without, [name])[name].consistent)
+
+
+def test_splats_that_were_left_stay_if_they_outnumber_the_deleted_ones(tmp_path):
+    """Only the rim of the square was deleted, which `inside_share` would fill by the rest of the square."""
+    folder, fit, labels = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})
+    means = load_ply(fit / "gaussians.ply").means
+    rim = labels & (means[:, :2].abs().amax(1) > 0.8 * wall_scene.HALF)
+    save_labels(folder / "deleted.npy", rim)
+    count, inside = int(rim.sum()), int((labels & ~rim).sum())
+    assert inside > count
+    params = masks.Params(inside_share=0.0)
+    with pytest.warns(UserWarning, match=rf"splats inside the hole stay, because they are more than the {count} that"):
+        out = run_masks(folder, fit, tmp_path / "masks", params)
+    assert (load_labels(out / "labels.npy") & ~load_labels(out / "debris.npy")).equal(rim)
+    assert len(load_json(out / "warnings.json")) == 1
+
+
 @pytest.mark.parametrize("moved", [(0.0, 0.0, -9.0), (0.9, 0.3, 0.0)])
 def test_gaussians_in_another_frame_than_the_cameras_are_refused(tmp_path, moved):
     folder, fit, labels = wall_scene.write_poses_and_fit(tmp_path, NEAR, masks={})
@@ -206,16 +280,33 @@ def test_the_patch_is_given_back_as_the_editor_wrote_the_scene(tmp_path):
     with pytest.raises(ValueError, match=r"scene\.ply is missing; `make scene=s patch`"):
         patch.make(home)
     similarity, result = load_scene(home / "poses").similarity, load_ply(home / "poses" / "gaussians.ply")
-    new = torch.arange(len(result)) >= 3900
+    before, new = load_labels(home / "poses" / "deleted.npy"), torch.arange(len(result)) >= 3900
+    deleted = int(before.sum())
     (home / "initialize").mkdir()
     save_labels(home / "initialize" / "labels.npy", new)
-    save_ply(home / "evaluate" / "scene.ply", result, similarity)
+    save_ply(home / "evaluate" / "scene.ply", replace(result, antialiased=True), similarity)
     (home / "evaluate" / "receipt.json").write_text('{"needs": {"initialize": "x", "distill": null}}')
-    assert "100 new ones" in patch.make(home)
+    said = patch.make(home).splitlines()
+    assert said[0] == f"{home / 'patch' / patch.WHOLE}: the whole scene, 4000 splats"
+    assert said[1].endswith("the 100 new splats alone, which the whole scene contains too")
+    assert said[2:] == [f"removed: the {deleted} splats that you deleted, and no others; added: 100 new splats"]
+    few = before & (before.cumsum(0) <= 20)
+    save_labels(home / "initialize" / "labels.npy", torch.arange(len(result)) >= 1999)
+    save_labels(home / "poses" / "deleted.npy", few)
+    said = patch.make(home).splitlines()
+    assert said[2:] == [
+        "removed: the 20 splats that you deleted, and 1981 more, haze and floaters inside or behind the hole; "
+        "added: 2001 new splats",
+        "warning: that is more than 100 new splats for each deleted one: unless these were large, the hole reaches far "
+        "beyond them; look at the result, and delete whole objects only",
+    ]
+    save_labels(home / "initialize" / "labels.npy", new)
+    patch.make(home)
     original = PlyData.read(str(tmp_path / "s" / "scene.ply"))["vertex"]
     whole, alone = (PlyData.read(str(home / "patch" / name))["vertex"] for name in (patch.WHOLE, patch.NEW))
     assert [p.name for p in whole.properties] == [p.name for p in original.properties]
     assert len(whole) == 4000 and len(alone) == 100
+    assert all(load_ply(home / "patch" / name).antialiased for name in (patch.WHOLE, patch.NEW))
     for name in ("x", "scale_1", "f_dc_2", "f_rest_5", "rot_3", "opacity"):
         np.testing.assert_allclose(whole[name], original[name], atol=2e-5)
         np.testing.assert_array_equal(alone[name], whole[name][3900:])

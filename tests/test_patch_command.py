@@ -239,7 +239,7 @@ def test_the_command_fills_a_hole_and_goes_on(tmp_path):
     made = random_gaussians(count, 0)
     whole = type(made)(
         torch.from_numpy(means).float(), made.quaternions, torch.full((count, 3), np.log(0.03)).float(),
-        torch.full((count,), 4.0), draw(count, 1, 3) - 0.5,
+        torch.full((count,), 4.0), draw(count, 1, 3) - 0.5, antialiased=True,
     )  # fmt: skip
     save_ply(tmp_path / "before.ply", whole)
     save_ply(tmp_path / "after.ply", whole.map(lambda p: p[torch.from_numpy(~deleted)].flip(0)))
@@ -255,7 +255,9 @@ def test_the_command_fills_a_hole_and_goes_on(tmp_path):
     first = run_module("reffusion.command", "patch", *words)
     assert first.returncode == 0, first.stdout + first.stderr
     assert f"{tmp_path / 'out.ply'}: the whole scene" in first.stdout and "painted" in first.stdout
-    assert len(load_ply(tmp_path / "out.ply")) > np.count_nonzero(~deleted)
+    patched = load_ply(tmp_path / "out.ply")
+    assert len(patched) > np.count_nonzero(~deleted) and patched.antialiased
+    assert f"removed: the {deleted.sum()} splats that you deleted, and " in first.stdout
     again = run_module("reffusion.command", "patch", *words)
     assert again.returncode == 0 and "not run yet" not in again.stdout
     with pytest.raises(BadInput):

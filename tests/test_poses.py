@@ -432,14 +432,16 @@ def test_a_sphere_on_an_optical_axis_is_filled_or_masks_what_lies_beyond(tmp_pat
 def test_preview_is_fast_and_describes_the_run(tmp_path):
     write_spin_nerf(tmp_path / "s", full=False)
     notes = plan.preview(poses.Params(), tmp_path / "s")
-    assert notes[0] == "4 training and 2 test views"
-    assert notes[1] == f"SfM left out: {Path('sparse/0/images.bin')} brings poses"
+    assert notes[0] == "4 photographs build the scene; 2 are kept to test it"
+    assert notes[1] == f"the poses come from {Path('sparse/0/images.bin')}"
     assert notes[2].startswith("undistortion: SIMPLE_RADIAL k1=0.05 moves the border by up to ")
     write_capture(tmp_path / "t", "transforms", make_truth())
-    assert "undistortion left out: the lens is a pinhole" in plan.preview(poses.Params(), tmp_path / "t")
+    assert "the photographs need no undistortion: the lens is a pinhole" in plan.preview(poses.Params(), tmp_path / "t")
     write_pictures(tmp_path / "p", ["a", "b", "c"])
     write_masks(tmp_path / "p" / "masks", ["a", "b", "c"])
-    assert "SfM: 3 photos bring no poses" in plan.preview(poses.Params(), tmp_path / "p")
+    assert "the poses of 3 photographs are computed from the pictures (structure from motion)" in plan.preview(
+        poses.Params(), tmp_path / "p"
+    )
     code = (
         "import sys, pathlib, stages.plan.poses as p, stages.plan.raw_masks as m; scene = pathlib.Path(sys.argv[1]); "
         "p.preview(p.Params(), scene); m.preview(m.Params(), scene=scene); "
@@ -507,7 +509,9 @@ def test_fox(tmp_path):
     assert (camera.width, camera.height) == (135, 240)
     assert 100 < len(scene.points) <= 10_000, "it brings none, these are of flow"
     notes = plan.preview(poses.Params(masks="none", test="every 8"), real_capture("fox"))
-    assert "43 training and 7 test views" in notes and any("OPENCV k1=0.05784" in n for n in notes)
+    assert "43 photographs build the scene; 7 are kept to test it" in notes and any(
+        "OPENCV k1=0.05784" in n for n in notes
+    )
 
 
 def test_statue_has_its_cameras_adjusted(tmp_path, monkeypatch):

@@ -166,18 +166,49 @@ def test_a_moved_reference_is_read_once_through_the_lens(tmp_path):
     shot = lens.from_colmap(OPENCV[0], WIDTH, HEIGHT, OPENCV[1])
     image = natural_noise(3, (WIDTH, HEIGHT))
     save_image(tmp_path / "whole.png", image)
-    whole, inside = undistort_reference(ReferenceFile("v", tmp_path / "whole.png"), shot, False)
-    still, _ = undistort_reference(ReferenceFile("v", tmp_path / "whole.png"), shot, False, np.eye(2, 3))
+    whole, inside = undistort_reference(ReferenceFile("v", tmp_path / "whole.png"), shot, image)
+    still, _ = undistort_reference(ReferenceFile("v", tmp_path / "whole.png"), shot, image, np.eye(2, 3))
     assert inside.all() and np.abs(whole.astype(int) - still).max() <= 1
     depth = np.tile(np.linspace(1, 2, WIDTH), (HEIGHT, 1))
     np.save(tmp_path / "depth.npy", depth)
     file = ReferenceFile("v", tmp_path / "whole.png", tmp_path / "depth.npy")
-    straight = undistort_reference_depth(file, shot, False)
+    straight = undistort_reference_depth(file, shot)
     where = lens.sampling_map(shot, lens.undistorted_pinhole(shot))
     np.testing.assert_allclose(straight, 1 + (where[..., 0] - 0.5) / (WIDTH - 1), atol=0.6 / WIDTH)
-    shifted = undistort_reference_depth(file, shot.pinhole, False, np.array([[1.0, 0, 4], [0, 1, 0]]))
+    shifted = undistort_reference_depth(file, shot.pinhole, np.array([[1.0, 0, 4], [0, 1, 0]]))
     np.testing.assert_allclose(shifted[:, :-4], depth[:, 4:], rtol=1e-6)
     assert np.isnan(shifted[:, -4:]).all()
+
+
+@pytest.mark.parametrize("affine", [None, np.eye(2, 3)], ids=["as it lies", "aligned"])
+def test_where_a_reference_is_transparent_the_photograph_shows(tmp_path, affine):
+    shot, photo = (
+        lens.from_colmap("SIMPLE_PINHOLE", WIDTH, HEIGHT, (90.0, WIDTH / 2, HEIGHT / 2)),
+        np.full((HEIGHT, WIDTH, 3), 200, np.uint8),
+    )
+    picture = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+    picture[10:30, 20:40] = (90, 60, 30, 255)
+    picture[40:60, 20:40] = (90, 60, 30, 51)
+    Image.fromarray(picture).save(tmp_path / "v.png")
+    image, inside = undistort_reference(ReferenceFile("v", tmp_path / "v.png"), shot, photo, affine)
+    assert image[20, 30].tolist() == [90, 60, 30] and image[50, 30].tolist() == [178, 172, 166]
+    assert (image[:9] == 200).all() and inside.sum() == 400 and inside[10:30, 20:40].all()
+
+
+def test_the_orientation_of_a_reference_is_obeyed_before_its_size_is_judged(tmp_path):
+    """A tag that would turn the picture away from its view's proportions is ignored."""
+    shot, photo = (
+        lens.from_colmap("SIMPLE_PINHOLE", WIDTH, HEIGHT, (90.0, WIDTH / 2, HEIGHT / 2)),
+        np.zeros((HEIGHT, WIDTH, 3), np.uint8),
+    )
+    upright = natural_noise(3, (WIDTH, HEIGHT))
+    tag = Image.Exif()
+    tag[0x0112] = 6  # to be turned clockwise by 90 degrees
+    Image.fromarray(np.rot90(upright)).save(tmp_path / "turned.png", exif=tag)
+    Image.fromarray(upright).save(tmp_path / "kept.png", exif=tag)
+    for name in ("turned.png", "kept.png"):
+        image, _ = undistort_reference(ReferenceFile("v", tmp_path / name), shot, photo)
+        assert np.array_equal(image, upright), name
 
 
 # ----------------------------------------------------------------------------------------------------- depth maps

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import struct
 import subprocess
@@ -12,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from plyfile import PlyData, PlyElement
 from scenes.cameras import make_camera
 from scenes.capture import make_truth, write_capture
 from scenes.edited_capture import write_edited_capture
@@ -23,6 +25,7 @@ from reffusion.io.arrays import load_labels
 from reffusion.io.compressed import load_spz, save_spz
 from reffusion.io.files import BadInput
 from reffusion.io.ply import load_ply, load_points, save_ply, save_splats
+from reffusion.io.ply_table import load_header
 from reffusion.io.quantized import save_splat
 from reffusion.io.splats import load_splats, summarize_splats
 from reffusion.types import Gaussians, Similarity
@@ -31,6 +34,7 @@ from stages.plan import poses as planned
 
 SH0 = 0.28209479177387814
 COUNT = 40
+HERE = Similarity(1.0, np.zeros(3))
 VIEW = make_camera("v", (48, 36), 40.0, (0.0, 0.0, -6.0))
 
 
@@ -174,6 +178,70 @@ def test_colours_in_bytes_stand_for_the_constant_harmonic(splat_file):
         summarize_splats(path)
 
 
+# ---------------------------------------------------------------------------------------------- comments
+
+
+def add_comments(path, *comments):
+    """Insert comments, each bytes, into the header of a .ply."""
+    first, rest = path.read_bytes().split(b"element", 1)
+    path.write_bytes(first + b"".join(b"comment " + each + b"\n" for each in comments) + b"element" + rest)
+
+
+@pytest.mark.parametrize(("comments", "antialiased"), [
+    ((), False),
+    ((b"SplatRenderMode: mip",), True),
+    ((b"Exported from Brush", b"splatrendermode:  MIP ", b"SH degree: 3"), True),
+    ((b"SplatRenderMode: default",), False),
+    ((b"SplatRenderMode: 2dgs",), False),
+    ((b"antialiased 1",), True),
+    ((b"antialiased 0",), False),
+    ((b"antialiased",), True),
+    ((b"antialiased edges are blurred",), False),
+    ((b"antialiased 1", b"SplatRenderMode: default"), False),
+    ((b"SplatRenderMode: default", b"antialiased 1"), True),
+])  # fmt: skip
+@pytest.mark.parametrize("ending", [".ply", ".compressed.ply"])
+def test_the_last_comment_says_whether_splats_are_antialiased(tmp_path, ending, comments, antialiased):
+    path = tmp_path / f"g{ending}"
+    if ending == ".compressed.ply":
+        pytest.importorskip("gsply")
+    save_splats(path, random_gaussians(3, 1), HERE)
+    add_comments(path, *comments)
+    assert summarize_splats(path).antialiased == load_ply(path).antialiased == antialiased
+
+
+def test_splats_of_two_scales_are_not_antialiased(splat_file):
+    path, table = splat_file
+    write_rows(path, replace_columns(table, {}, leave_out=("scale_2",)))
+    add_comments(path, b"SplatRenderMode: mip")
+    assert not load_ply(path).antialiased
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("ending", [".ply", ".compressed.ply", ".spz", ".splat"])
+def test_every_format_but_splat_says_whether_splats_are_antialiased(tmp_path, ending, antialiased):
+    gsply, path = pytest.importorskip("gsply"), tmp_path / f"g{ending}"
+    save_splats(path, replace(random_gaussians(300, 1), antialiased=antialiased), HERE)
+    assert load_ply(path).antialiased == (antialiased and ending != ".splat")
+    if ending.endswith(".ply"):
+        assert (b"\ncomment SplatRenderMode: mip\n" in path.read_bytes()) == antialiased
+    if ending != ".splat":
+        read = gsply.read_spz if ending == ".spz" else gsply.plyread
+        assert len(read(str(path))) == 300, "other readers read it, too"
+
+
+@pytest.mark.parametrize("comment", ["von Jörg 東京".encode(), "von Jörg".encode("latin-1")])
+@pytest.mark.parametrize("text", [False, True])
+def test_comments_beyond_ascii_are_read(splat_file, comment, text):
+    path, table = splat_file
+    write_rows(path, table, text)
+    add_comments(path, comment, b"antialiased 1")
+    made = load_ply(path)
+    np.testing.assert_allclose(made.means[:, 1], table["y"], rtol=1e-6)
+    np.testing.assert_allclose(load_points(path)[0][:, 2], table["z"], rtol=1e-6)
+    assert made.antialiased and load_header(path).comments[0].startswith("von Jörg")
+
+
 # ---------------------------------------------------------------------------------------------- quantised files
 
 
@@ -225,14 +293,6 @@ def test_spz_is_read_in_the_frame_of_a_ply(tmp_path, version):
         summarize_splats(path)
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_a_spz_says_how_it_is_meant_to_be_drawn(tmp_path, antialiased):
-    gsply, made = pytest.importorskip("gsply"), replace(random_gaussians(3, 1), antialiased=antialiased)
-    save_splats(tmp_path / "s.spz", made, Similarity(1.0, np.zeros(3)))
-    assert load_ply(tmp_path / "s.spz").antialiased == antialiased
-    assert len(gsply.read_spz(str(tmp_path / "s.spz"))) == 3, "other readers read it, too"
-
-
 def load_rows(folder, gaussians):
     save_ply(folder / "rows.ply", gaussians)
     return load_splats(folder / "rows.ply").rows
@@ -249,13 +309,29 @@ def test_splat_is_written_as_it_is_read(tmp_path):
     assert (torch.nn.functional.normalize(again.quaternions) * unit).sum(1).abs().min() > 0.999
 
 
-@pytest.mark.parametrize("ending", ["ksplat", "sog"])
-def test_other_formats_are_refused_with_what_converts_them(tmp_path, ending):
+@pytest.mark.parametrize(("ending", "remedy"), [
+    ("ksplat", "convert it to .ply, as with `npx @playcanvas/splat-transform scene.ksplat scene.ply`"),
+    ("sog", "convert it to .ply, as with `npx @playcanvas/splat-transform scene.sog scene.ply`"),
+    ("glb", "save the scene as .ply in the program that wrote it"),
+    ("zip", "unpack it, and name a file of splats in it"),
+    ("pt", "it is a checkpoint of gsplat; gsplat.export_splats writes a .ply of its `splats`"),
+    ("ckpt", "it is a checkpoint of nerfstudio; `ns-export gaussian-splat --load-config config.yml --output-dir .` "
+     "writes a .ply"),
+])  # fmt: skip
+def test_other_formats_are_refused_with_what_converts_them(tmp_path, ending, remedy):
     path = tmp_path / f"scene.{ending}"
     path.write_bytes(bytes(4096))
-    with pytest.raises(BadInput, match=rf"\.{ending} is not read; convert it to \.ply, as with `npx "
-                       rf"@playcanvas/splat-transform scene\.{ending} scene\.ply`"):  # fmt: skip
+    with pytest.raises(BadInput, match=f"^{re.escape(f'{path}: .{ending} is not read; {remedy}')}$"):
         summarize_splats(path)
+
+
+def test_a_ply_of_reduced_3dgs_is_named(splat_file):
+    path, table = splat_file
+    elements = [PlyElement.describe(table[:5], name) for name in ("vertex_0", "vertex_1", "codebook_centers")]
+    PlyData(elements).write(str(path))
+    with pytest.raises(BadInput, match=r"g\.ply: a \.ply of reduced-3dgs \(vertex_0, vertex_1, codebook_centers\) is "
+                       r"not read; load it with GaussianModel\.load_ply of that project"):  # fmt: skip
+        load_points(path)
 
 
 # ---------------------------------------------------------------------------------------------- the stage `poses`

@@ -121,6 +121,22 @@ def test_videos_without_enough_views_are_refused(tmp_path, made, message):
     assert not (tmp_path / "out/images").exists() and not (tmp_path / "out/frames.json").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a b.zip", "a b.zip: an archive; unpack it, and give the folder: scene=.*a b$"),
+        ("x.tar.gz", "x.tar.gz: an archive; unpack it, and give the folder: scene=.*x$"),
+        ("X.PLY", "X.PLY: a file of splats or points, and a scene has photographs; .*`reffusion patch before.ply"),
+        ("x.splat", "x.splat: a file of splats or points"),
+        ("IMG.jpg", "IMG.jpg: one picture; give the folder that holds the photographs: scene="),
+    ],
+)
+def test_other_files_in_place_of_a_scene(tmp_path, name, message):
+    (tmp_path / name).write_bytes(b"")
+    with pytest.raises(BadInput, match=message):
+        video.extract_frames(tmp_path / name, tmp_path / "out", "")
+
+
 @pytest.mark.integration
 def test_a_video_is_a_scene(walk_video, tmp_path, capfd):
     runs = tmp_path / "runs"

@@ -1,7 +1,9 @@
 """The viewer: cameras, layers of the result, and the pictures that a visitor receives."""
 
+import http.client
 import os
 import shutil
+import urllib.error
 import urllib.request
 from types import SimpleNamespace
 
@@ -9,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import viser
 from scenes import wall_scene
 from scenes.browser import open_page
 from scenes.cameras import make_scene
@@ -22,9 +25,12 @@ from reffusion.io.scene import load_scene, save_scene
 from reffusion.splat import rasterizer
 from reffusion.types import Similarity
 from report import gaussian_layers, unseen_overlay, view
+from report.access import REFUSAL, Access
 from report.app import live
 
 pytestmark = pytest.mark.integration
+
+ACCESS = Access(8300)
 
 SIMILARITY = Similarity(2.0, np.array([0.1, 0.2, 0.3]))
 NEEDS = {"poses": "a", "fit": "b", "masks": "c", "initialize": "d", "distill": "e", "lift": None}
@@ -124,7 +130,7 @@ def test_the_live_view_follows_a_job_from_stage_to_stage(tmp_path, monkeypatch):
     for stage in ("initialize", "distill", "evaluate"):
         shutil.rmtree(home / stage)
     (home / "masks/labels.npy").rename(tmp_path / "labels.npy")
-    opened = live.LatestViewer(home, port=8350)
+    opened = live.LatestViewer(home, 8350, Access(8350))
     try:
         wait_until(lambda: opened.gaussians is not None)
         assert len(opened.gaussians) == len(gaussians) and "with the object" in opened.title.content
@@ -150,21 +156,38 @@ def raise_next(errors):
 
 def test_a_missing_scene_is_not_served(tmp_path):
     with pytest.raises(ValueError, match="make scene=y all"):
-        view.Viewer(tmp_path / "y")
+        view.Viewer(tmp_path / "y", 8300, Access(8300))
 
 
 @pytest.fixture
 def viewer(tmp_path):
     write_finished_job(tmp_path / "x", NEEDS)
-    opened = view.Viewer(tmp_path / "x", port=8300)
+    opened = view.Viewer(tmp_path / "x", 8300, ACCESS)
     yield opened
     opened.close()
 
 
-def test_the_page_is_served_on_this_machine_only(viewer):
+def handshake(port, query="", **headers):
+    """Return the status of the first line that answers a request to open a WebSocket."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    upgrade = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
+    key = {"Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Protocol": "viser-v" + viser.__version__}
+    connection.request("GET", f"/{query}", headers=upgrade | key | headers)
+    return connection.getresponse().status
+
+
+def test_the_page_and_its_websocket_ask_for_the_token(viewer):
     assert viewer.server.get_host() == "127.0.0.1"
-    with urllib.request.urlopen(f"http://127.0.0.1:{viewer.server.get_port()}") as page:
-        assert page.status == 200
+    port = viewer.server.get_port()
+    for query in ("", "?token=", "?token=wrong"):
+        with pytest.raises(urllib.error.HTTPError, match="403") as refused:
+            urllib.request.urlopen(f"http://127.0.0.1:{port}/{query}")
+        assert refused.value.read().decode() == f"{REFUSAL}\n"
+        assert handshake(port, query) == 403
+    assert handshake(port, Cookie="reffusion_8300=wrong") == 403
+    with urllib.request.urlopen(ACCESS.link(f"http://127.0.0.1:{port}/")) as page:
+        assert page.status == 200 and page.headers["Set-Cookie"] == ACCESS.make_cookie()
+    assert handshake(port, Cookie=f"other=1; reffusion_8300={ACCESS.token}") == 101
 
 
 def test_a_visitor_gets_a_small_picture_at_once_then_the_whole_and_another_when_he_chooses(viewer, monkeypatch):
@@ -191,7 +214,7 @@ def test_a_visitor_gets_a_small_picture_at_once_then_the_whole_and_another_when_
 @pytest.mark.parametrize("width", [1280, 390])
 def test_a_browser_shows_the_result_without_what_is_unchecked_and_before_distillation(viewer, width):
     """The square, which distillation added, is red and in the middle. The page sends no request to another machine."""
-    with open_page(f"http://127.0.0.1:{viewer.server.get_port()}", width) as page:
+    with open_page(ACCESS.link(f"http://127.0.0.1:{viewer.server.get_port()}/"), width) as page:
         page.wait_for_selector("canvas", timeout=60000)
 
         def red() -> bool:

@@ -4,6 +4,5 @@
 - splat.py: the rasterizer against its float64 oracle.
 - solvers.py: the bilateral solver and the completion.
 - alignment.py: plain and robust alignment.
-- personalization.py: LoRA over steps, rank and learning rate (slow).
 - draw.py: charts. gate.py: baselines.
 """

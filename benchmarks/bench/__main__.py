@@ -6,13 +6,11 @@ A work-precision diagram shows the error of a method against its time, for sever
   bilateral           the fast bilateral solver along its iterations, by cell size
   completion          depth completion by a thin plate, by the size of its grid
   alignment           plain and robust alignment of depth, by the share of outliers
-  personalization-recorded   personalization, the values recorded in LOG.md
   tile                (--slow) the rasterizer, by height of a tile; each height is compiled anew
-  personalization     (--slow) LoRA by steps, rank and learning rate; needs runs/demo with its stage `reference`
 
 The command prints the recommended setting of each diagram. It writes a PNG for each diagram, and precision.json with
 the error and the seconds of every point: CPU seconds with one thread, except for `cutoff` (a count of the work times a
-time per pair) and `personalization` (wall time). --gate compares the points with baselines.json beside this file. The
+time per pair). --gate compares the points with baselines.json beside this file. The
 exit status is then 1 if a point has no baseline, was not measured, or is worse: if its error exceeds the diagram's
 tolerance (2 to 50 % above the baseline), or its time, relative to a fixed computation on the same machine, is more than
 twice the baseline's. Diagrams with such points are measured up to two more times, and the shortest times count.
@@ -30,7 +28,7 @@ os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read
 
 import torch
 
-from benchmarks.bench import alignment, gate, personalization, solvers, splat
+from benchmarks.bench import alignment, gate, solvers, splat
 from benchmarks.bench.draw import draw
 from benchmarks.bench.points import recommendation
 
@@ -44,24 +42,19 @@ QUICK = {
     "bilateral": solvers.bilateral_diagram,
     "completion": solvers.completion_diagram,
     "alignment": alignment.diagram,
-    "personalization-recorded": personalization.recorded_diagram,
 }
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/bench"))
-    parser.add_argument("--slow", action="store_true", help="also measure tiles and personalization")
-    parser.add_argument("--run", type=Path, default=Path("runs/demo"), help="scene of the personalization")
+    parser.add_argument("--slow", action="store_true", help="also measure tiles")
     parser.add_argument("--gate", action="store_true", help="fail if a point is worse than its baseline")
     parser.add_argument("--write-baselines", action="store_true", help="store the measured values as baselines")
     parser.add_argument("--baselines", type=Path, default=BASELINES)
-    parser.add_argument("--only", nargs="+", choices=[*QUICK, "tile", "personalization"], help="these diagrams")
+    parser.add_argument("--only", nargs="+", choices=[*QUICK, "tile"], help="these diagrams")
     arguments = parser.parse_args()
-    slow = {
-        "tile": splat.tile_diagram,
-        "personalization": lambda: personalization.diagram(arguments.run, arguments.out),
-    }
+    slow = {"tile": splat.tile_diagram}
     every = QUICK | slow
     chosen = arguments.only or [*QUICK, *(slow if arguments.slow else ())]
     baselines = gate.load(arguments.baselines) if arguments.gate else None  # a missing file is reported before any work

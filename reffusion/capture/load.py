@@ -1,20 +1,42 @@
-"""Reads a scene folder in one of four layouts: SPIn-NeRF/LLFF, COLMAP, nerfstudio's transforms.json, or photographs
-only.
+"""Reads a scene folder in one of several layouts, such as SPIn-NeRF/LLFF, COLMAP, nerfstudio's transforms.json, or
+photographs only.
 
 Every layout is read into a `Capture`: pictures by view name and, if the folder holds poses, lenses and poses in the
 scene's own frame. Of pictures only headers are read, except for a few, whose colours are compared with the colours of
-the sparse points.
+the sparse points, and pictures twice as wide as high.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
-from reffusion.capture.layouts import colmap, llff, photos, transforms
-from reffusion.capture.layouts.capture import Capture
+from reffusion.capture.layouts import (
+    bundler,
+    colmap,
+    llff,
+    opensfm,
+    photos,
+    polycam,
+    realitycapture,
+    splat_cameras,
+    transforms,
+    unread,
+)
+from reffusion.capture.layouts.capture import AS_GIVEN, Capture, Correction
+from reffusion.capture.lens import Lens
 from reffusion.io.files import BadInput, as_bad_input, is_file
+from reffusion.io.images import image_size
 
-LAYOUTS = ("llff", "colmap", "transforms", "photos")
+# layouts of other programs -> (finds the file with the poses in a scene folder, reads the scene)
+PROGRAMS = {
+    "polycam": (polycam.find, polycam.read),
+    "realitycapture": (realitycapture.find, realitycapture.read),
+    "opensfm": (opensfm.find, opensfm.read),
+    "bundler": (bundler.find, bundler.read),
+    "3dgs": (splat_cameras.find, splat_cameras.read),
+}
+LAYOUTS = ("llff", "colmap", "transforms", *PROGRAMS, "photos")
 LONGEST = 1600  # px, longer side of the pictures in the paper
 
 
@@ -24,6 +46,7 @@ def load_capture(
     images: str | None = None,
     longest: int = LONGEST,
     references: frozenset[Path] = frozenset(),
+    correction: Correction = AS_GIVEN,
 ) -> Capture:
     """Read a scene folder: its pictures and, if it holds poses, its cameras and sparse points.
 
@@ -33,6 +56,7 @@ def load_capture(
         longest: requested longer side of the pictures in pixels. The layout "llff" may hold the same pictures in
             several sizes; the smallest size that is large enough is taken, else the largest size.
         references: files of references (inpainted views). They may lie among the photographs, but are not views.
+        correction: what is changed in the poses. Views whose pose is lost are left out.
 
     Raises:
         BadInput: the folder is no capture, two pictures share a view name, a picture is unreadable, a pose is not
@@ -47,11 +71,45 @@ def load_capture(
     if images is not None and not (folder / images).is_dir():
         raise BadInput(f"{folder / images}: no such folder; correct `images` in scene.yaml")
     with as_bad_input(_source(folder, layout), "a capture that can be read"):
-        if layout == "llff":
-            return llff.read(folder, images, longest, references)
-        if layout == "transforms":
-            return transforms.read(folder, images)
-        return colmap.read(folder, images) if layout == "colmap" else photos.read(folder, images, references)
+        capture = _read(folder, layout, images, longest, references, correction)
+        return unread.add_warnings(folder, _restrict_to_poses(capture, correction))
+
+
+def _read(
+    folder: Path,
+    layout: str,
+    images: str | None,
+    longest: int,
+    references: frozenset[Path],
+    correction: Correction,
+) -> Capture:
+    if layout == "llff":
+        return llff.read(folder, images, longest, references, correction)
+    if layout == "photos":
+        return photos.read(folder, images, references)
+    if layout not in PROGRAMS:
+        return (colmap if layout == "colmap" else transforms).read(folder, images, correction)
+    find, read = PROGRAMS[layout]
+    source = find(folder)
+    if source is None:
+        raise BadInput(f"{folder}: no file with poses of the layout {layout}; correct `layout` in scene.yaml")
+    return read(folder, source, images, correction)
+
+
+def _restrict_to_poses(capture: Capture, correction: Correction) -> Capture:
+    """Return a capture without the views whose pose the correction loses, and with EXIF tags obeyed where poses do."""
+    if capture.poses is None:
+        return capture
+    lenses = capture.poses.lenses
+    pictures = {name: path for name, path in capture.pictures.items() if name in lenses}
+    turned = any(_fits_turned_only(path, lenses[name]) for name, path in pictures.items())
+    return replace(capture, pictures=pictures, upright=turned or correction.upright)
+
+
+def _fits_turned_only(picture: Path, lens: Lens) -> bool:
+    """Return whether a lens has the size of the picture turned by its EXIF orientation, and not of the stored one."""
+    size = lens.width, lens.height
+    return image_size(picture) != size and image_size(picture, upright=True) == size
 
 
 def _source(folder: Path, layout: str) -> Path:
@@ -65,7 +123,7 @@ def detect_layout(folder: Path) -> str:
 
     The first match decides: "llff" for poses_bounds.npy, or for a COLMAP model with masks in images_4/label (a scene of
     SPIn-NeRF without its poses_bounds.npy); "transforms" for transforms.json or Blender's transforms_train.json;
-    "colmap" for a COLMAP model; else "photos".
+    "colmap" for a COLMAP model; a layout of another program (`PROGRAMS`) for its file; else "photos".
     """
     if is_file(folder / "poses_bounds.npy"):
         return "llff"
@@ -73,4 +131,6 @@ def detect_layout(folder: Path) -> str:
         return "llff"
     if transforms.split_files(folder):
         return "transforms"
-    return "colmap" if colmap.find_model(folder) is not None else "photos"
+    if colmap.find_model(folder) or colmap.find_workspace(folder):
+        return "colmap"
+    return next((layout for layout, (find, _) in PROGRAMS.items() if find(folder) is not None), "photos")

@@ -16,7 +16,9 @@ from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS
 
 MASK_FOLDERS = ("label", "test_label", "masks", "mask")  # sub-folders of a folder of pictures that hold masks
-MASK_SUFFIXES = ("_mask", ".mask", "-mask")  # `A_mask.png` is the mask of `A.png` in the same folder
+MASK_SUFFIXES = ("_mask", ".mask", "-mask", "_seg")  # `A_mask.png` is the mask of `A.png` in the same folder
+MASK_PREFIXES = ("dynamic_mask_", "mask_")  # so is `mask_A.png`
+MASK_ENDINGS = (".json", ".npy")  # endings of masks that are no pictures, in lower case
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -37,7 +39,7 @@ def strip_ending(path: str) -> str:
 def list_pictures(folder: Path, nested: bool = False) -> list[str]:
     """Return the paths of the pictures in a folder, sorted, relative to the folder.
 
-    Hidden files are left out, and masks that lie beside their pictures (`A_mask.png` beside `A.png`, `MASK_SUFFIXES`).
+    Hidden files are left out, and masks that lie beside their pictures (`is_mask_of_another`).
     A folder that does not exist gives an empty list.
 
     Args:
@@ -59,8 +61,16 @@ def _walk(folder: Path, nested: bool) -> Iterable[Path]:
 
 
 def is_mask_of_another(stem: str, stems: Collection[str]) -> bool:
-    """Return whether the path `stem`, without ending, names a mask (`A_mask`) of a picture in `stems` (`A`)."""
-    return any(stem.endswith(suffix) and stem.removesuffix(suffix) in stems for suffix in MASK_SUFFIXES)
+    """Return whether the path `stem`, without ending, is a mask (`A_mask`, `mask_A`) of a picture in `stems` (`A`)."""
+    return any(each in stems for each in _picture_stems(stem))
+
+
+def _picture_stems(stem: str) -> list[str]:
+    """Return the paths of the pictures whose mask the path `stem` may name, all without endings."""
+    folder, slash, name = stem.rpartition("/")
+    found = [name.removesuffix(each) for each in MASK_SUFFIXES if name.endswith(each)]
+    found += [name.removeprefix(each) for each in MASK_PREFIXES if name.startswith(each)]
+    return [f"{folder}{slash}{each}" for each in found if each]
 
 
 def name_views(paths: Collection[str]) -> dict[str, str]:
@@ -155,16 +165,17 @@ def pair_masks(masks: Collection[str], views: Mapping[V, Iterable[str]]) -> dict
     """Return mask file -> key of the view to which the mask belongs. Masks that fit no single view are left out.
 
     Several masks may get the same view, if they are called differently. The mask of the picture `A.jpg` may be
-    called `A.png`, `A.jpg.png` (as COLMAP does), or `A` with one of `MASK_SUFFIXES`, such as `A_mask.png`.
+    called `A.png`, `A.jpg.png` (as COLMAP does), or `A` with one of `MASK_SUFFIXES` or `MASK_PREFIXES`, such as
+    `A_mask.png`, and may end in one of `MASK_ENDINGS`.
 
     Args:
         masks: paths of mask files.
         views: key of a view -> the paths by which its picture may be called, with their endings.
     """
-    stems = {mask: strip_ending(normalize_path(mask)) for mask in masks}
+    spelled = {mask: mask_stems(mask) for mask in masks}
+    stems, trimmed = ({mask: each[k] for mask, each in spelled.items()} for k in (0, -1))
     bare = {view: [strip_ending(normalize_path(path)) for path in paths] for view, paths in views.items()}
     whole = {view: list(paths) for view, paths in views.items()}
-    trimmed = {mask: _strip_mask_suffix(stem) for mask, stem in stems.items()}
     pairs: dict[str, V] = {}
     for spelling, known in ((stems, bare), (stems, whole), (trimmed, bare)):
         for mask, view in pair_names({m: [s] for m, s in spelling.items()}, known).items():
@@ -172,7 +183,14 @@ def pair_masks(masks: Collection[str], views: Mapping[V, Iterable[str]]) -> dict
     return pairs
 
 
-def _strip_mask_suffix(stem: str) -> str:
-    """Return a mask's stem without a second ending (`A.jpg` -> `A`) and without a mask suffix (`A_mask` -> `A`)."""
-    stem = strip_ending(stem)
-    return next((stem.removesuffix(suffix) for suffix in MASK_SUFFIXES if stem.endswith(suffix)), stem)
+def mask_stems(mask: str) -> list[str]:
+    """Return the paths, without ending, that the picture of the mask at a path may have; the likeliest comes last.
+
+    They are the mask's path without its ending, without a second ending (`A.jpg` -> `A`), and without a suffix or
+    prefix of masks (`A_mask` -> `A`).
+    """
+    path = normalize_path(mask)
+    stem, _, ending = path.rpartition(".")
+    first = stem if f".{ending}".lower() in MASK_ENDINGS else strip_ending(path)
+    second = strip_ending(first)
+    return [first, second, *_picture_stems(second)[:1]]

@@ -16,7 +16,8 @@ from reffusion.capture.layouts.mask_files import NONE, find_masks, match_masks
 from reffusion.capture.names import list_pictures
 from reffusion.capture.views import ViewTable, check_proportions, resolve_view
 from reffusion.io.files import BadInput
-from reffusion.io.images import WHITE, MaskValues, image_size
+from reffusion.io.given_masks import WHITE, MaskValues, mask_file_size
+from reffusion.io.images import image_size
 from reffusion.params.capture import MaskSpec
 
 LEAST_TRAINING_VIEWS = 3  # for a scene without camera-only views; with such views, one is enough
@@ -104,8 +105,9 @@ def load_roles(
       mask; or, if some training masks are missing too, to the first views of the capture;
     - the views that the layout itself holds out (`Capture.test`), except those that `train` names.
 
-    Training views are the views that `train` names, else all views that are neither test nor camera-only views. All
-    other views are left out of the scene, unless they are camera-only views.
+    Training views are the views that `train` names, else all views that are neither test nor camera-only views, without
+    those in neither list of the layout's own (`Capture.unused`). All other views are left out of the scene, unless they
+    are camera-only views.
 
     Args:
         folder: the scene's folder.
@@ -150,13 +152,23 @@ def load_roles(
     kept = {name: path for name, path in mask_files.items() if name in set(train_named)}
     training_masks = {thing: _restrict_files(files, {*kept, *held_out}) for thing, files in of_objects.items()}
     for name, path in (*(item for files in training_masks.values() for item in files.items()), *test_files.items()):
-        check_proportions(path, name, _size_of(name, capture), 0.10, "mask")
+        check_proportions(path, mask_file_size(path), name, _size_of(name, capture), 0.10, "mask")
     unmasked = [name for name in train_named if name not in kept and name not in clean_views]
     warning = f"{len(unmasked)} training views have no mask: {', '.join(unmasked)}" if kept and unmasked else None
     messages = tuple(filter(None, (found.warning, warning)))
     return Roles(
         tuple(train_named), tuple(test_views), clean_views, training_masks, test_files, messages, blank, found.values
     )
+
+
+def describe_split(train: int, test: int) -> str:
+    """Return in words what photographs are for, e.g. "20 photographs build the scene; 3 are kept to test it".
+
+    Args:
+        train, test: numbers of training views and of test views.
+    """
+    words = f"{train} photograph{' builds' if train == 1 else 's build'} the scene"
+    return words + (f"; {test} {'is' if test == 1 else 'are'} kept to test it" if test else "")
 
 
 def _clean_views(clean: Sequence[str], train: list[str], capture: Capture) -> frozenset[str]:
@@ -201,7 +213,7 @@ def _check_objects(remove: Sequence[str] | None, found: dict[str, dict[str, Path
 
 def capture_views(capture: Capture, roles: Roles) -> ViewTable:
     """Return the table of all views of a capture, against which files that the user made for a view are checked."""
-    return ViewTable(capture.pictures, roles.train, roles.test, lambda name: _size_of(name, capture), capture.upright)
+    return ViewTable(capture.pictures, roles.train, roles.test, lambda name: _size_of(name, capture))
 
 
 def _size_of(name: str, capture: Capture) -> tuple[int, int]:
@@ -220,7 +232,7 @@ def _split_views(
     """
     test_views = test if test is not None else (labelled or [*capture.test])
     if train is None:
-        train = [name for name in capture.pictures if name not in {*test_views, *blank}]
+        train = [name for name in capture.pictures if name not in {*test_views, *blank, *capture.unused}]
     elif test is None:
         test_views = [name for name in test_views if name not in set(train)]
     both = sorted(set(train) & set(test_views))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from reffusion.capture.click_coordinates import check_clicks
 from reffusion.capture.layouts.cameras import has_pictures
-from reffusion.capture.layouts.capture import Capture
+from reffusion.capture.layouts.capture import AS_GIVEN, Capture, Correction
 from reffusion.capture.layouts.mask_files import group_by_object
 from reffusion.capture.lens import undistorted_pinhole
 from reffusion.capture.load import LONGEST, load_capture
@@ -20,7 +20,9 @@ from reffusion.params.capture import SceneKeys
 from reffusion.params.reference import reference_list
 
 
-def read_scene(params: SceneKeys, scene: Path, longest: int = LONGEST) -> tuple[Capture, Roles]:
+def read_scene(
+    params: SceneKeys, scene: Path, longest: int = LONGEST, correction: Correction = AS_GIVEN
+) -> tuple[Capture, Roles]:
     """Read a scene folder: return the capture (pictures and cameras) and the roles of its views.
 
     Views that scene.yaml names under `exclude` are neither in `Capture.pictures` nor in the roles.
@@ -29,13 +31,14 @@ def read_scene(params: SceneKeys, scene: Path, longest: int = LONGEST) -> tuple[
         params: the keys of scene.yaml.
         scene: the scene's folder.
         longest: requested longer side of the pictures in pixels, see `load_capture`; no role depends on it.
+        correction: what is changed in the poses, see `load_capture`.
 
     Raises:
         BadInput: a file or a key of scene.yaml is wrong; the message names it and the remedy.
     """
     specs = reference_list(params.reference)
     references = frozenset(scene / name for each in specs for name in (each.image, each.depth) if name is not None)
-    capture = load_capture(scene, params.layout, params.images, longest, references)
+    capture = load_capture(scene, params.layout, params.images, longest, references, correction)
     roles = load_roles(
         scene,
         capture,

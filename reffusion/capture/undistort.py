@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +11,8 @@ from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import Lens, undistort_image, undistort_mask, undistortion_map
 from reffusion.capture.roles import Roles
 from reffusion.io.files import BadInput
-from reffusion.io.images import (
-    WHITE,
-    MaskValues,
-    image_size,
-    load_image,
-    load_mask,
-    resize_image,
-    save_image,
-    save_mask,
-)
+from reffusion.io.given_masks import WHITE, MaskValues, load_given_mask
+from reffusion.io.images import image_size, load_alpha, load_image, resize_image, save_image, save_mask
 
 
 def fitting_size(width: int, height: int, longest: int) -> tuple[int, int]:
@@ -73,6 +65,19 @@ def save_undistorted_view(out: Path, name: str, capture: Capture, longest: int) 
     return lens, pinhole
 
 
+def describe_transparency(names: Collection[str], capture: Capture) -> list[str]:
+    """Return a warning that names the views with transparent pixels in their photographs; no warning without any.
+
+    Only photographs with an alpha channel are read.
+    """
+    found = [name for name in names if load_alpha(capture.pictures[name]) is not None]
+    if not found:
+        return []
+    named = ", ".join(found[:4]) + (f" and {len(found) - 4} more" if len(found) > 4 else "")
+    count = "1 photograph has" if len(found) == 1 else f"{len(found)} photographs have"
+    return [f"{count} transparent pixels, which are trained on as black: {named}"]
+
+
 def save_undistorted_masks(out: Path, name: str, roles: Roles, lens: Lens) -> None:
     """Write the undistorted masks of the view `name` below `out`, as far as the view has such masks.
 
@@ -89,8 +94,20 @@ def save_undistorted_masks(out: Path, name: str, roles: Roles, lens: Lens) -> No
     for folder, files in roles.mask_files.items():
         if name in files:
             values = roles.values if files[name] in own else WHITE
-            mask, where = load_mask(files[name], (lens.height, lens.width), values), undistortion_map(lens)[1]
-            save_mask(out / folder / f"{name}.png", mask if where is None else undistort_mask(mask, where))
+            save_mask(out / folder / f"{name}.png", load_undistorted_mask(files[name], lens, values))
+
+
+def load_undistorted_mask(path: Path, lens: Lens, values: MaskValues = WHITE) -> np.ndarray:
+    """Read the mask file of a photograph and undistort it, bool [H, W], at the size of `lens`.
+
+    Args:
+        values: the pixel values that mark the object.
+
+    Raises:
+        BadInput: the file is unreadable; the message names it.
+    """
+    mask, where = load_given_mask(path, (lens.height, lens.width), values), undistortion_map(lens)[1]
+    return mask if where is None else undistort_mask(mask, where)
 
 
 def check_masks(masks: Mapping[str, Path], values: MaskValues = WHITE) -> None:
@@ -103,7 +120,7 @@ def check_masks(masks: Mapping[str, Path], values: MaskValues = WHITE) -> None:
     Raises:
         BadInput: a mask is unreadable, or all are empty or full; the message names the file or the folder.
     """
-    shares = [load_mask(path, values=values).mean() for path in masks.values()]
+    shares = [load_given_mask(path, values=values).mean() for path in masks.values()]
     if shares and (max(shares) == 0 or min(shares) == 1):
         state, folder = "empty" if max(shares) == 0 else "full", next(iter(masks.values())).parent
         if values.ids:

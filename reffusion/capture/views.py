@@ -15,7 +15,6 @@ from reffusion.capture.lenses import load_lenses
 from reffusion.capture.names import flatten, normalize_path, strip_ending
 from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput
-from reffusion.io.images import image_size
 
 
 @dataclass(frozen=True)
@@ -28,7 +27,6 @@ class ViewTable:
         names: names of all these views.
         train, test: names of the training views and of the test views.
         size_of: function from a view's name to the (width, height) of its picture.
-        upright: True if the EXIF orientation tags of pictures are obeyed.
         placed: True if the table holds only the placed views (`load_placed_views`), so that the capture may have more.
         outliers: names of the views that `poses` left out because their photographs contradict their poses.
     """
@@ -37,17 +35,16 @@ class ViewTable:
     train: Collection[str]
     test: Collection[str]
     size_of: Callable[[str], tuple[int, int]]
-    upright: bool
     placed: bool = False
     outliers: Collection[str] = ()
 
 
 def load_placed_views(poses_dir: Path) -> ViewTable:
     """Return the views of the folder that the stage `poses` wrote, with the sizes of its undistorted pictures."""
-    lenses, upright = load_lenses(poses_dir)
+    lenses = load_lenses(poses_dir)[0]
     roles = load_json(Path(poses_dir) / "views.json")
     size_of = lambda name: (lenses[name].width, lenses[name].height)
-    return ViewTable(lenses, roles["train"], roles["test"], size_of, upright, True, roles.get("outliers", ()))
+    return ViewTable(lenses, roles["train"], roles["test"], size_of, True, roles.get("outliers", ()))
 
 
 def resolve_view(name: str, names: Collection[str], key: str) -> str:
@@ -132,24 +129,29 @@ def _similar_names(name: str, names: Collection[str]) -> str:
     return ", ".join(get_close_matches(name, names, 3, 0.0))
 
 
+def is_in_proportion(size: tuple[int, int], of_size: tuple[int, int], tolerance: float) -> bool:
+    """Return whether the aspect ratios of two sizes (width, height) differ by at most the share `tolerance`."""
+    return abs(size[0] * of_size[1] - size[1] * of_size[0]) <= tolerance * size[0] * of_size[1]
+
+
 def check_proportions(
-    path: Path, name: str, of_size: tuple[int, int], tolerance: float, what: str, upright: bool = False
+    path: Path, size: tuple[int, int], name: str, of_size: tuple[int, int], tolerance: float, what: str
 ) -> None:
     """Check that a picture has the aspect ratio of its view.
 
     Args:
-        path: file of the picture.
+        path: file of the picture, for the message.
+        size: (width, height) of the picture.
         name: name of the view.
         of_size: (width, height) of the view.
         tolerance: largest allowed difference of the aspect ratios, relative to that of the picture.
         what: the kind of picture, such as "mask", for the message.
-        upright: True to obey the picture's EXIF orientation tag.
 
     Raises:
         BadInput: the ratios differ by more than `tolerance`.
     """
-    (width, height), (of_width, of_height) = image_size(path, upright), of_size
-    if abs(width * of_height - height * of_width) > tolerance * width * of_height:
+    (width, height), (of_width, of_height) = size, of_size
+    if not is_in_proportion(size, of_size, tolerance):
         raise BadInput(
             f"{path}: {width}x{height} px, but its view '{name}' has {of_width}x{of_height}; "
             f"make the {what} over the whole picture, in its proportions"

@@ -1,6 +1,7 @@
-"""Application of clicks and strokes to the mask of one photograph.
+"""Application of clicks, boxes and strokes to the mask of one photograph.
 
-The first click selects an object. Each later click adds or removes one connected region around the clicked pixel.
+The first click selects an object. Each later click adds or removes one connected region around the clicked pixel. A box
+adds or removes the thing inside it.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ import numpy as np
 
 from reffusion.clicks.geodesic_cut import correct_labels
 from reffusion.clicks.marks import OBJECT, OTHER, Clicks, Mark, clicks_of, confirmed_pixels, mark_pixels, stroke_pixels
-from reffusion.clicks.mask_borders import BAND, refine_edges
+from reffusion.clicks.mask_borders import BAND, bounding_box, cut_box, refine_edges
 from reffusion.clicks.pixel_grid import downscale, find_depth_edges, part_at, pixel_pairs, upscale, value_at
-from reffusion.clicks.single_view import ViewEvidence, propose_masks, segment_view, select_object
+from reffusion.clicks.segmenter import Prompt
+from reffusion.clicks.single_view import ViewEvidence, pick_by_size, propose_masks, segment_view, select_object
 
 # Penalties on a correction's merit: for each unit by which the logarithm of the mask's size grows or shrinks, and for
 # changing a dot around the click only, which is right if all proposed regions are too large.
@@ -26,9 +28,10 @@ def apply_marks(
 ) -> np.ndarray:
     """Return bool [H, W], the mask after marks are applied one after the other.
 
-    A stroke changes the pixels below the brush. While the mask is empty, a click on the object selects the object. Each
-    later click adds or removes one connected region around the clicked pixel. The region contains no pixel that
-    earlier marks confirm to be the opposite. So a click never changes pixels that are not connected with it.
+    A stroke changes the pixels below the brush. A box changes only pixels inside it. While the mask is empty, a click
+    on the object selects the object. Each later click adds or removes one connected region around the clicked pixel.
+    Clicks and boxes change no pixel that earlier marks confirm to be the opposite. So a click never changes pixels that
+    are not connected with it.
 
     Args:
         marks: all marks of the view, in the order in which they were made.
@@ -38,32 +41,62 @@ def apply_marks(
     shape = view.image.shape[:2]
     mask = np.zeros(shape, bool) if before is None else before
     for k in range(first, len(marks)):
-        mark = marks[k]
+        mark, done = marks[k], marks[: k + 1]
         if mark.radius:
             painted = stroke_pixels(mark, shape)
             mask = mask | painted if mark.positive else mask & ~painted
-            continue
-        for i in range(len(mark.points)):
-            done = [*marks[:k], Mark(mark.points[: i + 1], mark.positive)]
-            if mask.any():
-                mask = correct_mask(view, mask, clicks_of(done), confirmed_pixels(done, shape))
-            elif mark.positive:
-                mask = segment_view(view, clicks_of(done))
+        elif mark.is_box:
+            mask = apply_box(view, mask, done)
+        elif mask.any():
+            mask = correct_mask(view, mask, done)
+        elif mark.positive:
+            mask = segment_view(view, clicks_of(done), mark.size)
     return mask
 
 
-def correct_mask(view: ViewEvidence, before: np.ndarray, clicks: Clicks, confirmed: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the mask `before` with one connected region added or removed around the last click.
+def apply_box(view: ViewEvidence, before: np.ndarray, marks: Sequence[Mark]) -> np.ndarray:
+    """Return bool [H, W], the mask `before` with the thing inside the last mark, a box, added or removed.
 
-    A positive click adds a region, a negative click removes one. Small changes are preferred. The mask is returned
-    unchanged if it agrees with the last click already.
+    The network proposes things. If the box has no size, the thing is taken that the network is surest of, and whose own
+    bounding box is most like the box. Without a network, colours separate the thing from what surrounds the box.
+
+    Args:
+        marks: all marks of the view so far. Pixels that they confirm to be the opposite do not change.
+    """
+    mark = marks[-1]
+    inside = np.zeros_like(before)
+    left, top, right, bottom = (round(side) for side in mark.box)
+    inside[top : max(bottom, top + 1), left : max(right, left + 1)] = True
+    allowed = inside & (confirmed_pixels(marks, before.shape) != (OTHER if mark.positive else OBJECT))
+    if view.ask is None:
+        found = [(cut_box(view.image, inside), 1.0), (inside, 0.0)]
+    else:
+        found = [(each.mask & inside, each.score) for each in view.ask(Prompt(clicks_of([]), mark.box))]
+    found = [pair for pair in found if pair[0].any()] or [(inside, 0.0)]
+    if mark.size:
+        thing = pick_by_size([mask for mask, _ in found], mark.size)
+    else:
+        thing = max(found, key=lambda pair: pair[1] * _fill_of_box(pair[0], inside))[0]
+    return before | (thing & allowed) if mark.positive else before & ~(thing & allowed)
+
+
+def _fill_of_box(mask: np.ndarray, box: np.ndarray) -> float:
+    """Return the share of a box, bool [H, W], that the bounding box of a mask inside it covers."""
+    left, top, right, bottom = bounding_box(mask)
+    return (right - left) * (bottom - top) / float(box.sum())
+
+
+def correct_mask(view: ViewEvidence, before: np.ndarray, marks: Sequence[Mark]) -> np.ndarray:
+    """Return bool [H, W], the mask `before` with one connected region added or removed around the last mark, a click.
+
+    A positive click adds a region, a negative click removes one. Small changes are preferred, unless the click has a
+    size. The mask is returned unchanged if it agrees with the click already.
 
     Args:
         before: bool [H, W], the mask to correct.
-        clicks: all clicks of the view; the last one is applied.
-        confirmed: int8 [H, W], the pixels of all marks, from `marks.confirmed_pixels`. Pixels that are confirmed to be
-            the opposite of the last click do not change.
+        marks: all marks of the view so far. Pixels that they confirm to be the opposite of the click do not change.
     """
+    clicks, confirmed, size = clicks_of(marks), confirmed_pixels(marks, before.shape), marks[-1].size
     at, positive = clicks.points[-1], bool(clicks.positive[-1])
     if value_at(before, at) == positive:
         return before
@@ -83,6 +116,9 @@ def correct_mask(view: ViewEvidence, before: np.ndarray, clicks: Clicks, confirm
     opposite, speck = clicks.points[clicks.positive != positive], int(dot.sum())
     proposed = [apply(region) for region in regions if region.any()]
     results = [result for result in proposed if not _isolates_click(before, result, opposite, speck)]
+    if size and results:
+        changes = [result ^ before for result in results]
+        return before ^ pick_by_size(changes, size)
     penalties = [_change_penalty(before, result, speck) for result in results]
     results, penalties = [*results, apply(dot_region)], [*penalties, DOT_PENALTY]
     best = select_object(view, clicks, results, penalties)

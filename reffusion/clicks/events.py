@@ -1,4 +1,4 @@
-"""Marks (clicks and brush strokes) in the order in which a person makes them, and what they are for."""
+"""Marks (clicks, boxes and brush strokes) in the order in which a person makes them, and what they are for."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Masks = Mapping[str, np.ndarray]  # view -> bool [H, W]
 
 @dataclass(frozen=True)
 class Event:
-    """A mark (click or brush stroke) that a person makes in a view.
+    """A mark (click, box or brush stroke) that a person makes in a view.
 
     Attributes:
         view: name of the view.
@@ -28,17 +28,18 @@ class Event:
     is_early: bool = False
 
     @property
-    def key(self) -> tuple[str, bool, float, bytes, bool]:
+    def key(self) -> tuple[str, bool, float, str, bytes, bool]:
         """A hashable key, which is equal for equal events."""
-        return self.view, self.mark.positive, self.mark.radius, self.mark.points.tobytes(), self.is_early
+        mark = self.mark
+        return self.view, mark.positive, mark.radius, mark.size, mark.points.tobytes(), self.is_early
 
 
 def split_events(events: Sequence[Event], given: Masks) -> tuple[dict[str, list[Event]], list[list[Event]]]:
     """Return the events that select the object, view -> events, and the corrections in groups of one view each.
 
     The object is selected by the early events in views that have no given mask and a positive early event. If there are
-    neither such events nor given masks, it is selected by the first event and the clicks in the same view that directly
-    follow it.
+    neither such events nor given masks, it is selected by the first event and the clicks and boxes in the same view
+    that directly follow it.
 
     Args:
         events: the marks, in the order in which they were made.
@@ -54,4 +55,9 @@ def split_events(events: Sequence[Event], given: Masks) -> tuple[dict[str, list[
     rest = []
     for event, is_first in zip(events, selection, strict=True):
         (first.setdefault(event.view, []) if is_first else rest).append(event)
-    return first, [list(group) for _, group in groupby(rest, key=lambda event: event.view)]
+    return first, group_by_view(rest)
+
+
+def group_by_view(events: Sequence[Event]) -> list[list[Event]]:
+    """Return the events in groups of those that follow each other in one view."""
+    return [list(group) for _, group in groupby(events, key=lambda event: event.view)]

@@ -52,8 +52,8 @@ class FittedViews:
 def transfer_marks(views: FittedViews, events: Sequence[Event], name: str) -> list[Mark]:
     """Return the marks of other views as clicks in one view, where this view shows the marked surface points.
 
-    Each point of a stroke's path becomes a click. A correction of this view leaves pixels unchanged that these clicks
-    confirm.
+    Each point of a stroke's path becomes a click; a box becomes none. A correction of this view leaves pixels unchanged
+    that these clicks confirm.
 
     Args:
         events: all marks so far; those in the view `name` itself are not used.
@@ -61,7 +61,7 @@ def transfer_marks(views: FittedViews, events: Sequence[Event], name: str) -> li
     """
     camera, depth, found = views.cameras[name], views.depth(name), []
     for event in events:
-        if event.view == name or event.view not in views.cameras:
+        if event.view == name or event.view not in views.cameras or event.mark.is_box:
             continue
         points, inside = geometry.sample_nearest(views.surface(event.view), event.mark.points)
         uv, z = geometry.project(points[inside], camera)

@@ -1,4 +1,4 @@
-"""Clicks and strokes on a photograph, and the pixels that they mark."""
+"""Clicks, boxes and brush strokes on a photograph, and the pixels that they mark."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 OBJECT, OTHER, UNKNOWN = 1, -1, 0  # values of a pixel: marked as object, marked as background, not marked
+SIZES = "small", "middle", "large"  # values of `Mark.size`
 _SHIFT = 4  # fractional bits of the coordinates that OpenCV gets when strokes are painted
 
 
@@ -30,26 +31,46 @@ class Clicks:
 
 @dataclass(frozen=True)
 class Mark:
-    """A click or a brush stroke on a view.
+    """A click, a box or a brush stroke on a view.
 
-    A click adds a whole region to the mask or removes one. A stroke changes only the pixels that the brush covers.
+    A click adds a whole region to the mask or removes one. A box does so with the thing that it encloses. A stroke
+    changes only the pixels that the brush covers.
 
     Attributes:
-        points: float64 [K, 2], (x, y) in pixels of the view: the position of a click (K = 1), or the path of a stroke.
+        points: float64 [K, 2], (x, y) in pixels of the view: the position of a click (K = 1), two opposite corners of a
+            box (K = 2 without a radius), or the path of a stroke.
         positive: True = on the object, False = on the background.
-        radius: px, radius of the brush; 0 for a click.
+        radius: px, radius of the brush; 0 for a click and a box.
+        size: which of the proposed regions a click or a box takes, one of `SIZES`; "" for the most probable one.
     """
 
     points: np.ndarray
     positive: bool
     radius: float = 0.0
+    size: str = ""
+
+    @property
+    def is_click(self) -> bool:
+        """Whether the mark is a click, neither a box nor a stroke."""
+        return not self.radius and len(self.points) == 1
+
+    @property
+    def is_box(self) -> bool:
+        """Whether the mark is a box."""
+        return not self.radius and len(self.points) == 2
+
+    @property
+    def box(self) -> tuple[float, float, float, float]:
+        """(left, top, right, bottom) of the mark's points, px."""
+        (left, top), (right, bottom) = self.points.min(0).tolist(), self.points.max(0).tolist()
+        return left, top, right, bottom
 
 
 def clicks_of(marks: Sequence[Mark]) -> Clicks:
-    """Return the clicks among marks, without the strokes."""
-    clicks = [mark for mark in marks if not mark.radius]
+    """Return the clicks among marks, without the boxes and the strokes."""
+    clicks = [mark for mark in marks if mark.is_click]
     points = np.concatenate([np.zeros((0, 2)), *(mark.points for mark in clicks)])
-    return Clicks(points, np.array([mark.positive for mark in clicks for _ in mark.points], bool))
+    return Clicks(points, np.array([mark.positive for mark in clicks], bool))
 
 
 def mark_pixels(clicks: Clicks, shape: tuple[int, int]) -> np.ndarray:
@@ -71,7 +92,7 @@ def mark_pixels(clicks: Clicks, shape: tuple[int, int]) -> np.ndarray:
 def confirmed_pixels(marks: Sequence[Mark], shape: tuple[int, int]) -> np.ndarray:
     """Return int8 [H, W] with OBJECT or OTHER at the pixels of clicks and below strokes, and UNKNOWN elsewhere.
 
-    Where marks overlap, the later one counts.
+    A box confirms no pixel, because it also encloses what is not meant. Where marks overlap, the later one counts.
 
     Args:
         shape: (H, W).
@@ -81,8 +102,8 @@ def confirmed_pixels(marks: Sequence[Mark], shape: tuple[int, int]) -> np.ndarra
         sign = OBJECT if mark.positive else OTHER
         if mark.radius:
             found[stroke_pixels(mark, shape)] = sign
-        else:
-            clicked = mark_pixels(Clicks(mark.points, np.full(len(mark.points), mark.positive)), shape)
+        elif mark.is_click:
+            clicked = mark_pixels(clicks_of([mark]), shape)
             found[clicked != UNKNOWN] = sign
     return found
 

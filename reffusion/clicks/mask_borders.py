@@ -1,4 +1,4 @@
-"""Borders of masks: refinement along edges of a photograph, erosion, bounding box."""
+"""Borders of masks: refinement along edges of a photograph, cutting out a box, erosion, bounding box."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from reffusion.clicks.marks import OBJECT, OTHER
 from reffusion.morphology import disk
 
 BAND = 0.008  # share of the larger side: how far `refine_edges` may move a mask's border
+LEAST_PIXELS = 10  # least number of pixels for a model of their colours
 MARGIN = 3  # `refine_edges` uses the colours up to this many bands (`BAND`) away from a mask
 
 
@@ -39,12 +40,36 @@ def refine_edges(image: np.ndarray, mask: np.ndarray, marks: np.ndarray) -> np.n
     state[inner | (marks == OBJECT)], state[~outer | (marks == OTHER)] = cv2.GC_FGD, cv2.GC_BGD
     cut, models = state[window].copy(), (np.zeros((1, 65)), np.zeros((1, 65)))
     sides = np.isin(cut, (cv2.GC_FGD, cv2.GC_PR_FGD))
-    if min(sides.sum(), (~sides).sum()) < 10:  # too few pixels for a model of colours
+    if min(sides.sum(), (~sides).sum()) < LEAST_PIXELS:
         return mask
     cv2.setRNGSeed(0)
     cv2.grabCut(np.ascontiguousarray(image[window][..., ::-1]), cut, None, *models, 1, cv2.GC_INIT_WITH_MASK)
     found = mask.copy()
     found[window] = np.isin(cut, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    return found
+
+
+def cut_box(image: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Return bool [H, W], the thing inside a box, found by GrabCut: its colours are rare around the box.
+
+    Colours are compared up to the box's own size away from it. The result is empty if the box has no surroundings.
+
+    Args:
+        image: uint8 [H, W, 3].
+        inside: bool [H, W], the pixels of the box, at least one.
+    """
+    left, top, right, bottom = (int(side) for side in bounding_box(inside))
+    window = (
+        slice(max(0, 2 * top - bottom), 2 * bottom - top),
+        slice(max(0, 2 * left - right), 2 * right - left),
+    )
+    cut = np.where(inside[window], cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
+    found = np.zeros_like(inside)
+    if min((cut == cv2.GC_BGD).sum(), inside.sum()) >= LEAST_PIXELS:
+        cv2.setRNGSeed(0)
+        models = np.zeros((1, 65)), np.zeros((1, 65))
+        cv2.grabCut(np.ascontiguousarray(image[window][..., ::-1]), cut, None, *models, 5, cv2.GC_INIT_WITH_MASK)
+        found[window] = cut == cv2.GC_PR_FGD
     return found
 
 

@@ -6,6 +6,11 @@ the object's Gaussians in the next view gives the prompt for the network: a box,
 network's mask votes in turn. The next view is the one whose camera is nearest to a view with a mask, so that both views
 show mostly the same surfaces. At the end each view gets the network's mask or the projected labels, whichever agrees
 better with all votes.
+
+A brush stroke or a mask that is a few pixels too large covers a border of what lies behind or before the object. Pixels
+of such a border, beyond a step in depth, do not vote. The network is not asked for thin things: its masks are too
+coarse, and take in what the thing hides. After a correction, a view's former mask changes only where the
+votes contradict it.
 """
 
 from __future__ import annotations
@@ -21,6 +26,7 @@ from reffusion import trace
 from reffusion.clicks.all_views import remove_rim
 from reffusion.clicks.marks import UNKNOWN, Clicks
 from reffusion.clicks.mask_borders import bounding_box, erode, refine_edges
+from reffusion.clicks.pixel_grid import DEPTH_SLOPE
 from reffusion.clicks.segmenter import Candidate, Prompt
 from reffusion.clicks.single_view import ViewEvidence
 from reffusion.clicks.supports import find_support_gaussians
@@ -38,6 +44,9 @@ MIN_REST = 0.01  # share of the visible silhouette; the network gets a further p
 # Votes exclude a pixel whose `Projection.outside` is above MIN_AGAINST and whose `Projection.inside` is below MAX_FOR.
 MIN_AGAINST, MAX_FOR = 0.5, 0.2
 MIN_WIDTH = 0.004  # share of the image's width: radius of the narrowest part that votes take from a network's mask
+BORDER = 0.015  # share of the larger image side: how far a mask may reach beyond a step in depth
+THIN = 0.035  # share of the larger image side: a thing is thin if no disk with a larger radius fits into its masks
+RIDGE = 0.7  # share of the largest distance from a mask's border nearby, from which on a pixel is in the mask's middle
 # Points of a prompt are at least this far from the mask's border: as a share of the largest such distance, and in px.
 MIN_DEPTH = 0.3
 MIN_DEPTH_PX = 1.5
@@ -96,6 +105,7 @@ def propagate_masks(
     evidence_of: Callable[[str], ViewEvidence],
     masks: Mapping[str, np.ndarray],
     network_views: Collection[str],
+    former: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:
     """Return the object's mask in every view, view -> bool [H, W].
 
@@ -104,47 +114,108 @@ def propagate_masks(
         evidence_of: function from a view to its photograph and segmentation network.
         masks: view -> bool [H, W], the known masks, at least one. They are returned unchanged.
         network_views: the views in which the network is asked. In other views, and in those without a network (`ask`
-            is None), the mask is the projection of the votes.
+            is None), and in all views if the masks show a thin thing, the mask is the projection of the votes.
+        former: view -> bool [H, W], the masks of all views before a correction; None if there are none. They change
+            only where the votes contradict them.
     """
-    drawn, votes = dict(masks), count_all_votes(gaussians, cameras, masks)
-    order = order_by_distance(cameras, masks)
+    ballots = {name: find_voting_pixels(mask, evidence_of(name).relief) for name, mask in masks.items()}
+    drawn, votes = dict(masks), count_all_votes(gaussians, cameras, masks, ballots)
+    order, thin = order_by_distance(cameras, masks), all(is_thin(mask) for mask in masks.values())
     for k in trace.progress(len(order), "masks from view to view"):
         name = order[k]
         view, projection = evidence_of(name), project_votes(gaussians, cameras[name], assume_supports(gaussians, votes))
-        if name not in network_views or view.ask is None or projection.silhouette.sum() < MIN_PIXELS:
+        if thin or name not in network_views or view.ask is None or projection.silhouette.sum() < MIN_PIXELS:
             continue
         drawn[name] = mask = draw_mask(view, projection)
         if agreement(mask, projection) > MIN_AGREEMENT:
-            votes = votes.plus(count_votes(gaussians, cameras[name], mask))
-    votes = assume_supports(gaussians, votes)
-    return dict(masks) | {
-        name: combine(evidence_of(name).image, project_votes(gaussians, cameras[name], votes), drawn.get(name))
-        for name in order
-    }
+            votes = votes.plus(count_votes(gaussians, cameras[name], mask, find_voting_pixels(mask, view.relief)))
+    votes, found = assume_supports(gaussians, votes), dict(masks)
+    for name in order:
+        projection = project_votes(gaussians, cameras[name], votes)
+        found[name] = combine(evidence_of(name).image, projection, drawn.get(name))
+        if former is not None:
+            found[name] = change_where_votes_agree(former[name], found[name], projection)
+    return found
 
 
-def count_all_votes(gaussians: Gaussians, cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray]) -> Votes:
+def is_thin(mask: np.ndarray) -> bool:
+    """Return True if no disk fits into a mask, bool [H, W], with a radius above the share `THIN` of the larger side."""
+    return bool(ndimage.distance_transform_edt(mask).max() < THIN * max(mask.shape))
+
+
+def find_voting_pixels(mask: np.ndarray, relief: np.ndarray | None) -> np.ndarray:
+    """Return bool [H, W], the pixels of a mask that vote: those on the surfaces that the middle of the mask shows.
+
+    Pixels at most the share `BORDER` of the larger side from the mask's border vote only if no step in depth separates
+    them from the middle of the mask, or from the middle of a thin part. Small pieces between steps do not vote.
+
+    Args:
+        mask: bool [H, W], True = the object.
+        relief: float [H, W] as in `ViewEvidence`; None if depth is unknown, so that the whole mask votes.
+    """
+    if relief is None or not mask.any():
+        return mask
+    width, around = max(2, round(BORDER * max(mask.shape))), np.ones((3, 3))
+    distance = ndimage.distance_transform_edt(mask)
+    middle = mask & (distance >= np.minimum(width, RIDGE * ndimage.maximum_filter(distance, 2 * width + 1)))
+    smooth = ndimage.median_filter(relief, 3)
+    level = mask & (np.hypot(ndimage.sobel(smooth, 0), ndimage.sobel(smooth, 1)) / 8 < DEPTH_SLOPE[0])
+    reached = ndimage.binary_dilation(middle & level, around, round(1.5 * width), mask=level)
+    parts, _ = ndimage.label(reached, around)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    voting = reached & (sizes >= min(4 * width**2, MIN_PART * sizes.max()))[parts]
+    if not voting.any():
+        return mask
+    # The slope is also large at the last pixels before a step, which are as near as the pixels beside them.
+    far, at = ndimage.distance_transform_edt(~voting, return_indices=True)
+    return voting | (mask & (far <= 2) & (np.abs(smooth - smooth[tuple(at)]) < DEPTH_SLOPE[0] * far))
+
+
+def change_where_votes_agree(former: np.ndarray, new: np.ndarray, projection: Projection) -> np.ndarray:
+    """Return bool [H, W], the former mask of a view, changed in the connected regions where the votes are for it.
+
+    Args:
+        former, new: bool [H, W], the masks before and after a correction.
+        projection: the votes after the correction.
+    """
+    regions, count = ndimage.label(former ^ new, np.ones((3, 3)))
+    gain = np.where(new, 1, -1) * (projection.inside - projection.outside)
+    sums = ndimage.sum_labels(gain, regions, np.arange(count + 1))
+    return former ^ ((regions > 0) & (sums > 0)[regions])
+
+
+def count_all_votes(
+    gaussians: Gaussians,
+    cameras: Mapping[str, Camera],
+    masks: Mapping[str, np.ndarray],
+    voting: Mapping[str, np.ndarray] | None = None,
+) -> Votes:
     """Sum the votes of all masks on the N Gaussians.
 
     Args:
         masks: view -> bool [H, W], True = the object; at least one view.
+        voting: view -> bool [H, W], the pixels inside each mask that vote; None for all.
     """
-    counts = [count_votes(gaussians, cameras[name], mask) for name, mask in masks.items()]
+    voters = lambda name: voting[name] if voting else None
+    counts = [count_votes(gaussians, cameras[name], mask, voters(name)) for name, mask in masks.items()]
     weights = np.concatenate([each.sum(1) for each in counts])
     shown = weights[weights > SHOWN]
     return Votes(np.sum(counts, 0), LEAST_WEIGHT * float(shown.mean()) if len(shown) else SHOWN)
 
 
 @torch.no_grad()
-def count_votes(gaussians: Gaussians, camera: Camera, mask: np.ndarray) -> np.ndarray:
+def count_votes(gaussians: Gaussians, camera: Camera, mask: np.ndarray, voting: np.ndarray | None = None) -> np.ndarray:
     """Return [N, 2], each Gaussian's blending weight summed over the pixels inside and outside a mask, in px.
 
     Pixels at the mask's border do not count.
 
     Args:
         mask: bool [H, W], True = the object.
+        voting: bool [H, W], the pixels inside the mask that vote; None for all.
     """
-    ballots = torch.as_tensor(np.stack([remove_rim(mask), remove_rim(~mask)], -1), dtype=gaussians.means.dtype)
+    inside = remove_rim(mask) if voting is None else remove_rim(mask) & voting
+    ballots = torch.as_tensor(np.stack([inside, remove_rim(~mask)], -1), dtype=gaussians.means.dtype)
     return rasterizer.accumulate(gaussians, camera, ballots.to(gaussians.means.device)).cpu().numpy()
 
 

@@ -8,14 +8,14 @@ marks are propagated anew; they stay as their marks made them. A click on anothe
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from reffusion.clicks import all_views
 from reffusion.clicks.corrections import apply_marks
-from reffusion.clicks.events import Event, Masks, split_events
+from reffusion.clicks.events import Event, Masks, group_by_view, split_events
 from reffusion.clicks.fitted_views import FittedViews, transfer_marks
 from reffusion.clicks.marks import OTHER, confirmed_pixels
 from reffusion.clicks.propagation import propagate_masks
@@ -26,13 +26,30 @@ from reffusion.morphology import dilate
 Recall = Callable[[Hashable, Callable[[], Masks]], Masks]  # (key, compute) -> masks, see `segment_scene`
 
 
+@dataclass(frozen=True)
+class Settled:
+    """Masks that were saved after some marks.
+
+    Attributes:
+        events: the marks, in the order in which they were made.
+        masks: view -> bool [H, W], the masks of all views after these marks.
+    """
+
+    events: Sequence[Event]
+    masks: Masks
+
+
 def compute_always(_: Hashable, compute: Callable[[], Masks]) -> Masks:
     """Compute the masks without a cache: the default `recall` of `segment_scene`."""
     return compute()
 
 
 def segment_scene(
-    views: FittedViews, events: Sequence[Event], given: Masks, recall: Recall = compute_always
+    views: FittedViews,
+    events: Sequence[Event],
+    given: Masks,
+    recall: Recall = compute_always,
+    settled: Settled | None = None,
 ) -> dict[str, np.ndarray]:
     """Return the object's mask in every view, view -> bool [H, W].
 
@@ -46,11 +63,17 @@ def segment_scene(
         recall: cache of the results after each group of events, so that further events do not repeat the work for the
             earlier ones. It maps (key, compute) to the stored masks for this key, or else to the result of compute().
             The key holds the events only, so different scenes or given masks must not share a cache.
+        settled: the masks after the first of the events, which are then not computed anew; None for none.
     """
-    first, groups = split_events(events, given)
-    known = dict(given) | segment_first(views.evidence_of, first, recall)
-    done = [event for own in first.values() for event in own]
-    masks = recall(("all views", *(event.key for event in done)), partial(propagate, views, known))
+    if settled is not None:
+        done, masks = list(settled.events), settled.masks
+        known = {name: masks[name] for name in {*given, *(event.view for event in done)}}
+        groups = group_by_view(events[len(done) :])
+    else:
+        first, groups = split_events(events, given)
+        known = dict(given) | segment_first(views.evidence_of, first, recall)
+        done = [event for own in first.values() for event in own]
+        masks = recall(("all views", *(event.key for event in done)), partial(propagate, views, known))
     for group in groups:
         done = [*done, *group]
         step = partial(correct_scene, views, done, len(group), masks, frozenset(known), given, recall)
@@ -105,18 +128,19 @@ def _apply_last_event(
     return {last.view: apply_marks(view, [event.mark for event in events], before, first=len(events) - 1)}
 
 
-def propagate(views: FittedViews, masks: Masks) -> dict[str, np.ndarray]:
+def propagate(views: FittedViews, masks: Masks, former: Masks | None = None) -> dict[str, np.ndarray]:
     """Propagate masks to all views: view -> bool [H, W], by the segmentation network if there is one.
 
     Args:
         masks: view -> bool [H, W], the known masks, which are returned unchanged. If all are empty or there are none,
             the masks of all other views are all False.
+        former: view -> bool [H, W], the masks of all views before a correction; see `propagate_masks`.
     """
     if not any(mask.any() for mask in masks.values()):
         empty = lambda camera: np.zeros((camera.height, camera.width), bool)
         return {name: empty(camera) for name, camera in views.cameras.items()} | dict(masks)
     if views.evidence_of(next(iter(masks))).ask is not None:
-        return propagate_masks(views.gaussians, views.cameras, views.evidence_of, masks, views.network_views)
+        return propagate_masks(views.gaussians, views.cameras, views.evidence_of, masks, views.network_views, former)
     image_of = lambda name: views.evidence_of(name).image
     near = find_neighbours(views.gaussians)
     labels = all_views.label_gaussians(views.gaussians, near, views.cameras, masks, image_of)
@@ -160,7 +184,7 @@ def correct_scene(
         regions = propagate(views, {name: added})
         found = {other: mask | (regions[other] & _is_allowed(events, other, mask)) for other, mask in masks.items()}
         return found | dict(given) | own
-    return propagate(views, {other: masks[other] for other in known} | own)
+    return propagate(views, {other: masks[other] for other in known} | own, masks)
 
 
 def _is_allowed(events: Sequence[Event], name: str, mask: np.ndarray) -> np.ndarray:

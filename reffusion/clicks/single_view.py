@@ -41,14 +41,42 @@ class ViewEvidence:
     ask: Callable[[Prompt], list[Candidate]] | None = None
 
 
-def segment_view(view: ViewEvidence, clicks: Clicks) -> np.ndarray:
-    """Return bool [H, W], True = the object that the positive clicks are on; all False without a positive click."""
+def segment_view(view: ViewEvidence, clicks: Clicks, size: str = "") -> np.ndarray:
+    """Return bool [H, W], True = the object that the positive clicks are on; all False without a positive click.
+
+    Args:
+        size: which of the proposed masks is taken, as for `Mark.size`.
+    """
     if not clicks.positive.any():
         return np.zeros(view.image.shape[:2], bool)
-    own, *others = propose_masks(view, clicks)
+    if size and view.ask is None:
+        return segment_by_surfaces(view.image, clicks, view.relief, size)
+    own, *others = masks = propose_masks(view, clicks)
+    if size:
+        return pick_by_size([masks[k] for k in _agreeing(clicks, masks)] or [own], size)
     # The network's first mask shows a part of an object. A click rarely means a part, so this mask is left out.
     best = select_object(view, clicks, [own, *others[1:]])
     return own if best is None else best
+
+
+def pick_by_size(masks: Sequence[np.ndarray], size: str) -> np.ndarray:
+    """Return the mask, bool [H, W], of a size among masks, at least one.
+
+    Args:
+        size: "small" or "large" for the mask with fewest or most pixels; "middle" for the one whose number of pixels is
+            nearest to the geometric mean of these two.
+    """
+    areas = np.log([max(int(mask.sum()), 1) for mask in masks])
+    wanted = {"small": areas.min(), "middle": (areas.min() + areas.max()) / 2, "large": areas.max()}[size]
+    return masks[int(np.abs(areas - wanted).argmin())]
+
+
+def _agreeing(clicks: Clicks, masks: Sequence[np.ndarray]) -> list[int]:
+    """Return the indices of the masks that agree with all clicks."""
+    agrees = lambda mask: all(
+        value_at(mask, at) == sign for at, sign in zip(clicks.points, clicks.positive, strict=True)
+    )
+    return [k for k, mask in enumerate(masks) if agrees(mask)]
 
 
 def propose_masks(view: ViewEvidence, clicks: Clicks) -> list[np.ndarray]:
@@ -77,11 +105,7 @@ def select_object(
     Args:
         penalties: of each mask; None for no penalties.
     """
-    agreeing = [
-        k
-        for k, mask in enumerate(masks)
-        if all(value_at(mask, at) == positive for at, positive in zip(clicks.points, clicks.positive, strict=True))
-    ]
+    agreeing = _agreeing(clicks, masks)
     if len(agreeing) < 2:
         return masks[agreeing[0]] if agreeing else None
     lab, small, _ = downscale(view.image, clicks)
@@ -100,7 +124,9 @@ def select_object(
     return masks[max(agreeing, key=merit)]
 
 
-def segment_by_surfaces(image: np.ndarray, clicks: Clicks, relief: np.ndarray | None = None) -> np.ndarray:
+def segment_by_surfaces(
+    image: np.ndarray, clicks: Clicks, relief: np.ndarray | None = None, size: str = ""
+) -> np.ndarray:
     """Return bool [H, W], True = the object that the positive clicks are on, found without a segmentation network.
 
     Colours and edges of surfaces are used. Colours alone are used if depth is unknown, or shows no edge around the
@@ -110,6 +136,7 @@ def segment_by_surfaces(image: np.ndarray, clicks: Clicks, relief: np.ndarray | 
         image: uint8 [H, W, 3].
         clicks: clicks in pixels of the image, at least one of them positive.
         relief: float [H, W] as in `ViewEvidence`; None if the scene is not fitted yet.
+        size: which of the proposed regions is taken, as for `Mark.size`.
     """
     shape = image.shape[:2]
     lab, small, marks = downscale(image, clicks)
@@ -118,9 +145,13 @@ def segment_by_surfaces(image: np.ndarray, clicks: Clicks, relief: np.ndarray | 
     pairs, length = pixel_pairs(small)
     depth_edges, found = find_depth_edges(relief, small, pairs, length), None
     problem = lab, pairs, length, marks.ravel(), border.ravel()
-    if depth_edges is not None:
-        candidates = [*nested_candidates(*problem, depth_edges), grow_object(*problem, depth_edges)]
-        found = _select_candidate(candidates, marks, lab, pairs, depth_edges)
+    if size or depth_edges is not None:
+        edges = np.zeros(len(pairs)) if depth_edges is None else depth_edges
+        candidates = [*nested_candidates(*problem, edges), grow_object(*problem, depth_edges)]
+        if size:
+            found = pick_by_size([_fill_holes(labels, marks) for labels in candidates], size)
+        else:
+            found = _select_candidate(candidates, marks, lab, pairs, edges)
     mask = _fill_holes(grow_object(*problem), marks) if found is None else found
     return refine_edges(image, upscale(mask, shape), mark_pixels(clicks, shape))
 

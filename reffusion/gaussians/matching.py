@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 CANDIDATES = 8  # nearest Gaussians of the whole scene with which a Gaussian of the cleaned scene is compared
@@ -20,6 +22,10 @@ MIN_SPACING = 0.1
 SAMPLE_SIZE = 5000  # Gaussians of the cleaned scene by which axis flips and different scenes are detected
 QUERY_SIZE = 100_000  # points per query of neighbours
 MIN_MATCHED_SHARE = 0.95  # share of the cleaned scene's Gaussians that must be matched for both files to be one scene
+# A deleted Gaussian is a core if so large a share of its NEIGHBORS nearest Gaussians was deleted, too. Connected cores
+# form a hole if there are at least LEAST_CORES. A deleted Gaussian belongs to the hole if it is at most REACH times as
+# far from the nearest core as that core's farthest neighbour is.
+NEIGHBORS, CORE_SHARE, LEAST_CORES, REACH = 16, 1 / 3, 16, 2.0
 # Signs of x, y and z: unchanged, or rotated by 180 degrees about x, y or z, as editors do with scenes that have y down.
 AXIS_FLIPS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
@@ -71,6 +77,36 @@ def match_gaussians(whole: np.ndarray, cleaned: np.ndarray) -> Match:
     if len(unmatched):
         is_kept |= _match_one_to_one(near_index or _NearIndex(whole), cleaned[unmatched] * flip, is_kept)
     return Match(~is_kept, float(is_kept.sum() / len(cleaned)), flip)
+
+
+def find_scattered(whole: np.ndarray, deleted: np.ndarray) -> np.ndarray:
+    """Find the deleted Gaussians that stood alone among others that stay, and so leave no hole to fill.
+
+    Only the nearest Gaussians are compared, so the result does not depend on the scale of the scene or on how densely
+    it is sampled. An object may be a single layer on a surface that stays.
+
+    Args:
+        whole: [N, 3] positions of the whole scene.
+        deleted: bool [N], True for the Gaussians that were deleted.
+
+    Returns:
+        bool [N], True for scattered Gaussians, all of which were deleted.
+    """
+    index, count = np.flatnonzero(deleted), min(NEIGHBORS, len(whole) - 1)
+    distances, near = cKDTree(whole).query(whole[index], range(2, count + 2), workers=-1)  # the first is itself
+    cores = np.flatnonzero(deleted[near].mean(1) >= CORE_SHARE)
+    number = np.full(len(whole), -1)
+    number[index[cores]] = np.arange(len(cores))
+    first, column = np.nonzero(number[near[cores]] >= 0)
+    pairs = first, number[near[cores[first], column]]
+    links = csr_array((np.ones(len(first), bool), pairs), shape=(len(cores), len(cores)))
+    labels = connected_components(links, directed=False)[1]
+    cores = cores[np.bincount(labels)[labels] >= LEAST_CORES]
+    scattered = deleted.copy()
+    if len(cores):
+        away, nearest = cKDTree(whole[index[cores]]).query(whole[index])
+        scattered[index] = away > REACH * distances[cores[nearest], -1]
+    return scattered
 
 
 class _ExactIndex:

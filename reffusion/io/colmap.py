@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ MODELS = {
     "EUCM": 6, "EQUIRECTANGULAR": 2,
 }  # fmt: skip
 NAMES = tuple(MODELS)
+OBSERVATIONS = re.compile(r"[-+.\deE\s]+")  # a line of numbers in images.txt: x, y, id of a point, and so on
 
 
 @dataclass(frozen=True)
@@ -84,13 +86,10 @@ def is_model(folder: Path) -> bool:
 # ---------------------------------------------------------------------------------------------- reading
 
 
-def _lines(path: Path) -> list[str]:
-    """Return the stripped lines of a text file, without comment lines.
-
-    Blank lines are kept, because images.txt has an empty line where an image observes no points.
-    """
-    lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-    return [line.strip() for line in lines if not line.lstrip().startswith("#")]
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """Return the lines of a text file as pairs (number, stripped line), without blank lines and comments."""
+    lines = enumerate(map(str.strip, Path(path).read_text(encoding="utf-8-sig").splitlines()), start=1)
+    return [(number, line) for number, line in lines if line and not line.startswith("#")]
 
 
 def load_cameras(path: Path) -> dict[int, ModelCamera]:
@@ -133,8 +132,8 @@ def _cameras_binary(path: Path) -> dict[int, ModelCamera]:
 
 def _cameras_text(path: Path) -> dict[int, ModelCamera]:
     cameras = {}
-    for line in filter(None, _lines(path)):
-        with _line_errors(path, "camera", line):
+    for number, line in _lines(path):
+        with _line_errors(path, number, "camera", line):
             identity, model, width, height, *params = line.split()
             if len(params) != MODELS[model]:
                 raise ValueError("its number of parameters")
@@ -150,11 +149,11 @@ def _add(found: dict, identity: int, value: ModelCamera | ModelImage, path: Path
 
 
 @contextmanager
-def _line_errors(path: Path, what: str, line: str) -> Iterator[None]:
+def _line_errors(path: Path, number: int, what: str, line: str) -> Iterator[None]:
     """Turn parsing errors raised inside the context into BadInput.
 
     Args:
-        path: the file, for the message.
+        path, number: the file and the number of the line, for the message.
         what: what the line describes, for the message, e.g. "camera".
         line: the line that is parsed; the message shows it.
     """
@@ -163,7 +162,9 @@ def _line_errors(path: Path, what: str, line: str) -> Iterator[None]:
     except BadInput:
         raise
     except (ValueError, KeyError, OverflowError) as error:
-        raise BadInput(f"{path}: cannot read the {what} '{shorten(line)}' ({shorten(str(error))})") from None
+        raise BadInput(
+            f"{path}: line {number}: cannot read the {what} '{shorten(line)}' ({shorten(str(error))})"
+        ) from None
 
 
 def load_images(path: Path) -> dict[int, ModelImage]:
@@ -200,19 +201,20 @@ def _images_binary(path: Path) -> dict[int, ModelImage]:
 
 
 def _images_text(path: Path) -> dict[int, ModelImage]:
-    images, lines = {}, _lines(path)
-    while lines and not lines[0]:
-        lines.pop(0)
-    for line in lines[::2]:
-        if not line:
-            break
-        with _line_errors(path, "image", line):
+    """Read images.txt. The next line after that of an image may hold the points that the image observes."""
+    images: dict[int, ModelImage] = {}
+    points_at = 0
+    for number, line in _lines(path):
+        if number == points_at and OBSERVATIONS.fullmatch(line) and len(line.split()) % 3 == 0:
+            continue
+        with _line_errors(path, number, "image", line):
             fields = line.split(maxsplit=9)
             if len(fields) != 10:
                 raise ValueError("10 fields are expected")
             pose = [float(f) for f in fields[1:8]]
             image = ModelImage(_check_name(fields[9], path), int(fields[8]), quaternion_to_pose(pose[:4], pose[4:]))
             _add(images, int(fields[0]), image, path)
+        points_at = number + 1
     return images
 
 
@@ -263,8 +265,8 @@ def _points_binary(path: Path) -> ModelPoints:
 
 def _points_text(path: Path) -> ModelPoints:
     positions, colors, tracks = [], [], []
-    for line in filter(None, _lines(path)):
-        with _line_errors(path, "point", line):
+    for number, line in _lines(path):
+        with _line_errors(path, number, "point", line):
             row = line.split()
             x, y, z, red, green, blue, _ = row[1:8]
             positions.append((float(x), float(y), float(z)))

@@ -20,6 +20,7 @@ from reffusion.io.splat_rows import Rows
 if TYPE_CHECKING:
     from reffusion.types import Gaussians, Similarity
 
+MIP_COMMENT = "SplatRenderMode: mip"  # the comment by which Brush marks a .ply as antialiased; splat-transform reads it
 PACKED = "packed_position"  # a vertex property by which a compressed .ply is recognised
 SPZ_HEADER, SPZ_MAGIC = struct.Struct("<IIIBBBB"), 0x5053474E
 SPZ_LIMIT = 2.0**22  # coordinates are below: 24 bits, one of them fractional, one the sign
@@ -29,7 +30,7 @@ TURNED_SH = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], n
 
 
 def save_compressed(path: Path, gaussians: Gaussians, similarity: Similarity) -> None:
-    """Write Gaussians as a compressed .ply in the scene's own frame. `Gaussians.antialiased` is not stored.
+    """Write Gaussians as a compressed .ply in the scene's own frame.
 
     The Gaussians are sorted along a Morton curve, so that chunks have a small extent and quantisation is fine. The x, y
     and z of a position keep 11, 10 and 11 bits of the chunk's extent. Colours, opacity and spherical harmonics keep 8
@@ -57,6 +58,8 @@ def save_compressed(path: Path, gaussians: Gaussians, similarity: Similarity) ->
         plain(sh[:, 0]),
         plain(sh[:, 1:]) if sh.shape[1] > 1 else None,
     )
+    if gaussians.antialiased:  # gsply writes no comment about it
+        data = data.replace(b"element", f"comment {MIP_COMMENT}\nelement".encode(), 1)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     Path(path).write_bytes(data)
 

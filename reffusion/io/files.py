@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 MOST_PIXELS = 200_000_000  # largest size of a picture or depth map; larger ones are refused before they are read
+VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp", ".insv")  # endings, in lower case
 LONGEST_WORD = 400  # characters; longer words of a message are cut
 
 

@@ -6,21 +6,21 @@ import logging
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image, TiffImagePlugin
 
 from reffusion.io.files import BadInput, check_pixels, reading, shorten
 
 HEIC = (".heic", ".heif")  # endings of the pictures that phones write
-ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", *HEIC)  # endings of pictures, in lower case
+# endings of pictures, in lower case
+ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".tif", ".tiff", ".bmp", ".webp", ".avif", *HEIC)
 
-DARK = 8  # grey level up to which an area of a mask counts as background
-FLAT = 0.002  # share of a mask that a value must fill to count as an area, not as part of a soft edge
-_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "HEIF")
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "HEIF", "AVIF")
+_SINCE = ("HEIF", "AVIF")  # formats that Pillow reads only with a plugin, or in newer versions
+_FLOATS = 3  # value of TIFF's tag SampleFormat
 _HEIC_BRANDS = tuple(
     b"ftyp" + brand for brand in (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"hevc", b"hevx")
 )
@@ -41,9 +41,14 @@ def open_image(path: Path, what: str = "a readable image") -> Iterator[Image.Ima
     """
     with reading(path, what):
         with open(path, "rb") as file:
-            if file.read(12)[4:12] in _HEIC_BRANDS:  # the ending of the file's name may be another one
-                _register_heic(path)
-        known = [each for each in _FORMATS if each != "HEIF" or each in Image.OPEN]
+            start = file.read(12)  # the ending of the file's name may be another one
+        if start[4:12] in _HEIC_BRANDS:
+            _register_heic(path)
+        if start[4:12] in (b"ftypavif", b"ftypavis"):
+            _register_avif(path)
+        if start[:4] in (b"II*\0", b"MM\0*"):
+            _refuse_float_colors(path)
+        known = [each for each in _FORMATS if each not in _SINCE or each in Image.OPEN]
     with reading(path, what), Image.open(path, formats=known) as image:
         check_pixels(path, *image.size)
         yield image
@@ -65,6 +70,27 @@ def _register_heic(path: Path) -> None:
     pi_heif.register_heif_opener()
 
 
+def _register_avif(path: Path) -> None:
+    """Enable Pillow to read AVIF pictures. Raises BadInput if the installed Pillow cannot."""
+    try:
+        from PIL.AvifImagePlugin import SUPPORTED
+    except ImportError:
+        SUPPORTED = False
+    if not SUPPORTED:
+        raise BadInput(f"{path}: AVIF pictures need Pillow 11.3: `pip install -U pillow`, or save them as JPEG")
+
+
+def _refuse_float_colors(path: Path) -> None:
+    """Raise BadInput if a TIFF picture has several channels of floats, which Pillow does not read."""
+    with open(path, "rb") as file:
+        tags = TiffImagePlugin.ImageFileDirectory_v2(file.read(8))
+        file.seek(tags.next)
+        tags.load(file)
+    kinds = tags.get(TiffImagePlugin.SAMPLEFORMAT, ())
+    if _FLOATS in kinds and len(kinds) > 1:
+        raise BadInput(f"{path}: float pixels; save it as a picture of 8 or 16 bits")
+
+
 def image_size(path: Path, upright: bool = False) -> tuple[int, int]:
     """Return the (width, height) of a picture in pixels; only the file's header is read.
 
@@ -73,14 +99,73 @@ def image_size(path: Path, upright: bool = False) -> tuple[int, int]:
     """
     with open_image(path) as image:
         width, height = image.size
-        turned = upright and image.getexif().get(0x0112, 1) in (5, 6, 7, 8)
+        turned = _orientation(image) in (5, 6, 7, 8) and upright != _is_turned(image)
         return (height, width) if turned else (width, height)
+
+
+def orientation_matrix(path: Path) -> np.ndarray:
+    """Return [2, 3], the affine map from places in a stored picture to those in the picture turned by its EXIF tag.
+
+    Places are (x, y) as shares of the picture's width and height. Only the file's header is read.
+    """
+    with open_image(path) as image:
+        return np.array(_TURNS[_orientation(image)], float)
+
+
+# EXIF orientation tag -> rows (x by x, x by y, shift of x) and the same for y
+_TURNS = {
+    1: ((1, 0, 0), (0, 1, 0)),
+    2: ((-1, 0, 1), (0, 1, 0)),
+    3: ((-1, 0, 1), (0, -1, 1)),
+    4: ((1, 0, 0), (0, -1, 1)),
+    5: ((0, 1, 0), (1, 0, 0)),
+    6: ((0, -1, 1), (1, 0, 0)),
+    7: ((0, -1, 1), (-1, 0, 1)),
+    8: ((0, 1, 0), (-1, 0, 1)),
+}
+
+
+def _is_turned(image: Image.Image) -> bool:
+    """Return whether Pillow itself turns a picture by its orientation tag while it decodes the pixels."""
+    return image.format == "TIFF"
+
+
+def _turn(pixels: Image.Image, tag: int, is_turned: bool, upright: bool) -> Image.Image:
+    """Return pixels as the orientation `tag` shows them if `upright`, else as they are stored.
+
+    Args:
+        is_turned: True if they are already as the tag shows them (`_is_turned`).
+    """
+    if upright == is_turned or tag == 1:
+        return pixels
+    turn, back = _TRANSPOSES[tag]
+    return pixels.transpose(turn if upright else back)
+
+
+# EXIF orientation tag -> the operation that shows the stored pixels upright, and its inverse
+_TRANSPOSES = {
+    2: (Image.Transpose.FLIP_LEFT_RIGHT,) * 2,
+    3: (Image.Transpose.ROTATE_180,) * 2,
+    4: (Image.Transpose.FLIP_TOP_BOTTOM,) * 2,
+    5: (Image.Transpose.TRANSPOSE,) * 2,
+    6: (Image.Transpose.ROTATE_270, Image.Transpose.ROTATE_90),
+    7: (Image.Transpose.TRANSVERSE,) * 2,
+    8: (Image.Transpose.ROTATE_90, Image.Transpose.ROTATE_270),
+}
+
+
+def _orientation(image: Image.Image) -> int:
+    """Return the EXIF orientation tag of a picture; 1, upright, where it has none or an undefined one."""
+    tag = image.getexif().get(0x0112, 1)
+    return tag if tag in _TURNS else 1
 
 
 def load_image(path: Path, upright: bool = False) -> np.ndarray:
     """Read a picture as uint8 [H, W, 3], sRGB.
 
-    Grey becomes RGB, 16-bit grey levels are divided by 257, and an alpha channel is dropped.
+    Grey becomes RGB, and 16-bit grey levels are divided by 257. A picture with transparent pixels is shown over black:
+    its colours are multiplied by alpha, so that colours which nobody sees have no effect. Black is what Gaussians are
+    rendered over, as in 3DGS; pixels without supervision would need a mask in every stage that compares pictures.
 
     Args:
         upright: True applies the EXIF orientation tag. False ignores the tag, because poses that come with photographs
@@ -91,27 +176,56 @@ def load_image(path: Path, upright: bool = False) -> np.ndarray:
             names the file.
     """
     with open_image(path) as image:
-        turned = ImageOps.exif_transpose(image) if upright else image
+        tag, is_turned = _orientation(image), _is_turned(image)
+        image.load()  # before the size is used, which changes where Pillow turns the pixels
+        turned = _turn(image, tag, is_turned, upright)
         if image.mode[0] not in "IF":
-            return np.array(turned.convert("RGB"))
+            return np.array(_to_rgb(turned))
         levels = np.array(turned)
         if image.mode == "F" or levels.min() < 0 or levels.max() > 65535:
             raise BadInput(f"{path}: {image.mode} pixels; save it as a picture of 8 or 16 bits")
         return np.repeat(np.round(levels / 257).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def load_thumbnail(path: Path, side: int) -> np.ndarray:
+def _to_rgb(image: Image.Image) -> Image.Image:
+    """Return a picture of 8 bits as RGB, shown over black where it is transparent."""
+    if not image.has_transparency_data:
+        return image.convert("RGB")
+    return Image.alpha_composite(Image.new("RGBA", image.size, "black"), image.convert("RGBA")).convert("RGB")
+
+
+def load_alpha(path: Path, upright: bool = False) -> np.ndarray | None:
+    """Read the alpha channel of a picture as uint8 [H, W]; None if every pixel is opaque.
+
+    Args:
+        upright: True applies the orientation tag, as in `load_image`.
+    """
+    with open_image(path) as image:
+        if image.mode[0] in "IF" or not image.has_transparency_data:
+            return None
+        tag, is_turned = _orientation(image), _is_turned(image)
+        image.load()
+        turned = _turn(image, tag, is_turned, upright)
+        alpha = np.array(turned.convert("RGBA").getchannel("A"))
+        return None if alpha.min() == 255 else alpha
+
+
+def load_thumbnail(path: Path, side: int, upright: bool = False) -> np.ndarray:
     """Read a picture, reduced so that its longer side is at most `side` px, as uint8 [h, w, 3].
 
-    The orientation tag is ignored. OpenCV is not imported.
+    OpenCV is not imported.
+
+    Args:
+        upright: True applies the orientation tag, as in `load_image`.
     """
     with open_image(path) as image:
         if image.mode[0] not in "IF":
+            tag, is_turned = _orientation(image), _is_turned(image)
             image.draft("RGB", (2 * side, 2 * side))  # JPEGs are decoded at a fraction of their size
-            image = image.convert("RGB")
+            image = _to_rgb(image)
             image.thumbnail((side, side), Image.Resampling.BOX)
-            return np.array(image)
-    whole = load_image(path)
+            return np.array(_turn(image, tag, is_turned, upright))
+    whole = load_image(path, upright)
     step = max(1, -(-max(whole.shape[:2]) // side))
     return np.ascontiguousarray(whole[::step, ::step])
 
@@ -165,120 +279,23 @@ def _is_png(path: Path) -> bool:
     return Path(path).suffix.lower() == ".png"
 
 
-@dataclass(frozen=True)
-class MaskValues:
-    """The pixel values of a mask file that mark the object.
+def load_mask(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
+    """Read a mask that `save_mask` wrote, as bool [H, W], True = masked.
 
-    Attributes:
-        ids: grey levels, or entries of a palette, that mark the object. If empty, white pixels mark it, as `load_mask`
-            describes.
-        inverted: True if the object is all other pixels instead.
-    """
-
-    ids: tuple[int, ...] = ()
-    inverted: bool = False
-
-
-WHITE = MaskValues()  # the object is white
-
-
-def load_mask(path: Path, size: tuple[int, int] | None = None, values: MaskValues = WHITE) -> np.ndarray:
-    """Read a mask file as bool [H, W], True = masked.
-
-    The file may have values {0, 1} or {0, 255}, one bit per pixel, a palette, or colours on a black background. Values
-    up to 255 are thresholded at 128, so that lossy compression and soft edges do not matter; 16-bit values at 32768. Of
-    a colour, the brightest channel counts; in a palette of colours, every entry but black. An alpha channel is ignored.
-    A file whose colours are constant while its alpha varies is refused, because tools disagree whether transparent or
-    opaque pixels are the object.
+    Masks that a user made are read by `reffusion.io.given_masks`.
 
     Args:
         size: (height, width) to which the mask is resized by nearest neighbour; None keeps the file's size.
-        values: which pixel values mark the object.
 
     Raises:
-        BadInput: the file is unreadable, or has colours while `values` has `ids`. Without `ids`: the file has its mask
-            in the alpha channel, has areas of several values or colours (such as numbers of objects), or has values
-            above 1 that all lie below the threshold. The message names the file.
+        BadInput: the file is unreadable, or has other values than 0 and 255; the message names it.
     """
     with open_image(path, "a readable mask") as image:
-        if values.ids:
-            mask = np.isin(_object_numbers(path, image), values.ids)
-        else:
-            mask = _white_pixels(path, image)
-    mask = mask ^ values.inverted
+        levels = np.array(image.convert("L"))
+    mask = levels == 255
+    if not (mask | (levels == 0)).all():
+        raise BadInput(f"{path}: its values are not only 0 and 255; it is no mask that a stage wrote")
     return mask if size is None else resize_nearest(mask, size)
-
-
-def _object_numbers(path: Path, image: Image.Image) -> np.ndarray:
-    """Return the object numbers [H, W] of a mask file: its grey levels, or the indices of its palette entries.
-
-    Raises:
-        BadInput: the pixels have colours.
-    """
-    array = np.array(image)
-    if array.ndim == 3 and (array[..., :1] == array[..., : min(3, array.shape[2])]).all():
-        array = array[..., 0]
-    if array.ndim != 2:
-        raise BadInput(f"{path}: {image.mode} colours are no object numbers; save grey levels or a palette, or no `id`")
-    return array
-
-
-def _white_pixels(path: Path, image: Image.Image) -> np.ndarray:
-    mode = image.mode
-    array = np.array(image.convert("RGB") if mode in ("P", "PA") else image)
-    if array.ndim == 3:
-        colors = array[..., : 3 if array.shape[2] >= 3 else 1]
-        if mode in ("RGBA", "LA") and (colors == colors[0, 0]).all() and np.ptp(array[..., -1]):
-            raise BadInput(f"{path}: its alpha differs, its colours do not; write 255 where the object is, 0 elsewhere")
-        if image.format != "JPEG" and np.ptp(colors, axis=2).any():
-            _check_colors(path, mode, colors)
-            if mode in ("P", "PA"):
-                return np.any(colors, axis=2)
-        array = colors.max(axis=2)
-    if array.dtype == np.bool_ or array.max() <= 1:
-        return array > 0
-    half = 32768 if array.max() > 255 else 128
-    levels = _flat_levels(array) if image.format != "JPEG" else []
-    inner = [level for level in levels if level > DARK]
-    if array.max() < half or len(inner) > 1:
-        found = ", ".join(str(level) for level in ([level for level in levels if level] or [array.max()])[:6])
-        raise BadInput(
-            f"{path}: its values ({found}) are neither 0/1 nor 0/255; write 255 where the object is, 0 elsewhere, or "
-            "name the object's numbers in scene.yaml: `masks: {id: ...}`"
-        )
-    return array >= half
-
-
-def _check_colors(path: Path, mode: str, colors: np.ndarray) -> None:
-    """Raise BadInput if a mask file has areas of more than one colour besides black.
-
-    Each of these colours could be the object.
-
-    Args:
-        path: the file, for the message.
-        mode: Pillow's mode of the picture.
-        colors: its pixels, [H, W, 3].
-    """
-    found = [color for color in _flat_levels(colors.astype(np.int32) @ (65536, 256, 1)) if color]
-    if len(found) > 1:
-        numbers = ", or name the object's entries in scene.yaml: `masks: {id: ...}`" if mode in ("P", "PA") else ""
-        raise BadInput(
-            f"{path}: {len(found)} colours beside black; write white where the object is, black elsewhere{numbers}"
-        )
-
-
-def _flat_levels(array: np.ndarray) -> list[int]:
-    """Return the values of an array [H, W] that fill areas, ascending.
-
-    A pixel lies in an area if its upper, left and upper left neighbours have the same value. Values that only occur
-    along soft edges are thereby left out. The areas of a value must cover more than the share `FLAT` of the pixels.
-    """
-    same = np.ones(array.shape, bool)
-    same[1:] &= array[1:] == array[:-1]
-    same[:, 1:] &= array[:, 1:] == array[:, :-1]
-    same[1:, 1:] &= array[1:, 1:] == array[:-1, :-1]
-    levels, counts = np.unique(array[same], return_counts=True)
-    return [int(level) for level, count in zip(levels, counts, strict=True) if count > FLAT * array.size]
 
 
 def resize_image(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from reffusion.io import compressed
-from reffusion.io.compressed import PACKED
+from reffusion.io.compressed import MIP_COMMENT, PACKED
 from reffusion.io.files import BadInput, reading
 from reffusion.io.ply_table import load_header, load_vertices, save_vertices
 from reffusion.io.quantized import save_splat
 from reffusion.io.splat_rows import Rows
 from reffusion.io.splats import (
-    ANTIALIASED,
     BLOCK,
     DC,
     FORMATS,
@@ -67,7 +66,7 @@ def save_ply(
         (SCALES, log_scales),
         (ROTATION, array("quaternions")),
     )
-    comments = [ANTIALIASED] if gaussians.antialiased else []
+    comments = [MIP_COMMENT] if gaussians.antialiased else []
     found = {name: column for names, values in blocks for name, column in zip(names, values.T, strict=True)}
     columns = [name for name in properties or found if name in found]
     columns += [name for name in found if name not in columns and name not in NORMAL]
@@ -97,7 +96,7 @@ def check_can_save(path: Path) -> None:
 def save_splats(path: Path, gaussians: Gaussians, similarity: Similarity, properties: Sequence[str] = ()) -> None:
     """Write Gaussians in the scene's own frame, in the format that the file's ending names (see `splats.FORMATS`).
 
-    A plain .ply and a .spz store `Gaussians.antialiased`, the other formats do not.
+    All formats but .splat store `Gaussians.antialiased`.
 
     Args:
         gaussians: in the normalised frame.

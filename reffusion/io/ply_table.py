@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +32,7 @@ class Header:
         text: True if the data is ASCII text, False if it is binary.
         elements: (name, number of rows, properties) of each element, in the order of the file. Properties are pairs
             (type, name); the type of a list is "list".
-        comments: the comment lines, without the word `comment`.
+        comments: the comment lines, without the word `comment`. Words are separated by one blank.
         at: offset in bytes at which the data begins.
     """
 
@@ -69,7 +70,7 @@ def load_header(path: Path) -> Header:
             raise BadInput(f"{path}: not a PLY file; its first line is not `ply`")
         form, elements, comments = "", [], []
         for raw in iter(lambda: file.readline(LONGEST_LINE), b""):
-            words = raw.decode("ascii", "replace").split()
+            words = _decode(raw).split()
             if words[:1] == ["format"]:
                 form = words[1]
             elif words[:1] == ["comment"]:
@@ -86,11 +87,25 @@ def load_header(path: Path) -> Header:
         header = Header(form == "ascii", layout, tuple(comments), file.tell())
         if form not in ("ascii", "binary_little_endian", "binary_big_endian"):
             raise BadInput(f"{path}: not a readable PLY file with vertices: its format is '{shorten(form)}'")
-        if any(count < 0 for _, count, _ in layout) or not any(name == "vertex" for name, _, _ in layout):
+        names = [name for name, _, _ in layout]
+        if "vertex_0" in names:
+            raise BadInput(
+                f"{path}: a .ply of reduced-3dgs ({', '.join(names)}) is not read; load it with GaussianModel.load_ply "
+                "of that project, and save its Gaussians as a .ply of 3DGS, as gsplat.export_splats writes it"
+            )
+        if any(count < 0 for _, count, _ in layout) or "vertex" not in names:
             raise BadInput(f"{path}: not a readable PLY file with vertices")
         if header.at + header.least_bytes() > Path(path).stat().st_size:
             raise BadInput(f"{path}: cut off: it is too short for what its header declares")
         return header
+
+
+def _decode(line: bytes) -> str:
+    """Decode a line of the header, which other programs write in UTF-8 or in Latin-1."""
+    try:
+        return line.decode()
+    except UnicodeDecodeError:
+        return line.decode("latin-1")
 
 
 def load_vertices(path: Path, header: Header) -> np.ndarray:
@@ -118,7 +133,13 @@ def load_vertices(path: Path, header: Header) -> np.ndarray:
             if len(table) != count:
                 raise BadInput(f"{path}: cut off: {len(table)} of {count} vertices")
             return table
-        return PlyData.read(str(path))["vertex"].data
+        with open(path, "rb") as file:
+            start = file.read(header.at)
+            if start.isascii():
+                return PlyData.read(str(path))["vertex"].data
+            # plyfile reads ASCII only. The replaced characters are in comments, so the data is read all the same.
+            start = start.decode("ascii", "replace").encode("ascii", "replace")
+            return PlyData.read(io.BytesIO(start + file.read()))["vertex"].data
 
 
 def save_vertices(path: Path, table: np.ndarray, comments: Sequence[str] = ()) -> None:

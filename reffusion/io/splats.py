@@ -6,6 +6,7 @@ result.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,9 +29,20 @@ SCALES = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 RED_GREEN_BLUE = ("red", "green", "blue")
 FILTER = "filter_3D"  # property of Mip-Splatting: the standard deviation of the 3D filter of each Gaussian
-ANTIALIASED = "antialiased"  # a comment in a .ply: the Gaussians are to be rendered with Mip-Splatting's 2D filter
+# Comments of a .ply that say whether the Gaussians are to be rendered with Mip-Splatting's 2D filter: first those of
+# Brush and splat-transform, then those of Postshot and, without a number, of earlier versions of this program.
+RENDERING = re.compile(r"splatrendermode: ?(\w+)|antialiased(?: ([01]))?", re.IGNORECASE)
 FORMATS = (".ply", ".compressed.ply", ".spz", ".splat")  # endings of the files that are read and written
-UNREAD = (".ksplat", ".sog", ".lcc", ".lcc2", ".glb", ".gltf", ".usdz", ".zip", ".json")
+BY_PROGRAM = "save the scene as .ply in the program that wrote it"
+UNREAD = {  # ending of a file that is not read: how to get a .ply from it; None: splat-transform converts it
+    **dict.fromkeys((".ksplat", ".sog", ".lcc", ".lcc2", ".json")),
+    **dict.fromkeys((".glb", ".gltf", ".usdz"), BY_PROGRAM),
+    ".zip": "unpack it, and name a file of splats in it",
+    ".ckpt": "it is a checkpoint of nerfstudio; `ns-export gaussian-splat --load-config config.yml --output-dir .` "
+    "writes a .ply",
+    ".pt": "it is a checkpoint of gsplat; gsplat.export_splats writes a .ply of its `splats`",
+    ".pth": "it is a checkpoint of 3DGS; name the point_cloud/iteration_*/point_cloud.ply beside it",
+}
 BLOCK = 8192  # rows that are read at a time
 DEGREES = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(11)}  # number of `f_rest` properties -> degree
 
@@ -42,7 +54,7 @@ class Splats:
     Attributes:
         rows: the valid Gaussians, in the order of the file.
         antialiased: True if they are to be rendered with Mip-Splatting's 2D filter, which lowers the opacity of
-            Gaussians that the low-pass widens.
+            Gaussians that the low-pass widens. Always False for the two scales of 2DGS and for a .splat.
         notes: what was changed, a sentence each, without the file's name.
     """
 
@@ -97,10 +109,8 @@ def summarize_splats(path: Path) -> Summary:
     path = Path(path)
     ending = path.suffix.lower()
     if ending in UNREAD:
-        raise BadInput(
-            f"{path}: {ending} is not read; convert it to .ply, as with `npx @playcanvas/splat-transform "
-            f"{path.name} {path.stem}.ply`"
-        )
+        by_npm = f"convert it to .ply, as with `npx @playcanvas/splat-transform {path.name} {path.stem}.ply`"
+        raise BadInput(f"{path}: {ending} is not read; {UNREAD[ending] or by_npm}")
     if ending == ".splat":
         return Summary(quantized.count_splat(path))
     if ending == ".spz":
@@ -111,10 +121,16 @@ def summarize_splats(path: Path) -> Summary:
     count, names = header.vertices()
     if compressed.PACKED in names:
         compressed.check_gsply(path)
-        return Summary(count)
+        return Summary(count, antialiased=is_antialiased(header.comments))
     notes = _check_properties(path, names)
-    smoothed = ANTIALIASED in header.comments or FILTER in names
+    smoothed = FILTER in names or (SCALES[2] in names and is_antialiased(header.comments))
     return Summary(count, notes, tuple(names), smoothed)
+
+
+def is_antialiased(comments: Sequence[str]) -> bool:
+    """Return whether the comments of a .ply ask for Mip-Splatting's 2D filter. The last comment about it counts."""
+    found = [match[1] or match[2] or "1" for comment in comments if (match := RENDERING.fullmatch(comment))]
+    return bool(found) and found[-1].lower() in ("mip", "1")
 
 
 def load_splats(path: Path) -> Splats:

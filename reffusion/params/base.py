@@ -63,6 +63,13 @@ class Settings(BaseModel):
         return type(self).model_validate(nested)
 
 
+def to_slashes(value: Any) -> Any:
+    """Return a path, or a list of paths, with slashes for the backslashes of Windows. Other values stay as they are."""
+    if isinstance(value, list):
+        return [to_slashes(each) for each in value]
+    return value.replace("\\", "/") if isinstance(value, str) else value
+
+
 def prior_field() -> Any:
     return Field(PRIOR, description="inpainting prior: a diffusers folder or a hub id", json_schema_extra=WEIGHTS)
 
@@ -119,7 +126,9 @@ class Sampler(Settings):
 
     steps: int = Field(50, ge=1, description="sampler steps from pure noise")
     guidance: float = Field(
-        0.0, ge=0, description="a of the paper; the guidance scale of libraries is 1 + a; no effect without a prompt"
+        0.0,
+        ge=0,
+        description="γ of (1 + γ) ε(cond) - γ ε(empty); libraries' scale is 1 + γ; no effect without a prompt",
     )
     # PAPER leaves open: the noise level. SDXL's authors advise against pure noise: diffusers starts just below it.
     start: float = Field(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from reffusion.params.base import UNKEYED, Settings
+from reffusion.params.base import UNKEYED, Settings, to_slashes
 from reffusion.params.clicks import Clicked
 from reffusion.params.reference import ReferenceSpec
 
@@ -41,6 +41,7 @@ class MaskSpec(Settings):
     id: int | list[int] | None = Field(
         None, description="in maps of object numbers, and in palettes: the numbers that are the object"
     )
+    _slashes = field_validator("folder")(to_slashes)
 
     @property
     def numbers(self) -> tuple[int, ...]:
@@ -55,7 +56,10 @@ class SceneKeys(Settings):
     these keys select do enter the hash (`scene_facts` in `stages.plan`).
     """
 
-    layout: Literal["llff", "colmap", "transforms", "photos"] | None = Field(None, description="None: detected")
+    layout: (
+        Literal["llff", "colmap", "transforms", "polycam", "realitycapture", "opensfm", "bundler", "3dgs", "photos"]
+        | None
+    ) = Field(None, description="None: detected")
     images: str | None = Field(None, description="folder of pictures, relative to the scene; None: the usual folders")
     masks: str | MaskSpec | None = Field(
         None,
@@ -94,6 +98,8 @@ class SceneKeys(Settings):
         description="read by the stage `reference`; here only checked against the views",
         json_schema_extra=UNKEYED,
     )
+
+    _slashes = field_validator("images", "masks", "test_masks", "gaussians", "cleaned", "fill")(to_slashes)
 
     @property
     def has_masks(self) -> bool:

@@ -49,7 +49,7 @@ class SdsTerm(Settings):
     hole_only: bool = Field(False, description="drop the gradient at latents that are not repainted")
     # Not in the paper: the predictions of a small prior have too little contrast, and fade a correct rendering.
     keep_contrast: bool = Field(False, description="raise the prediction's contrast to that of the rendered hole")
-    guidance: float = Field(4.0, ge=0, description="the paper's a; libraries' guidance scale is 1 + a")
+    guidance: float = Field(4.0, ge=0, description="γ of (1 + γ) ε(cond) - γ ε(empty); libraries' scale is 1 + γ")
     reduction: Literal["sum", "mean"] = Field("sum", description="over a latent's elements")
 
     @property

@@ -17,3 +17,4 @@ class Params(SceneKeys):
     refine: bool = Field(
         False, description="adjust poses and principal points of views to optical flow, where they disagree with it"
     )
+    trust: bool = Field(False, description="use the poses that come with photographs even where they contradict these")

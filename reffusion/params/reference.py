@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
-from reffusion.params.base import Device, Dtype, Sampler, Settings, memory_field, prior_field
+from reffusion.params.base import Device, Dtype, Sampler, Settings, memory_field, prior_field, to_slashes
 from reffusion.params.inpainter import Inpainter, ReferenceKind
 
 
@@ -18,6 +18,7 @@ class ReferenceSpec(Settings):
     depth: str | None = Field(None, description="its depth or disparity, any scale: 16-bit .png, .npy or .exr")
     undistorted: bool = Field(False, description="painted over the undistorted image of `poses`, not over the photo")
     trust: bool = Field(False, description="use it even though it does not seem to show its view")
+    _slashes = field_validator("image", "depth")(to_slashes)
 
 
 def reference_list(given: ReferenceSpec | Sequence[ReferenceSpec] | None) -> list[ReferenceSpec]:
@@ -31,6 +32,7 @@ class Params(Settings):
     )
     # "Ours (LoRA)" of the paper's sparse-view experiment: pictures that are neither reconstructed nor unprojected.
     teach: list[str] = Field([], description="pictures of the scene that only personalize the prior; files")
+    _slashes = field_validator("teach")(to_slashes)
     inpainter: Inpainter[ReferenceKind] = Inpainter[ReferenceKind](kind="diffusion")
     prior: str = prior_field()
     prompt: str = Field("", description="what the invented region shows, for a prior with a text encoder")

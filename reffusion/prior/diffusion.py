@@ -197,7 +197,7 @@ def sample(
         text: [B, L, D], the hidden states of the prompts.
         steps: Number of denoising steps, at least 1.
         random: Draws the noise, on the CPU.
-        guidance: The paper's a in (1 + a) eps(cond) - a eps(empty). The guidance scale of libraries is 1 + a.
+        guidance: γ in (1 + γ) ε(cond) - γ ε(empty). The guidance scale of libraries is 1 + γ.
         empty: [B, L, D], the hidden states of the empty prompt; needed if `guidance` > 0.
         start: Initial noise level in (0, 1], as a fraction of the schedule. 1 starts from pure noise.
 
@@ -227,7 +227,7 @@ def sample(
 def guided(
     prior: Prior, noisy: Tensor, t: Tensor, condition: Tensor, text: Tensor, empty: Tensor | None, guidance: float
 ) -> tuple[Tensor, Tensor]:
-    """Return eps and z_0 with classifier-free guidance, (1 + a) eps(cond) - a eps(empty), in one batch of the UNet.
+    """Return eps and z_0 with classifier-free guidance, (1 + γ) ε(cond) - γ ε(empty), in one batch of the UNet.
 
     If the prompt itself is empty, the result is eps(empty) for every a, and the UNet runs for this prompt only.
 
@@ -238,7 +238,7 @@ def guided(
         condition: [B, 1 + C, h, w], see `conditioning`.
         text: [B, L, D], the hidden states of the prompts.
         empty: [B, L, D], the hidden states of the empty prompt. None is allowed without guidance.
-        guidance: The paper's a; 0 means no guidance.
+        guidance: γ; 0 means no guidance.
 
     Raises:
         ValueError: `guidance` is not 0 and `empty` is None.

@@ -112,7 +112,7 @@ def paint(
         prompt: The text prompt.
         seeds: One seed for each candidate.
         steps: Number of sampler steps from pure noise. A lower noise level takes a proportional part of them.
-        guidance: The paper's a, the strength of classifier-free guidance.
+        guidance: γ, the strength of classifier-free guidance.
         start: Initial noise level of the whole view in (0, 1], as a fraction of the schedule (1 = pure noise). Below 1
             noise is added to the harmonic extension of the known pixels into the hole.
         finest: Initial noise level at finer levels.
@@ -203,7 +203,7 @@ def repaint(
         finest: Upper limit of the noise level at finer sizes. From pure noise a window would ignore the whole view.
         levels: Number of finer sizes.
         steps: Number of sampler steps from pure noise. A lower noise level takes a proportional part of them.
-        guidance: The paper's a, the strength of classifier-free guidance.
+        guidance: γ, the strength of classifier-free guidance.
 
     Returns:
         [3, H, W] in [-1, 1]. Pixels outside the hole are unchanged.

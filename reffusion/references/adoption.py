@@ -87,15 +87,14 @@ def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tu
             is trusted; or a file cannot be used.
         ValueError: the picture covers less than `LEAST_HOLE_SHARE` of the hole.
     """
-    lenses, upright = load_lenses(space.poses)
-    camera, lens = space.scene.cameras[file.view], lenses[file.view]
+    camera, lens = space.scene.cameras[file.view], load_lenses(space.poses)[0][file.view]
     keeps_exposure = not file.painted and has_photograph(space.poses, file.view)
     photo = load_photo(space, file.view) if keeps_exposure else space.load_photos([file.view])[file.view]
     hidden = object_pixels(masks)
-    image, inside = undistort_reference(file, lens, upright)
+    image, inside = undistort_reference(file, lens, photo)
     found = registration.register(image, photo, hidden)
     if not found.fits and not file.undistorted:
-        straight, _ = undistort_reference(replace(file, undistorted=True), lens, upright)
+        straight, _ = undistort_reference(replace(file, undistorted=True), lens, photo)
         if registration.register(straight, photo, hidden).fits:
             raise BadInput(
                 f"{file.path}: fits the undistorted picture of its view '{file.view}', not the photograph; write "
@@ -106,17 +105,19 @@ def adopt_reference(file: ReferenceFile, masks: MaskSet, space: Workspace) -> tu
     print(f"reference {file.view}: {found}", flush=True)
     usual = 0.0
     if not found.is_identical:
-        image, inside = undistort_reference(file, lens, upright, found.affine)
+        image, inside = undistort_reference(file, lens, photo, found.affine)
         image = color.recolor(image, found.gain, found.offset)
         usual = shadows.redrawn_difference(image, photo, inside & ~hidden)
     margin, blend = (share * camera.width for share in (PASTE_MARGIN, PASTE_BLEND))
     hole = hidden | shadows.detect_shadows(image, photo, hidden) & inside
     image = color.paste(image, photo, hole, inside, margin, blend)
     if masks.invent.any() and (share := inside[masks.invent].mean()) < LEAST_HOLE_SHARE:
-        raise ValueError(f"{file.path}: shows only {share:.0%} of the hole in '{file.view}'; crop less")
+        raise ValueError(
+            f"{file.path}: shows only {share:.0%} of the hole in '{file.view}'; crop less, or paint all of it"
+        )
     differs = masks.consistent | shadows.changed_pixels(image, photo, masks.invent, usual)
     image = image if file.painted else exposure.normalize_exposure(image, space.fit, file.view)
-    depth = undistort_reference_depth(file, lens, upright, found.affine)
+    depth = undistort_reference_depth(file, lens, found.affine)
     if depth is not None:  # a depth map in the unit of the scene's own files is now in that of the normalised frame
         depth = depth * space.scene.similarity.scale
     return Reference(camera, image, masks.invent & inside & differs, depth), str(found)

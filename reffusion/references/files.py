@@ -6,7 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from reffusion.capture.views import ViewTable, check_proportions, not_placed_error, resolve_file_view
+from reffusion.capture.views import (
+    ViewTable,
+    check_proportions,
+    is_in_proportion,
+    not_placed_error,
+    resolve_file_view,
+)
 from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS, image_size
 from reffusion.params.reference import ReferenceSpec, reference_list
@@ -50,6 +56,20 @@ class ReferenceFile:
 def list_paintings(folder: Path) -> list[Path]:
     """Return all files in the scene's folder `painted` (pictures, depth maps, masks), sorted, but no hidden files."""
     return sorted(path for path in (Path(folder) / PAINTED).glob("[!.]*") if path.is_file())
+
+
+def obeys_orientation(path: Path, of_size: tuple[int, int]) -> bool:
+    """Return whether the EXIF orientation tag of a reference is obeyed.
+
+    It is, unless the picture has the proportions of its view only without it: an editor may keep the tag of a
+    photograph whose tag is ignored because its pose refers to the stored pixels.
+
+    Args:
+        path: file of the picture.
+        of_size: (width, height) of its view.
+    """
+    turned, stored = (is_in_proportion(image_size(path, each), of_size, PROPORTION_TOLERANCE) for each in (True, False))
+    return turned or not stored
 
 
 def list_teaching_files(folder: Path, names: Sequence[str]) -> list[Path]:
@@ -156,7 +176,9 @@ def _check(file: ReferenceFile, views: ViewTable) -> None:
             f"{file.path}: '{file.view}' is neither a training nor a test view; "
             "name it in `train` in scene.yaml, or make the reference for another view"
         )
-    check_proportions(file.path, file.view, views.size_of(file.view), PROPORTION_TOLERANCE, "reference", views.upright)
+    of_size = views.size_of(file.view)
+    size = image_size(file.path, obeys_orientation(file.path, of_size))
+    check_proportions(file.path, size, file.view, of_size, PROPORTION_TOLERANCE, "reference")
     if file.depth is not None:
         if file.depth.suffix.lower() not in DEPTH_ENDINGS:
             raise BadInput(f"{file.depth}: a depth map is a 16-bit .png, a .npy or an .exr; convert it")

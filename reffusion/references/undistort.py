@@ -7,32 +7,51 @@ import numpy as np
 from reffusion.capture.lens import Lens, to_pixels, undistort_image, undistortion_map
 from reffusion.io.depth_maps import load_depth
 from reffusion.io.files import BadInput
-from reffusion.io.images import image_size, load_image, resize_image, resize_nearest
-from reffusion.references.files import ReferenceFile
+from reffusion.io.images import image_size, load_alpha, load_image, resize_image, resize_nearest
+from reffusion.references.files import ReferenceFile, obeys_orientation
 
 DOWNSCALE_ABOVE = 1.5  # pictures wider than this many times their view are reduced before they are resampled
 
 
 def undistort_reference(
-    given: ReferenceFile, lens: Lens, upright: bool, affine: np.ndarray | None = None
+    given: ReferenceFile, lens: Lens, photo: np.ndarray, affine: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Load the picture of a reference, and undistort it as the photograph of its view was undistorted.
 
-    A picture that is undistorted already (`given.undistorted`) is only resized and aligned.
+    A picture that is undistorted already (`given.undistorted`) is only resized and aligned. Where it is transparent,
+    the photograph shows.
 
     Args:
         given: the files of the reference.
         lens: the lens of the view's photograph, at the size of the undistorted photograph (`reffusion.capture.lenses`).
-        upright: whether the EXIF orientation of pictures is applied.
+        photo: uint8 [H, W, 3], the undistorted photograph.
         affine: [2, 3], an affine map that aligns the picture in addition. It leads from pixels of the view to pixels of
             the picture that this function returns for None. Both steps take a single resampling of the file. None if
             the picture needs no alignment.
 
     Returns:
-        The picture, uint8 [H, W, 3] of the size of `lens`, and bool [H, W], the pixels that the file covers (without
-        `affine` all).
+        The picture, uint8 [H, W, 3] of the size of `lens`, and bool [H, W], the pixels that the file covers: where it
+        is rather opaque and, with `affine`, not beyond its border.
     """
-    image, size = load_image(given.path, upright), (lens.width, lens.height)
+    upright = obeys_orientation(given.path, (lens.width, lens.height))
+    image, inside = _resample(load_image(given.path, upright), given, lens, affine)
+    alpha = load_alpha(given.path, upright)
+    if alpha is None:
+        return image, inside
+    share = _resample(alpha, given, lens, affine)[0] / 255.0
+    blended = image + (1 - share[..., None]) * photo  # `load_image` multiplied the colours by alpha
+    return np.round(blended).clip(0, 255).astype(np.uint8), inside & (share >= 0.5)
+
+
+def _resample(
+    image: np.ndarray, given: ReferenceFile, lens: Lens, affine: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a picture or its alpha, uint8 [h, w, ...], undistorted and aligned, and bool [H, W], where it has pixels.
+
+    Args:
+        given, lens, affine: as of `undistort_reference`.
+    """
+    size = lens.width, lens.height
     pinhole, where = undistortion_map(lens)
     if affine is None:
         image = resize_image(image, size)
@@ -45,13 +64,11 @@ def undistort_reference(
     return undistort_image(image, points), inside
 
 
-def undistort_reference_depth(
-    given: ReferenceFile, lens: Lens, upright: bool, affine: np.ndarray | None = None
-) -> np.ndarray | None:
+def undistort_reference_depth(given: ReferenceFile, lens: Lens, affine: np.ndarray | None = None) -> np.ndarray | None:
     """Load the depth map of a reference, and undistort it as `undistort_reference` does, but by the nearest pixel.
 
     Args:
-        given, lens, upright, affine: as of `undistort_reference`.
+        given, lens, affine: as of `undistort_reference`.
 
     Returns:
         float32 [H, W] in the unit of the file, NaN where unknown and outside the file; None if the reference has no
@@ -62,6 +79,7 @@ def undistort_reference_depth(
     """
     if given.depth is None:
         return None
+    upright = obeys_orientation(given.path, (lens.width, lens.height))
     depth, (of_width, of_height) = load_depth(given.depth), image_size(given.path, upright)
     height, width = depth.shape
     if abs(width * of_height - height * of_width) > 0.01 * width * of_height:

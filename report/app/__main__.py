@@ -15,14 +15,14 @@ def main() -> None:
     parser = cli.scene_parser("app", __doc__, needs_scene=False)
     parser.add_argument("--port", type=int, default=PORT, help="if it is in use, the next free one is taken")
     arguments = parser.parse_args()
-    app = App(arguments.runs.resolve())
+    app = App(arguments.runs.resolve(), command=cli.typed_command("app", arguments.scene))
     try:
         if arguments.scene:
             app.first = app.open(str(arguments.scene)).name
         server = Server(app, arguments.port)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
-    announce(server, server.address + (f"#{quote(app.first)}/photographs" if app.first else ""))
+    announce(server, server.link(fragment=f"{quote(app.first)}/photographs" if app.first else ""))
     server.serve()
     sys.stdout.flush()
     os._exit(0)  # threads of onnxruntime may still compute, and abort the interpreter's usual end

@@ -22,9 +22,11 @@ class App:
     Args:
         runs: folder of all results, absolute.
         options: further arguments of the runner.
+        command: the command that the user typed, for the page to name when its program has stopped.
     """
 
-    def __init__(self, runs: Path, options: tuple[str, ...] = ()):
+    def __init__(self, runs: Path, options: tuple[str, ...] = (), command: str = "reffusion app"):
+        self.command = command
         self.jobs, self.viewer = Jobs(runs, options), tasks.Viewer(runs)
         self.scenes: dict[str, OpenScene] = {}
         self.exports: dict[str, tasks.Export] = {}
@@ -64,10 +66,12 @@ class App:
 
     def describe(self, scene: OpenScene) -> dict[str, Any]:
         """Return the state of a scene, see `state.describe`."""
-        return describe(scene, self.jobs, self.exports[scene.name])
+        return describe(scene, self.jobs, self.exports[scene.name]) | {"command": self.command}
 
     def begin_masks(self, scene: OpenScene) -> bool:
         """Run the stages up to `fit` in the background, and open the mask step once `raw_masks` is done.
+
+        A job that was stopped before the fit was done goes on.
 
         Returns:
             True if the mask step is open.
@@ -75,11 +79,13 @@ class App:
         Raises:
             ValueError: clicks do not suit the scene's masks.
         """
-        if scene.mask_step is not None:
+        step, state = scene.mask_step, self.jobs.state(scene)
+        if step is not None and step.session.gaussians is not None:
             return True
-        state = self.jobs.state(scene)
         if state["state"] not in ("running", "elsewhere") and not self.jobs.is_finished(scene, "fit"):
             self.jobs.start(scene, "fit", with_clicks=True)
+        if step is not None:
+            return True
         poses, fit = (scene.home / stage / "receipt.json" for stage in ("poses", "fit"))
         if not (scene.home / "raw_masks" / "receipt.json").is_file():
             return False

@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import re
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 # A progress bar: its label, steps done, all steps, and the time left.
 BAR = re.compile(r"(\w+):\s+\d+%\|[^|]*\|\s*(\d+)/(\d+) \[[^<\]]*<([\d:]+)")
+# The shown time left is corrected if an estimate differs by more than this share of it, and by more seconds than this.
+STEADY_SHARE, STEADY_SECONDS = 0.25, 15.0
 OVERDUE_SHARE = 0.1  # a stage that takes longer than expected is expected to take this share of its time longer
 
 
@@ -52,6 +55,53 @@ def estimate_remaining(
     if bar:
         left = (1 - bar[0]) ** 2 * expected + bar[0] * bar[1]
     return elapsed / (elapsed + left), left
+
+
+@dataclass
+class ShownProgress:
+    """The numbers that the page shows of a job: bars never run back, and the time left counts down.
+
+    Estimates change at every look. A new one replaces the shown end only if it differs much.
+
+    Attributes:
+        began: time at which the job began.
+        stage: the stage that runs.
+        share: share of the stage that is shown.
+        whole: share of the job that is shown.
+        end: time at which the job ends, as shown; None if it is unknown.
+    """
+
+    began: float
+    stage: str = ""
+    share: float = 0.0
+    whole: float = 0.0
+    end: float | None = None
+
+    def update(self, now: float, stage: str, share: float | None, left: float | None) -> dict[str, float | None]:
+        """Return what to show as {"share", "left", "whole"}, each None if it is unknown.
+
+        Args:
+            now: the time.
+            stage: the stage that runs.
+            share: share of the stage that is estimated to be done.
+            left: estimated seconds to the end of the job.
+        """
+        if stage != self.stage:
+            self.stage, self.share = stage, 0.0
+        if left is None:
+            self.end = None
+        else:
+            shown = self.end - now if self.end is not None else 0.0
+            if abs(left - shown) > max(STEADY_SHARE * left, STEADY_SECONDS) or shown <= 0:
+                self.end = now + left
+            elapsed = max(now - self.began, 0.0)
+            self.whole = max(self.whole, elapsed / (elapsed + left) if elapsed + left else 0.0)
+        self.share = max(self.share, share or 0.0)
+        return {
+            "share": None if share is None else self.share,
+            "left": None if self.end is None else self.end - now,
+            "whole": None if left is None else self.whole,
+        }
 
 
 def find_bar(lines: list[str], stage: str) -> tuple[float, float] | None:

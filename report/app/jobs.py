@@ -18,7 +18,7 @@ from typing import Any
 
 from reffusion.command import root
 from reffusion.io.arrays import load_json, save_json
-from report.app.job_progress import BAR, estimate_remaining, find_bar, find_running_stage
+from report.app.job_progress import BAR, ShownProgress, estimate_remaining, find_bar, find_running_stage
 from report.app.scenes import OpenScene
 from runner.files import MACHINE, lock_holder
 from runner.plan import FINAL
@@ -38,6 +38,13 @@ def make_environment() -> dict[str, str]:
     return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(root()), os.environ.get("PYTHONPATH", "")]))}
 
 
+def describe_loss(scene: OpenScene) -> str:
+    """Return a sentence on a scene whose photographs were moved away, and on what would bring them back."""
+    return (
+        f"The photographs are no longer at {scene.source}. Move them back to run stages again; finished results stay."
+    )
+
+
 @dataclass
 class Plan:
     """The runner's plan for a scene, as last computed.
@@ -47,6 +54,7 @@ class Plan:
         profile: name of the profile.
         lacks_masks: True if the scene needs masks before the whole job can run.
         error: why there is no plan; "" if there is one.
+        is_lost: True if the scene's folder or video was not there.
         busy: True while it is being computed.
     """
 
@@ -54,6 +62,7 @@ class Plan:
     profile: str = ""
     lacks_masks: bool = False
     error: str = ""
+    is_lost: bool = False
     busy: bool = False
 
 
@@ -69,13 +78,18 @@ class Jobs:
         self.runs, self.options = runs, options
         self.plans: dict[str, Plan] = {}
         self.started: dict[str, subprocess.Popen] = {}
+        self.shown: dict[str, ShownProgress] = {}
         self.lock = threading.Lock()
 
     # ------------------------------------------------------------------------------------------------ plans
 
     def plan(self, scene: OpenScene) -> Plan:
-        """Return the latest plan of a scene; without one, it is computed in the background."""
-        if scene.name not in self.plans:
+        """Return the latest plan of a scene.
+
+        It is computed in the background if there is none, or if the scene was moved away or back since.
+        """
+        plan = self.plans.get(scene.name)
+        if plan is None or plan.is_lost == scene.source.exists():
             self.renew_plan(scene)
         return self.plans[scene.name]
 
@@ -89,6 +103,11 @@ class Jobs:
         threading.Thread(target=self._compute_plan, args=(scene, plan), daemon=True).start()
 
     def _compute_plan(self, scene: OpenScene, plan: Plan) -> None:
+        plan.is_lost = not scene.source.exists()
+        if plan.is_lost:
+            plan.lacks_masks, plan.error, plan.stages = False, describe_loss(scene), self._read_finished(scene)
+            plan.busy = False
+            return
         try:
             lacks_masks, error = False, self._record_plan(scene)
             stages = self._read_plan(scene)
@@ -114,6 +133,16 @@ class Jobs:
     def _read_plan(self, scene: OpenScene) -> dict[str, dict[str, Any]]:
         path = scene.home / "plan.json"
         return load_json(path)["stages"] if path.is_file() else {}
+
+    def _read_finished(self, scene: OpenScene) -> dict[str, dict[str, Any]]:
+        """Return the last plan; stages that were done since then are done in it, too."""
+        record = scene.home / "plan.json"
+        stages = self._read_plan(scene)
+        for stage, entry in stages.items():
+            receipt = scene.home / stage / "receipt.json"
+            if receipt.is_file() and receipt.stat().st_mtime >= record.stat().st_mtime:
+                entry |= {"word": "cached", "reason": ""}
+        return stages
 
     def _words(self, scene: OpenScene) -> tuple[str, ...]:
         return ("--scene", str(scene.source), "--runs", str(self.runs), *self.options)
@@ -188,8 +217,8 @@ class Jobs:
         Returns:
             "state": idle, running (started by the page), elsewhere (by somebody else), failed, stopped or finished;
             "words": one sentence on it; "target": what was asked for; "stage": the current stage, its "reason" and
-            "share" done in [0, 1]; "left": expected seconds to the end of the job; "done": stages that this job has
-            done; "log": last lines of the output.
+            "share" done in [0, 1]; "left": expected seconds to the end of the job; "whole": share of the whole job that
+            is done; "done": stages that this job has done; "log": last lines of the output.
         """
         record, holder, process = self._read_record(scene), lock_holder(self.runs, scene.name), None
         process = self.started.get(scene.name)
@@ -198,7 +227,7 @@ class Jobs:
         lines = self._tail(scene) if record else []
         target = record.get("target", "all")
         found = {"state": "idle", "words": "", "target": target, "stage": "", "reason": "", "done": []}
-        found |= {"share": None, "left": None}
+        found |= {"share": None, "left": None, "whole": None}
         if mine or holder:
             found |= self._progress(scene, target, lines if mine else [])
             found["state"] = "running" if mine else "elsewhere"
@@ -219,7 +248,7 @@ class Jobs:
         return found | {"log": lines[-TAIL_LINES:]}
 
     def _progress(self, scene: OpenScene, target: str, lines: list[str]) -> dict[str, Any]:
-        """Return "stage", "reason", "share", "left" and "done" of a running job; see `state`."""
+        """Return "stage", "reason", "share", "left", "whole" and "done" of a running job; see `state`."""
         lock, stages = self.runs / ".locks" / scene.name, self.plan(scene).stages
         began = lock.stat().st_mtime if lock.exists() else time.time()
         stage, since = find_running_stage(scene.home, began)
@@ -233,7 +262,11 @@ class Jobs:
             share, left = estimate_remaining(time.time() - since, expected.get(stage), find_bar(lines, stage))
         total = None if stage and left is None else (left or 0.0) + sum(expected[s] for s in ahead)
         reason = stages.get(stage, {}).get("reason", "")
-        return {"stage": stage, "reason": reason, "share": share, "left": total, "done": sorted(done)}
+        shown = self.shown.get(scene.name)
+        if shown is None or shown.began != began:
+            shown = self.shown[scene.name] = ShownProgress(began)
+        numbers = shown.update(time.time(), stage, share, total)
+        return {"stage": stage, "reason": reason, "done": sorted(done)} | numbers
 
     def expected_seconds(self, scene: OpenScene) -> dict[str, float]:
         """Return stage -> expected seconds of the plan, for the stages that it would run; 0 where they are unknown."""

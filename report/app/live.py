@@ -1,7 +1,9 @@
 """The 3D viewer of the page, as a process: `python -m report.app.live HOME PORT latest|finished`.
 
 `finished` shows the finished scene, as `reffusion view` does. `latest` shows the latest state of a job, also of one
-that runs, and reloads when there is a newer state. The process ends when its standard input closes.
+that runs, and reloads when there is a newer state. The first line of its standard input has the port and the token of
+the page, because other users of the machine can read arguments. It prints `READY` when it listens. The process ends
+when its standard input closes.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ import pickle
 import sys
 import threading
 import time
-from contextlib import suppress
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,10 @@ from reffusion.io.scene import load_scene
 from reffusion.types import Camera, Gaussians
 from reffusion.workspace import Workspace
 from report import camera_path, view
+from report.access import Access
+from report.app.pictures import OWN_FRAME
+from report.app.tasks import READY
+from report.viewer_server import start_viewer_server
 
 PERIOD = 4.0  # seconds between two looks for a newer state
 LABELS = "labels.npy"  # of the stage `masks`: which Gaussians of the fit are removed
@@ -36,7 +42,6 @@ STATES = {
     "distill/gaussians.ply": "distilled",
     "finish/scene.ply": "finished",
 }
-OWN_FRAME = "scene.ply"  # the name of files in the scene's own frame
 
 
 def find_latest(home: Path) -> tuple[Path, str, int] | None:
@@ -51,20 +56,17 @@ class LatestViewer:
     Args:
         home: runs/<scene>, in which the stage `poses` is done.
         port: port to listen on.
+        access: the token that requests must bring.
 
     Raises:
         ValueError: viser is not installed, or the stage `poses` has not run.
     """
 
-    def __init__(self, home: Path, port: int):
-        try:
-            import viser
-        except ImportError:
-            raise ValueError("the viewer needs viser: `pip install viser`") from None
+    def __init__(self, home: Path, port: int, access: Access):
         self.home, self.scene = home, load_scene(home / "poses")
         self.gaussians: Gaussians | None = None
         self.latest: tuple[Path, str, int] | None = None
-        self.server = viser.ViserServer(host="127.0.0.1", port=port, label=home.name, verbose=False)
+        self.server = start_viewer_server(home.name, port, access)
         self.title = self.server.gui.add_markdown("The latest state is being loaded.")
         train = [self.scene.cameras[name] for name in self.scene.train]
         self.server.scene.set_up_direction(-np.mean([camera.world_to_camera[1, :3] for camera in train], 0))
@@ -101,10 +103,16 @@ class LatestViewer:
 
 def main() -> None:
     home, port, kind = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
+    page, token = sys.stdin.readline().split()
+    access = Access(int(page), token)
     try:
-        _ = LatestViewer(home, port) if kind == "latest" else view.Viewer(home, port)
+        with redirect_stdout(sys.stderr):  # viser prints its address
+            viewer = LatestViewer(home, port, access) if kind == "latest" else view.Viewer(home, port, access)
+        if viewer.server.get_port() != port:
+            raise ValueError(f"port {port}, on which the 3D view is shown, is in use; start this page again")
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
+    print(READY, flush=True)
     sys.stdin.read()
 
 

@@ -23,7 +23,7 @@ from report.mask_session import Session
 PAGE = Path(__file__).parent.with_name("mask.html")
 THUMBNAIL = 160  # longer side, px
 TINT = (255, 0, 160)
-ACTIONS = ("mark", "remove", "clear", "undo", "save")
+ACTIONS = ("mark", "remove", "resize", "clear", "undo", "save")
 
 
 @dataclass
@@ -71,6 +71,8 @@ class MaskStep:
             return self.state() | {"changed": changed}
         elif action == "remove":
             session.remove(int(request["index"]))
+        elif action == "resize":
+            session.resize(int(request["index"]), str(request["size"]))
         else:
             session.clear(str(request["view"]))
         return self.state()

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from io import BytesIO
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
 from reffusion.io.files import BadInput, check_pixels
 from reffusion.io.images import image_size, replace_image
@@ -20,14 +21,23 @@ FORMATS = ("PNG", "JPEG", "WEBP")
 
 
 def list_views(scene: OpenScene, job: JobFiles) -> list[dict[str, Any]]:
-    """Return the views worth painting, the best first, as {"view", "share" of the hole, "painted"}."""
+    """Return the views worth painting, the best first.
+
+    Returns:
+        For each view "view", its name; "share", the share of the hole in [0, 1] that it shows and better views do not;
+        and "painted", the time of change of its painting in seconds, or None without one.
+    """
     folder = scene.home / TO_PAINT
-    has_template = lambda name: (folder / f"{name}.png").is_file()
     return [
-        {"view": name, "share": share, "painted": (scene.folder / PAINTED / f"{name}.png").is_file()}
+        {"view": name, "share": share, "painted": path.stat().st_mtime if path.is_file() else None}
         for name, share, _ in rank_views(job)
-        if has_template(name)
+        if (folder / f"{name}.png").is_file() and (path := painting_path(scene, name))
     ]
+
+
+def painting_path(scene: OpenScene, view: str) -> Path:
+    """Return the file of a view's painting, which may not exist."""
+    return scene.folder / PAINTED / f"{view}.png"
 
 
 def save_painting(scene: OpenScene, view: str, content: bytes, replace: bool) -> None:
@@ -42,7 +52,7 @@ def save_painting(scene: OpenScene, view: str, content: bytes, replace: bool) ->
         FileExistsError: there is a painting of this view, and `replace` is False.
         ValueError: the content is no such picture.
     """
-    path = scene.folder / PAINTED / f"{view}.png"
+    path = painting_path(scene, view)
     picture = decode_picture(content)
     width, height = image_size(scene.home / TO_PAINT / f"{view}.png")
     ratio = picture.shape[1] / picture.shape[0] / (width / height)
@@ -59,13 +69,15 @@ def save_painting(scene: OpenScene, view: str, content: bytes, replace: bool) ->
 def decode_picture(content: bytes, mode: Literal["RGB", "RGBA"] = "RGB") -> np.ndarray:
     """Return the picture in the bytes of a PNG, JPEG or WebP file, uint8 [H, W, 3], or [H, W, 4] with alpha.
 
+    The orientation tag, with which phones save pictures, is applied.
+
     Raises:
         ValueError: the bytes are no such picture, or it has too many pixels.
     """
     try:
         with Image.open(BytesIO(content), formats=FORMATS) as image:
             check_pixels("the picture", *image.size)  # type: ignore[arg-type]
-            return np.array(image.convert(mode))
+            return np.array(ImageOps.exif_transpose(image).convert(mode))
     except BadInput:
         raise
     except Exception:

@@ -24,6 +24,7 @@ from report.sheet import stage_folder
 
 SMALL = 240  # longer side of a thumbnail, px
 KEPT = 64  # pictures that stay in memory
+OWN_FRAME = "scene.ply"  # the name of files in the scene's own frame
 # Origins of pixels (reffusion/initialize/origins.py) that the page marks, by their colour there -> RGBA of the overlay.
 UNSURE = {(60, 120, 255): (60, 120, 255, 110), (255, 170, 0): (255, 170, 0, 130), (220, 30, 50): (220, 30, 50, 170)}
 RENDERING = threading.Lock()  # the rasterizer uses all threads for one picture
@@ -40,12 +41,22 @@ def draw_thumbnail(scene: OpenScene, view: str) -> bytes:
     masks = scene.home / "raw_masks"
     if (masks / "receipt.json").is_file() and path.parent.parent == scene.home / "poses":
         return to_jpeg(overlay_masks(scene.home / "poses", masks, view), SMALL)
-    return to_jpeg(load_thumbnail(path, SMALL), SMALL)
+    return to_jpeg(load_thumbnail(path, SMALL, upright=True), SMALL)
 
 
 def draw_photograph(scene: OpenScene, view: str) -> bytes:
     """Return a photograph as a JPEG; errors as for `draw_thumbnail`."""
     return to_jpeg(load_image(scene.pictures()[view]))
+
+
+def draw_fit(scene: OpenScene, view: str) -> bytes:
+    """Return the scene with the object from a view as a JPEG: as `evaluate` rendered it, or else rendered now.
+
+    Raises:
+        KeyError: there is no such view.
+    """
+    fit = stage_folder(scene.home, "fit") / "gaussians.ply"
+    return to_jpeg(_load_or_render(scene, view, "renders_fit", fit))
 
 
 def draw_result(scene: OpenScene, view: str) -> bytes:
@@ -59,16 +70,21 @@ def load_result(scene: OpenScene, view: str) -> np.ndarray:
     Raises:
         KeyError: there is no such view.
     """
-    rendered, result = scene.home / "evaluate" / "renders" / f"{view}.png", scene.home / "evaluate" / "scene.ply"
+    return _load_or_render(scene, view, "renders", scene.home / "evaluate" / OWN_FRAME)
+
+
+def _load_or_render(scene: OpenScene, view: str, renders: str, gaussians: Path) -> np.ndarray:
+    """Return a view of the folder `renders` of the stage `evaluate`, or else a render of a .ply file."""
+    rendered = scene.home / "evaluate" / renders / f"{view}.png"
     if view in scene.pictures() and rendered.is_file():
         return load_image(rendered)
-    return _render(scene.home, view, result.stat().st_mtime_ns)
+    return _render(scene.home, view, gaussians, gaussians.stat().st_mtime_ns)
 
 
 def draw_unsure(scene: OpenScene, view: str) -> bytes:
     """Return a transparent PNG that tints the pixels of a view which no photograph shows.
 
-    Blue shows a reference, orange patches of photographs, red nothing at all.
+    Blue is filled from a reference, orange from patches of photographs; red is not filled.
 
     Raises:
         KeyError: there is no such view.
@@ -90,17 +106,17 @@ def draw_unsure(scene: OpenScene, view: str) -> bytes:
 
 
 @lru_cache(KEPT)
-def _render(home: Path, view: str, changed: int) -> np.ndarray:
+def _render(home: Path, view: str, path: Path, changed: int) -> np.ndarray:
     with RENDERING, torch.no_grad():
-        scene, gaussians, exposures = _load_gaussians(home, changed)
+        scene, gaussians, exposures = _load_gaussians(home, path, changed)
         rendering = rasterizer.render(gaussians, scene.cameras[view])
         color = exposure.apply_exposure(rendering.color, exposures.get(view)).clamp(0, 1)
     return to_uint8(color.numpy())
 
 
-@lru_cache(1)
-def _load_gaussians(home: Path, changed: int) -> tuple[Scene, Gaussians, dict[str, np.ndarray]]:
-    """Return the scene, the result's Gaussians and the exposures; `changed` is the result's time of change."""
+@lru_cache(2)
+def _load_gaussians(home: Path, path: Path, changed: int) -> tuple[Scene, Gaussians, dict[str, np.ndarray]]:
+    """Return the scene, the Gaussians of a file and the exposures; `changed` is the file's time of change."""
     scene = load_scene(home / "poses")
-    gaussians = load_ply(home / "evaluate" / "scene.ply", scene.similarity)
+    gaussians = load_ply(path, scene.similarity) if path.name == OWN_FRAME else load_ply(path)
     return scene, gaussians, exposure.view_exposures(stage_folder(home, "fit"), list(scene.cameras.values()))

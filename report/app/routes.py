@@ -18,10 +18,12 @@ from starlette.responses import FileResponse, JSONResponse, Response, StreamingR
 from starlette.routing import Route
 
 from report import verdict
+from report.access import Access
 from report.app import brush, mask_step, painting, pictures, tasks
 from report.app.app import App
 from report.app.scenes import OpenScene, list_recent
-from report.app.security import LocalOnly, TooLarge, read_body
+from report.app.security import OwnPageOnly, TooLarge, read_body
+from report.app.state import list_views_to_paint
 from report.app.uploads import Upload
 
 STATIC = Path(__file__).with_name("static")
@@ -34,24 +36,25 @@ FILES = {
 PICTURES: dict[str, Callable[[OpenScene, str], bytes]] = {
     "small": pictures.draw_thumbnail,
     "photo": pictures.draw_photograph,
+    "fit": pictures.draw_fit,
     "result": pictures.draw_result,
     "unsure": pictures.draw_unsure,
 }
 PERIOD, SILENCE = 1.0, 15.0  # seconds between two looks at the files, and longest time without an event
 
 
-def make_app(app: App, port: int) -> Starlette:
+def make_app(app: App, access: Access) -> Starlette:
     """Return the web application.
 
     Args:
-        port: port of the server.
+        access: the token that every request must bring, and the port of the server.
     """
     find_step = lambda request: app.mask_step(request.path_params["scene"])
     handlers: dict[Any, Any] = dict.fromkeys((ValueError, TypeError, OSError), _refuse(400))
     handlers |= {LookupError: _refuse(404), TooLarge: _refuse(413), FileExistsError: _refuse(409)}
     return Starlette(
-        routes=[*mask_step.make_routes("/scenes/{scene}/mask", find_step), *_Addresses(app).routes()],
-        middleware=[Middleware(LocalOnly, port=port, frames=(app.viewer.port,))],
+        routes=[*mask_step.make_routes("/scenes/{scene}/mask", find_step), *_Addresses(app, access).routes()],
+        middleware=[Middleware(OwnPageOnly, access=access, frames=(app.viewer.port,))],
         exception_handlers=handlers,
     )
 
@@ -69,10 +72,11 @@ class _Addresses:
 
     Args:
         app: the scenes, jobs and processes behind the page.
+        access: the token of the page, for the viewer.
     """
 
-    def __init__(self, app: App):
-        self.app = app
+    def __init__(self, app: App, access: Access):
+        self.app, self.access = app, access
 
     def routes(self) -> list[Route]:
         """Return all routes, except those of the mask step."""
@@ -85,10 +89,12 @@ class _Addresses:
             Route("/uploads/{upload}/{file}", self.receive_file, methods=["POST"]),
             Route(f"{scene}/state", self.send_state),
             Route(f"{scene}/events", self.send_events),
+            Route(f"{scene}/live", self.show_live, methods=["POST"]),
             Route(f"{scene}/do/{{action}}", self.act, methods=["POST"]),
             Route(f"{scene}/pictures/{{kind}}/{{view}}", self.send_picture),
             Route(f"{scene}/paint/{{view}}", self.send_template),
             Route(f"{scene}/paint/{{view}}", self.receive_painting, methods=["POST"]),
+            Route(f"{scene}/paint/{{view}}/painted", self.send_painting),
             Route(f"{scene}/paint/{{view}}/canvas", self.send_canvas),
             Route(f"{scene}/paint/{{view}}/fill", self.fill, methods=["POST"]),
             Route(f"{scene}/export/{{file}}", self.send_export),
@@ -99,7 +105,9 @@ class _Addresses:
         return FileResponse(STATIC / name, media_type=kind)
 
     def list_scenes(self, request: Request) -> Response:
-        return JSONResponse({"first": self.app.first, "scenes": list_recent(self.app.jobs.runs)})
+        return JSONResponse(
+            {"first": self.app.first, "scenes": list_recent(self.app.jobs.runs), "command": self.app.command}
+        )
 
     async def open_scene(self, request: Request) -> Response:
         content = await _read_json(request)
@@ -131,6 +139,13 @@ class _Addresses:
             raise LookupError("no such action")
         return JSONResponse(await run_in_threadpool(action, self.app, scene, content) or {})
 
+    async def show_live(self, request: Request) -> Response:
+        scene, viewer = self._scene(request), self.app.viewer
+        running = self.app.jobs.state(scene)["state"] in ("running", "elsewhere")
+        follow = running or not tasks.has_result(scene)
+        await run_in_threadpool(viewer.show, scene, follow, self.access)
+        return JSONResponse({"port": viewer.port})
+
     def send_picture(self, request: Request) -> Response:
         scene, kind, view = self._scene(request), request.path_params["kind"], request.path_params["view"]
         if kind not in PICTURES or view not in scene.pictures():
@@ -150,6 +165,13 @@ class _Addresses:
         await run_in_threadpool(painting.save_painting, scene, view, content, replace)
         self.app.jobs.renew_plan(scene)
         return JSONResponse({})
+
+    def send_painting(self, request: Request) -> Response:
+        scene, view = self._scene(request), self._view_to_paint(request)
+        path = painting.painting_path(scene, view)
+        if not path.is_file():
+            raise LookupError("not painted yet")
+        return FileResponse(path)
 
     def send_canvas(self, request: Request) -> Response:
         scene, view = self._scene(request), self._view_to_paint(request)
@@ -173,7 +195,7 @@ class _Addresses:
 
     def _view_to_paint(self, request: Request) -> str:
         view = request.path_params["view"]
-        if view not in [each["view"] for each in self.app.describe(self._scene(request))["to_paint"]]:
+        if view not in [each["view"] for each in list_views_to_paint(self._scene(request))]:
             raise LookupError("no such view to paint")
         return view
 
@@ -190,21 +212,14 @@ def _stop(app: App, scene: OpenScene, content: dict[str, Any]) -> None:
     app.jobs.stop(scene)
 
 
-def _show_live(app: App, scene: OpenScene, content: dict[str, Any]) -> dict[str, Any]:
-    running = app.jobs.state(scene)["state"] in ("running", "elsewhere")
-    app.viewer.show(scene, follow=running or not tasks.has_result(scene))
-    return {"port": app.viewer.port}
-
-
 def _export(app: App, scene: OpenScene, content: dict[str, Any]) -> None:
-    app.exports[scene.name].start(scene)
+    app.exports[scene.name].start(scene, content.get("sog") is True)
 
 
 ACTIONS: dict[str, Callable[[App, OpenScene, dict[str, Any]], dict[str, Any] | None]] = {
     "mask": _begin_masks,
     "start": _start,
     "stop": _stop,
-    "live": _show_live,
     "export": _export,
 }
 

@@ -9,12 +9,12 @@ from pathlib import Path
 from reffusion.capture.load import detect_layout, load_capture
 from reffusion.command import root, scene_name, scene_path, workplace
 from reffusion.io.arrays import load_json
+from reffusion.io.files import VIDEOS
 from reffusion.io.images import ENDINGS
 from report.app.mask_step import MaskStep
 from runner.frames import FRAMES
 
 MAX_RECENT = 12
-VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".m4v", ".avi")
 
 
 @dataclass
@@ -36,7 +36,7 @@ class OpenScene:
     @property
     def folder(self) -> Path:
         """The folder of the photographs; of a video, that of its frames."""
-        return self.home / FRAMES if self.source.is_file() else self.source
+        return self.home / FRAMES if self.source.suffix.lower() in VIDEOS and not self.source.is_dir() else self.source
 
     def pictures(self) -> dict[str, Path]:
         """Return view name -> photograph: undistorted as soon as `poses` has run, until then as captured.
@@ -67,9 +67,11 @@ def find_scene(text: str, runs: Path) -> OpenScene:
     Raises:
         ValueError: there is no folder or video there, or it holds nothing to read.
     """
-    source = scene_path(text.strip(), root())
+    source = scene_path(text.strip(), root()) or _find_lost(text.strip(), runs)
     if source is None:
         raise ValueError(f"there is no folder or video at {text.strip() or 'an empty path'}")
+    if not source.exists():
+        return OpenScene(_name(source), source, runs / _name(source))
     if source.is_file() and source.suffix.lower() not in VIDEOS:
         raise ValueError(f"{source}: neither a folder nor a video ({', '.join(VIDEOS)})")
     if source.is_dir() and not _holds_capture(source):
@@ -84,22 +86,53 @@ def _holds_capture(folder: Path) -> bool:
     return any(path.suffix.lower() in ENDINGS for place in places if place.is_dir() for path in place.iterdir())
 
 
-def list_recent(runs: Path) -> list[dict[str, object]]:
-    """Return the scenes of data/ and runs/, the latest first, as {"name", "path", "state"}."""
-    found: dict[Path, tuple[float, str]] = {}
+def _list_homes(runs: Path) -> dict[Path, Path]:
+    """Return source -> runs/<scene>, for the scenes that have run. The folder or video may be there no longer."""
+    found = {}
     for home in runs.iterdir() if runs.is_dir() else ():
         source = home / "source"
         if home.name[0] != "." and "@" not in home.name and source.is_file():
             folder = root() / source.read_text(encoding="utf-8").strip()
             if folder.name == FRAMES and (record := folder / "frames.json").is_file():
                 folder = Path(load_json(record)["video"])
-            state = "finished" if (home / "evaluate" / "receipt.json").is_file() else "begun"
-            if folder.exists():
-                found[folder.resolve()] = (max(path.stat().st_mtime for path in (home, source)), state)
+            found[folder.resolve()] = home
+    return found
+
+
+def _is_finished(home: Path) -> bool:
+    return (home / "evaluate" / "receipt.json").is_file()
+
+
+def _find_lost(text: str, runs: Path) -> Path | None:
+    """Return the source of a finished scene, named by its name or path, that is there no longer."""
+    lost = {source: home for source, home in _list_homes(runs).items() if not source.exists() and _is_finished(home)}
+    return next((source for source, home in lost.items() if text in (str(source), home.name)), None)
+
+
+def list_recent(runs: Path) -> list[dict[str, object]]:
+    """Return the scenes of data/ and runs/, the latest first.
+
+    Returns:
+        For each scene "name", "path", "state" ("finished", "begun" or "new") and "lost", which is True if the
+        photographs are there no longer. Of lost scenes only finished ones are listed.
+    """
+    found: dict[Path, tuple[float, str]] = {}
+    for source, home in _list_homes(runs).items():
+        state = "finished" if _is_finished(home) else "begun"
+        if source.exists() or state == "finished":
+            found[source] = (max(path.stat().st_mtime for path in (home, home / "source")), state)
     data = workplace(root()) / "data"
     for path in data.iterdir() if data.is_dir() else ():
         is_scene = path.is_dir() and path.name[0] not in "._" and _holds_capture(path)
         if is_scene or path.suffix.lower() in VIDEOS:
             found.setdefault(path.resolve(), (path.stat().st_mtime, "new"))
     latest = sorted(found.items(), key=lambda each: -each[1][0])[:MAX_RECENT]
-    return [{"name": scene_name(path), "path": str(path), "state": state} for path, (_, state) in latest]
+    return [
+        {"name": _name(path), "path": str(path), "state": state, "lost": not path.exists()}
+        for path, (_, state) in latest
+    ]
+
+
+def _name(source: Path) -> str:
+    """Return the name of a scene, as `scene_name` does, whose folder or video may be there no longer."""
+    return source.stem if source.suffix.lower() in VIDEOS and not source.is_dir() else source.name

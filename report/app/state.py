@@ -8,16 +8,30 @@ from pathlib import Path
 from typing import Any
 
 from reffusion.capture.load import detect_layout
+from reffusion.capture.roles import describe_split
 from reffusion.io.arrays import load_json
 from reffusion.io.scene import load_warnings
+from reffusion.weights.published import SEGMENTER_FILES
+from reffusion.weights.segmenters import AUTO, segmenter_folder
 from report import verdict
 from report.app import painting, tasks
-from report.app.jobs import Jobs
+from report.app.jobs import Jobs, describe_loss
 from report.app.scenes import OpenScene
 from report.job_data import JobFiles, load_job
+from report.sheet import stage_folder
 from runner.plan import FINAL
 
-LAYOUTS = {"llff": "LLFF", "transforms": "nerfstudio (transforms.json)", "colmap": "COLMAP", "photos": "photographs"}
+LAYOUTS = {
+    "llff": "LLFF",
+    "transforms": "nerfstudio (transforms.json)",
+    "colmap": "COLMAP",
+    "polycam": "Polycam",
+    "realitycapture": "RealityCapture",
+    "opensfm": "OpenSfM",
+    "bundler": "Bundler",
+    "3dgs": "3D Gaussian Splatting (cameras.json)",
+    "photos": "photographs",
+}
 
 
 def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, Any]:
@@ -28,7 +42,6 @@ def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, An
     except ValueError as failure:
         pictures, error = [], str(failure)
     expected = jobs.expected_seconds(scene) if not error else {}
-    finished = tasks.has_result(scene)
     return {
         "name": scene.name,
         "source": str(scene.source),
@@ -40,6 +53,9 @@ def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, An
         "lacks_masks": plan.lacks_masks and not count_masks(scene.home),
         "brings_masks": bool(plan.stages) and not plan.error and not plan.lacks_masks,
         "has_unsaved_marks": scene.mask_step is not None and scene.mask_step.session.unsaved,
+        "awaits_fit": scene.mask_step is not None and scene.mask_step.session.gaussians is None,
+        "has_network": has_network(scene),
+        "lost": "" if scene.source.exists() else describe_loss(scene),
         "has_poses": (scene.home / "raw_masks" / "receipt.json").is_file(),
         "plan": {
             "busy": plan.busy,
@@ -54,9 +70,9 @@ def describe(scene: OpenScene, jobs: Jobs, export: tasks.Export) -> dict[str, An
         "job": job,
         "has_viewer": importlib.util.find_spec("viser") is not None,
         "has_state": any((scene.home / stage / "receipt.json").is_file() for stage in ("fit", "initialize")),
-        "result": describe_result(scene) if finished else None,
-        "to_paint": painting.list_views(scene, _load_job(scene.home, _version(scene.home))) if finished else [],
-        "export": {"busy": export.busy, "error": export.error, "files": tasks.list_exports(scene, export.busy)},
+        "result": describe_result(scene) if tasks.has_result(scene) else None,
+        "to_paint": list_views_to_paint(scene),
+        "export": export.describe() | {"files": tasks.list_exports(scene, export.unfinished)},
     }
 
 
@@ -69,9 +85,10 @@ def describe_capture(scene: OpenScene, stages: dict[str, dict[str, Any]]) -> lis
     words += [load_json(frames)["said"]] if frames.is_file() else []
     views = scene.views()
     if views:
-        words.append(f"{len(views['train'])} training and {len(views['test'])} test views")
+        words.append(describe_split(len(views["train"]), len(views["test"])))
         words += [load_json(sfm)["summary"]] if sfm.is_file() else []
-        words.append(f"{count_masks(scene.home)} masks")
+        count = count_masks(scene.home)
+        words.append(f"{count} photograph{'s have' if count != 1 else ' has'} a mask" if count else "no mask yet")
     else:
         notes = [note for stage in ("poses", "raw_masks") for note in stages.get(stage, {}).get("notes", ())]
         words += list(dict.fromkeys(notes))
@@ -83,18 +100,40 @@ def find_doubts(home: Path) -> list[str]:
     return [line for stage in ("poses", "raw_masks", "masks") for line in load_warnings(home / stage)]
 
 
+def has_network(scene: OpenScene) -> bool:
+    """Return whether a network segments the object around a click; otherwise colours and surfaces do."""
+    if scene.mask_step is not None:
+        return scene.mask_step.session.segmenter is not None
+    return all((segmenter_folder(AUTO) / name).is_file() for name in SEGMENTER_FILES)
+
+
 def count_masks(home: Path) -> int:
     """Return the number of views that have a mask."""
     return len({path.stem for path in (home / "raw_masks" / "masks").rglob("*.png")})
 
 
 def describe_result(scene: OpenScene) -> dict[str, Any]:
-    """Return {"verdict": sentence, "views": names of all views, "rendered": those that `evaluate` rendered}."""
+    """Return what the page shows of a finished scene.
+
+    Returns:
+        "verdict": sentences; "views": names of all views; "rendered": those that `evaluate` rendered; "has_fit": True
+        if the scene with the object can be shown; "is_painted": True if the user gave the picture that fills the hole.
+    """
     job = _load_job(scene.home, _version(scene.home))
-    views = scene.views()
-    rendered = sorted(path.stem for path in (scene.home / "evaluate" / "renders").glob("*.png"))
+    views, evaluate = scene.views(), scene.home / "evaluate"
     names = sorted({*views.get("train", ()), *views.get("test", ())} & {*scene.pictures()})
-    return {"verdict": verdict.describe_result(job), "views": names, "rendered": rendered}
+    return {
+        "verdict": verdict.describe_result(job),
+        "views": names,
+        "rendered": sorted(path.stem for path in (evaluate / "renders").glob("*.png")),
+        "has_fit": (stage_folder(scene.home, "fit") / "gaussians.ply").is_file(),
+        "is_painted": verdict.is_reference_given(job),
+    }
+
+
+def list_views_to_paint(scene: OpenScene) -> list[dict[str, Any]]:
+    """Return the views worth painting, see `painting.list_views`; none before the scene is finished."""
+    return painting.list_views(scene, _load_job(scene.home, _version(scene.home))) if tasks.has_result(scene) else []
 
 
 def _version(home: Path) -> int:

@@ -2,36 +2,75 @@
 
 from __future__ import annotations
 
+import select
 import shutil
 import socket
 import subprocess
 import sys
 import threading
-import time
+from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from reffusion.io.arrays import load_json
+from report.access import Access
+from report.app.job_progress import BAR
 from report.app.jobs import make_command, make_environment
 from report.app.scenes import OpenScene
 
-EXPORTS = ("export", "turntable", "report")  # commands, in order
-# file in runs/<scene>/ -> what it is
-FILES = {
-    "evaluate/scene.ply": "the scene as Gaussians (.ply), for any 3DGS viewer",
-    "export/scene.compressed.ply": "the same, compressed (PlayCanvas, SuperSplat)",
-    "export/scene.spz": "the same as .spz (Niantic)",
-    "export/cameras.zip": "cameras (COLMAP model, transforms.json) and undistorted photographs",
-    "turntable.webm": "video around the scene",
-    "report.html": "report on the job, one page",
+
+@dataclass(frozen=True)
+class Work:
+    """A part of the export.
+
+    Attributes:
+        command: a command of `reffusion` and its options.
+        files: file in runs/<scene>/ that it makes -> what the file is.
+    """
+
+    command: tuple[str, ...]
+    files: dict[str, str]
+
+
+# what is made -> the work, in order: the slowest last
+EXPORTS = {
+    "files for other programs": Work(
+        ("export",),
+        {
+            "export/scene.compressed.ply": "the same, compressed (PlayCanvas, SuperSplat)",
+            "export/scene.spz": "the same as .spz (Niantic)",
+            "export/scene.sog": "the same as .sog, small, for the web (PlayCanvas)",
+            "export/with_object.ply": "the scene with the object, for an editor: reffusion patch fills what you delete "
+            "there",
+            "export/cameras.zip": "cameras (COLMAP model, transforms.json) and undistorted photographs",
+        },
+    ),
+    "the video of before and after": Work(
+        ("turntable", "--before-after"),
+        {
+            "before_after.webm": "video of before and after: a line moves across",
+            "before_after.webp": "the same as a small animated picture, for messages and web pages",
+        },
+    ),
+    "the report": Work(("report",), {"report.html": "report on the job, one page"}),
+    "the video around the scene": Work(("turntable",), {"turntable.webm": "video around the scene"}),
 }
-VIEWER_PORT = 8080
+# file in runs/<scene>/ -> what it is
+FILES = {"evaluate/scene.ply": "the scene as Gaussians (.ply), for any 3DGS viewer"}
+FILES |= {file: words for work in EXPORTS.values() for file, words in work.files.items()}
+VIEWER_PORT, START_SECONDS = 8080, 180
+READY = "ready"  # the line that the process of the viewer prints when it listens
 
 
 class Viewer:
-    """The 3D viewer (report/view.py) as a process of its own, for one scene at a time.
+    """The 3D viewer (report/app/live.py) as a process of its own, for one scene at a time.
 
     Args:
         runs: folder of all results.
+
+    Attributes:
+        port: port of the viewer.
     """
 
     def __init__(self, runs: Path):
@@ -40,10 +79,11 @@ class Viewer:
         self.scene, self.follows = "", False
         self.lock = threading.Lock()
 
-    def show(self, scene: OpenScene, follow: bool) -> None:
+    def show(self, scene: OpenScene, follow: bool, access: Access) -> None:
         """Start the viewer of a scene, unless it runs already.
 
         Args:
+            access: the token of the page, which the viewer asks for, too.
             follow: True shows the latest state of an unfinished job, and reloads when there is a newer one.
 
         Raises:
@@ -58,19 +98,23 @@ class Viewer:
                     [sys.executable, *words],
                     env=make_environment(),
                     stdin=subprocess.PIPE,  # closes with this server, and ends the viewer
-                    stdout=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
                     stderr=subprocess.PIPE,
                     text=True,
                 )
+                self.process.stdin.write(f"{access.port} {access.token}\n")
+                self.process.stdin.flush()
                 self.scene, self.follows = scene.name, follow
-            for _ in range(1800):  # importing and loading take seconds, on a busy machine minutes
-                if self.process.poll() is not None:
-                    lines = self.process.stderr.read().strip().splitlines()
-                    raise ValueError(lines[-1].removeprefix("error: ") if lines else "the viewer ended")
-                if is_open(self.port):
-                    return
-                time.sleep(0.1)
+                self._await_start(self.process)
+
+    def _await_start(self, process: subprocess.Popen) -> None:
+        """Wait until the viewer listens. Importing and loading take seconds, on a busy machine minutes."""
+        if not select.select([process.stdout], [], [], START_SECONDS)[0]:
+            self._stop()
             raise ValueError("the viewer does not answer")
+        if process.stdout.readline() != f"{READY}\n":
+            lines = process.stderr.read().strip().splitlines()
+            raise ValueError(lines[-1].removeprefix("error: ") if lines else "the viewer ended")
 
     def stop(self) -> None:
         with self.lock:
@@ -83,47 +127,77 @@ class Viewer:
 
 
 class Export:
-    """The export of one scene: `reffusion export`, `turntable` and `report`, one after the other.
+    """The export of one scene: the commands of `EXPORTS`, one after the other.
 
     Args:
         runs: folder of all results.
+
+    Attributes:
+        work: what is being made now, and which of how many works it is; "" if nothing is.
+        share: share of this work that is done; None if it is unknown.
+        unfinished: the files of `FILES` that this work and those after it will write.
+        error: why a work failed, or "".
     """
 
     def __init__(self, runs: Path):
-        self.runs, self.busy, self.error = runs, "", ""
+        self.runs, self.work, self.error = runs, "", ""
+        self.share: float | None = None
+        self.unfinished: frozenset[str] = frozenset()
 
-    def start(self, scene: OpenScene) -> None:
-        """Start in the background, unless it runs already."""
-        if not self.busy:
-            self.busy, self.error = EXPORTS[0], ""
-            threading.Thread(target=self._run, args=(scene,), daemon=True).start()
+    def start(self, scene: OpenScene, sog: bool) -> None:
+        """Start in the background, unless it runs already.
 
-    def _run(self, scene: OpenScene) -> None:
+        Args:
+            sog: True also makes a .sog file, which takes Node and minutes.
+        """
+        if not self.work:
+            self.work, self.error = "begins", ""
+            self.unfinished = frozenset(file for work in EXPORTS.values() for file in work.files)
+            threading.Thread(target=self._run, args=(scene, sog), daemon=True).start()
+
+    def describe(self) -> dict[str, Any]:
+        """Return "work", "share" and "error"; and "has_npm", True if a .sog file can be made on this machine."""
+        has_npm = shutil.which("npm") is not None
+        return {"work": self.work, "share": self.share, "error": self.error, "has_npm": has_npm}
+
+    def _run(self, scene: OpenScene, sog: bool) -> None:
         cameras = scene.home / "export" / "cameras"
         try:
-            for command in EXPORTS:
-                self.busy = command
-                words = make_command(command, "--scene", str(scene.source), "--runs", str(self.runs))
-                done = subprocess.run(words, env=make_environment(), capture_output=True, text=True)
-                if done.returncode:
-                    lines = done.stderr.strip().splitlines() or [f"`{command}` failed"]
-                    self.error = lines[-1].removeprefix("error: ")
-            if cameras.is_dir():
-                shutil.make_archive(str(cameras), "zip", cameras)
+            for k, (words, work) in enumerate(EXPORTS.items(), start=1):
+                self.work, self.share = f"{k} of {len(EXPORTS)}: {words}", None
+                command, *options = work.command
+                more = ["--sog"] if sog and command == "export" else []
+                self._do(make_command(command, "--scene", str(scene.source), "--runs", str(self.runs), *options, *more))
+                if command == "export" and cameras.is_dir():
+                    shutil.make_archive(str(cameras), "zip", cameras)
+                self.unfinished -= work.files.keys()
         finally:
-            self.busy = ""
+            self.work, self.unfinished = "", frozenset()
+
+    def _do(self, command: list[str]) -> None:
+        """Run a command, read its progress, and keep the last line that it prints if it fails."""
+        with subprocess.Popen(
+            command, env=make_environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        ) as process:
+            last = ""
+            for line in process.stderr:  # a carriage return ends a line, too
+                last = line.strip() or last
+                if bar := BAR.search(line):
+                    self.share = int(bar[2]) / int(bar[3])
+        if process.returncode:
+            self.error = last.removeprefix("error: ") or f"`{' '.join(command[3:])}` failed"
 
 
-def list_exports(scene: OpenScene, busy: str = "") -> dict[str, dict[str, object]]:
+def list_exports(scene: OpenScene, unfinished: Collection[str] = ()) -> dict[str, dict[str, object]]:
     """Return the files to download, as name -> {"words", "bytes"}; files older than the result are left out.
 
     Args:
-        busy: command that is writing files now; only the result itself is then returned.
+        unfinished: files of `FILES` that are being written, which are left out, too.
     """
     found: dict[str, dict[str, object]] = {}
-    for name, words in FILES.items() if not busy else [next(iter(FILES.items()))]:
+    for name, words in FILES.items():
         path = scene.home / name
-        if path.is_file() and path.stat().st_mtime >= _result_time(scene):
+        if name not in unfinished and path.is_file() and path.stat().st_mtime >= _result_time(scene):
             found[path.name] = {"words": words, "bytes": path.stat().st_size}
     return found
 
@@ -158,10 +232,3 @@ def free_port(first: int) -> int:
         except OSError:
             continue
     raise ValueError(f"no free port from {first} to {first + 99}; choose another with port=")
-
-
-def is_open(port: int) -> bool:
-    """Return whether something listens on a port of this machine."""
-    with socket.socket() as each:
-        each.settimeout(0.2)
-        return each.connect_ex(("127.0.0.1", port)) == 0

@@ -15,8 +15,8 @@ import cv2
 from starlette.concurrency import run_in_threadpool
 
 from reffusion.command import root, workplace
+from reffusion.io.files import VIDEOS
 from reffusion.io.images import ENDINGS, load_thumbnail
-from report.app.scenes import VIDEOS
 from report.app.security import TooLarge
 
 PICTURE_BYTES, VIDEO_BYTES = 100_000_000, 4_000_000_000

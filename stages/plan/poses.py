@@ -7,15 +7,17 @@ from pathlib import Path
 from reffusion.capture import lens
 from reffusion.capture.layouts import cameras
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.roles import capture_views
+from reffusion.capture.roles import capture_views, describe_split
 from reffusion.capture.scene_folder import check_gaussian_files, is_gaussians_only, read_scene
+from reffusion.io.annotations import file_of
+from reffusion.io.images import ENDINGS
 from reffusion.params.clicks import CLICKS
 from reffusion.params.poses import Params
 from reffusion.references.files import PAINTED, describe_references, load_reference_files
 
 # Endings of pictures and depth maps. Of such files the stage reads only those of the capture; others are masks or
 # references, which later stages read.
-NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".npy", ".exr")
+NOT_READ = (*ENDINGS, ".npy", ".exr")
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
@@ -40,8 +42,9 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
         return others
     shown = {path for name, path in capture.pictures.items() if name not in roles.blank}
     read = shown | brought | set(capture.depth_maps)
+    masks = {file_of(path) for files in roles.mask_files.values() for path in files.values()}
     kept = [path for path in others if path.suffix.lower() not in NOT_READ or path.name == "poses_bounds.npy"]
-    return sorted(read | {path for path in kept if path.parent != scene / PAINTED})
+    return sorted(read | {path for path in kept if path.parent != scene / PAINTED and path not in masks})
 
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
@@ -84,7 +87,7 @@ def preview(params: Params, scene: Path) -> list[str]:
         return [f"no photographs: {who} look at renders of {params.gaussians} instead", *brought]
     capture, roles = read_scene(params, scene, params.longest)
     given = load_reference_files(scene, capture_views(capture, roles), params.reference)
-    notes = [f"{len(roles.train)} training and {len(roles.test)} test views"]
+    notes = [describe_split(len(roles.train), len(roles.test))]
     notes += [f"{len(roles.blank)} views are cameras only"] if roles.blank else []
     notes += _describe_poses(capture, scene)
     notes += [f"the scene brings a reference of {describe_references(given)}"] if given else []
@@ -94,12 +97,14 @@ def preview(params: Params, scene: Path) -> list[str]:
 def _describe_poses(capture: Capture, scene: Path) -> list[str]:
     """Describe in sentences where the poses come from, and whether the pictures need undistortion."""
     if capture.poses is None:
-        return [f"SfM: {len(capture.pictures)} photos bring no poses"]
+        return [
+            f"the poses of {len(capture.pictures)} photographs are computed from the pictures (structure from motion)"
+        ]
     shifts = {each: lens.largest_shift(each) for each in set(capture.poses.lenses.values())}
     worst = max(shifts, key=shifts.__getitem__)
     moved = f"{worst.coefficients()} moves the border by up to {shifts[worst]:.1f} px"
     pinhole = shifts[worst] <= lens.PINHOLE_ENOUGH
     return [
-        f"SfM left out: {capture.pose_source.relative_to(scene)} brings poses",
-        "undistortion left out: the lens is a pinhole" if pinhole else f"undistortion: {moved}",
+        f"the poses come from {capture.pose_source.relative_to(scene)}",
+        "the photographs need no undistortion: the lens is a pinhole" if pinhole else f"undistortion: {moved}",
     ]

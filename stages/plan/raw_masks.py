@@ -6,6 +6,7 @@ from pathlib import Path
 
 from reffusion.capture.scene_folder import is_gaussians_only, read_scene
 from reffusion.capture.undistort import check_masks
+from reffusion.io.annotations import file_of
 from reffusion.params.raw_masks import Params
 
 
@@ -20,7 +21,7 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
         roles = None if is_gaussians_only(params, scene) else read_scene(params, scene)[1]
     except ValueError:  # `preview` reports this error
         return files
-    return sorted({path for views in roles.mask_files.values() for path in views.values()}) if roles else []
+    return sorted({file_of(path) for views in roles.mask_files.values() for path in views.values()}) if roles else []
 
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
@@ -65,4 +66,5 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None) -> list[s
     check_masks(roles.fill)
     count = sum(len(files) for files in roles.masks.values())
     apart = f" of {', '.join(roles.masks)}" if len(roles.masks) > 1 else ""
-    return [f"{count} masks{apart}", *roles.warnings]
+    words = f"{count} mask{'' if count == 1 else 's'}{apart}" if count else "no masks"
+    return [words, *roles.warnings]

@@ -9,7 +9,7 @@ from reffusion.capture.layouts.capture import Poses
 from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS
 
-FOLDERS = ("images", "images_2", "images_4", "images_8", "photos", "input")
+FOLDERS = ("images", "images_2", "images_4", "images_8", "photos", "input", "rgb", "keyframes", "dense")
 LEAST = 3  # smallest number of cameras
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from reffusion.capture.layouts.unread import refuse_without_pictures
 from reffusion.capture.lens import Lens, from_colmap
 from reffusion.capture.names import list_pictures, name_views, normalize_path
 from reffusion.io.colmap import ModelCamera
@@ -41,7 +43,7 @@ class Capture:
     """The contents of a scene folder.
 
     Attributes:
-        layout: "llff", "colmap", "transforms" or "photos".
+        layout: one of `load.LAYOUTS`.
         pictures: view name -> picture file, sorted by path. Either all of them have poses, or none.
         paths: name of a view, or path of a picture that is left out -> the paths by which its mask file may be named.
             Pictures that are left out are listed so that their masks are not refused.
@@ -50,10 +52,13 @@ class Capture:
         label_folder: the folder whose sub-folders `label` and `test_label` are searched for masks and test masks. It is
             the folder of the pictures, or of the same pictures at another size.
         warnings: sentences for the user.
-        test: names of the views that the layout itself holds out (Blender's transforms_test.json).
+        test: names of the views that the layout itself holds out (Blender's transforms_test.json, or `test_filenames`).
+        unused: names of the views that are in neither of the layout's own lists of training and test views.
         ignore_masks: view name -> the mask file that the layout names for the view. Such a mask is black where training
             should ignore the picture.
         depth_maps: files of depth maps from which points may be made.
+        upright: True if EXIF orientation tags are obeyed: for photographs without poses, and where the poses are those
+            of the turned pictures. Other poses refer to the stored pixels.
     """
 
     layout: str
@@ -64,16 +69,36 @@ class Capture:
     label_folder: Path
     warnings: tuple[str, ...]
     test: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
     ignore_masks: dict[str, Path] = field(default_factory=dict)
     depth_maps: tuple[Path, ...] = ()
+    upright: bool = False
 
-    @property
-    def upright(self) -> bool:
-        """True if EXIF orientation tags are obeyed, as for photographs without poses.
 
-        Poses that come with a capture refer to the stored pixels, so tags are ignored there.
-        """
-        return self.layout == "photos"
+@dataclass(frozen=True)
+class Correction:
+    """A mistake in the poses of a capture, and how to undo it (`reffusion.capture.checks.agreement`).
+
+    Attributes:
+        cause: the mistake, as a part of a sentence.
+        poses: function from the given world-to-camera poses to the right ones, view name -> [4, 4]. Views whose pose is
+            lost are missing from the result.
+        upright: True if the poses are those of photographs turned by their EXIF orientation.
+    """
+
+    cause: str = "none"
+    poses: Callable[[Mapping[str, np.ndarray]], dict[str, np.ndarray]] = dict
+    upright: bool = False
+
+    def apply(self, given: Poses) -> Poses:
+        """Return the cameras with corrected poses, without the views whose pose is lost."""
+        poses = self.poses(given.world_to_camera)
+        lenses = {name: given.lenses[name] for name in poses}
+        bounds = {name: given.bounds[name] for name in poses if name in given.bounds}
+        return replace(given, world_to_camera=poses, lenses=lenses, bounds=bounds)
+
+
+AS_GIVEN = Correction()
 
 
 def find_pictures(folder: Path, nested: bool = False) -> dict[str, Path]:
@@ -125,7 +150,7 @@ def find_image_folder(folder: Path, images: str | None, usual: tuple[str, ...]) 
         return folder / images
     folders = [folder / name for name in usual if has_pictures(folder / name, nested=name != ".")]
     if not folders:
-        raise BadInput(f"{folder}: no pictures in {', '.join(usual)}; name their folder as `images` in scene.yaml")
+        raise refuse_without_pictures(folder, usual)
     return next((path for path in folders if (path / "label").is_dir()), folders[0])
 
 
@@ -145,14 +170,20 @@ def lens_from_model(camera: ModelCamera, source: Path) -> Lens:
 
 
 def resize_lens(lens: Lens, picture: Path) -> Lens:
-    """Return the lens, resized to a picture file. Raises BadInput if the aspect ratios differ by more than 2%."""
-    width, height = image_size(picture)
-    if abs(width * lens.height - height * lens.width) > 0.02 * width * lens.height:
-        raise BadInput(
-            f"{picture}: {width}x{height} px, but its camera is for {lens.width}x{lens.height}; "
-            "other proportions: the picture was cropped or turned after its pose was found"
-        )
-    return lens.resized(width, height)
+    """Return the lens, resized to a picture file, or to the picture turned by its EXIF orientation if only that fits.
+
+    Raises:
+        BadInput: the aspect ratios differ by more than 2% either way.
+    """
+    sizes = [image_size(picture), image_size(picture, upright=True)]
+    for width, height in sizes:
+        if abs(width * lens.height - height * lens.width) <= 0.02 * width * lens.height:
+            return lens.resized(width, height)
+    width, height = sizes[0]
+    raise BadInput(
+        f"{picture}: {width}x{height} px, but its camera is for {lens.width}x{lens.height}; "
+        "other proportions: the picture was cropped or turned after its pose was found"
+    )
 
 
 def nearest_rigid(matrix: np.ndarray, name: str, source: Path) -> np.ndarray:

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from reffusion.capture.layouts.capture import (
+    AS_GIVEN,
     NO_POINTS,
     Capture,
+    Correction,
     PointCloud,
     Poses,
     count_message,
     find_image_folder,
+    has_pictures,
     lens_from_model,
     relative_paths,
     resize_lens,
 )
-from reffusion.capture.layouts.points import are_tracks_inside, contradicts_order, keep_points_in_frame
+from reffusion.capture.layouts.points import are_tracks_inside, keep_points_in_frame
 from reffusion.capture.names import list_pictures, name_views, normalize_path, pair_pictures
 from reffusion.io.colmap import ModelImage, is_model, load_cameras, load_images, load_model_points, model_file
 from reffusion.io.files import BadInput
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap", ".")
+USUAL = ("images", "images_2", "images_4", ".")  # usual folders of pictures
 RENAMED = re.compile(r"image\d+")  # names of LLFF's reduced copies, numbered in the order of the originals' names
 
 
@@ -30,11 +35,28 @@ def find_model(folder: Path) -> Path | None:
     return max(found, key=found.__getitem__) if (found := _count_images(folder)) else None
 
 
+def find_workspace(folder: Path) -> Path | None:
+    """Return the folder in which COLMAP put undistorted pictures with their model; None without one.
+
+    The folder has sub-folders `images` and `sparse`, as dense/0 of an automatic reconstruction. It counts if the scene
+    has no other model, or no pictures in the usual folders. Of several folders the one with most pictures is returned.
+    """
+    found = [
+        path for path in (folder / "dense", *sorted((folder / "dense").glob("[0-9]*"))) if is_model(path / "sparse")
+    ]
+    sizes = {path: len(list_pictures(path / "images", nested=True)) for path in found}
+    if not any(sizes.values()):
+        return None
+    if find_model(folder) is not None and any(has_pictures(folder / name) for name in USUAL):
+        return None
+    return max(sizes, key=sizes.__getitem__)
+
+
 def other_models(folder: Path, model: Path) -> str | None:
     """Return a message to the user about the COLMAP models that are not used; None if `model` is the only one."""
     found = _count_images(folder)
     others = [f"{_relative(folder, path)} ({count})" for path, count in found.items() if path != model]
-    if not others:
+    if not others or model not in found:
         return None
     return f"{_relative(folder, model)} is taken, which has most images ({found[model]}); not {', '.join(others)}"
 
@@ -64,23 +86,29 @@ def _files(model: Path) -> tuple[Path, Path]:
     return images, cameras
 
 
-def read(folder: Path, images: str | None) -> Capture:
+def read(folder: Path, images: str | None, correction: Correction = AS_GIVEN) -> Capture:
     """Read a scene folder with a COLMAP model.
 
     Args:
         images: folder of pictures, relative to the scene; None for the usual folders.
+        correction: what is changed in the poses.
 
     Raises:
         BadInput: there is no model; the usual folders hold no pictures; or as for `capture_from_model`.
     """
-    model = find_model(folder)
+    model, workspace = find_model(folder), find_workspace(folder)
+    if workspace is not None and images is None:
+        pictures = workspace / "images"
+        return capture_from_model(folder, workspace / "sparse", pictures, "colmap", pictures, correction)
     if model is None:
         raise BadInput(f"{folder}: no COLMAP model (cameras and images, .bin or .txt) in {', '.join(MODEL_FOLDERS)}")
-    image_folder = find_image_folder(folder, images, ("images", "images_2", "images_4", "."))
-    return capture_from_model(folder, model, image_folder, "colmap", image_folder)
+    image_folder = find_image_folder(folder, images, USUAL)
+    return capture_from_model(folder, model, image_folder, "colmap", image_folder, correction)
 
 
-def capture_from_model(folder: Path, model: Path, image_folder: Path, layout: str, label_folder: Path) -> Capture:
+def capture_from_model(
+    folder: Path, model: Path, image_folder: Path, layout: str, label_folder: Path, correction: Correction = AS_GIVEN
+) -> Capture:
     """Return the capture of a COLMAP model whose images are paired with picture files.
 
     Pairs are found by paths (`pair_pictures`). LLFF's renamed copies (`image000.png` and so on) are paired by order if
@@ -93,17 +121,17 @@ def capture_from_model(folder: Path, model: Path, image_folder: Path, layout: st
         model: the model's folder.
         image_folder: the folder of the pictures.
         layout, label_folder: see `Capture`.
+        correction: what is changed in the poses.
 
     Raises:
         BadInput: no image has a picture; a camera is missing, its model is not supported, or it has another aspect
-            ratio than the picture; two images have the same name; or pictures that are paired by order do not show the
-            model's points.
+            ratio than the picture; or two images have the same name.
     """
     source, camera_file = _files(model)
     images, identities = _images_by_name(source)
     files = _pictures_of_model(folder, image_folder, list(images))
     pairs, warnings = pair_pictures({name: name for name in images}, files), [other_models(folder, model)]
-    if by_order := not pairs and len(files) == len(images) and all(RENAMED.match(Path(f).name) for f in files):
+    if not pairs and len(files) == len(images) and all(RENAMED.match(Path(f).name) for f in files):
         pairs = dict(zip(sorted(images), files, strict=True))
         warnings.append(f"{image_folder}: renamed pictures, paired with the images of {source.name} in order of names")
     if not pairs:
@@ -118,13 +146,10 @@ def capture_from_model(folder: Path, model: Path, image_folder: Path, layout: st
             raise BadInput(f"{source}: the camera {of_file[file].camera_id} of '{view}' is missing in the model")
         lenses[view] = resize_lens(lens_from_model(camera, camera_file), pictures[view])
         poses[view] = of_file[file].world_to_camera
-    found = Poses(lenses, poses, *NO_POINTS, {})
-    points, point_warning = _points(model, found, pictures, {v: identities[of_file[f].name] for v, f in views.items()})
-    if by_order and contradicts_order([*pictures.values()], [*lenses.values()], [*poses.values()], points):
-        raise BadInput(
-            f"{image_folder}: its pictures are not in the order of the images of {source}: they show the model's "
-            "points elsewhere; give them the names that the model has"
-        )
+    found = correction.apply(Poses(lenses, poses, *NO_POINTS, {}))
+    points, point_warning = _points(
+        model, found, pictures, {v: identities[of_file[views[v]].name] for v in found.lenses}
+    )
     unplaced, lost = sorted(set(files) - set(pairs.values())), sorted(images.keys() - pairs.keys())
     warnings += [
         count_message("images of the model have no picture", [_stem(name) for name in lost]),
@@ -138,7 +163,7 @@ def capture_from_model(folder: Path, model: Path, image_folder: Path, layout: st
         layout,
         pictures,
         paths | rest,
-        Poses(lenses, poses, *points, {}),
+        replace(found, points=points[0], colors=points[1]),
         source,
         label_folder,
         tuple(filter(None, warnings)),

@@ -14,8 +14,10 @@ import numpy as np
 
 from reffusion.capture.frame import depths_in_view
 from reffusion.capture.layouts.capture import (
+    AS_GIVEN,
     NO_POINTS,
     Capture,
+    Correction,
     PointCloud,
     Poses,
     find_image_folder,
@@ -36,7 +38,13 @@ from reffusion.io.images import image_size
 USUAL = ("images_4", "images_2", "images_8", "images")
 
 
-def read(folder: Path, images: str | None, longest: int, references: frozenset[Path] = frozenset()) -> Capture:
+def read(
+    folder: Path,
+    images: str | None,
+    longest: int,
+    references: frozenset[Path] = frozenset(),
+    correction: Correction = AS_GIVEN,
+) -> Capture:
     """Read a scene folder in this layout.
 
     Args:
@@ -45,6 +53,7 @@ def read(folder: Path, images: str | None, longest: int, references: frozenset[P
             else the largest size.
         references: files of references (inpainted views), which are not views. They are left out if the numbers of
             pictures and of rows in poses_bounds.npy differ.
+        correction: what is changed in the poses.
 
     Raises:
         BadInput: there is neither poses_bounds.npy nor a COLMAP model; the numbers of poses and pictures differ; a pose
@@ -55,7 +64,7 @@ def read(folder: Path, images: str | None, longest: int, references: frozenset[P
     image_folder, warnings = (folder / images, []) if images else _choose_image_folder(folder, label_folder, longest)
     model = find_model(folder)
     if model is not None:  # with its exact poses, distortion and points
-        found = capture_from_model(folder, model, image_folder, "llff", label_folder)
+        found = capture_from_model(folder, model, image_folder, "llff", label_folder, correction)
         return replace(found, warnings=(*warnings, *found.warnings))
     if not is_file(source):
         raise BadInput(f"{source}: missing, and there is no complete COLMAP model in {folder / 'sparse/0'}")
@@ -81,10 +90,11 @@ def read(folder: Path, images: str | None, longest: int, references: frozenset[P
         bounds[name] = float(row[15]), float(row[16])
     partial = folder / "sparse" / "0"
     lenses = _lens_of_partial_model(partial, lenses, pictures, warnings)
-    points = _points_of_partial_model(partial, lenses, poses, bounds, warnings)
-    capture_poses = Poses(lenses, poses, *points, bounds)
+    right = correction.apply(Poses(lenses, poses, *NO_POINTS, bounds))
+    points = _points_of_partial_model(partial, right.lenses, right.world_to_camera, right.bounds, warnings)
+    right = replace(right, points=points[0], colors=points[1])
     paths = relative_paths(image_folder, pictures)
-    return Capture("llff", pictures, paths, capture_poses, source, label_folder, tuple(warnings))
+    return Capture("llff", pictures, paths, right, source, label_folder, tuple(warnings))
 
 
 def _label_folder(folder: Path, images: str | None) -> Path:

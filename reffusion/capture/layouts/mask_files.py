@@ -5,18 +5,22 @@ Masks may distinguish between several objects: each object then has a folder of 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.names import is_mask_of_another, pair_masks, strip_ending
+from reffusion.capture.names import MASK_ENDINGS, is_mask_of_another, pair_masks, strip_ending
+from reffusion.io.annotations import annotated_pictures, is_labelme
 from reffusion.io.files import BadInput
-from reffusion.io.images import ENDINGS, WHITE, MaskValues
+from reffusion.io.given_masks import WHITE, MaskValues
+from reffusion.io.images import ENDINGS
 from reffusion.params.capture import MaskSpec
 
 NONE = "none"
-USUAL = ("masks", "mask", "label")  # usual folders, searched after `label` in the folder of pictures
+COMPANIONS = (".txt", ".xml", ".xmp", ".csv", ".yaml", ".thm", "")  # endings of files beside a picture that are none
+USUAL = ("masks", "mask", "label", "annotations")  # usual folders, searched after `label` in the folder of pictures
 
 
 @dataclass(frozen=True)
@@ -24,8 +28,8 @@ class FoundMasks:
     """The masks of a scene.
 
     Attributes:
-        files: object -> view -> mask file. The object is "" if the masks do not distinguish between objects. Empty if
-            the scene has no masks.
+        files: object -> view -> mask file (for a mask in a COCO file, see `reffusion.io.annotations`). The object is ""
+            if the masks do not distinguish between objects. Empty if the scene has no masks.
         values: the pixel values that mark the object.
         warning: a sentence for the user, or None.
     """
@@ -39,12 +43,13 @@ def find_masks(folder: Path, capture: Capture, spec: str | MaskSpec | None, opti
     """Find the mask files of a scene, and check by their names that each belongs to a picture.
 
     If no folder is named, masks are taken from the first of these places that has some: `label` in the folder of
-    pictures, the usual folders, masks beside their pictures (`A_mask.png` beside `A.png`), the files that the layout
-    names (`Capture.ignore_masks`), whose black pixels then mark the object. Masks of left-out pictures are dropped.
+    pictures, the usual folders, masks beside their pictures (`A_mask.png` or `A.json` beside `A.png`), the files that
+    the layout names (`Capture.ignore_masks`), whose black pixels then mark the object. Masks of left-out pictures are
+    dropped.
 
     Args:
-        spec: the key `masks` of scene.yaml (`reffusion.params.capture`): a folder, optionally with the numbers that
-            mark the object; "none" for no masks; None to search.
+        spec: the key `masks` of scene.yaml (`reffusion.params.capture`): a folder or a COCO file, optionally with the
+            numbers that mark the object; "none" for no masks; None to search.
         optional: True if it is no error that the search finds no masks. A folder that `spec` names must hold masks in
             any case.
 
@@ -56,11 +61,13 @@ def find_masks(folder: Path, capture: Capture, spec: str | MaskSpec | None, opti
         return FoundMasks({})
     values = MaskValues(named.numbers)
     if named.folder is not None:
-        place = folder / named.folder
-        if not (files := _mask_paths(place, capture)):
+        place, files = _mask_paths(folder / named.folder, capture)
+        if not files:
             inside = any(place in path.parents for path in capture.pictures.values())
             why = (
-                "it holds photographs, and no mask beside one (A_mask.png beside A.png)" if inside else "no masks there"
+                "it holds photographs, and no mask beside one (A_mask.png beside A.png)"
+                if inside
+                else f"no masks there{_unread(place)}"
             )
             raise BadInput(f"{place}: {why}; correct `masks` in scene.yaml")
         return FoundMasks(group_by_object(place, files, capture), values)
@@ -68,7 +75,7 @@ def find_masks(folder: Path, capture: Capture, spec: str | MaskSpec | None, opti
     beside = _pictures_folder(capture)
     ignored = set(capture.ignore_masks.values())
     for place in (*(p for p in places if p != capture.label_folder), *([beside] if beside else [])):
-        files = _mask_paths(place, capture)
+        place, files = _mask_paths(place, capture)
         if files and not {place / path for path in files} <= ignored:
             return FoundMasks(group_by_object(place, files, capture), values)
     if ignored:
@@ -77,7 +84,8 @@ def find_masks(folder: Path, capture: Capture, spec: str | MaskSpec | None, opti
     if optional:
         return FoundMasks({})
     raise BadInput(
-        f"{folder}: no mask at all (looked for {', '.join(str(p.relative_to(folder)) for p in places)}); click on "
+        f"{folder}: no mask at all (looked for {', '.join(str(p.relative_to(folder)) for p in places)}"
+        f"{''.join(map(_unread, places))}); click on "
         f"the object (`make scene={folder} mask`, or `clicks` in scene.yaml), add a mask for each picture, name "
         "their folder as `masks` or a box as `region` in scene.yaml, or say `masks: none` to fit and render only"
     )
@@ -89,23 +97,58 @@ def _pictures_folder(capture: Capture) -> Path | None:
     return parents.pop() if len(parents) == 1 else None
 
 
-def _mask_paths(place: Path, capture: Capture) -> list[str]:
-    """Return the paths of the masks in a folder and its sub-folders, sorted, relative to the folder.
+def _mask_paths(place: Path, capture: Capture) -> tuple[Path, list[str]]:
+    """Return the folder of the masks in a place, and their paths, sorted, relative to the folder.
 
-    All pictures in the folder are masks, unless it holds photographs of the capture. Then only files such as
-    `A_mask.png` beside `A.png` are masks.
+    All pictures in the folder and its sub-folders are masks, unless it holds photographs of the capture. Then only
+    files such as `A_mask.png` beside `A.png` are masks. Without such pictures, masks are the files of labelme and
+    arrays (`A.json`, `A.npy`; among photographs only `A.json`), else the pictures that a single COCO file names.
+
+    Args:
+        place: a folder, or a COCO file.
+
+    Returns:
+        `place`, or the COCO file in it; and the paths, none if there are no masks.
+
+    Raises:
+        BadInput: there are several COCO files, or a .json file in a folder without photographs is unreadable.
     """
-    if not place.is_dir():
-        return []
-    found = sorted(
-        path.relative_to(place).as_posix()
-        for path in place.rglob("*")
-        if path.suffix.lower() in ENDINGS and not any(part.startswith(".") for part in path.relative_to(place).parts)
-    )
-    if not {place / path for path in found} & set(capture.pictures.values()):
-        return found
-    stems = {strip_ending(path) for path in found}
-    return [path for path in found if is_mask_of_another(strip_ending(path), stems)]
+    if place.suffix.lower() == ".json" and place.is_file():
+        return place, annotated_pictures(place)
+    found = _visible_files(place, (*ENDINGS, *MASK_ENDINGS))
+    pictures = [path for path in found if Path(path).suffix.lower() in ENDINGS]
+    stems = {strip_ending(path) for path in pictures}
+    if among_photographs := not {place / path for path in pictures}.isdisjoint(capture.pictures.values()):
+        pictures = [path for path in pictures if is_mask_of_another(strip_ending(path), stems)]
+        found = [path for path in found if path.lower().endswith(".json") and path[: -len(".json")] in stems]
+    if pictures:
+        return place, pictures
+    others = [path for path in found if path.lower().endswith(".npy") or is_labelme(place / path)]
+    if others or among_photographs:
+        return place, others
+    files = [path for path in found if annotated_pictures(place / path)]
+    if len(files) > 1:
+        raise BadInput(f"{place}: {len(files)} COCO files ({', '.join(files)}); name one as `masks` in scene.yaml")
+    return (place / files[0], annotated_pictures(place / files[0])) if files else (place, [])
+
+
+def _visible_files(place: Path, endings: Collection[str] = ()) -> list[str]:
+    """Return the paths of the files in a folder and its sub-folders, sorted, relative to it, but no hidden files.
+
+    Args:
+        endings: the endings, in lower case, of the paths that are returned, also of folders and broken links, which
+            readers refuse; if empty, all files.
+    """
+    paths = [path for path in place.rglob("*") if (path.suffix.lower() in endings if endings else path.is_file())]
+    relative = [path.relative_to(place) for path in paths]
+    return sorted(each.as_posix() for each in relative if not any(part.startswith(".") for part in each.parts))
+
+
+def _unread(place: Path) -> str:
+    """Return which files of a folder without masks are not read, as the end of a sentence; empty if it has none."""
+    counts = Counter(Path(path).suffix or "without ending" for path in _visible_files(place))
+    found = ", ".join(f"{count} {ending}" for ending, count in sorted(counts.items()))
+    return f"; {place.name} holds {found}, not read as masks" if found else ""
 
 
 def group_by_object(place: Path, files: Collection[str], capture: Capture) -> dict[str, dict[str, Path]]:

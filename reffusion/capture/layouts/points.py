@@ -7,7 +7,7 @@ projection, a picture shows the point's colour.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,6 @@ CELLS, NEARLY = 40, 1.1  # cells along each side; points up to this many times t
 # same clouds scaled by 2, turned, mirrored or moved have up to .31.
 CORRELATED = 0.25
 GREY = np.full(3, 1 / 3)  # weights of red, green and blue
-BETTER = 0.02  # a picture contradicts its pose if the correlation at another view's pose is higher by more than this
 
 
 def keep_points_in_frame(
@@ -84,33 +83,6 @@ def are_tracks_inside(points: ModelPoints, poses: Mapping[int, tuple[Lens, np.nd
         inside += len(depths_in_view(mine, pose, lens))
         seen += len(mine)
     return inside >= TRACKED * seen
-
-
-def contradicts_order(
-    pictures: Sequence[Path], lenses: Sequence[Lens], poses: Sequence[np.ndarray], points: PointCloud
-) -> bool:
-    """Return whether pictures seem to be in the wrong order: most fit another view's pose better than their own.
-
-    A picture fits a pose if it shows the points' colours at their projections (`correlate_colors`). At most `VIEWS`
-    pictures, spread evenly, are tested with the poses of all views. The result is False if no picture can be tested,
-    for example because the points are too few or all of one brightness.
-
-    Args:
-        pictures, lenses, poses: view k has pictures[k], lenses[k] and the world-to-camera pose poses[k], [4, 4].
-        points: positions [P, 3] and colours [P, 3].
-    """
-    if not _has_contrast(points[1] @ GREY):
-        return False
-    chosen = range(0, len(pictures), -(-len(pictures) // VIEWS))
-    misplaced = compared = 0
-    for k in chosen:
-        grey = read_grey(pictures[k])
-        fits = np.array([correlate_colors(grey, lens, pose, *points) for lens, pose in zip(lenses, poses, strict=True)])
-        if np.isnan(fits[k]) or np.isnan(fits).sum() > len(fits) / 2:
-            continue
-        compared += 1
-        misplaced += np.nanmax(fits) > fits[k] + BETTER
-    return bool(compared) and 2 * misplaced > compared
 
 
 def correlate_colors(

@@ -1,12 +1,14 @@
 """Reads a capture in the layout "transforms": nerfstudio's transforms.json, or Blender's transforms_<split>.json.
 
-Blender's files are transforms_train.json and optionally transforms_test.json and transforms_val.json.
+Blender's files are transforms_train.json and optionally transforms_test.json and transforms_val.json. `ns-export
+cameras` writes transforms_train.json and transforms_eval.json as lists of frames; both are read if they have focal
+lengths.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +16,10 @@ from typing import Any
 import numpy as np
 
 from reffusion.capture.layouts.capture import (
+    AS_GIVEN,
     NO_POINTS,
     Capture,
+    Correction,
     PointCloud,
     Poses,
     count_message,
@@ -26,13 +30,16 @@ from reffusion.capture.layouts.capture import (
 from reffusion.capture.layouts.depth_maps import points_from_depth
 from reffusion.capture.layouts.frame_lens import frame_lens, load_frame_lens, read_number
 from reffusion.capture.layouts.points import keep_points_in_frame
+from reffusion.capture.layouts.pose_matrices import read_matrices
 from reffusion.capture.names import list_pictures, name_views, normalize_path, pair_pictures
 from reffusion.io.arrays import load_json
-from reffusion.io.files import BadInput, as_bad_input, is_file, shorten
+from reffusion.io.files import BadInput, is_file, shorten
 from reffusion.io.images import ENDINGS
 from reffusion.io.ply import load_points
 
-SPLITS = ("train", "test", "val")
+HELD_OUT = ("test", "val", "eval")  # names of splits; the first that exists has the test views
+UNUSED = "unused"  # split of frames that none of the file's lists names
+MATRIX, EXPORTED = "transform_matrix", "transform"  # keys of a frame's matrix; the second is of `ns-export cameras`
 USUAL = ("images", "images_2", "images_4", "images_8", "input", "rgb")  # usual folders of pictures
 
 
@@ -44,45 +51,56 @@ class Frame:
         values: the keys of the frame, together with the keys of the whole file that the frame does not have.
         file_path: value of the frame's key `file_path`: a path of its picture, which need not exist.
         source: the transforms file.
-        split: "" for transforms.json; "train", "test" or "val" for Blender's files.
+        split: "train" or one of `HELD_OUT`, by the file's name or by the file's own lists; "" if neither tells.
+        matrix: [4, 4] float64, OpenGL's camera-to-world pose (y up, looking along -z).
+        transposed: True if the file has the matrix transposed.
     """
 
     values: dict[str, Any]
     file_path: str
     source: Path
     split: str
+    matrix: np.ndarray
+    transposed: bool
 
 
 def split_files(folder: Path) -> dict[str, Path]:
     """Return split -> transforms file of a scene folder.
 
-    This is {"": transforms.json} if that file exists; else Blender's files that exist, by "train", "test" and "val", if
-    transforms_train.json is among them; else empty.
+    This is {"": transforms.json} if that file exists; else Blender's files that exist, by "train" and `HELD_OUT`, if
+    transforms_train.json is among them and has focal lengths; else empty.
     """
     if is_file(folder / "transforms.json"):
         return {"": folder / "transforms.json"}
-    found = {
-        split: folder / f"transforms_{split}.json" for split in SPLITS if is_file(folder / f"transforms_{split}.json")
-    }
-    return found if "train" in found else {}
+    files = {split: folder / f"transforms_{split}.json" for split in ("train", *HELD_OUT)}
+    found = {split: path for split, path in files.items() if is_file(path)}
+    return found if "train" in found and not _is_without_lenses(found["train"]) else {}
 
 
-def read(folder: Path, images: str | None) -> Capture:
+def _is_without_lenses(path: Path) -> bool:
+    """Return whether a file is a list of poses without focal lengths, as `ns-export cameras` writes it."""
+    content = path.read_bytes()
+    return content.lstrip().startswith(b"[") and not any(key in content for key in (b'"fl_x"', b'"camera_angle_x"'))
+
+
+def read(folder: Path, images: str | None, correction: Correction = AS_GIVEN) -> Capture:
     """Read a scene folder with transforms files.
 
     The test views of Blender's files are the frames of transforms_test.json, or without that file those of
-    transforms_val.json, which is otherwise not read. Frames without a picture are left out. `Capture.warnings` tells
-    both.
+    transforms_val.json, which is otherwise not read. Those of transforms.json are its `test_filenames`, or without them
+    its `val_filenames`. Frames without a picture are left out, and so are frames that are listed again.
+    `Capture.warnings` tells this.
 
     Args:
         images: folder of pictures, relative to the scene. None to use the paths in the frames, or the usual folders if
             no frame's path leads to a picture.
+        correction: what is changed in the poses.
 
     Raises:
-        BadInput: a file or frame is wrong; no frame has a picture; or two frames have the same picture.
+        BadInput: a file or frame is wrong; no frame has a picture; or two frames have the same picture and differ.
     """
     sources = split_files(folder)
-    unread = [sources.pop("val").name] if {"test", "val"} <= sources.keys() else []
+    unread = [sources.pop(split).name for split in [each for each in HELD_OUT if each in sources][1:]]
     frames = [frame for split, source in sources.items() for frame in _load_frames(source, split)]
     source = next(iter(sources.values()))
     files = _find_pictures(folder, images, frames)
@@ -90,20 +108,25 @@ def read(folder: Path, images: str | None) -> Capture:
         raise BadInput(f"{source}: none of its {len(frames)} frames has a picture; name their folder as `images`")
     missing = [frame.file_path for k, frame in enumerate(frames) if k not in files]
     root = Path(os.path.commonpath([path.parent for path in files.values()]))
-    of_path = {path.relative_to(root).as_posix(): frames[k] for k, path in files.items()}
-    if len(of_path) < len(files):
-        raise BadInput(f"{source}: two of its frames are the same picture; remove one")
+    of_path, repeated = _drop_repeated((path.relative_to(root).as_posix(), frames[k]) for k, path in files.items())
     views = name_views(list(of_path))
     pictures = {view: root / path for view, path in views.items()}
     placed = {view: of_path[path] for view, path in views.items()}
     lenses = {view: load_frame_lens(each.values, pictures[view], each.source) for view, each in placed.items()}
-    poses = {view: _frame_pose(each.values, view, each.source) for view, each in placed.items()}
-    found = Poses(lenses, poses, *NO_POINTS, {})
+    poses = {view: _frame_pose(each, view) for view, each in placed.items()}
+    test, unused, split_messages = _split(placed)
+    found = correction.apply(Poses(lenses, poses, *NO_POINTS, {}))
     points, messages = _points(folder, source, frames[0].values, placed, found, pictures)
     paths = relative_paths(root, pictures)
     warnings = (
         count_message(f"of the {len(frames)} frames in {source.name} have no picture", sorted(missing)),
         count_message("beside the test views are left out", unread),
+        count_message(f"of the {len(frames)} frames in {source.name} are listed again with the same pose", repeated),
+        *(
+            f"{name}: its matrices are transposed (their last column is 0 0 0 1) and are read as such"
+            for name in dict.fromkeys(each.source.name for each in frames if each.transposed)
+        ),
+        *split_messages,
         *messages,
     )
     return Capture(
@@ -114,7 +137,8 @@ def read(folder: Path, images: str | None) -> Capture:
         source,
         next(iter(pictures.values())).parent if len({path.parent for path in pictures.values()}) == 1 else root,
         tuple(filter(None, warnings)),
-        tuple(view for view, each in placed.items() if each.split in ("test", "val")),
+        test,
+        unused,
         _named_files(folder, placed, "mask_path"),
         tuple(_named_files(folder, placed, "depth_file_path").values()),
     )
@@ -125,13 +149,10 @@ def read_cameras(folder: Path) -> Poses:
 
     Raises:
         BadInput: a file or frame is wrong; a frame has no w and h, which tell the size of its picture; or two frames
-            have the same file_path.
+            have the same file_path and differ.
     """
     frames = [each for split, source in split_files(folder).items() for each in _load_frames(source, split)]
-    listed = {normalize_path(each.file_path): each for each in frames}
-    if len(listed) < len(frames):
-        twice = next(path for path in listed if sum(normalize_path(each.file_path) == path for each in frames) > 1)
-        raise BadInput(f"{frames[0].source}: two frames are called '{Path(twice).stem}'; rename one")
+    listed, _ = _drop_repeated((normalize_path(each.file_path), each) for each in frames)
     lenses, poses = {}, {}
     for view, path in name_views(list(listed)).items():
         each = listed[path]
@@ -140,7 +161,7 @@ def read_cameras(folder: Path) -> Poses:
                 f"{each.source}: neither pictures nor w and h of '{Path(path).name}'; give its size in pixels"
             )
         lenses[view] = frame_lens(each.values, Path(path), each.source, (0, 0))
-        poses[view] = _frame_pose(each.values, view, each.source)
+        poses[view] = _frame_pose(each, view)
     return Poses(lenses, poses, *NO_POINTS, {})
 
 
@@ -151,20 +172,88 @@ def has_pictures(folder: Path) -> bool:
 
 
 def _load_frames(source: Path, split: str) -> list[Frame]:
-    """Read the frames of a transforms file. `split`: see `Frame`."""
+    """Read the frames of a transforms file. `split`: the split of all frames, unless the file itself has lists."""
     record = load_json(source)
-    return [Frame({**record, **frame}, frame["file_path"], source, split) for frame in _frames(record, source)]
+    shared, frames = (record if isinstance(record, dict) else {}), _frames(record, source)
+    names = [frame["file_path"] for frame in frames]
+    matrices, transposed = read_matrices([frame.get(MATRIX, frame.get(EXPORTED)) for frame in frames], names, source)
+    splits = {**dict.fromkeys(names, split), **_listed_splits(shared, names, source)}
+    return [
+        Frame({**shared, **frame}, name, source, splits[name], matrix, transposed)
+        for frame, name, matrix in zip(frames, names, matrices, strict=True)
+    ]
 
 
 def _frames(record: object, source: Path) -> list[dict]:
     """Return the list `frames` of a parsed transforms file. Raises BadInput if it is missing or a frame lacks a key."""
-    frames = record.get("frames") if isinstance(record, dict) else None
+    frames = record.get("frames") if isinstance(record, dict) else record
     if not isinstance(frames, list) or not frames:
         raise BadInput(f"{source}: it has no list `frames`")
     for frame in frames:
-        if not isinstance(frame, dict) or "transform_matrix" not in frame or not _is_path(frame.get("file_path")):
+        if not isinstance(frame, dict) or not frame.keys() & {MATRIX, EXPORTED} or not _is_path(frame.get("file_path")):
             raise BadInput(f"{source}: a frame without file_path or transform_matrix: {shorten(frame)}")
     return frames
+
+
+def _listed_splits(shared: Mapping[str, Any], names: list[str], source: Path) -> dict[str, str]:
+    """Return file_path of a frame -> its split, if transforms.json has the lists train_filenames, test_filenames, ...
+
+    Of the lists of `HELD_OUT` the first one counts. A frame in it and in train_filenames is held out. A frame in
+    neither has the split `UNUSED`, unless there is no train_filenames; then it has the split "train".
+
+    Raises:
+        BadInput: a list is not of names, or one of them is no frame's.
+    """
+    lists = {split: shared[f"{split}_filenames"] for split in ("train", *HELD_OUT) if shared.get(f"{split}_filenames")}
+    splits = dict.fromkeys(names, UNUSED if "train" in lists else "train") if lists else {}
+    for split in [each for each in lists if each == "train"] + [each for each in HELD_OUT if each in lists][:1]:
+        listed = lists[split]
+        if not isinstance(listed, list) or not all(_is_path(name) for name in listed):
+            raise BadInput(f"{source}: {split}_filenames = {shorten(listed)} is no list of names")
+        found = pair_pictures({name: name for name in listed}, names)
+        if lost := sorted(set(listed) - found.keys()):
+            raise BadInput(f"{source}: {split}_filenames: '{shorten(lost[0])}' is no frame's file_path; correct it")
+        splits |= dict.fromkeys(found.values(), split)
+    return splits
+
+
+def _split(placed: Mapping[str, Frame]) -> tuple[tuple[str, ...], tuple[str, ...], list[str | None]]:
+    """Return the test views, the views that are neither training nor test views, and messages to the user."""
+    held_out = next((split for split in HELD_OUT if any(each.split == split for each in placed.values())), None)
+    test = tuple(view for view, each in placed.items() if each.split == held_out)
+    unused = [view for view, each in placed.items() if each.split not in ("", "train", held_out)]
+    return (
+        test,
+        tuple(unused),
+        [count_message("frames are neither in the list of training views nor of test views", unused)],
+    )
+
+
+def _drop_repeated(listed: Iterable[tuple[str, Frame]]) -> tuple[dict[str, Frame], list[str]]:
+    """Return path -> frame, and the paths that come again with the same pose, lens and split, a path each time.
+
+    Args:
+        listed: pairs of a picture's path and its frame.
+
+    Raises:
+        BadInput: a path comes again with another pose, lens or split.
+    """
+    frames: dict[str, Frame] = {}
+    repeated = []
+    for path, frame in listed:
+        first = frames.setdefault(path, frame)
+        if first is frame:
+            continue
+        lenses = [frame_lens(each.values, Path(path), each.source, (1, 1)) for each in (first, frame)]
+        alike = {
+            "pose": np.allclose(first.matrix, frame.matrix, rtol=1e-6, atol=1e-9),
+            "lens": lenses[0] == lenses[1],
+            "split": first.split == frame.split,
+        }
+        if differs := [what for what, same in alike.items() if not same]:
+            raise BadInput(f"{frame.source}: '{path}' is listed twice, with another {differs[0]} each time; remove one")
+        repeated.append(path)
+    return frames, repeated
 
 
 def _is_path(value: object) -> bool:
@@ -211,28 +300,15 @@ def _named_files(folder: Path, placed: Mapping[str, Frame], key: str) -> dict[st
     return {view: path for view, path in files.items() if path.is_file()}
 
 
-def _frame_pose(frame: dict, name: str, source: Path) -> np.ndarray:
-    """Return the world-to-camera pose [4, 4] (y down, looking along +z) of a frame.
-
-    The key transform_matrix is OpenGL's camera-to-world pose (y up, looking along -z), 3x4 or 4x4.
-
-    Args:
-        frame: the keys of the frame.
-        name, source: the view and the transforms file, for messages.
+def _frame_pose(frame: Frame, name: str) -> np.ndarray:
+    """Return the world-to-camera pose [4, 4] (y down, looking along +z) of a frame. `name`: the view, for messages.
 
     Raises:
-        BadInput: the matrix is not of numbers, has another shape, or is no rigid pose.
+        BadInput: the frame's matrix is no rigid pose.
     """
-    with as_bad_input(source, f"a number in each place of the transform_matrix of '{name}'"):
-        matrix = np.array(frame["transform_matrix"])
-        if matrix.dtype.kind not in "fiu":
-            raise BadInput(f"{source}: the transform_matrix of '{name}' is no 4x4 matrix of numbers")
-        matrix = matrix.astype(np.float64)
-    if matrix.shape not in ((3, 4), (4, 4)):
-        raise BadInput(f"{source}: the transform_matrix of '{name}' is no 4x4 matrix")
     camera_to_world = np.eye(4)
-    camera_to_world[:3] = matrix[:3] * (1.0, -1.0, -1.0, 1.0)
-    return invert_pose(nearest_rigid(camera_to_world, name, source))
+    camera_to_world[:3] = frame.matrix[:3] * (1.0, -1.0, -1.0, 1.0)
+    return invert_pose(nearest_rigid(camera_to_world, name, frame.source))
 
 
 def _points(

@@ -19,10 +19,12 @@ import numpy as np
 from PIL import Image
 
 from reffusion import trace
+from reffusion.capture.layouts.unread import ARCHIVES
 from reffusion.capture.undistort import fitting_size
 from reffusion.io.arrays import save_json
 from reffusion.io.files import BadInput, reading
-from reffusion.io.images import resize_image
+from reffusion.io.images import ENDINGS, resize_image
+from reffusion.io.splats import FORMATS
 
 MOST = 80  # largest number of selected frames: all their pairs can be matched within minutes
 FEWEST = 12  # smallest number of windows, and of frames that a video must have
@@ -76,8 +78,10 @@ def extract_frames(video: Path, folder: Path, content: str) -> str:
         A sentence about the frames that were taken and those that were left out.
 
     Raises:
-        BadInput: the file is no video, is too short, has a picture that hardly moves, or is blurred throughout.
+        BadInput: the file is no video, is too short, has a picture that hardly moves, or is blurred throughout. If the
+            file is an archive, splats or a picture, the message says what to give instead.
     """
+    _refuse_other_files(video)
     seen = measure_frames(video)
     if not seen:
         raise BadInput(
@@ -104,6 +108,22 @@ def extract_frames(video: Path, folder: Path, content: str) -> str:
     facts |= {"blurred": len(blurred), "said": sentence}
     save_json(folder / RECORD, {"video": str(video), "content": content, **facts})
     return sentence
+
+
+def _refuse_other_files(path: Path) -> None:
+    """Raise BadInput if a file, given in place of a scene's folder, is an archive, Gaussians or a picture."""
+    name = path.name.lower()
+    if name.endswith(ARCHIVES):
+        raise BadInput(
+            f"{path}: an archive; unpack it, and give the folder: scene={path.parent / path.name.split('.')[0]}"
+        )
+    if name.endswith((*FORMATS, ".ksplat", ".sog")):
+        raise BadInput(
+            f"{path}: a file of splats or points, and a scene has photographs; to fill what was deleted in an editor: "
+            "`reffusion patch before.ply after.ply --out patched.ply`"
+        )
+    if name.endswith(ENDINGS):
+        raise BadInput(f"{path}: one picture; give the folder that holds the photographs: scene={path.parent}")
 
 
 def measure_frames(video: Path) -> list[FrameStats]:

@@ -92,7 +92,7 @@ def evaluate_depth(
         prior: The adapted prior.
         text: [3, L, D], the embeddings of the global, the local and the empty prompt.
         depth: Parameters of the depth term.
-        guidance: The paper's a, the strength of classifier-free guidance.
+        guidance: γ, the strength of classifier-free guidance.
         generator: Draws timestep and noise, on the CPU.
         estimator: The depth estimator.
         max_side: Longer side, in pixels, at which a larger view is rendered. The returned rendering has this size.

@@ -1,16 +1,20 @@
 'use strict';
 const $ = id => document.getElementById(id);
 const STEPS = {photographs: 'Photographs', object: 'Object', start: 'Start', live: 'Live 3D', result: 'Result', paint: 'Paint', export: 'Export'};
-let scene = '', step = 'photographs', state = null, source = null, shownView = '', shown = {};
+let scene = '', step = 'photographs', state = null, source = null, shownView = '', shown = {}, command = 'make app';
 
-// What a stage does, for people who do not know the method.
+// What a stage does, for people who do not know the method: a sentence, and in a word or two.
 const MEANING = {
-  poses: 'finds where the photographs were taken', raw_masks: 'reads the masks', fit: 'builds the scene in 3D, with the object',
-  masks: 'finds all of the object in 3D, and what is known behind it', reference: 'completes one picture of the hole',
-  lift: 'completes every picture (for comparisons only)', initialize: 'removes the object and fills the hole in 3D',
-  personalize: 'adapts the image model to the scene', distill: 'refines the filling',
-  finish: 'writes the finished scene', evaluate: 'renders and scores the result',
+  poses: ['finds where the photographs were taken', 'cameras'], raw_masks: ['reads the masks', 'masks'],
+  fit: ['builds the scene in 3D, with the object', '3D scene'],
+  masks: ['finds all of the object in 3D, and what is known behind it', 'object in 3D'],
+  reference: ['completes one picture of the hole', 'picture of the hole'],
+  lift: ['completes every picture (for comparisons only)', 'pictures'],
+  initialize: ['removes the object and fills the hole in 3D', 'filling'],
+  personalize: ['adapts the image model to the scene', 'image model'], distill: ['refines the filling', 'refining'],
+  finish: ['writes the finished scene', 'finishing'], evaluate: ['renders the result from all views', 'rendering'],
 };
+const sentence = stage => (MEANING[stage] || [`runs ${stage}`])[0];
 const at = path => `scenes/${encodeURIComponent(scene)}/${path}`;
 const picture = (kind, view) => at(`pictures/${kind}/${encodeURIComponent(view)}?${state.version}`);
 const isBusy = () => state && ['running', 'elsewhere'].includes(state.job.state);
@@ -35,7 +39,7 @@ function complain(id, error) {
 
 function duration(seconds) {
   if (seconds == null) return '';
-  if (seconds < 90) return `${Math.max(1, Math.round(seconds))} s`;
+  if (seconds < 90) return `${Math.max(5, 5 * Math.round(seconds / 5))} s`;
   return seconds < 5400 ? `${Math.round(seconds / 60)} min` : `${(seconds / 3600).toFixed(1)} h`;
 }
 
@@ -59,9 +63,8 @@ async function route() {
     state = null;
     shown = {};
     shownView = '';
-    $('mask').hidden = $('viewer').hidden = true;
-    $('mask').removeAttribute('src');
-    $('viewer').removeAttribute('src');
+    closeFrame('mask');
+    closeFrame('viewer');
     if (source) source.close();
     source = null;
     if (scene) follow();
@@ -70,16 +73,34 @@ async function route() {
   draw();
 }
 
+// A frame without its `src` goes on showing its page; a new one does not.
+function closeFrame(id) {
+  const frame = $(id).cloneNode();
+  frame.removeAttribute('src');
+  frame.hidden = true;
+  $(id).replaceWith(frame);
+}
+
 function follow() {
   source = new EventSource(at('events'));
-  source.onmessage = event => { state = JSON.parse(event.data); $('lost').hidden = true; draw(); };
+  source.onmessage = event => { state = JSON.parse(event.data); command = state.command; $('lost').hidden = true; draw(); };
   source.onerror = async () => {
     const own = source;
     try {
       await ask(at('state'));
     } catch (error) {
       if (source !== own) return;
-      if (error.status === 404) { source.close(); source = null; reopen(); } else $('lost').hidden = false;
+      if (error.status) {  // another program: it has another token, or knows no open scenes
+        source.close();
+        source = null;
+      }
+      if (error.status === 404) reopen();
+      else {
+        $('lost').replaceChildren(error.status ? 'The program of this page was started again. Open the address that it printed.' :
+          'The program of this page has stopped; nothing is lost. Start it again with ', ...(error.status ? [] : [make('code', command), ', and open the address that it prints.']));
+        $('lost').hidden = false;
+        if (error.status) closeFrame('mask');
+      }
     }
   };
 }
@@ -90,15 +111,15 @@ async function reopen() {
   try {
     await ask('scenes', {path: state ? state.source : known ? known.path : scene});
     shown = {};
-    $('mask').removeAttribute('src');
+    closeFrame('mask');
     follow();
   } catch { go('photographs', ''); }
 }
 
 function drawSteps() {
   const done = state ? {
-    photographs: state.pictures.length > 0, object: state.masks > 0 || state.brings_masks, start: Boolean(state.result) && !state.plan.due.length,
-    result: Boolean(state.result), live: false, paint: state.to_paint.some(each => each.painted), export: Object.keys(state.export.files).length > 1,
+    photographs: state.pictures.length > 0, object: state.masks > 0 || state.brings_masks, start: Boolean(state.result) && state.plan.stages.length > 0 && !state.plan.due.length,
+    result: Boolean(state.result), live: false, paint: state.to_paint.some(each => each.painted), export: !state.export.work && Object.keys(state.export.files).length > 1,
   } : {};
   const closed = {object: !state, start: !state, live: !state || !state.has_state, result: !state || !state.result,
     paint: !state || !state.result, export: !state || !state.result};
@@ -131,20 +152,23 @@ function draw() {
 function drawPill() {
   $('pill').hidden = !isBusy();
   if (!isBusy()) return;
-  const {stage, share, left} = state.job;
+  const {stage, share, left} = state.job, name = stage ? MEANING[stage] ? MEANING[stage][1] : stage : 'planning';
   $('pill').href = `#${encodeURIComponent(scene)}/start`;
-  $('pill').textContent = `${stage || 'planning'}${share != null ? ` ${Math.round(100 * share)} %` : ''}${left ? `, ${duration(left)} left` : ''}`;
+  $('pill').textContent = `${name}${share != null ? ` ${Math.round(100 * share)} %` : ''}${left ? `, ${duration(left)} left` : ''}`;
 }
 
 // ------------------------------------------------------------------------------------------------ photographs
 
 async function showRecent() {
-  const {scenes, first} = await ask('scenes');
+  let scenes, first;
+  try {
+    ({scenes, first, command} = await ask('scenes'));
+  } catch (error) { complain('wrong', error); return; }
   if (first && !sessionStorage.begun) { sessionStorage.begun = 1; go('photographs', first); return; }
   const words = {finished: 'finished', begun: 'begun', new: 'not begun'};
   $('recent').replaceChildren(...(scenes.length ? [make('h3', 'Recent scenes')] : []), ...scenes.map(each => {
     const button = make('button', make('span', each.name));
-    button.append(make('small', words[each.state]));
+    button.append(make('small', words[each.state] + (each.lost ? '; photographs moved away' : '')));
     button.title = each.path;
     button.addEventListener('click', () => open(each.path));
     return button;
@@ -164,7 +188,7 @@ function drawPhotographs() {
   $('captured').textContent = pictures.length ? `${pictures.length} photographs` : 'No photographs yet';
   $('source').textContent = state.source;
   if (changed('found', state.found)) $('found').replaceChildren(...state.found.map(words => make('li', words)));
-  const doubts = [...state.doubts, ...(plan.error && !plan.busy ? [plan.error] : [])];
+  const doubts = [...(plan.error && !plan.busy ? [plan.error] : []), ...state.doubts];
   $('doubts').hidden = !doubts.length;
   if (changed('doubts', doubts)) {
     $('doubts').firstChild.textContent = `${doubts.length} doubt${doubts.length === 1 ? '' : 's'}`;
@@ -172,10 +196,11 @@ function drawPhotographs() {
     $('doubts').open = doubts.length > 0 && doubts.length < 4;
   }
   $('checking').textContent = plan.busy ? 'looking at the capture …' : '';
-  $('next').hidden = !pictures.length;
-  $('next').textContent = masks ? 'Next: start the job' : 'Next: mark the object';
-  $('next').href = `#${encodeURIComponent(scene)}/${masks ? 'start' : 'object'}`;
-  $('next').onclick = masks ? null : wantMasks;
+  const ends = state.lost && state.result;
+  $('next').hidden = !pictures.length || (state.lost && !ends);
+  $('next').textContent = ends ? 'Look at the result' : masks ? 'Next: start the job' : 'Next: mark the object';
+  $('next').href = `#${encodeURIComponent(scene)}/${ends ? 'result' : masks ? 'start' : 'object'}`;
+  $('next').onclick = masks || ends ? null : wantMasks;
   drawThumbnails('thumbnails', pictures, true);
 }
 
@@ -246,13 +271,16 @@ function drawObject() {
   const ask_ = $('mask').dataset.wanted === scene;
   $('masked').hidden = open || !masks;
   $('object').classList.toggle('marking', open);
+  $('method').textContent = state.has_network ? 'Clicks: a segmentation network finds the object around a click.' :
+    'Clicks: colours and surfaces decide what belongs to the object. With the network that `make weights` fetches (37 MB) fewer clicks are enough.';
+  $('halted').hidden = !(open && state.awaits_fit && !isBusy() && !state.lost);
   if (open) {
     $('object-progress').replaceChildren();
     $('object-buttons').replaceChildren();
     return;
   }
   if ((masks || state.brings_masks) && !ask_) {
-    $('object-lead').textContent = `${masks ? `${masks} views have a mask` : 'The scene brings masks'}. Go on, or change them by clicks.`;
+    $('object-lead').textContent = `${masks ? `${masks} ${masks === 1 ? 'photograph has' : 'photographs have'} a mask` : 'The scene brings masks'}. Go on, or change the masks by clicks.`;
     if (changed('object', 'masks')) {
       const change = make('button', 'Change the masks');
       change.addEventListener('click', wantMasks);
@@ -271,9 +299,8 @@ function drawObject() {
     return;
   }
   if (changed('object', 'waits')) $('object-buttons').replaceChildren();
-  if (ready || !isBusy()) {
-    if (Date.now() - asked > 3000) wantMasks();
-  }
+  if (state.lost) { $('object-lead').textContent = state.lost; return; }
+  if ((ready || !isBusy()) && Date.now() - asked > 3000) wantMasks();
   if (isBusy()) {
     $('object-lead').textContent = job.state === 'elsewhere' ? `${job.words}.` : 'Preparing the photographs. The page for clicks opens by itself.';
     const bar = $('object-progress').firstChild || $('object-progress').appendChild(make('progress', '', {max: 1}));
@@ -289,7 +316,7 @@ async function wantMasks() {
     if (open) {
       $('mask').src = at('mask/');
       $('mask').hidden = false;
-    } else if (state.job.state === 'failed') throw new Error(`The cameras were not found: ${state.job.words}`);
+      } else if (state.job.state === 'failed') throw new Error(`The cameras were not found: ${state.job.words}`);
     draw();
   } catch (error) {
     $('mask').dataset.wanted = '';
@@ -301,37 +328,48 @@ async function wantMasks() {
 
 // ------------------------------------------------------------------------------------------------ start
 
+// The photographs were being prepared for the step Object when the job ended.
+const wasPreparing = () => state.lacks_masks && ['stopped', 'failed'].includes(state.job.state) && state.job.target !== 'all';
+
 function drawStart() {
-  const {job, plan} = state, due = plan.due.length, running = job.state === 'running';
-  $('run').hidden = isBusy();
-  $('run').disabled = plan.busy || Boolean(plan.error) || state.lacks_masks || !due;
+  const {job, plan} = state, due = plan.due.length, running = job.state === 'running', resumes = wasPreparing();
+  const isDone = !due && Boolean(state.result) && !isBusy() && !plan.busy;
+  $('run').hidden = isBusy() || (isDone && !state.lacks_masks);
+  $('run').disabled = Boolean(state.lost) || plan.busy || (!resumes && (Boolean(plan.error) || state.lacks_masks || !due));
   $('run').textContent = job.state === 'stopped' || job.state === 'failed' ? 'Go on' : 'Start';
   $('halt').hidden = !running;
+  $('look').hidden = !state.result || isBusy() || !(isDone || state.lost);
+  $('look').href = `#${encodeURIComponent(scene)}/result`;
   $('bar').hidden = !isBusy();
-  if (job.left != null && plan.seconds) $('bar').value = Math.max(0, 1 - job.left / plan.seconds); else $('bar').removeAttribute('value');
+  if (job.whole != null) $('bar').value = job.whole; else $('bar').removeAttribute('value');
   let lead = '';
   if (job.state === 'elsewhere') lead = `${job.words}.`;
-  else if (running && job.target !== 'all') lead = `Prepares the step Object, up to the stage ${job.target}: ${job.stage || 'planning'}.`;
-  else if (running) lead = job.stage ? `Runs the stage ${job.stage}, which ${MEANING[job.stage] || 'is needed'}.` : 'Plans the next stage.';
+  else if (running && job.target !== 'all') lead = `Preparing the step Object: the program ${job.stage ? sentence(job.stage) : 'plans what to do'}.${state.has_poses ? ' You can mark the object there meanwhile.' : ''}`;
+  else if (running) lead = job.stage ? `Now the program ${sentence(job.stage)}.` : 'Now the program plans the next step.';
+  else if (state.lost) lead = state.lost;
   else if (job.state === 'failed') lead = `The job failed: ${job.words}`;
   else if (plan.busy) lead = 'Looking at what has to run …';
+  else if (resumes) lead = 'Preparing the photographs was stopped. Go on from there; you can mark the object meanwhile.';
+  else if (state.lacks_masks && state.has_unsaved_marks) lead = 'Your marks are not saved yet: save the masks in the step Object.';
   else if (state.lacks_masks) lead = 'The object is not marked yet: go to the step Object.';
   else if (plan.error) lead = plan.error;
-  else if (!due && state.result) lead = 'Everything is done. Look at the result, or paint a view.';
+  else if (isDone) lead = 'Everything is done.';
   else if (job.state === 'stopped') lead = job.words;
-  else lead = state.result ? 'Something changed: only the stages that depend on it run again.' : 'Fits the scene, removes the object, and fills the hole. You may close this page meanwhile.';
+  else lead = state.result ? 'Something changed. Start runs the steps again that depend on it.' : 'Builds the scene in 3D, removes the object, and fills the hole. You may close this page meanwhile.';
   $('start-lead').textContent = lead;
-  $('start-lead').classList.toggle('wrong', job.state === 'failed' || (Boolean(plan.error) && !plan.busy && !isBusy()));
+  $('start-lead').classList.toggle('wrong', !isBusy() && !plan.busy && (Boolean(state.lost) || (!resumes && (job.state === 'failed' || Boolean(plan.error)))));
   $('total').textContent = isBusy() ? (job.left ? `about ${duration(job.left)} left` : '') :
     due && !plan.busy && !plan.error && plan.seconds ? `about ${duration(plan.seconds)} in all` : '';
   if (changed('stages', [plan.stages, job.stage, job.done])) {
     $('stages').tBodies[0].replaceChildren(...plan.stages.map(each => {
       const done = ['cached', 'provided'].includes(each.word) || job.done.includes(each.name);
       const kind = each.name === job.stage ? 'running' : done ? 'done' : each.word === 'skip' ? 'skip' : each.word === 'missing' ? 'missing' : '';
-      const row = make('tr', '', {className: kind});
-      const what = make('td', MEANING[each.name] || '');
-      if (!done && !/^(not run yet|waits for|left out if)/.test(each.reason)) what.append(make('small', each.reason));
-      row.append(make('td', each.name), what, make('td', done || kind === 'skip' ? '' : duration(each.seconds)));
+      const row = make('tr', '', {className: kind, title: [each.name, each.reason].filter(Boolean).join(': ')});
+      const what = make('td', sentence(each.name));
+      const why = kind === 'missing' ? each.reason : kind === 'skip' ? 'not needed for this scene' :
+        done || /^(not run yet|waits for|left out if)/.test(each.reason) || !each.reason ? '' : 'runs again, because something that it depends on changed';
+      if (why) what.append(make('small', why));
+      row.append(what, make('td', done || kind === 'skip' ? '' : duration(each.seconds)));
       return row;
     }));
   }
@@ -343,12 +381,14 @@ function drawStart() {
   }
 }
 
-const act = (name, id = 'start-lead') => ask(at(`do/${name}`), {}).catch(error => { $(id).textContent = error.message; });
+const act = (name, id = 'start-lead', body = {}) => ask(at(`do/${name}`), body).catch(error => { $(id).textContent = error.message; });
 $('run').addEventListener('click', () => {
+  if (wasPreparing()) { $('run').disabled = true; act('mask'); return; }
   if (state.has_unsaved_marks && !confirm('Your last marks are not in the saved masks. Start without them? (To use them, save the masks in the step Object.)')) return;
   $('run').disabled = true;
   act('start');
 });
+$('resume').addEventListener('click', () => act('mask', 'method'));
 $('halt').addEventListener('click', async () => {
   $('halt').disabled = true;
   $('start-lead').textContent = 'Stopping …';
@@ -369,11 +409,11 @@ async function drawLive() {
     }
     return;
   }
-  if (!state.has_state) { $('live-lead').textContent = 'Comes with the stage fit.'; return; }
+  if (!state.has_state) { $('live-lead').textContent = 'The 3D view opens when the scene is built in 3D, with the object.'; return; }
   if (!changed('live', follows)) return;
   $('live-lead').textContent = 'The viewer starts …';
   try {
-    const {port} = await ask(at('do/live'), {});
+    const {port} = await ask(at('live'), {});
     $('viewer').src = `http://${location.hostname}:${port}/`;
     $('viewer').hidden = false;
     $('live-lead').textContent = follows ? 'The scene as it is now; it reloads when there is a newer state. Drag to turn, wheel to zoom.' : 'The finished scene. Drag to turn, wheel to zoom.';
@@ -385,10 +425,14 @@ async function drawLive() {
 function drawResult() {
   const {result} = state;
   $('compare').hidden = $('remedies').hidden = !result;
-  if (!result) { $('verdict').textContent = 'The result comes at the end of the job.'; return; }
-  $('verdict').textContent = result.verdict || 'The scene is finished.';
+  const words = !result ? ['The result comes at the end of the job.'] : result.verdict.length ? result.verdict : ['The scene is finished.'];
+  if (changed('verdict', words)) $('verdict').replaceChildren(...words.map(each => make('p', each)));
+  if (!result) return;
   $('correct').href = `#${encodeURIComponent(scene)}/object`;
   $('complete').href = `#${encodeURIComponent(scene)}/paint`;
+  $('against').parentElement.hidden = !result.has_fit;
+  if (!result.has_fit) $('against').value = 'photo';
+  $('filled').textContent = result.is_painted ? 'from the picture that you gave' : 'made up in one picture, and used for all views';
   if (changed('views', result.views)) $('view').replaceChildren(...result.views.map(name => make('option', name)));
   if (!result.views.includes(shownView)) choose(result.views.find(name => result.rendered.includes(name)) || result.views[0]);
   else if (changed('compared', [shownView, state.version])) choose(shownView);
@@ -398,7 +442,9 @@ function choose(name) {
   shownView = name;
   changed('compared', [shownView, state.version]);
   $('view').value = name;
-  $('before').src = picture('photo', name);
+  const kind = $('against').value;
+  $('before').src = picture(kind, name);
+  $('slider').querySelector('b.l').textContent = $('before').alt = kind === 'photo' ? 'photograph' : 'with the object';
   $('after').src = picture('result', name);
   $('overlay').src = picture('unsure', name);
 }
@@ -408,11 +454,91 @@ function move(by) {
   choose(views[(views.indexOf(shownView) + by + views.length) % views.length]);
 }
 
-$('before').addEventListener('load', () => $('slider').style.setProperty('--ratio', $('before').naturalWidth / $('before').naturalHeight));
+// The pictures on the slider: magnification, and the place of their upper left corner in px; and fingers on them.
+const MOST_ZOOM = 16, NEAR = 28;  // px around the line in which a press moves it
+let zoom = 1, corner = [0, 0], line = 0.5, grip = null;
+const fingers = new Map();
+
+function placePictures() {
+  const box = $('slider').getBoundingClientRect(), sides = [box.width, box.height];
+  zoom = Math.min(Math.max(zoom, 1), MOST_ZOOM);
+  corner = corner.map((place, k) => Math.min(0, Math.max(place, sides[k] * (1 - zoom))));
+  $('slider').style.setProperty('--view', zoom > 1 ? `translate(${corner[0]}px, ${corner[1]}px) scale(${zoom})` : 'none');
+  $('slider').classList.toggle('zoomed', zoom > 1);
+  $('slider').style.setProperty('--at', `${100 * line}%`);
+  $('slider').querySelector('input').value = 1000 * line;
+}
+
+// Magnify about a point of the slider, in px; without one about its centre.
+function magnify(factor, point) {
+  const box = $('slider').getBoundingClientRect(), [x, y] = point || [box.width / 2, box.height / 2];
+  const before = zoom;
+  zoom = Math.min(Math.max(zoom * factor, 1), MOST_ZOOM);
+  corner = [x - (x - corner[0]) * zoom / before, y - (y - corner[1]) * zoom / before];
+  placePictures();
+}
+
+function onSlider(event) {
+  const box = $('slider').getBoundingClientRect();
+  return [event.clientX - box.left, event.clientY - box.top];
+}
+
+function press(event) {
+  if (event.button) return;
+  const [x, y] = onSlider(event), width = $('slider').clientWidth;
+  $('slider').setPointerCapture(event.pointerId);
+  fingers.set(event.pointerId, [x, y]);
+  const moves_line = fingers.size === 1 && (zoom === 1 || Math.abs(x - line * width) < NEAR);
+  grip = fingers.size > 1 ? 'pinch' : moves_line ? 'line' : 'pictures';
+  if (grip === 'line') drag(event);
+}
+
+function drag(event) {
+  const last = fingers.get(event.pointerId), now = onSlider(event);
+  if (!last) return;
+  const distance = () => { const [a, b] = [...fingers.values()]; return Math.hypot(a[0] - b[0], a[1] - b[1]) || 1; };
+  const before = fingers.size > 1 ? distance() : 1;
+  fingers.set(event.pointerId, now);
+  if (grip === 'line') line = Math.min(Math.max(now[0] / $('slider').clientWidth, 0), 1);
+  else if (grip === 'pictures') corner = corner.map((place, k) => place + now[k] - last[k]);
+  else if (fingers.size > 1) {
+    const [a, b] = [...fingers.values()];
+    magnify(distance() / before, [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2]);
+  }
+  placePictures();
+}
+
+function release(event) {
+  fingers.delete(event.pointerId);
+  if (!fingers.size) grip = null;
+}
+
+$('slider').addEventListener('pointerdown', press);
+$('slider').addEventListener('pointermove', drag);
+for (const name of ['pointerup', 'pointercancel']) $('slider').addEventListener(name, release);
+$('slider').addEventListener('wheel', event => {
+  event.preventDefault();
+  magnify(Math.exp(-event.deltaY * (event.deltaMode ? 33 : 1) / 400), onSlider(event));
+}, {passive: false});
+$('larger').addEventListener('click', () => magnify(1.6));
+$('smaller').addEventListener('click', () => magnify(1 / 1.6));
+$('whole').addEventListener('click', () => magnify(0));
+$('full').hidden = !$('compare').requestFullscreen;
+$('full').addEventListener('click', () => document.fullscreenElement ? document.exitFullscreen() : $('compare').requestFullscreen());
+document.addEventListener('fullscreenchange', () => {
+  $('full').textContent = document.fullscreenElement ? 'Leave full screen' : 'Full screen';
+  placePictures();
+});
+addEventListener('resize', placePictures);
+$('before').addEventListener('load', () => {
+  $('slider').style.setProperty('--ratio', $('before').naturalWidth / $('before').naturalHeight);
+  placePictures();
+});
 $('view').addEventListener('change', () => choose($('view').value));
+$('against').addEventListener('change', () => choose(shownView));
 $('previous').addEventListener('click', () => move(-1));
 $('following').addEventListener('click', () => move(1));
-$('slider').querySelector('input').addEventListener('input', event => $('slider').style.setProperty('--at', `${event.target.value / 10}%`));
+$('slider').querySelector('input').addEventListener('input', event => { line = event.target.value / 1000; placePictures(); });
 $('unsure').addEventListener('change', () => { $('overlay').hidden = $('legend').hidden = !$('unsure').checked; });
 addEventListener('keydown', event => {
   if (step !== 'result' || !state || !state.result || event.target.tagName === 'SELECT' || event.ctrlKey || event.metaKey || event.altKey) return;
@@ -427,20 +553,21 @@ addEventListener('keydown', event => {
 function drawPaint() {
   const views = state.to_paint;
   $('paint-lead').textContent = views.length ?
-    'Grey is what no photograph shows. Paint a view here; or download it, complete the grey part with any program, keep the framing, and upload it. Then Start runs what depends on it.' :
-    'Nothing has to be painted: the photographs show all that the object hid, or scene.yaml names a reference.';
+    'The grey part is what no photograph shows. Paint it here. Or download the picture, paint the grey part with any program without cropping the picture, and upload it. The next Start uses your picture.' :
+    'Nothing has to be painted: the photographs show everything behind the object, or scene.yaml names a reference picture.';
   if (!changed('paint', [views, state.version])) return;
   $('paintings').replaceChildren(...views.map((each, k) => {
     const address = at(`paint/${encodeURIComponent(each.view)}`), figure = make('figure'), row = make('p', '', {className: 'row'});
     const file = make('input', '', {type: 'file', accept: 'image/png,image/jpeg,image/webp', hidden: true});
-    const button = make('button', each.painted ? 'Upload another' : 'Upload completed');
+    const button = make('button', each.painted ? 'Upload another' : 'Upload');
     button.addEventListener('click', () => file.click());
     file.addEventListener('change', () => paint(address, file.files[0]));
-    const words = `${each.view}: shows ${Math.round(100 * each.share)} % of the hole${k ? ' that the views before do not show' : ''}${each.painted ? '. Painted.' : ''}`;
+    const share = `${Math.round(100 * each.share)} %`, picture_ = each.painted ? `${address}/painted?${each.painted}` : `${address}?${state.version}`;
+    const words = `${each.view}: ${k ? 'another ' : ''}${share} of the missing part can be painted in this view.${each.painted ? ' You painted it.' : ''}`;
     const here = make('button', 'Paint here', {className: 'main'});
     here.addEventListener('click', () => beginPainting(address));
     row.append(here, make('a', 'Download', {className: 'button', href: address, download: `${each.view}.png`}), button, file);
-    figure.append(make('img', '', {src: `${address}?${state.version}`, alt: `${each.view}, to be painted`, loading: 'lazy'}), make('p', words), row);
+    figure.append(make('img', '', {src: picture_, alt: `${each.view}, ${each.painted ? '' : 'to be '}painted`, loading: 'lazy'}), make('p', words), row);
     return figure;
   }));
 }
@@ -546,12 +673,16 @@ $('leave').addEventListener('click', () => { easel = null; drawEasel(); });
 // ------------------------------------------------------------------------------------------------ export
 
 function drawExport() {
-  const {busy, error, files} = state.export, made = Object.keys(files).length > 1;
+  const {work, share, error, has_npm: npm, files} = state.export, made = Object.keys(files).length > 1;
   $('export-lead').textContent = 'Files for other tools, in the coordinates of the capture.';
-  $('make').disabled = Boolean(busy) || isBusy();
+  $('make').disabled = Boolean(work) || isBusy();
+  $('sog').disabled = !npm;
+  $('sog-words').textContent = npm ? 'also .sog, for the web: takes minutes, and the first time downloads 210 MB' : 'also .sog: needs Node with npm, which is not installed here';
+  $('made').hidden = !work;
+  if (share != null) $('made').value = share; else $('made').removeAttribute('value');
   $('make').textContent = made ? 'Make all formats again' : 'Make all formats';
-  $('making').textContent = busy ? `making: ${busy} …` : error;
-  $('making').classList.toggle('wrong', Boolean(error) && !busy);
+  $('making').textContent = work ? `Making ${work}${share != null ? `, ${Math.round(100 * share)} %` : ' …'}` : error;
+  $('making').classList.toggle('wrong', Boolean(error) && !work);
   if (!changed('exports', files)) return;
   $('exports').replaceChildren(...Object.entries(files).map(([name, {words, bytes}]) => {
     const item = make('li');
@@ -561,7 +692,9 @@ function drawExport() {
   }));
 }
 
-$('make').addEventListener('click', () => { $('make').disabled = true; act('export', 'making'); });
+$('make').addEventListener('click', () => { $('make').disabled = true; act('export', 'making', {sog: $('sog').checked}); });
 
+// The cookie has the token by now, and the address bar should not show it.
+if (location.search) history.replaceState(null, '', location.pathname + location.hash);
 addEventListener('hashchange', route);
 route();

@@ -1,0 +1,87 @@
+"""Reads the CSV file "Internal/External camera parameters" of RealityCapture and RealityScan.
+
+A row holds the position of a camera (x, y, alt), its orientation in degrees, and its lens. Heading, pitch and roll of 0
+mean a camera that looks down the axis of alt, with the top of its picture towards y. The heading turns it clockwise as
+seen from above; pitch and roll turn it about its own x and y axis. The focal length is that of a picture 36 mm wide.
+The principal point is an offset from the picture's center, in units of the longer side.
+"""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from reffusion.capture.layouts.capture import Capture, Correction, invert_pose
+from reffusion.capture.layouts.placed import Placed, read_placed
+from reffusion.capture.lens import Lens
+from reffusion.io.files import BadInput, as_bad_input, reading
+
+COLUMNS = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")  # the other columns may be missing
+FLIP = np.diag([1.0, -1.0, -1.0])  # from the axes of a camera of the file (y up, looking along -z) to ours
+
+
+def find(folder: Path) -> Path | None:
+    """Return the first CSV file in the scene's folder that has these columns; None without such a file."""
+    return next((path for path in sorted(folder.glob("*.csv")) if path.is_file() and _columns(path)[1]), None)
+
+
+def _columns(path: Path) -> tuple[int, list[str]]:
+    """Return the number of lines up to the names of the columns, and these names, in lower case and without the #.
+
+    A line with the number of cameras may stand before. There are no names if the file is of another kind.
+    """
+    with open(path, encoding="utf-8-sig", errors="replace", newline="") as file:
+        for number in (1, 2):
+            names = [name.strip().lstrip("#").lower() for name in file.readline(10_000).split(",")]
+            if set(COLUMNS) <= set(names):
+                return number, names
+    return 0, []
+
+
+def read(folder: Path, source: Path, images: str | None, correction: Correction) -> Capture:
+    """Read the capture. `source`: the CSV file; `images`, `correction`: as in `read_placed`.
+
+    Raises:
+        BadInput: the file is damaged, or another one lies beside it; or as for `read_placed`.
+    """
+    if others := [path for path in sorted(folder.glob("*.csv")) if path != source and _columns(path)[1]]:
+        raise BadInput(f"{others[0]}: cameras of RealityCapture, as in {source.name} beside it; keep one of both files")
+    head, names = _columns(source)
+    with reading(source, "cameras of RealityCapture"), open(source, encoding="utf-8-sig", newline="") as file:
+        lines = list(csv.reader(file))[head:]
+    placed = {}
+    for number, cells in enumerate(lines, start=head + 1):
+        if cells:
+            row = dict(zip(names, cells, strict=False))
+            if row["name"] in placed:
+                raise BadInput(f"{source}: line {number}: another camera of '{row['name']}'; keep one")
+            placed[row["name"]] = _parse_row(row, source, number)
+    return read_placed(folder, images, "realitycapture", source, placed, correction)
+
+
+def _parse_row(row: dict[str, str], source: Path, line: int) -> Placed:
+    with as_bad_input(source, f"readable in line {line}"):
+        number = lambda name: float(row.get(name) or 0.0)
+        focal, center = float(row["f"]), (number("px"), number("py"))
+        radial, tangential = [number(f"k{k}") for k in (1, 2, 3, 4)], (number("t1"), number("t2"))
+        camera_to_world = np.eye(4)
+        camera_to_world[:3, :3] = _rotation(*(float(row[name]) for name in ("heading", "pitch", "roll"))) @ FLIP
+        camera_to_world[:3, 3] = [float(row[name]) for name in ("x", "y", "alt")]
+
+    def lens(size: tuple[int, int]) -> Lens:
+        (width, height), longer = size, max(size)
+        f, cx, cy = focal / 36 * longer, width / 2 + center[0] * longer, height / 2 + center[1] * longer
+        return Lens(width, height, f, f, cx, cy, tuple(radial), tangential=tangential, model="RealityCapture")
+
+    return Placed(invert_pose(camera_to_world), lens)
+
+
+def _rotation(heading: float, pitch: float, roll: float) -> np.ndarray:
+    """Return the rotation [3, 3] from the camera (y up, looking along -z) to the world, for angles in degrees."""
+    (sh, sp, sr), (ch, cp, cr) = (each(np.radians((heading, pitch, roll))) for each in (np.sin, np.cos))
+    turned = np.array([[ch, sh, 0], [-sh, ch, 0], [0, 0, 1]])
+    pitched = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
+    rolled = np.array([[cr, 0, sr], [0, 1, 0], [-sr, 0, cr]])
+    return turned @ pitched @ rolled
