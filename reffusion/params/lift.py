@@ -16,6 +16,6 @@ class Params(Settings):
     inpainter: Inpainter[Kind] = Inpainter[Kind](kind="fsr")
     prior: str = prior_field()
     prompt: str = Field("", description="prompt for the inpainted region, for text-conditioned priors")
-    guidance: float = Field(0.0, ge=0, description="the paper's a; no effect without a prompt")
+    guidance: float = Field(0.0, ge=0, description="γ of (1 + γ) ε(cond) - γ ε(empty); no effect without a prompt")
     steps: int = Field(50, ge=1, description="sampler steps from pure noise")
     device: Device = "cpu"
