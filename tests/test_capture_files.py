@@ -382,7 +382,9 @@ def test_files_that_are_no_pictures_are_named(tmp_path, monkeypatch):
     Image.init()  # registers every format before the table of formats is replaced
     monkeypatch.setattr(Image, "OPEN", {kind: opener for kind, opener in Image.OPEN.items() if kind != "HEIF"})
     (folder / "images/v01.png").write_text("<html>404</html>")
-    with pytest.raises(BadInput, match=r"v01\.png: not a readable image \(UnidentifiedImageError"):
+    with pytest.raises(
+        BadInput, match=r"v01\.png: not a readable image; save it anew as JPEG or PNG \(UnidentifiedImageError"
+    ):
         plan.preview(Params(), folder)
 
 

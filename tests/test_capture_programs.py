@@ -395,6 +395,12 @@ def test_a_workspace_of_automatic_reconstruction(tmp_path):
 EXPORT = "export a COLMAP model or transforms.json from it"
 UNREAD = {
     "images/v00.xmp": ("http://www.capturingreality.com/ns/xcr/1.1#", "RealityCapture", "export its Internal/External"),
+    "images/v00.XMP": (
+        'xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#"',
+        "RealityCapture",
+        "export its Internal/",
+    ),
+    "images/registration.csv": ("#name,x,y,alt,heading,pitch,roll", "RealityCapture", "export its Internal/External"),
     "cameras.xml": ('<?xml version="1.0"?><document version="2.0.0"><chunk label="1">', "Metashape", EXPORT),
     "blocks.xml": ('<?xml version="1.0"?><BlocksExchange version="2.1">', "ContextCapture", EXPORT),
     "metadata.json": ('{"w": 96, "K": [], "poses": []}', "Record3D", "convert it by `ns-process-data record3d`"),
@@ -473,13 +479,15 @@ def test_camera_raw_among_photographs(tmp_path):
         (["images/a.jxl"], "images holds 1 .jxl pictures"),
         (["clip.MP4"], r"give the video itself: scene=.*clip.MP4"),
         (["IMG one/a.png", "IMG one/b.png"], "IMG one holds 2 pictures: name their folder as `images: IMG one` in"),
+        (["one/rgb/a.png"], "one/rgb holds 1 picture: give the folder of the capture: scene=.*/one$"),
+        (["DCIM/a.MP4"], "give the video itself: scene=.*/DCIM/a.MP4$"),
         (["capture.zip"], "unpack capture.zip"),
         ([], "name their folder as `images` in scene.yaml"),
     ],
 )
 def test_folders_without_pictures(tmp_path, files, hint):
     for name in files:
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"")
     with pytest.raises(BadInput, match=f"no pictures in images, photos, input, rgb, .; {hint}"):
         load_capture(tmp_path)
