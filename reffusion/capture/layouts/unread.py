@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 RAW = (".dng", ".raw", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".x3f", ".3fr")
 PICTURES = {  # ending -> (kind of picture, what to do)
     **dict.fromkeys(RAW, ("camera raw", "develop them to JPEG")),
+    **dict.fromkeys((".exr", ".hdr"), ("high dynamic range", "save them as JPEG")),
     **dict.fromkeys((".jxl", ".jp2", ".gif", ".psd"), ("a format of pictures that is not read", "save them as JPEG")),
 }
 ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".gz", ".r3d")
@@ -52,7 +53,10 @@ POSE_FILES = (
     ),
     PoseFile("*.xml", "Metashape", EXPORT, b"<chunk"),
     PoseFile("*.xml", "ContextCapture", EXPORT, b"<BlocksExchange"),
-    PoseFile("metadata.json", "Record3D", "convert it by `ns-process-data record3d`", b'"poses"'),
+    *(
+        PoseFile(name, "Record3D", "convert it by `ns-process-data record3d`", b'"poses"')
+        for name in ("metadata.json", "metadata")
+    ),
     PoseFile("odometry.csv", "Stray Scanner", "convert it to transforms.json"),
     PoseFile("frame_*.json", "3D Scanner App", "convert it to transforms.json", b"cameraPose"),
     PoseFile("sfm_data.json", "OpenMVG", "convert it by openMVG_main_openMVG2Colmap"),
