@@ -451,6 +451,7 @@ def test_masks_beside_photographs(tmp_path, word):
 
 def test_a_file_of_bundler_under_another_name_and_a_camera_of_polycam_without_a_size(tmp_path):
     truth = make_truth(RADIAL)
+    (tmp_path / "a").mkdir()
     write_bundler(tmp_path / "a", truth)
     (tmp_path / "a/bundle.out").rename(tmp_path / "a/scan.out")
     (tmp_path / "a/other.out").write_text("training ended\n")
