@@ -24,8 +24,6 @@ class Camera:
         width, height: image size in pixels.
         fx, fy, cx, cy: focal lengths and principal point in pixels.
         world_to_camera: [4, 4] float64 rigid transform. In the camera's axes z points forward, x right, y down.
-        every: 1 for a complete view. For a view that consists of every n-th pixel of another view (`sampled`), n. The
-            rasterizer divides the low-pass by n^2, so that it has the same width in the scene as in the other view.
     """
 
     name: str
@@ -36,7 +34,6 @@ class Camera:
     cx: float
     cy: float
     world_to_camera: np.ndarray
-    every: int = 1
 
     @cached_property
     def intrinsics(self) -> np.ndarray:
@@ -63,28 +60,6 @@ class Camera:
         """Return the view at a reduced resolution, with no side above `longest` px; small views stay the same."""
         share = min(1.0, longest / max(self.width, self.height))
         return self.resized(max(1, round(self.width * share)), max(1, round(self.height * share)))
-
-    def sampled(self, every: int, left: int, top: int) -> Camera:
-        """Return the view that consists of every `every`-th pixel of this view in both directions.
-
-        A rendering of the result has the same values as a rendering of this view at these pixels, because Gaussians
-        keep the width that they have in this view (see the attribute `every`).
-
-        Args:
-            every: distance of the selected pixels, in pixels of this view.
-            left, top: column and row of the first selected pixel.
-        """
-        sparse = lambda at, first: (at - first - 0.5) / every + 0.5  # the centre of the first pixel stays at 0.5
-        return replace(
-            self,
-            width=-(-(self.width - left) // every),
-            height=-(-(self.height - top) // every),
-            fx=self.fx / every,
-            fy=self.fy / every,
-            cx=sparse(self.cx, left),
-            cy=sparse(self.cy, top),
-            every=self.every * every,
-        )
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
         """Return the view that shows a window of this view.

@@ -377,12 +377,19 @@ def test_composed_and_decomposed_accents_are_one_name(tmp_path):
     assert len(mask_shares(out)) == 6
 
 
-def test_files_that_are_no_pictures_are_named(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("<html>404</html>", r"not a readable image; save it anew as JPEG or PNG \(UnidentifiedImageError"),
+        ("version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "a pointer of Git LFS, not the file; download"),
+    ],
+)
+def test_files_that_are_no_pictures_are_named(tmp_path, monkeypatch, content, message):
     folder = write_capture(tmp_path / "s", "colmap", make_truth())
     Image.init()  # registers every format before the table of formats is replaced
     monkeypatch.setattr(Image, "OPEN", {kind: opener for kind, opener in Image.OPEN.items() if kind != "HEIF"})
-    (folder / "images/v01.png").write_text("<html>404</html>")
-    with pytest.raises(BadInput, match=r"v01\.png: not a readable image \(UnidentifiedImageError"):
+    (folder / "images/v01.png").write_text(content)
+    with pytest.raises(BadInput, match=rf"v01\.png: {message}"):
         plan.preview(Params(), folder)
 
 

@@ -282,6 +282,12 @@ def test_lists_of_training_and_test_views(tmp_path, lists, train, test):
     assert sorted(capture.unused, reverse=True) == unused and len(capture.warnings) == bool(unused)
 
 
+def test_a_list_of_test_pictures_beside_a_model(tmp_path):
+    write_capture(tmp_path, "colmap", make_truth())
+    (tmp_path / "sparse/0/test.txt").write_text("v01.png\r\nv04\n")
+    assert load_capture(tmp_path).test == ("v01", "v04")
+
+
 def test_scene_yaml_prevails_over_lists(tmp_path):
     write_capture(tmp_path, "transforms", make_truth())
     lists = {"train_filenames": ["images/v00.png", "images/v01.png"], "test_filenames": ["images/v05.png"]}
@@ -395,8 +401,15 @@ def test_a_workspace_of_automatic_reconstruction(tmp_path):
 EXPORT = "export a COLMAP model or transforms.json from it"
 UNREAD = {
     "images/v00.xmp": ("http://www.capturingreality.com/ns/xcr/1.1#", "RealityCapture", "export its Internal/External"),
+    "images/v00.XMP": (
+        'xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#"',
+        "RealityCapture",
+        "export its Internal/",
+    ),
+    "images/registration.csv": ("#name,x,y,alt,heading,pitch,roll", "RealityCapture", "export its Internal/External"),
     "cameras.xml": ('<?xml version="1.0"?><document version="2.0.0"><chunk label="1">', "Metashape", EXPORT),
     "blocks.xml": ('<?xml version="1.0"?><BlocksExchange version="2.1">', "ContextCapture", EXPORT),
+    "metadata": ('{"w": 96, "K": [], "poses": []}', "Record3D", "convert it by `ns-process-data record3d`"),
     "metadata.json": ('{"w": 96, "K": [], "poses": []}', "Record3D", "convert it by `ns-process-data record3d`"),
     "sfm_data.json": ("{}", "OpenMVG", "convert it by openMVG_main_openMVG2Colmap"),
     "cameras.sfm": ("{}", "Meshroom", EXPORT),
@@ -426,6 +439,29 @@ def test_other_tables_and_sidecars_are_not_poses(tmp_path):
     (tmp_path / "prices.csv").write_text("name,x,y\n")
     (tmp_path / "metadata.json").write_text('{"author": "me"}')
     assert load_capture(tmp_path).warnings == ()
+
+
+@pytest.mark.parametrize("word", ["_matte", "-segmentation", ".alpha"])
+def test_masks_beside_photographs(tmp_path, word):
+    write_pictures(tmp_path / "images", ["a", "b", "c"])
+    write_masks(tmp_path / "images", [f"{name}{word}" for name in "abc"])
+    capture = load_capture(tmp_path)
+    assert [*capture.pictures] == ["a", "b", "c"] and [*load_roles(tmp_path, capture).masks[""]] == ["a", "b", "c"]
+
+
+def test_a_file_of_bundler_under_another_name_and_a_camera_of_polycam_without_a_size(tmp_path):
+    truth = make_truth(RADIAL)
+    (tmp_path / "a").mkdir()
+    write_bundler(tmp_path / "a", truth)
+    (tmp_path / "a/bundle.out").rename(tmp_path / "a/scan.out")
+    (tmp_path / "a/other.out").write_text("training ended\n")
+    assert load_capture(tmp_path / "a").pose_source == tmp_path / "a/scan.out"
+    write_polycam(tmp_path / "b", truth)
+    for path in tmp_path.glob("b/keyframes/*cameras/*.json"):
+        record = json.loads(path.read_text())
+        path.write_text(json.dumps({key: value for key, value in record.items() if key not in ("width", "height")}))
+    lenses = load_capture(tmp_path / "b").poses.lenses
+    assert {(lens.width, lens.height) for lens in lenses.values()} == {(WIDTH, HEIGHT)}
 
 
 @pytest.mark.parametrize("ending", [".jfif", ".jpe", ".avif"])
@@ -473,13 +509,15 @@ def test_camera_raw_among_photographs(tmp_path):
         (["images/a.jxl"], "images holds 1 .jxl pictures"),
         (["clip.MP4"], r"give the video itself: scene=.*clip.MP4"),
         (["IMG one/a.png", "IMG one/b.png"], "IMG one holds 2 pictures: name their folder as `images: IMG one` in"),
+        (["one/rgb/a.png"], "one/rgb holds 1 picture: give the folder of the capture: scene=.*/one$"),
+        (["DCIM/a.MP4"], "give the video itself: scene=.*/DCIM/a.MP4$"),
         (["capture.zip"], "unpack capture.zip"),
         ([], "name their folder as `images` in scene.yaml"),
     ],
 )
 def test_folders_without_pictures(tmp_path, files, hint):
     for name in files:
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"")
     with pytest.raises(BadInput, match=f"no pictures in images, photos, input, rgb, .; {hint}"):
         load_capture(tmp_path)

@@ -398,24 +398,6 @@ def test_a_dense_start_looks_at_half_the_size_first():
     )
 
 
-def test_sparse_steps_look_at_every_pixel_in_four_turns(monkeypatch):
-    camera = make_camera("v", (7, 5), 5.0)
-    image, counts = np.zeros((5, 7, 3), np.uint8), np.arange(35, dtype=np.float32).reshape(5, 7)
-    image[..., 0] = counts
-    args = [camera], {"v": image}, {"v": counts}, range(5), 0
-    # Pictures below MIN_SPARSE_PIXELS are always shown in full.
-    assert all(look[0] == camera for look in view_loader.iterate_views(*args, sparse=range(4)))
-    monkeypatch.setattr(view_loader, "MIN_SPARSE_PIXELS", 35)
-    looks = list(view_loader.iterate_views(*args, sparse=range(4)))
-    assert sorted(np.concatenate([weights.flatten() for _, _, weights in looks[:4]])) == list(range(35))
-    for seen, target, weights in looks[:4]:
-        assert target.shape[:2] == weights.shape == (seen.height, seen.width) and seen.every == 2
-        assert torch.equal((255 * target[..., 0]).round(), weights)
-    assert looks[4][0] == camera
-    settings = Params(iterations=10, init=Init(flow_cell=3), densify=Densify(stop=0.5))
-    assert step.sparse_steps(settings) == range(5, 9) and not step.sparse_steps(Params(iterations=10))
-
-
 def test_the_end_of_a_fit_is_a_mean_where_no_gaussian_is_added_any_more():
     counted = lambda **changed: [k for k in range(1, 101) if step.is_averaged(Params(iterations=100, **changed), k)]
     assert counted() == [], "as 3DGS"

@@ -118,19 +118,6 @@ def test_cropped_view():
     assert_matches_reference(random_cloud(100, -3.0), view.cropped(17, 9, 32, 24))
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_a_sampled_view_draws_those_pixels_of_the_whole(antialiased):
-    gaussians, whole = replace(random_cloud(60, -3.0), antialiased=antialiased), off_center_camera(40, 29)
-    pixels = rasterizer.render(gaussians, whole, background=torch.tensor([0.2, 0.3, 0.4]))
-    for left, top in ((0, 0), (1, 0), (2, 1)):
-        sampled = whole.sampled(3, left, top)
-        exact = assert_matches_reference(gaussians, sampled)
-        for name in ("color", "depth", "alpha"):
-            expected = getattr(pixels, name)[top::3, left::3]
-            assert getattr(exact, name).shape == expected.shape
-            assert (getattr(exact, name) - expected).abs().max() < 1e-4, name
-
-
 @pytest.mark.parametrize("footprint", [30.0, 300.0, 3000.0])
 def test_needles(footprint):
     """Gaussians 1000 times longer than wide, `footprint` px long, at random angles."""

@@ -16,7 +16,8 @@ from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS
 
 MASK_FOLDERS = ("label", "test_label", "masks", "mask")  # sub-folders of a folder of pictures that hold masks
-MASK_SUFFIXES = ("_mask", ".mask", "-mask", "_seg")  # `A_mask.png` is the mask of `A.png` in the same folder
+MASK_WORDS = ("mask", "seg", "segmentation", "matte", "alpha", "silhouette", "label")
+MASK_SUFFIXES = tuple(mark + word for mark in "_-." for word in MASK_WORDS)  # `A_mask.png` beside `A.png` is its mask
 MASK_PREFIXES = ("dynamic_mask_", "mask_")  # so is `mask_A.png`
 MASK_ENDINGS = (".json", ".npy")  # endings of masks that are no pictures, in lower case
 

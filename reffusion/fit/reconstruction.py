@@ -19,7 +19,6 @@ from reffusion.fit.step import (
     control_density,
     degree_at,
     learning_rates,
-    sparse_steps,
     squared_error,
     step,
 )
@@ -96,10 +95,10 @@ def fit(
     trace_inputs = (held_out, images, settings, impl)
     if run.iteration == 0:
         _write_line(log, run, *trace_inputs)
-    steps, view_schedule = range(run.iteration, settings.iterations), (coarse_steps(settings), sparse_steps(settings))
+    steps, coarse = range(run.iteration, settings.iterations), coarse_steps(settings)
     for i, (camera, target, counts) in zip(
         trace.progress(settings.iterations, label, run.iteration),
-        iterate_views(cameras, images, weights, steps, settings.seed, *view_schedule, optimizer.masked.device),
+        iterate_views(cameras, images, weights, steps, settings.seed, coarse, optimizer.masked.device),
         strict=True,
     ):
         run.count(*step(optimizer, run.exposures, camera, target, counts, settings, i, impl))

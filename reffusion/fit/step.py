@@ -29,7 +29,6 @@ REFIT_RATES = Rates(
     means=4e-4, means_last=2e-5, quaternions=2e-3, log_scales=5e-3, opacity_logits=0.05, sh_dc=5e-3, sh_rest=5e-4
 )
 COARSE_SHARE = 0.3  # share of the steps, at the start, that use views of half the size
-SPARSE_UNTIL = 0.9  # share of the steps up to which every second pixel is used
 AVERAGED_FROM = 0.9  # share of the steps after which Gaussians are averaged into the result
 GROW_SCALE3D = 0.01  # size (see `densify.size_unit`) above which a Gaussian is split, not cloned
 
@@ -134,17 +133,6 @@ def coarse_steps(settings: Params) -> int:
     Without a dense start the number is 0, as in 3DGS.
     """
     return round(COARSE_SHARE * settings.iterations) if settings.init.flow_cell else 0
-
-
-def sparse_steps(settings: Params) -> range:
-    """Return the steps that use every second pixel in each direction, that is, a quarter of the pixels.
-
-    These are the steps from the end of densification up to the share `SPARSE_UNTIL` of the fit. Without a dense start
-    the range is empty, as in 3DGS.
-    """
-    if not settings.init.flow_cell:
-        return range(0)
-    return range(round(settings.densify.stop * settings.iterations), round(SPARSE_UNTIL * settings.iterations))
 
 
 def average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:

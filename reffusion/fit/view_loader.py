@@ -13,8 +13,6 @@ from torch import Tensor
 from reffusion import seeding
 from reffusion.types import Camera
 
-MIN_SPARSE_PIXELS = 200_000  # views with fewer pixels are never subsampled
-
 
 def iterate_views(
     cameras: Sequence[Camera],
@@ -23,7 +21,6 @@ def iterate_views(
     steps: range,
     seed: int,
     coarse: int = 0,
-    sparse: range = range(0),
     device: torch.device | str = "cpu",
 ) -> Iterator[tuple[Camera, Tensor, Tensor | None]]:
     """Yield the view of each step, as camera, image and weights; a thread prepares it while the previous step runs.
@@ -36,10 +33,8 @@ def iterate_views(
         images: view name -> uint8 [H, W, 3].
         weights: view name -> [H, W], weights of the pixels; a view without an entry has none.
         steps: the numbers of the steps; a resumed fit does not begin at 0.
-        seed: seed of the order of the views and of the subsampled pixels.
+        seed: seed of the order of the views.
         coarse: number of the first step that gets full views; all steps before it get views of half the size.
-        sparse: steps that get every second pixel in each direction, from views of at least `MIN_SPARSE_PIXELS` pixels.
-            Four visits of a view cover all its pixels.
         device: the device of the tensors.
 
     Yields:
@@ -51,9 +46,6 @@ def iterate_views(
         view = camera, images[camera.name], weights.get(camera.name)
         if i < coarse:
             return to_tensors(*downsample(*view), device)
-        if i in sparse and camera.width * camera.height >= MIN_SPARSE_PIXELS:
-            phase = seeding.epoch_index(i // len(cameras), 4, seed, "pixels", camera.name)
-            return to_tensors(*subsample(*view, phase % 2, phase // 2), device)
         return to_tensors(*view, device)
 
     with ThreadPoolExecutor(1, thread_name_prefix="fit") as executor:
@@ -96,20 +88,6 @@ def downsample(
         lowest = cv2.erode(np.asarray(weights, np.float32), np.ones((side, side), np.uint8))
         weights = cv2.resize(lowest, size, interpolation=cv2.INTER_NEAREST)
     return camera.resized(*size), small, weights
-
-
-def subsample(
-    camera: Camera, image: np.ndarray, weights: np.ndarray | None, left: int, top: int
-) -> tuple[Camera, np.ndarray, np.ndarray | None]:
-    """Return every second pixel of the view in each direction, as camera, image and weights.
-
-    A step on these pixels is a quarter of the work, at the sharpness of the full view.
-
-    Args:
-        left, top: column and row of the first pixel, each 0 or 1.
-    """
-    weights = None if weights is None else weights[top::2, left::2]
-    return camera.sampled(2, left, top), np.ascontiguousarray(image[top::2, left::2]), weights
 
 
 def check_sizes(cameras: Sequence[Camera], images: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray]) -> None:

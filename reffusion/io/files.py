@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+LFS = b"version https://git-lfs"  # beginning of a pointer that a clone without Git LFS has instead of a file
 MOST_PIXELS = 200_000_000  # largest size of a picture or depth map; larger ones are refused before they are read
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp", ".insv")  # endings, in lower case
 LONGEST_WORD = 400  # characters; longer words of a message are cut
@@ -52,10 +53,14 @@ def reading(path: Path, what: str) -> Iterator[None]:
         path, what: as in `as_bad_input`.
 
     Raises:
-        BadInput: the file is missing, or a folder, pipe or device; or an exception was raised inside.
+        BadInput: the file is missing, or a folder, pipe or device, or a pointer of Git LFS; or an exception was raised
+            inside.
     """
     with as_bad_input(path, what):
         _check_regular(path)
+        with open(path, "rb") as file:
+            if file.read(len(LFS)) == LFS:
+                raise BadInput(f"{path}: a pointer of Git LFS, not the file; download the file by `git lfs pull`")
         yield
 
 

@@ -29,7 +29,7 @@ Image.MAX_IMAGE_PIXELS = None  # `open_image` checks the size: Pillow would warn
 
 
 @contextmanager
-def open_image(path: Path, what: str = "a readable image") -> Iterator[Image.Image]:
+def open_image(path: Path, what: str = "a readable image; save it anew as JPEG or PNG") -> Iterator[Image.Image]:
     """Open a picture as a context; only its header is read at first.
 
     Args:

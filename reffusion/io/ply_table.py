@@ -21,7 +21,7 @@ TYPES: dict[str, np.dtype] = {
     **dict.fromkeys(("float", "float32"), np.dtype("f4")),
     **dict.fromkeys(("double", "float64"), np.dtype("f8")),
 }
-LONGEST_LINE = 10_000  # bytes that are read at once of a line of the header
+LONGEST_LINE = 1_000_000  # bytes that are read at once of a line of the header
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,9 @@ def load_header(path: Path) -> Header:
     """
     with reading(path, "a readable PLY file with vertices"), open(path, "rb") as file:
         if file.readline(8).strip() != b"ply":
-            raise BadInput(f"{path}: not a PLY file; its first line is not `ply`")
+            raise BadInput(
+                f"{path}: not a PLY file; its first line is not `ply`; export the Gaussians or points as .ply"
+            )
         form, elements, comments = "", [], []
         for raw in iter(lambda: file.readline(LONGEST_LINE), b""):
             words = _decode(raw).split()

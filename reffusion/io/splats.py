@@ -38,6 +38,7 @@ UNREAD = {  # ending of a file that is not read: how to get a .ply from it; None
     **dict.fromkeys((".ksplat", ".sog", ".lcc", ".lcc2", ".json")),
     **dict.fromkeys((".glb", ".gltf", ".usdz"), BY_PROGRAM),
     ".zip": "unpack it, and name a file of splats in it",
+    ".gz": "unpack it, and name the file in it",
     ".ckpt": "it is a checkpoint of nerfstudio; `ns-export gaussian-splat --load-config config.yml --output-dir .` "
     "writes a .ply",
     ".pt": "it is a checkpoint of gsplat; gsplat.export_splats writes a .ply of its `splats`",

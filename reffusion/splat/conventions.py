@@ -1,7 +1,7 @@
 """The constants of the splatting model, shared by its implementations (docs/method.md#splatting)."""
 
 NEAR = 0.01  # camera z below which a Gaussian is culled, in units of the normalised frame
-LOW_PASS = 0.3  # px^2 added to the diagonal of the 2D covariance; in a subsampled view, pixels of the full view
+LOW_PASS = 0.3  # px^2 added to the diagonal of the 2D covariance
 MIN_ALPHA = 1.0 / 255.0  # a Gaussian is skipped at the pixels where its alpha is smaller
 MAX_ALPHA = 0.999  # larger alphas are clamped, with zero gradient; gsplat has the same value compiled in
 MIN_TRANSMITTANCE = 1e-4  # a Gaussian that would bring the transmittance below is not blended, and ends the pixel

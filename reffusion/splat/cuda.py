@@ -135,7 +135,7 @@ def _project(gaussians: Gaussians, camera: Camera) -> _Footprints:
         intrinsics[None],
         camera.width,
         camera.height,
-        eps2d=LOW_PASS / camera.every**2,
+        eps2d=LOW_PASS,
         near_plane=NEAR,
         calc_compensations=gaussians.antialiased,
         opacities=opacities,

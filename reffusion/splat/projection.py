@@ -50,7 +50,7 @@ def view_numbers(camera: Camera, antialiased: bool) -> np.ndarray:
             (camera.width - camera.cx) / camera.fx + JACOBIAN_MARGIN * half_x,
             -camera.cy / camera.fy - JACOBIAN_MARGIN * half_y,
             (camera.height - camera.cy) / camera.fy + JACOBIAN_MARGIN * half_y,
-            *(camera.width, camera.height, antialiased, LOW_PASS / camera.every**2),
+            *(camera.width, camera.height, antialiased, LOW_PASS),
         ],
         np.float64,
     )

@@ -135,7 +135,7 @@ def project(gaussians: Gaussians, camera: Camera, probe: Tensor | None) -> tuple
     # Cauchy-Binet: det(root rootᵀ) is the sum of the squared 2x2 minors, without the cancellation of xx·yy - xy².
     minors = torch.linalg.cross(root[:, 0], root[:, 1])
     sharp = minors.square().sum(1)
-    low = LOW_PASS / camera.every**2
+    low = LOW_PASS
     determinants = sharp + low * (xx + yy) + low**2
     covariances = torch.stack((xx + low, xy, yy + low), 1)
     opacities = torch.sigmoid(gaussians.opacity_logits[index])

@@ -12,14 +12,21 @@ from reffusion.capture.layouts.placed import Placed, read_placed
 from reffusion.capture.lens import Lens
 from reffusion.io.files import BadInput, is_file, reading
 
+HEAD = b"# Bundle file"  # beginning of a file, which other programs write under a name of their own
 PLACES = ("bundle.out", "bundle/bundle.out")
 FLIP = np.diag([1.0, -1.0, -1.0])  # from the axes of Bundler's cameras (y up, looking along -z) to ours
 FOCAL_LENGTH = re.compile(r"\s+0\s+[\d.eE+-]+$")  # at the end of a line of a list: a zero and the focal length of EXIF
 
 
 def find(folder: Path) -> Path | None:
-    """Return the file bundle.out of a scene folder; None without one."""
-    return next((folder / name for name in PLACES if is_file(folder / name)), None)
+    """Return the file bundle.out of a scene folder, or a file .out that begins as Bundler's do; None without one."""
+    usual = [folder / name for name in PLACES if is_file(folder / name)]
+    return next(iter(usual + [path for path in sorted(folder.glob("*.out")) if _is_of_bundler(path)]), None)
+
+
+def _is_of_bundler(path: Path) -> bool:
+    with open(path, "rb") as file:
+        return file.read(len(HEAD)) == HEAD
 
 
 def read(folder: Path, source: Path, images: str | None, correction: Correction) -> Capture:

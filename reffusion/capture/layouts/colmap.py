@@ -23,9 +23,10 @@ from reffusion.capture.layouts.capture import (
 from reffusion.capture.layouts.points import are_tracks_inside, keep_points_in_frame
 from reffusion.capture.names import list_pictures, name_views, normalize_path, pair_pictures
 from reffusion.io.colmap import ModelImage, is_model, load_cameras, load_images, load_model_points, model_file
-from reffusion.io.files import BadInput
+from reffusion.io.files import BadInput, is_file, reading
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap", ".")
+HELD_OUT = "test.txt"  # list of the test pictures in a model's folder, as training of 3DGS reads it
 USUAL = ("images", "images_2", "images_4", ".")  # usual folders of pictures
 RENAMED = re.compile(r"image\d+")  # names of LLFF's reduced copies, numbered in the order of the originals' names
 
@@ -159,6 +160,7 @@ def capture_from_model(
     paths = relative_paths(image_folder, pictures)
     paths = {view: (*paths[view], of_file[file].name) for view, file in views.items()}
     rest = {path: (path,) for path in (*lost, *unplaced)}
+    test = _held_out(model / HELD_OUT, list(views.values()))
     return Capture(
         layout,
         pictures,
@@ -167,7 +169,17 @@ def capture_from_model(
         source,
         label_folder,
         tuple(filter(None, warnings)),
+        test=tuple(view for view, file in views.items() if file in test),
     )
+
+
+def _held_out(source: Path, files: list[str]) -> set[str]:
+    """Return those of the pictures `files` that a list of test pictures names, one a line; none without the list."""
+    if not is_file(source):
+        return set()
+    with reading(source, "a list of test pictures"):
+        lines = [line.strip() for line in source.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
+    return set(pair_pictures({line: line for line in lines}, files).values())
 
 
 def _images_by_name(source: Path) -> tuple[dict[str, ModelImage], dict[str, int]]:

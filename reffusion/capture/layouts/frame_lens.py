@@ -79,7 +79,7 @@ def _lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[int, 
     width, height = number("w", size[0]), number("h", size[1])
     fx = _focal_length(values, "x", width, number)
     if fx is None:
-        raise BadInput(f"{source}: neither fl_x nor camera_angle_x for '{picture.name}'; one of them is needed")
+        raise BadInput(f"{source}: neither fl_x nor camera_angle_x for '{picture.name}'; add one of them to the file")
     fy = _focal_length(values, "y", height, number)
     model = values.get("camera_model", "OPENCV")
     model = model.upper() if isinstance(model, str) else shorten(model)

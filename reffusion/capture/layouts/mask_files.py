@@ -20,7 +20,13 @@ from reffusion.params.capture import MaskSpec
 
 NONE = "none"
 COMPANIONS = (".txt", ".xml", ".xmp", ".csv", ".yaml", ".thm", "")  # endings of files beside a picture that are none
-USUAL = ("masks", "mask", "label", "annotations")  # usual folders, searched after `label` in the folder of pictures
+USUAL = (
+    "masks",
+    "mask",
+    "label",
+    "labels",
+    "annotations",
+)  # usual folders, searched after `label` in the folder of pictures
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ FISHEYE = ("fisheye", "fisheye_opencv")
 
 
 def find(folder: Path) -> Path | None:
-    """Return the file in a scene folder; None without one."""
-    return folder / NAME if is_file(folder / NAME) else None
+    """Return the file in a scene folder, or in its sub-folder of a project of OpenDroneMap; None without one."""
+    return next((path for path in (folder / NAME, folder / "opensfm" / NAME) if is_file(path)), None)
 
 
 def read(folder: Path, source: Path, images: str | None, correction: Correction) -> Capture:

@@ -6,7 +6,7 @@ They are pictures in formats that are not read, videos, archives, and poses of p
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,10 +20,12 @@ if TYPE_CHECKING:
 RAW = (".dng", ".raw", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".x3f", ".3fr")
 PICTURES = {  # ending -> (kind of picture, what to do)
     **dict.fromkeys(RAW, ("camera raw", "develop them to JPEG")),
+    **dict.fromkeys((".exr", ".hdr"), ("high dynamic range", "save them as JPEG")),
     **dict.fromkeys((".jxl", ".jp2", ".gif", ".psd"), ("a format of pictures that is not read", "save them as JPEG")),
 }
 ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".gz", ".r3d")
 HEAD = 4000  # bytes at the beginning of a file in which `PoseFile.word` is looked for
+DEPTHS = ("*", "*/*", "*/*/*")  # patterns of the paths at which pictures and videos are looked for, to name them
 MOST = 20  # files of one pattern that are looked at
 EXPORT = "export a COLMAP model or transforms.json from it"
 
@@ -46,16 +48,24 @@ class PoseFile:
 
 
 POSE_FILES = (
-    PoseFile("*.xmp", "RealityCapture", "export its Internal/External camera parameters (.csv)", b"capturingreality"),
+    PoseFile(
+        "*.[xX][mM][pP]", "RealityCapture", "export its Internal/External camera parameters (.csv)", b"capturingreality"
+    ),
     PoseFile("*.xml", "Metashape", EXPORT, b"<chunk"),
     PoseFile("*.xml", "ContextCapture", EXPORT, b"<BlocksExchange"),
-    PoseFile("metadata.json", "Record3D", "convert it by `ns-process-data record3d`", b'"poses"'),
+    *(
+        PoseFile(name, "Record3D", "convert it by `ns-process-data record3d`", b'"poses"')
+        for name in ("metadata.json", "metadata")
+    ),
     PoseFile("odometry.csv", "Stray Scanner", "convert it to transforms.json"),
     PoseFile("frame_*.json", "3D Scanner App", "convert it to transforms.json", b"cameraPose"),
     PoseFile("sfm_data.json", "OpenMVG", "convert it by openMVG_main_openMVG2Colmap"),
     PoseFile("*.sfm", "Meshroom", EXPORT),
     PoseFile("*.nvm", "VisualSFM", EXPORT),
     PoseFile("*calibrated_camera_parameters*.txt", "Pix4D", "export bundle.out from it"),
+    PoseFile(
+        "*.csv", "RealityCapture", "export its Internal/External camera parameters to the scene's folder", b"heading"
+    ),
     PoseFile("*.csv", "a table of omega, phi and kappa", "export a COLMAP model or Bundler's bundle.out", b"appa"),
     PoseFile("cams/*_cam.txt", "MVSNet", "convert them to transforms.json"),
     PoseFile("pose/*.txt", "NSVF", "convert them to transforms.json"),
@@ -116,15 +126,20 @@ def _begins_with(path: Path, word: bytes) -> bool:
         return word in file.read(HEAD)
 
 
-def refuse_without_pictures(folder: Path, usual: Iterable[str]) -> BadInput:
+def refuse_without_pictures(folder: Path, usual: Sequence[str]) -> BadInput:
     """Return the error of a scene folder without pictures in the usual folders; the message names what lies there."""
     places = [folder / name for name in usual]
     hints = [each for place in places for each in _describe_pictures(folder, place, _unread_pictures(place))]
-    files = [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")]
+    files = [path for pattern in DEPTHS for path in sorted(folder.glob(pattern)) if not path.name.startswith(".")]
     hints += [f"give the video itself: scene={path}" for path in files if path.suffix.lower() in VIDEOS]
     hints += [
-        f"{path.name} holds {count} pictures: name their folder as `images: {path.name}` in scene.yaml"
-        for path in files
+        f"{_relative(path, folder)} holds {count} picture{'s' * (count > 1)}: "
+        + (
+            f"name their folder as `images: {path.name}` in scene.yaml"
+            if path.parent == folder
+            else f"give the folder of the capture: scene={folder / path.relative_to(folder).parts[0]}"
+        )
+        for path in sorted(files, key=lambda path: path.name not in usual)
         if path.is_dir() and (count := len(list_pictures(path)))
     ]
     hints += [f"unpack {path.name}" for path in files if path.suffix.lower() in ARCHIVES]
