@@ -197,19 +197,20 @@ def report_remnants(remnants: Sequence[Remnant], out: Path, photo_of: Callable[[
         out: folder of this stage.
         photo_of: view name -> uint8 [H, W, 3].
     """
-    lines = []
+    described: dict[bool, list[str]] = {True: [], False: []}  # would float -> texts
     for k, remnant in enumerate(remnants, start=1):
         photo, picture = photo_of(remnant.view).copy(), f"remnants/{k}.png"
         photo[remnant.mask] = photo[remnant.mask] // 2 + np.array(TINT) // 2
         save_image(out / picture, photo)
-        outcome = (
-            "a part of the object that no mask covers is removed, too, because it would float in the air (to keep it: "
-            "`--set masks.remnants=false`)"
-            if remnant.would_float
-            else "part of the object seems to be left; if so, mark it in that view and run again"
-        )
-        lines.append(f"{outcome}: {remnant.describe()}, see masks/{picture}")
-        warnings.warn(lines[-1], stacklevel=1)
+        described[remnant.would_float].append(f"{remnant.describe()}, see masks/{picture}")
+    outcomes = {
+        True: "parts of the object that no mask covers are removed, too, because they would float in the air (to keep "
+        "them: `--set masks.remnants=false`)",
+        False: "parts of the object seem to be left; if so, mark them in these views and run again",
+    }
+    lines = [f"{outcomes[floats]}: {'; '.join(texts)}" for floats, texts in described.items() if texts]
+    for line in lines:
+        warnings.warn(line, stacklevel=1)
     if lines:
         save_json(out / WARNINGS, lines)
 
