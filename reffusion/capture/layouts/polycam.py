@@ -42,6 +42,6 @@ def _load_camera(path: Path) -> Placed:
     with as_bad_input(path, "a camera of Polycam"):
         camera_to_world = np.eye(4)
         camera_to_world[:3] = [[float(values[f"t_{row}{column}"]) for column in range(4)] for row in range(3)]
-        numbers = [float(values[key]) for key in ("fx", "fy", "cx", "cy")]
+        fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
         stored = (int(values["width"]), int(values["height"])) if "width" in values else None
-    return Placed(invert_pose(camera_to_world @ FLIP), lambda size: Lens(*(stored or size), *numbers))
+    return Placed(invert_pose(camera_to_world @ FLIP), lambda size: Lens(*(stored or size), fx, fy, cx, cy))
