@@ -387,7 +387,8 @@ def _fit_planar_model(
         values = np.concatenate([values, view.disparity[rows, columns]])
         pixels = np.concatenate([pixels, np.stack([columns, rows], 1) + 0.5])
         model = _fit_planes(view, pixels, values, settings)
-    return model, f"{model.planes} planes explain {model.explained:.0%} of {len(values)} {source}"
+    planes = "1 plane explains" if model.planes == 1 else f"{model.planes} planes explain"
+    return model, f"{planes} {model.explained:.0%} of {len(values)} {source}"
 
 
 def _fit_planes(
