@@ -356,9 +356,9 @@ def test_the_stage_starts_from_flow_points_of_the_views_it_fits(tmp_path, capsys
     assert len(seen) == 1 and {c.name for c in seen[0]} == {"view1", "view2", "view4"}, "not the held-out view"
 
 
-def test_larger_pictures_have_room_for_more_gaussians():
-    cameras = arc_cameras()
-    pixels = cameras[0].width * cameras[0].height
+def test_larger_pictures_and_more_views_have_room_for_more_gaussians():
+    few, pixels = arc_cameras(), arc_cameras()[0].width * arc_cameras()[0].height
+    cameras = few * 10
     budget = lambda cameras, **densify: (
         limit_gaussians(stage.Params(densify=Densify(**densify)), cameras).densify.cap_max
     )
@@ -367,6 +367,8 @@ def test_larger_pictures_have_room_for_more_gaussians():
     assert budget(doubled, per_pixel=0.25) == pixels
     assert budget(doubled, per_pixel=0.25, cap_max=100) == 100
     assert budget(cameras, cap_max=1234) == 1234
+    assert budget(few, per_pixel=0.25) == round(0.4 * 0.25 * pixels)
+    assert budget(cameras[:24], per_pixel=0.25) == round(0.7 * 0.25 * pixels)
 
 
 def test_the_stage_takes_over_a_scene_of_gaussians(tmp_path):

@@ -19,6 +19,9 @@ from reffusion.masks import voting
 from reffusion.params.fit import Params
 from reffusion.types import Camera, Gaussians, Scene
 
+# One Gaussian a pixel gains .8 dB with 60 views and loses .8 dB with 18 or 21: docs/results.md.
+FEW_VIEWS, MANY_VIEWS, FEW_SHARE = 18, 30, 0.4
+
 
 def limit_sh_degree(params: Params, scene: Scene) -> Params:
     """Return the parameters with the degree of spherical harmonics limited to what the training views determine.
@@ -154,12 +157,15 @@ def make_gaussians(params: Params, points: np.ndarray, colors: np.ndarray) -> Ga
 def limit_gaussians(params: Params, cameras: list[Camera]) -> Params:
     """Return the parameters with `densify.cap_max`, the maximum number of Gaussians, limited by the image size.
 
-    Larger pictures show more detail, which needs more Gaussians. The limit is `densify.per_pixel` times the mean number
-    of pixels of a view, at least 4. With `densify.per_pixel` = 0 the parameters are returned unchanged.
+    Larger pictures show more detail, which needs more Gaussians. Few views do not determine so many. The limit is
+    `densify.per_pixel` times the mean number of pixels of a view, times a share that grows linearly from `FEW_SHARE`
+    with `FEW_VIEWS` views to 1 with `MANY_VIEWS`; at least 4. With `densify.per_pixel` = 0 the parameters are returned
+    unchanged.
     """
     densify = params.densify
     if not densify.per_pixel:
         return params
     pixels = sum(camera.width * camera.height for camera in cameras) / len(cameras)
-    max_gaussians = min(densify.cap_max, max(4, round(densify.per_pixel * pixels)))
+    share = float(np.interp(len(cameras), (FEW_VIEWS, MANY_VIEWS), (FEW_SHARE, 1.0)))
+    max_gaussians = min(densify.cap_max, max(4, round(share * densify.per_pixel * pixels)))
     return params.changed({"densify.cap_max": max_gaussians})

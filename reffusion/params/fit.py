@@ -43,7 +43,9 @@ class Densify(Settings):
         "densifications can still add Gaussians; or it is `cap_max` from the start (3DGS)",
     )
     per_pixel: float = Field(
-        0.0, ge=0, description="maximum number of Gaussians per pixel of a view; 0: `cap_max` only"
+        0.0,
+        ge=0,
+        description="maximum number of Gaussians per pixel of a view, with 30 views or more; 0: `cap_max` only",
     )
     size_unit: MeansUnit = Field(
         "distance", description="unit of a Gaussian's size: its distance, or the cameras' extent (3DGS)"
