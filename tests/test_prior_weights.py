@@ -21,7 +21,7 @@ SAMPLES = 200
 
 
 @pytest.fixture(scope="module")
-def held_out():
+def pictures():
     """Pictures [200, 3, 32, 32] in [-1, 1] that training never sees, their masks, and right and wrong captions."""
     pool = train.Pool(0, 0, 40, images.bundled_photographs(held_out=True), held_out=True)
     pixels, masks, captions = pool.batch(np.random.default_rng(0), SIDE, 2 * SAMPLES)
@@ -35,9 +35,9 @@ def held_out():
     return pixels[named], masks[named], [captions[index] for index in named], wrong
 
 
-def test_the_papers_two_prompts_change_the_prediction(held_out):
+def test_the_papers_two_prompts_change_the_prediction(pictures):
     """The change is at least 1 % of the rms of the prediction, in the mean over the noise levels."""
-    prior, (pixels, masks, *_) = load_prior(TINY), held_out
+    prior, (pixels, masks, *_) = load_prior(TINY), pictures
     pixels, masks = pixels[:16], masks[:16]
     text = diffusion.embed_text(prior, Prompts().texts)
     condition = diffusion.conditioning(prior, pixels, masks)
@@ -51,8 +51,8 @@ def test_the_papers_two_prompts_change_the_prediction(held_out):
     assert (whole - crop).square().mean().sqrt() > 0.01 * whole.square().mean().sqrt()
 
 
-def test_the_right_caption_explains_a_picture_better_than_a_wrong_one(held_out):
-    pixels, masks, right, wrong = held_out
+def test_the_right_caption_explains_a_picture_better_than_a_wrong_one(pictures):
+    pixels, masks, right, wrong = pictures
     assert len(right) == SAMPLES and (masks.mean((1, 2, 3)) > 0.65).float().mean() > 0.25
     model, alphas = train.Model(0), build.scheduler().alphas_cumprod
     train.load_weights(model, TINY)
@@ -63,9 +63,9 @@ def test_the_right_caption_explains_a_picture_better_than_a_wrong_one(held_out):
     assert (losses[0] < losses[1]).float().mean() >= 0.6
 
 
-def test_guidance_changes_what_is_painted(held_out):
+def test_guidance_changes_what_is_painted(pictures):
     """Fillings of large holes without guidance and with a = 4 differ by two grey levels or more (rms in the hole)."""
-    prior, (pixels, masks, right, _) = load_prior(TINY), held_out
+    prior, (pixels, masks, right, _) = load_prior(TINY), pictures
     large = (masks.mean((1, 2, 3)) > 0.65).nonzero().flatten()[:12].tolist()
     text, empty = diffusion.embed_text(prior, [right[k] for k in large]), diffusion.embed_text(prior, [""] * len(large))
     plain, guided = (

@@ -78,7 +78,7 @@ def run_fit(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]
     return trace.read_trace(out / "trace.jsonl")
 
 
-def held_out_lpips(poses: Path, folder: Path, every: int) -> float:
+def measure_lpips(poses: Path, folder: Path, every: int) -> float:
     """Return the mean LPIPS (vgg) of the held-out views, rendered from the fit in `folder`, over whole views.
 
     Raises:
@@ -135,7 +135,7 @@ def main() -> None:
     for name, params in chosen.items():
         folder = out / name.replace(" ", "_").replace(",", "")
         curves[name] = run_fit(poses, folder, params)
-        perceptual[name], last = held_out_lpips(poses, folder, arguments.every), curves[name][-1]
+        perceptual[name], last = measure_lpips(poses, folder, arguments.every), curves[name][-1]
         print(
             f"{name}: LPIPS {perceptual[name]:.4f}, {last['psnr_held_out']:.2f} dB after {last['seconds']:.0f} s, "
             f"{last['gaussians']} Gaussians"

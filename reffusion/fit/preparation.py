@@ -19,7 +19,7 @@ from reffusion.masks import voting
 from reffusion.params.fit import Params
 from reffusion.types import Camera, Gaussians, Scene
 
-# One Gaussian a pixel gains .8 dB with 60 views and loses .8 dB with 18 or 21: docs/results.md.
+# One Gaussian a pixel gains .7 dB with 60 views and loses .8 dB with 18 or 21: docs/results.md.
 FEW_VIEWS, MANY_VIEWS, FEW_SHARE = 18, 30, 0.4
 
 

@@ -26,7 +26,7 @@ from reffusion.io.colmap import ModelImage, is_model, load_cameras, load_images,
 from reffusion.io.files import BadInput, is_file, reading
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap", ".")
-HELD_OUT = "test.txt"  # list of the test pictures in a model's folder, as training of 3DGS reads it
+TEST_LIST = "test.txt"  # list of the test pictures in a model's folder, as training of 3DGS reads it
 USUAL = ("images", "images_2", "images_4", ".")  # usual folders of pictures
 RENAMED = re.compile(r"image\d+")  # names of LLFF's reduced copies, numbered in the order of the originals' names
 
@@ -160,7 +160,7 @@ def capture_from_model(
     paths = relative_paths(image_folder, pictures)
     paths = {view: (*paths[view], of_file[file].name) for view, file in views.items()}
     rest = {path: (path,) for path in (*lost, *unplaced)}
-    test = _held_out(model / HELD_OUT, list(views.values()))
+    test = _list_test_pictures(model / TEST_LIST, list(views.values()))
     return Capture(
         layout,
         pictures,
@@ -173,7 +173,7 @@ def capture_from_model(
     )
 
 
-def _held_out(source: Path, files: list[str]) -> set[str]:
+def _list_test_pictures(source: Path, files: list[str]) -> set[str]:
     """Return those of the pictures `files` that a list of test pictures names, one a line; none without the list."""
     if not is_file(source):
         return set()
