@@ -28,8 +28,8 @@ def build(inputs: TermInputs, settings: Params) -> Term | None:
     """Build the SDS term. Return None if SDS is off, or if no view has a hole and is near enough to a reference.
 
     All views with a hole and with known pixels beside it take turns. A view that is too far from every reference is
-    left out in its turn. The gradient
-    reaches the masked Gaussians, or with `sds.reaches: all` or `confined: false` all that show in the view.
+    left out in its turn. The gradient reaches the masked Gaussians, or with `sds.reaches: all` or `confined: false`
+    all that show in the view.
 
     Raises:
         ValueError: There is no prior, or its prompts are not embedded.
