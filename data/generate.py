@@ -7,6 +7,7 @@ A furnished room is ray-cast with and without one object. Kinds:
   360     demo with cameras all around an object that lies on the floor
   beside  360 with a chest on the floor, close to four things that stay and that it partly hides in every view
   seen    demo with an object in mid-air: other views see everything that it hides, so nothing has to be invented
+  mono    wide in small views, with a reference whose depth map is as a monocular network gives it
   behind  wide with a second object in front, which stays and hides a part of what the reference is to fill
   table   an object on the edge of a table, free space under it, some cameras low enough to look there
   corner  an object in front of the corner of a projecting wall: behind the object the depth has a step
@@ -36,11 +37,20 @@ from pathlib import Path
 
 import numpy as np
 from files import write_image, write_model, write_poses_bounds, write_truth_cameras
-from kinds import KINDS, Kind
+from kinds import KINDS, Kind, randomness
 from photographs import Session, corner_shift, take_photographs
 from reconstruction import Frame, scene_frame, sparse_points
 from room import furnish
-from tasks import SPHERE, bounding_region, choose_covering_views, depth, outside_sphere, point_on_axis, without_object
+from tasks import (
+    SPHERE,
+    bounding_region,
+    choose_covering_views,
+    depth,
+    estimate_disparity,
+    outside_sphere,
+    point_on_axis,
+    without_object,
+)
 from world import World, bake
 
 AWAY = 2.5  # distance from the middle camera to the sphere's centre, metres; about the point that the cameras look at
@@ -163,7 +173,8 @@ def _write_test_masks(out: Path, session: Session, masks: Sequence[np.ndarray]) 
 def _write_removal(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
     """Write masks of the object, or of each object, and the references unless the object hangs.
 
-    Behind a hanging object nothing has to be invented.
+    Behind a hanging object nothing has to be invented. With `Kind.depth_error`, the truth of the training views is
+    written, too.
     """
     _write_test_masks(out, session, session.masks[: session.test])
     for k, name in enumerate(session.names):
@@ -174,7 +185,14 @@ def _write_removal(out: Path, session: Session, kind: Kind, world: World, frame:
             write_image(out / f"masks/{own}/{name}.png", of[k] * np.uint8(255))
         if not session.object_masks:
             write_image(out / f"images_4/label/{name}.png", session.masks[k] * np.uint8(1))
-    (out / "scene.yaml").write_text(("" if kind.hangs else _write_references(out, session)) + PROFILE)
+    if not kind.depth_error:
+        references = "" if kind.hangs else _write_references(out, session)
+    else:
+        removed = replace(world, solids=without_object(world.solids))
+        references = _write_measured(out, session, session.completions, kind, removed, frame)
+        for name, picture in zip(session.names[session.test :], session.emptied, strict=True):
+            write_image(out / f"truth/without_object/{name}.png", picture)
+    (out / "scene.yaml").write_text(references + PROFILE)
 
 
 def _write_references(out: Path, session: Session) -> str:
@@ -230,12 +248,20 @@ def _write_outpainting(out: Path, session: Session, kind: Kind, world: World, fr
 def _write_measured(
     out: Path, session: Session, pictures: dict[int, np.ndarray], kind: Kind, world: World, frame: Frame
 ) -> str:
-    """Write pictures of views with their depth, and return the lines of scene.yaml that name them as references."""
+    """Write pictures of views with their depth, and return the lines of scene.yaml that name them as references.
+
+    With `Kind.depth_error`, the depth is estimated disparity.
+    """
     entries = ["reference:\n"]
     for k, picture in pictures.items():
-        name = session.names[k]
+        name, true_depth = session.names[k], depth(session.cameras[k], kind, world, frame)
         write_image(out / f"references/{name}.png", picture)
-        np.save(out / f"references/{name}.npy", depth(session.cameras[k], kind, world, frame))
+        if kind.depth_error:
+            (out / "truth/depth").mkdir(parents=True, exist_ok=True)
+            np.save(out / f"truth/depth/{name}.npy", true_depth)
+            draw = randomness(session.seed, f"estimate {name}")
+            true_depth = estimate_disparity(true_depth, kind.depth_error, draw)
+        np.save(out / f"references/{name}.npy", true_depth)
         entries.append(f"- {{view: {name}, image: references/{name}.png, depth: references/{name}.npy}}\n")
     return "".join(entries)
 

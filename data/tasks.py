@@ -50,6 +50,27 @@ def depth(camera: np.ndarray, kind: Kind, world: World, frame: Frame) -> np.ndar
     return (frame.scale * ((points - camera[13:]) @ camera[4:13].reshape(3, 3)[:, 2])).astype(np.float32)
 
 
+def estimate_disparity(depth: np.ndarray, error: float, draw: np.random.Generator) -> np.ndarray:
+    """Return the disparity [H, W] of a depth map as a monocular network gives it: with smooth errors and another unit.
+
+    The logarithm of the disparity has an error that is a sum of waves. Their lengths are .4 to 1.5 widths of the
+    picture, too short for a scale and an offset to undo the error. Scale and offset are random.
+
+    Args:
+        depth: [H, W], camera z.
+        error: rms of the error of the logarithm.
+        draw: random generator.
+    """
+    rows, columns = (np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5) / depth.shape[1]
+    field = np.zeros(depth.shape)
+    for length in np.geomspace(0.4, 1.5, 6):
+        turn, phase = draw.uniform(0, 2 * np.pi, 2)
+        field += length * np.sin(2 * np.pi * (np.cos(turn) * columns + np.sin(turn) * rows) / length + phase)
+    field *= error / np.sqrt(np.square(field).mean())
+    scale, offset = draw.uniform(0.5, 2), draw.uniform(0, 0.5)
+    return ((np.exp(field) / depth + offset / depth.mean()) * scale).astype(np.float32)
+
+
 def outside_sphere(camera: np.ndarray, kind: Kind, world: World, center: np.ndarray, radius: float) -> np.ndarray:
     """Return bool [H, W], True for the pixels whose rays miss the sphere around `center` [3]."""
     _, along = rays(camera, kind, world)

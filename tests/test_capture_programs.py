@@ -282,9 +282,18 @@ def test_lists_of_training_and_test_views(tmp_path, lists, train, test):
     assert sorted(capture.unused, reverse=True) == unused and len(capture.warnings) == bool(unused)
 
 
-def test_a_list_of_test_pictures_beside_a_model(tmp_path):
+@pytest.mark.parametrize(
+    ("place", "text"),
+    [
+        ("sparse/0/test.txt", "v01.png\r\nv04\n"),
+        ("test.txt", "images/v01.png\nimages/v04.png\n"),
+        ("test_list.txt", "v01\nv04"),
+        ("train_test_lists.json", '{"train": ["v00.png"], "test": ["v01.png", "v04.png"], "has_masks": false}'),
+    ],
+)
+def test_a_list_of_test_pictures_beside_a_model(tmp_path, place, text):
     write_capture(tmp_path, "colmap", make_truth())
-    (tmp_path / "sparse/0/test.txt").write_text("v01.png\r\nv04\n")
+    (tmp_path / place).write_text(text)
     assert load_capture(tmp_path).test == ("v01", "v04")
 
 
@@ -406,11 +415,17 @@ UNREAD = {
         "RealityCapture",
         "export its Internal/",
     ),
+    "xmp/v00.xmp": (
+        'xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#"',
+        "RealityCapture",
+        "export its Internal/",
+    ),
+    "odm_report/shots.geojson": ("{}", "OpenDroneMap", "copy the project's opensfm/reconstruction.json here"),
     "images/registration.csv": ("#name,x,y,alt,heading,pitch,roll", "RealityCapture", "export its Internal/External"),
     "cameras.xml": ('<?xml version="1.0"?><document version="2.0.0"><chunk label="1">', "Metashape", EXPORT),
     "blocks.xml": ('<?xml version="1.0"?><BlocksExchange version="2.1">', "ContextCapture", EXPORT),
-    "metadata": ('{"w": 96, "K": [], "poses": []}', "Record3D", "convert it by `ns-process-data record3d`"),
-    "metadata.json": ('{"w": 96, "K": [], "poses": []}', "Record3D", "convert it by `ns-process-data record3d`"),
+    "metadata": ('{"w": 96, "K": [], "poses": []}', "Record3D", "convert it to transforms.json, or"),
+    "metadata.json": ('{"w": 96, "K": [], "poses": []}', "Record3D", "convert it to transforms.json, or"),
     "sfm_data.json": ("{}", "OpenMVG", "convert it by openMVG_main_openMVG2Colmap"),
     "cameras.sfm": ("{}", "Meshroom", EXPORT),
     "cameras.json": ("[]", "not of 3D Gaussian Splatting", EXPORT),
@@ -441,7 +456,7 @@ def test_other_tables_and_sidecars_are_not_poses(tmp_path):
     assert load_capture(tmp_path).warnings == ()
 
 
-@pytest.mark.parametrize("word", ["_matte", "-segmentation", ".alpha"])
+@pytest.mark.parametrize("word", ["_matte", "-segmentation", ".alpha", "_msk", ".png.mask"])
 def test_masks_beside_photographs(tmp_path, word):
     write_pictures(tmp_path / "images", ["a", "b", "c"])
     write_masks(tmp_path / "images", [f"{name}{word}" for name in "abc"])
@@ -456,12 +471,28 @@ def test_a_file_of_bundler_under_another_name_and_a_camera_of_polycam_without_a_
     (tmp_path / "a/bundle.out").rename(tmp_path / "a/scan.out")
     (tmp_path / "a/other.out").write_text("training ended\n")
     assert load_capture(tmp_path / "a").pose_source == tmp_path / "a/scan.out"
+    (tmp_path / "a/export").mkdir()
+    for name in ("scan.out", "list.txt"):
+        (tmp_path / "a" / name).rename(tmp_path / "a/export" / name)
+    assert load_capture(tmp_path / "a").pose_source == tmp_path / "a/export/scan.out"
     write_polycam(tmp_path / "b", truth)
     for path in tmp_path.glob("b/keyframes/*cameras/*.json"):
         record = json.loads(path.read_text())
         path.write_text(json.dumps({key: value for key, value in record.items() if key not in ("width", "height")}))
     lenses = load_capture(tmp_path / "b").poses.lenses
     assert {(lens.width, lens.height) for lens in lenses.values()} == {(WIDTH, HEIGHT)}
+    # Pictures of half the size: the middle of the lens says for which size it holds.
+    write_pictures(tmp_path / "b/keyframes/images", truth.world_to_camera, (WIDTH // 2, HEIGHT // 2), ending=".jpg")
+    for lens in load_capture(tmp_path / "b").poses.lenses.values():
+        assert (lens.width, lens.fx) == (WIDTH // 2, pytest.approx(truth.lens.fx / 2))
+
+
+def test_a_table_of_realitycapture_may_say_yaw(tmp_path):
+    truth = make_truth(RADIAL)
+    write_realitycapture(tmp_path, truth)
+    table = tmp_path / "cameras.csv"
+    table.write_text(table.read_text().replace("heading", "yaw"))
+    assert_cameras(load_capture(tmp_path), truth)
 
 
 @pytest.mark.parametrize("ending", [".jfif", ".jpe", ".avif"])

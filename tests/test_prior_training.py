@@ -56,20 +56,39 @@ def test_images_are_cropped_from_the_given_photographs():
     assert len(crops) > 5 and all(crop.std(axis=(0, 1)).max() == 0 for crop in crops)
 
 
-def test_masks_cover_between_nothing_and_everything():
+def test_masks_are_silhouettes_or_large_or_the_whole_picture():
     shares = np.array([images.mask(np.random.default_rng(k), 64).mean() for k in range(60)])
-    assert shares.min() < 0.2 and shares.max() < 1
+    assert shares.min() < 0.2
+    assert 8 <= (shares == 1).sum() <= 22  # a quarter of them
     assert 12 <= (np.abs(shares - images.LARGE_HOLE) < 0.001).sum() <= 28  # a third of them
 
 
-def test_captions_name_subject_and_scale_or_nothing():
-    drawn = [train.draw_caption(np.random.default_rng(k), "brick", cropped=k % 2 == 1) for k in range(1000)]
+def test_captions_name_subject_color_and_scale_or_nothing():
+    drawn = [train.draw_caption(np.random.default_rng(k), "brick", "dark red", cropped=k % 2 == 1) for k in range(1000)]
     counts = {caption: drawn.count(caption) for caption in set(drawn)}
     assert 70 < counts.pop("") < 130
-    subjects = {"brick": 0, "sks": 0, "a scene": 0}
+    subjects = {"brick, dark red": 0, "brick": 0, "sks": 0, "a scene": 0}
     for caption, count in counts.items():
         subjects[caption.removeprefix("A photo of ").removesuffix(", cropped")] += count
-    assert set(subjects) == {"brick", "sks", "a scene"} and 100 < subjects["sks"] + subjects["a scene"] < 170
+    assert 100 < subjects["sks"] + subjects["a scene"] < 170
+    assert 140 < subjects["brick"] < 220
+
+
+@pytest.mark.parametrize(
+    ("color", "name"),
+    [
+        ((20, 20, 22), "dark gray"),
+        ((128, 60, 50), "red"),
+        ((250, 240, 120), "bright yellow"),
+        ((60, 130, 50), "green"),
+        ((20, 30, 110), "dark blue"),
+        ((130, 40, 140), "purple"),
+        ((150, 30, 60), "red"),
+    ],
+)
+def test_colors_of_pictures_are_named_in_words_of_the_tokenizer(color, name):
+    assert images.name_color(np.full((4, 5, 3), color, np.uint8)) == name
+    assert set(name.split()) <= set(build.WORDS)
 
 
 def test_rooms_that_are_held_out_never_train(rooms):

@@ -27,7 +27,7 @@ def pictures():
     pixels, masks, captions = pool.batch(np.random.default_rng(0), SIDE, 2 * SAMPLES)
     subjects = [caption.removeprefix("A photo of ").removesuffix(", cropped") for caption in captions]
     named = [index for index, subject in enumerate(subjects) if subject not in ("", "sks", "a scene")][:SAMPLES]
-    words = lambda index: set(subjects[index].split()) - {"a", "and"}
+    words = lambda index: set(subjects[index].replace(",", "").split()) - {"a", "and", "dark", "bright"}
     shift = lambda index: next(
         other for other in [*named, *named][named.index(index) :] if not words(other) & words(index)
     )

@@ -135,9 +135,12 @@ def test_the_papers_terms_are_the_papers_at_the_laptops_size(tmp_path):
     paper, ours, theirs = (
         by_dotted_name(p) for p in (distill.Params().model_dump(mode="json"), terms["distill"], laptop["distill"])
     )
-    assert {name for name, value in ours.items() if value != paper[name]} == size
+    assert {name for name, value in ours.items() if value != paper[name]} == {*size, "repaint"}
     assert all(ours[name] == theirs[name] for name in size)
-    assert {stage for stage in terms if terms[stage] != laptop[stage]} == {"personalize", "initialize", "distill"}
+    changed = {stage for stage in terms if terms[stage] != laptop[stage]}
+    assert changed == {"masks", "personalize", "initialize", "distill"}
+    start = resolve(Request(ROOT, runs, str(scene), profile="paper")).params["initialize"]
+    assert {name for name in start if start[name] != terms["initialize"][name]} == {"depth", "device"}
 
 
 def by_dotted_name(params):

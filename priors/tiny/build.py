@@ -22,6 +22,7 @@ WORDS = (
     *("brick", "planks", "plaster", "tiles", "stripes", "fabric", "dots"),
     *("room", "corner", "table", "bedroom", "garden"),
     *("flowers", "leaves", "grass", "water", "sky", "wood", "hills", "forest", "things", "person", "stone"),
+    *("dark", "bright", "gray", "red", "orange", "yellow", "green", "blue", "purple"),
 )
 TEXT_LENGTH = 24
 # Opponent colours of (r, g, b) in [-1, 1]. Their rows in `analysis` are orthogonal and of equal length, so that an

@@ -7,6 +7,7 @@ their licences); pictures of rooms come from `rooms`.
 
 from __future__ import annotations
 
+import colorsys
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import TypeAlias
@@ -32,14 +33,26 @@ SUBJECTS = {  # of scikit-image's photographs, in the words of `build.WORDS`
     "gravel": "stone",
     "rocket": "sky",
 }
-LARGE_SHARE, LARGE_HOLE = 1 / 3, 0.7  # share of masks that cover this share of the picture
+# Of the masks, a quarter cover the whole picture, as in the training of SD's inpainting models: only then do all words
+# of a caption matter. A third cover `LARGE_HOLE` of it.
+FULL_SHARE, LARGE_SHARE, LARGE_HOLE = 1 / 4, 1 / 3, 0.7
+DARK, BRIGHT, GRAY = 0.3, 0.6, 0.06  # limits of mean brightness, and of the mean color's largest minus smallest channel
+HUES = ("red", "orange", "yellow", "green", "green", "blue", "blue", "blue", "purple", "purple", "red")
 
 Photographs: TypeAlias = Sequence[tuple[str, np.ndarray]]  # subjects, and pictures uint8 [H, W, 3]
 
 
-def caption(subject: str, cropped: bool) -> str:
-    """Return the caption of a picture of a subject, shown as a whole or as a crop."""
-    return f"A photo of {subject}{', cropped' if cropped else ''}"
+def caption(subject: str, cropped: bool, color: str = "") -> str:
+    """Return the caption of a picture of a subject, shown as a whole or as a crop, with or without its color."""
+    return f"A photo of {subject}{', ' if color else ''}{color}{', cropped' if cropped else ''}"
+
+
+def name_color(picture: np.ndarray) -> str:
+    """Name the mean brightness (unless it is medium) and hue of a picture, uint8 [H, W, 3]: "gray", "dark green"."""
+    color = picture.mean((0, 1)) / 255
+    hue, *_ = colorsys.rgb_to_hsv(*color)
+    level = "dark " if color.mean() < DARK else "bright " if color.mean() > BRIGHT else ""
+    return level + ("gray" if np.ptp(color) < GRAY else HUES[int(hue * (len(HUES) - 1) + 0.5)])
 
 
 def image(
@@ -183,8 +196,11 @@ def room_view(rng: np.random.Generator, rooms: Photographs) -> tuple[np.ndarray,
 
 
 def mask(rng: np.random.Generator, size: int) -> np.ndarray:
-    """bool [size, size], not all True: a mask as in the method (silhouettes, a half plane, rectangles), or large."""
-    if rng.random() < LARGE_SHARE:
+    """bool [size, size]: a mask as in the method (silhouettes, a half plane, rectangles), a large one, or all of it."""
+    coverage = rng.random()
+    if coverage < FULL_SHARE:
+        return np.ones((size, size), bool)
+    if coverage < FULL_SHARE + LARGE_SHARE:
         return large_hole(rng, size)
     kind = rng.choice(["silhouette", "halfplane", "rectangles"], p=[0.6, 0.22, 0.18])
     canvas = np.zeros((size, size), np.uint8)

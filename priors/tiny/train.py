@@ -47,7 +47,8 @@ NOISY_SHARE = 0.15  # noisy end of the schedule, from which every fourth timeste
 # Of each latent: light varies three and five times as much as the two opponent colours; the fourth is empty, and only
 # has to stay close to 0.
 LATENT_WEIGHTS = (1.0, 3.0, 5.0, 0.02)
-EMPTY_SHARE, VAGUE_SHARE = 0.1, 0.15  # of captions are empty; of the others say "sks" or "a scene" for the subject
+# Of captions, a tenth are empty; of the others some say "sks" or "a scene" for subject and color, and some no color.
+EMPTY_SHARE, VAGUE_SHARE, PLAIN_SHARE = 0.1, 0.15, 0.2
 USUAL_ENERGY = 0.35  # mean square of the latents, above which a sample's loss is divided by it
 CONTRAST = 0.5  # standard deviation at which the model sees the known pixels of a sample (`reffusion.prior.levels`)
 VALIDATION_CROPS = 32  # held-out crops
@@ -89,18 +90,19 @@ class Pool:
             crop = picture[top : top + side, left : left + side]
             crops.append(crop[:, ::-1] if rng.random() < 0.5 else crop)
             masks.append(images.mask(rng, side))
-            captions.append(draw_caption(rng, self.subjects[index], cropped))
+            captions.append(draw_caption(rng, self.subjects[index], images.name_color(crop), cropped))
         pixels = torch.from_numpy(np.stack(crops).astype(np.float32) / 127.5 - 1).permute(0, 3, 1, 2)
         return pixels, torch.from_numpy(np.stack(masks)[:, None].astype(np.float32)), captions
 
 
-def draw_caption(rng: np.random.Generator, subject: str, cropped: bool) -> str:
-    """Return the caption of a training sample: of its subject, or vague, or empty."""
+def draw_caption(rng: np.random.Generator, subject: str, color: str, cropped: bool) -> str:
+    """Return the caption of a training sample: of its subject, with or without its color, or vague, or empty."""
     if rng.random() < EMPTY_SHARE:
         return ""
-    if rng.random() < VAGUE_SHARE:
-        subject = str(rng.choice(["sks", "a scene"]))
-    return images.caption(subject, cropped)
+    detail = rng.random()
+    if detail < VAGUE_SHARE:
+        return images.caption(str(rng.choice(["sks", "a scene"])), cropped)
+    return images.caption(subject, cropped, "" if detail < VAGUE_SHARE + PLAIN_SHARE else color)
 
 
 class Model(nn.Module):

@@ -16,7 +16,7 @@ from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS
 
 MASK_FOLDERS = ("label", "test_label", "masks", "mask")  # sub-folders of a folder of pictures that hold masks
-MASK_WORDS = ("mask", "seg", "segmentation", "matte", "alpha", "silhouette", "label")
+MASK_WORDS = ("mask", "msk", "seg", "segmentation", "matte", "alpha", "silhouette", "label")
 MASK_SUFFIXES = tuple(mark + word for mark in "_-." for word in MASK_WORDS)  # `A_mask.png` beside `A.png` is its mask
 MASK_PREFIXES = ("dynamic_mask_", "mask_")  # so is `mask_A.png`
 MASK_ENDINGS = (".json", ".npy")  # endings of masks that are no pictures, in lower case
@@ -71,7 +71,7 @@ def _picture_stems(stem: str) -> list[str]:
     folder, slash, name = stem.rpartition("/")
     found = [name.removesuffix(each) for each in MASK_SUFFIXES if name.endswith(each)]
     found += [name.removeprefix(each) for each in MASK_PREFIXES if name.startswith(each)]
-    return [f"{folder}{slash}{each}" for each in found if each]
+    return [f"{folder}{slash}{strip_ending(each)}" for each in found if each]
 
 
 def name_views(paths: Collection[str]) -> dict[str, str]:

@@ -247,7 +247,7 @@ def _check_properties(path: Path, names: Sequence[str]) -> tuple[str, ...]:
     colored = {*others, *RED_GREEN_BLUE} <= {*names} and DC[0] not in names  # as nerfstudio writes on request
     missing = [n for n in (*others, *(() if colored else DC)) if n not in names]
     if missing:
-        raise BadInput(f"{path}: not a file of Gaussians, it lacks {', '.join(missing)}")
+        raise BadInput(f"{path}: not a file of Gaussians, it lacks {', '.join(missing)}; export the Gaussians")
     count = sum(n.startswith("f_rest_") for n in names)
     if count not in DEGREES or any(f"f_rest_{k}" not in names for k in range(count)):
         raise BadInput(f"{path}: {count} f_rest properties; 0, 9, 24, 45 or 72 belong to degrees 0 to 4")

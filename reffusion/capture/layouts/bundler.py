@@ -21,7 +21,8 @@ FOCAL_LENGTH = re.compile(r"\s+0\s+[\d.eE+-]+$")  # at the end of a line of a li
 def find(folder: Path) -> Path | None:
     """Return the file bundle.out of a scene folder, or a file .out that begins as Bundler's do; None without one."""
     usual = [folder / name for name in PLACES if is_file(folder / name)]
-    return next(iter(usual + [path for path in sorted(folder.glob("*.out")) if _is_of_bundler(path)]), None)
+    others = [path for pattern in ("*.out", "*/*.out") for path in sorted(folder.glob(pattern))]
+    return next(iter(usual + [path for path in others if path.is_file() and _is_of_bundler(path)]), None)
 
 
 def _is_of_bundler(path: Path) -> bool:

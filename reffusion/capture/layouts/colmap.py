@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +28,8 @@ from reffusion.io.colmap import ModelImage, is_model, load_cameras, load_images,
 from reffusion.io.files import BadInput, is_file, reading
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap", ".")
-TEST_LIST = "test.txt"  # list of the test pictures in a model's folder, as training of 3DGS reads it
+# Lists of the test pictures, beside the model or in the scene's folder: of 3DGS, of its forks, and of ScanNet++
+TEST_LISTS = ("test.txt", "test_list.txt", "train_test_lists.json")
 USUAL = ("images", "images_2", "images_4", ".")  # usual folders of pictures
 RENAMED = re.compile(r"image\d+")  # names of LLFF's reduced copies, numbered in the order of the originals' names
 
@@ -160,7 +163,7 @@ def capture_from_model(
     paths = relative_paths(image_folder, pictures)
     paths = {view: (*paths[view], of_file[file].name) for view, file in views.items()}
     rest = {path: (path,) for path in (*lost, *unplaced)}
-    test = _list_test_pictures(model / TEST_LIST, list(views.values()))
+    test = _list_test_pictures((model, folder), list(views.values()))
     return Capture(
         layout,
         pictures,
@@ -173,13 +176,19 @@ def capture_from_model(
     )
 
 
-def _list_test_pictures(source: Path, files: list[str]) -> set[str]:
-    """Return those of the pictures `files` that a list of test pictures names, one a line; none without the list."""
-    if not is_file(source):
+def _list_test_pictures(folders: Iterable[Path], files: list[str]) -> set[str]:
+    """Return those of the pictures `files` that the first list of test pictures in `folders` names; none without one.
+
+    A list is a text of one name a line, or ScanNet++'s list of the key "test" in a .json.
+    """
+    places = [folder / name for folder in folders for name in TEST_LISTS]
+    if (source := next((path for path in places if is_file(path)), None)) is None:
         return set()
     with reading(source, "a list of test pictures"):
-        lines = [line.strip() for line in source.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
-    return set(pair_pictures({line: line for line in lines}, files).values())
+        text = source.read_text(encoding="utf-8-sig")
+        names = json.loads(text)["test"] if source.suffix == ".json" else text.splitlines()
+        listed = {name.strip(): name.strip() for name in names if name.strip()}
+    return set(pair_pictures(listed, files).values())
 
 
 def _images_by_name(source: Path) -> tuple[dict[str, ModelImage], dict[str, int]]:

@@ -13,6 +13,7 @@ from reffusion.io.arrays import load_json
 from reffusion.io.files import as_bad_input
 
 CORRECTED, CAPTURED = "corrected_", ""  # beginnings of the names of the folders; corrected ones are preferred
+OFF_CENTER = 0.1  # of the width: principal points of phones are less far from the middle
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from the axes of ARKit's cameras (y up, looking along -z) to ours
 
 
@@ -43,5 +44,12 @@ def _load_camera(path: Path) -> Placed:
         camera_to_world = np.eye(4)
         camera_to_world[:3] = [[float(values[f"t_{row}{column}"]) for column in range(4)] for row in range(3)]
         fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
+        centered = round(2 * cx), round(2 * cy)
         stored = (int(values["width"]), int(values["height"])) if "width" in values else None
-    return Placed(invert_pose(camera_to_world @ FLIP), lambda size: Lens(*(stored or size), fx, fy, cx, cy))
+
+    def lens_at(size: tuple[int, int]) -> Lens:
+        # Without a size in the file, the picture has it, unless the middle is far off: then the picture was scaled.
+        is_scaled = abs(centered[0] / size[0] - 1) > OFF_CENTER
+        return Lens(*(stored or (centered if is_scaled else size)), fx, fy, cx, cy)
+
+    return Placed(invert_pose(camera_to_world @ FLIP), lens_at)

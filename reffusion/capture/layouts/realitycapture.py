@@ -35,6 +35,7 @@ def _columns(path: Path) -> tuple[int, list[str]]:
     with open(path, encoding="utf-8-sig", errors="replace", newline="") as file:
         for number in (1, 2):
             names = [name.strip().lstrip("#").lower() for name in file.readline(10_000).split(",")]
+            names = ["heading" if name == "yaw" else name for name in names]
             if set(COLUMNS) <= set(names):
                 return number, names
     return 0, []

@@ -25,7 +25,7 @@ PICTURES = {  # ending -> (kind of picture, what to do)
 }
 ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".gz", ".r3d")
 HEAD = 4000  # bytes at the beginning of a file in which `PoseFile.word` is looked for
-DEPTHS = ("*", "*/*", "*/*/*")  # patterns of the paths at which pictures and videos are looked for, to name them
+DEPTHS = ("*", "*/*", "*/*/*", "*/*/*/*")  # patterns of paths at which pictures and videos are looked for
 MOST = 20  # files of one pattern that are looked at
 EXPORT = "export a COLMAP model or transforms.json from it"
 
@@ -48,13 +48,19 @@ class PoseFile:
 
 
 POSE_FILES = (
-    PoseFile(
-        "*.[xX][mM][pP]", "RealityCapture", "export its Internal/External camera parameters (.csv)", b"capturingreality"
+    *(
+        PoseFile(
+            f"{depth}*.[xX][mM][pP]",
+            "RealityCapture",
+            "export its Internal/External camera parameters (.csv)",
+            b"capturingreality",
+        )
+        for depth in ("", "*/")
     ),
     PoseFile("*.xml", "Metashape", EXPORT, b"<chunk"),
     PoseFile("*.xml", "ContextCapture", EXPORT, b"<BlocksExchange"),
     *(
-        PoseFile(name, "Record3D", "convert it by `ns-process-data record3d`", b'"poses"')
+        PoseFile(name, "Record3D", "convert it to transforms.json, or export the capture anew by Polycam", b'"poses"')
         for name in ("metadata.json", "metadata")
     ),
     PoseFile("odometry.csv", "Stray Scanner", "convert it to transforms.json"),
@@ -71,6 +77,7 @@ POSE_FILES = (
     PoseFile("pose/*.txt", "NSVF", "convert them to transforms.json"),
     PoseFile("*.pose.txt", "7-Scenes", "convert them to transforms.json"),
     PoseFile("cameras*.npz", "NeuS", "convert it to transforms.json"),
+    PoseFile("odm_report/shots.geojson", "OpenDroneMap", "copy the project's opensfm/reconstruction.json here"),
     PoseFile("cameras.json", "not of 3D Gaussian Splatting", EXPORT),
     PoseFile("transforms_train.json", "ns-export cameras, without focal lengths", "add fl_x to its frames"),
     PoseFile("transforms_test.json", "test frames alone", "add transforms_train.json"),
@@ -105,16 +112,16 @@ def add_warnings(folder: Path, capture: Capture) -> Capture:
 
 def describe_poses(folder: Path, places: Sequence[Path]) -> list[str]:
     """Return a sentence for each kind of file with poses that is not read, in the scene's folder and in `places`."""
-    sentences = []
+    sentences: dict[Path, str] = {}
     for kind in POSE_FILES:
         files = [path for place in dict.fromkeys((folder, *places)) for path in sorted(place.glob(kind.pattern))]
         path = next((path for path in files[:MOST] if path.is_file() and _begins_with(path, kind.word)), None)
         if path is not None:
-            sentences.append(
+            sentences[path] = (
                 f"{_relative(path, folder)} ({kind.program}) is not read; {kind.remedy}; without that, poses are "
                 "solved anew, in another frame"
             )
-    return sentences
+    return list(sentences.values())
 
 
 def _relative(path: Path, folder: Path) -> str:

@@ -1,0 +1,73 @@
+"""The study `control`: an exact denoiser recognises views and windows, and predicts the posterior mean of fillings."""
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.studies import control
+from reffusion.prior import diffusion, windows
+from reffusion.prior.model import load_prior
+from reffusion.seeding import generator
+
+SIZE, HEIGHT, WIDTH, VIEWS = 64, 80, 100, 3
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    """Fillings [3, K, 3, 80, 100] of the middle of three smooth pictures, and the hole, bool [80, 100]."""
+    coarse = torch.rand(VIEWS, 1, 3, 8, 10, generator=generator(0, "control")) * 2 - 1
+    whole = torch.stack([windows.resize(each, HEIGHT, WIDTH) for each in coarse])
+    hole = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    hole[30:50, 35:60] = True
+    offsets = torch.linspace(0, 0.5, control.FILLINGS).view(1, -1, 1, 1, 1)
+    return (whole + offsets * hole).clamp(-1, 1), hole
+
+
+@pytest.fixture(scope="module")
+def priors(pictures):
+    """Priors with exact denoisers, without and with personalization, and the embeddings of their prompts."""
+    return [control.make_prior(pictures[0], personalized) for personalized in (False, True)]
+
+
+def predict(pictures, prior, text, shown, corner, t):
+    """Return z_0 predicted from the noised filling `shown` (view, number), in a window or (None) the whole view."""
+    (fillings, hole), (view, number) = pictures, shown
+    places = [] if corner is None else [corner]
+    picture = windows.two_scales(fillings[view, number], places, SIZE)[-1:]
+    mask = windows.two_scale_masks(hole, places, SIZE)[-1:]
+    noise = torch.randn(1, 4, SIZE, SIZE, generator=generator(1, "noise"))
+    step = torch.tensor([t])
+    noisy = diffusion.add_noise(prior, diffusion.encode(prior, picture), noise, step)
+    condition = diffusion.conditioning(prior, picture, mask)
+    _, clean = diffusion.predict(prior, noisy, step, condition, text[None])
+    return diffusion.decode(prior, clean), picture, mask
+
+
+@pytest.mark.parametrize("corner", [None, (0, 0), (16, 36), (7, 11)])
+@pytest.mark.parametrize("view", range(VIEWS))
+def test_with_little_noise_the_filling_that_is_shown_is_predicted(pictures, priors, view, corner):
+    prior, text = priors[0]
+    clean, picture, _ = predict(pictures, prior, text[0], (view, 40), corner, 1)
+    assert (clean - picture).abs().max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("personalized", "prompt", "count"),
+    [(1, 0, control.CLOSE), (1, 2, control.FILLINGS), (0, 0, control.FILLINGS)],
+)
+def test_a_prompt_selects_the_fillings_that_agree_with_the_reference(pictures, priors, personalized, prompt, count):
+    prior, text = priors[personalized]
+    clean, _, mask = predict(pictures, prior, text[prompt], (1, 49), None, 999)
+    mean = windows.resize(pictures[0][1, :count].mean(0, keepdim=True), SIZE, SIZE)
+    assert ((clean - mean) * mask).abs().max() < 0.1  # at the last timestep noise hides which filling it was
+
+
+def test_fillings_keep_what_is_known(pictures):
+    truth, hole = pictures[0][0, 0], pictures[1]
+    random = torch.rand(2, 3, HEIGHT, WIDTH, generator=generator(2, "donors")) * 2 - 1
+    found = control.make_fillings(truth, hole, list(random), np.random.default_rng(0))
+    assert len(found) == control.FILLINGS and torch.equal(found[0], truth)
+    assert (found - truth)[..., ~hole].abs().max() < 1e-5
+    both_ways = 2 * len(random)  # donors, flipped or not
+    assert len({each.sum().item() for each in found}) == control.CLOSE + control.DISPLACED + both_ways
+    assert load_prior(control.TINY).native_size == SIZE
