@@ -260,7 +260,7 @@ def _write_measured(
             (out / "truth/depth").mkdir(parents=True, exist_ok=True)
             np.save(out / f"truth/depth/{name}.npy", true_depth)
             draw = randomness(session.seed, f"estimate {name}")
-            true_depth = estimate_disparity(true_depth, kind.depth_error, draw)
+            true_depth = estimate_disparity(true_depth, session.masks[k], kind.depth_error, draw)
         np.save(out / f"references/{name}.npy", true_depth)
         entries.append(f"- {{view: {name}, image: references/{name}.png, depth: references/{name}.npy}}\n")
     return "".join(entries)

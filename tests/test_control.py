@@ -24,9 +24,9 @@ def pictures():
 
 
 @pytest.fixture(scope="module")
-def priors(pictures):
-    """Priors with exact denoisers, without and with personalization, and the embeddings of their prompts."""
-    return [control.make_prior(pictures[0], personalized) for personalized in (False, True)]
+def exact(pictures):
+    """The prior with the exact denoiser, and the embeddings of its prompts."""
+    return control.make_prior(pictures[0])
 
 
 def predict(pictures, prior, text, shown, corner, t):
@@ -45,18 +45,20 @@ def predict(pictures, prior, text, shown, corner, t):
 
 @pytest.mark.parametrize("corner", [None, (0, 0), (16, 36), (7, 11)])
 @pytest.mark.parametrize("view", range(VIEWS))
-def test_with_little_noise_the_filling_that_is_shown_is_predicted(pictures, priors, view, corner):
-    prior, text = priors[0]
+def test_with_little_noise_the_filling_that_is_shown_is_predicted(pictures, exact, view, corner):
+    prior, text = exact
+    prior.unet.personalized = False
     clean, picture, _ = predict(pictures, prior, text[0], (view, 40), corner, 1)
     assert (clean - picture).abs().max() < 1e-3
 
 
 @pytest.mark.parametrize(
     ("personalized", "prompt", "count"),
-    [(1, 0, control.CLOSE), (1, 2, control.FILLINGS), (0, 0, control.FILLINGS)],
+    [(True, 0, control.CLOSE), (True, 2, control.FILLINGS), (False, 0, control.FILLINGS)],
 )
-def test_a_prompt_selects_the_fillings_that_agree_with_the_reference(pictures, priors, personalized, prompt, count):
-    prior, text = priors[personalized]
+def test_a_prompt_selects_the_fillings_that_agree_with_the_reference(pictures, exact, personalized, prompt, count):
+    prior, text = exact
+    prior.unet.personalized = personalized
     clean, _, mask = predict(pictures, prior, text[prompt], (1, 49), None, 999)
     mean = windows.resize(pictures[0][1, :count].mean(0, keepdim=True), SIZE, SIZE)
     assert ((clean - mean) * mask).abs().max() < 0.1  # at the last timestep noise hides which filling it was

@@ -50,6 +50,25 @@ def test_same_seed_same_bytes_and_old_files_go(generate, mini_scene, tmp_path):
     assert other[name] != read_files(mini_scene)[name]
 
 
+def test_a_depth_map_as_a_network_gives_it(generate, tmp_path):
+    kind = replace(generate.KINDS["mini"], depth_error=0.25, bend=0.0)
+    generate.generate(tmp_path / "mono", 0, kind)
+    (reference,) = yaml.safe_load((tmp_path / "mono/scene.yaml").read_text())["reference"]
+    name = reference["view"]
+    label = lambda view: np.atleast_3d(load_image(tmp_path / f"mono/images_4/label/{view}.png"))[..., 0] > 0
+    estimate = np.load(tmp_path / "mono" / reference["depth"])
+    depth, mask = np.load(tmp_path / f"mono/truth/depth/{name}.npy"), label(name)
+    # Scale and offset of the disparity, by least squares where the photograph shows the scene.
+    known = np.stack([estimate[~mask], np.ones((~mask).sum())], 1)
+    scale, offset = np.linalg.lstsq(known, 1 / depth[~mask], rcond=None)[0]
+    error = np.abs(np.log((scale * estimate + offset) * depth))
+    assert scale > 0 and error[mask].max() > 0.15 and np.median(error[~mask]) < 0.06
+    for path in sorted((tmp_path / "mono/truth/without_object").glob("*.png")):
+        hidden = label(path.stem)
+        assert np.array_equal(load_image(path)[~hidden], load_image(tmp_path / f"mono/images_4/{path.name}")[~hidden])
+    assert len([*(tmp_path / "mono/truth/without_object").iterdir()]) == kind.train
+
+
 def test_foreign_files_are_never_overwritten(generate, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match="did not write"):

@@ -95,10 +95,11 @@ def displace(picture: Tensor, hole: Tensor, shift: tuple[float, float]) -> Tenso
     return torch.from_numpy(moved).permute(2, 0, 1)
 
 
-def transplant(picture: Tensor, donor: Tensor, hole: Tensor) -> Tensor:
-    """Return a picture [3, H, W] whose hole shows the donor, shifted smoothly to the colours around the hole."""
-    mask = hole[None, None].float()
-    return picture + hole * (donor - picture + harmonic_fill.harmonic_extension((picture - donor)[None], mask)[0])
+def transplant(picture: Tensor, donors: Tensor, hole: Tensor) -> Tensor:
+    """Return pictures [N, 3, H, W] whose holes show the donors [N, 3, H, W], shifted smoothly to the known colours."""
+    difference = picture - donors
+    shift = harmonic_fill.harmonic_extension(difference, hole.float().expand(len(donors), 1, -1, -1))
+    return picture + hole * (shift - difference)
 
 
 def make_fillings(truth: Tensor, hole: Tensor, donors: Sequence[Tensor], random: np.random.Generator) -> Tensor:
@@ -115,10 +116,9 @@ def make_fillings(truth: Tensor, hole: Tensor, donors: Sequence[Tensor], random:
     for _ in range(DISPLACED):
         turn, length = random.uniform(0, 2 * np.pi), random.uniform(*DISPLACEMENT)
         found.append(displace(truth, hole, (length * np.cos(turn), length * np.sin(turn))))
-    while len(found) < FILLINGS:
-        donor = donors[random.integers(len(donors))]
-        found.append(transplant(truth, donor.flip(2) if random.random() < 0.5 else donor, hole))
-    return torch.stack(found).clamp(-1, 1)
+    chosen = [donors[k] for k in random.integers(len(donors), size=FILLINGS - len(found))]
+    flipped = [donor.flip(2) if random.random() < 0.5 else donor for donor in chosen]
+    return torch.cat([torch.stack(found), transplant(truth, torch.stack(flipped), hole)]).clamp(-1, 1)
 
 
 # ---------------------------------------------------------------------------------------------- denoiser
@@ -132,25 +132,30 @@ class Recognized(NamedTuple):
 
 
 class ExactDenoiser(nn.Module):
-    """The posterior mean over fillings, in place of a UNet: it takes [z_t | mask | known latents] and predicts v."""
+    """The posterior mean over fillings, in place of a UNet: it takes [z_t | mask | known latents] and predicts v.
 
-    def __init__(self, fillings: Tensor, prior: Prior, empty: Tensor, personalized: bool):
+    Attributes:
+        personalized: whether a prompt other than the empty one selects the fillings that agree with the reference.
+    """
+
+    def __init__(self, fillings: Tensor, prior: Prior, empty: Tensor):
         """Prepare the denoiser.
 
         Args:
             fillings: [V, K, 3, H, W] in [-1, 1], of all views; the first `CLOSE` agree with the reference.
             prior: provides schedule, native size and VAE, whose latents are a linear map of pixels.
             empty: [L, D], the embedding of the empty prompt.
-            personalized: whether a prompt other than the empty one selects the fillings that agree.
         """
         super().__init__()
         self.alphas, self.size = prior.alphas_cumprod, prior.native_size
-        self.empty, self.personalized = empty, personalized
-        latents = lambda images: torch.cat([diffusion.encode(prior, part) for part in images.split(64)])
-        with torch.no_grad():
-            self.full = torch.stack([latents(each) for each in fillings])
-            small = [windows.resize(each, self.size, self.size) for each in fillings]
-            self.small = torch.stack([latents(each) for each in small])
+        self.empty, self.personalized = empty, True
+        with torch.no_grad():  # the VAE is linear, and slower than its matrix
+            colors = torch.cat([torch.zeros(1, 3), torch.eye(3)])[..., None, None].expand(4, 3, 8, 8)
+            black, *basis = diffusion.encode(prior, colors)[:, :, 4, 4]
+            matrix = torch.stack(basis, 1) - black[:, None]
+            latents = lambda images: torch.einsum("lc,vkchw->vklhw", matrix, images) + black[:, None, None]
+            self.full = latents(fillings)
+            self.small = latents(torch.stack([windows.resize(each, self.size, self.size) for each in fillings]))
         self.config = SimpleNamespace(sample_size=self.size, addition_embed_type=None)
         self.untrained = nn.Parameter(
             torch.zeros(()), requires_grad=False
@@ -190,20 +195,24 @@ class ExactDenoiser(nn.Module):
                 found = found[:CLOSE]
             abar = self.alphas[step].double()
             signal, spread = abar.sqrt(), (1 - abar).sqrt()
-            distance = ((noisy - signal * found) * mask).double().square().sum((1, 2, 3))
+            distance = ((noisy - signal.float() * found) * mask).square().sum((1, 2, 3)).double()
             weight = torch.softmax(-distance / (2 * spread.square()), 0).float()
-            clean = (weight[:, None, None, None] * found).sum(0)
+            clean = torch.einsum("k,kchw->chw", weight, found)
             eps = (noisy - signal * clean) / spread
             predictions.append((signal * eps - spread * clean).float())
         return SimpleNamespace(sample=torch.stack(predictions))
 
 
-def make_prior(fillings: Tensor, personalized: bool) -> tuple[Prior, Tensor]:
-    """Return a prior with an exact denoiser, and the embeddings [3, L, D] of the global, local and empty prompt."""
+def make_prior(fillings: Tensor) -> tuple[Prior, Tensor]:
+    """Return a prior with an exact denoiser, and the embeddings [3, L, D] of the global, local and empty prompt.
+
+    Args:
+        fillings: as of `ExactDenoiser`.
+    """
     prior = replace(load_prior(TINY), fills=False, contrast=0.0)
     # Any embeddings that differ will do, and those of the prior's text encoder need not.
     text = torch.eye(3)[:, None]
-    return replace(prior, unet=ExactDenoiser(fillings, prior, text[2], personalized), text_encoder=None), text
+    return replace(prior, unet=ExactDenoiser(fillings, prior, text[2]), text_encoder=None), text
 
 
 # ---------------------------------------------------------------------------------------------- one scene
@@ -298,7 +307,7 @@ def measure_scene(
         Method -> scores; and the middle test view by each method, the truth last.
     """
     models = {"vgg": lpips.load("vgg")[0]}
-    found, pictures, fillings = {}, [], None
+    found, pictures, prior, text = {}, [], None, None
     for method in methods:
         run, params = run_stages(scene, runs, method, more)
         home = runs / scene.name  # a variant shares what it does not change
@@ -309,17 +318,20 @@ def measure_scene(
             gaussians = initial
         else:
             views = load_train_views(params, space, part("initialize"))
-            if fillings is None:
+            if prior is None:
                 truth, random = load_truth(scene, views), np.random.default_rng(0)
                 fillings = torch.stack(
                     [make_fillings(t, v.repaint, donors, random) for t, v in zip(truth, views, strict=True)]
                 )
+                prior, text = make_prior(fillings)
                 print(f"{scene.name}: displacement {measure_displacement(home, scene, 64):.2f} px of the prior")
                 print(f"{scene.name}: known pixels in windows, median and least: {measure_known_share(views, 64)}")
-            prior, text = make_prior(fillings, method != "no_personalization")
+            prior.unet.personalized = method != "no_personalization"
             estimator = depth_estimator.build_estimator(params, space.scene.points) if params.depth.weight else None
             inputs = TermInputs(views, references, initial.means[masked], prior, text, estimator, None)
-            gaussians, _ = distill(initial, masked, inputs, params, out / scene.name / method)
+            folder = out / scene.name / method
+            folder.mkdir(parents=True, exist_ok=True)
+            gaussians, _ = distill(initial, masked, inputs, params, folder)
         found[method], picture = score(gaussians, home, models)
         pictures.append(picture)
         print(f"{scene.name}, {method}: " + ", ".join(f"{name} {value:.4f}" for name, value in found[method].items()))
@@ -353,7 +365,8 @@ def main() -> None:
     parser.add_argument("--set", default="", help="parameters, as in `make set=...`")
     arguments = parser.parse_args()
     scenes, out = [scene.resolve() for scene in arguments.scenes], arguments.out.resolve()
-    found, sheet = load_json(out / "control.json") if (out / "control.json").exists() else {}, []
+    found = load_json(out / "control.json") if (out / "control.json").exists() else {}
+    sheet: dict[str, list[np.ndarray]] = {}
     truth = {s: [load_image(p) for p in sorted((s / "truth/without_object").glob("*.png"))] for s in scenes}
     for scene in scenes:
         if scene.name in found:
@@ -363,9 +376,9 @@ def main() -> None:
         found[scene.name], pictures = measure_scene(
             scene, arguments.runs.resolve(), donors, arguments.methods, arguments.set, out
         )
-        sheet.append([picture.repeat(SHEET_SCALE, 0).repeat(SHEET_SCALE, 1) for picture in pictures])
+        sheet[scene.name] = [picture.repeat(SHEET_SCALE, 0).repeat(SHEET_SCALE, 1) for picture in pictures]
         save_json(out / "control.json", found)
-        save_image(out / "sheet.png", compose_sheet(sheet, [*arguments.methods, "truth"], [s.name for s in scenes]))
+        save_image(out / "sheet.png", compose_sheet([*sheet.values()], [*arguments.methods, "truth"], [*sheet]))
     save_text(out / "control.md", tabulate(found))
     print(tabulate(found))
 
