@@ -190,7 +190,7 @@ def _write_removal(out: Path, session: Session, kind: Kind, world: World, frame:
     else:
         removed = replace(world, solids=without_object(world.solids))
         references = _write_measured(out, session, session.completions, kind, removed, frame)
-        for name, picture in zip(session.names[session.test :], session.emptied, strict=True):
+        for name, picture in zip(session.names[session.test :], session.backgrounds, strict=True):
             write_image(out / f"truth/without_object/{name}.png", picture)
     (out / "scene.yaml").write_text(references + PROFILE)
 

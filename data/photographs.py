@@ -34,7 +34,8 @@ class Session:
             each time the view whose distance to the nearest view chosen before is largest.
         object_masks: name of an object -> bool [V, H, W], the object's mask; only objects with masks of their own.
         seed: seed of the scene.
-        emptied: uint8 [N, H, W, 3], the training views without the object; N = 0 unless the kind has a `depth_error`.
+        backgrounds: uint8 [N, H, W, 3], the training views without the object; N = 0 unless the kind has a
+            `depth_error`.
     """
 
     names: list[str]
@@ -48,7 +49,7 @@ class Session:
     spread: list[int]
     object_masks: dict[str, np.ndarray]
     seed: int
-    emptied: np.ndarray
+    backgrounds: np.ndarray
 
 
 def take_photographs(seed: int, kind: Kind, world: World, target: np.ndarray) -> Session:
@@ -74,10 +75,10 @@ def take_photographs(seed: int, kind: Kind, world: World, target: np.ndarray) ->
     object_masks = {
         name: np.stack([_object_mask(world, c, kind, own) for c in cameras]) for name, own in world.objects.items()
     }
-    emptied = [shoot(world, camera, kind, with_object=False)[0] for camera in train] if kind.depth_error else []
+    backgrounds = [shoot(world, camera, kind, with_object=False)[0] for camera in train] if kind.depth_error else []
     return Session(
         names, cameras, kind.test, photos, masks, np.stack(hidden), middle, whole, spread, object_masks, seed,
-        np.array(emptied),
+        np.array(backgrounds),
     )  # fmt: skip
 
 

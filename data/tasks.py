@@ -50,21 +50,21 @@ def depth(camera: np.ndarray, kind: Kind, world: World, frame: Frame) -> np.ndar
     return (frame.scale * ((points - camera[13:]) @ camera[4:13].reshape(3, 3)[:, 2])).astype(np.float32)
 
 
-def estimate_disparity(depth: np.ndarray, filled: np.ndarray, error: float, draw: np.random.Generator) -> np.ndarray:
+def estimate_disparity(depth: np.ndarray, hole: np.ndarray, error: float, draw: np.random.Generator) -> np.ndarray:
     """Return the disparity [H, W] of a depth map as a monocular network gives it: with smooth errors and another unit.
 
-    The logarithm of the disparity is wrong by `error` in the middle of the filled pixels, where the network sees
-    painted content. The error falls towards their border, where it is a third. Everywhere waves with an rms of a tenth
-    of `error` are added. Sign, waves, scale and offset are random.
+    The logarithm of the disparity is wrong by `error` in the middle of the hole, where the network sees painted
+    content. The error falls towards the hole's border, where it is a third. Everywhere waves with an rms of a tenth of
+    `error` are added. Sign, waves, scale and offset are random.
 
     Args:
         depth: [H, W], camera z.
-        filled: bool [H, W], the pixels that the reference fills.
+        hole: bool [H, W], the pixels that the reference fills.
         error: largest error of the logarithm.
         draw: random generator.
     """
     rows, columns = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
-    down, across = np.nonzero(filled)
+    down, across = np.nonzero(hole)
     (top, left), (bottom, right) = (down.min(), across.min()), (down.max() + 1, across.max() + 1)
     beside = (2 * columns - left - right) / (right - left), (2 * rows - top - bottom) / (bottom - top)
     field = draw.choice([-1, 1]) * np.exp(-np.square(beside).sum(0))

@@ -60,9 +60,11 @@ TINY = ROOT / "priors" / "tiny"
 FILLINGS, CLOSE = 50, 3  # fillings of a hole; the first `CLOSE` of them agree with the reference
 DISPLACED = 24  # fillings whose content is displaced
 DISPLACEMENT = (2.0, 10.0)  # px, smallest and largest displacement
-# Method -> variant of pipeline.yaml. "start" is the initialization.
+# Method -> variant of pipeline.yaml. "start" is the initialization. In "ceiling" the photographs show the truth, and
+# the reconstruction term is the only one.
 METHODS = {
     "start": "",
+    "ceiling": "",
     "full": "",
     "no_sds": "no_sds",
     "no_local_sds": "no_local_sds",
@@ -73,6 +75,7 @@ METHODS = {
     "no_depth": "no_depth",
 }
 SCORES = {"lpips_vgg_box": 4, "psnr_box": 2, "psnr_outside": 2}  # column of per_view.csv -> decimals
+CEILING = {"sds.weight": 0, "depth.weight": 0, "adversarial.weight": 0}
 SHEET_SCALE = 3
 
 
@@ -124,7 +127,7 @@ def make_fillings(truth: Tensor, hole: Tensor, donors: Sequence[Tensor], random:
 # ---------------------------------------------------------------------------------------------- denoiser
 
 
-class Recognized(NamedTuple):
+class Place(NamedTuple):
     """Where a sample was found: the view's number, and the window's corner, None for a whole view."""
 
     view: int
@@ -157,12 +160,10 @@ class ExactDenoiser(nn.Module):
             self.full = latents(fillings)
             self.small = latents(torch.stack([windows.resize(each, self.size, self.size) for each in fillings]))
         self.config = SimpleNamespace(sample_size=self.size, addition_embed_type=None)
-        self.untrained = nn.Parameter(
-            torch.zeros(()), requires_grad=False
-        )  # by which the code finds the type of weights
+        self.anchor = nn.Parameter(torch.zeros(()), requires_grad=False)  # by which the code finds the type of weights
         self.spectra = torch.fft.rfft2(torch.cat([self.full[:, 0], self.full[:, 0].square().sum(1, keepdim=True)], 1))
 
-    def recognize(self, known: Tensor, mask: Tensor) -> Recognized:
+    def recognize(self, known: Tensor, mask: Tensor) -> Place:
         """Find the view and the window that the known pixels show.
 
         Args:
@@ -177,9 +178,9 @@ class ExactDenoiser(nn.Module):
         error = torch.fft.irfft2((self.spectra * transformed.conj()).sum(1), s=(height, width))
         error = error[:, : height - self.size + 1, : width - self.size + 1] + (known * seen).square().sum()
         if whole.min() < error.min():
-            return Recognized(int(whole.argmin()), None)
+            return Place(int(whole.argmin()), None)
         view, top, left = np.unravel_index(int(error.argmin()), error.shape)
-        return Recognized(int(view), (int(top), int(left)))
+        return Place(int(view), (int(top), int(left)))
 
     def forward(self, sample: Tensor, t: Tensor, encoder_hidden_states: Tensor) -> SimpleNamespace:
         """Return v [B, 4, S, S] as `.sample`, for samples [B, 9, S, S], timesteps [B] and embeddings [B, L, D]."""
@@ -245,6 +246,13 @@ def load_truth(scene: Path, views: Sequence[TrainView]) -> list[Tensor]:
     return [torch.from_numpy(picture).permute(2, 0, 1) / 127.5 - 1 for picture in pictures]
 
 
+def show_truth(view: TrainView, truth: Tensor) -> TrainView:
+    """Return a training view whose photograph is the truth [3, H, W] in [-1, 1], and supervises everywhere."""
+    photo = ((truth.permute(1, 2, 0) + 1) * 127.5).round().to(torch.uint8)
+    nothing = torch.zeros_like(view.repaint)
+    return replace(view, photo=photo, supervises=~nothing, repaint=nothing, clean=True)
+
+
 def measure_displacement(run: Path, scene: Path, size: int) -> float:
     """Return the median displacement of the reference's pixels in other views by the error of its estimated depth.
 
@@ -279,7 +287,7 @@ def measure_known_share(views: Sequence[TrainView], size: int) -> tuple[float, f
 
 
 @torch.no_grad()
-def score(gaussians: Gaussians, run: Path, models: Mapping[str, lpips.Lpips]) -> tuple[dict[str, float], np.ndarray]:
+def score(gaussians: Gaussians, run: Path, models: dict[str, lpips.Lpips]) -> tuple[dict[str, float], np.ndarray]:
     """Return the mean `SCORES` over the test views, and the middle test view as rendered."""
     space, scored, pictures = Workspace(run / "poses", run / "fit", run / "masks"), [], []
     renderer = ViewRenderer({"distill": gaussians}, "distill", None, {})
@@ -287,10 +295,36 @@ def score(gaussians: Gaussians, run: Path, models: Mapping[str, lpips.Lpips]) ->
         camera = space.scene.cameras[name]
         picture = load_ground_truth(camera, run / "poses")
         view = renderer.render(camera, load_object_mask(camera, run / "raw_masks", run / "masks"), picture).result
-        scored.append(scores.score_row(view, None, scores.GroundTruth(picture, False, None), dict(models)))
+        scored.append(scores.score_row(view, None, scores.GroundTruth(picture, False, None), models))
         pictures.append(view.picture)
     mean = scores.summarize(scored)["mean"]
     return {name: mean[name] for name in SCORES}, pictures[len(pictures) // 2]
+
+
+class Exact(NamedTuple):
+    """The truth of a scene, and the exact prior.
+
+    Attributes:
+        truth: the training views without the object, [3, H, W] in [-1, 1] each.
+        prior: as of `make_prior`.
+        text: [3, L, D], as of `make_prior`.
+    """
+
+    truth: list[Tensor]
+    prior: Prior
+    text: Tensor
+
+
+def prepare(scene: Path, run: Path, views: Sequence[TrainView], donors: Sequence[Tensor]) -> Exact:
+    """Load the truth, make the exact prior, and print the displacement of the start and the share of known pixels."""
+    truth, random = load_truth(scene, views), np.random.default_rng(0)
+    fillings = [make_fillings(each, view.repaint, donors, random) for each, view in zip(truth, views, strict=True)]
+    prior, text = make_prior(torch.stack(fillings))
+    size = prior.native_size
+    print(f"{scene.name}: displacement of the start {measure_displacement(run, scene, size):.2f} px of the prior")
+    middle, least = measure_known_share(views, size)
+    print(f"{scene.name}: known share of windows, median {middle:.2f}, least {least:.2f}")
+    return Exact(truth, prior, text)
 
 
 def measure_scene(
@@ -304,39 +338,36 @@ def measure_scene(
         out: folder for checkpoints.
 
     Returns:
-        Method -> scores; and the middle test view by each method, the truth last.
+        Method -> scores; and the middle test view by each method.
+
+    Raises:
+        ValueError: the weights of LPIPS are missing, or as for `run_stages` and `load_truth`.
     """
-    models = {"vgg": lpips.load("vgg")[0]}
-    found, pictures, prior, text = {}, [], None, None
+    network, reason = lpips.load("vgg")
+    if network is None:
+        raise ValueError(f"LPIPS cannot be measured: {reason}")
+    home, exact, found, pictures = runs / scene.name, None, {}, []
     for method in methods:
         run, params = run_stages(scene, runs, method, more)
-        home = runs / scene.name  # a variant shares what it does not change
-        part = lambda stage, run=run, home=home: next(p / stage for p in (run, home) if (p / stage).is_dir())
+        # A variant shares what it does not change.
+        part = lambda stage, run=run: next(place / stage for place in (run, home) if (place / stage).is_dir())
         space = Workspace(part("poses"), part("fit"), part("masks"))
-        initial, masked, references = load_initialization(params, space.scene, part("reference"), part("initialize"))
-        if method == "start":
-            gaussians = initial
-        else:
+        gaussians, masked, references = load_initialization(params, space.scene, part("reference"), part("initialize"))
+        if method != "start":
             views = load_train_views(params, space, part("initialize"))
-            if prior is None:
-                truth, random = load_truth(scene, views), np.random.default_rng(0)
-                fillings = torch.stack(
-                    [make_fillings(t, v.repaint, donors, random) for t, v in zip(truth, views, strict=True)]
-                )
-                prior, text = make_prior(fillings)
-                print(f"{scene.name}: displacement {measure_displacement(home, scene, 64):.2f} px of the prior")
-                print(f"{scene.name}: known pixels in windows, median and least: {measure_known_share(views, 64)}")
-            prior.unet.personalized = method != "no_personalization"
+            exact = exact or prepare(scene, home, views, donors)
+            exact.prior.unet.personalized = method != "no_personalization"
+            if method == "ceiling":
+                views = [show_truth(view, each) for view, each in zip(views, exact.truth, strict=True)]
+                params = params.changed(CEILING)
             estimator = depth_estimator.build_estimator(params, space.scene.points) if params.depth.weight else None
-            inputs = TermInputs(views, references, initial.means[masked], prior, text, estimator, None)
+            inputs = TermInputs(views, references, gaussians.means[masked], exact.prior, exact.text, estimator, None)
             folder = out / scene.name / method
             folder.mkdir(parents=True, exist_ok=True)
-            gaussians, _ = distill(initial, masked, inputs, params, folder)
-        found[method], picture = score(gaussians, home, models)
+            gaussians, _ = distill(gaussians, masked, inputs, params, folder)
+        found[method], picture = score(gaussians, home, {"vgg": network})
         pictures.append(picture)
         print(f"{scene.name}, {method}: " + ", ".join(f"{name} {value:.4f}" for name, value in found[method].items()))
-    test = Workspace(home / "poses", home / "fit", home / "masks").scene
-    pictures.append(load_ground_truth(test.cameras[test.test[len(test.test) // 2]], home / "poses"))
     return found, pictures
 
 
@@ -378,7 +409,7 @@ def main() -> None:
         )
         sheet[scene.name] = [picture.repeat(SHEET_SCALE, 0).repeat(SHEET_SCALE, 1) for picture in pictures]
         save_json(out / "control.json", found)
-        save_image(out / "sheet.png", compose_sheet([*sheet.values()], [*arguments.methods, "truth"], [*sheet]))
+        save_image(out / "sheet.png", compose_sheet([*sheet.values()], [*arguments.methods], [*sheet]))
     save_text(out / "control.md", tabulate(found))
     print(tabulate(found))
 
