@@ -254,14 +254,14 @@ def _write_measured(
     """
     entries = ["reference:\n"]
     for k, picture in pictures.items():
-        name, true_depth = session.names[k], depth(session.cameras[k], kind, world, frame)
+        name, measured = session.names[k], depth(session.cameras[k], kind, world, frame)
         write_image(out / f"references/{name}.png", picture)
         if kind.depth_error:
             (out / "truth/depth").mkdir(parents=True, exist_ok=True)
-            np.save(out / f"truth/depth/{name}.npy", true_depth)
+            np.save(out / f"truth/depth/{name}.npy", measured)
             draw = randomness(session.seed, f"estimate {name}")
-            true_depth = estimate_disparity(true_depth, session.masks[k], kind.depth_error, draw)
-        np.save(out / f"references/{name}.npy", true_depth)
+            measured = estimate_disparity(measured, session.masks[k], kind.depth_error, draw)
+        np.save(out / f"references/{name}.npy", measured)
         entries.append(f"- {{view: {name}, image: references/{name}.png, depth: references/{name}.npy}}\n")
     return "".join(entries)
 

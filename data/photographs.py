@@ -77,9 +77,19 @@ def take_photographs(seed: int, kind: Kind, world: World, target: np.ndarray) ->
     }
     backgrounds = [shoot(world, camera, kind, with_object=False)[0] for camera in train] if kind.depth_error else []
     return Session(
-        names, cameras, kind.test, photos, masks, np.stack(hidden), middle, whole, spread, object_masks, seed,
-        np.array(backgrounds),
-    )  # fmt: skip
+        names,
+        cameras,
+        kind.test,
+        photos,
+        masks,
+        np.stack(hidden),
+        middle,
+        whole,
+        spread,
+        object_masks,
+        seed=seed,
+        backgrounds=np.array(backgrounds),
+    )
 
 
 def _spread(cameras: np.ndarray, first: int, count: int) -> list[int]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.studies import control
+from benchmarks.studies import exact_prior
 from reffusion.prior import diffusion, windows
 from reffusion.prior.model import load_prior
 from reffusion.seeding import generator
@@ -19,14 +19,14 @@ def pictures():
     whole = torch.stack([windows.resize(each, HEIGHT, WIDTH) for each in coarse])
     hole = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     hole[30:50, 35:60] = True
-    offsets = torch.linspace(0, 0.5, control.FILLINGS).view(1, -1, 1, 1, 1)
+    offsets = torch.linspace(0, 0.5, exact_prior.FILLINGS).view(1, -1, 1, 1, 1)
     return (whole + offsets * hole).clamp(-1, 1), hole
 
 
 @pytest.fixture(scope="module")
 def exact(pictures):
     """The prior with the exact denoiser, and the embeddings of its prompts."""
-    return control.make_prior(pictures[0])
+    return exact_prior.make_prior(pictures[0])
 
 
 def predict(pictures, prior, text, shown, corner, t):
@@ -54,7 +54,7 @@ def test_with_little_noise_the_filling_that_is_shown_is_predicted(pictures, exac
 
 @pytest.mark.parametrize(
     ("personalized", "prompt", "count"),
-    [(True, 0, control.CLOSE), (True, 2, control.FILLINGS), (False, 0, control.FILLINGS)],
+    [(True, 0, exact_prior.CLOSE), (True, 2, exact_prior.FILLINGS), (False, 0, exact_prior.FILLINGS)],
 )
 def test_a_prompt_selects_the_fillings_that_agree_with_the_reference(pictures, exact, personalized, prompt, count):
     prior, text = exact
@@ -67,9 +67,9 @@ def test_a_prompt_selects_the_fillings_that_agree_with_the_reference(pictures, e
 def test_fillings_keep_what_is_known(pictures):
     truth, hole = pictures[0][0, 0], pictures[1]
     random = torch.rand(2, 3, HEIGHT, WIDTH, generator=generator(2, "donors")) * 2 - 1
-    found = control.make_fillings(truth, hole, list(random), np.random.default_rng(0))
-    assert len(found) == control.FILLINGS and torch.equal(found[0], truth)
+    found = exact_prior.make_fillings(truth, hole, list(random), np.random.default_rng(0))
+    assert len(found) == exact_prior.FILLINGS and torch.equal(found[0], truth)
     assert (found - truth)[..., ~hole].abs().max() < 1e-5
     both_ways = 2 * len(random)  # donors, flipped or not
-    assert len({each.sum().item() for each in found}) == control.CLOSE + control.DISPLACED + both_ways
-    assert load_prior(control.TINY).native_size == SIZE
+    assert len({each.sum().item() for each in found}) == exact_prior.CLOSE + exact_prior.DISPLACED + both_ways
+    assert load_prior(exact_prior.TINY).native_size == SIZE

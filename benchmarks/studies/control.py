@@ -1,11 +1,9 @@
 """Distillation with an exact denoiser: `python -m benchmarks.studies.control data/demo-mono-5 ... --runs runs`.
 
 The embedded prior is small, so a result with it judges the prior as much as the method. Here the same code distils an
-exact prior instead. For each training view, the data distribution consists of `FILLINGS` fillings of its hole, and the
-denoiser is the posterior mean over them. It recognises view and window by their known pixels, as any inpainting model
-could. A few fillings agree with the reference: the truth, and two pictures close to it. All others are the truth with
-the hole's content displaced, or hold content of other scenes. The personalized prior knows only those that agree with
-the reference; the prior without personalization, and the empty prompt, know all.
+exact prior instead (`exact_prior`): the posterior mean over fillings of the training views, which recognises view and
+window by their known pixels, as any inpainting model could. The personalized prior knows only the fillings that agree
+with the reference; the prior without personalization, and the empty prompt, know all.
 
 The stages up to `initialize` run in the profile `paper-terms`. Then each of the `METHODS` distils from the same start.
 Scored are test views, in the box of the object: LPIPS (vgg) and PSNR, and PSNR outside. The study prints and writes
@@ -22,21 +20,22 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from benchmarks.studies import scene_priors
+from benchmarks.studies.exact_prior import make_fillings, make_prior
+from benchmarks.studies.prior import keep_if_same
 from reffusion import geometry
 from reffusion.distill import depth_estimator
 from reffusion.distill.inputs import load_initialization, load_train_views
 from reffusion.distill.loop import distill
 from reffusion.distill.terms.term import TermInputs
 from reffusion.distill.train_view import TrainView
-from reffusion.io.arrays import load_json, save_json, save_text
+from reffusion.io.arrays import save_json, save_text
 from reffusion.io.ground_truth import load_ground_truth, load_object_mask
 from reffusion.io.images import load_exr, load_image, save_image
 from reffusion.io.scene import load_references
@@ -44,8 +43,8 @@ from reffusion.metrics import lpips
 from reffusion.metrics import rows as scores
 from reffusion.metrics.view_renders import ViewRenderer
 from reffusion.params.distill import Params
-from reffusion.prior import diffusion, harmonic_fill, windows
-from reffusion.prior.model import Prior, load_prior
+from reffusion.prior import windows
+from reffusion.prior.model import Prior
 from reffusion.seeding import generator
 from reffusion.splat import rasterizer
 from reffusion.types import Gaussians
@@ -56,15 +55,11 @@ from report.sheet import compose_sheet
 from runner.resolve import Request, resolve
 
 ROOT = Path(__file__).resolve().parents[2]
-TINY = ROOT / "priors" / "tiny"
-FILLINGS, CLOSE = 50, 3  # fillings of a hole; the first `CLOSE` of them agree with the reference
-DISPLACED = 24  # fillings whose content is displaced
-DISPLACEMENT = (2.0, 10.0)  # px, smallest and largest displacement
-# Method -> variant of pipeline.yaml. "start" is the initialization. In "ceiling" the photographs show the truth, and
-# the reconstruction term is the only one.
+# Method -> variant of pipeline.yaml. "start" is the initialization. The next two have the true views in place of SDS.
 METHODS = {
     "start": "",
-    "ceiling": "",
+    "l1_and_ssim": "",
+    "squared_error": "",
     "full": "",
     "no_sds": "no_sds",
     "no_local_sds": "no_local_sds",
@@ -75,145 +70,10 @@ METHODS = {
     "no_depth": "no_depth",
 }
 SCORES = {"lpips_vgg_box": 4, "psnr_box": 2, "psnr_outside": 2}  # column of per_view.csv -> decimals
-CEILING = {"sds.weight": 0, "depth.weight": 0, "adversarial.weight": 0}
+NO_PRIOR: dict[str, Any] = {"sds.weight": 0, "depth.weight": 0, "adversarial.weight": 0}
+# Method -> its parameters of `distill`: the true views supervise all Gaussians, or the masked ones in the hole.
+TRUE_VIEWS = {"l1_and_ssim": NO_PRIOR, "squared_error": NO_PRIOR | {"lift.weight": 1, "lift.loss": "mse"}}
 SHEET_SCALE = 3
-
-
-# ---------------------------------------------------------------------------------------------- fillings
-
-
-def displace(picture: Tensor, hole: Tensor, shift: tuple[float, float]) -> Tensor:
-    """Return a picture [3, H, W] whose content in the hole is displaced by `shift` (x, y) px, and less near the border.
-
-    Args:
-        hole: bool [H, W].
-        shift: displacement in the middle of the hole.
-    """
-    inside = cv2.distanceTransform(hole.numpy().astype(np.uint8), cv2.DIST_L2, 3)
-    weight = np.clip(inside / max(np.hypot(*shift), 1), 0, 1).astype(np.float32)
-    rows, columns = np.mgrid[: hole.shape[0], : hole.shape[1]]
-    x, y = ((axis - weight * by).astype(np.float32) for axis, by in zip((columns, rows), shift, strict=True))
-    source = np.ascontiguousarray(picture.permute(1, 2, 0).numpy())
-    moved = cv2.remap(source, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_REFLECT)
-    return torch.from_numpy(moved).permute(2, 0, 1)
-
-
-def transplant(picture: Tensor, donors: Tensor, hole: Tensor) -> Tensor:
-    """Return pictures [N, 3, H, W] whose holes show the donors [N, 3, H, W], shifted smoothly to the known colours."""
-    difference = picture - donors
-    shift = harmonic_fill.harmonic_extension(difference, hole.float().expand(len(donors), 1, -1, -1))
-    return picture + hole * (shift - difference)
-
-
-def make_fillings(truth: Tensor, hole: Tensor, donors: Sequence[Tensor], random: np.random.Generator) -> Tensor:
-    """Return the fillings of a view's hole, [FILLINGS, 3, H, W] in [-1, 1]; the first `CLOSE` agree with the reference.
-
-    Args:
-        truth: [3, H, W], the view without the object.
-        hole: bool [H, W], the pixels to fill.
-        donors: pictures [3, H, W] of other scenes.
-        random: the source of randomness.
-    """
-    blurred = torch.from_numpy(cv2.GaussianBlur(truth.permute(1, 2, 0).numpy().copy(), (0, 0), 0.5)).permute(2, 0, 1)
-    found = [truth, torch.where(hole, blurred, truth), displace(truth, hole, (0.3, 0.3))]
-    for _ in range(DISPLACED):
-        turn, length = random.uniform(0, 2 * np.pi), random.uniform(*DISPLACEMENT)
-        found.append(displace(truth, hole, (length * np.cos(turn), length * np.sin(turn))))
-    chosen = [donors[k] for k in random.integers(len(donors), size=FILLINGS - len(found))]
-    flipped = [donor.flip(2) if random.random() < 0.5 else donor for donor in chosen]
-    return torch.cat([torch.stack(found), transplant(truth, torch.stack(flipped), hole)]).clamp(-1, 1)
-
-
-# ---------------------------------------------------------------------------------------------- denoiser
-
-
-class Place(NamedTuple):
-    """Where a sample was found: the view's number, and the window's corner, None for a whole view."""
-
-    view: int
-    corner: tuple[int, int] | None
-
-
-class ExactDenoiser(nn.Module):
-    """The posterior mean over fillings, in place of a UNet: it takes [z_t | mask | known latents] and predicts v.
-
-    Attributes:
-        personalized: whether a prompt other than the empty one selects the fillings that agree with the reference.
-    """
-
-    def __init__(self, fillings: Tensor, prior: Prior, empty: Tensor):
-        """Prepare the denoiser.
-
-        Args:
-            fillings: [V, K, 3, H, W] in [-1, 1], of all views; the first `CLOSE` agree with the reference.
-            prior: provides schedule, native size and VAE, whose latents are a linear map of pixels.
-            empty: [L, D], the embedding of the empty prompt.
-        """
-        super().__init__()
-        self.alphas, self.size = prior.alphas_cumprod, prior.native_size
-        self.empty, self.personalized = empty, True
-        with torch.no_grad():  # the VAE is linear, and slower than its matrix
-            colors = torch.cat([torch.zeros(1, 3), torch.eye(3)])[..., None, None].expand(4, 3, 8, 8)
-            black, *basis = diffusion.encode(prior, colors)[:, :, 4, 4]
-            matrix = torch.stack(basis, 1) - black[:, None]
-            latents = lambda images: torch.einsum("lc,vkchw->vklhw", matrix, images) + black[:, None, None]
-            self.full = latents(fillings)
-            self.small = latents(torch.stack([windows.resize(each, self.size, self.size) for each in fillings]))
-        self.config = SimpleNamespace(sample_size=self.size, addition_embed_type=None)
-        self.anchor = nn.Parameter(torch.zeros(()), requires_grad=False)  # by which the code finds the type of weights
-        self.spectra = torch.fft.rfft2(torch.cat([self.full[:, 0], self.full[:, 0].square().sum(1, keepdim=True)], 1))
-
-    def recognize(self, known: Tensor, mask: Tensor) -> Place:
-        """Find the view and the window that the known pixels show.
-
-        Args:
-            known: [4, S, S], latents of the known pixels.
-            mask: [1, S, S], 1 = hole.
-        """
-        seen = 1 - mask
-        whole = ((self.small[:, 0] - known).square() * seen).sum((1, 2, 3))
-        height, width = self.full.shape[-2:]
-        kernel = torch.cat([-2 * known * seen, seen])
-        transformed = torch.fft.rfft2(kernel, s=(height, width))
-        error = torch.fft.irfft2((self.spectra * transformed.conj()).sum(1), s=(height, width))
-        error = error[:, : height - self.size + 1, : width - self.size + 1] + (known * seen).square().sum()
-        if whole.min() < error.min():
-            return Place(int(whole.argmin()), None)
-        view, top, left = np.unravel_index(int(error.argmin()), error.shape)
-        return Place(int(view), (int(top), int(left)))
-
-    def forward(self, sample: Tensor, t: Tensor, encoder_hidden_states: Tensor) -> SimpleNamespace:
-        """Return v [B, 4, S, S] as `.sample`, for samples [B, 9, S, S], timesteps [B] and embeddings [B, L, D]."""
-        predictions = []
-        for row, step, words in zip(sample, t, encoder_hidden_states, strict=True):
-            noisy, mask, known = row[:4], row[4:5], row[5:]
-            view, corner = self.recognize(known, mask)
-            found = self.small[view]
-            if corner:
-                top, left = corner
-                found = self.full[view, ..., top : top + self.size, left : left + self.size]
-            if self.personalized and not torch.equal(words, self.empty):
-                found = found[:CLOSE]
-            abar = self.alphas[step].double()
-            signal, spread = abar.sqrt(), (1 - abar).sqrt()
-            distance = ((noisy - signal.float() * found) * mask).square().sum((1, 2, 3)).double()
-            weight = torch.softmax(-distance / (2 * spread.square()), 0).float()
-            clean = torch.einsum("k,kchw->chw", weight, found)
-            eps = (noisy - signal * clean) / spread
-            predictions.append((signal * eps - spread * clean).float())
-        return SimpleNamespace(sample=torch.stack(predictions))
-
-
-def make_prior(fillings: Tensor) -> tuple[Prior, Tensor]:
-    """Return a prior with an exact denoiser, and the embeddings [3, L, D] of the global, local and empty prompt.
-
-    Args:
-        fillings: as of `ExactDenoiser`.
-    """
-    prior = replace(load_prior(TINY), fills=False, contrast=0.0)
-    # Any embeddings that differ will do, and those of the prior's text encoder need not.
-    text = torch.eye(3)[:, None]
-    return replace(prior, unet=ExactDenoiser(fillings, prior, text[2]), text_encoder=None), text
 
 
 # ---------------------------------------------------------------------------------------------- one scene
@@ -246,11 +106,13 @@ def load_truth(scene: Path, views: Sequence[TrainView]) -> list[Tensor]:
     return [torch.from_numpy(picture).permute(2, 0, 1) / 127.5 - 1 for picture in pictures]
 
 
-def show_truth(view: TrainView, truth: Tensor) -> TrainView:
-    """Return a training view whose photograph is the truth [3, H, W] in [-1, 1], and supervises everywhere."""
-    photo = ((truth.permute(1, 2, 0) + 1) * 127.5).round().to(torch.uint8)
+def show_truth(view: TrainView, truth: Tensor, method: str) -> TrainView:
+    """Return a training view that shows the truth [3, H, W] in [-1, 1], as one of the `TRUE_VIEWS`."""
+    picture = (truth.permute(1, 2, 0) + 1) / 2
+    if method == "squared_error":
+        return replace(view, lifted=picture)
     nothing = torch.zeros_like(view.repaint)
-    return replace(view, photo=photo, supervises=~nothing, repaint=nothing, clean=True)
+    return replace(view, photo=picture, supervises=~nothing, repaint=nothing, clean=True)
 
 
 def measure_displacement(run: Path, scene: Path, size: int) -> float:
@@ -357,13 +219,13 @@ def measure_scene(
             views = load_train_views(params, space, part("initialize"))
             exact = exact or prepare(scene, home, views, donors)
             exact.prior.unet.personalized = method != "no_personalization"
-            if method == "ceiling":
-                views = [show_truth(view, each) for view, each in zip(views, exact.truth, strict=True)]
-                params = params.changed(CEILING)
+            if method in TRUE_VIEWS:
+                views = [show_truth(view, each, method) for view, each in zip(views, exact.truth, strict=True)]
+                params = params.changed(TRUE_VIEWS[method])
             estimator = depth_estimator.build_estimator(params, space.scene.points) if params.depth.weight else None
             inputs = TermInputs(views, references, gaussians.means[masked], exact.prior, exact.text, estimator, None)
             folder = out / scene.name / method
-            folder.mkdir(parents=True, exist_ok=True)
+            keep_if_same(folder, params)
             gaussians, _ = distill(gaussians, masked, inputs, params, folder)
         found[method], picture = score(gaussians, home, {"vgg": network})
         pictures.append(picture)
@@ -396,12 +258,12 @@ def main() -> None:
     parser.add_argument("--set", default="", help="parameters, as in `make set=...`")
     arguments = parser.parse_args()
     scenes, out = [scene.resolve() for scene in arguments.scenes], arguments.out.resolve()
-    found = load_json(out / "control.json") if (out / "control.json").exists() else {}
+    if len(scenes) < 2 or "full" not in arguments.methods:
+        raise ValueError("fillings need the pictures of another scene, and the table needs `full`: name both")
+    found: dict[str, dict[str, dict[str, float]]] = {}
     sheet: dict[str, list[np.ndarray]] = {}
     truth = {s: [load_image(p) for p in sorted((s / "truth/without_object").glob("*.png"))] for s in scenes}
     for scene in scenes:
-        if scene.name in found:
-            continue
         others = [picture for other, pictures in truth.items() if other != scene for picture in pictures]
         donors = [torch.from_numpy(picture).permute(2, 0, 1) / 127.5 - 1 for picture in others]
         found[scene.name], pictures = measure_scene(
@@ -415,7 +277,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except ValueError as error:
-        sys.exit(f"error: {error}")
+    scene_priors.run_study(main)

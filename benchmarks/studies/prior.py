@@ -54,7 +54,7 @@ from reffusion.io.arrays import load_json, save_json
 from reffusion.io.ground_truth import load_ground_truth, load_object_mask
 from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import load_references, load_scene
-from reffusion.params.base import Prompts
+from reffusion.params.base import Prompts, Settings
 from reffusion.prior import diffusion, lora
 from reffusion.prior.model import Prior, load_prior
 from reffusion.prior.windows import window_around
@@ -242,8 +242,8 @@ def replace_references(reference: Path, picture: Path, folder: Path) -> Path:
     return folder
 
 
-def keep_if_same(folder: Path, params: stage.Params) -> None:
-    """Make the folder of a personalization. An earlier attempt with other parameters is removed."""
+def keep_if_same(folder: Path, params: Settings) -> None:
+    """Make the folder of a personalization or distillation. An earlier attempt with other parameters is removed."""
     settings, record = params.model_dump(mode="json"), folder / "settings.json"
     if not record.exists() or load_json(record) != settings:
         shutil.rmtree(folder, ignore_errors=True)

@@ -48,7 +48,7 @@ def _load_camera(path: Path) -> Placed:
         stored = (int(values["width"]), int(values["height"])) if "width" in values else None
 
     def lens_at(size: tuple[int, int]) -> Lens:
-        # Without a size in the file, the picture has it, unless the middle is far off: then the picture was scaled.
+        # A file without a size is for the picture's own, unless its center is far off: then the picture was scaled.
         is_scaled = abs(centered[0] / size[0] - 1) > OFF_CENTER
         return Lens(*(stored or (centered if is_scaled else size)), fx, fy, cx, cy)
 

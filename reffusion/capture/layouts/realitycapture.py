@@ -18,7 +18,8 @@ from reffusion.capture.layouts.placed import Placed, read_placed
 from reffusion.capture.lens import Lens
 from reffusion.io.files import BadInput, as_bad_input, reading
 
-COLUMNS = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")  # the other columns may be missing
+# The other columns may be missing. Some versions write yaw for heading.
+COLUMNS = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 FLIP = np.diag([1.0, -1.0, -1.0])  # from the axes of a camera of the file (y up, looking along -z) to ours
 
 
