@@ -7,9 +7,9 @@ with the reference; the prior without personalization, and the empty prompt, kno
 
 The stages up to `initialize` run in the profile `paper-terms`. Then each of the `METHODS` distils from the same start.
 Scored are test views, in the box of the object: LPIPS (vgg) and PSNR, and PSNR outside. The study prints and writes
-control.md (differences to `full`, means over scenes with 95 % intervals), control.json and sheet.png to --out. It also
-prints the share of known pixels in windows, and how far the estimated depth displaces the reference's pixels in other
-views. Scenes are those of the kind `mono`, whose folders hold the truth of the training views.
+control.md (differences to `full`, means over scenes with 95 % intervals; then each scene), control.json and sheet.png
+to --out. A scene's line has the share of known pixels in windows, and how far the estimated depth displaces the
+reference's pixels in other views. Scenes are those of the kind `mono`, which hold the truth of the training views.
 """
 
 from __future__ import annotations
@@ -163,44 +163,56 @@ def score(gaussians: Gaussians, run: Path, models: dict[str, lpips.Lpips]) -> tu
     return {name: mean[name] for name in SCORES}, pictures[len(pictures) // 2]
 
 
+class Measured(NamedTuple):
+    """What the study measures of a scene.
+
+    Attributes:
+        scores: method -> `SCORES`.
+        facts: as of `Exact`.
+        pictures: the middle test view by each method.
+    """
+
+    scores: dict[str, dict[str, float]]
+    facts: dict[str, float]
+    pictures: list[np.ndarray]
+
+
 class Exact(NamedTuple):
-    """The truth of a scene, and the exact prior.
+    """The truth of a scene, the exact prior, and facts of the scene as this prior sees it.
 
     Attributes:
         truth: the training views without the object, [3, H, W] in [-1, 1] each.
         prior: as of `make_prior`.
         text: [3, L, D], as of `make_prior`.
+        facts: displacement (px of the prior), and the median and the smallest share of known pixels in windows.
     """
 
     truth: list[Tensor]
     prior: Prior
     text: Tensor
+    facts: dict[str, float]
 
 
 def prepare(scene: Path, run: Path, views: Sequence[TrainView], donors: Sequence[Tensor]) -> Exact:
-    """Load the truth, make the exact prior, and print the displacement of the start and the share of known pixels."""
+    """Load the truth of a scene, and make its exact prior."""
     truth, random = load_truth(scene, views), np.random.default_rng(0)
     fillings = [make_fillings(each, view.repaint, donors, random) for each, view in zip(truth, views, strict=True)]
     prior, text = make_prior(torch.stack(fillings))
     size = prior.native_size
-    print(f"{scene.name}: displacement of the start {measure_displacement(run, scene, size):.2f} px of the prior")
     middle, least = measure_known_share(views, size)
-    print(f"{scene.name}: known share of windows, median {middle:.2f}, least {least:.2f}")
-    return Exact(truth, prior, text)
+    facts = {"displacement": measure_displacement(run, scene, size), "known_median": middle, "known_least": least}
+    return Exact(truth, prior, text, facts)
 
 
 def measure_scene(
     scene: Path, runs: Path, donors: Sequence[Tensor], methods: Sequence[str], more: str, out: Path
-) -> tuple[dict[str, dict[str, float]], list[np.ndarray]]:
+) -> Measured:
     """Distil a scene by each method.
 
     Args:
         donors: pictures [3, H, W] in [-1, 1] of other scenes.
         more: parameters, as `set=` of the command line.
         out: folder for checkpoints.
-
-    Returns:
-        Method -> scores; and the middle test view by each method.
 
     Raises:
         ValueError: the weights of LPIPS are missing, or as for `run_stages` and `load_truth`.
@@ -230,7 +242,18 @@ def measure_scene(
         found[method], picture = score(gaussians, home, {"vgg": network})
         pictures.append(picture)
         print(f"{scene.name}, {method}: " + ", ".join(f"{name} {value:.4f}" for name, value in found[method].items()))
-    return found, pictures
+    return Measured(found, exact.facts if exact else {}, pictures)
+
+
+def tabulate_scenes(measured: Mapping[str, Measured]) -> str:
+    """Return a Markdown table of the scenes: their facts, and LPIPS (vgg) by each method."""
+    methods = list(next(iter(measured.values())).scores)
+    rows = [
+        [scene, *(f"{value:.2f}" for value in each.facts.values())]
+        + [f"{each.scores[method]['lpips_vgg_box']:.4f}" for method in methods]
+        for scene, each in measured.items()
+    ]
+    return page.markdown_table(["scene", "displaced, px", "known, median", "known, least", *methods], rows)
 
 
 def tabulate(found: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
@@ -260,20 +283,20 @@ def main() -> None:
     scenes, out = [scene.resolve() for scene in arguments.scenes], arguments.out.resolve()
     if len(scenes) < 2 or "full" not in arguments.methods:
         raise ValueError("fillings need the pictures of another scene, and the table needs `full`: name both")
-    found: dict[str, dict[str, dict[str, float]]] = {}
+    measured: dict[str, Measured] = {}
     sheet: dict[str, list[np.ndarray]] = {}
     truth = {s: [load_image(p) for p in sorted((s / "truth/without_object").glob("*.png"))] for s in scenes}
     for scene in scenes:
         others = [picture for other, pictures in truth.items() if other != scene for picture in pictures]
         donors = [torch.from_numpy(picture).permute(2, 0, 1) / 127.5 - 1 for picture in others]
-        found[scene.name], pictures = measure_scene(
-            scene, arguments.runs.resolve(), donors, arguments.methods, arguments.set, out
-        )
-        sheet[scene.name] = [picture.repeat(SHEET_SCALE, 0).repeat(SHEET_SCALE, 1) for picture in pictures]
-        save_json(out / "control.json", found)
+        done = measure_scene(scene, arguments.runs.resolve(), donors, arguments.methods, arguments.set, out)
+        measured[scene.name] = done
+        sheet[scene.name] = [picture.repeat(SHEET_SCALE, 0).repeat(SHEET_SCALE, 1) for picture in done.pictures]
+        save_json(out / "control.json", {name: {"facts": e.facts} | e.scores for name, e in measured.items()})
         save_image(out / "sheet.png", compose_sheet([*sheet.values()], [*arguments.methods], [*sheet]))
-    save_text(out / "control.md", tabulate(found))
-    print(tabulate(found))
+    tables = "\n".join([tabulate({name: each.scores for name, each in measured.items()}), tabulate_scenes(measured)])
+    save_text(out / "control.md", tables)
+    print(tables)
 
 
 if __name__ == "__main__":
