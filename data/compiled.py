@@ -15,12 +15,10 @@ _CACHE = "kernels-"  # beginning of the names of cache folders in __pycache__
 
 @functools.cache
 def _folder() -> Path:
-    """Return the cache folder of machine code, whose name contains a hash of all Python files in this folder.
-
-    numba checks only the file of a function. Without the hash it would reuse machine code although constants or called
-    functions in other files have changed. Folders of earlier hashes are deleted.
-    """
+    """Return the cache folder of machine code, named by a hash of the Python files here; delete those of old hashes."""
     here = Path(__file__).parent
+    # numba checks only the file of a function. Without the hash it would reuse machine code although constants or
+    # called functions in other files have changed.
     state = hashlib.blake2b(b"".join(path.read_bytes() for path in sorted(here.glob("*.py"))), digest_size=8)
     folder = here / "__pycache__" / (_CACHE + state.hexdigest())
     if not folder.exists():

@@ -85,15 +85,7 @@ def generate(out: Path, seed: int, kind: Kind) -> dict:
 
 
 def _changed_by_hand(out: Path, new_scene: Path) -> list[Path]:
-    """Return the files of an existing scene that somebody has added or changed by hand.
-
-    These are files that the new scene does not have, and files younger than the stamp `.generated`. Without this stamp
-    the list is empty.
-
-    Args:
-        out: folder of the existing scene.
-        new_scene: folder of the newly generated scene.
-    """
+    """Return the files of an existing scene that somebody added or changed; [] without the stamp `.generated`."""
     sign = out / ".generated"
     files = [path for path in out.rglob("*") if path.is_file() and path != sign] if sign.exists() else []
     young = lambda path: path.stat().st_mtime > sign.stat().st_mtime
@@ -131,20 +123,15 @@ def _write_scene(out: Path, seed: int, kind: Kind) -> dict:
 
 
 def _facts(seed: int, session: Session) -> dict:
-    """Return the facts of a scene.
-
-    They are the seed; the name of the middle view; the mean share of pixels that are masked and the mean share of the
-    masks that is never seen, for training and test views; the shift of the image corners by the lens, px; and the names
-    of training views that are far apart.
-    """
+    """Return the facts of a scene, such as the mean masked share of pixels and the mean never seen share of masks."""
     shares = [float(h.sum() / max(m.sum(), 1)) for h, m in zip(session.hidden, session.masks, strict=True)]
     return {
         "seed": seed,
-        "reference": session.names[session.middle],
+        "reference": session.names[session.middle],  # the middle view
         "mask_share": _by_split(session.masks.mean((1, 2)), session.test),
         "never_seen_share": _by_split(shares, session.test),
-        "lens_shift_px": float(corner_shift(session.cameras[0])),
-        "shown": [session.names[k] for k in session.spread],
+        "lens_shift_px": float(corner_shift(session.cameras[0])),  # of the image corners
+        "shown": [session.names[k] for k in session.spread],  # training views that are far apart
     }
 
 
@@ -171,11 +158,7 @@ def _write_test_masks(out: Path, session: Session, masks: Sequence[np.ndarray]) 
 
 
 def _write_removal(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
-    """Write masks of the object, or of each object, and the references unless the object hangs.
-
-    Behind a hanging object nothing has to be invented. With `Kind.depth_error`, the truth of the training views is
-    written, too.
-    """
+    """Write masks of the object, or of each, and references; with `Kind.depth_error` also the training views' truth."""
     _write_test_masks(out, session, session.masks[: session.test])
     for k, name in enumerate(session.names):
         write_image(out / f"truth/never_seen/{name}.png", session.hidden[k] * np.uint8(255))
@@ -186,6 +169,7 @@ def _write_removal(out: Path, session: Session, kind: Kind, world: World, frame:
         if not session.object_masks:
             write_image(out / f"images_4/label/{name}.png", session.masks[k] * np.uint8(1))
     if not kind.depth_error:
+        # Behind a hanging object nothing has to be invented.
         references = "" if kind.hangs else _write_references(out, session)
     else:
         removed = replace(world, solids=without_object(world.solids))
@@ -208,10 +192,7 @@ def _write_references(out: Path, session: Session) -> str:
 
 
 def _write_sparse_views(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
-    """Write scene.yaml, in which a few photographs are training views and references.
-
-    All other training views are cameras without pixels.
-    """
+    """Write scene.yaml: a few photographs are training views and references; other training views have no pixels."""
     shown = [session.names[k] for k in session.spread[: kind.shown]]
     references = "".join(f"- {{view: {name}, image: images_4/{name}.png}}\n" for name in shown)
     listed = lambda names: f"[{', '.join(names)}]\n"
@@ -230,16 +211,13 @@ def _write_insertion(out: Path, session: Session, kind: Kind, world: World, fram
 
 
 def _write_outpainting(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
-    """Write test masks, a region, and references with depth. The region is everything outside a sphere.
-
-    The centre of the sphere is on the middle view's optical axis. The references are photographs of training views.
-    """
+    """Write test masks, a region (all outside a sphere on the middle view's axis) and references with depth."""
     center = point_on_axis(session.cameras[session.middle], AWAY)
     masks = [outside_sphere(camera, kind, world, center, SPHERE) for camera in session.cameras[: session.test]]
     _write_test_masks(out, session, masks)
     middle = session.middle - session.test
     chosen = choose_covering_views(session.cameras[session.test :], kind, world, center, middle)
-    whole = {session.test + k: session.photos[session.test + k] for k in chosen}
+    whole = {session.test + k: session.photos[session.test + k] for k in chosen}  # photographs of training views
     sphere = {"view": session.names[session.middle], "distance": frame.scale * AWAY}
     sphere |= {"radius": frame.scale * SPHERE, "outside": True}
     _write_region(out, sphere, _write_measured(out, session, whole, kind, world, frame))
@@ -248,10 +226,7 @@ def _write_outpainting(out: Path, session: Session, kind: Kind, world: World, fr
 def _write_measured(
     out: Path, session: Session, pictures: dict[int, np.ndarray], kind: Kind, world: World, frame: Frame
 ) -> str:
-    """Write pictures of views with their depth, and return the lines of scene.yaml that name them as references.
-
-    With `Kind.depth_error`, the depth is estimated disparity.
-    """
+    """Write pictures and their depth (disparity if `Kind.depth_error`); return the lines of scene.yaml on them."""
     entries = ["reference:\n"]
     for k, picture in pictures.items():
         name, measured = session.names[k], depth(session.cameras[k], kind, world, frame)

@@ -92,10 +92,7 @@ def direct_light(solids, points, normals, owner, lamps, side):
 
 @kernel()
 def _lamp_sum(solids, with_object, point, normal, lamp, side):
-    """Return the sum of cos(surface) cos(lamp) / distance² over side x side points of a lamp, for one node.
-
-    Points that the node does not see add 0.
-    """
+    """Return a node's sum of cos(surface) cos(lamp) / distance² over side x side lamp points; unseen points add 0."""
     total = 0.0
     for s in range(side * side):
         a, b = 2.0 * (s % side + 0.5) / side - 1.0, 2.0 * (s // side + 0.5) / side - 1.0

@@ -60,10 +60,7 @@ def build_mipmaps(pictures: dict[str, np.ndarray]) -> tuple[Textures, dict[str, 
 
 @kernel()
 def _texel(textures, k, level, a, b, out, weight):
-    """Add a bilinear sample of mip level `level` of texture k, times `weight`, to the linear colour `out` [3].
-
-    The sample is at (a, b), in tiles.
-    """
+    """Add `weight` times a bilinear sample of mip `level` of texture k, at (a, b) in tiles, to `out` [3] (linear)."""
     side = max(textures.side[k] >> level, 1)
     x, y = (a - math.floor(a)) * side - 0.5, (b - math.floor(b)) * side - 0.5
     i, j = math.floor(x), math.floor(y)

@@ -102,11 +102,7 @@ def _spread(cameras: np.ndarray, first: int, count: int) -> list[int]:
 
 
 def _object_mask(world: World, camera: np.ndarray, kind: Kind, own: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the pixels in which an object is the first surface of at least one ray.
-
-    Args:
-        own: bool [n], True for the solids of the object.
-    """
+    """Return bool [H, W], pixels where at least one ray meets the object first; `own` [n] marks the object's solids."""
     alone = replace(world, solids=world.solids._replace(removable=own))
     return _radiance(alone, camera, kind, True, kind.samples)[1]
 
@@ -148,13 +144,7 @@ def path(seed: int, kind: Kind, target: np.ndarray, count: int, label: str) -> n
 
 
 def _turn_away(center: np.ndarray, aim: np.ndarray, slope: float, draw: np.random.Generator) -> np.ndarray:
-    """Return other points [V, 3] to look at, so that each camera is turned in a random direction.
-
-    Args:
-        center: [V, 3], the cameras.
-        aim: [V, 3], the points that they look at.
-        slope: tangent of the angle by which a camera turns.
-    """
+    """Return new aims [V, 3], which turn each camera in a random direction by an angle whose tangent is `slope`."""
     ahead = aim - center
     right = np.cross(ahead, [0.0, 1.0, 0.0])
     right *= np.linalg.norm(ahead, axis=1, keepdims=True) / np.linalg.norm(right, axis=1, keepdims=True)
@@ -164,10 +154,7 @@ def _turn_away(center: np.ndarray, aim: np.ndarray, slope: float, draw: np.rando
 
 
 def _middle(cameras: np.ndarray, kind: Kind) -> int:
-    """Return the index of the camera nearest to the mean position of all cameras.
-
-    If the kind has low cameras, the mean position is raised to the height of the highest camera.
-    """
+    """Return the index of the camera nearest to the mean position, at the height of the highest if some are low."""
     mean_position = cameras[:, 13:].mean(0)
     if kind.low is not None:
         mean_position[1] = cameras[:, 14].max()
@@ -175,17 +162,7 @@ def _middle(cameras: np.ndarray, kind: Kind) -> int:
 
 
 def _walk(kind: Kind, count: int, reach: float, draw: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the positions of the cameras along the walk.
-
-    Args:
-        count: number of cameras.
-        reach: factor on the azimuth to either side.
-        draw: random generator.
-
-    Returns:
-        Azimuth in degrees, height above the floor in metres, and horizontal distance from the target in metres, [count]
-        each.
-    """
+    """Return azimuth in degrees, height above the floor and horizontal distance to the target in m, [count] each."""
     s = (np.arange(count) + 0.5) / max(count, 1)
     phase = draw.random(4) * 6.28
     if kind.is_circle:
@@ -193,6 +170,7 @@ def _walk(kind: Kind, count: int, reach: float, draw: np.random.Generator) -> tu
         height = 1.15 + 0.12 * np.sin(6.28 * 3 * s + phase[1]) + np.where(s < 0.5, 0.2, -0.1)
         return azimuth, height, 2.25 + 0.1 * np.sin(6.28 * 5 * s + phase[2])
     # The azimuth swings 2.5 times, the height 1.5 times, so that different heights occur on both sides.
+    # `reach` is a factor on the azimuth to either side.
     azimuth = reach * kind.spread * np.sin(6.28 * 2.5 * s + phase[0])
     swing = np.sin(6.28 * 1.5 * s + phase[1])
     # The square keeps most views high even if the lowest cameras are near the floor.

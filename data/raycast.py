@@ -58,16 +58,7 @@ def project(camera, px, py, pz):
 
 @kernel()
 def _in_tile(solids, camera, left, top, listed):
-    """List the solids that may be visible in a tile, by comparing bounding spheres with the tile's cone of rays.
-
-    Args:
-        left: column of the tile's first pixel.
-        top: row of the tile's first pixel.
-        listed: int [n], receives the indices of the solids, the room first.
-
-    Returns:
-        Number of listed solids.
-    """
+    """List in `listed` [n] the solids that the tile at (left, top) may show, the room first; return their number."""
     ax, ay, az = ray(camera, left + 0.5 * TILE, top + 0.5 * TILE)
     widest = 1.0
     for corner in range(4):
@@ -80,7 +71,7 @@ def _in_tile(solids, camera, left, top, listed):
             solids.center[i, 0] - camera[13], solids.center[i, 1] - camera[14], solids.center[i, 2] - camera[15]
         )  # fmt: skip
         far = math.sqrt(bx * bx + by * by + bz * bz)
-        if far > solids.reach[i]:
+        if far > solids.reach[i]:  # bounding sphere against the tile's cone of rays
             off_axis = math.acos(min(1.0, max(-1.0, (ax * bx + ay * by + az * bz) / far)))
             if off_axis > half_angle + math.asin(solids.reach[i] / far):
                 continue
@@ -91,13 +82,7 @@ def _in_tile(solids, camera, left, top, listed):
 
 @kernel()
 def _first(solids, listed, camera, with_object, dx, dy, dz):
-    """Find the first surface on a ray, with or without the object.
-
-    Returns:
-        distance: distance to the surface, or 1e30 if there is none.
-        solid: index of the solid, or -1 if there is none.
-        on_object: True if the first surface of the room with the object belongs to the object.
-    """
+    """Return distance (else 1e30) and solid (else -1) of a ray's first surface, and whether the object is hit first."""
     t, i, least, on_object = 1e30, -1, 1e30, False
     for solid in listed:
         far = distance(solids, solid, camera[13], camera[14], camera[15], dx, dy, dz)
@@ -110,13 +95,7 @@ def _first(solids, listed, camera, with_object, dx, dy, dz):
 
 @kernel()
 def _add_radiance(solids, faces, textures, light, camera, i, t, dx, dy, dz, samples, scratch, out):
-    """Add the radiance of the surface point at distance t on solid i along a ray to `out` [3].
-
-    Args:
-        samples: rays along a side of a pixel.
-        scratch: [2, 3], working memory.
-        out: [3] linear colour, changed in place.
-    """
+    """Add the radiance of solid i at distance t on a ray to `out` [3]; `samples` is rays along a pixel's side."""
     face, u, v, nx, ny, nz = surface(solids, i, camera[13] + t * dx, camera[14] + t * dy, camera[15] + t * dz)
     # The footprint of a ray on a slanted surface is an ellipse with axes 1 and 1 / cosine. The geometric mean is a
     # compromise: the mip level blurs a part of the long axis, supersampling resolves the rest.

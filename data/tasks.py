@@ -110,12 +110,7 @@ def choose_covering_views(cameras: np.ndarray, kind: Kind, world: World, center:
 
 
 def _is_visible(points: np.ndarray, camera: np.ndarray, depth: np.ndarray, kind: Kind) -> np.ndarray:
-    """Return bool [N], True for the room points that a camera shows; the lens distortion is ignored.
-
-    Args:
-        points: [N, 3].
-        depth: [H, W], camera z of the view's surfaces, metres.
-    """
+    """Return bool [N], room points that a camera shows, lens distortion ignored; `depth` [H, W] is camera z, metres."""
     at = (points - camera[13:]) @ camera[4:13].reshape(3, 3)
     z = np.maximum(at[:, 2], 1e-6)
     column, row = (np.floor(camera[0] * at[:, k] / z + camera[1 + k]).astype(int) for k in (0, 1))

@@ -27,14 +27,7 @@ def _mix_bits(state):
 
 @kernel()
 def _leaf(solids, n, i, j, k, leaf):
-    """Compute the leaf, an ellipsoid, in cell (i, j, k) of solid n and write it to `leaf` [4, 3].
-
-    Row 0 is the leaf's centre. Rows 1 to 3 are the axes of the ellipsoid along its width, length and thickness; the
-    length of each is 1 / half extent.
-
-    Returns:
-        False if the cell has no leaf.
-    """
+    """Write the leaf in cell (i, j, k) of solid n to `leaf` [4, 3], centre and axes; return False if there is none."""
     columns, layers = int(solids.leaves[n, 0]), int(solids.leaves[n, 1])
     state = _mix_bits(((k * layers + j) * columns + i + 1) * 7919 + int(solids.leaves[n, 7]))
     if state < BARE * 4294967296.0:
@@ -58,6 +51,7 @@ def _leaf(solids, n, i, j, k, leaf):
         state = _mix_bits(state + 3)
         room = half - smaller * leaf[0, axis]
         leaf[0, axis] = (2 * cell + 1) * half - solids.half[n, axis] + room * (2.0 * state / 4294967296.0 - 1.0)
+    # The axes along the ellipsoid's width, length and thickness get the length 1 / half extent.
     for side in range(3):
         for axis in range(3):
             leaf[1 + side, axis] /= smaller * solids.leaves[n, 3 + side]
@@ -66,10 +60,7 @@ def _leaf(solids, n, i, j, k, leaf):
 
 @kernel()
 def _extent(solids, n, leaf, axis):
-    """Return half the extent of a leaf along an axis of the box, before it is shrunk to fit its cell.
-
-    The axes leaf[1:] must still have unit length.
-    """
+    """Return half a leaf's extent along a box axis, before it is shrunk to its cell; leaf[1:] must have unit length."""
     total = 0.0
     for side in range(3):
         total += (leaf[1 + side, axis] * solids.leaves[n, 3 + side]) ** 2
@@ -101,19 +92,8 @@ def _cell(solids, n, axis, x):
 
 @kernel(inline="always")
 def _crossings(solids, n, axis, cell, wide, o, d):
-    """Return where a ray crosses the walls between cells along one axis.
-
-    Args:
-        cell: index of the cell in which the ray is.
-        wide: width of the cells.
-        o: coordinate of the ray's origin.
-        d: coordinate of the ray's direction.
-
-    Returns:
-        step: 1, -1 or 0, the change of the cell index at a wall.
-        distance: ray parameter at the next wall; 1e30 if there is none.
-        spacing: increase of the ray parameter from one wall to the next; 1e30 if there is none.
-    """
+    """Return the cell step (1, -1, 0), the ray parameter at the next wall and its increase per wall (1e30 if none)."""
+    # `o` and `d` are the coordinates of the ray's origin and direction along the axis.
     if abs(d) < 1e-12:
         return 0, 1e30, 1e30
     step = 1 if d > 0.0 else -1

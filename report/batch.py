@@ -58,16 +58,7 @@ def make(record: Path) -> Path:
 
 
 def _line(run: dict[str, Any], names: list[str], runs: Path, with_picture: bool) -> str:
-    """Return a row of the table: the scene's name, scores, seconds and picture.
-
-    A run that is not done shows its state, or the reason of its failure, instead of scores, seconds and picture.
-
-    Args:
-        run: the scene's entry in the batch's record.
-        names: names of the scores to show, in the order of the columns.
-        runs: folder of the runs.
-        with_picture: True if the row may have a picture.
-    """
+    """Return a table row of the scores `names`, seconds and picture, or of the state or error if a run is not done."""
     name, home = escape(run["scene"]), run.get("home", run["scene"])
     if (runs / home / "report.html").is_file():
         name = f'<a href="{escape(home)}/report.html">{name}</a>'
@@ -83,12 +74,7 @@ def _line(run: dict[str, Any], names: list[str], runs: Path, with_picture: bool)
 
 
 def _picture(home: Path, scene: str) -> str:
-    """Return the result's first rendered view by name, `WIDTH` px wide, as an `img` element; "" if there is none.
-
-    Args:
-        home: runs/<scene> or runs/<scene>@<variant>.
-        scene: name of the scene, the alternative text of the picture.
-    """
+    """Return the result's first rendered view by name, `WIDTH` px wide, as an `img` element; "" if there is none."""
     first = next(iter(sorted((home / "evaluate" / "renders").glob("*.png"))), None)
     if first is None:
         return ""

@@ -138,10 +138,8 @@ def find_pictures(job: JobFiles, name: str) -> dict[str, Path]:
 
 
 def _left(kinds: list[str]) -> str:
-    """Return the kind of picture that the left side shows at first: fit, photograph or ground truth, if available.
-
-    A photograph is sharper than any render, so beside one the result looks worse than the removal left it.
-    """
+    """Return the kind of picture that the left side shows at first: fit, photograph or ground truth, if available."""
+    # A photograph is sharper than any render, so beside one the result looks worse than the removal left it.
     return next((kind for kind in ("renders_fit", "photograph", "truth") if kind in kinds), kinds[0])
 
 
@@ -154,15 +152,7 @@ def _select(options: dict[str, str | None], chosen: str = "") -> str:
 
 
 def _pair(name: str, pictures: dict[str, Path], row: dict[str, float], longest: int, first: bool) -> str:
-    """Return the HTML figure of one view: all pictures in one place, the slider, and a caption with the scores.
-
-    Args:
-        name: name of the view.
-        pictures: kind of picture -> file.
-        row: the view's row of per_view.csv; may be empty.
-        longest: longer side of the embedded pictures, px.
-        first: True for the view that is visible at first. Without JavaScript only this view is visible.
-    """
+    """Return a view's figure: its pictures (longer side `longest` px) in one place, a slider, a caption with scores."""
     kinds, images = list(pictures), []
     width, height = image_size(pictures[kinds[0]])
     sides = {_left(kinds): "left", kinds[-1]: "right"}
@@ -176,5 +166,5 @@ def _pair(name: str, pictures: dict[str, Path], row: dict[str, float], longest: 
     words = f'<b class="l">{TITLES[_left(kinds)]}</b><b class="r">{TITLES[kinds[-1]]}</b>'
     stage = f'<div class="stage" style="aspect-ratio: {width} / {height}">{"".join(images)}{slider}{words}</div>'
     caption = f"<figcaption>{escape(', '.join([name, *scores]))}</figcaption>"
-    hidden = "" if first else " hidden"
+    hidden = "" if first else " hidden"  # without JavaScript only the first view is visible
     return f'<figure class="pair" data-view="{escape(name)}" style="--at: 50%"{hidden}>{stage}{caption}</figure>'

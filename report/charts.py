@@ -169,38 +169,22 @@ def label_points(axes: Axes, points: np.ndarray, names: Sequence[str], strong: n
 
 
 def _box(point: np.ndarray, place: tuple[float, float], wide: float, high: float, unit: float) -> np.ndarray:
-    """Return the box [left, bottom, right, top] in px of a text that is placed beside a point.
-
-    Args:
-        point: [2], px.
-        place: offset of the text from the point, in points (1/72 inch). A positive x puts the text on the right, a
-            negative x on the left, and 0 centres it.
-        wide: width of the text, px.
-        high: height of the text, px.
-        unit: px per point (1/72 inch).
-    """
+    """Return the box [left, bottom, right, top], px, of a text at `place` (in points, `unit` px each) from `point`."""
     x, y = point + np.array(place) * unit
+    # A positive offset puts the text on the right of the point, a negative one on the left, and 0 centres it.
     left = x - wide / 2 if place[0] == 0 else x if place[0] > 0 else x - wide
     return np.array([left, y - high / 2, left + wide, y + high / 2])
 
 
 def _cost(box: np.ndarray, place: tuple[float, float], boxes: list[np.ndarray], inside) -> float:
-    """Return the cost of placing a text in `box`: its overlap with other boxes in px^2, plus penalties.
-
-    The largest penalty is for leaving the axes, the smallest for the distance to the point.
-
-    Args:
-        box: [left, bottom, right, top], px.
-        place: offset of the text from its point, in points (1/72 inch).
-        boxes: boxes of other points, names and lines.
-        inside: matplotlib box of the axes, px.
-    """
+    """Return the cost of placing a text in `box`: its overlap with other boxes in px^2, plus penalties."""
     box = box + np.array([-LABEL_GAP, 0, LABEL_GAP, 0])
     covered = sum(
         max(0, min(box[2], other[2]) - max(box[0], other[0])) * max(0, min(box[3], other[3]) - max(box[1], other[1]))
         for other in boxes
     )
     outside = max(0, inside.x0 - box[0], box[2] - inside.x1) + max(0, inside.y0 - box[1], box[3] - inside.y1)
+    # The largest penalty is for leaving the axes (`inside`), the smallest for the distance to the point in 1/72 inch.
     return covered + 1000 * outside + 2 * float(np.hypot(*place))
 
 
@@ -244,16 +228,10 @@ def draw_forest(
 
 
 def _interval(axes: Axes, difference: Difference, row: int, sign: int, far: float) -> None:
-    """Draw one method's difference and its intervals into a row of a panel.
-
-    Args:
-        row: index of the row.
-        sign: 1 if more of the metric is better, else -1.
-        far: largest absolute difference that fits the panel. A larger one is drawn as an arrow with the number.
-    """
+    """Draw a method's difference and its intervals into a row; `sign` is 1 if more of the metric is better, else -1."""
     mean, views = difference.mean, difference.views or 0
     colour = GREY if abs(mean) <= views else BLUE if sign * mean > 0 else ORANGE
-    if abs(mean) > far:
+    if abs(mean) > far:  # does not fit the panel: drawn as an arrow with the number
         worse = sign * mean < 0
         words = f"◂ {mean:+.2g}" if worse else f"{mean:+.2g} ▸"
         at = {"ha": "left" if worse else "right", "va": "center", "transform": axes.get_yaxis_transform()}
@@ -268,12 +246,8 @@ def _interval(axes: Axes, difference: Difference, row: int, sign: int, far: floa
 
 
 def _far(differences: Sequence[Difference]) -> float:
-    """Return the largest absolute mean difference to draw to scale, or infinity if all are drawn to scale.
-
-    This limit is three times the median of the absolute mean differences.
-
-    Without this limit a few failing methods would make the differences of all other methods indistinguishable.
-    """
+    """Return the largest absolute mean difference to draw to scale, three times the median; infinity if all fit."""
     sizes = np.abs([difference.mean for difference in differences])
+    # Without this limit a few failing methods would make the differences of all other methods indistinguishable.
     usual = 3 * float(np.median(sizes))
     return usual if sizes.max() > usual > 0 else np.inf

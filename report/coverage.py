@@ -82,11 +82,7 @@ def _bar(share: float | None) -> str:
 
 
 def _unseen(job: JobFiles) -> list[str]:
-    """Return a paragraph on test views with more than 1 % of the pixels outside the mask that no training view saw.
-
-    The paragraph names at most twelve test views, those with the largest unseen shares first. The list is empty if
-    there is no such view or the stage `evaluate` has not run.
-    """
+    """Return a paragraph on test views with over 1 % of pixels outside the mask unseen in training; [] if none."""
     rows = load_views(job.folders["evaluate"] / "per_view.csv") if "evaluate" in job.folders else {}
     shares = {name: row["unseen_share"] for name, row in rows.items() if row.get("unseen_share", 0) > MIN_UNCOVERED}
     if not shares:

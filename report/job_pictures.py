@@ -155,13 +155,7 @@ def _facts(folder: Path) -> dict:
 
 
 def _origin(facts: dict, folder: Path, name: str) -> str:
-    """Return in words where a reference comes from and, if it was given, how well it fits its photograph.
-
-    Args:
-        facts: content of facts.json of the stage `reference`.
-        folder: folder of the stage `reference`.
-        name: name of the reference's view.
-    """
+    """Return in words where a reference comes from and, if given, how it fits; `facts` is the stage's facts.json."""
     if name in facts.get("given", ()):
         return f"given; {facts.get('fits', {}).get(name, 'how well it fits was not recorded')}"
     path = folder / "candidates.json"

@@ -394,10 +394,8 @@ class Session:
         return encode_image(self.segmenter, self.images[name])
 
     def _encode_all(self) -> None:
-        """Encode the views in which the segmentation network will be asked, before the user marks any.
-
-        A background thread does this while the scene is being fitted.
-        """
+        """Encode the views for the segmentation network in a background thread, before the user marks any."""
+        # This runs while the scene is being fitted.
         for name in spread_evenly(sorted(self.views), MAX_NETWORK_VIEWS):
             self.features_of(name)
 
@@ -439,15 +437,7 @@ class Session:
             self.revision += bool(self.events)
 
     def _solve(self, events: list[Event], revision: int) -> None:
-        """Compute the masks that follow from the marks and show them on the page.
-
-        Args:
-            events: the marks, in the order in which they were made.
-            revision: revision of the marks.
-
-        Raises:
-            Superseded: the user changed the marks during the computation.
-        """
+        """Compute the masks from the marks and show them; raises Superseded if the user changes the marks meanwhile."""
 
         def evidence_of(name: str) -> ViewEvidence:
             if revision != self.revision:

@@ -117,16 +117,13 @@ def _random_name(draws: torch.Generator) -> str:
 
 
 def _pairs(comparison: Comparison, methods: list[str], frames: int) -> Iterator[tuple[str, list[tuple[Clip, Clip]]]]:
-    """Yield each scene's name with pairs of clips: (clip of the full method, clip of another method).
-
-    If both results are Gaussians, both clips follow the same camera path of `frames` frames. Otherwise both clips show
-    the rendered test views one after the other. A pair is omitted if a clip cannot be made.
-    """
+    """Yield each scene's name with pairs of clips (full method, another method), without those that cannot be made."""
     for scene in comparison.scenes:
         runs = [comparison.runs[method, scene] for method in (FULL, *methods)]
         ours, *others = [run for run in runs if run.state == "done"] if runs[0].state == "done" else [runs[0]]
         path_clip, pairs = _render_path(ours, frames), []
         for run in others:
+            # Both clips follow the same path if both results are Gaussians. Otherwise both show the test views in turn.
             theirs = _render_path(run, frames) if path_clip else None
             pair = (path_clip, theirs) if theirs else (_load_test_views(ours), _load_test_views(run))
             if all(pair):
@@ -135,10 +132,7 @@ def _pairs(comparison: Comparison, methods: list[str], frames: int) -> Iterator[
 
 
 def _render_path(run: Run, frames: int) -> Clip | None:
-    """Render a clip along an elliptical path through the capture.
-
-    None if the run has no finished result, or the result is inpainted pictures instead of Gaussians.
-    """
+    """Render a clip along an elliptical path; None if the run is not finished or has pictures instead of Gaussians."""
     evaluate, poses = run.folders.get("evaluate"), run.folders.get("poses")
     if not evaluate or not poses or not (evaluate / "scene.ply").exists() or "inpainter" in run.metrics:
         return None
@@ -155,14 +149,10 @@ def _load_test_views(run: Run) -> Clip | None:
 
 
 def _save_clip(frames: list[np.ndarray], rate: int, folder: Path, name: str) -> str:
-    """Save a clip as a .webm, or as a PNG with `STILLS` frames side by side if no video encoder is available.
-
-    Returns:
-        Address of the file relative to the page.
-    """
+    """Save a clip as .webm, or without an encoder as a PNG of stills; return its address relative to the page."""
     try:
         save_video(folder / f"{name}.webm", frames, rate)
-    except ValueError:
+    except ValueError:  # no video encoder is available
         (folder / f"{name}.webm").unlink(missing_ok=True)
         gap = np.full((frames[0].shape[0], GAP, 3), 255, np.uint8)
         stills = [
@@ -176,12 +166,10 @@ def _save_clip(frames: list[np.ndarray], rate: int, folder: Path, name: str) -> 
 
 
 def _corrupt(picture: np.ndarray, draws: torch.Generator) -> np.ndarray:
-    """Return a picture reduced to coarse blocks, a third of which have random colours.
-
-    The result is clearly worse than the picture, so that a participant who prefers it did not pay attention.
-    """
+    """Return a picture reduced to coarse blocks, a third of which have random colours."""
     high, wide = picture.shape[:2]
     rows, columns = (max(2, round(side / BLOCK_SIZE)) for side in (high, wide))
+    # The result is clearly worse, so that a participant who prefers it did not pay attention.
     small = cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA)
     noise = torch.randint(256, (rows, columns, 3), generator=draws).numpy().astype(np.uint8)
     chosen = torch.rand(rows, columns, generator=draws).numpy() < 1 / 3

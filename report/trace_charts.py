@@ -111,12 +111,7 @@ def quantity_curve(lines: Lines, name: str) -> np.ndarray:
 
 
 def _curve(axes: Axes, name: str, points: np.ndarray, colour: str, words: str, main: bool) -> None:
-    """Draw one curve, labelled with its last value and `words`.
-
-    Args:
-        points: [moments, 2], seconds and value.
-        main: True also marks the best value, if it differs from the last value.
-    """
+    """Draw a curve [moments, 2] (seconds, value) with its last value and `words`; `main` marks the best value too."""
     axes.plot(*points.T, color=colour, linewidth=1.8, marker="o", markersize=3)
     last, top = points[-1], points[best_index(name, points[:, 1])]
     annotate(axes, f"{last[1]:.3g}{words}", last, (6, 0), colour if main or not words else INK)

@@ -114,14 +114,11 @@ class Visitors:
             self.requests[visitor].set()
 
     def _render_loop(self, client: Any) -> None:
-        """Render pictures for one visitor until the visitor leaves.
-
-        Each request is answered by a small picture at once. A picture of full size follows unless another request has
-        arrived.
-        """
+        """Render pictures for one visitor until the visitor leaves."""
         request = self.requests[client.client_id]
         while self.open and client.client_id in self.server.get_clients():
             request.wait(1.0)
+            # A small picture answers at once. One of full size follows unless another request has arrived.
             for height in (MOVING, STILL) if request.is_set() else ():
                 request.clear()
                 picture = self.render(visitor_camera(client.camera, height), client.camera)
@@ -201,14 +198,7 @@ class Viewer:
             checkbox.on_update(lambda _, frusta=frusta, box=checkbox: _set_visible(frusta, box.value))
 
     def _add_frustum(self, kind: str, camera: Camera, image: np.ndarray | None, target: np.ndarray) -> Any:
-        """Add a camera frustum, hidden at first, and return its handle in viser.
-
-        Args:
-            kind: key of `FRUSTUM_STYLES`.
-            camera: camera of the frustum.
-            image: picture to show in the frustum, uint8 [H, W, 3]; None for no picture.
-            target: [3], a point in the scene, for `move_to_view`.
-        """
+        """Add a frustum, hidden at first, that shows `image` (uint8 [H, W, 3]) if given; return its handle in viser."""
         width, color, thickness = FRUSTUM_STYLES[kind]
         step = max(1, camera.width // width)
         small = image[::step, ::step] if image is not None else None
@@ -221,17 +211,10 @@ class Viewer:
         return frustum
 
     def _render_for(self, camera: Camera, place: Any) -> np.ndarray:
-        """Render a visitor's picture, uint8 [H, W, 3].
-
-        In full size, parts that no photograph shows are hatched, unless the visitor switched this off or shows the
-        removed Gaussians.
-
-        Args:
-            camera: camera of the picture.
-            place: the visitor's camera in viser, for a small camera of the same pose.
-        """
+        """Render a visitor's picture, uint8 [H, W, 3]; `place` is the visitor's camera in viser."""
         gaussians = self.gaussians
         picture = render_picture(gaussians, camera)
+        # In full size, parts that no photograph shows are hatched, unless switched off or removed Gaussians are shown.
         if camera.height == STILL and self.marks_unseen:
             with RENDER_LOCK:
                 picture = unseen_overlay.hatch_unseen(picture, gaussians, visitor_camera(place, MOVING), self.seen_by)

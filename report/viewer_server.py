@@ -39,11 +39,7 @@ def start_viewer_server(label: str, port: int, access: Access) -> Any:
 
 @contextmanager
 def _protect_servers(access: Access) -> Iterator[list[bool]]:
-    """Let each server of websockets that starts in this context check the token first.
-
-    Yields:
-        A list that gets an entry for each such server.
-    """
+    """Let each websockets server that starts in this context check the token; yields a list with an entry for each."""
     from websockets.asyncio import server
 
     original, protected = server.serve, []

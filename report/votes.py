@@ -85,12 +85,8 @@ def count_votes(answers: list[dict[str, Any]], key: dict[str, Any]) -> tuple[lis
 def _preference(
     accepted: list[list[dict[str, Any]]], key: dict[str, Any], method: str, question: str
 ) -> Preference | None:
-    """Return the preference for one method and question; None if no participant answered it.
-
-    Args:
-        accepted: the answers of each participant who counts, without attention checks.
-        key: content of study-key.json.
-    """
+    """Return the preference of the accepted participants for a method and question; None if nobody answered."""
+    # `key` is the content of study-key.json. `accepted` has the answers of each participant, without attention checks.
     counts = []
     for each in accepted:
         pairs = [(answer, _pair(key, answer["trial"])) for answer in each if question in answer]

@@ -115,19 +115,12 @@ def recover_swap(home: Path, hashes: Hashes) -> None:
 
 
 def _retire(old: Path, place: Path, hashes: Hashes) -> None:
-    """Delete an old artifact, but keep what people did in it.
-
-    Files that people added are moved to the new artifact, or to kept/<stage>/ if it has a file of this name. Files that
-    people changed, and files that were accepted by `keep`, are moved to kept/<stage>/.
-
-    Args:
-        old: folder of the old artifact; nothing is done if it does not exist.
-        place: folder of the new artifact.
-        hashes: the cache of hashes.
-    """
+    """Delete an old artifact, if it exists, after moving out the files that people changed or added."""
     if not old.exists():
         return
     diff, kept = diff_artifact(old, hashes), place.parent / KEPT / place.name
+    # Files that people changed, or that `keep` accepted, go to kept/<stage>/. Added files go to the new artifact,
+    # or to kept/<stage>/ if it has a file of this name.
     targets = {name: kept / name for name in (*diff.by_hand, *diff.changed) if (old / name).exists()}
     targets |= {name: kept / name if (place / name).exists() else place / name for name in diff.added}
     for name, target in targets.items():

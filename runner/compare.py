@@ -99,40 +99,20 @@ def compare(
 
 
 def _check_requests(scenes: list[str], requests: dict[tuple[str, str], Request], hashes: Hashes) -> None:
-    """Check the parameters of all methods on the first scene that can be resolved, before any stage runs.
-
-    Errors of other scenes appear when these scenes run.
-
-    Args:
-        scenes: the scenes, as requests name them.
-        requests: (scene as requests name it, method) -> request.
-        hashes: the cache of hashes.
-
-    Raises:
-        Refused: no scene can be resolved, e.g. because a parameter is wrong. The error is that of the first scene.
-    """
+    """Check each method's parameters on the first scene that resolves, before any run; raises Refused if none does."""
     refusals = []
     for each in scenes:
         try:
             resolve_all([request for (scene, _), request in requests.items() if scene == each], hashes)
-            return
+            return  # errors of other scenes appear when these scenes run
         except Refused as error:
             refusals.append(error)
     raise refusals[0]
 
 
 def _choose_methods(only: str, pipeline: Pipeline, own: str) -> list[str]:
-    """Return the names of the methods to run besides FULL, which always runs.
-
-    Args:
-        only: names, separated by commas or blanks; empty for the scene's own run and all variants.
-        pipeline: has the variants.
-        own: name of the scene's own run.
-
-    Raises:
-        Refused: a name is unknown.
-    """
-    known = [name for name in dict.fromkeys((own, *pipeline.variants)) if name != FULL]
+    """Return the methods to run besides FULL: those in `only`, else `own` (the scene's own run) and all variants."""
+    known = [name for name in dict.fromkeys((own, *pipeline.variants)) if name != FULL]  # FULL always runs
     methods = [name for name in re.split(r"[,\s]+", only) if name and name != FULL]
     for name in (name for name in methods if name not in known):
         raise Refused(f"variants: {unknown_name('variant', name, known)}")
@@ -140,14 +120,7 @@ def _choose_methods(only: str, pipeline: Pipeline, own: str) -> list[str]:
 
 
 def _scenes(request: Request, seeds: int, data: Path | None) -> dict[str, str]:
-    """Find the scenes of a comparison; for the arguments see `compare`.
-
-    Returns:
-        Name or path that a request uses for the scene -> name of the scene.
-
-    Raises:
-        Refused: a scene does not exist, or the options contradict each other.
-    """
+    """Return the scenes of `compare` (name or path that a request uses -> name); raises Refused if one is missing."""
     if seeds < 1:
         raise Refused(f"seeds={seeds}: seeds must be at least 1; it is the number of scenes")
     if data:
@@ -165,11 +138,7 @@ def _scenes(request: Request, seeds: int, data: Path | None) -> dict[str, str]:
 
 
 def _scene_folders(data: Path) -> list[Path]:
-    """Return the scenes in a folder: its subfolders, sorted, except those whose names begin with "." or "_".
-
-    Raises:
-        Refused: there are none.
-    """
+    """Return the subfolders of a folder without a leading "." or "_", sorted; raises Refused if there are none."""
     data = data.expanduser()
     found = sorted(p for p in data.iterdir() if p.is_dir() and p.name[0] not in "._") if data.is_dir() else []
     if not found:

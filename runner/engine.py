@@ -189,18 +189,13 @@ class LocalEngine:
 
     @contextmanager
     def _reserve(self, resources: Resources) -> Iterator[tuple[list[int], list[str]]]:
-        """Wait until a stage's cores, GPUs and memory are free, and reserve them inside the context.
-
-        A stage that asks for more memory than there is waits until no other stage runs.
-
-        Yields:
-            The numbers of the cores and of the GPUs.
-        """
+        """Wait for free cores, GPUs and memory, reserve them inside the context, and yield the core and GPU numbers."""
         core_count = min(resources.cores or self.cores, self.cores)
         gpu_count = min(resources.gpus, self.gpus)
         with self._change:
             self._number += 1
             number = self._number
+            # A stage that asks for more memory than there is waits until no other stage runs.
             while not (self._stopped or self._fits(core_count, gpu_count, resources.memory_mb)):
                 self._change.wait(1.0)  # a timeout, because free memory changes without a notification
             if self._stopped:

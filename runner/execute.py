@@ -83,28 +83,9 @@ def _run_stage(
     lock: int,
     execution: Execution,
 ) -> Decision:
-    """Run one stage of a job, and move its artifact into place.
-
-    The stage works in the folder `.partial-<stage>-<key>`. If an interrupted run with the same key left this folder,
-    the stage resumes from its state. If another variant of the scene has an artifact with the same key, that one is
-    copied and nothing runs.
-
-    Args:
-        job: the job.
-        stage: name of the stage.
-        decision: the decision to run it.
-        time_left: text on the expected time, which follows the reason for the run.
-        earlier: decisions about all earlier stages, which are done.
-        lock: file descriptor of the lock of the job's folder.
-        execution: settings.
-
-    Returns:
-        The new decision about the stage, `cached`.
-
-    Raises:
-        Failed: the stage fails.
-    """
+    """Run one stage or copy its artifact, move the artifact into place, return `cached`; raises Failed if it fails."""
     assert decision.inputs
+    # If an interrupted run with the same key left this folder, the stage resumes from its state.
     partial, place = partial_folder(job, stage, decision.inputs.key), job.home / stage
     take_over(partial)
     if not partial.exists() and (other := _copy_from_variant(job, stage, decision.inputs.key, partial)):
@@ -135,17 +116,7 @@ def _time_left(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
 
 
 def _copy_from_variant(job: ResolvedJob, stage: str, key: str, to: Path) -> str | None:
-    """Copy an artifact from another variant of the scene, if one has an undamaged artifact with the same key.
-
-    Args:
-        job: the job.
-        stage: name of the stage.
-        key: key of the artifact.
-        to: folder to which it is copied.
-
-    Returns:
-        Name of the folder of the variant; None if no variant has such an artifact.
-    """
+    """Copy an undamaged artifact with this key from another variant of the scene; return its folder's name, or None."""
     for home in sorted(job.runs.glob(f"{job.base.name}@*")):
         if home != job.home and (read_receipt(home / stage) or {}).get("key") == key:
             with suppress(Refused), hold_lock(job.runs, home.name, shared=True, wait=False):
@@ -161,20 +132,7 @@ def _copy_from_variant(job: ResolvedJob, stage: str, key: str, to: Path) -> str 
 def _run_in_engine(
     execution: Execution, job: ResolvedJob, stage: str, partial: Path, earlier: dict[str, Decision], lock: int
 ) -> dict[str, Any]:
-    """Run the process of a stage by the engine, and return the answer of the process, see `worker.run`.
-
-    Args:
-        execution: settings.
-        job: the job.
-        stage: name of the stage.
-        partial: the folder in which the stage works.
-        earlier: decisions about all earlier stages.
-        lock: file descriptor of the lock of the job's folder.
-
-    Raises:
-        Failed: the stage failed; the message has its error.
-        KeyboardInterrupt: the stage was interrupted.
-    """
+    """Run a stage's process by the engine, return its answer (see `worker.run`); raises Failed or KeyboardInterrupt."""
     log = job.home / f"{stage}.log"
     needs = dict.fromkeys(job.pipeline.stages[stage].all_needs)
     needs |= {need: job.folder if need == SCENE else earlier[need].path for need in used_needs(job, stage)}

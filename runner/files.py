@@ -151,12 +151,9 @@ def lock_holder(runs: Path, name: str) -> tuple[str, str] | None:
 
 
 def _holder(lock: int) -> tuple[str, str]:
-    """Read the process id and the machine that the last holder of a lock wrote into its file.
-
-    Both are "" if the last holder released the lock. A killed holder leaves them in the file.
-    """
+    """Return the process id and machine of a lock's last holder from its file; both are "" if it released the lock."""
     process, _, host = os.pread(lock, 999, 0).decode(errors="replace").strip().partition(" ")
-    return process, host
+    return process, host  # a killed holder leaves them in the file
 
 
 def _sign(lock: int, text: str) -> None:

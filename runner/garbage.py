@@ -67,11 +67,7 @@ def collect_garbage(request: Request, yes: bool) -> None:
 
 
 def _unused(request: Request, hashes: Hashes) -> Iterator[Unused]:
-    """Yield the unused artifacts, see `collect_garbage`.
-
-    Raises:
-        Refused: the request names a scene for which nothing was computed.
-    """
+    """Yield unused artifacts, see `collect_garbage`; raises Refused if nothing was computed for the requested scene."""
     homes = sorted(path for path in request.runs.glob("*") if is_home(path)) if request.runs.is_dir() else []
     name = Path(request.scene).name
     with suppress(Refused):  # the scene may have been removed
@@ -98,17 +94,7 @@ def _unused(request: Request, hashes: Hashes) -> Iterator[Unused]:
 
 
 def _planned(request: Request, home: Path, reasons: dict[Path, str], hashes: Hashes) -> set[Path]:
-    """Return the folders of the artifacts that the plan of one run uses or may use.
-
-    Args:
-        request: the options.
-        home: folder of the run in runs/, of a scene or a variant.
-        reasons: folder -> reason why the plan does not use its artifact; filled here.
-        hashes: the cache of hashes.
-
-    Raises:
-        Refused: the scene's folder does not exist, or the run cannot be planned.
-    """
+    """Return the artifact folders that a run's plan uses or may use; add why it leaves out the others to `reasons`."""
     name, _, variant = home.name.partition("@")
     pipeline = load_pipeline(request.root)
     receipts = [path.parent for path in home.glob(f"*/{RECEIPT}")]
@@ -137,10 +123,7 @@ def _planned(request: Request, home: Path, reasons: dict[Path, str], hashes: Has
 
 
 def _remove(runs: Path, folder: Path, hashes: Hashes) -> None:
-    """Remove the files of an artifact that agree with its receipt, and its folder if it is empty then.
-
-    An artifact that another process uses is kept, with a message.
-    """
+    """Remove an artifact's files that agree with its receipt, and empty folders; keep an artifact that is in use."""
     try:
         with hold_lock(runs, folder.parent.name, wait=False):
             recover_swap(folder.parent, hashes)

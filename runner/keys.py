@@ -202,10 +202,7 @@ def _read_module(path: Path) -> list[Any]:
 
 
 def _imported(tree: ast.AST) -> Iterator[str]:
-    """Yield every imported name that may be a module (`.name` if relative), also of imports inside functions.
-
-    Imports under `if TYPE_CHECKING` are left out, because they never run.
-    """
+    """Yield every imported name that may be a module (`.name` if relative), also of imports inside functions."""
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -213,27 +210,18 @@ def _imported(tree: ast.AST) -> Iterator[str]:
             module = "." * node.level + (node.module or "")
             yield module
             yield from (module + ("" if module.endswith(".") else ".") + alias.name for alias in node.names)
-        elif not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)):
+        elif not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)):  # such imports never run
             yield from _imported(node)
 
 
 def _module_path(path: Path, root: Path) -> Path:
-    """Return the path of a module relative to the root, such as reffusion/types.py.
-
-    In an installed package the root lies inside the library `reffusion`. The path of a module of the library is then
-    relative to the folder that contains the library.
-    """
+    """Return the path of a module relative to the root, such as reffusion/types.py."""
+    # An installed root lies inside the library, whose modules are relative to the folder that contains the library.
     return path.relative_to(root if path.is_relative_to(root) else root.parents[1])
 
 
 def _imported_files(names: Iterable[str], path: Path, root: Path) -> Iterator[Path]:
-    """Yield the files of CODE_PACKAGES that Python runs when the file at `path` imports `names`.
-
-    Args:
-        names: imported names, see `_imported`.
-        path: the importing file.
-        root: folder with stages/.
-    """
+    """Yield the files of CODE_PACKAGES that Python runs when the file at `path` imports `names`, see `_imported`."""
     places = set()
     for name in names:
         level = len(name) - len(name.lstrip("."))

@@ -95,13 +95,7 @@ def clean(request: Request) -> None:
 
 
 def _homes(request: Request) -> list[Path]:
-    """Return the folders in runs/ of a scene and its variants, or of one variant if the request names it.
-
-    The list is empty for a scene that was not run. The folder of the scene itself may have been removed.
-
-    Raises:
-        Refused: there is neither a scene nor a folder in runs/ of this name, or the variant is unknown.
-    """
+    """Return the folders in runs/ of a scene and its variants (none if it was not run), or of the requested variant."""
     name, runs = scene_name(Path(request.scene).expanduser()), request.runs
     existing = sorted(path.name for path in (runs.iterdir() if runs.is_dir() else ()) if is_home(path))
     scenes = list(dict.fromkeys(each.partition("@")[0] for each in existing))
@@ -111,7 +105,7 @@ def _homes(request: Request) -> list[Path]:
         )
     try:
         scene = find_scene(request.scene, request.root)
-    except Refused:
+    except Refused:  # the folder of the scene itself may have been removed
         if name not in scenes:
             raise Refused(f"{display_path(runs)}: {unknown_name('scene', name, scenes)}") from None
     else:
@@ -133,10 +127,7 @@ def is_home(folder: Path) -> bool:
 
 
 def _find_artifact_files(home: Path, pipeline: Pipeline, hashes: Hashes) -> Iterator[Path]:
-    """Yield the files in a scene's folder in runs/ that the runner or report/ wrote and nobody changed.
-
-    The receipt of an artifact comes after its other files. Some of the paths may not exist.
-    """
+    """Yield the files in runs/<scene> that the runner or report/ wrote and nobody changed; some may not exist."""
     yield from (home / name for name in RECORDS)
     yield from (home / f"{stage}.log" for stage in pipeline.stages)
     yield from (path for pattern in PAGES for path in home.glob(pattern))
@@ -148,7 +139,7 @@ def _find_artifact_files(home: Path, pipeline: Pipeline, hashes: Hashes) -> Iter
         for name in pipeline.stages[folder.name].export if folder.name in pipeline.stages else ():
             twins = {path.relative_to(home): hashes.file(path) for path in list_files(home / name)}
             yield from (home / path for path, own in twins.items() if listing.get(str(path)) == own)
-        yield from artifact_files(folder, hashes)
+        yield from artifact_files(folder, hashes)  # the receipt comes last
 
 
 def artifact_files(folder: Path, hashes: Hashes) -> Iterator[Path]:

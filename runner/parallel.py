@@ -109,19 +109,7 @@ def _run_in_threads(
     on_end: Callable[[int, Outcome], None],
     engine: Engine,
 ) -> None:
-    """Do the runs of all groups in several threads.
-
-    On an interrupt (Ctrl-C) the engine is stopped, and KeyboardInterrupt is raised. An error in `on_end` is raised
-    after all threads have ended.
-
-    Args:
-        runs: all runs.
-        groups: for each group the indices of its runs.
-        at_once: number of threads, each of which does one group at a time.
-        run_one: does one run, given its index and the run.
-        on_end: see `run_all`.
-        engine: the engine to stop.
-    """
+    """Do the runs of all groups (lists of indices), `at_once` groups at a time; an interrupt stops the engine."""
     order, one_at_a_time = count(), threading.Lock()
 
     def run_groups() -> None:
@@ -146,18 +134,15 @@ def _run_in_threads(
         for thread in threads:
             thread.join(max(0, until - time.monotonic()))
         raise
-    if errors:
+    if errors:  # e.g. of `on_end`
         raise errors[0]
 
 
 def _collect_errors(function: Callable[[], None], errors: list[BaseException]) -> None:
-    """Call a function, and append the error that it raises to `errors`.
-
-    Errors of stages are part of an outcome and are not raised. An error here is e.g. a table that could not be written.
-    """
+    """Call a function, and append the error that it raises to `errors`."""
     try:
         function()
-    except BaseException as error:
+    except BaseException as error:  # e.g. a table cannot be written; errors of stages are part of an outcome
         errors.append(error)
 
 

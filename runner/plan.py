@@ -170,39 +170,21 @@ def _has_value(job: ResolvedJob, param: str, value: Any) -> bool:
 
 
 def _existing_artifact(job: ResolvedJob, stage: str) -> Path | None:
-    """Return the stage's artifact in the job's folder, or else in that of the scene's own run (for a variant).
-
-    The artifact may be out of date. None if there is none.
-    """
+    """Return the stage's artifact, maybe out of date, of the job, else of the scene's own run; None without any."""
     return next((home / stage for home in (job.home, job.base) if (home / stage / RECEIPT).is_file()), None)
 
 
 def _weights(job: ResolvedJob, stage: str) -> Iterator[tuple[str, str, Path | None]]:
-    """Yield the parameters of a stage that name weights.
-
-    Yields:
-        (name of the parameter, its value, path). The path is None if the value is the id of a published model, and may
-        not exist otherwise. Parameters without a value are left out.
-    """
+    """Yield (name, value, path) of a stage's set weights parameters; the path is None for a published model's id."""
     for param in job.stages[stage].weights:
         if name := flatten_params(job.params[stage])[param]:
-            path = job.root / Path(name).expanduser()
+            path = job.root / Path(name).expanduser()  # may not exist
             local = path.exists() or name.startswith(("/", ".", "~")) or name.count("/") != 1
             yield param, name, path if local or (job.root / name.split("/")[0]).is_dir() else None
 
 
 def _inputs(job: ResolvedJob, stage: str, needs: dict[str, Path | None], code: dict[str, str]) -> Inputs:
-    """Compute the inputs of a stage: everything on which its artifact depends.
-
-    Args:
-        job: the job.
-        stage: name of the stage.
-        needs: need -> folder of its artifact; None if the need is skipped.
-        code: file -> fingerprint, see `keys.code_fingerprints`.
-
-    Raises:
-        Refused: scene.yaml names a folder that contains the scene itself.
-    """
+    """Return everything on which a stage's artifact depends; skipped needs are None; `code`: file -> fingerprint."""
     own = job.stages[stage]
     hashes = {need: job.hashes.folder(path) if path else None for need, path in needs.items()}
     hashes |= {f"{SCENE}: {name}": digest(json.dumps(fact)) for name, fact in own.facts.items()}
@@ -220,18 +202,14 @@ def _inputs(job: ResolvedJob, stage: str, needs: dict[str, Path | None], code: d
 
 
 def _compare_receipts(job: ResolvedJob, stage: str, inputs: Inputs) -> Decision:
-    """Decide between `cached` and `run` by comparing receipts with the current inputs.
-
-    The stage is cached if a receipt, that of the variant or else that of the scene's own run, agrees with the inputs,
-    and the files of its artifact agree with the receipt. Otherwise it runs, and the reason names the differences. With
-    `trust`, differences of code alone are accepted.
-    """
+    """Return `cached` if a receipt, of the variant or else the scene, agrees with inputs and files; otherwise `run`."""
     places = [home / stage for home in dict.fromkeys((job.home, job.base))]
     receipts = [(place, list_changes(found, inputs), found) for place in places if (found := read_receipt(place))]
     reasons = []
     for place, differs, found in sorted(receipts, key=lambda receipt: bool(receipt[1])):
         notes = [] if place.parent == job.home else [f"shared with {job.base.name}"]
         diff = diff_artifact(place, job.hashes)
+        # With `trust`, differences of code alone are accepted.
         if differs and not (job.trust and differs == list_code_changes(found, inputs)):
             reasons.append(differs)
         elif harm := _damage(job, diff):
@@ -245,20 +223,15 @@ def _compare_receipts(job: ResolvedJob, stage: str, inputs: Inputs) -> Decision:
 
 
 def _damage(job: ResolvedJob, diff: ArtifactDiff) -> list[str]:
-    """Return why an artifact cannot be used, a phrase each; empty if it can.
-
-    Reasons are missing files and, unless the job has `keep`, changed files.
-    """
+    """Return why an artifact cannot be used, as phrases: missing files and, without `keep`, changed files; else []."""
     missing = [f"{join_names(diff.missing)} missing"] if diff.missing else []
     changed = [f"{join_names(diff.changed)} changed since (keep=1 keeps it)"] if diff.changed and not job.keep else []
     return missing + changed
 
 
 def _check_device(job: ResolvedJob, stage: str, decision: Decision) -> Decision:
-    """Return the decision, or the decision `missing` if the stage would run on CUDA and there is no GPU.
-
-    A cached artifact is not affected, because it is valid on any machine.
-    """
+    """Return the decision, or the decision `missing` if the stage would run on CUDA and there is no GPU."""
+    # A cached artifact is valid on any machine.
     if decision.status not in TO_DO or job.params[stage].get("device") != "cuda":
         return decision
     if has_cuda() if job.cuda is None else job.cuda:
@@ -303,13 +276,9 @@ def plan(job: ResolvedJob, stages: list[str], done: dict[str, Decision] | None =
 
 
 def _stage_question(job: ResolvedJob, stage: str, decisions: dict[str, Decision]) -> dict[str, Any]:
-    """Build the question to a stage, see `worker.describe`.
-
-    If the stage may run, the question has the paths of its needs, and thereby asks for a preview. A stage that reads
-    the scene is asked for a preview even if its other needs have not run yet, so that it can refuse the scene early.
-    Then only needs that are final have a path.
-    """
+    """Build a stage's question (`worker.describe`); if the stage may run, the paths of its needs ask for a preview."""
     spec, question = job.pipeline.stages[stage], job.question(stage)
+    # A stage that reads the scene is asked before its other needs have run, so that it can refuse the scene early.
     others = {need: decisions[need] for need in spec.all_needs if need != SCENE}
     needs = {need: each.path for need, each in others.items() if each.is_final or SCENE not in spec.all_needs}
     needs |= {SCENE: job.folder} if SCENE in spec.all_needs else {}
@@ -319,17 +288,7 @@ def _stage_question(job: ResolvedJob, stage: str, decisions: dict[str, Decision]
 
 
 def _apply_answer(job: ResolvedJob, question: dict[str, Any], decision: Decision, answer: dict[str, Any]) -> Decision:
-    """Add a stage's answer to the decision about it.
-
-    The decision becomes `missing` if the machine lacks something for CUDA, if weights are missing that the stage cannot
-    do without, or if the stage refuses.
-
-    Args:
-        job: the job.
-        question: the question to the stage, from `_stage_question`.
-        decision: the decision so far.
-        answer: the answer, see `worker._describe`.
-    """
+    """Add a stage's answer to its decision: `missing` if CUDA or needed weights are absent, or the stage refuses."""
     needed, notes = (tuple(answer.get(name, ())) for name in ("needed", "notes"))
     if decision.status not in TO_DO:
         return replace(decision, needed=needed)

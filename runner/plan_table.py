@@ -41,10 +41,7 @@ def plan_table(job: ResolvedJob, decisions: dict[str, Decision]) -> str:
 
 
 def _paths_outside_scene(job: ResolvedJob, stages: list[str]) -> list[Path]:
-    """Return the paths outside the scene's folder that the stages read, sorted.
-
-    scene.yaml or files of the capture name such paths.
-    """
+    """Return the paths outside the scene's folder that stages read, sorted; scene.yaml or capture files name them."""
     readers = [stage for stage in stages if stage in job.stages and SCENE in job.pipeline.stages[stage].all_needs]
     reads = [path for stage in readers for path in files_outside(job.stages[stage].reads or (), job.folder)]
     named = [

@@ -142,10 +142,7 @@ class Progress:
         return f"for {since}" + ("" if seconds is None else f"; {format_seconds(seconds)} left of all its stages")
 
     def _seconds_left(self, row: _Row) -> float | None:
-        """Estimate the seconds to the end of a run, from the mean duration of each stage in earlier runs.
-
-        Returns None if the duration of a remaining stage is unknown.
-        """
+        """Estimate the seconds to a run's end from mean stage durations of earlier runs; None if one is unknown."""
         total = 0.0
         for stage in self._stages:
             if stage not in row.finished:

@@ -87,16 +87,12 @@ class RayEngine:
         return result
 
     def _wait(self, ref: "ray.ObjectRef[StageResult]") -> StageResult:
-        """Wait for a task, and return its result.
-
-        On an interrupt (Ctrl-C) the engine is stopped, and this method waits for the stage to end, because Ray kills
-        the stage as soon as this process ends.
-        """
+        """Wait for a task and return its result; on an interrupt (Ctrl-C), stop the engine and wait for the stage."""
         try:
             return ray.get(ref)
         except KeyboardInterrupt:
             self.stop()
-            return ray.get(ref, timeout=GRACE + 5)
+            return ray.get(ref, timeout=GRACE + 5)  # Ray kills the stage as soon as this process ends
 
     def stop(self) -> None:
         """See `Engine.stop`."""

@@ -266,11 +266,7 @@ def check_unique_name(base: Path, folder: Path | None, root: Path) -> None:
 
 
 def _questions(job: ResolvedJob) -> dict[str, dict[str, Any]]:
-    """Build the questions to all stages that have a file, see `worker.describe`.
-
-    Returns:
-        Key under which the answer may be cached -> question.
-    """
+    """Return the questions, see `worker.describe`, to all stages that have a file, by the keys of `_answer_key`."""
     questions = {}
     for stage, spec in job.pipeline.stages.items():
         if (job.root / "stages" / f"{stage}.py").is_file():
@@ -282,11 +278,7 @@ def _questions(job: ResolvedJob) -> dict[str, dict[str, Any]]:
 
 
 def _answer_key(job: ResolvedJob, question: dict[str, Any]) -> str:
-    """Return a key for the answer to a question, which changes with everything on which the answer depends.
-
-    The answer is cached if the key begins with CACHED. Caching saves half a second, which a process that imports stages
-    takes to start, and as much for finding the files that a stage reads.
-    """
+    """Return a key that changes with everything the answer depends on; a key that begins with CACHED may be cached."""
     stage, plan, listed = question["stage"], "stages/plan", list_files(job.folder) if "scene" in question else ()
     try:
         folder = plan if (job.root / plan / f"{stage}.py").is_file() else "stages"
@@ -297,20 +289,12 @@ def _answer_key(job: ResolvedJob, question: dict[str, Any]) -> str:
     if "scene" in question and any(paths_outside(question["params"], job.folder)):
         return json.dumps(question)  # the answer may depend on files outside the scene
     files = [(str(path), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in listed]
+    # Caching saves the half second that a process that imports stages takes to start, and as much to find the files.
     return CACHED + digest(json.dumps([question, code, job.hashes.file(WORKER), files]))
 
 
 def _add_descriptions(job: ResolvedJob, questions: dict[str, dict[str, Any]], answers: dict[str, Any]) -> ResolvedJob:
-    """Add the descriptions of the stages to a job.
-
-    Args:
-        job: the job from `_draft`.
-        questions: from `_questions`.
-        answers: key -> answer, see `worker._describe`.
-
-    Raises:
-        Refused: a parameter is wrong; the message is about the first one.
-    """
+    """Add the stages' descriptions from `answers` (by key) to a job; raises Refused for the first wrong parameter."""
     broken = {name: f"stages/{name}.py: no such file, and pipeline.yaml names it" for name in job.pipeline.stages}
     stages = {}
     for name, question in questions.items():
@@ -327,13 +311,7 @@ def _add_descriptions(job: ResolvedJob, questions: dict[str, dict[str, Any]], an
 
 
 def _refusal(stage: str, error: dict[str, Any], known: list[str]) -> str:
-    """Return the message for a wrong parameter.
-
-    Args:
-        stage: the stage.
-        error: see `worker._error`.
-        known: dotted names of all parameters of the stage.
-    """
+    """Return the message for an error of `worker._error`; `known` has the dotted names of the stage's parameters."""
     if error["unknown"]:
         return f"stage {stage}: {unknown_name('parameter', error['where'], known)}"
     return f"{stage}.{error['where']} = {error['value']}: {error['message']}"

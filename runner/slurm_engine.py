@@ -81,11 +81,7 @@ class SlurmEngine:
         raise Failed(f"{task.line['stage']}: its job was lost {RETRIES + 1} times: {reason}")
 
     def _wait(self, job: submitit.Job[Any]) -> StageResult:
-        """Wait for a job, and return its result.
-
-        On an interrupt (Ctrl-C) the engine is stopped, and the job has GRACE + 5 seconds to end; after that
-        KeyboardInterrupt is raised.
-        """
+        """Wait for a job and return its result; on Ctrl-C, stop the engine and wait GRACE + 5 seconds at most."""
         until = math.inf
         while not job.done() and time.monotonic() < until:
             try:

@@ -92,15 +92,7 @@ def _line_with_tab(text: str, error: Exception) -> int | None:
 
 
 def _tree(text: str) -> tuple[Any, Any]:
-    """Parse a YAML document, and check the limits of this module.
-
-    Returns:
-        The root node, None for an empty document; and the loader that constructs values from nodes.
-
-    Raises:
-        ValueError: a limit is exceeded, or there is a tag that is no basic type.
-        yaml.YAMLError: the text is not valid YAML.
-    """
+    """Parse YAML within the module's limits to (root node or None, loader); raises ValueError or yaml.YAMLError."""
     depth = 0
     for event in yaml.parse(text, _Loader):  # event by event, so that the depth is checked before nodes are built
         starts = isinstance(event, yaml.CollectionStartEvent)
@@ -123,11 +115,7 @@ def _tree(text: str) -> tuple[Any, Any]:
 
 
 def _pairs(loader: Any, node: yaml.MappingNode) -> list[tuple[str, Any]]:
-    """Return the (key as text, node of the value) pairs of a mapping, with those that `<<` merges into it.
-
-    Raises:
-        ValueError: a key occurs twice, or is a list or a mapping.
-    """
+    """Return (key as text, value node) pairs, also those merged by `<<`; raises ValueError for bad or repeated keys."""
     keys = Counter(_key(key) for key, _ in node.value)
     if twice := [key for key, count in keys.items() if count > 1]:
         raise ValueError(f"line {node.start_mark.line + 1}: the key {twice[0]!r:.60} comes twice; keep one")
@@ -146,11 +134,7 @@ def _is_null(node: Any) -> bool:
 
 
 def _value(loader: Any, node: Any, is_text: bool) -> Any:
-    """Construct the value of a node; with `is_text` scalars stay text as written, or None.
-
-    Raises:
-        ValueError: with `is_text`, a list has an entry that YAML reads as nothing, such as `~` and `null`.
-    """
+    """Construct a node's value; with `is_text` scalars stay text or None, and a null in a list raises ValueError."""
     if isinstance(node, yaml.SequenceNode):
         if is_text and (empty := [each for each in node.value if _is_null(each)]):
             what = (

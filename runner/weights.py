@@ -48,11 +48,7 @@ def fetch_weights(request: Request, offline: bool) -> int:
 
 
 def _print_problems(missing: list[dict[str, Any]]) -> None:
-    """Print why weights cannot be downloaded, and in which folders each one was searched.
-
-    Args:
-        missing: the missing weights, as fields of reffusion.weights.local.Need.
-    """
+    """Print why missing weights (dicts of `weights.local.Need`) cannot be downloaded, and where each was searched."""
     for need in missing:
         if not need["fetched"]:
             print(f"error: {need['problem']}", file=sys.stderr)

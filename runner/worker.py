@@ -67,17 +67,7 @@ def describe() -> None:
 
 
 def _describe(question: dict[str, Any]) -> dict[str, Any]:
-    """Answer one question about a stage (see `describe`).
-
-    Returns:
-        The fields of `resolve.StageInfo`; or only {"broken": error} if the stage's code has an error; or only
-        {"errors": list of `_error`, "known": names of all parameters} if parameters are wrong. Some fields of the
-        question add fields to the answer:
-
-        - "scene" adds "reads" and "facts", see `resolve.StageInfo`;
-        - "brings" adds "needed" and "optional", lists of weights, and "lacks", what this machine lacks for CUDA;
-        - "needs" adds "notes" of the stage's preview, or its "refusal".
-    """
+    """Answer a question of `describe` with the fields of `resolve.StageInfo` and those for which the question asks."""
     stage = question["stage"]
     needs, brings, scene = (question.get(name) for name in ("needs", "brings", "scene"))
     path = _description_file(stage)
@@ -86,7 +76,7 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
         path = Path(f"stages/{stage}.py")
         _check_run(path, question["takes"])
     except Exception as error:
-        return {"broken": f"{path}: {format_error(error)}"}
+        return {"broken": f"{path}: {format_error(error)}"}  # the stage's code has an error
     fields = dict(_fields(planned.Params))
     try:
         resolved = planned.Params(**question["params"])
@@ -107,7 +97,7 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
     if brings is not None and hasattr(planned, "needed_weights"):
         answer["needed"] = [asdict(need) for need in planned.needed_weights(resolved, frozenset(brings))]
     if brings is not None and hasattr(planned, "lacks") and answer["params"].get("device") == "cuda":
-        answer["lacks"] = planned.lacks(resolved)
+        answer["lacks"] = planned.lacks(resolved)  # what this machine lacks for CUDA
     if scene is not None and hasattr(planned, "scene_files"):
         files = planned.scene_files(resolved, Path(scene), list(list_files(Path(scene))))
         answer["reads"] = sorted(str(path) for path in files)
@@ -127,17 +117,8 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_run(path: Path, takes: list[str]) -> None:
-    """Check that a stage's function run() takes its needs as arguments.
-
-    The source is parsed and not imported, because stages may import heavy modules.
-
-    Args:
-        path: the stage's file.
-        takes: names of its needs in pipeline.yaml.
-
-    Raises:
-        ValueError: the arguments are other ones.
-    """
+    """Check that a stage's run() has its needs in pipeline.yaml (`takes`) as arguments; raises ValueError if not."""
+    # The source is parsed and not imported, because stages may import heavy modules.
     named = {n.name: n.args for n in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(n, ast.FunctionDef)}
     run = named["run"]
     plain, needs = [a.arg for a in run.args][2:], [a.arg for a in run.kwonlyargs]
@@ -161,16 +142,7 @@ def _is_group(annotation: Any) -> TypeGuard[type[BaseModel]]:
 
 
 def _error(error: Any, model: type[BaseModel]) -> dict[str, Any]:
-    """Convert an error of pydantic to a dict.
-
-    Args:
-        error: an entry of `ValidationError.errors()`.
-        model: the model of the parameters.
-
-    Returns:
-        "where": dotted name of the parameter; "unknown": True if no parameter has this name; "value": the wrong value
-        as text; "message".
-    """
+    """Convert an entry of pydantic's `ValidationError.errors()`; "unknown" means that no parameter has this name."""
     where, value, group = _place(error["loc"], model), error["input"], model
     for part in where[:-1]:
         group = _is_group(group) and part in group.model_fields and group.model_fields[part].annotation
@@ -183,13 +155,10 @@ def _error(error: Any, model: type[BaseModel]) -> dict[str, Any]:
 
 
 def _place(loc: tuple[Any, ...], model: type[BaseModel]) -> list[str]:
-    """Return the names that lead to a wrong value in a model.
-
-    Of a parameter with alternative types, such as `str | list[str]`, pydantic's location also names the type that was
-    tried. This part is left out.
-    """
+    """Return the names that lead to a wrong value in a model, from the location that pydantic gives."""
     field = model.model_fields.get(loc[0]) if loc else None
     alternatives = [kind for kind in get_args(field.annotation) if kind is not NoneType] if field else []
+    # Of a parameter with alternative types, such as `str | list[str]`, the location also names the type that was tried.
     tried = isinstance(field and field.annotation, UnionType) and len(alternatives) > 1
     return [str(part) for part in (loc[:1] + loc[2:] if tried else loc)]
 
@@ -284,13 +253,7 @@ def run() -> int:
 
 
 def _limit_resources(cores: int | None, on: list[int] | None, gpus: str | None) -> None:
-    """Limit the resources of the libraries that are imported later. None means no limit.
-
-    Args:
-        cores: number of threads.
-        on: numbers of the CPU cores on which this process may run.
-        gpus: numbers of the visible GPUs, separated by commas.
-    """
+    """Limit the threads, the CPU cores `on` and the GPUs ("0,1") of libraries imported later; None means no limit."""
     if cores is not None:
         os.environ |= {f"{library}_NUM_THREADS": str(cores) for library in THREADS}
         os.environ["OPENCV_FOR_THREADS_NUM"] = str(cores)
@@ -301,12 +264,7 @@ def _limit_resources(cores: int | None, on: list[int] | None, gpus: str | None) 
 
 
 def _run_stage(job: dict[str, Any], log: TextIO) -> dict[str, Any]:
-    """Run a stage in this process, and return the answer that `run` describes.
-
-    Args:
-        job: the description of the job, see `run`.
-        log: file for the traceback of an error.
-    """
+    """Run a stage in this process and return its answer, see `run`; the traceback of an error is written to `log`."""
     started = time.perf_counter()
     try:
         params = _import_file(_description_file(job["stage"])).Params(**job["params"])
@@ -322,12 +280,10 @@ def _run_stage(job: dict[str, Any], log: TextIO) -> dict[str, Any]:
 
 
 def _end_with_runner(fd: int) -> None:
-    """Wait until the runner has ended, which closes the pipe `fd`, and then kill this process.
-
-    Otherwise the process would go on writing to its folder, while the next runner works there.
-    """
+    """Wait until the runner has ended, which closes the pipe `fd`, and then kill this process."""
     while os.read(fd, 4096):
         pass
+    # Otherwise this process would go on writing to its folder, while the next runner works there.
     os.kill(os.getpid(), signal.SIGKILL)
 
 

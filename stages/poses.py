@@ -140,14 +140,7 @@ class OwnSplats:
 
 
 def _load_own_splats(params: Params, scene: Path) -> OwnSplats | None:
-    """Read the Gaussians that the scene brings, and find which of them were deleted; None if it brings none.
-
-    Args:
-        scene: folder of the scene.
-
-    Raises:
-        BadInput: a file that the keys `gaussians` or `cleaned` name cannot be used.
-    """
+    """Load the scene's own Gaussians and find the deleted ones; None without any; raises BadInput for unusable ones."""
     check_gaussian_files(params, scene)
     if params.gaussians is None:
         return None
@@ -162,30 +155,15 @@ def _load_own_splats(params: Params, scene: Path) -> OwnSplats | None:
 
 
 def _load_positions(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Read the positions [M, 3] of the Gaussians in a file, and the notes on what reading changed.
-
-    The other parameters are freed on return, before positions are matched, because a file may have millions of splats.
-    """
+    """Read the positions [M, 3] of the Gaussians in a file, and the notes on what reading changed."""
     splats = load_splats(path)
+    # The other parameters are freed on return, before positions are matched: a file may have millions of splats.
     return splats.rows.means, splats.notes
 
 
 def _find_deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the Gaussians that the user deleted, by matching positions. The counts are printed.
-
-    Args:
-        files: the file of the whole scene and the cleaned file, for messages.
-        whole: [N, 3] positions of the whole scene.
-        cleaned: [M, 3] positions of the cleaned scene.
-
-    Returns:
-        deleted: bool [N], True for Gaussians of the whole scene that are missing from the cleaned one.
-        scattered: bool [N], True for those of them that leave no hole to fill.
-
-    Raises:
-        BadInput: the files are of different scenes, or nothing was deleted, or only scattered Gaussians.
-    """
-    match = matching.match_gaussians(whole, cleaned)
+    """Return bool [N] twice: Gaussians missing from the cleaned scene, and those of them that leave no hole to fill."""
+    match = matching.match_gaussians(whole, cleaned)  # positions [N, 3] and [M, 3]
     if match.found < matching.MIN_MATCHED_SHARE:
         raise BadInput(
             f"{files[1]}: of its splats {match.found:.0%} are where {files[0].name} has one: it is another scene, or "
@@ -208,14 +186,8 @@ def _find_deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarr
 
 
 def _save_own_splats(out: Path, placed: Scene, own_splats: OwnSplats) -> None:
-    """Write the Gaussians that the scene brings: gaussians.ply in the normalised frame, deleted.npy and scattered.npy.
-
-    The properties of gaussians.ply have the order of the scene's file. The other two files are written if Gaussians
-    were deleted, scattered.npy only if some of them were scattered.
-
-    Args:
-        placed: the scene in the normalised frame.
-    """
+    """Write gaussians.ply in the normalised frame, and deleted.npy and scattered.npy if there are such Gaussians."""
+    # The properties have the order of the scene's file.
     save_ply(out / "gaussians.ply", own_splats.splats.gaussians(placed.similarity), properties=own_splats.properties)
     if own_splats.deleted is not None:
         save_labels(out / "deleted.npy", own_splats.deleted)
@@ -224,20 +196,14 @@ def _save_own_splats(out: Path, placed: Scene, own_splats: OwnSplats) -> None:
 
 
 def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: OwnSplats) -> None:
-    """Run the stage for a scene without photographs, which brings Gaussians from which an object was deleted.
-
-    The cameras are those in the scene's folder; without any, some are placed around the hole. The sparse points are a
-    random sample of opaque Gaussians. No picture is written.
-
-    Args:
-        out: folder of this stage.
-        scene: folder of the scene.
-    """
+    """Write the stage's files, but no pictures, for a scene of Gaussians with a deleted object and no photographs."""
     rows, found = own_splats.splats.rows, cameras.read(scene)
     assert own_splats.deleted is not None and own_splats.scattered is not None
     hole = own_splats.deleted & ~own_splats.scattered
     means, opaque, sizes = rows.means, rows.opacity_logits > 0, np.exp(np.median(rows.log_scales, axis=1))
+    # The cameras are those in the scene's folder; without any, some are placed around the hole.
     poses, source = found or (ring.place_cameras(means, sizes, opaque, hole, params.longest), None)
+    # The sparse points are a random sample of opaque Gaussians.
     some = np.flatnonzero(opaque)
     draws = seeding.generator(SEED, "poses", "points of Gaussians")
     some = some[torch.randperm(len(some), generator=draws)[:MORE_POINTS].numpy()]
@@ -258,23 +224,13 @@ def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: Own
 
 
 def _drop_outliers(params: Params, roles: Roles, scene: Scene, out: Path) -> tuple[Scene, list[str]]:
-    """Leave out the training views whose photographs contradict their poses, and adjust the cameras of the others.
-
-    Args:
-        scene: the scene in the normalised frame.
-        out: folder of this stage, with the undistorted pictures.
-
-    Returns:
-        The scene, and sentences about the views that contradict their poses.
-
-    Raises:
-        BadInput: scene.yaml uses a view that is left out, e.g. for a reference.
-    """
+    """Return the scene without views that contradict their poses, cameras adjusted, and sentences about these views."""
     # The check compares views at shared points. A scene with too few sparse points gets points from optical flow first.
     connected = scene if len(scene.points) >= LEAST_POINTS else _adjust_cameras(params, scene, out)
     shown = [camera for name, camera in connected.cameras.items() if name not in connected.blank]
     check = check_poses(shown, connected.points, lambda name: load_views(out, [name])[name])
     verdict = judge(check, connected, roles.keep, params.exclude)
+    # Raises BadInput if scene.yaml uses a view that is left out, e.g. for a reference.
     check_outliers("reference", [each.view for each in reference_list(params.reference)], verdict.outliers)
     check_outliers("clicks", params.clicks or (), verdict.outliers)
     if params.region is not None and params.region.view is not None:
@@ -285,13 +241,7 @@ def _drop_outliers(params: Params, roles: Roles, scene: Scene, out: Path) -> tup
 
 
 def _adjust_cameras(params: Params, scene: Scene, out: Path) -> Scene:
-    """Adjust the cameras to optical flow if `params.refine`, and add points from flow if the scene has few points.
-
-    Cameras of a scene that brings Gaussians are not adjusted.
-
-    Args:
-        out: folder of this stage, with the undistorted pictures.
-    """
+    """Adjust the cameras to optical flow if `params.refine`, and add points from flow if the scene has few points."""
     if params.refine and params.gaussians is None:  # Gaussians that the scene brings were fitted with its cameras
         scene = _refine_cameras(scene, out)
     return scene if len(scene.points) >= LEAST_POINTS else _add_flow_points(scene, out)
@@ -303,24 +253,19 @@ def _oddities(scene: Scene, out: Path) -> list[str]:
 
 
 def _save_warnings(out: Path, messages: list[str]) -> None:
-    """Print warnings, and write them to warnings.json if there are any.
-
-    `make check` reads this file. A run in which this stage is cached prints its warnings again.
-    """
+    """Print warnings, and write them to warnings.json if there are any."""
     for line in messages:
         warnings.warn(line, stacklevel=1)
+    # `make check` reads this file. A run in which this stage is cached prints its warnings again.
     if messages:
         save_json(out / WARNINGS, messages)
 
 
 def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
-    """Return the larger image side in px at which the pictures are used: `params.longest`, or half of their side.
-
-    Pictures that are blurred or were enlarged show no more detail at full size than at half size, and are halved. Up to
-    15 training views are tested.
-    """
+    """Return the larger image side, px, at which to use the pictures: `params.longest`, or half if that is as sharp."""
     if params.min_detail == 0:
         return params.longest
+    # Up to 15 training views are tested. Pictures that are blurred or were enlarged are halved.
     chosen = roles.train[:: max(1, len(roles.train) // 8)]
     images = [load_resized(capture.pictures[name], params.longest, capture.upright) for name in chosen]
     if not image_detail.is_enlarged(images, params.min_detail):
@@ -331,14 +276,8 @@ def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
 
 
 def _refine_cameras(scene: Scene, out: Path) -> Scene:
-    """Adjust the cameras to optical flow between the views, if the flow shows that they need adjustment.
-
-    Test views are adjusted too, as in structure from motion. The residuals before and after, in px, are printed and
-    written to refine.json.
-
-    Args:
-        out: folder of this stage, with the undistorted pictures.
-    """
+    """Adjust the cameras to optical flow if it shows a need; the residuals, px, are printed and go to refine.json."""
+    # Test views are adjusted too, as in structure from motion.
     shown = {name: camera for name, camera in scene.cameras.items() if name not in scene.blank}
     found = refine_cameras(list(shown.values()), load_views(out, shown))
     if np.isnan(found.before):
@@ -353,11 +292,7 @@ def _refine_cameras(scene: Scene, out: Path) -> Scene:
 
 
 def _add_flow_points(scene: Scene, out: Path) -> Scene:
-    """Add up to `MORE_POINTS` points to the scene, triangulated from optical flow between the training views.
-
-    Args:
-        out: folder of this stage, with the undistorted pictures.
-    """
+    """Add up to `MORE_POINTS` points, triangulated from optical flow between the training views."""
     cameras = [scene.cameras[name] for name in scene.train]
     pixels = sum(camera.width * camera.height for camera in cameras)
     # A view adds points only where no earlier view has any. So four times as many cells as wanted points are used.
@@ -375,13 +310,7 @@ def _add_flow_points(scene: Scene, out: Path) -> Scene:
 
 
 def _run_sfm(params: Params, out: Path, capture: Capture) -> Capture:
-    """Estimate the poses of a capture by structure from motion, and leave out the views that could not be placed.
-
-    A summary is printed and written to sfm.json.
-
-    Args:
-        out: folder of this stage.
-    """
+    """Estimate the poses by structure from motion, leave out views that could not be placed, and write sfm.json."""
     found = sfm.reconstruct(capture.pictures, params.longest, out / "sfm", SEED)
     facts = found.facts()
     print(facts["summary"], flush=True)

@@ -66,14 +66,7 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
 
 
 def _save_region(params: Params, out: Path, scene: Scene) -> None:
-    """Write the region that the scene names, in the normalised frame.
-
-    A region that holds the object, or is to be filled, is written as region.json. If `outside` is set, everything
-    beyond the sphere is masked instead: a mask is written for each training view, united with the view's given mask.
-
-    Args:
-        out: folder of this stage, with the masks of the views.
-    """
+    """Write the scene's region as region.json in the normalised frame, or as masks of all beyond it if `outside`."""
     region, scale = params.region, scene.similarity.scale
     if region.view is not None:
         check_outliers("region", [region.view], scene.outliers)
@@ -90,4 +83,4 @@ def _save_region(params: Params, out: Path, scene: Scene) -> None:
         return
     size = [side * scale for side in region.size or [2 * region.radius] * 3]
     facts = {"center": center.tolist(), "size": size, "round": region.size is None}
-    save_json(out / "region.json", {**facts, "holds": params.has_masks})
+    save_json(out / "region.json", {**facts, "holds": params.has_masks})  # holds the object, or is to be filled

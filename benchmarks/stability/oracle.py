@@ -80,11 +80,7 @@ def blended_pixels(gaussians: Gaussians, camera: Camera) -> Tensor:
 
 
 def _render_reference(blended: Tensor, gaussians: Gaussians, camera: Camera, features, background, probe):
-    """Render the images in float64 with given cut-offs; return the images by name and the radii.
-
-    Args:
-        blended: result of `blended_pixels`.
-    """
+    """Render in float64 with the cut-offs of `blended_pixels`; return the images by name, and the radii."""
     projected, radii = pure_torch.project(gaussians, camera, probe)
     again = torch.sort(projected.depths.float(), stable=True).indices  # equal depths by index
     projected = pure_torch.Projected(*(array[again] for array in projected))

@@ -104,12 +104,7 @@ def _place(random: np.random.Generator, view: Camera) -> np.ndarray:
 
 
 def _camera(random: np.random.Generator, distance: float, focal: float) -> Camera:
-    """Draw a camera that looks at the origin, with up to 12 x 10 pixels.
-
-    Args:
-        distance: distance to the origin.
-        focal: focal length relative to the image width.
-    """
+    """Draw a camera of up to 12 x 10 pixels that looks at the origin; `focal` is relative to the image width."""
     width, height = _integer(random, 1, 12), _integer(random, 1, 10)
     pose = np.eye(4)
     pose[:3, :3] = Rotation.random(random_state=int(random.integers(2**31))).as_matrix()

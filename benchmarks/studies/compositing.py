@@ -162,19 +162,8 @@ def interpolate_points(view: PixelRays, camera: np.ndarray) -> np.ndarray:
 
 
 def _cube(ways: np.ndarray, start: np.ndarray, half: np.ndarray):
-    """Intersect N rays with the cube of half extent 1.
-
-    Args:
-        ways: [N, 3], ray directions in the object's axes, divided by the half extents.
-        start: [3], origin of the rays in the same coordinates.
-        half: [3], half extents of the object (used for the ball only).
-
-    Returns:
-        far: [N], ray parameter of the hit.
-        hit: bool [N].
-        normal: [N, 3] in the object's axes.
-        face: [N], axis of the face that is hit.
-    """
+    """Intersect rays [N, 3] from `start` with the cube [-1, 1]^3; return ray parameter, hit, normal and face axis."""
+    # In the object's axes, divided by its half extents; `half` is used for the ball only.
     with np.errstate(divide="ignore"):
         walls = np.stack([(-1 - start) / ways, (1 - start) / ways])
     enter, leave = walls.min(0), walls.max(0)

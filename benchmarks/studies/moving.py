@@ -57,14 +57,7 @@ def select_references(capture: placement.Photographs, thing: placement.PlacedObj
 
 
 def _fineness(capture: placement.Photographs, name: str, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return the resolution [P] at which a photograph shows surface points: the larger, the finer; 0 if not shown.
-
-    It is sqrt(cosine of the viewing angle) / depth.
-
-    Args:
-        points: [P, 3].
-        normals: [P, 3].
-    """
+    """Return how finely a photograph shows points, [P]: sqrt(cosine of viewing angle) / depth, 0 if not shown."""
     camera = capture.cameras[name]
     image, z = capture.project(camera, points)
     framed = ((image >= 0) & (image < (capture.width, capture.height))).all(1) & (z > 0)

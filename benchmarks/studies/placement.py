@@ -201,11 +201,8 @@ def _surface(capture: Photographs, place: Place) -> np.ndarray:
 
 
 def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fit a plane to points [P, 3] and return (a point [3] on the plane, normal [3]).
-
-    The fit is repeated five times; each time the points farthest from the plane are removed.
-    """
-    for _ in range(5):
+    """Fit a plane to points [P, 3] and return (a point [3] on the plane, normal [3])."""
+    for _ in range(5):  # each time the points farthest from the plane are removed
         normal = np.linalg.svd(points - points.mean(0))[2][2]
         off = np.abs((points - np.median(points, 0)) @ normal)
         points = points[off <= max(np.percentile(off, 85), 1e-9)]

@@ -129,16 +129,14 @@ def _means(of: dict[str, float | None]) -> dict[str, float | None]:
 
 
 def _telea(run: Run) -> dict[str, float | None]:
-    """Score the run's own renders of the test views with their masks filled by Telea's method.
-
-    This is a baseline without any 3D method inside the mask; the pixels outside are the same as in the run's result.
-    """
+    """Score the run's own renders of the test views with their masks filled by Telea's method."""
     rows, (vgg, _) = [], lpips.load("vgg")
     models = {"vgg": vgg} if vgg else {}
     for name in run.scene.test:
         mask = run.mask(name)
         box = image_metrics.mask_box(mask)
         if box is not None:
+            # A baseline without any 3D method inside the mask; the pixels outside are those of the run's result.
             painted = classical.telea(run.picture(name), mask)
             truth = box.crop(run.truth(name))
             rows.append(image_metrics.score(box.crop(painted), truth, image_metrics.lpips_targets(truth, models)))
@@ -146,10 +144,7 @@ def _telea(run: Run) -> dict[str, float | None]:
 
 
 def _sharpness(run: Run) -> float | None:
-    """Return the gradient energy of the renders in the box relative to that of the truth, averaged over test views.
-
-    1 means as sharp as the truth, below 1 too smooth.
-    """
+    """Return the mean gradient energy of the renders in the box relative to the truth's; below 1 is too smooth."""
     shares = []
     for name in run.scene.test:
         box = image_metrics.mask_box(run.mask(name))
@@ -167,16 +162,12 @@ def _untouched(run: Run, ceiling: Run, name: str) -> np.ndarray | None:
 
 
 def _worst(run: Run, truths: dict[str, np.ndarray | None]) -> float | None:
-    """Return the largest uncovered share of a view's mask over the named views; None if all their masks are empty.
-
-    Args:
-        truths: view -> photograph without the object, or None if unknown.
-    """
+    """Return the largest uncovered share of a mask; `truths` has photographs without the object, None if unknown."""
     gaussians = run.gaussians()
     worst = [
         uncovered_share(gaussians, run.scene.cameras[name], run.mask(name), truth) for name, truth in truths.items()
     ]
-    return max((share for share in worst if share is not None), default=None)
+    return max((share for share in worst if share is not None), default=None)  # None: all masks are empty
 
 
 def uncovered_share(gaussians: Gaussians, camera: Camera, mask: np.ndarray, truth: np.ndarray | None) -> float | None:

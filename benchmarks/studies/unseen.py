@@ -106,10 +106,7 @@ def find_unseen_views(run: Path, count: int) -> list[UnseenView]:
 
 
 def _is_seen(points: np.ndarray, camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """Return bool [P], True for the world points [P, 3] that lie on the surface that a view shows.
-
-    The depth map [H, W] of the view is 0 where neither its photograph nor its reference shows the surface.
-    """
+    """Return bool [P], points on a view's surface; `depth` [H, W] is 0 where no photograph or reference shows it."""
     uv, z = geometry.project(points, camera)
     shown, inside = geometry.sample_nearest(depth, uv)
     return inside & (z > 0) & (np.abs(shown - z) < MATCH * z)

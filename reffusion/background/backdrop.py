@@ -138,12 +138,7 @@ def concatenate(patches: Sequence[Patches]) -> Patches:
 
 
 def _blocks(camera: Camera, color: np.ndarray, alpha: np.ndarray) -> Patches:
-    """Return the blocks of a view, `BLOCK` px a side, as patches; blocks with a mean alpha up to 0.5 are left out.
-
-    Args:
-        color: [H, W, 3], the rendering over a black background.
-        alpha: [H, W].
-    """
+    """Return the `BLOCK` px blocks of a view with a mean alpha above 0.5; `color` is rendered over black."""
     rows, columns = (np.arange(0, size, BLOCK) for size in color.shape[:2])
     total = lambda values: np.add.reduceat(np.add.reduceat(values, rows, 0), columns, 1)
     covered, size = total(alpha), total(np.ones_like(alpha))
@@ -190,13 +185,9 @@ def _fibonacci_sphere(count: int) -> np.ndarray:
 
 
 def _intersect_unit_sphere(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return [S, 3] unit vectors, the points where rays that start inside the unit sphere leave it.
-
-    Args:
-        origins: [S, 3], inside the unit sphere.
-        directions: [S, 3], of any length. For a direction of length 0 the result is the ray's origin.
-    """
+    """Return the points [S, 3] where rays that start inside the unit sphere leave it."""
     length = np.linalg.norm(directions, axis=1, keepdims=True)
+    # for a direction of length 0 the result is the ray's origin
     directions = directions / np.maximum(length, np.finfo(np.float64).tiny)
     along = (origins * directions).sum(1)
     far = np.sqrt(along**2 + 1 - (origins**2).sum(1)) - along
@@ -204,20 +195,11 @@ def _intersect_unit_sphere(origins: np.ndarray, directions: np.ndarray) -> np.nd
 
 
 def _interpolate_colors(disks: np.ndarray, hits: np.ndarray, colors: np.ndarray, blur: np.ndarray) -> np.ndarray:
-    """Return [D, 3], the colours of the disks: weighted means of the patches' colours.
-
-    The weight of a patch is (d^2 + blur^2)^-3, where d is the distance between the unit vectors of disk and patch. So
-    the weight decreases with the sixth power of the distance, and is about constant within `blur`.
-
-    Args:
-        disks: [D, 3], directions of the disks, unit vectors.
-        hits: [S, 3], directions of the points where the patches' rays meet the sphere, unit vectors.
-        colors: [S, 3], colours of the patches.
-        blur: [S] radians, see `Patches`.
-    """
+    """Return the disks' colours [D, 3]; `disks` and `hits` (where patches' rays meet the sphere) are unit vectors."""
     mixed = np.empty_like(disks)
     for part in np.array_split(np.arange(len(disks)), 10):  # all at once would take gigabytes
         squared_distance = 2 - 2 * disks[part] @ hits.T
+        # It decreases with the sixth power of the distance, and is about constant within `blur` radians.
         weight = 1 / (squared_distance + blur**2) ** 3
         mixed[part] = weight @ colors / weight.sum(1, keepdims=True)
     return mixed

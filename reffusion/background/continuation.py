@@ -106,18 +106,10 @@ def find_planes(
 def _is_duplicate(
     normal: np.ndarray, offset: float, planes: Sequence[tuple[np.ndarray, float]], center: np.ndarray, distance: float
 ) -> bool:
-    """Return whether a plane coincides with one of `planes`, up to the precision of the views.
-
-    It is called for planes that sparse points could not refine, whose position is less precise.
-
-    Args:
-        normal, offset: the plane normal . x = offset.
-        planes: (normal, offset) of the planes found so far.
-        center: [3], point near which the distance of the planes is measured.
-        distance: distance below which parallel planes coincide.
-    """
+    """Return whether the plane normal . x = offset coincides with one of `planes` near `center`."""
     for other, other_offset in planes:
         foot = center - (center @ other - other_offset) * other
+        # Without refinement by sparse points, the position is only as precise as the views, hence the tolerance.
         if abs(normal @ other) > MAX_TURN and abs(normal @ foot - offset) < distance:
             return True
     return False
@@ -169,23 +161,14 @@ def align_plane(plane: Plane, depth: np.ndarray, camera: Camera, hole: np.ndarra
 
 
 def _continued_hull(plane: Plane, seen: np.ndarray, grounds: Sequence[Plane]) -> np.ndarray:
-    """Return the region in which a plane may continue: the convex hull of the large patches of seen cells.
-
-    Seen cells are also projected down onto the planes on which the surface may stand, so that e.g. a wall continues
-    down to the floor.
-
-    Args:
-        seen: bool [CELLS, CELLS], cells where the plane is seen.
-        grounds: planes that cross this plane and have more samples. The surface may stand on them.
-
-    Returns:
-        bool [CELLS, CELLS].
-    """
+    """Return the convex hull [CELLS, CELLS] of a plane's large seen patches, the region in which it may continue."""
     patches, count = ndimage.label(_without_rims(seen))
     areas = np.bincount(patches.ravel(), minlength=count + 1)
     areas[0] = 0
     large = (areas >= MIN_PATCH * max(areas.max(), 1))[patches]
     standing = plane.cell_centers[large]
+    # The surface may stand on `grounds`, planes that cross it and have more samples. Seen cells are projected down onto
+    # them, so that e.g. a wall continues down to the floor.
     for other in grounds:
         down = other.normal - (other.normal @ plane.normal) * plane.normal
         feet = standing + ((other.offset - standing @ other.normal) / (down @ down))[:, None] * down
@@ -201,20 +184,10 @@ def _without_rims(seen: np.ndarray) -> np.ndarray:
 def _map_plane(
     normal: np.ndarray, offset: float, center: np.ndarray, reach: float, views: Sequence[DepthView], third: bool
 ) -> tuple[Plane, np.ndarray]:
-    """Build a plane with its map of seen, free and reflective cells.
-
-    Args:
-        normal, offset: the plane normal . x = offset.
-        center: [3], the middle of the removed object. Its projection onto the plane is the middle of the map.
-        reach: half of the map's side, in world units.
-        third: True for a third face of a corner.
-
-    Returns:
-        The plane, which does not continue anywhere yet, and bool [CELLS, CELLS], True for cells that the object's mask
-        covers in some view.
-    """
+    """Return the plane with its map, not yet continued, and the cells [CELLS, CELLS] that the object's mask covers."""
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     axes = np.stack([first / np.linalg.norm(first), np.cross(normal, first / np.linalg.norm(first))])
+    # `center`, the middle of the removed object, is projected onto the middle of the map; `reach` is half its side.
     origin, cell_size = center - (center @ normal - offset) * normal, 2 * reach / CELLS
     empty = np.zeros((CELLS, CELLS), bool)
     plane = Plane(normal, offset, origin, axes, cell_size, empty, empty, empty, empty, empty)
@@ -224,7 +197,8 @@ def _map_plane(
     if not any(view.camera.center @ facing > plane.origin @ facing for view in views):
         facing = -facing
     seen, free, occluded = _cell_visibility(plane, facing, views)
-    # An object at the edge of a wall lies on both sides of a third face. Then the side counts from which more is seen.
+    # An object at the edge of a wall lies on both sides of a third face of a corner. Then the side counts from which
+    # more is seen.
     if third and (other := _cell_visibility(plane, -facing, views))[0].sum() > seen.sum():
         facing, (seen, free, occluded) = -facing, other
     wide = replace(plane, cell_size=WIDER_MAP * cell_size)
@@ -237,11 +211,8 @@ def _map_plane(
 
 
 def _small_holes(free: np.ndarray, min_cells: float) -> np.ndarray:
-    """Return bool [CELLS, CELLS], the patches of fewer than `min_cells` free cells.
-
-    Such patches arise from depth errors beside the object's edge. A patch at the border of the map is never small,
-    because it may continue beyond the map.
-    """
+    """Return the patches of fewer than `min_cells` free cells, except those at the border of the map."""
+    # Depth errors beside the object's edge make small patches. A patch at the map's border may continue beyond the map.
     patches, count = ndimage.label(np.pad(free, 1, constant_values=True))  # joins all patches at the map's border
     areas = np.bincount(patches.ravel(), minlength=count + 1)
     return free & (areas < min_cells)[patches][1:-1, 1:-1]
@@ -250,15 +221,7 @@ def _small_holes(free: np.ndarray, min_cells: float) -> np.ndarray:
 def _cell_visibility(
     plane: Plane, facing: np.ndarray, views: Sequence[DepthView]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Classify the cells of a plane as seen, free or occluded by the object, for the views on one side of the plane.
-
-    Args:
-        facing: [3], normal that points to this side.
-
-    Returns:
-        Three arrays, bool [CELLS, CELLS]: the cells where views show the plane, the cells where views see through the
-        plane (from either side), and the cells that the object's mask covers in some view.
-    """
+    """Return three cell masks: seen from the side of `facing`, seen through from either side, hidden by the object."""
     normals = np.broadcast_to(facing, (CELLS * CELLS, 3))
     visibility = count_views(plane.cell_centers.reshape(-1, 3), views, normals)
     seen = (visibility.seen >= 1) & (visibility.seen >= visibility.free)
@@ -267,14 +230,11 @@ def _cell_visibility(
 
 
 def _enclosed_patches(seen: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Return bool [CELLS, CELLS], the large patches of free cells that seen cells enclose.
-
-    A mirror or a window in the plane is such a patch. Views seem to see through the plane there. Patches that touch the
-    border of the map are not enclosed.
-    """
+    """Return the large patches of free cells that seen cells enclose, but none at the border of the map."""
     patches, count = ndimage.label(np.pad(free, 1, constant_values=True))
     found = np.zeros(patches.shape, bool)
     padded = np.pad(seen, 1)
+    # A mirror or a window in the plane is such a patch: views seem to see through the plane there.
     for patch in set(range(1, count + 1)) - {patches[0, 0]}:
         inside = patches == patch
         border = ndimage.binary_dilation(inside) & ~inside
@@ -286,22 +246,10 @@ def _enclosed_patches(seen: np.ndarray, free: np.ndarray) -> np.ndarray:
 def _continue_plane(
     plane: Plane, occluded: np.ndarray, grounds: Sequence[Plane], others: Sequence[Plane], band: float, third: bool
 ) -> Plane:
-    """Return the plane with its attributes `continued` and `enclosed`, the cells into which it continues.
-
-    The plane continues into a patch of unknown cells that the object occludes, if enough of the patch's border is seen.
-    Within the patch the plane ends at its visible borders, which are extended straight (`borders.extend_borders`), and
-    at the border of the region of `_continued_hull`.
-
-    Args:
-        occluded: bool [CELLS, CELLS], True for cells that the object occludes.
-        grounds: those planes of `others` that have more samples than this plane. This plane may stand on them.
-        others: planes that cross this plane.
-        band: distance to a plane of `others` within which a view may confuse the two planes, in world units.
-        third: True for a third face of a corner. Most cells around its patches are inside walls and unknown, so only
-            the seen and free cells of a patch's border count.
-    """
+    """Return the plane with `continued` and `enclosed`, the cells into which it continues behind the object."""
     # Reflective cells, through which views see only because the plane is a mirror there, count as seen.
-    # Seen cells near another plane, and thin strips of seen cells, do not determine the borders of the plane.
+    # Seen cells within `band` (world units) of another plane, where a view may confuse the two, and thin strips of seen
+    # cells do not determine the borders of the plane.
     seen, free = plane.seen | plane.reflective, plane.free & ~plane.reflective
     own = seen.copy()
     for other in others if not third else ():
@@ -309,9 +257,12 @@ def _continue_plane(
     unknown = ~seen & ~free & occluded
     patches, count = ndimage.label(unknown)
     continued, beyond_border = np.zeros((2, *occluded.shape), bool)
+    # The plane continues into a patch if enough of the patch's border is seen. It ends at its visible borders, which
+    # are extended straight, and at the border of `_continued_hull`.
     for patch in range(1, count + 1):
         inside = patches == patch
         border = ndimage.binary_dilation(inside, iterations=2) & ~inside
+        # Most cells around a patch of a third face of a corner are inside walls and unknown.
         decisive = border & (seen | free) if third else border
         if inside.sum() >= 4 and seen[decisive].sum() > TOUCHING * decisive.sum():
             beyond = extend_borders(inside, _without_rims(own), free) < 0.5
@@ -325,18 +276,7 @@ def _continue_plane(
 def _cells_facing(
     planes: Sequence[Plane], grounds: Sequence[Sequence[Plane]], views: Sequence[DepthView]
 ) -> list[np.ndarray]:
-    """Return for each plane the cells where the visible surface has about the normal of the plane.
-
-    A cell is True if most views that show a surface there show a normal that is closer to the plane's normal than to
-    the normals of its grounds.
-
-    Args:
-        grounds: for each plane, the planes that cross it and have more samples. For a plane without grounds all cells
-            are True.
-
-    Returns:
-        bool [CELLS, CELLS] for each plane.
-    """
+    """Return per plane the cells where most views show a normal closer to the plane's than to its grounds' normals."""
     # The normals of a view take more memory than all its other data, so only those of one view exist at a time.
     cells = [plane.cell_centers.reshape(-1, 3) for plane in planes]
     agreeing, visible = ([np.zeros(len(points), np.int64) for points in cells] for _ in range(2))

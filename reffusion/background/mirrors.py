@@ -132,11 +132,6 @@ def render_mirrors(
 
 
 def _fill_pits(depth: np.ndarray, fraction: float) -> np.ndarray:
-    """Replace the depth of small places that are deeper than their surroundings by the depth of the surroundings.
-
-    Args:
-        depth: [H, W], 0 where unknown; unknown pixels count as the farthest depth of the map.
-        fraction: radius of the places as a fraction of the image's width.
-    """
+    """Fill pits of a depth map, of a radius up to `fraction` of its width; unknown pixels (0) count as the farthest."""
     radius = morphology.to_pixels(fraction, depth.shape[1])
     return cv2.morphologyEx(np.where(depth > 0, depth, depth.max()), cv2.MORPH_OPEN, morphology.disk(radius))

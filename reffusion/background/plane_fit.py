@@ -105,10 +105,7 @@ def refine_by_points(
 
 
 def _refit(normal: np.ndarray, offset: float, points: np.ndarray, inlier_distance: float) -> tuple[np.ndarray, float]:
-    """Refit a plane to its inliers by least squares, five times, and return its normal and offset.
-
-    The plane is returned as it is if it has fewer than three inliers.
-    """
+    """Refit a plane to its inliers by least squares, five times; stop if there are fewer than three inliers."""
     for _ in range(5):
         inliers = points[np.abs(points @ normal - offset) < inlier_distance]
         if len(inliers) < 3:

@@ -89,15 +89,10 @@ def find_mirrors(
 
 
 def _with_mean_colors(gaussians: Gaussians, views: Sequence[DepthView]) -> Gaussians:
-    """Replace view-dependent colours by the mean of a Gaussian's colours in the views that show it.
-
-    A mirror image shows a Gaussian from directions in which there is no photograph, where its harmonics are arbitrary.
-
-    Returns:
-        The Gaussians with harmonics of degree 0. A Gaussian that no view shows keeps its constant harmonic.
-    """
+    """Replace the harmonics of each Gaussian by its mean colour in the views that show it (degree 0)."""
     means = gaussians.means.double().cpu().numpy()
     total, count = torch.zeros_like(gaussians.means), torch.zeros_like(gaussians.means[:, :1])
+    # A mirror image shows a Gaussian from directions without a photograph, where its harmonics are arbitrary.
     for view in views[:: max(1, len(views) // VIEWS)]:
         seen = torch.from_numpy(is_seen(view, means)).to(total)[:, None]
         total += seen * colors(gaussians, view.camera, gaussians.sh_degree)
@@ -109,14 +104,7 @@ def _with_mean_colors(gaussians: Gaussians, views: Sequence[DepthView]) -> Gauss
 def _find_things(
     center: np.ndarray, radius: float, up: np.ndarray, views: Sequence[DepthView], planes: Sequence[Plane]
 ) -> list[np.ndarray]:
-    """Find things: connected groups of cells with surface points that several views show.
-
-    Args:
-        up: [3], unit normal of the ground, towards the object.
-
-    Returns:
-        For each thing [P, 3], the mean surface point of each of its cells in world coordinates.
-    """
+    """Return, for each connected group of cells that several views show, the mean surface point of each cell [P, 3]."""
     cell, points = CELL * radius, _standing_points(center, radius, up, views, planes)
     if not len(points):
         return []
@@ -141,10 +129,7 @@ def _find_things(
 def _standing_points(
     center: np.ndarray, radius: float, up: np.ndarray, views: Sequence[DepthView], planes: Sequence[Plane]
 ) -> np.ndarray:
-    """Return [P, 3], the surface points near the object that may belong to things that stand on the ground.
-
-    These are points that views show outside their masks, above the ground, but not close to a plane parallel to it.
-    """
+    """Return the surface points [P, 3] outside the masks that may belong to things that stand on the ground."""
     found = [np.zeros((0, 3))]
     for view in views[:: max(1, len(views) // VIEWS)]:
         depth = remove_reflected_depth(view.depth, view.camera, planes)
@@ -173,16 +158,7 @@ def _distance_from_axis(points: np.ndarray, center: np.ndarray, up: np.ndarray) 
 def _select_mirrors(
     points: np.ndarray, up: np.ndarray, cell: float, views: Sequence[DepthView], photos: Mapping[str, np.ndarray]
 ) -> list[tuple[np.ndarray, float]]:
-    """Return (normal, offset) of the accepted mirrors of a thing, first the one that shows most unobserved cells.
-
-    The following mirrors must show unobserved cells that the mirrors before them do not show.
-
-    Args:
-        points: [P, 3], the cells of the thing.
-        up: [3], unit normal of the ground.
-        cell: side of a cell in world units.
-        photos: view name -> uint8 [H, W, 3].
-    """
+    """Return the accepted mirrors (normal, offset) of a thing, first the one that shows most unobserved cells."""
     candidates, found, known = _search_mirrors(points, up, cell, views), [], points
     if candidates:
         candidates = _with_matching_colors(points, candidates, cell, _mean_colors(points, views, photos))
@@ -191,6 +167,7 @@ def _select_mirrors(
         for normal, offset in candidates:
             images = reflect_points(points, normal, offset)
             visibility = count_views(images, views)
+            # a further mirror must show unobserved cells that the mirrors before it do not show
             new = cKDTree(known).query(images, distance_upper_bound=NEAR * cell)[0] > NEAR * cell
             unobserved = ~visibility.is_observed & ~visibility.is_empty & (visibility.masked > 0)
             gains.append(images[new & unobserved])
@@ -205,15 +182,7 @@ def _select_mirrors(
 def _search_mirrors(
     points: np.ndarray, up: np.ndarray, cell: float, views: Sequence[DepthView]
 ) -> list[tuple[np.ndarray, float]]:
-    """Return (normal, offset) of upright mirrors whose images lie on the thing, hardly in free space.
-
-    Mirrors are found by a grid search over angles and offsets, and refined by Nelder-Mead. Colours are not compared.
-
-    Args:
-        points: [P, 3], the cells of the thing.
-        up: [3], unit normal of the ground.
-        cell: side of a cell in world units.
-    """
+    """Return upright mirrors (normal, offset) whose images of the thing lie on the thing, hardly in free space."""
     first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     first /= np.linalg.norm(first)
     second, tree = np.cross(up, first), cKDTree(points)
@@ -238,6 +207,7 @@ def _search_mirrors(
         overlap, free = overlap_and_free(*mirror)
         return FREE_COST * free - overlap
 
+    # grid search over angles and offsets, refined by Nelder-Mead; colours are not compared
     grid = []
     for angle in np.linspace(0, np.pi, ANGLES, endpoint=False):
         low, high = np.percentile(points @ normal_at(angle), [10, 90])
@@ -255,17 +225,7 @@ def _search_mirrors(
 def _with_matching_colors(
     points: np.ndarray, mirrors: Sequence[tuple[np.ndarray, float]], cell: float, colors: np.ndarray
 ) -> list[tuple[np.ndarray, float]]:
-    """Return those of the mirrors whose mirror images agree with the thing in colour.
-
-    The median colour difference between mirror images and the cells on which they lie must be less than `COLOR_RATIO`
-    times that between random cells.
-
-    Args:
-        points: [P, 3], the cells of the thing.
-        mirrors: (normal, offset) of each mirror.
-        cell: side of a cell in world units.
-        colors: [P, 3], the colours of the cells.
-    """
+    """Return the mirrors whose images have about the colours of the cells of the thing on which they lie."""
     tree, shuffled, found = cKDTree(points), np.random.default_rng(0).permutation(len(points)), []
     for normal, offset in mirrors:
         moved = np.abs(points @ normal - offset) > NEAR * cell
@@ -275,6 +235,7 @@ def _with_matching_colors(
         if len(on_thing) < MIN_CELLS / 4:
             continue
         difference = np.abs(colors[on_thing] - colors[nearest[on_thing]]).mean(1)
+        # compared with the difference between random cells
         if np.median(difference) < COLOR_RATIO * np.median(np.abs(colors - colors[shuffled]).mean(1)):
             found.append((normal, offset))
     return found

@@ -125,12 +125,7 @@ def find_unobserved(
 
 
 def _below_planes(planes: Sequence[Plane], camera: Camera, depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the pixels whose depth lies behind a plane, because they show a reflection or an artifact.
-
-    Args:
-        depth: [H, W], camera z of the visible surface.
-        pixels: bool [H, W], the pixels to test.
-    """
+    """Return which of `pixels` have a depth behind a plane, because they show a reflection or an artifact."""
     found = np.zeros_like(pixels)
     for plane in planes:
         at = plane.depth(camera)
@@ -142,26 +137,17 @@ def _below_planes(planes: Sequence[Plane], camera: Camera, depth: np.ndarray, pi
 def _continues_surroundings(
     patch: np.ndarray, plane: Plane, plane_depth: np.ndarray, camera: Camera, depth: np.ndarray, known: np.ndarray
 ) -> bool:
-    """Return whether a plane agrees with the surfaces around one of its patches in a view, so that it may continue.
-
-    A pixel beside the patch agrees if the plane is near the pixel's depth, or if most views show the plane there.
-    Pixels at which views see through the plane are ignored. A plane that merely cuts through a solid thing does not
-    agree.
-
-    Args:
-        patch: bool [H, W], the pixels into which the plane would continue.
-        plane_depth: [H, W], camera z of the plane; inf where a ray does not meet the plane.
-        depth: [H, W], camera z of the visible surface.
-        known: bool [H, W], True where `depth` can be compared.
-    """
+    """Return whether a plane agrees with the surfaces around `patch`, so that it may continue into the patch."""
     if not patch.any():
         return False
     radius = max(3, round(RING * patch.shape[1]))
     ring = cv2.dilate(patch.astype(np.uint8), morphology.square(radius)) > 0
     ring &= known & np.isfinite(plane_depth)
+    # pixels at which views see through the plane are ignored
     ring &= ~plane.pixels_on(plane.free, plane_depth, camera, ring)
     if not ring.any():
         return False
+    # A plane that merely cuts through a solid thing does not agree with the depth beside the patch.
     nearest, farthest = depth_range(depth)
     agrees = (plane_depth > nearest * (1 - SURFACE)) & (plane_depth < farthest * (1 + SURFACE))
     agrees &= np.abs(plane_depth - depth) < DEPTH_EDGE * depth

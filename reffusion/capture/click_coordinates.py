@@ -117,19 +117,14 @@ def distort_mask(mask: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndar
 
 @lru_cache(maxsize=4)
 def _undistortion(lens: Lens) -> tuple[Lens, np.ndarray | None]:
-    """Return the pinhole that replaces a lens, and the `_distortion_map`; the map is None if it would move nothing.
-
-    The result is cached, because most captures have a single lens, and most of the time is spent on its inversion.
-    """
+    """Return the pinhole that replaces a lens, and the `_distortion_map`, or None if it would move nothing."""
+    # cached: most captures have a single lens, and inverting it takes most of the time
     pinhole, where = undistortion_map(lens)
     return pinhole, None if where is None else _distortion_map(lens, pinhole)
 
 
 def _distortion_map(lens: Lens, pinhole: Lens) -> np.ndarray:
-    """Return float32 [H, W, 2], for each pixel of the photograph its coordinates in the undistorted picture.
-
-    The coordinates are OpenCV's: the centre of the first pixel is (0, 0).
-    """
+    """Return undistorted coordinates, float32 [H, W, 2], as OpenCV's: (0, 0) is the centre of the first pixel."""
     columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     directions = to_directions(np.stack([columns, rows], -1), lens)
     return (directions * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy) - 0.5).astype(np.float32)

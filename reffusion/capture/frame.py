@@ -93,11 +93,7 @@ def camera_centers(world_to_camera: np.ndarray) -> np.ndarray:
 
 
 def _axis_intersection_depths(world_to_camera: np.ndarray) -> np.ndarray:
-    """Return [V], the camera depth in each view of the point nearest to all optical axes.
-
-    Depths are at least 0.2 times their median. If the axes are parallel or meet behind the cameras, all depths are
-    three times the spread of the cameras. If all cameras are at one place, all depths are NaN.
-    """
+    """Return the camera depth [V] of the point nearest to all optical axes; NaN if all cameras are at one place."""
     centers, axes = camera_centers(world_to_camera), world_to_camera[:, 2, :3]
     perpendicular = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     middle = centers.mean(axis=0)
@@ -111,6 +107,7 @@ def _axis_intersection_depths(world_to_camera: np.ndarray) -> np.ndarray:
     spread = np.sqrt(((centers - middle) ** 2).sum(axis=1).mean())
     if np.median(depths) > 0.2 * spread:
         return np.maximum(depths, 0.2 * np.median(depths))
+    # the axes are parallel or meet behind the cameras
     return np.full(len(centers), 3.0 * spread if spread > 0 else np.nan)
 
 

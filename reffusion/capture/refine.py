@@ -91,16 +91,13 @@ def refine_cameras(cameras: Sequence[Camera], images: Mapping[str, np.ndarray]) 
 
 
 def _adjust(matches: Sequence[stereo.Matches], initial: Mapping[str, Camera]) -> dict[str, Camera]:
-    """Return the cameras after `ROUNDS` rounds of `bundle_adjust`.
-
-    If the principal points of some views move by more than `LARGEST_SHIFT`, the adjustment starts again with these
-    points fixed.
-    """
+    """Return the cameras after `ROUNDS` rounds of `bundle_adjust`."""
     fixed: set[str] = set()
     while True:
         cameras = dict(initial)
         for _ in range(ROUNDS):
             cameras = bundle_adjust(cameras, *_build_tracks(matches, cameras), fixed)
+        # Principal points that move further than this are fixed, and the adjustment starts again.
         escaped = {name for name, camera in cameras.items() if _shift(camera, initial[name]) > LARGEST_SHIFT} - fixed
         if not escaped:
             return cameras
@@ -139,11 +136,7 @@ def flow_residual(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camer
 
 
 def _build_tracks(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camera]):
-    """Return the arguments `sightings` and `points` of `bundle_adjust`, from matches that agree with the cameras.
-
-    Each matched pixel is triangulated to one point. The observation of the point in a neighbouring view is used if its
-    reprojection error in x and in y is below `stereo.RESIDUAL`.
-    """
+    """Return `sightings` and `points` of `bundle_adjust`: one point per matched pixel that agrees with a neighbour."""
     seen_at: dict[str, list[np.ndarray]] = {name: [] for name in cameras}
     points = []
     for match in matches:

@@ -182,16 +182,9 @@ def _clean_views(clean: Sequence[str], train: list[str], capture: Capture) -> fr
 def _split_masks(
     test: list[str], masks: dict[str, Path], labels: dict[str, Path]
 ) -> tuple[dict[str, Path], dict[str, Path]]:
-    """Return two mappings from test view to file: masks of the object in its photograph, and `Roles.test_masks`.
-
-    A test view with a mask among `masks`, and none among `labels`, shows the object: its photograph is no ground truth
-    inside this mask. The mask is then both the mask of the object and the test mask.
-
-    Args:
-        test: names of the test views.
-        masks: view -> mask of the object.
-        labels: view -> test mask.
-    """
+    """Return two mappings of test view -> file: the masks of the object in its photograph, and `Roles.test_masks`."""
+    # A test view with a mask, and no test mask, shows the object. Its photograph is no ground truth inside the mask,
+    # which is then also its test mask.
     held_out = {name: path for name, path in masks.items() if name in set(test)}
     own = {name: path for name, path in labels.items() if name in set(test)}
     return {name: path for name, path in held_out.items() if name not in own}, held_out | own
@@ -223,13 +216,7 @@ def _size_of(name: str, capture: Capture) -> tuple[int, int]:
 def _split_views(
     train: list[str] | None, test: list[str] | None, labelled: list[str] | None, blank: list[str], capture: Capture
 ) -> tuple[list[str], list[str]]:
-    """Return the names of the training views and of the test views, see `load_roles`.
-
-    Args:
-        train, test: the views that scene.yaml names; None if it names none.
-        labelled: the views of the test masks; None without test masks.
-        blank: the camera-only views that scene.yaml names.
-    """
+    """Return the names of the training and test views, see `load_roles`; `labelled` are the views of the test masks."""
     test_views = test if test is not None else (labelled or [*capture.test])
     if train is None:
         train = [name for name in capture.pictures if name not in {*test_views, *blank, *capture.unused}]
@@ -244,13 +231,7 @@ def _split_views(
 def _camera_only_views(
     cameras_only: Sequence[str] | str | None, named: Sequence[str] | None, used: set[str], capture: Capture
 ) -> tuple[str, ...]:
-    """Return the names of the camera-only views.
-
-    Args:
-        cameras_only: the key of scene.yaml.
-        named: the views that it names; None for "others".
-        used: training and test views.
-    """
+    """Return the names of the camera-only views; `named` is None if the key `cameras_only` is "others"."""
     if cameras_only is None:
         return ()
     if named is None:
@@ -287,14 +268,7 @@ def _select_views(value: Sequence[str] | str | None, capture: Capture, key: str)
 
 
 def _test_mask_files(found: Path, test_masks: str | None) -> list[Path] | None:
-    """Return the files of test masks in the folder `found`, sorted by path; None if the scene has no test masks.
-
-    Args:
-        test_masks: the key of scene.yaml that names the folder, or "none"; None if scene.yaml does not have it.
-
-    Raises:
-        BadInput: scene.yaml names the folder, and there are no masks in it.
-    """
+    """Return the sorted test masks in a folder, None if it has none; raises BadInput if scene.yaml names it."""
     if test_masks is not None and test_masks.lower() == NONE:
         return None
     files = [found / path for path in list_pictures(found, nested=True)]
@@ -306,24 +280,13 @@ def _test_mask_files(found: Path, test_masks: str | None) -> list[Path] | None:
 def _test_mask_views(
     capture: Capture, masks: dict[str, Path], place: Path, labels: list[Path], test_named: list[str] | None
 ) -> list[str]:
-    """Return the view of each test mask, in the order of `labels`.
-
-    The first possibility that fits decides: the names of the masks; all views without a training mask, in order; the
-    first views of the capture, if none of them has a training mask; the views that scene.yaml names as `test`.
-
-    Args:
-        masks: view -> training mask.
-        place: the folder of the test masks.
-        labels: files of the test masks, sorted.
-        test_named: the views that scene.yaml names as `test`, or None.
-
-    Raises:
-        BadInput: nothing fits, because the numbers differ.
-    """
+    """Return the view of each test mask in `labels`; raises BadInput if neither their names nor their number fit."""
     files = [path.relative_to(place).as_posix() for path in labels]
     named = match_masks(place, files, capture, strict=False)
     if all(view in capture.pictures for view in named.values()) and len(named) == len(labels):
         return [named[file] for file in files]
+    # Else the masks are of all views without a training mask, in order, or of the first views of the capture, if none
+    # of them has a training mask.
     without = [name for name in capture.pictures if name not in masks]
     first = list(capture.pictures)[: len(labels)]
     for candidate in (without, first):

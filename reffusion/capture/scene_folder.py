@@ -133,11 +133,7 @@ def is_gaussians_only(params: SceneKeys, scene: Path) -> bool:
 
 
 def _find_fill_masks(folder: Path, capture: Capture, roles: Roles) -> dict[str, Path]:
-    """Return training view -> file of the mask of pixels to fill, from the folder that scene.yaml names as `fill`.
-
-    Raises:
-        BadInput: a training view that is not clean has no such mask.
-    """
+    """Return training view -> mask file in the folder `fill`; raises BadInput if a view that is not clean has none."""
     found = group_by_object(folder, list_pictures(folder, nested=True), capture)
     files = {name: path for views in found.values() for name, path in views.items()}
     if lacking := [name for name in roles.train if name not in {*files, *roles.clean}]:

@@ -119,12 +119,7 @@ def reconstruct(photographs: Mapping[str, Path], longest: int, work: Path, seed:
 
 
 def _register(database: Path, folder: Path, files: Sequence[str], focal: float | None) -> None:
-    """Add pictures that share one lens to COLMAP's database.
-
-    Args:
-        files: names of the pictures in `folder`.
-        focal: focal length divided by the picture's longer side; None if unknown.
-    """
+    """Add pictures of one lens to COLMAP's database; `focal` is relative to their longer side, None if unknown."""
     import pycolmap
 
     reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
@@ -136,10 +131,7 @@ def _register(database: Path, folder: Path, files: Sequence[str], focal: float |
 
 
 def _match(database: Path, folder: Path, seed: int) -> None:
-    """Write the SIFT features of the registered pictures, and the matches of all pairs, to the database.
-
-    The result is the same for any number of threads.
-    """
+    """Write SIFT features and the matches of all pairs to the database; the number of threads changes nothing."""
     import pycolmap
 
     threads, cpu = torch.get_num_threads(), pycolmap.Device.cpu
@@ -172,14 +164,8 @@ def _file_of(view: str) -> str:
 
 
 def _poses_of(model, images: Mapping[str, pycolmap.Image], turned: Collection[str]) -> Poses:
-    """Return the lenses, poses and points of a COLMAP reconstruction, for the pictures before they were turned.
-
-    Args:
-        model: a `pycolmap.Reconstruction`.
-        images: view name -> its image in the model.
-        turned: names of the views whose pictures were turned by 90 degrees counterclockwise.
-    """
-    # turns by 90 degrees clockwise (x right, y down)
+    """Return the lenses, poses and points of a `pycolmap.Reconstruction`, undoing the turn of the pictures `turned`."""
+    # turns by 90 degrees clockwise (x right, y down), as the pictures were turned counterclockwise
     back = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], np.float64)
     poses, lenses = {}, {}
     for name, image in images.items():
@@ -243,12 +229,7 @@ def relative_focal_length(photograph: Path, work: Path) -> float | None:
 
 @lru_cache(maxsize=64)  # most photographs of a capture have the same tags
 def _focal_of_tags(size: tuple[int, int], camera: tuple, focal: tuple, work: Path) -> float | None:
-    """Return `relative_focal_length` for EXIF tags.
-
-    Args:
-        size: (width, height) of the photograph.
-        camera, focal: pairs of tag and value, which name the camera, or tell the focal length (`FOCAL_TAGS`).
-    """
+    """Return `relative_focal_length` for EXIF (tag, value) pairs, which name the camera or tell the focal length."""
     import pycolmap
 
     tags = Image.Exif()

@@ -136,14 +136,7 @@ def _pixels(gray: np.ndarray, cell: int) -> np.ndarray:
 def _flow_both_ways(
     one: tuple[Camera, np.ndarray], other: tuple[Camera, np.ndarray], cell: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Match the pixels of each of two views with the other view, see `_follow_flow`.
-
-    Args:
-        one, other: camera and grey picture [H, W] of each view.
-
-    Returns:
-        For `one`, then for `other`: coordinates [P, 2] of its pixels in the other view; and bool [P], True if valid.
-    """
+    """Match the pixels of two views (camera, grey picture) both ways; return `_follow_flow` for each view."""
     if not _has_same_scale(one[0], other[0]):
         return [_follow_resampled(*one, *other, cell), _follow_resampled(*other, *one, cell)]
     forward, back = _flow(one[1], other[1]), _flow(other[1], one[1])
@@ -164,19 +157,13 @@ def _has_same_scale(one: Camera, other: Camera) -> bool:
 def _follow_resampled(
     camera: Camera, gray: np.ndarray, other: Camera, picture: np.ndarray, cell: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return `_follow_flow` to a neighbour with another picture size or focal length.
-
-    The neighbour's picture is first resampled to the intrinsics of this view; the coordinates are then mapped back.
-
-    Args:
-        camera, gray: this view and its grey picture.
-        other, picture: the neighbour and its grey picture.
-    """
+    """Return `_follow_flow` to a neighbour, `other` and `picture`, of another picture size or focal length."""
     scale = np.array([camera.fx / other.fx, camera.fy / other.fy])
     # pixel coordinates as in docs/architecture.md; OpenCV counts from the centre of the first pixel
     shift = np.array([camera.cx, camera.cy]) - scale * (other.cx, other.cy)
     if scale.min() < 1:
         picture = cv2.GaussianBlur(picture, (0, 0), 0.5 / scale.min())
+    # resamples to the intrinsics of this view; the coordinates are mapped back below
     warp = np.array([[scale[0], 0, shift[0] + scale[0] / 2 - 0.5], [0, scale[1], shift[1] + scale[1] / 2 - 0.5]])
     resampled = cv2.warpAffine(picture, warp, (camera.width, camera.height), borderMode=cv2.BORDER_REPLICATE)
     places, seen = _follow_flow(gray, _flow(gray, resampled), _flow(resampled, gray), cell)
@@ -185,17 +172,7 @@ def _follow_resampled(
 
 
 def _follow_flow(gray: np.ndarray, forward: np.ndarray, back: np.ndarray, cell: int) -> tuple[np.ndarray, np.ndarray]:
-    """Follow the flow from one pixel per cell into the other view.
-
-    Args:
-        gray: grey picture of this view.
-        forward: flow [H, W, 2] from this view to the other.
-        back: flow [H, W, 2] from the other view to this one.
-
-    Returns:
-        Coordinates [P, 2] in the other view; and bool [P], True if the backward flow leads back to the pixel and the
-        picture has contrast around the pixel.
-    """
+    """Return the coordinates [P, 2] in the other view of one pixel per cell, and which of them are valid, bool [P]."""
     pixels = _pixels(gray, cell)
     columns, rows = pixels.astype(int).transpose(2, 0, 1)
     moved = forward[rows, columns]
@@ -203,6 +180,7 @@ def _follow_flow(gray: np.ndarray, forward: np.ndarray, back: np.ndarray, cell: 
     # 1e6: outside the picture, backward flow never leads back to the pixel
     returned = cv2.remap(back, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e6,) * 4)
     agree = np.linalg.norm(moved + returned, axis=-1) < ROUND_TRIP
+    # the backward flow must lead back, and the picture must have contrast around the pixel
     seen = (_local_contrast(gray)[rows, columns] > LEAST_CONTRAST) & agree
     return (pixels + moved).reshape(-1, 2), seen.reshape(-1)
 
@@ -302,25 +280,16 @@ def _neighbour_depth(line: _ReprojectionLine, inverse: np.ndarray) -> np.ndarray
 
 
 def _agrees(line: _ReprojectionLine, inverse: np.ndarray) -> np.ndarray:
-    """Return bool [P], True if the point at inverse depth [P] fits its match in the neighbour.
-
-    It fits if it lies in front of the neighbour, and its reprojection error in x and in y is below `RESIDUAL` px.
-    """
+    """Return whether each point is in front of the neighbour and within `RESIDUAL` px of its match in x and y, [P]."""
     z = _neighbour_depth(line, inverse)
     miss_x, miss_y = np.abs(line.slope * inverse[:, None] + line.offset).T  # numpy is slow to reduce an axis of 2
     return (z > 1e-3) & (np.maximum(miss_x, miss_y) < RESIDUAL * z)
 
 
 def _solve_inverse_depth(lines: Sequence[_ReprojectionLine], weights: Sequence) -> tuple[np.ndarray, np.ndarray]:
-    """Return the inverse depths [P] that minimise the weighted sum of squares of slope r + offset, and a denominator.
-
-    The denominator [P] is the weighted sum of squared slopes. If each weight is one over the squared depth in the
-    neighbour, the variance of the inverse depth is the variance of flow in px^2 divided by the denominator.
-
-    Args:
-        lines: one per neighbour.
-        weights: [P] or a number for each neighbour.
-    """
+    """Return the least-squares inverse depths [P], and the denominator [P], the weighted sum of squared slopes."""
+    # If each weight is one over the squared depth in the neighbour, the variance of the inverse depth is the variance
+    # of flow in px^2 divided by this denominator.
     square = sum(_dot(line.slope, line.slope) * weight for line, weight in zip(lines, weights, strict=True))
     square = np.maximum(square, 1e-12)
     return -sum(_dot(line.slope, line.offset) * w for line, w in zip(lines, weights, strict=True)) / square, square
@@ -334,13 +303,7 @@ def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _is_covered(camera: Camera, points: np.ndarray, pixels: np.ndarray, depth: np.ndarray, cell: int) -> np.ndarray:
-    """Return bool [P], True if an existing point projects into the pixel's cell, in front of the pixel or at its depth.
-
-    Args:
-        points: [N, 3] existing points.
-        pixels: [P, 2] pixels of the camera's view.
-        depth: [P] depths of these pixels; up to `SAME_DEPTH` more counts as the same depth.
-    """
+    """Return bool [P], True if an existing point is in the pixel's cell, in front of the pixel or at its depth."""
     local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     local = local[local[:, 2] > 1e-3]
     column = np.floor((local[:, 0] / local[:, 2] * camera.fx + camera.cx) / cell)

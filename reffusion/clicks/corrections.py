@@ -126,13 +126,7 @@ def correct_mask(view: ViewEvidence, before: np.ndarray, marks: Sequence[Mark]) 
 
 
 def _isolates_click(before: np.ndarray, after: np.ndarray, points: np.ndarray, least: int) -> bool:
-    """Return True if a correction leaves only a speck of the region that an earlier click is on.
-
-    Args:
-        before, after: bool [H, W], the mask before and after the correction.
-        points: float [n, 2], the earlier clicks, all positive or all negative, in pixels.
-        least: number of pixels below which a connected region is a speck.
-    """
+    """Return whether a correction leaves fewer than `least` px of the region that one of the earlier clicks is on."""
 
     def is_speck(mask: np.ndarray, at: np.ndarray) -> bool:
         return bool(part_at(mask == value_at(before, at), at).sum() < least)
@@ -141,24 +135,15 @@ def _isolates_click(before: np.ndarray, after: np.ndarray, points: np.ndarray, l
 
 
 def _change_penalty(before: np.ndarray, after: np.ndarray, dot: int) -> float:
-    """Return the penalty on a correction's merit, which grows with the change of the mask's size.
-
-    A change smaller than a dot around the click is hardly what a person clicks on, so it is penalised, too.
-
-    Args:
-        before, after: bool [H, W], the mask before and after the correction.
-        dot: number of pixels of the dot.
-    """
+    """Return the penalty on a correction's merit for growth, shrinkage, or a change of less than `dot` pixels."""
     growth = float(np.log(max(after.sum(), 1) / max(before.sum(), 1)))
+    # a person hardly clicks to change less than a dot around the click
     tiny = max(0.0, 1 - float((after ^ before).sum()) / dot)
     return GROWTH_PENALTY * max(growth, 0.0) + SHRINKAGE_PENALTY * max(-growth, 0.0) + DOT_PENALTY * tiny
 
 
 def _reach_of_click(view: ViewEvidence, before: np.ndarray, clicks: Clicks) -> np.ndarray:
-    """Return bool [H, W], the mask `before`, corrected around the clicks that contradict it.
-
-    A correction extends up to changes of colour, and up to edges of surfaces if the view has a relief.
-    """
+    """Return the mask, corrected around clicks that contradict it, up to changes of colour and edges of the relief."""
     lab, small, marks = downscale(view.image, clicks)
     before_small = cv2.resize(before.astype(np.float32), small[::-1], interpolation=cv2.INTER_AREA) > 0.5
     grid = pixel_pairs(small)

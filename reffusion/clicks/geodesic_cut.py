@@ -103,11 +103,7 @@ def nested_candidates(
 def _cut_within(
     inside_of: np.ndarray, true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray
 ) -> np.ndarray:
-    """Return bool [N], the result of `min_cut` if only the nodes in `inside_of`, bool [N], may become True.
-
-    Args:
-        true_cost, false_cost, pairs, strength: as for `min_cut`.
-    """
+    """Return the labels [N] of `min_cut` if only the nodes in `inside_of`, bool [N], may become True."""
     ends, at = inside_of[pairs], np.cumsum(inside_of) - 1
     both, crossing = ends.all(1), ends[:, 0] != ends[:, 1]
     inner = np.where(ends[crossing, 0], pairs[crossing, 0], pairs[crossing, 1])
@@ -192,9 +188,8 @@ def correct_labels(
 
 
 def _smoothness(step: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Return [E], the cost of a border between two neighbours; it is lower where `step` (from `color_steps`) is large
-    compared with its root mean square."""
-    usual = float((step**2).sum()) / max(len(step), 1)
+    """Return the cost [E] of a border between neighbours, low where `step` (`color_steps`) exceeds its usual size."""
+    usual = float((step**2).sum()) / max(len(step), 1)  # mean square
     return SMOOTH * np.exp(-(step**2) / (2 * usual + 1e-9)) / length
 
 
@@ -229,10 +224,7 @@ def relative_distance(pairs: np.ndarray, length: np.ndarray, these: np.ndarray, 
 
 
 def _distance(graph: sparse.csr_array, start: np.ndarray) -> np.ndarray:
-    """Return [N], the length of the shortest path from any node of `start`, bool [N].
-
-    Nodes that no path reaches get more than twice the largest length. All nodes get 1 if `start` is empty.
-    """
+    """Return the length [N] of the shortest path from any `start` node; over twice the largest if there is no path."""
     if not start.any():
         return np.ones(graph.shape[0])
     found = csgraph.dijkstra(graph, directed=False, indices=np.flatnonzero(start), min_only=True)

@@ -311,12 +311,9 @@ def _find_excluded(projection: Projection) -> np.ndarray:
 
 
 def _ask(view: ViewEvidence, prompts: Sequence[Prompt], parts: bool = False) -> list[tuple[Candidate, float]]:
-    """Return the network's masks for all prompts as pairs (mask, bonus to its merit).
-
-    Of its masks from part to whole the last two are taken for each prompt, or the last three if `parts` is True. The
-    last mask, that of the largest object, gets the bonus `WHOLE_BONUS`; all other masks get 0.
-    """
+    """Return the network's masks for all prompts, each with the bonus to its merit."""
     assert view.ask is not None
+    # masks go from part to whole; the last one, that of the largest object, gets the bonus
     answers = [view.ask(prompt)[-3 if parts else -2 :] for prompt in prompts]
     return [(each, WHOLE_BONUS * (each is masks[-1])) for masks in answers for each in masks]
 
@@ -324,16 +321,9 @@ def _ask(view: ViewEvidence, prompts: Sequence[Prompt], parts: bool = False) -> 
 def _select(
     candidates: Sequence[tuple[Candidate, float]], projection: Projection, known: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return bool [H, W], the candidate mask with the largest merit.
-
-    The merit is the agreement with the votes, times the IoU that the network expects of its mask, plus the bonus.
-
-    Args:
-        candidates: pairs of mask and bonus, from `_ask`.
-        known: bool [H, W], a mask that is united with each candidate before the agreement is computed; None for no
-            such mask. The returned mask does not contain it.
-    """
+    """Return the mask with the largest merit; `known` is united with each candidate to compute its agreement only."""
     joined = lambda mask: mask if known is None else mask | known
+    # agreement with the votes, times the IoU that the network expects of its mask, plus the bonus
     merit = lambda pair: agreement(joined(pair[0].mask), projection) * pair[0].score + pair[1]
     return max(candidates, key=merit)[0].mask
 

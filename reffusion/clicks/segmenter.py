@@ -125,11 +125,7 @@ def predict_masks(segmenter: Segmenter, features: ImageFeatures, prompt: Prompt)
 
 
 def _to_picture(logits: np.ndarray, side: int, features: ImageFeatures) -> np.ndarray:
-    """Resample logits [h, w] of the network's square input to the picture's pixels, float32 [H, W].
-
-    Args:
-        side: side of the square input, px.
-    """
+    """Resample logits [h, w] of the network's square input of `side` px to the picture's pixels [H, W]."""
     height, width = features.size
     square = cv2.resize(logits.astype(np.float32), (side, side), interpolation=cv2.INTER_LINEAR)
     inside = np.ascontiguousarray(square[:height, :width])

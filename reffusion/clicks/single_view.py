@@ -159,15 +159,7 @@ def segment_by_surfaces(
 def _select_candidate(
     candidates: list[np.ndarray], marks: np.ndarray, lab: np.ndarray, pairs: np.ndarray, depth_edges: np.ndarray
 ) -> np.ndarray | None:
-    """Return bool [h, w], the candidate that best outlines one complete object by `object_score`.
-
-    None if depth shows no edge around this candidate, or if no candidate has regions as large as `_has_regions` asks.
-
-    Args:
-        candidates: labels of the pixels, bool [h * w] each.
-        marks: int8 [h, w], OBJECT, OTHER or UNKNOWN.
-        lab, pairs, depth_edges: as in `geodesic_cut.grow_object`.
-    """
+    """Return the candidate of best `object_score`; None if all have tiny regions or depth shows no edge around it."""
     whole = [each for each in (_fill_holes(labels, marks) for labels in candidates) if _has_regions(each, marks)]
     if not whole:
         return None
@@ -178,11 +170,7 @@ def _select_candidate(
 
 
 def _has_regions(mask: np.ndarray, marks: np.ndarray) -> bool:
-    """Return True if each marked pixel lies in a connected region of at least `LEAST_REGION` pixels.
-
-    Positive marks are looked up in the regions of the mask, negative marks in the regions outside the mask. A mark that
-    the mask contradicts is not counted.
-    """
+    """Return whether every mark that agrees with the mask lies in a region of at least `LEAST_REGION` pixels."""
     for side, kind in ((mask, OBJECT), (~mask, OTHER)):
         parts, _ = ndimage.label(side, np.ones((3, 3)))
         if np.bincount(parts.ravel())[parts[(marks == kind) & side]].min(initial=LEAST_REGION) < LEAST_REGION:
@@ -191,12 +179,7 @@ def _has_regions(mask: np.ndarray, marks: np.ndarray) -> bool:
 
 
 def _fill_holes(labels: np.ndarray, marks: np.ndarray) -> np.ndarray:
-    """Return bool [h, w], the labels with holes filled, except holes that contain a negative mark.
-
-    Args:
-        labels: bool [h * w].
-        marks: int8 [h, w], OBJECT, OTHER or UNKNOWN.
-    """
+    """Return the labels [h * w] as a mask [h, w], with holes filled unless they contain a negative mark."""
     mask = labels.reshape(marks.shape)
     return mask | (ndimage.binary_fill_holes(mask) & ~_marked_holes(marks == OTHER, mask))
 
@@ -208,11 +191,6 @@ def _ring(mask: np.ndarray) -> np.ndarray:
 
 
 def _marked_holes(marks: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the connected parts outside the mask that contain a marked pixel.
-
-    Args:
-        marks: bool [H, W], True = marked.
-        mask: bool [H, W].
-    """
+    """Return the connected parts outside the mask that contain a marked pixel, bool [H, W]."""
     holes, _ = ndimage.label(~mask)
     return np.isin(holes, holes[marks & ~mask])

@@ -103,14 +103,8 @@ def condition_numbers(estimate: np.ndarray, weights: np.ndarray | None = None) -
 def _robust_line(
     x: np.ndarray, y: np.ndarray, w: np.ndarray, plain: Alignment, generator: torch.Generator
 ) -> Alignment:
-    """Fit a line by M-estimation, starting from the line of `_consensus`, or from `plain` if there is none.
-
-    Args:
-        x, y: [S] estimate and target of each pixel.
-        w: [S] weights > 0.
-        plain: The least-squares fit.
-        generator: Draws the random samples.
-    """
+    """Fit a line to estimates x and targets y, [S] each, by M-estimation with weights w > 0, [S]."""
+    # `plain` is the least-squares fit, the start if no line is better than chance.
     result, share = _consensus(x, y, w, generator) or (plain, 1.0)
     for _ in range(MAX_REWEIGHTINGS):
         error = np.abs(y - result.apply(x))
@@ -140,21 +134,7 @@ def geman_mcclure_weights(error: np.ndarray, spread: float) -> np.ndarray:
 def _consensus(
     x: np.ndarray, y: np.ndarray, w: np.ndarray, generator: torch.Generator
 ) -> tuple[Alignment, float] | None:
-    """Return the line through two random pixels whose support is least likely by chance, and the share of support.
-
-    The criterion is a contrario, so no noise level has to be known. Suppose that x carries no information about y. Let
-    q be the share of pixels whose residual is at most r after the targets were shuffled. Then h of n residuals are at
-    most r with probability exp(-n KL(h/n || q)) (Chernoff). The line and the r with the largest exponent are chosen.
-    The pixels whose residual is at most r support the line.
-
-    Args:
-        x, y: [S] estimate and target of each pixel.
-        w: [S] weights > 0.
-        generator: Draws the random samples.
-
-    Returns:
-        None if no line is better than chance.
-    """
+    """Return the line whose support is least likely by chance, and its share of support; None if none beats chance."""
     uniform = lambda count: torch.rand(count, generator=generator, dtype=torch.float64).numpy()
     edges = np.cumsum(w) / w.sum()
     first, second = (np.minimum(np.searchsorted(edges, uniform(TRIALS)), x.size - 1) for _ in range(2))
@@ -165,6 +145,10 @@ def _consensus(
         return None
     first, slope = first[distinct], (y[second] - y[first])[distinct] / distance[distinct]
     predicted = y[first, None] + slope[:, None] * (x[voters] - x[first, None])
+    # The criterion is a contrario, so no noise level has to be known. Suppose that x carries no information about y.
+    # Let q be the share of pixels whose residual is at most r after the targets were shuffled. Then h of n residuals
+    # are at most r with probability exp(-n KL(h/n || q)) (Chernoff). The line and the r with the largest exponent are
+    # chosen. The pixels whose residual is at most r support the line.
     error = np.sort(np.abs(y[voters] - predicted), 1)
     shuffled = np.abs(y[voters][np.argsort(uniform(len(voters)))] - predicted)
     support = np.unique(np.geomspace(3, len(voters), SUPPORT_LEVELS).round().astype(int))

@@ -260,13 +260,8 @@ def continue_depth(
 
 
 def _farthest_surface(view: ViewDepth, surfaces: np.ndarray, usable: np.ndarray) -> int:
-    """Return the label of the surface with the smallest median disparity.
-
-    Args:
-        view: The depth of the view.
-        surfaces: int [H, W], the surface 1, 2, ... of each pixel.
-        usable: bool [H, W], True at pixels whose disparity is read, unless a plane is only assumed to continue there.
-    """
+    """Return the label of the surface with the smallest median disparity at the pixels `usable`, bool [H, W]."""
+    # At anchored pixels a plane is only assumed to continue.
     median_disparity = lambda surface: float(np.median(view.disparity[usable & ~view.anchored & (surfaces == surface)]))
     present = [k for k in range(1, surfaces.max() + 1) if (usable & ~view.anchored & (surfaces == k)).any()]
     return min(present, key=median_disparity)
@@ -275,19 +270,13 @@ def _farthest_surface(view: ViewDepth, surfaces: np.ndarray, usable: np.ndarray)
 def _complete_gaps(
     view: ViewDepth, surfaces: np.ndarray, usable: np.ndarray, guide: np.ndarray, plate: Plate
 ) -> np.ndarray:
-    """Return [H, W] disparity in which each gap of the hole continues the farthest of the surfaces that it touches.
-
-    Args:
-        surfaces: int [H, W], the surface of each pixel (`layers.label_surfaces`).
-        usable: bool [H, W], True at pixels whose disparity is known or anchored.
-        guide: [H, W, 3] picture.
-        plate: Settings of the smooth continuation.
-    """
+    """Return disparity [H, W] in which each gap of the hole continues the farthest of the surfaces that it touches."""
     result, continued = view.disparity.copy(), {}
     gaps, count = ndimage.label(view.hole, np.ones((3, 3)))
     nearest = ndimage.distance_transform_edt(~view.hole, return_distances=False, return_indices=True)
     nearest_gap = gaps[tuple(nearest)]
     for gap in range(1, count + 1):
+        # `usable` pixels have a known or an anchored disparity.
         border = usable & ~view.anchored & (surfaces > 0) & morphology.dilate(gaps == gap, GAP_RING)
         sizes = np.bincount(surfaces[border], minlength=surfaces.max() + 1)
         # A gap that touches no surface continues the farthest of all.
@@ -302,17 +291,8 @@ def _complete_gaps(
 def _complete_layers(
     view: ViewDepth, surfaces: np.ndarray, planes: Sequence[np.ndarray], guide: np.ndarray, plate: Plate
 ) -> np.ndarray:
-    """Return [H, W] disparity in which each surface is continued smoothly by itself, with a step between two surfaces.
-
-    The graph cut may give a surface pixels at which a plane was assumed to continue. There the surface's disparity is
-    at least that of the plane, so that the surface lies in front of the plane.
-
-    Args:
-        surfaces: int [H, W], the surface of each pixel (`layers.label_surfaces`).
-        planes: Depth [H, W] of each plane.
-        guide: [H, W, 3] picture.
-        plate: Settings of the smooth continuation.
-    """
+    """Return disparity [H, W] in which each surface is continued smoothly by itself, with a step between surfaces."""
+    # The graph cut may give a surface pixels at which a plane was assumed to continue.
     reassigned = view.anchored & (plane_labels(view.disparity, view.anchored, surfaces, planes) != surfaces)
     usable = view.known | (view.anchored & ~reassigned)
     result = np.where(usable, view.disparity, 0.0)
@@ -324,22 +304,17 @@ def _complete_layers(
         filled = complete(view.disparity, usable & is_surface, guide, plate)
         low, high = np.percentile(view.disparity[usable & is_surface], [1, 99])
         result[missing] = filled[missing].clip(low / MAX_EXTRAPOLATION, high * MAX_EXTRAPOLATION)
+    # At these reassigned pixels the surface lies in front of the plane: its disparity is at least that of the plane.
     result = np.where(reassigned, np.maximum(result, view.disparity), result)
     rest = ~usable & (result <= 0)
     return np.where(rest, complete(result, result > 0, guide, plate), result) if rest.any() else result
 
 
 def _refuted_share(view: ViewDepth, disparity: np.ndarray) -> float:
-    """Return the share of the hole, in [0, 1], in which other knowledge contradicts a surface of this disparity.
-
-    The surface is contradicted where the surface would hide a plane that continues there, or where other views see past
-    the surface. For example, the planes of a post and of the ground behind the post intersect in front of ground that
-    other views see, so these planes are rejected.
-
-    Args:
-        view: The depth of the view.
-        disparity: [H, W] of the surface.
-    """
+    """Return the share of the hole, in [0, 1], in which other knowledge contradicts a surface of disparity [H, W]."""
+    # The surface would hide a plane that continues there, or other views see past the surface. For example, the planes
+    # of a post and of the ground behind the post intersect in front of ground that other views see, so these planes are
+    # rejected.
     refuted = (view.anchored & (disparity > view.disparity * IN_FRONT_RATIO)) | _in_free_space(view, disparity)
     return float(refuted[view.hole].mean()) if view.hole.any() else 0.0
 
@@ -367,12 +342,7 @@ def _surroundings(view: ViewDepth, settings: CompletionSettings) -> np.ndarray:
 def _fit_planar_model(
     view: ViewDepth, points: np.ndarray, settings: CompletionSettings
 ) -> tuple[planes.PlanarModel, str]:
-    """Fit planes to the surroundings of the hole, and describe how many planes explain which share of the samples.
-
-    The samples are the sparse points if there are enough of them, else the rendered depth. If planes explain less than
-    `CONCLUSIVE_SHARE` of the sparse points, the noise of these points would decide whether the planes are accepted.
-    Pixels of swept depth are then added to the samples.
-    """
+    """Fit planes to the surroundings of the hole, and describe how many planes explain which share of the samples."""
     (pixels, values), source = points_around(view, points, settings), "sparse points"
     sparse = len(values) >= MIN_POINTS
     if not sparse:
@@ -380,6 +350,8 @@ def _fit_planar_model(
         values, source = view.disparity[rows, columns], "rendered depth"
         pixels = np.stack([columns, rows], 1) + 0.5
     model = _fit_planes(view, pixels, values, settings)
+    # If planes explain less than `CONCLUSIVE_SHARE` of the sparse points, the noise of these points would decide
+    # whether the planes are accepted. Pixels of swept depth are then added to the samples.
     if sparse and view.hints.swept is not None and model.explained < CONCLUSIVE_SHARE:
         rows, columns = np.nonzero(_surroundings(view, settings) & view.known & view.hints.swept)
         every = slice(None, None, max(1, len(rows) // (SWEPT_RATIO * len(values))))

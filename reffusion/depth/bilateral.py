@@ -167,14 +167,12 @@ def condition_numbers(confidence: np.ndarray, guide: np.ndarray) -> tuple[float,
 
 
 def _grid(guide: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bilateral grid of a guide: the vertex of each pixel, int [H * W], and the vertices, int [V, 5].
-
-    A vertex has the coordinates x, y, luma and two chroma components, in units of the cell sizes.
-    """
+    """Return the vertex of each pixel in the bilateral grid of a guide, int [H * W], and the vertices, int [V, 5]."""
     levels = 255.0 * unit_range(guide)
     luma = levels @ (0.299, 0.587, 0.114)
     chroma = (levels[..., [2, 0]] - luma[..., None]) * (0.564, 0.713)
     rows, columns = np.mgrid[: guide.shape[0], : guide.shape[1]]
+    # A vertex has the coordinates x, y, luma and two chroma components, in units of the cell sizes.
     position = np.stack([columns, rows, luma, chroma[..., 0], chroma[..., 1]], -1).reshape(-1, 5)
     sizes = np.array([solver.spatial, solver.spatial, solver.luma, solver.chroma, solver.chroma])
     coordinates = np.round(position / sizes).astype(np.int64)
@@ -184,13 +182,8 @@ def _grid(guide: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _keys(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return one integer key per row of coordinates, [V], and the increment of the key along each axis, [5].
-
-    The keys have the lexicographic order of the rows.
-
-    Args:
-        coordinates: int [V, 5].
-    """
+    """Return one integer key per row of coordinates, int [V, 5], and the increment of the key along each axis, [5]."""
+    # The keys have the lexicographic order of the rows.
     low = coordinates.min(0) - 1
     sides = coordinates.max(0) - low + 2
     strides = np.concatenate([np.cumprod(sides[:0:-1])[::-1], [1]])
@@ -198,14 +191,12 @@ def _keys(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _blur(coordinates: np.ndarray) -> sparse.csr_matrix:
-    """Return the sparse matrix [V, V] that blurs the grid: the kernel (1, 2, 1) along each axis, summed over the axes.
-
-    Only vertices that contain pixels exist; the kernel skips missing neighbours.
-    """
+    """Return the sparse matrix [V, V] that blurs the grid: the kernel (1, 2, 1) along each axis, summed over axes."""
     keys, strides = _keys(coordinates)  # increasing, because `_grid` sorts them
     blur = sparse.diags(np.full(len(keys), 2.0 * len(strides)))
     for stride in strides:
         neighbour = np.minimum(np.searchsorted(keys, keys + stride), len(keys) - 1)
+        # Only vertices that contain pixels exist; the kernel skips missing neighbours.
         occupied = np.flatnonzero(keys[neighbour] == keys + stride)
         link = sparse.coo_matrix((np.ones(len(occupied)), (occupied, neighbour[occupied])), shape=blur.shape)
         blur = blur + link + link.T
@@ -213,16 +204,10 @@ def _blur(coordinates: np.ndarray) -> sparse.csr_matrix:
 
 
 def _laplacian(blur: sparse.csr_matrix, mass: np.ndarray, rounds: int) -> sparse.csr_matrix:
-    """Return the graph Laplacian [V, V] of the blur matrix after bistochastisation.
-
-    Bistochastisation scales the blur matrix symmetrically so that its row sums become `mass`.
-
-    Args:
-        blur: [V, V], see `_blur`.
-        mass: [V], number of pixels of each vertex.
-        rounds: Number of bistochastisation steps.
-    """
+    """Return the graph Laplacian [V, V] of the blur matrix after bistochastisation to the row sums `mass`, [V]."""
     balance = np.ones(len(mass))
+    # Bistochastisation scales the blur matrix symmetrically so that its row sums become `mass`, the number of pixels of
+    # each vertex.
     for _ in range(rounds):
         balance = np.sqrt(balance * mass / (blur @ balance))
     scale = sparse.diags(balance)

@@ -49,36 +49,24 @@ def billboard_depth(object_pixels: np.ndarray, depth: np.ndarray, camera: Camera
 def _foot(
     component: np.ndarray, depth: np.ndarray, normals: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the point where an object meets the surface below it, and the unit normal of this surface, [3] each.
-
-    Both are medians over the surface one pixel below the lowest pixels of the object.
-
-    Args:
-        component: bool [H, W], True at the object.
-        depth: [H, W] of the scene without the object.
-        normals: [H, W, 3], the normals of this depth map.
-        camera: The camera of the view.
-    """
+    """Return the point where an object meets the surface below it, and the unit normal of this surface, [3] each."""
     rows, columns = np.nonzero(component)
     lowest = np.full(component.shape[1], -1)
     np.maximum.at(lowest, columns, rows)
     foot_columns = np.flatnonzero(lowest >= rows.max() - FOOT_SHARE * (np.ptp(rows) + 1))
+    # Point and normal are medians over the surface one pixel below the lowest pixels of the object. `depth` and
+    # `normals` are those of the scene without the object.
     below = np.minimum(lowest[foot_columns] + 1, component.shape[0] - 1), foot_columns
     normal = np.median(normals[below], 0)
     return np.median(geometry.unproject(depth, camera)[below], 0), normal / np.linalg.norm(normal)
 
 
 def _billboard_normal(view_direction: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return the unit normal [3] of a plane that stands upright on a surface and is turned towards the camera.
-
-    If the camera looks at the surface almost head-on, as at a wall, the plane faces the camera instead.
-
-    Args:
-        view_direction: [3], unit vector from the camera to the foot of the object.
-        normal: [3], unit normal of the surface.
-    """
+    """Return the unit normal [3] of a plane that stands upright on a surface and is turned towards the camera."""
+    # `view_direction` is the unit vector from the camera to the foot of the object.
     across = view_direction - (view_direction @ normal) * normal
     length = np.linalg.norm(across)
+    # If the camera looks at the surface almost head-on, as at a wall, the plane faces the camera.
     return -view_direction if length < MIN_SINE else -across / length
 
 

@@ -120,14 +120,8 @@ def check_maps(disparity: np.ndarray, confidence: np.ndarray, guide: np.ndarray 
 
 
 def _complete_region(disparity, confidence, guide, domain, plate: Plate) -> np.ndarray:
-    """Return [H, W], the completed disparity inside `domain`, and elsewhere the plane that fits the known pixels best.
-
-    Args:
-        disparity, confidence: [H, W].
-        guide: [H, W, C] in [0, 1], or None.
-        domain: bool [H, W], True at the pixels of a hole and of the ring around it.
-        plate: Settings of the plate.
-    """
+    """Return disparity [H, W], completed inside `domain`, and elsewhere the plane that fits the known pixels best."""
+    # `domain` is True at the pixels of a hole and of the ring around it.
     known = domain & (confidence > 0)
     _check_determines_plane(known)
     # Solve for a correction to the best plane, in units of the data's spread: few digits are lost to the offset.
@@ -192,21 +186,12 @@ def extremes_ratio(matrix: sparse.spmatrix) -> float:
 
 
 def _solve_coarsely(residual, data, guide, domain, plate: Plate) -> np.ndarray:
-    """Return [H, W], the correction to the plane, solved over blocks of pixels and interpolated.
-
-    A block's mean may come from pixels on one side of the block. This does little harm, because `residual` is the small
-    difference from the plane.
-
-    Args:
-        residual: [H, W], disparity minus plane, 0 where unknown.
-        data: [H, W] confidence, 0 where unknown.
-        guide: [H, W, C] in [0, 1], or None.
-        domain: bool [H, W].
-        plate: Settings of the plate.
-    """
+    """Return the correction to the plane, [H, W], solved over blocks of pixels and interpolated."""
     factor = int(np.ceil(np.sqrt(domain.sum() / plate.most_unknowns)))
     blocks = lambda array: _block_sum(array, factor)
     weights = blocks(data)
+    # A block's mean may come from pixels on one side of the block. This does little harm, because `residual` is the
+    # small difference from the plane.
     means = np.divide(blocks(residual * data), weights, where=weights > 0, out=np.zeros_like(weights))
     if guide is not None:
         pixels = blocks(np.ones(domain.shape))
@@ -234,10 +219,8 @@ def _check_determines_plane(known: np.ndarray) -> None:
 
 
 def _bending(domain: np.ndarray, guide: np.ndarray | None, edge: float) -> sparse.csr_matrix:
-    """Return the sparse matrix [equations, P] of weighted second differences over the P pixels of the domain.
-
-    The differences are d_xx, d_yy and d_xy, of which d_xy has the weight 2.
-    """
+    """Return the sparse matrix [equations, P] of weighted second differences over the P pixels of the domain."""
+    # The differences are d_xx, d_yy and d_xy, of which d_xy has the weight 2.
     index = np.full(domain.shape, -1)
     index[domain] = np.arange(domain.sum())
     return sparse.vstack([_stencil_rows(index, guide, stencil, edge) for stencil in STENCILS]).tocsr()

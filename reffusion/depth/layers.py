@@ -87,16 +87,9 @@ def label_surfaces(
 
 
 def _remove_islands(labels: np.ndarray, surfaces: np.ndarray, missing: np.ndarray) -> np.ndarray:
-    """Return the labels, int [H, W], after each island in the hole has taken the nearest label around it.
-
-    An island is a connected component of one label that contains no known pixel of this surface. It arises where a
-    pattern in the hole has the colours of another surface.
-
-    Args:
-        labels: int [H, W], the surface of each pixel.
-        surfaces: int [H, W], the surfaces of the known pixels, 0 elsewhere.
-        missing: bool [H, W], True at the pixels that may change their label.
-    """
+    """Return the labels, int [H, W], after each island in the hole has taken the nearest label around it."""
+    # An island is a connected component of one label that contains no known pixel of this surface (`surfaces` is 0 at
+    # unknown pixels). It arises where a pattern in the hole has the colours of another surface.
     island = np.zeros_like(missing)
     for surface in range(1, int(surfaces.max()) + 1):
         component, _ = ndimage.label(labels == surface, np.ones((3, 3)))
@@ -109,15 +102,8 @@ def _remove_islands(labels: np.ndarray, surfaces: np.ndarray, missing: np.ndarra
 
 
 def _weighted_edges(index: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs of neighbouring pixels, [E, 2], and the cost of giving the two pixels of a pair different labels,
-    [E].
-
-    The cost is low across edges of the picture. Each pixel has up to eight neighbours.
-
-    Args:
-        index: int [H, W], the number of each pixel, -1 at pixels that take no part. The pairs consist of these numbers.
-        colors: [H, W, 3] picture in [0, 1].
-    """
+    """Return pairs of neighbouring pixels, [E, 2], and the cost [E] of giving a pair's pixels different labels."""
+    # A pair consists of two numbers of `index`; pixels whose number is -1 take no part.
     firsts, seconds, apart = [], [], []
     for offset in ((0, 1), (1, 0), (1, 1), (1, -1)):
         first, second = _neighbor_pairs(index, offset)
@@ -126,20 +112,14 @@ def _weighted_edges(index: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, 
     pairs, length = np.stack([np.concatenate(firsts), np.concatenate(seconds)], 1), np.concatenate(apart)
     flat_colors = _at(colors, index >= 0)
     steps = ((flat_colors[pairs[:, 0]] - flat_colors[pairs[:, 1]]) ** 2).sum(-1)
+    # The cost is low across edges of the picture.
     return pairs, (MIN_EDGE_COST + np.exp(-steps / max(2 * steps.mean(), 1e-12))) / length
 
 
 def _color_cost(colors: np.ndarray, surfaces: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return [K, P], the cost -log p(surface | colour) of each of K surfaces at each of P pixels.
-
-    The probabilities come from a colour histogram of each surface; all surfaces are equally probable a priori.
-
-    Args:
-        colors: [H, W, 3] picture in [0, 1].
-        surfaces: int [H, W], the surfaces 1 to K of the known pixels.
-        pixels: bool [H, W], True at the P pixels.
-    """
+    """Return [K, P], the cost -log p(surface | colour) of each of the surfaces 1 to K at each of P pixels."""
     cells = (colors * COLOR_BINS).astype(np.int64).clip(0, COLOR_BINS - 1)
+    # The probabilities come from a colour histogram of each surface; all surfaces are equally probable a priori.
     counts = np.zeros((int(surfaces.max()), COLOR_BINS, COLOR_BINS, COLOR_BINS))
     for k in range(len(counts)):
         np.add.at(counts[k], tuple(cells[surfaces == k + 1].T), 1.0)
@@ -175,19 +155,13 @@ def _at(values: np.ndarray, domain: np.ndarray) -> np.ndarray:
 
 
 def _neighbor_pairs(index: np.ndarray, offset: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return int [E] and int [E], the numbers of pixels and the numbers of their neighbours at `offset`.
-
-    Only pairs in which both pixels have a number are returned.
-
-    Args:
-        index: int [H, W], the number of each pixel, -1 at pixels without a number.
-        offset: (row, column) of the neighbour relative to the pixel, row >= 0.
-    """
+    """Return int [E] and int [E], the numbers of pixels and of their neighbours at `offset`, (row >= 0, column)."""
     height, width = index.shape
     rows_down, right = offset
     first_column = max(0, -right)
     first = index[: height - rows_down, first_column : width - max(0, right)]
     second = index[rows_down:, first_column + right : first_column + right + first.shape[1]]
+    # Pixels without a number have -1.
     valid = (first >= 0) & (second >= 0)
     return first[valid], second[valid]
 
@@ -267,12 +241,7 @@ def segment_foreground(disparity: np.ndarray, known: np.ndarray, hole: np.ndarra
 
 
 def _smooth_neighbor_pairs(index: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return int [E] and int [E], the numbers of pairs of neighbouring pixels without a jump in disparity between them.
-
-    Args:
-        index: int [H, W], the number of each pixel, -1 at pixels without a number.
-        values: [P] disparities of the numbered pixels.
-    """
+    """Return int [E] and int [E], the numbers of neighbouring pixels without a jump in disparity between them."""
     firsts, seconds = [], []
     for offset in ((0, 1), (1, 0)):
         first, second = _neighbor_pairs(index, offset)
@@ -284,18 +253,9 @@ def _smooth_neighbor_pairs(index: np.ndarray, values: np.ndarray) -> tuple[np.nd
 def _label_foreground(
     smooth: sparse.csr_matrix, disparity: np.ndarray, known: np.ndarray, hole: np.ndarray
 ) -> np.ndarray:
-    """Return int [P], for each known pixel the number of the foreground object to which it belongs, or 0.
-
-    The known pixels in a band around the hole are divided into segments without jumps in disparity. A segment that is
-    nearer than all segments it touches is a foreground object. Every known pixel then belongs to the segment that is
-    nearest along the links of `smooth`.
-
-    Args:
-        smooth: Sparse [P, P], nonzero for neighbouring known pixels without a jump in disparity between them.
-        disparity: [H, W].
-        known: bool [H, W], True at the P pixels.
-        hole: bool [H, W].
-    """
+    """Return int [P], for each known pixel the number of the foreground object to which it belongs, or 0."""
+    # The known pixels in a band around the hole are divided into segments without jumps in disparity. `smooth` [P, P]
+    # is nonzero for neighbouring known pixels without a jump.
     in_band = known & (ndimage.distance_transform_edt(~hole) <= BAND_WIDTH * hole.shape[1])
     band = np.flatnonzero(in_band[known])
     _, component = connected_components(smooth[band][:, band], directed=False)
@@ -306,25 +266,21 @@ def _label_foreground(
     for mask, seed in zip(masks, seeds, strict=True):
         mask[tuple(coordinates[seed].T)] = True
     dilated = [ndimage.binary_dilation(mask, np.ones((3, 3)), CONTACT_PX) for mask in masks]
+    # A segment that is nearer than all segments it touches is a foreground object.
     foreground = [k for k in range(len(seeds)) if _is_in_front(k, masks, dilated, disparity)]
     label = np.zeros(smooth.shape[0] + 1, np.int64)
     if not foreground:
         return label[:-1]
     for number, k in enumerate(foreground, start=1):
         label[seeds[k]] = number
+    # Every known pixel belongs to the segment that is nearest along the links of `smooth`.
     _, _, nearest_seed = dijkstra(smooth, False, np.concatenate(seeds), return_predecessors=True, min_only=True)
     return label[np.where(nearest_seed >= 0, nearest_seed, smooth.shape[0])]
 
 
 def _is_in_front(k: int, masks: np.ndarray, dilated: Sequence[np.ndarray], disparity: np.ndarray) -> bool:
-    """Return True if the k-th mask touches others and is nearer than each of them at the contact.
-
-    Args:
-        k: Index of the mask.
-        masks: bool [K, H, W], the segments in the band around the hole.
-        dilated: K masks [H, W], each dilated by the distance within which two segments touch.
-        disparity: [H, W].
-    """
+    """Return True if the k-th mask touches others and is nearer than each of them at the contact."""
+    # `dilated` has each mask dilated by the distance within which two segments touch.
     touching = [
         j for j in range(len(masks)) if j != k and (dilated[k] & masks[j]).any() and (dilated[j] & masks[k]).any()
     ]
@@ -335,10 +291,5 @@ def _is_in_front(k: int, masks: np.ndarray, dilated: Sequence[np.ndarray], dispa
 
 
 def _is_on_plane(disparity: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the pixels whose disparity agrees with that of a plane within `PLANE_TOLERANCE`.
-
-    Args:
-        disparity: [H, W].
-        depth: [H, W] of the plane, inf where the plane is absent.
-    """
+    """Return the pixels, bool [H, W], whose disparity agrees with that of a plane of depth [H, W], inf where absent."""
     return np.isfinite(depth) & (np.abs(disparity * np.where(np.isfinite(depth), depth, 0) - 1) < PLANE_TOLERANCE)

@@ -92,11 +92,8 @@ def estimate_multiview_depth(
 def _refine_planes(
     view: Camera, views: Sequence[Camera], images: Mapping[str, np.ndarray], initial: np.ndarray, seed: int
 ) -> np.ndarray:
-    """Return [H, W, 3], the plane of each pixel: the initial depth, refined by stereo with the most similar views.
-
-    The most similar views are those with the smallest angle between their optical axes and that of the view. If no view
-    is within `MAX_ANGLE_DEG`, the planes are the tangent planes of the initial depth.
-    """
+    """Return [H, W, 3], the plane of each pixel: the initial depth, refined by stereo with the most similar views."""
+    # The most similar views are those with the smallest angle between their optical axes and that of the view.
     axis_cosine = lambda other: float(view.world_to_camera[2, :3] @ other.world_to_camera[2, :3])
     near = [
         other for other in views if other.name != view.name and axis_cosine(other) > np.cos(np.radians(MAX_ANGLE_DEG))
@@ -133,42 +130,21 @@ def _refuted_pixels(
 def _compare_views(
     view: Camera, depth: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray], views: Sequence[Camera]
 ):
-    """Project the pixels [H, W] of a view into each other view.
-
-    Args:
-        view: The view whose pixels are projected.
-        depth: View name -> depth [H, W].
-        values: View name -> array [H, W] that is looked up in the other views.
-        views: All views.
-
-    Yields:
-        For each other view four arrays [H, W]: the other view's depth where a pixel's surface point projects to, the
-            depth of the point in the other view, whether the point is in the frame of the other view, and the other
-            view's `values` where the point projects to.
-    """
+    """Project the pixels of a view into each other view, and yield four arrays [H, W] for each other view."""
     points = geometry.unproject(depth[view.name], view)
     for other in views:
         if other.name != view.name:
             uv, z = geometry.project(points, other)
             other_depth, inside = geometry.sample_nearest(depth[other.name], uv)
+            # Yield the other view's depth where a pixel's surface point projects to, the depth of the point in the
+            # other view, whether the point is in its frame, and its `values` where the point projects to.
             yield other_depth, z, inside & (z > 0), geometry.sample_nearest(values[other.name], uv)[0]
 
 
 def _complete_depth(
     view: Camera, image: np.ndarray, samples: DepthSamples, planes: np.ndarray, depth: np.ndarray, confirmed: np.ndarray
 ) -> np.ndarray:
-    """Return [H, W], the depth of a view in which the unconfirmed pixels are interpolated anew.
-
-    They are interpolated from confirmed pixels, and from the sparse points that project to unconfirmed pixels.
-
-    Args:
-        view: The camera of the view.
-        image: uint8 [H, W, 3], its photograph.
-        samples: The sparse points that are visible in the view.
-        planes: [H, W, 3], the planes found by stereo.
-        depth: [H, W], the depth of these planes.
-        confirmed: bool [H, W].
-    """
+    """Return the depth [H, W] of a view in which the unconfirmed pixels are interpolated anew."""
     if not confirmed.any():
         return depth
     columns, rows = samples.pixels.astype(int).T
@@ -178,5 +154,7 @@ def _complete_depth(
     grid[::spacing, ::spacing] = True
     grid_pixels = np.argwhere(confirmed & grid)
     dense = DepthSamples(grid_pixels[:, ::-1] + 0.5, planes[tuple(grid_pixels.T)], 1 / depth[tuple(grid_pixels.T)])
+    # Unconfirmed pixels are interpolated from confirmed ones and from the sparse points that project to unconfirmed
+    # ones.
     completed = interpolate_depth(samples.select(~refuted).concatenate(dense), view, image)
     return depth if completed is None else np.where(confirmed, depth, completed)

@@ -109,22 +109,15 @@ def tangent_planes(disparity: np.ndarray, rays: np.ndarray) -> np.ndarray:
 
 
 def _homography(camera: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return a matrix [3, 3] and a vector [3] that map a pixel's ray and disparity to a pixel of another view.
-
-    The homogeneous pixel in the view `other` is matrix @ ray + vector * disparity, where ray = (x, y, 1) in `camera`.
-    The matrix is the relative rotation and the vector is the relative translation, both multiplied by the intrinsics of
-    `other`.
-    """
+    """Return a matrix [3, 3] and a vector [3] that map a pixel's ray and disparity to a pixel of another view."""
     inner = np.array([[other.fx, 0, other.cx], [0, other.fy, other.cy], [0, 0, 1]])
     relative = other.world_to_camera @ np.linalg.inv(camera.world_to_camera)
+    # The homogeneous pixel in `other` is matrix @ ray + vector * disparity, where ray = (x, y, 1) in `camera`.
     return inner @ relative[:3, :3], inner @ relative[:3, 3]
 
 
 def _stack_padded(pictures: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return pictures [H_k, W_k] of different sizes as one array [K, H, W], and their sizes (height, width) as [K, 2].
-
-    H and W are the largest height and width. Smaller pictures are padded with zeros at the right and below.
-    """
+    """Return pictures [H_k, W_k] as one array [K, H, W], padded with zeros, and their sizes (height, width), [K, 2]."""
     sizes = np.array([picture.shape for picture in pictures])
     result = np.zeros((len(pictures), *sizes.max(0)), np.float32)
     for whole, picture in zip(result, pictures, strict=True):
@@ -134,17 +127,9 @@ def _stack_padded(pictures: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarra
 
 @kernel
 def _bilateral_weights(colour, row, column, spacing, weights):
-    """Write the bilateral weights of the samples of a window, and return their sum.
-
-    A sample has a high weight if it is near the window's centre and has a similar colour. A sample outside the picture
-    has weight 0.
-
-    Args:
-        colour: [H, W, 3] picture, in levels from 0 to 255.
-        row, column: The pixel at the centre of the window.
-        spacing: Factor on the window's size in pixels: 1 for a picture `REFERENCE_WIDTH` wide, 2 for one twice as wide.
-        weights: [_SAMPLES], the output.
-    """
+    """Write the bilateral weights of the samples of a window to `weights`, [_SAMPLES], and return their sum."""
+    # `colour` has levels from 0 to 255. `spacing` is the factor on the window's size in pixels: 1 for a picture
+    # `REFERENCE_WIDTH` wide, 2 for one twice as wide.
     height, width = colour.shape[:2]
     n, total = 0, 0.0
     for down in range(-WINDOW_HALF, WINDOW_HALF + 1, WINDOW_STRIDE):
@@ -165,19 +150,9 @@ def _bilateral_weights(colour, row, column, spacing, weights):
 
 @kernel
 def _matching_cost(grey, rays, rotation, translation, picture, size, row, column, plane, spacing, weights, total):
-    """Return 1 - the correlation of a window with the corresponding window of another view, at most 1.
-
-    The plane maps each sample of the window to the other view. The cost is 1 if samples with less than half of the
-    total weight lie in the frame of the other view.
-
-    Args:
-        grey: [H, W], the photograph in grey.
-        rotation, translation: The matrix and the vector of `_homography` for the other view.
-        picture, size: The other view in grey, padded by `_stack_padded`, and its size before padding.
-        row, column, spacing: See `_bilateral_weights`.
-        plane: [3].
-        weights, total: The weights of the samples, and their sum.
-    """
+    """Return 1 - the correlation of a window with the window that `plane` maps to in another view, at most 1."""
+    # `rotation` and `translation` are those of `_homography`, `picture` is the other view in grey, padded by
+    # `_stack_padded`, and `size` its size before padding. `weights` and `total` are those of `_bilateral_weights`.
     height, width = size
     n, covered = 0, 0.0
     mean_here, mean_there, square_here, square_there, product = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -208,6 +183,7 @@ def _matching_cost(grey, rays, rotation, translation, picture, size, row, column
             square_here += w * own * own
             square_there += w * other * other
             product += w * own * other
+    # Less than half of the window's weight lies in the frame of the other view.
     if covered < 0.5 * total:
         return 1.0
     mean_here /= covered
@@ -221,11 +197,7 @@ def _matching_cost(grey, rays, rotation, translation, picture, size, row, column
 def _plane_cost(
     grey, rays, initial_disparity, rotations, translations, pictures, sizes, row, column, plane, spacing, weights, total
 ):
-    """Return the cost of a plane at a pixel: the matching cost, and a penalty for leaving the initial depth.
-
-    The matching cost is the lowest of the matching costs in the other views. With three or more other views it is the
-    mean of the two lowest. A plane behind the camera costs infinity.
-    """
+    """Return the cost of a plane at a pixel: the matching cost, and a penalty for leaving the initial depth."""
     x, y = rays[row, column, 0], rays[row, column, 1]
     disparity = plane[0] * x + plane[1] * y + plane[2]
     if not disparity > 0:
@@ -250,6 +222,8 @@ def _plane_cost(
             best, second = cost, best
         elif cost < second:
             second = cost
+    # The matching cost is the lowest of those in the other views. With three or more other views it is the mean of the
+    # two lowest.
     data_cost = best if len(rotations) < 3 else 0.5 * (best + second)
     return data_cost + PRIOR_COST * min(1.0, abs(disparity / initial_disparity[row, column] - 1) / PRIOR_TOLERANCE)
 
@@ -273,37 +247,28 @@ def _spread(
     change_size,
     spacing,
 ):
-    """Update the planes of half of the pixels, in a chessboard pattern, to planes of lower cost.
-
-    The candidates are the pixel's own plane, the planes of eight neighbours and two random changes of the own plane.
-    The squares of the chessboard have sides of `spacing` pixels. So the neighbours are in squares of the other colour,
-    and their planes do not change during the update. The result does not depend on the order in which threads take
-    rows.
-
-    Args:
-        tickets: Counter from which each thread takes the next row.
-        planes: [H, W, 3], updated in place.
-        cost: [H, W], the costs of `planes`, updated in place.
-        noise: [H, W, 3] standard normal, of the random changes.
-        parity: 0 or 1, the colour of the squares whose pixels are updated.
-        first: True in the first iteration, in which the costs of the initial planes are computed.
-        change_size: Factor on the random changes in this iteration.
-        spacing: See `_bilateral_weights`; also the factor on the distances of the neighbours.
-    """
+    """Update the planes of half of the pixels, in a chessboard pattern, to planes of lower cost, in place."""
     height, width = grey.shape
     weights, plane = np.empty(_SAMPLES), np.empty(3)
     views = grey, rays, initial_disparity, rotations, translations, pictures, sizes
+    # `noise` [H, W, 3] is standard normal and gives the random changes; `change_size` is a factor on them. `spacing` is
+    # that of `_bilateral_weights`, and also the factor on the distances of the neighbours.
     while True:
         row = take_ticket(tickets)
         if row >= height:
             return
         for column in range(width):
+            # The squares of the chessboard have sides of `spacing` pixels. So the neighbours are in squares of the
+            # other colour, and their planes do not change during the update. The result does not depend on the order in
+            # which threads take rows.
             if (row // spacing + column // spacing + parity) % 2:
                 continue
             total = _bilateral_weights(colour, row, column, spacing, weights)
+            # The first iteration computes the costs of the initial planes.
             if first:
                 plane[:] = planes[row, column]
                 cost[row, column] = _plane_cost(*views, row, column, plane, spacing, weights, total)
+            # The candidates are the planes of eight neighbours and two random changes of the own plane.
             for candidate in range(_CANDIDATES):
                 if candidate < len(_NEIGHBORS):
                     y, x = row + spacing * _NEIGHBORS[candidate, 0], column + spacing * _NEIGHBORS[candidate, 1]
@@ -320,14 +285,12 @@ def _spread(
 
 @kernel
 def _perturb(plane, ray, noise, change_size, candidate, result):
-    """Write a randomly changed copy of a plane to `result`.
-
-    The plane's disparity at the pixel's ray is changed, and the plane is tilted about its point on this ray. The last
-    candidate (`candidate` = `_CANDIDATES` - 1) gets a smaller change.
-    """
+    """Write a randomly changed copy of a plane to `result`; `noise` [3] is standard normal."""
     disparity = plane[0] * ray[0] + plane[1] * ray[1] + plane[2]
+    # The last candidate gets a smaller change.
     scale = disparity * change_size * (1.0 if candidate == _CANDIDATES - 2 else SMALL_CHANGE)
     across, down = SLOPE_CHANGE * scale * noise[0], SLOPE_CHANGE * scale * noise[1]
+    # The plane's disparity at the pixel's ray is changed, and the plane is tilted about its point on this ray.
     result[0] = plane[0] + across
     result[1] = plane[1] + down
     result[2] = plane[2] + DISPARITY_CHANGE * scale * noise[2] - across * ray[0] - down * ray[1]

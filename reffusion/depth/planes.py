@@ -119,14 +119,9 @@ def _at_pixel_centers(plane: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _find_planes(points, values, tolerances, generator) -> list[np.ndarray]:
-    """Return the coefficients [3] of each plane found, at least of one.
-
-    Args:
-        points: [S, 3], for each sample its image point divided by the image's width, and 1.
-        values: [S] disparities. A plane explains a sample if points @ plane is within `tolerances` of the disparity.
-        tolerances: [S].
-        generator: Draws triples of samples.
-    """
+    """Return the coefficients [3] of each plane found, at least one, in the disparities `values` [S]."""
+    # A row of `points` is a sample's image point divided by the image's width, and 1. A plane explains a sample if
+    # points @ plane is within `tolerances` of the disparity.
     unexplained, planes = np.ones(len(values), bool), []
     while unexplained.sum() >= max(MIN_SAMPLES, MIN_SHARE * len(values)) and len(planes) < MAX_PLANES:
         candidate = _best_supported_plane(points, values, tolerances, np.flatnonzero(unexplained), generator)
@@ -138,10 +133,7 @@ def _find_planes(points, values, tolerances, generator) -> list[np.ndarray]:
 
 
 def _best_supported_plane(points, values, tolerances, index, generator) -> np.ndarray | None:
-    """Return the plane [3] through three of the samples `index` with the most inliers among them.
-
-    Return None if none of the random triples forms a triangle.
-    """
+    """Return the plane [3] through three samples of `index` with the most inliers; None if no triple is a triangle."""
     triples = index[torch.randint(len(index), (TRIALS, 3), generator=generator).numpy()]
     is_triangle = np.abs(np.linalg.det(points[triples])) > 1e-4  # sides of about 1% of the width
     if not is_triangle.any():
@@ -153,11 +145,9 @@ def _best_supported_plane(points, values, tolerances, index, generator) -> np.nd
 
 
 def _refit_plane(plane, points, values, tolerances, unexplained) -> np.ndarray:
-    """Return the plane [3], refitted by least squares to its inliers among the unexplained samples.
-
-    Fitting and the choice of inliers alternate up to ten times.
-    """
+    """Return the plane [3], refitted by least squares to its inliers among the unexplained samples."""
     inliers = unexplained & (np.abs(points @ plane - values) < tolerances)
+    # Fitting and the choice of inliers alternate.
     for _ in range(10):
         if inliers.sum() < 3:
             break

@@ -195,20 +195,7 @@ class _Contribution(NamedTuple):
 
 
 def _add_gradient(term: Term, step: int, gaussians: Gaussians, masked: Tensor) -> _Contribution | None:
-    """Add the gradient of a weighted term to the `.grad` of the Gaussians.
-
-    If the view does not determine the loss (Degenerate), no gradient is added, and the contribution only counts the
-    view as skipped.
-
-    Args:
-        term: The term.
-        step: Number of the step, from 0.
-        gaussians: Leaf tensors that accumulate the gradient.
-        masked: bool [N], True for masked Gaussians.
-
-    Returns:
-        None if the term is not computed in this step.
-    """
+    """Add the gradient of a weighted term to the Gaussians' `.grad`; return None if it is not computed in this step."""
     if step % term.every or (term.fills_hole and not masked.any()):
         return None
     view = term.select_view(step // term.every)
@@ -219,6 +206,7 @@ def _add_gradient(term: Term, step: int, gaussians: Gaussians, masked: Tensor) -
         try:
             value = term.loss(gaussians, reached, view, step)
         except Degenerate as error:
+            # The view does not determine the loss: no gradient is added, and the view counts as skipped.
             reason = error.reason.replace(" ", "_")
             return _Contribution(torch.zeros_like(masked), {}, skipped=f"{label}_skipped_{reason}")
         _backward(term.weight * value.loss, gaussians)
@@ -342,13 +330,7 @@ class _Run:
 
 
 def _write_line(log: trace.Trace, run: _Run, line: dict[str, float]) -> None:
-    """Write one line of the trace. The time that this takes is not counted.
-
-    Args:
-        log: The trace.
-        run: The state of the distillation.
-        line: The values that the terms logged in the last step.
-    """
+    """Write one line of the trace, with the values `line` of the last step; the time that this takes is not counted."""
     optimizer, objective = run.optimizer, run.objective
     end = {"reason": "finished"} if run.step == objective.settings.iterations else {}
     counts = {"gaussians": len(optimizer.masked), "masked_gaussians": int(optimizer.masked.sum())}
@@ -370,11 +352,9 @@ def _reference_psnr(gaussians: Gaussians, references: Sequence[ReferenceHole]) -
 
 
 def _save_snapshot(optimizer: GaussianOptimizer, folder: Path, done: int, steps: int) -> None:
-    """Save the masked Gaussians as folder/snapshots/<steps done>.ply, if a part of the run ends with this step.
-
-    The run has `SNAPSHOTS` parts. No snapshot is saved at the end of the last part, where the result is saved.
-    """
+    """Save the masked Gaussians as folder/snapshots/<done>.ply, if one of `SNAPSHOTS` parts of the run ends here."""
     part, masked = SNAPSHOTS * done // steps, optimizer.masked
+    # No snapshot is saved at the end of the last part, where the result is saved.
     if SNAPSHOTS * (done - 1) // steps < part < SNAPSHOTS and masked.any():
         path = folder / "snapshots" / f"{done}.ply"
         save_ply(path, optimizer.gaussians.map(lambda parameter: parameter.detach()[masked].cpu()))

@@ -149,11 +149,9 @@ def view_exposures(fit: Path, cameras: Sequence[Camera]) -> dict[str, np.ndarray
 
 
 def _pose_distances(views: Sequence[Camera], fitted_cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the distances [V, K] between the poses of V views and of K fitted cameras.
-
-    A distance is the length of a vector of six numbers: the difference of the two camera centres (normalised frame) and
-    the difference of the two unit viewing directions, with equal weight.
-    """
+    """Return the distances [V, K] between the poses of V views and of K fitted cameras."""
+    # The distance is the length of a vector of six numbers: the difference of the two camera centres (normalised frame)
+    # and the difference of the two unit viewing directions, with equal weight.
     features = lambda cameras: np.array([[*camera.center, *camera.world_to_camera[2, :3]] for camera in cameras])
     return np.linalg.norm(features(views)[:, None] - features(fitted_cameras)[None], axis=-1)
 
@@ -210,20 +208,14 @@ def match_exposure(matrix: np.ndarray, color: np.ndarray, photo: np.ndarray, pix
 
 
 def _fit_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Fit the line y = gain * x + offset robustly, by reweighted least squares.
-
-    Args:
-        x, y: [K] values in [0, 1].
-
-    Returns:
-        The gain, bounded by `GAIN_BOUNDS`, and the offset. If x varies too little to separate gain and offset, the gain
-        is mean(y) / mean(x), without bounds, and the offset is 0.
-    """
+    """Fit y = gain * x + offset, [K] values in [0, 1], by reweighted least squares; return the gain and the offset."""
     weight, gain, offset = np.ones_like(x), 1.0, 0.0
     for _ in range(REWEIGHTINGS):
         mean_x, mean_y = np.average(x, weights=weight), np.average(y, weights=weight)
         spread = np.average((x - mean_x) ** 2, weights=weight)
         gain = np.average((x - mean_x) * (y - mean_y), weights=weight) / max(spread, 1e-9)
+        # The gain is bounded by `GAIN_BOUNDS`. If x varies too little to separate gain and offset, the gain is
+        # mean(y) / mean(x), without bounds, and the offset is 0.
         gain = float(np.clip(gain, *GAIN_BOUNDS)) if spread > MIN_SPREAD**2 else mean_y / max(mean_x, 1e-3)
         offset = mean_y - gain * mean_x
         weight = 1 / np.maximum(np.abs(y - gain * x - offset) / ERROR_SCALE, 1.0)

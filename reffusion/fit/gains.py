@@ -57,15 +57,9 @@ def _blur(photo: np.ndarray) -> np.ndarray:
 
 
 def _view_offsets(values: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """Split log colours into an offset per view and a colour per point, and return the offsets [V], of mean 0.
-
-    The model is value = offset of the view + colour of the point.
-
-    Args:
-        values: [V, P] log colours, one for each view and point.
-        usable: bool [V, P], True where a value is known; all other values are ignored.
-    """
+    """Split log colours [V, P] into an offset per view and a colour per point; return the offsets [V], of mean 0."""
     offsets, weight = np.zeros(len(values)), usable.astype(np.float64)
+    # Values that are not `usable` [V, P] are ignored.
     for _ in range(REWEIGHTINGS):
         total = np.maximum(weight.sum(0), 1e-12)
         centered = values - (weight * values).sum(0) / total

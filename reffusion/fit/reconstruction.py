@@ -207,10 +207,7 @@ def _write_line(
     settings: Params,
     impl: Implementation,
 ) -> None:
-    """Write a line of the trace and reset the sums of `run`. The time of this call does not count in "seconds".
-
-    The line after the last step also has the entry "reason": "finished".
-    """
+    """Write a line of the trace and reset the sums of `run`; the time of this call does not count in "seconds"."""
     with log.paused():
         end = {"reason": "finished"} if run.iteration == settings.iterations else {}
         log.log(run.iteration, **_trace_values(run, held_out, images, settings, impl), **end)
@@ -220,12 +217,7 @@ def _write_line(
 def _trace_values(
     run: _Run, held_out: Sequence[Camera], images: Mapping[str, np.ndarray], settings: Params, impl: Implementation
 ) -> dict[str, Any]:
-    """Return the values of a line of the trace.
-
-    Returns:
-        "gaussians", their number; "loss" and "psnr" in dB of the steps since the last line, if there were any; and
-        "psnr_held_out" in dB, the mean over the held-out views, if there are such views.
-    """
+    """Return a trace line's values: number of Gaussians, loss and PSNR (dB) since the last line, held-out PSNR."""
     line: dict[str, Any] = {"gaussians": len(run.optimizer.gaussians)}
     if run.steps:
         line = {"loss": run.loss / run.steps, "psnr": trace.decibels(run.error / run.steps)} | line
@@ -241,12 +233,7 @@ def _trace_values(
 
 
 def _check_gaussians(gaussians: Gaussians, step: int, camera: Camera, check_values: bool) -> None:
-    """Raise ValueError if no Gaussian is left, or FloatingPointError if a parameter is NaN or infinite.
-
-    Args:
-        step, camera: the step that was just done and its view, which the messages name.
-        check_values: True to check the parameters, too.
-    """
+    """Raise ValueError if no Gaussian is left, FloatingPointError if a parameter is checked and not finite."""
     if not len(gaussians):
         remedy = "raise densify.prune_scale3d"
         raise ValueError(f"fit, step {step}: pruning left no Gaussian: {remedy}")

@@ -204,13 +204,11 @@ def _size_unit(means: Tensor, cameras: Sequence[Camera], schedule: Densify) -> T
 
 
 def _max_gaussians(started_with: int, settings: Params, done: int) -> int:
-    """Return the maximum number of Gaussians after the densification at `done` steps.
-
-    With `densify.cap_growth: linear` it grows linearly from `started_with` to `densify.cap_max` while the schedule
-    densifies, so that late densifications can still add Gaussians.
-    """
+    """Return the maximum number of Gaussians after the densification at `done` steps."""
     if settings.densify.cap_growth == "immediate":
         return settings.densify.cap_max
+    # With `densify.cap_growth: linear` the maximum grows linearly while the schedule densifies, so that late
+    # densifications can still add Gaussians.
     first, last = settings.densify.start * settings.iterations, settings.densify.stop * settings.iterations
     progress = (done + settings.densify.every - first) / (last - first)
     return round(started_with + (settings.densify.cap_max - started_with) * min(1.0, progress))

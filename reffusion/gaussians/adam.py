@@ -101,14 +101,9 @@ def adam_cpu(updates: list[Update], steps, visible, masked, unbias1, unbias2, be
 
 @_jit
 def _adam_kernel(tickets, parameters, firsts, seconds, gradients, rates, factors, rows, numbers):
-    """Update all parameters; a ticket is a chunk of `_CHUNK` Gaussians of one parameter.
-
-    Args:
-        parameters, firsts, seconds, gradients, rates: tuples with one array per parameter, as in `Update`.
-        factors: [len(parameters)] masked factors.
-        rows: steps, visible, masked, unbias1 and unbias2 of `adam`.
-        numbers: beta1, beta2 and epsilon.
-    """
+    """Update all parameters (tuples as in `Update`); a ticket is a chunk of `_CHUNK` Gaussians of one parameter."""
+    # `factors` are the masked factors. `rows` has steps, visible, masked, unbias1 and unbias2 of `adam`; `numbers` has
+    # beta1, beta2 and epsilon.
     count = len(rows[0])
     chunks = (count + _CHUNK - 1) // _CHUNK
     while True:

@@ -112,13 +112,11 @@ def _products_along_rows(
 
 @triton.jit
 def _filtered(field, taps, at, step, low, high, BLOCK: tl.constexpr, RADIUS: tl.constexpr):
-    """Return the window sums around the elements `at` of a field.
-
-    Neighbouring pixels of the window are `step` elements apart. Elements before `low` or from `high` on count as 0.
-    """
+    """Return the window sums around the elements `at` of a field; neighbouring pixels are `step` elements apart."""
     total = tl.zeros((BLOCK,), tl.float32)
     for k in tl.static_range(2 * RADIUS + 1):
         to = at + (k - RADIUS) * step
+        # Elements before `low` or from `high` on count as 0.
         total += tl.load(taps + k) * tl.load(field + to, mask=(to >= low) & (to < high), other=0.0)
     return total
 
@@ -128,12 +126,7 @@ def _compared_down_columns(
     weights, taps, fields, slopes, sums, count, row, channels, c1, c2,
     BLOCK: tl.constexpr, RADIUS: tl.constexpr, WEIGHTED: tl.constexpr,
 ):  # fmt: skip
-    """Filter the fields down the columns, and compute SSIM and its derivatives at each pixel.
-
-    Args:
-        sums: [programs], output, the sum of weights * (1 - SSIM) over the pixels of each program.
-        slopes: [3, H, W * C], output, derivatives of this sum with respect to the windowed x, x^2 + y^2 and x y.
-    """
+    """Filter the fields down the columns, and compute SSIM and its derivatives at each pixel."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mean_x = _filtered(fields, taps, at, row, 0, count, BLOCK, RADIUS)
     mean_y = _filtered(fields + count, taps, at, row, 0, count, BLOCK, RADIUS)
@@ -153,7 +146,9 @@ def _compared_down_columns(
     pixel = tl.where(at < count, 1.0, 0.0)
     if WEIGHTED:
         pixel = tl.load(weights + at // channels, mask=at < count, other=0.0)
+    # `sums` [programs] has the sum of weights * (1 - SSIM) over the pixels of each program.
     tl.store(sums + tl.program_id(0), tl.sum(pixel * (1.0 - similarity), 0))
+    # `slopes` [3, H, W * C] has the derivatives of this sum with respect to the windowed x, x^2 + y^2 and x y.
     part = -pixel * inverse
     by_mean = 2.0 * over * (mean_y * (structure - light) + mean_x * similarity * (brightness - contrast))
     tl.store(slopes + at, part * by_mean, mask=at < count)
@@ -177,12 +172,10 @@ def _gathered_down_columns(
     x, y, weights, taps, filtered, gradient, count, row, channels,
     BLOCK: tl.constexpr, RADIUS: tl.constexpr, WEIGHTED: tl.constexpr,
 ):  # fmt: skip
-    """Write gradient [H, W * C], the derivative of the sum of weights * (1 - SSIM) with respect to x.
-
-    The filtered slopes are filtered down the columns, too: the window is symmetric, so this is the backward pass of the
-    windowing.
-    """
+    """Write gradient [H, W * C], the derivative of the sum of weights * (1 - SSIM) with respect to x."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    # The filtered slopes are filtered down the columns, too: the window is symmetric, so this is the backward pass of
+    # the windowing.
     by_mean = _filtered(filtered, taps, at, row, 0, count, BLOCK, RADIUS)
     by_squares = _filtered(filtered + count, taps, at, row, 0, count, BLOCK, RADIUS)
     by_product = _filtered(filtered + 2 * count, taps, at, row, 0, count, BLOCK, RADIUS)

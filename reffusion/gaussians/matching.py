@@ -177,11 +177,8 @@ class _NearIndex:
 
 
 def _find_candidates(index: _NearIndex, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the C nearest Gaussians of each point [M, 3], nearest first; C is `CANDIDATES`, or all if there are fewer.
-
-    Returns:
-        The distances float32 [M, C], infinite beyond the Gaussian's matching radius, and the indices int32 [M, C].
-    """
+    """Return distances float32 and indices int32, [M, C] each, of the C nearest Gaussians of points [M, 3]."""
+    # C is `CANDIDATES`, or all Gaussians if there are fewer; the nearest come first.
     count = min(CANDIDATES, index.tree.n)
     distances, candidates = np.empty((len(points), count), np.float32), np.empty((len(points), count), np.int32)
     order = cKDTree(points).indices
@@ -190,22 +187,16 @@ def _find_candidates(index: _NearIndex, points: np.ndarray) -> tuple[np.ndarray,
         near_distances, splats = (
             each.reshape(-1, count) for each in index.tree.query(points[block], count, workers=-1)
         )
+        # Distances beyond the Gaussian's matching radius are infinite.
         distances[block] = np.where(near_distances <= index.radius(splats), near_distances, np.inf)
         candidates[block] = splats
     return distances, candidates
 
 
 def _match_one_to_one(index: _NearIndex, points: np.ndarray, excluded: np.ndarray) -> np.ndarray:
-    """Match points to Gaussians one to one, the nearest pairs first.
-
-    Args:
-        points: [M, 3].
-        excluded: bool [N], True for Gaussians that cannot be matched.
-
-    Returns:
-        bool [N], True for the Gaussians that are matched to a point.
-    """
+    """Match points [M, 3] one to one, the nearest pairs first; return bool [N], the Gaussians that are matched."""
     distances, candidates = _find_candidates(index, points)
+    # Gaussians that are `excluded`, bool [N], cannot be matched.
     distances[excluded[candidates]] = np.inf
     count = distances.shape[1]
     owner = np.full(index.tree.n, -1)

@@ -152,21 +152,15 @@ class _FastDssim(torch.autograd.Function):
 
 
 def _allocate_fields(count: int, image: np.ndarray) -> np.ndarray:
-    """Return `count` uninitialised fields [count, H + 10, W * C], with 5 rows of zeros above and below each.
-
-    Args:
-        image: [H, W * C], gives the size.
-    """
+    """Return `count` uninitialised fields [count, H + 10, W * C], with 5 rows of zeros above and below each."""
     fields = empty_aligned(count, image.shape[0] + 2 * RADIUS, image.shape[1])
     fields[:, :RADIUS], fields[:, -RADIUS:] = 0, 0
     return fields
 
 
 def _weight_rows(weights: np.ndarray, channels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights [H, W] and their window sums, each repeated for every channel: two arrays [H, W * C].
-
-    Window sums at pixels of weight 0 are set to 1, so that nothing is divided by 0.
-    """
+    """Return the weights [H, W] and their window sums, each repeated for every channel: two arrays [H, W * C]."""
+    # Window sums at pixels of weight 0 are set to 1, so that nothing is divided by 0.
     norm = np.where(weights > 0, _filtered(weights, 1), np.float32(1))
     return np.repeat(weights, channels, 1), np.repeat(norm, channels, 1)
 
@@ -186,12 +180,7 @@ _jit = partial(kernel, fastmath=FREE_ROUNDING)
 
 @_jit
 def _along_row(padded, out, n, step):
-    """Write out[j], the window sum around padded[5 * step + j] along a row, for j < n.
-
-    Args:
-        padded: a row of n numbers with 5 * step zeros before and after it.
-        step: distance of two neighbouring pixels in the row, the number of channels.
-    """
+    """Write out[j], the window sum around padded[5 * step + j] along a row with `step` channels, for j < n."""
     a0, a1, a2, a3 = padded[:n], padded[step:], padded[2 * step :], padded[3 * step :]
     a4, a5, a6, a7 = padded[4 * step :], padded[5 * step :], padded[6 * step :], padded[7 * step :]
     a8, a9, a10 = padded[8 * step :], padded[9 * step :], padded[10 * step :]
@@ -208,10 +197,8 @@ def _along_row(padded, out, n, step):
 
 @_jit
 def _down_column(rows, i, out, n):
-    """Write out[j], the window sum around rows[i + 5, j] down the column, for j < n.
-
-    `rows` [H + 10, n] has 5 rows of zeros above and below; i is the row of the image.
-    """
+    """Write out[j], the window sum around rows[i + 5, j] down the column, for j < n; i is the row of the image."""
+    # `rows` [H + 10, n] has 5 rows of zeros above and below.
     r0, r1, r2, r3 = rows[i], rows[i + 1], rows[i + 2], rows[i + 3]
     r4, r5, r6, r7 = rows[i + 4], rows[i + 5], rows[i + 6], rows[i + 7]
     r8, r9, r10 = rows[i + 8], rows[i + 9], rows[i + 10]
@@ -243,10 +230,7 @@ def _filtered(field, channels):
 
 @_jit
 def _filter_products(tickets, x, y, weights, channels, fields):
-    """Write fields [4, H + 10, W * C]: weights * (x, y, x^2 + y^2, x y), filtered by the window along each row.
-
-    `x`, `y` and `weights` are [H, W * C].
-    """
+    """Write fields [4, H + 10, W * C]: weights * (x, y, x^2 + y^2, x y), filtered by the window along each row."""
     height, n = x.shape
     lead = RADIUS * channels
     padded = np.zeros((4, n + 2 * lead), np.float32)
@@ -268,15 +252,8 @@ def _filter_products(tickets, x, y, weights, channels, fields):
 
 @_jit
 def _compare(tickets, fields, weights, norm, channels, sums, partials):
-    """Filter the fields down the columns, and compute SSIM and its derivatives at each pixel.
-
-    Args:
-        fields: [4, H + 10, W * C], from `_filter_products`.
-        weights, norm: [H, W * C], from `_weight_rows`.
-        sums: [H] float64, output, the sum of weights * (1 - SSIM) of each row.
-        partials: [3, H + 10, W * C], output, derivatives of this sum with respect to the windowed x, x^2 + y^2 and x y,
-            filtered along each row, which is the first half of the backward pass.
-    """
+    """Filter the fields down the columns, and compute SSIM and its derivatives at each pixel."""
+    # `fields` [4, H + 10, W * C] is from `_filter_products`; `weights` and `norm` [H, W * C] are from `_weight_rows`.
     height, n = weights.shape
     lead = RADIUS * channels
     column, padded = np.empty((4, n), np.float32), np.zeros((3, n + 2 * lead), np.float32)
@@ -304,20 +281,19 @@ def _compare(tickets, fields, weights, norm, channels, sums, partials):
             similarity = light * structure * over
             total += wi[j] * (one - similarity)
             part = -wi[j] * inverse
+            # Derivatives of the sum of weights * (1 - SSIM) with respect to the windowed x, x^2 + y^2 and x y.
             d0[j] = part * two * over * (my * (structure - light) + mx * similarity * (brightness - contrast))
             d1[j] = part * -similarity * brightness * over
             d2[j] = part * two * light * over
         sums[i] = total
+        # The derivatives are filtered along each row: the first half of the backward pass.
         for f in range(3):
             _along_row(padded[f], partials[f, i + RADIUS], n, channels)
 
 
 @_jit
 def _gather_gradient(tickets, partials, x, y, weights, gradient):
-    """Write gradient [H, W * C], the derivative of the sum of weights * (1 - SSIM) with respect to x.
-
-    `partials` is from `_compare`, and is filtered down the columns here.
-    """
+    """Write gradient [H, W * C], the derivative of the sum of weights * (1 - SSIM) with respect to x."""
     height, n = x.shape
     column, two = np.empty((3, n), np.float32), np.float32(2)
     c0, c1, c2 = column[0], column[1], column[2]
@@ -326,6 +302,7 @@ def _gather_gradient(tickets, partials, x, y, weights, gradient):
         if i >= height:
             return
         for f in range(3):
+            # `partials`, which `_compare` filtered along each row, is filtered down the columns here.
             _down_column(partials[f], i, column[f], n)
         xi, yi, wi, out = x[i], y[i], weights[i], gradient[i]
         for j in range(n):

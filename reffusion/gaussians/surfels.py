@@ -73,15 +73,10 @@ def surface_gaussians(
 
 
 def _axes(normals: np.ndarray, view_directions: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the axes of N disks as the columns of rotation matrices [N, 3, 3] in world coordinates.
-
-    The first axis lies within the surface and across the slope, where the disk has its smaller standard deviation. The
-    second lies within the surface and along the slope, where the disk is stretched. The third is the normal.
-
-    Args:
-        normals: [N, 3] unit normals.
-        view_directions: [N, 3] unit vectors from the camera to the disks.
-    """
+    """Return the axes of N disks as the columns of rotation matrices [N, 3, 3] in world coordinates."""
+    # The first axis lies within the surface and across the slope, where the disk has its smaller standard deviation.
+    # The second lies within the surface and along the slope, where the disk is stretched. The third is the normal.
+    # `view_directions` are unit vectors from the camera to the disks.
     first_axis = np.cross(normals, view_directions)
     length = np.linalg.norm(first_axis, axis=-1, keepdims=True)
     # A disk that faces the camera has no slope, so any axis within the surface serves.

@@ -98,17 +98,11 @@ def find_uncovered(
 
 
 def _contradicts(image_depth: np.ndarray, rendering: Rendering, unobserved: np.ndarray) -> np.ndarray:
-    """Return bool [H, W], the pixels at which a rendering contradicts a plausible mirror image.
-
-    It does so where the rendered surface lies behind the image. It also does so where the rendered surface lies in
-    front of the image, no reference added this surface, and the pixel is unobserved.
-
-    Args:
-        image_depth: [H, W], camera z of the mirror image; inf where there is none.
-        rendering: of the draft, with one feature, which is 1 for the new Gaussians and 0 for all others.
-        unobserved: bool [H, W], pixels of C whose background no photograph shows.
-    """
+    """Return bool [H, W], the pixels at which a rendering contradicts a plausible mirror image."""
     depth, is_new = (each.cpu().numpy() for each in (rendering.depth, rendering.features[..., 0] > 0.5))
+    # The rendering contradicts the image (`image_depth` is its camera z, inf where there is none) where the rendered
+    # surface lies behind the image. It also does so where the rendered surface lies in front of the image, no reference
+    # added this surface, and the pixel is unobserved: no photograph shows its background.
     in_front = (depth < (1 - EDGE) * image_depth) & ~is_new & unobserved
     return np.isfinite(image_depth) & (in_front | (image_depth < (1 - EDGE) * depth))
 

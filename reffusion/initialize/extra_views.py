@@ -82,20 +82,13 @@ def complete_extra_views(
 
 
 def _complete_view(draft: Draft, camera, hole: np.ndarray, sources: Background, painter: Painter | None) -> np.ndarray:
-    """Return a view with its uncovered pixels completed in 2D, uint8 [H, W, 3].
-
-    Args:
-        draft: the scene that is rendered inside C.
-        camera: the view.
-        hole: bool [H, W], the uncovered pixels of C.
-        sources: the photographs and completed views from which patches are taken.
-        painter: a feed-forward inpainter, or None for patches.
-    """
+    """Return a view of the draft, uint8 [H, W, 3], whose uncovered pixels `hole` are completed in 2D."""
     mask = sources.masks[camera.name]
     # Just outside C a photograph may still show the object's rim; the inpainter would continue this rim into the hole.
     photo = sources.photos[camera.name]
     base = inpaint.composite_background(draft.gaussians, camera, photo, morphology.dilate(mask, exemplar.RIM_WIDTH))
     region = exemplar.add_rim(hole, mask)
+    # Without a feed-forward inpainter, patches are taken from the photographs and completed views in `sources`.
     if painter is not None:
         return painter.paint(base, region)
     if coverage.is_narrow(hole):  # a narrow gap shows no texture; continuing the adjacent colours is enough

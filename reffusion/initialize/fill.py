@@ -168,18 +168,12 @@ def fill_reference(
 def _gather_hints(
     remaining: Gaussians, camera: Camera, background: Background, swept: np.ndarray | None, use_free_space: bool
 ) -> Hints:
-    """Return what planes, mirror images and other views tell about the depth in the hole of a view.
-
-    Args:
-        remaining: the scene without the removed and without new Gaussians.
-        camera: the view.
-        background: the photographs and surfaces around the object.
-        swept: bool [H, W], the pixels whose depth was found by a plane sweep; None without one.
-        use_free_space: True to reject continued surfaces that other views see past.
-    """
+    """Return what planes, mirror images and other views tell about the depth in the hole of a view."""
     uncovered = find_unobserved(
         remaining, camera, background.masks[camera.name], background.views, background.planes, background.mirrors
     )
+    # `remaining` has neither the removed nor new Gaussians. `swept`, bool [H, W] or None, marks depth found by a plane
+    # sweep. With `use_free_space`, continued surfaces that other views see past are rejected.
     return Hints(
         plane_depth=uncovered.continued_depth,
         planes=uncovered.plane_depths,
@@ -191,10 +185,7 @@ def _gather_hints(
 
 
 def _predict_disparity(network: DepthNetwork | None, reference: Reference) -> np.ndarray | None:
-    """Return the depth model's output for the reference: disparity [H, W], up to scale and offset.
-
-    None without a model.
-    """
+    """Return the depth model's disparity [H, W] of the reference, up to scale and offset; None without a model."""
     if network is None:
         return None
     image = torch.from_numpy(reference.image).permute(2, 0, 1) / 255

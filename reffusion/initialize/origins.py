@@ -89,14 +89,7 @@ def find_origins(draft: Draft, camera: Camera, masks: MaskSet, background: Backg
 
 
 def _find_conflicts(rendering: Rendering, camera: Camera, pixels: np.ndarray, background: Background) -> np.ndarray:
-    """Return bool [H, W], the pixels whose surface photographs show in another colour than the rendering does.
-
-    Args:
-        rendering: the view.
-        camera: its camera.
-        pixels: bool [H, W], the pixels to compare.
-        background: the photographs, of which at most `SOURCES` are compared.
-    """
+    """Return bool [H, W], the `pixels` whose surface photographs show in another colour than the rendering does."""
     grid = np.zeros_like(pixels)
     grid[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE] = True
     rows, columns = np.nonzero(pixels & grid)

@@ -103,24 +103,20 @@ def sweep_depth(
 
 
 def _smooth_depth(depth: np.ndarray, known: np.ndarray, side: int) -> np.ndarray:
-    """Return [H, W], the depth map after a median filter with a window of `side` px.
-
-    Before, each pixel that is not `known`, bool [H, W], takes the depth of the nearest known pixel.
-    """
+    """Return the depth map [H, W] after a median filter with a window of `side` px."""
+    # Before, each pixel that is not `known` takes the depth of the nearest known pixel.
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     return ndimage.median_filter(depth[tuple(nearest)].astype(np.float64), side)
 
 
 def _select_neighbors(camera: Camera, point: np.ndarray, views: Sequence[DepthView]) -> list[DepthView]:
-    """Return up to `NEIGHBORS` views that see a point from a different, but not too different, direction.
-
-    The angle at the point between the camera and such a view lies between `MIN_ANGLE` and `MAX_ANGLE`. The views are
-    spread over this range, by increasing angle.
-    """
+    """Return up to `NEIGHBORS` views that see a point from a different, but not too different, direction."""
     direction = lambda center: (center - point) / max(np.linalg.norm(center - point), 1e-12)
     angles = [
         np.degrees(np.arccos(np.clip(direction(v.camera.center) @ direction(camera.center), -1, 1))) for v in views
     ]
+    # The angle, in degrees, is the one at the point between the camera and the view. The views are spread over the
+    # range by increasing angle.
     chosen = sorted(
         (angle, k)
         for k, angle in enumerate(angles)
@@ -138,20 +134,10 @@ def _correlation(
     photos: Mapping[str, np.ndarray],
     side: int,
 ) -> np.ndarray:
-    """Return [H, W], how well the neighbours' photographs agree with the view's if the surface is at given points.
-
-    The value is the normalised correlation of windows, averaged over the better half of the neighbours. A neighbour
-    whose window cannot be compared counts as -1.
-
-    Args:
-        gray: [H, W], the view's photograph in grey levels.
-        points: [H, W, 3], the surface point assumed for each pixel.
-        known: bool [H, W], the pixels that take part in the windows.
-        neighbors: the other views.
-        photos: view name -> uint8 [H, W, 3].
-        side: px, side of the window.
-    """
+    """Return [H, W], how well the neighbours' photographs agree with the view's if the surface is at given points."""
     mean = lambda values: cv2.boxFilter(values, -1, (side, side), borderType=cv2.BORDER_CONSTANT)
+    # The value is the normalised correlation of windows of `side` px over the `known` pixels, averaged over the better
+    # half of the neighbours. A neighbour whose window cannot be compared counts as -1.
     scores = []
     for view in neighbors:
         uv, z = geometry.project(points.reshape(-1, 3), view.camera)

@@ -218,12 +218,10 @@ def match_colors(
 
 
 def _color_bounds(gaussians: Gaussians, image: np.ndarray, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the lowest and the highest constant harmonic that each Gaussian may have, [N, 3] each.
-
-    The bounds are the colours of the picture, uint8 [H, W, 3], within `COLOR_WINDOW_PX` of the Gaussian's centre, with
-    a margin of `COLOR_MARGIN`.
-    """
+    """Return the lowest and the highest constant harmonic that each Gaussian may have, [N, 3] each."""
     uv, _ = geometry.project(gaussians.means.double().cpu().numpy(), camera)
+    # The bounds are the colours of the picture within `COLOR_WINDOW_PX` of the Gaussian's centre, with a margin of
+    # `COLOR_MARGIN`.
     bounds = []
     for extreme, margin in ((cv2.erode, -COLOR_MARGIN), (cv2.dilate, COLOR_MARGIN)):
         color, _ = geometry.sample_nearest(extreme(image, square(COLOR_WINDOW_PX)), uv)

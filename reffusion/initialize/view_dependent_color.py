@@ -99,13 +99,7 @@ def measure_change(
 
 
 def _blur(image: np.ndarray, known: np.ndarray, blur: float) -> np.ndarray:
-    """Return [H, W, 3] float32 in [0, 1], the image blurred over the `known` pixels only.
-
-    Args:
-        image: uint8 [H, W, 3].
-        known: bool [H, W].
-        blur: standard deviation, as a fraction of the image's width.
-    """
+    """Return the uint8 image in [0, 1], blurred over `known` pixels; `blur` is sigma as a fraction of the width."""
     sigma, weight = morphology.to_pixels(blur, known.shape[1]), known.astype(np.float32)
     total = cv2.GaussianBlur(weight, (0, 0), sigma)
     blurred = cv2.GaussianBlur(image.astype(np.float32) / 255 * weight[..., None], (0, 0), sigma)
@@ -143,10 +137,7 @@ def transfer_sh(
 
 
 def _fit_harmonics(batch: Gaussians, camera: Camera, change: ColorChange, views: Sequence[DepthView]) -> torch.Tensor:
-    """Return [N, K, 3], the spherical harmonics of N new Gaussians; arguments as of `transfer_sh`.
-
-    The non-constant harmonics c_k minimise the sum of squares in docs/method.md#initialization (view-dependent colour).
-    """
+    """Return [N, K, 3], the spherical harmonics of N new Gaussians; arguments as of `transfer_sh`."""
     degree, means, constant = batch.sh_degree, batch.means.double(), batch.sh[:, 0].double()
     own, _ = geometry.sample_nearest(change.material, geometry.project(means.numpy(), camera)[0])
     mean, known = _neighbor_change(means.numpy(), own, change)
@@ -160,23 +151,16 @@ def _fit_harmonics(batch: Gaussians, camera: Camera, change: ColorChange, views:
         weighted = row * weight[:, number, None]
         normal += weighted[:, :, None] * row[:, None]
         right += weighted[:, :, None] * target[:, number, None]
+    # These non-constant harmonics c_k minimise the sum of squares in docs/method.md#initialization (view-dependent
+    # colour).
     rest = torch.linalg.solve(normal, right)
     constant = constant - (base[..., None] * rest).sum(1) / SH0
     return torch.cat([constant[:, None], rest], 1).to(batch.sh.dtype)
 
 
 def _neighbor_change(means: np.ndarray, own: np.ndarray, change: ColorChange) -> tuple[np.ndarray, np.ndarray]:
-    """Average the changes of colour of the samples around each new Gaussian.
-
-    Args:
-        means: [N, 3], centres of the new Gaussians.
-        own: [N, 3], their colours in `change.material`.
-        change: the samples.
-
-    Returns:
-        The mean change in each view, [N, V, 3], which is shrunk towards 0 where neighbours disagree; and bool [N, V],
-        True where a view shows enough of the neighbours (`MIN_SHARE`).
-    """
+    """Return the mean change of colour around each Gaussian in each view, [N, V, 3], and where it is known, [N, V]."""
+    # `own` are the colours of the Gaussians in `change.material`.
     distance, index = cKDTree(change.points).query(means, k=NEIGHBORS)
     near = np.exp(-0.5 * (distance / np.maximum(distance[:, -1:] / 2, 1e-12)) ** 2)
     alike = np.exp(-0.5 * ((own[:, None] - change.colors[index]) ** 2).sum(-1) / COLOR_SIGMA**2)
@@ -191,26 +175,16 @@ def _neighbor_change(means: np.ndarray, own: np.ndarray, change: ColorChange) ->
     # On a mirror the change differs from point to point, and a mean of it is wrong: disagreement shrinks the mean.
     size = (mean**2).sum(-1)
     agreement = size / np.maximum(square.sum(-1), 1e-12) * np.maximum(1 - 3 * NOISE**2 / np.maximum(size, 1e-12), 0)
+    # The mean change is known where a view shows enough of the neighbours.
     return mean * agreement[..., None], share > MIN_SHARE
 
 
 def _fill_unknown_views(
     change: np.ndarray, known: np.ndarray, middle: np.ndarray, views: Sequence[DepthView]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Guess the change of colour in views where it is unknown from the view with the nearest direction.
-
-    Without the guesses, harmonics that are constrained in a few directions would take extreme values in all others.
-
-    Args:
-        change: [N, V, 3], the change of each Gaussian in each view.
-        known: bool [N, V], True where the change is known.
-        middle: [3], the point from which the directions to the cameras are compared.
-        views: the V views.
-
-    Returns:
-        The completed change, [N, V, 3]; and the weights of the views, [N, V]: 1 where known, `GUESS_WEIGHT` where
-        guessed, and 0 for a Gaussian whose change is known in no view.
-    """
+    """Guess unknown changes of colour from the view with the nearest direction; return changes and weights [N, V]."""
+    # Without the guesses, harmonics that are constrained in a few directions would take extreme values in all others.
+    # Directions to the cameras are compared from `middle` [3].
     directions = np.stack([view.camera.center for view in views]) - middle
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     distance, any_known = 1 - directions @ directions.T, known.any(1)
@@ -219,5 +193,6 @@ def _fill_unknown_views(
         missing = np.flatnonzero(any_known & ~known[:, number])
         nearest = np.where(known[missing], distance[number], np.inf).argmin(1)
         filled[missing, number] = change[missing, nearest]
+    # The weight is 0 for a Gaussian whose change is known in no view.
     weight = np.where(known, 1.0, GUESS_WEIGHT) * any_known[:, None]
     return torch.from_numpy(filled), torch.from_numpy(weight)

@@ -107,11 +107,7 @@ def _choose_views(surface: _Surface, pixels: np.ndarray, cameras: Sequence[Camer
 
 @torch.no_grad()
 def _warp(draft: Draft, image: np.ndarray, surface: _Surface, camera: Camera) -> Reference:
-    """Return another view of the picture uint8 [H, W, 3] of a surface.
-
-    The detail is that of the picture. The tone is that of the rendering, because colours change with the direction
-    (`view_dependent_color`).
-    """
+    """Return another view of the picture uint8 [H, W, 3] of a surface."""
     is_new = draft.is_new[:, None].to(draft.gaussians.means)
     rendering = rasterizer.render(draft.gaussians, camera, features=is_new)
     assert rendering.features is not None
@@ -120,6 +116,8 @@ def _warp(draft: Draft, image: np.ndarray, surface: _Surface, camera: Camera) ->
     mask = _smallest_scale(uv) > MIN_SCALE
     if not mask.any():
         return Reference(camera, np.zeros((*mask.shape, 3), np.uint8), mask)
+    # The detail is that of the picture. The tone is that of the rendering, because colours change with the direction
+    # (`view_dependent_color`).
     difference = 255 * rendering.color.cpu().numpy() - (picture := _sample_area(image, uv, mask))
     blur = lambda values: cv2.GaussianBlur(values, (0, 0), to_pixels(TONE_BLUR, camera.width))
     weight = mask.astype(np.float32)[..., None]
@@ -128,18 +126,8 @@ def _warp(draft: Draft, image: np.ndarray, surface: _Surface, camera: Camera) ->
 
 
 def _intersect(surface: _Surface, camera: Camera, depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Intersect the rays of another view with the surface, by Newton's method.
-
-    Args:
-        surface: the surface.
-        camera: the other view.
-        depth: [h, w], camera z that the other view shows.
-        pixels: bool [h, w], the pixels of the other view to intersect.
-
-    Returns:
-        [h, w, 2] float32, the pixel coordinates of the intersection in the view of the surface; NaN where there is
-        none or the other view shows another surface, and outside `pixels`.
-    """
+    """Return where the rays of another view meet the surface, in px of the surface's view, [h, w, 2]; NaN elsewhere."""
+    # Newton's method starts from `depth`, the camera z that the other view shows.
     rays = geometry.pixel_rays(camera)[pixels] @ camera.world_to_camera[:3, :3]
     start = z = depth[pixels]
     position = lambda z: geometry.project(camera.center + z[:, None] * rays, surface.camera)[0]
@@ -152,6 +140,7 @@ def _intersect(surface: _Surface, camera: Camera, depth: np.ndarray, pixels: np.
         faces = inside & known & (slope < 0)
         z = np.where(faces, ((point - camera.center) * normal).sum(1) / np.where(faces, slope, 1.0), z)
         before, uv = uv, position(z)
+    # Far from `depth` the other view shows another surface.
     shows_surface = faces & (np.abs(z - start) < MATCH * start) & (np.abs(uv - before) < MAX_MOVE).all(1)
     found = np.full((*depth.shape, 2), np.nan, np.float32)
     found[pixels] = np.where(shows_surface[:, None], uv, np.nan)
@@ -159,27 +148,17 @@ def _intersect(surface: _Surface, camera: Camera, depth: np.ndarray, pixels: np.
 
 
 def _smallest_scale(uv: np.ndarray) -> np.ndarray:
-    """Return how many pixels of the source a pixel spans, along the direction in which it spans fewest.
-
-    Args:
-        uv: [h, w, 2], the position of each pixel in the source; NaN where it has none.
-
-    Returns:
-        [h, w]; NaN where a neighbouring pixel has no position.
-    """
+    """Return [h, w], how many source pixels a pixel spans in the direction in which it spans fewest; NaN if unknown."""
+    # `uv` [h, w, 2] is the position of each pixel in the source, NaN where it has none. The result is NaN where a
+    # neighbouring pixel has no position.
     down, right = np.gradient(uv, axis=(0, 1))
     square, area = (down**2 + right**2).sum(-1), np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0])
     return np.sqrt((square - np.sqrt(np.maximum(square**2 - 4 * area**2, 0))) / 2)
 
 
 def _sample_area(image: np.ndarray, uv: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return [h, w, 3] float32, the mean colours of the picture uint8 [H, W, 3] under each pixel of the mask.
-
-    Args:
-        image: the picture.
-        uv: [h, w, 2] float32, the position of each pixel in the picture.
-        mask: bool [h, w], the pixels to sample; outside, the result is meaningless.
-    """
+    """Return [h, w, 3] float32, the mean colours under each pixel of the mask, at the positions `uv` in the picture."""
+    # Outside the mask the result is meaningless.
     nearest = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
     size = (FINE * mask.shape[1], FINE * mask.shape[0])
     fine = cv2.resize(uv[tuple(nearest)] - np.float32(0.5), size, interpolation=cv2.INTER_LINEAR)

@@ -112,15 +112,7 @@ def complete_view(
 def _complete_rest(
     target: SourceImage, hole: np.ndarray, sources: Sequence[SourceImage], smooth: Sequence[int], seed: int
 ) -> Completion:
-    """Fill the hole from large pieces of the view's own photograph, and from patches where no such piece suits.
-
-    Args:
-        target: the view.
-        hole: bool [H, W], the pixels that are still to be filled.
-        sources: images from which texture is taken; the view's own photograph is the first.
-        smooth: indices of the planes whose perspective patches follow.
-        seed: seed of the random searches.
-    """
+    """Fill the hole from large pieces of the view's photograph, `sources[0]`, and from patches where none suits."""
     assembly = fill_from_photo(target, hole, sources[0], smooth, seed)
     rest = hole & ~assembly.filled
     completion = complete(_with_filled(target, assembly.image, assembly.filled), rest, sources, smooth, seed)
@@ -141,17 +133,7 @@ def _with_filled(target: SourceImage, image: np.ndarray, filled: np.ndarray) -> 
 def _find_surfaces(
     image: np.ndarray, hole: np.ndarray, camera: Camera, hidden: np.ndarray, around: Background, mirrored: MirrorImage
 ) -> tuple[SourceImage, list[SourceImage], list[int], dict[int, PlaneSymmetry]]:
-    """Collect the surfaces behind the hole, and the images from which the hole is filled.
-
-    Arguments are those of `complete_view`, and `mirrored`, the mirror images of symmetric things in this view.
-
-    Returns:
-        target: the view, with the surfaces that continue into its hole.
-        sources: the view's own photograph, other photographs, and views completed before.
-        smooth: indices of the smooth planes, whose perspective patches follow.
-        symmetries: plane index -> how the texture of the plane repeats itself, for the planes in the hole whose texture
-            does.
-    """
+    """Return the target, the sources, the indices of smooth planes, and plane index -> symmetry of its texture."""
     own = next(view for view in around.views if view.camera.name == camera.name)
     plane, depth, layer = _surfaces_behind(own, hidden, hole | hidden, around.planes, mirrored)
     counts = np.bincount(layer[hole].clip(0), minlength=layer.max() + 1)
@@ -169,20 +151,13 @@ def _find_surfaces(
     roughness = {k: _roughness(each, around) for k, each in enumerate(around.planes, start=1)}
     even = [k for k, rough in roughness.items() if rough < SMOOTH_IF_REPEATING and (plane == k)[hole].any()]
     symmetries = {k: symmetry for k in even if (symmetry := _symmetry_of(k, sources)) is not None}
+    # perspective patches follow these planes
     smooth = [k for k, rough in roughness.items() if rough < SMOOTH or k in symmetries]
     return target, sources, smooth, symmetries
 
 
 def _symmetry_of(plane: int, sources: Sequence[SourceImage]) -> PlaneSymmetry | None:
-    """Find how the texture of a plane repeats itself, in the source that shows most of the plane.
-
-    Args:
-        plane: index of the plane in the sources.
-        sources: images with the planes that they show.
-
-    Returns:
-        None if the texture does not repeat itself, or too little of the plane is visible.
-    """
+    """Return the symmetry of a plane's texture in the source that shows most of it; None if none is found."""
     masks = [source.usable & ~source.masked & (source.plane == plane) for source in sources]
     best = int(np.argmax([mask.sum() for mask in masks]))
     rows, columns = np.nonzero(masks[best])
@@ -195,27 +170,14 @@ def _symmetry_of(plane: int, sources: Sequence[SourceImage]) -> PlaneSymmetry | 
 def _surfaces_behind(
     own: DepthView, hidden: np.ndarray, pixels: np.ndarray, planes: Sequence[Plane], mirrored: MirrorImage
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Determine the surfaces that a view would show without the object.
-
-    A pixel of C and its rim (`pixels`) shows the nearest plane that other views see there or that continues there, or
-    a mirror image. If there is neither, its depth and layer are interpolated from the surroundings
-    (`_interpolate_depth`).
-
-    Args:
-        own: the depth view, with the object.
-        hidden: bool [H, W], C.
-        pixels: bool [H, W], C and the hole, which includes C's rim.
-        planes: the planes around the object.
-        mirrored: the mirror images of symmetric things in this view.
-
-    Returns:
-        The index of each pixel's plane, int [H, W], 0 for none; the depth, float64 [H, W]; and the foreground layer,
-        int [H, W], as in `_interpolate_depth`.
-    """
+    """Return the plane index (0: none), depth and foreground layer [H, W] that a view would show without the object."""
+    # `hidden` is C; `pixels` is C and the hole, which includes C's rim.
     surface = remove_reflected_depth(own.depth, own.camera, planes)
     known = (surface > 0) & ~hidden
     depth, layer = _interpolate_depth(surface, known, hidden)
     plane, nearest = np.where(hidden, 0, label_planes(surface, own.camera, planes)), np.full(hidden.shape, np.inf)
+    # A pixel shows the nearest plane that other views see there or that continues there, or a mirror image. If there is
+    # neither, its depth and layer are interpolated from the surroundings.
     for k, each in enumerate(planes, start=1):
         at = each.depth(own.camera)
         cells = each.seen | each.enclosed | each.continued | each.reflective
@@ -235,22 +197,7 @@ def _surfaces_behind(
 
 
 def _interpolate_depth(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate depth across the hidden pixels, and separate foreground layers.
-
-    The surroundings of the hidden pixels are split into pieces where depth jumps. Each piece is continued by itself. A
-    nearer piece continues as far as its convex hull in the image reaches, so that it ends at the straight continuation
-    of its visible borders. Beyond, the farther pieces continue.
-
-    Args:
-        depth: [H, W], camera z.
-        known: bool [H, W], the pixels whose depth is known.
-        hidden: bool [H, W], the pixels to interpolate.
-
-    Returns:
-        The depth, [H, W]; and the foreground layer, int [H, W]: 1, 2, ... for surfaces that are nearer than all
-        surfaces they touch beside the hidden pixels, 0 for all other pixels, and -1 beyond the ring in which layers are
-        separated.
-    """
+    """Interpolate depth across the hidden pixels; return it, and the foreground layer, int [H, W], of each pixel."""
     if not known.any():
         return np.ones(depth.shape), np.zeros(depth.shape, np.int64)
     across = inpaint_depth(depth, known)
@@ -258,8 +205,11 @@ def _interpolate_depth(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray)
     ring = known & dilate(hidden, RING)
     disparity = geometry.reciprocal(depth)
     piece, foreground = segment_surfaces(disparity, ring, hole=hidden), segment_foreground(disparity, ring, hidden)
+    # 1, 2, ... for surfaces nearer than all they touch beside the hidden pixels, 0 for other pixels, -1 beyond the ring
     layer = np.where(ring, foreground, np.where(hidden, 0, -1))
     far_first = lambda k: -float(np.median(depth[piece == k]))
+    # Each piece of the surroundings, which are split where depth jumps, is continued by itself. A nearer piece reaches
+    # as far as its convex hull in the image, so that it ends at the straight continuation of its visible borders.
     for position, k in enumerate(sorted(range(1, piece.max() + 1), key=far_first)):
         own = inpaint_depth(depth, piece == k)
         mine = hidden & (own > 0) & (convex_hull(piece == k) if position else True)
@@ -298,19 +248,11 @@ def _source_image(
     layers: _LayerLookup | None = None,
     with_reflections: bool = False,
 ) -> SourceImage:
-    """Convert a view to a source of texture. Its usable pixels are those that show surfaces near the object.
-
-    Args:
-        view: the depth view.
-        image: uint8 [H, W, 3], the picture of the view.
-        around: the planes around the object, and the object's extent.
-        layers: the foreground layers; None for no layers.
-        with_reflections: whether pixels that show a reflection in a plane are usable too. Other views see other
-            reflections there, so only those of the view's own photograph suit.
-    """
+    """Convert a view to a source of texture, whose usable pixels show surfaces near the object."""
     depth = remove_reflected_depth(view.depth, view.camera, around.planes)
     points = geometry.unproject(depth, view.camera)
     near = np.linalg.norm(points - around.center, axis=-1) < SOURCE_REACH * around.radius
+    # Other views see other reflections, so only those of the view's own photograph suit (`with_reflections`).
     usable = near & (depth > 0) & (with_reflections | (depth == view.depth))
     plane = label_planes(depth, view.camera, around.planes)
     pixel_size = np.where(depth > 0, depth, 1.0) / view.camera.fx
@@ -322,24 +264,18 @@ def _source_image(
 
 
 def _choose_others(own: DepthView, views: Sequence[DepthView]) -> list[DepthView]:
-    """Choose up to `OTHER_PHOTOS` other views, evenly spread from near to far.
-
-    So a surface that one of them sees obliquely is seen less obliquely by another one. If there are more other views,
-    the nearest one is left out, because it shows nearly the same as the view itself.
-    """
+    """Choose up to `OTHER_PHOTOS` other views, evenly spread from near to far."""
     distance = lambda view: float(np.linalg.norm(view.camera.center - own.camera.center))
     others = sorted((view for view in views if view is not own), key=distance)
     count = len(others)
+    # So a surface that one view sees obliquely is seen less obliquely by another. The nearest view is left out, because
+    # it shows nearly the same as the view itself.
     chosen = {int(k) for k in np.linspace(1, count - 1, OTHER_PHOTOS)} if count > OTHER_PHOTOS else range(count)
     return [others[k] for k in sorted(chosen)]
 
 
 def _roughness(plane: Plane, around: Background) -> float:
-    """Return the roughness of a plane near the object.
-
-    It is the median distance of the pixels near the plane from the plane, relative to their depth, over several views.
-    It is inf if no view shows enough of the plane.
-    """
+    """Return the median relative distance of the pixels near a plane from it; inf if no view shows enough of it."""
     medians = []
     for view in around.views[:: max(1, len(around.views) // 6)]:
         off = np.abs(view.depth / plane.depth(view.camera) - 1)

@@ -49,11 +49,7 @@ def load(file: Path, dtype: str) -> Network:
 
 
 def _read_side(session: Any, file: Path, dtype: str) -> int | None:
-    """Return the side, in px, of the square images that the model takes; None if it takes any size.
-
-    Raises:
-        ValueError: the model's inputs and outputs are not those that `load` describes.
-    """
+    """Return the side, px, of the model's square images, None for any; raises ValueError if the interface is wrong."""
     inputs = {each.name: (each.type, list(each.shape)) for each in session.get_inputs()}
     outputs = [(each.type, list(each.shape)) for each in session.get_outputs()]
     sides = [side for _, shape in inputs.values() for side in shape[2:]]

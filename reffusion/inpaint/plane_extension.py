@@ -172,16 +172,7 @@ def _map_planes(
     views: Sequence[_View],
     cameras: Sequence[Camera],
 ) -> list[_PlaneMap]:
-    """Map all planes, without targets yet. A cell near an earlier plane counts as unseen, since it belongs to that one.
-
-    Args:
-        planes: normal [3] and offset of each plane.
-        samples: [S, 3], points of the visible surfaces.
-        pixel_size: median size of a pixel of the rendered views on the surfaces.
-        reach: distance by which a map extends beyond the samples on its plane.
-        views: some training views, rendered.
-        cameras: all training views.
-    """
+    """Map all planes, without targets; a map extends by `reach` beyond the samples [S, 3] on its plane."""
 
     def observe(plane: tuple[np.ndarray, float]) -> _PlaneMap:
         near = samples[np.abs(samples @ plane[0] - plane[1]) < INLIER * pixel_size]
@@ -189,6 +180,7 @@ def _map_planes(
 
     maps = []
     for index, plane_map in enumerate(side_by_side(observe, planes)):
+        # a cell near an earlier plane counts as unseen, since it belongs to that plane
         for other, distance in planes[:index]:
             apart = np.abs(plane_map.centers @ other - distance) > CROSSING * INLIER * pixel_size
             plane_map = replace(plane_map, seen=plane_map.seen & apart)
@@ -214,13 +206,7 @@ def _empty_map(normal: np.ndarray, offset: float, points: np.ndarray, pixel_size
 
 
 def _observe(plane_map: _PlaneMap, views: Sequence[_View], cameras: Sequence[Camera]) -> _PlaneMap:
-    """Return the map with the cells that views show, their colours, and the cells in the frame of a training view.
-
-    Args:
-        plane_map: an empty map.
-        views: some training views, rendered.
-        cameras: all training views.
-    """
+    """Return the map with its seen cells and their colours, from `views`, and its cells in the frames of `cameras`."""
     shape, normal = plane_map.seen.shape, plane_map.normal
     points = plane_map.centers.reshape(-1, 3)
     in_frame, near_frame = np.zeros((2, len(points)), bool)
@@ -241,15 +227,7 @@ def _observe(plane_map: _PlaneMap, views: Sequence[_View], cameras: Sequence[Cam
 
 
 def _gather_colors(points: np.ndarray, normal: np.ndarray, views: Sequence[_View]) -> tuple[np.ndarray, np.ndarray]:
-    """Return bool [N], which points of a plane more views show than see through, and their colours [N, 3].
-
-    The colour is that of the view which shows the point best: near, and along the normal.
-
-    Args:
-        points: [N, 3].
-        normal: [3], the plane's normal.
-        views: the rendered views.
-    """
+    """Return which points of a plane more views show than see through, and their colours in the best view."""
     seen, free = np.zeros(len(points), int), np.zeros(len(points), int)
     best, color = np.zeros(len(points)), np.zeros((len(points), 3))
     for view in views:
@@ -261,6 +239,7 @@ def _gather_colors(points: np.ndarray, normal: np.ndarray, views: Sequence[_View
         free += inside & (z > 0) & (z < (1 - FREE) * depth)
         ray = points - view.camera.center
         quality = np.abs(ray @ normal) / np.linalg.norm(ray, axis=1) ** 3  # cosine over the squared distance
+        # best: near, and along the normal
         better = shows & (quality > best)
         best[better] = quality[better]
         at = uv[better, ::-1].T - 0.5
@@ -270,16 +249,14 @@ def _gather_colors(points: np.ndarray, normal: np.ndarray, views: Sequence[_View
 
 
 def _mark_targets(plane_map: _PlaneMap, reach: float) -> _PlaneMap:
-    """Return the map with the cells into which the plane may go on: those up to `reach` from where the capture ends it.
-
-    The capture ends the plane where the large patches of seen cells meet cells outside all frames.
-    """
+    """Return the map with the cells into which the plane may go on, up to `reach` from where the capture ends it."""
     seen, outside = plane_map.seen, ~plane_map.in_frame
     parts, count = ndimage.label(seen)
     if not count:
         return plane_map
     sizes = np.bincount(parts.ravel())[1:]
     large = np.isin(parts, 1 + np.flatnonzero(sizes >= MAIN * sizes.max()))
+    # the capture ends the plane where seen cells meet cells outside all frames
     border = ndimage.binary_dilation(large, iterations=CONTACT) & outside
     areas, area_count = ndimage.label(outside)
     lengths = np.bincount(areas[border], minlength=area_count + 1)

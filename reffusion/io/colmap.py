@@ -150,13 +150,7 @@ def _add(found: dict, identity: int, value: ModelCamera | ModelImage, path: Path
 
 @contextmanager
 def _line_errors(path: Path, number: int, what: str, line: str) -> Iterator[None]:
-    """Turn parsing errors raised inside the context into BadInput.
-
-    Args:
-        path, number: the file and the number of the line, for the message.
-        what: what the line describes, for the message, e.g. "camera".
-        line: the line that is parsed; the message shows it.
-    """
+    """Turn parsing errors inside the context into BadInput, which shows the file, the line and `what` it describes."""
     try:
         yield
     except BadInput:

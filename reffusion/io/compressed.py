@@ -149,11 +149,9 @@ def _to_rows(data) -> Rows:
 
 
 def _turn_about_x(rows: Rows) -> Rows:
-    """Rotate rows by 180 degrees about x: y and z of positions and rotations change sign.
-
-    The spherical harmonics that are odd under this change of sign are negated (`TURNED_SH`).
-    """
+    """Rotate rows by 180 degrees about x: y and z of positions and rotations change sign."""
     means, quaternions = rows.means * (1, -1, -1), rows.quaternions * np.array([1, 1, -1, -1], np.float32)
+    # The spherical harmonics that are odd under this change of sign are negated.
     return Rows(means, quaternions, rows.log_scales, rows.opacity_logits, rows.sh * TURNED_SH[: rows.sh.shape[1], None])
 
 
@@ -172,12 +170,10 @@ def _import_gsply(path: Path):
 
 
 def _morton_codes(points: np.ndarray) -> np.ndarray:
-    """Compute Morton codes, uint64 [N], of positions [N, 3].
-
-    A code interleaves the bits of x, y and z (20 each), so that positions with similar codes lie near each other.
-    """
+    """Compute Morton codes, uint64 [N], of positions [N, 3]."""
     low, extent = points.min(0, initial=np.inf), np.ptp(points, axis=0).max(initial=1e-30)
     cells = ((points - low) / extent * (2**20 - 1)).astype(np.uint64)
+    # A code interleaves the bits of x, y and z (20 each), so that positions with similar codes lie near each other.
     code = np.zeros(len(points), np.uint64)
     for bit in range(20):
         for axis in range(3):

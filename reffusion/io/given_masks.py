@@ -103,11 +103,7 @@ def _load_array(path: Path) -> np.ndarray:
 
 
 def _numbered_pixels(path: Path, image: Image.Image, ids: tuple[int, ...]) -> np.ndarray:
-    """Return the pixels, bool [H, W], whose object number (grey level, or entry of the palette) is one of `ids`.
-
-    Raises:
-        BadInput: the pixels have colours.
-    """
+    """Return the pixels, bool [H, W], whose grey level or palette entry is one of `ids`; raises BadInput on colours."""
     array = np.array(image)
     opaque: np.ndarray | bool = True
     if image.mode in ("RGBA", "LA"):
@@ -120,11 +116,7 @@ def _numbered_pixels(path: Path, image: Image.Image, ids: tuple[int, ...]) -> np
 
 
 def _find_marked_pixels(path: Path, image: Image.Image) -> np.ndarray:
-    """Return the pixels, bool [H, W], that a picture marks by its alpha or by its colours.
-
-    Raises:
-        BadInput: as for `load_given_mask` without `ids`.
-    """
+    """Return the pixels, bool [H, W], that a picture's alpha or colours mark; raises BadInput as `load_given_mask`."""
     lossless, palette = image.format != "JPEG", image.mode in ("P", "PA")
     if image.mode[0] in "IF" or not image.has_transparency_data:
         array = np.array(image if image.mode[0] in "IF1L" and image.mode != "LAB" else image.convert("RGB"))
@@ -150,17 +142,9 @@ def _is_drawing(colors: np.ndarray, lossless: bool) -> bool:
 
 
 def _marked_pixels(path: Path, colors: np.ndarray, lossless: bool, palette: bool = False) -> np.ndarray:
-    """Return the pixels, bool [H, W], that the colours of a mask mark.
-
-    Args:
-        path: the file, for messages.
-        colors: [H, W, C] of any type, C = 1 or 3.
-        lossless: False for JPEG, whose colours are not exact.
-        palette: True if the file has a palette, whose entries may be named as `masks: {id: ...}`.
-
-    Raises:
-        BadInput: the colours are those of several objects, or of a photograph.
-    """
+    """Return the pixels, bool [H, W], that colours mark; raises BadInput for several objects or a photograph."""
+    # `colors` is [H, W, C] of any type, C = 1 or 3. The colours of a JPEG (not `lossless`) are not exact. The entries
+    # of a palette may be named as `masks: {id: ...}`.
     colors = colors.astype(np.uint8) if colors.dtype == bool else colors
     is_gray = all((colors[..., :1] == colors[..., k : k + 1]).all() for k in range(1, colors.shape[2]))
     colors = colors[..., :1] if is_gray else colors
@@ -213,24 +197,20 @@ def _scale_of(colors: np.ndarray) -> np.float32 | np.uint8:
 
 
 def _sample(colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return about `SAMPLES` pixels of colours [H, W, C], evenly spaced, as [N, C], and which are even, bool [N].
-
-    An even pixel has the same colour as its upper, left and upper left neighbours.
-    """
+    """Return about `SAMPLES` pixels [N, C] of colours [H, W, C], evenly spaced, and which are even, bool [N]."""
     every = int(np.ceil((colors.shape[0] * colors.shape[1] / SAMPLES) ** 0.5))
     if every == 1:  # a small picture, of which borders count too
         colors = np.pad(colors, ((1, 0), (1, 0), (0, 0)), mode="edge")
     here, before = slice(1, None, every), slice(0, -1, every)
     some = colors[here, here]
+    # An even pixel has the same colour as its upper, left and upper left neighbours.
     even = np.all([(some == colors[r, c]).all(2) for r, c in ((before, here), (here, before), (before, before))], 0)
     return some.reshape(-1, colors.shape[2]), even.ravel()
 
 
 def _flat_areas(numbers: np.ndarray, even: np.ndarray) -> list:
-    """Return the values of an array [N] whose even pixels are more than the share `FLAT` of all pixels, ascending.
-
-    Values that only occur along soft edges are thereby left out.
-    """
+    """Return, ascending, the values of an array [N] whose even pixels are more than the share `FLAT` of all pixels."""
+    # Values that only occur along soft edges are thereby left out.
     levels, counts = np.unique(numbers[even], return_counts=True)
     return levels[counts > FLAT * numbers.size].tolist()
 
@@ -254,15 +234,7 @@ class _Levels:
 
 
 def _find_levels(colors: np.ndarray, even: np.ndarray, lossless: bool) -> _Levels:
-    """Return the two levels of pixels [N, C]: the medians of those darker and lighter than the middle of the range.
-
-    The upper level of a grey picture that reaches a light grey is its maximum instead, because soft edges may be wider
-    than what they surround.
-
-    Args:
-        even: bool [N], the pixels that equal their neighbours.
-        lossless: False for JPEG.
-    """
+    """Return the two levels of pixels [N, C]: the medians of those darker and lighter than the middle of the range."""
     colors = colors.astype(np.float32)
     brightness = colors.max(1)
     bottom, top = float(brightness.min()), float(brightness.max())
@@ -280,6 +252,8 @@ def _find_levels(colors: np.ndarray, even: np.ndarray, lossless: bool) -> _Level
     other_hue = np.abs(colors[above] - brightness[above, None] * (color / color.max())).max(1) > tolerance
     share = float((has_low | has_high).mean())
     is_thin = is_gray and high >= LIGHT and share >= THIN and has_high[above].mean() >= THIN_HIGH
+    # The upper level of a grey picture that reaches a light grey is its maximum instead, because soft edges may be
+    # wider than what they surround.
     if is_gray and top >= LIGHT:
         high, has_high = top, top - brightness <= slack
     areas = (has_high & even)[above].mean() >= EVEN_HIGH and (has_low & even).mean() >= EVEN_LOW
@@ -287,19 +261,14 @@ def _find_levels(colors: np.ndarray, even: np.ndarray, lossless: bool) -> _Level
 
 
 def _cut_out(drawn: np.ndarray) -> np.ndarray | None:
-    """Return the object, bool [H, W], in a photograph that was cut out on black; None if that is ambiguous.
-
-    Dots of at most 1 % of the drawn pixels are removed outside the object and filled inside. In a photograph of the
-    night, as opposed to a cut-out, such dots are many.
-
-    Args:
-        drawn: bool [H, W], the pixels that are not black.
-    """
+    """Return the object, bool [H, W], in a photograph that was cut out on black; None if that is ambiguous."""
     from reffusion.morphology import remove_small_parts  # imports scipy, which `plan` should not wait for
 
     count = int(drawn.sum())
     if not 0 < count <= drawn.size / 2:
         return None
+    # Remove dots of at most 1 % of the drawn pixels outside the object and fill them inside. In a photograph of the
+    # night, as opposed to a cut-out, such dots are many.
     diameter = (0.01 * count * 4 / np.pi) ** 0.5
     mask = remove_small_parts(drawn, diameter, diameter)
     return mask if (mask ^ drawn).sum() <= SPECKS * count else None

@@ -55,14 +55,9 @@ def open_image(path: Path, what: str = "a readable image; save it anew as JPEG o
 
 
 def _register_heic(path: Path) -> None:
-    """Enable Pillow to read HEIC pictures, always with their orientation applied.
-
-    pi-heif is used, and not pillow-heif: pi-heif only decodes, and the wheels of pillow-heif contain an encoder under
-    the GPL.
-
-    Raises:
-        BadInput: pi-heif is not installed.
-    """
+    """Enable Pillow to read HEIC pictures, with their orientation applied; raises BadInput without pi-heif."""
+    # pi-heif is used, and not pillow-heif: pi-heif only decodes, and the wheels of pillow-heif contain an encoder under
+    # the GPL.
     try:
         import pi_heif
     except ImportError:
@@ -131,11 +126,8 @@ def _is_turned(image: Image.Image) -> bool:
 
 
 def _turn(pixels: Image.Image, tag: int, is_turned: bool, upright: bool) -> Image.Image:
-    """Return pixels as the orientation `tag` shows them if `upright`, else as they are stored.
-
-    Args:
-        is_turned: True if they are already as the tag shows them (`_is_turned`).
-    """
+    """Return pixels as the orientation `tag` shows them if `upright`, else as they are stored."""
+    # `is_turned` says whether the pixels already are as the tag shows them.
     if upright == is_turned or tag == 1:
         return pixels
     turn, back = _TRANSPOSES[tag]

@@ -93,13 +93,8 @@ def find_missing(here: Machine, memory_gb: float = 0.0, splats: bool = True, mem
 
 
 def _cannot_build(here: Machine, cuda_major: int | None) -> list[str]:
-    """Return why the CUDA kernels of gsplat cannot be compiled here, as a list of at most one line.
-
-    The wheel of gsplat contains only sources, which nvcc compiles when gsplat is first loaded.
-
-    Args:
-        cuda_major: major version of the CUDA for which torch was built; None if unknown.
-    """
+    """Return why gsplat's CUDA kernels cannot be compiled here, in at most one line; `cuda_major` is that of torch."""
+    # The wheel of gsplat contains only sources, which nvcc compiles when gsplat is first loaded.
     if here.nvcc is None:
         toolkit = f"CUDA toolkit {cuda_major}" if cuda_major else "the CUDA toolkit"
         return [
@@ -124,10 +119,7 @@ def _major(version: str | None) -> int | None:
 
 
 def _query_gpu() -> tuple[str | None, float | None, int | None]:
-    """Ask nvidia-smi for the name, the memory in GB and the driver's major version of the first visible GPU.
-
-    All three are None if nvidia-smi does not exist or gives no answer.
-    """
+    """Return the first visible GPU's name, memory in GB and driver's major version; all None if nvidia-smi fails."""
     command = shutil.which("nvidia-smi") or shutil.which("nvidia-smi", path="/usr/lib/wsl/lib")
     if not command:
         return None, None, None
@@ -143,12 +135,10 @@ def _query_gpu() -> tuple[str | None, float | None, int | None]:
 
 
 def _driver(path: Path) -> int | None:
-    """Read the driver's major version from the file that the NVIDIA kernel module provides; None if unknown.
-
-    The line is like `NVRM version: NVIDIA UNIX x86_64 Kernel Module  580.65.06  Sun ...`, or that of the open kernel
-    modules.
-    """
+    """Read the driver's major version from the file that the NVIDIA kernel module provides; None if unknown."""
     with suppress(OSError):
+        # The line is like `NVRM version: NVIDIA UNIX x86_64 Kernel Module  580.65.06  Sun ...`, or that of the open
+        # kernel modules.
         if found := re.search(r"Kernel Module\D*?(?:for \S+)?\s+(\d+)\.\d", path.read_text()):
             return int(found[1])
     return None
@@ -161,11 +151,7 @@ def _package(name: str) -> Path | None:
 
 
 def _torch_cuda() -> str | None:
-    """Read from torch/version.py for which CUDA version torch was built, without importing torch.
-
-    Returns:
-        The version; "" if torch was built without CUDA; None if torch is not installed or the version is not found.
-    """
+    """Return the CUDA version of torch, read without importing torch; "" if built without CUDA, None if not found."""
     folder = _package("torch")
     with suppress(OSError):
         text = (folder / "version.py").read_text() if folder else ""
@@ -175,13 +161,8 @@ def _torch_cuda() -> str | None:
 
 
 def _nvcc() -> str | None:
-    """Return the version of the CUDA toolkit that torch would use to compile kernels.
-
-    Like torch, this function looks at CUDA_HOME, CUDA_PATH, nvcc on the path, and /usr/local/cuda, in this order.
-
-    Returns:
-        The version; "" if nvcc exists and its version is unknown; None if there is no nvcc.
-    """
+    """Return the version of the CUDA toolkit that torch would use; "" if it is unknown, None if there is no nvcc."""
+    # Like torch, look at CUDA_HOME, CUDA_PATH, nvcc on the path, and /usr/local/cuda, in this order.
     on_path = shutil.which("nvcc")
     named = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
     home = Path(named) if named else Path(on_path).resolve().parent.parent if on_path else TOOLKIT

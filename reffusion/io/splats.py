@@ -159,15 +159,7 @@ def load_splats(path: Path) -> Splats:
 
 
 def _gather(path: Path, count: int, read: Callable[[slice], Rows]) -> tuple[Rows, Repairs]:
-    """Read a file of `count` rows in blocks, and keep the valid rows.
-
-    Args:
-        path: the file, for messages.
-        read: returns the rows of a slice.
-
-    Returns:
-        The valid rows in the order of the file, and how many rows were dropped or changed.
-    """
+    """Read `count` rows in blocks; return the valid rows, in order, and how many rows were dropped or changed."""
     first, repairs, at = read(slice(0, 0)), Repairs(), 0
     whole = Rows(*(np.empty((count, *array.shape[1:]), array.dtype) for array in vars(first).values()))
     for start in range(0, count, BLOCK):
@@ -187,13 +179,10 @@ def _gather(path: Path, count: int, read: Callable[[slice], Rows]) -> tuple[Rows
 
 
 def _open_ply(table: np.ndarray) -> Callable[[slice], Rows]:
-    """Return a function that converts a slice of a plain .ply's vertex table to rows.
-
-    Mip-Splatting's 3D filter is folded into scales and opacities. The missing third scale of 2DGS becomes that of a
-    flat axis. Spherical harmonics above `DEGREE` are dropped.
-    """
+    """Return a function that converts a slice of a plain .ply's vertex table to rows."""
     names = table.dtype.names
     higher = sum(name.startswith("f_rest_") for name in names) // 3
+    # Spherical harmonics above `DEGREE` are dropped.
     used = min(higher, (DEGREE + 1) ** 2 - 1)
     rest = [[f"f_rest_{channel * higher + k}" for channel in range(3)] for k in range(used)]
 
@@ -208,8 +197,10 @@ def _open_ply(table: np.ndarray) -> Callable[[slice], Rows]:
         block = np.array(table[chosen])  # the table is a memory map: copy it once, or each property reads the disk
         logits = read_columns(block, ["opacity"], "f8")[:, 0]
         scales = read_columns(block, [name for name in SCALES if name in names], "f8")
+        # The missing third scale of 2DGS becomes that of a flat axis.
         if scales.shape[1] == 2:
             scales = np.column_stack([scales, np.full(len(block), FLAT)])
+        # Mip-Splatting's 3D filter is folded into scales and opacities.
         if FILTER in names:
             scales, logits = fold_filter(scales, logits, block[FILTER])
         sh = np.empty((len(block), 1 + used, 3), np.float32)
@@ -224,25 +215,14 @@ def _open_ply(table: np.ndarray) -> Callable[[slice], Rows]:
 
 
 def _color_coefficients(block: np.ndarray) -> np.ndarray:
-    """Return the constant spherical harmonic [N, 3] float32 of the colours red, green and blue of N rows.
-
-    The colours are bytes, or floats in [0, 1].
-    """
+    """Return the constant spherical harmonic, float32 [N, 3], of colours that are bytes, or floats in [0, 1]."""
     colors = np.stack([block[name] for name in RED_GREEN_BLUE], axis=1)
     unit = colors if np.issubdtype(colors.dtype, np.floating) else colors / 255
     return ((unit - 0.5) / SH0).astype(np.float32)
 
 
 def _check_properties(path: Path, names: Sequence[str]) -> tuple[str, ...]:
-    """Return what reading a plain .ply will change, a sentence each.
-
-    Args:
-        path: the file, for messages.
-        names: the names of its vertex properties.
-
-    Raises:
-        BadInput: the properties are not those of Gaussians.
-    """
+    """Return what reading a plain .ply will change, a sentence each; raises BadInput if it is no file of Gaussians."""
     others = (*POSITION, "opacity", *SCALES[:2], *ROTATION)
     colored = {*others, *RED_GREEN_BLUE} <= {*names} and DC[0] not in names  # as nerfstudio writes on request
     missing = [n for n in (*others, *(() if colored else DC)) if n not in names]

@@ -106,13 +106,7 @@ def load_trace(path: Path, stage: str) -> dict[str, list[dict[str, Any]]]:
 
 
 def _find_violation(line: dict[str, Any], before: dict[str, Any] | None, seconds: float, stage: str) -> str | None:
-    """Return how a line of a trace violates the schema, in words; None if it does not.
-
-    Args:
-        before: the previous line of the same series; None for the first line.
-        seconds: "seconds" of the previous line of any series.
-        stage: name of the stage that wrote the trace.
-    """
+    """Return how a line of a trace violates the schema, in words; None if it does not."""
     if missing := [key for key in ("seconds", "iteration") if key not in line]:
         return f"no {missing[0]!r}"
     texts = {"series", "reason"} & line.keys()
@@ -123,6 +117,7 @@ def _find_violation(line: dict[str, Any], before: dict[str, Any] | None, seconds
     known = {"seconds", "iteration", "series", *QUANTITIES, "reason"}
     if stage != "distill" and (strange := line.keys() - known):
         return f"unknown quantity {sorted(strange)[0]!r}"
+    # `seconds` is that of the previous line of any series, and `before` the previous line of the same series.
     if line["seconds"] < seconds:
         return f"its seconds fell from {seconds} to {line['seconds']}"
     rises = before is None or line["iteration"] > before["iteration"]

@@ -42,13 +42,11 @@ _CACHE = "splat-"  # prefix of the folder of machine code in __pycache__; its na
 
 @functools.cache
 def _cache_folder() -> Path:
-    """Return the folder of machine code for the present sources of `_PACKAGES`.
-
-    numba itself checks only whether the file of a function has changed. It would go on using machine code with an old
-    constant or an old callee from another file.
-    """
+    """Return the folder of machine code for the present sources of `_PACKAGES`."""
     library = Path(__file__).parents[1]
     sources = [path for package in _PACKAGES for path in sorted((library / package).glob("*.py"))]
+    # numba itself checks only whether the file of a function has changed. It would go on using machine code with an old
+    # constant or an old callee from another file.
     digest = hashlib.blake2b(b"".join(path.read_bytes() for path in sources), digest_size=8).hexdigest()
     return Path(__file__).parent / "__pycache__" / (_CACHE + digest)
 
@@ -203,10 +201,6 @@ def side_by_side(function: Callable[[T], R], items: Iterable[T], most: int = 8) 
 
 @functools.lru_cache(maxsize=1)
 def _pool(process: int, helpers: int) -> ThreadPoolExecutor:
-    """Return a pool of `helpers` threads that is kept between calls.
-
-    Args:
-        process: id of this process. Threads do not survive a fork, so a forked process makes its own pool.
-        helpers: number of threads.
-    """
+    """Return a pool of `helpers` threads that is kept between calls of the process with the id `process`."""
+    # Threads do not survive a fork, so a forked process makes its own pool.
     return ThreadPoolExecutor(helpers, thread_name_prefix="splat")

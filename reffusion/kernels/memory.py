@@ -20,12 +20,8 @@ _LONG = ir.IntType(64)
 
 
 def _pointer(context, builder, array, place, kind=None):
-    """Return the address of an element of a contiguous one-dimensional array.
-
-    Args:
-        array, place: (numba type, LLVM value) pairs of the array and of the index.
-        kind: LLVM type to which the address points; None: the type of the elements.
-    """
+    """Return the address, as LLVM type `kind` if given, of an element of a contiguous one-dimensional array."""
+    # `array` and `place` are (numba type, LLVM value) pairs of the array and of the index.
     data = context.make_array(array[0])(context, builder, array[1]).data
     pointer = builder.gep(data, [context.cast(builder, place[1], place[0], types.intp)])
     return pointer if kind is None else builder.bitcast(pointer, kind.as_pointer())
@@ -64,13 +60,9 @@ def store(typing, array, place, value):
 
 
 def _element(context, builder, kinds, values, lane: int):
-    """Return the address of the element [row + lane, column] of a flat array [R, width].
-
-    Args:
-        kinds, values: numba types and LLVM values of the array, width, column, row and, optionally, the last row. Rows
-            after the last row are replaced by the last row.
-        lane: constant added to the row.
-    """
+    """Return the address of the element [row + lane, column] of a flat array [R, width]."""
+    # `kinds` and `values` are the numba types and LLVM values of the array, width, column, row and, optionally, the
+    # last row. Rows after the last row are replaced by the last row.
     data = context.make_array(kinds[0])(context, builder, values[0]).data
     pairs = zip(values[1:], kinds[1:], strict=True)
     width, column, row, *last = (context.cast(builder, value, kind, types.intp) for value, kind in pairs)
@@ -160,11 +152,9 @@ def _indices(places) -> ir.Constant:
 
 
 def _fold(builder, x, y, unit: int, span: int):
-    """Add neighbouring groups of lanes of two vectors, so that one vector holds the sums of both.
-
-    Within each `span` of lanes, every two neighbouring groups of `unit` lanes are added element by element. In the
-    result the sums of x come first in each span, and the sums of y follow.
-    """
+    """Add neighbouring groups of lanes of two vectors, so that one vector holds the sums of both."""
+    # Within each `span` of lanes, every two neighbouring groups of `unit` lanes are added element by element. In the
+    # result the sums of x come first in each span, and the sums of y follow.
     even = [
         source + start + at
         for start in range(0, LANES, span)

@@ -90,12 +90,7 @@ def copies(builder, kind: ir.VectorType, number):
 
 
 def _as_vector(context, builder, value, have, want):
-    """Return a vector of type `want`: `value` itself if it has this type, else the number `value` in every lane.
-
-    Args:
-        have: numba type of `value`.
-        want: `lanes` or `wide`, or the type of `value`.
-    """
+    """Return a vector of type `want`: `value` itself if it has this type, else the number `value` in every lane."""
     if have == want:
         return value
     number = types.float32 if want == lanes else types.float64
@@ -103,14 +98,8 @@ def _as_vector(context, builder, value, have, want):
 
 
 def _register_operator(symbol, emit, kind, result):
-    """Register a binary operator in numba for vectors; on one of its sides a number may stand instead (not for masks).
-
-    Args:
-        symbol: function of the module `operator`, such as `operator.add`.
-        emit: emit(builder, x, y) writes the LLVM instruction and returns its result.
-        kind: type of the vectors.
-        result: type of the result.
-    """
+    """Register a binary operator in numba for vectors; emit(builder, x, y) writes its LLVM instruction."""
+    # On one side a number may stand instead of a vector, but not for masks.
     pairs = [(kind, kind)]
     if kind != lane_mask:
         pairs += [pair for number in (types.float32, types.float64) for pair in ((kind, number), (number, kind))]

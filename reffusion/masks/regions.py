@@ -119,14 +119,12 @@ def restrict_to_new(invent: np.ndarray, consistent: np.ndarray, new_share: np.nd
 
 
 def _ray_interval(region: Region, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the camera z at which the rays of a view enter and leave the region, [H, W] each.
-
-    Where a ray misses the region, the two values are NaN, or the first is not less than the second. They may be
-    negative, i.e. behind the camera.
-    """
+    """Return the camera z at which the rays of a view enter and leave the region, [H, W] each; may be negative."""
     rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
     half = np.asarray(region.size) / 2
     offset = np.asarray(region.center) - camera.center
+    # Where a ray misses the region, the two values are NaN, or the first is not less than the second. Negative values
+    # are behind the camera.
     with np.errstate(divide="ignore", invalid="ignore"):
         if not region.round:
             bounds = (offset + np.multiply.outer((-1, 1), half))[:, None, None] / rays

@@ -152,14 +152,7 @@ def find_soft_shadow(background: Background, object_means: Tensor) -> SoftShadow
 
 
 def _cell_brightness(background: Background, index: int) -> np.ndarray:
-    """Return [CELLS, CELLS, 3], the logarithmic brightness of a plane's cells in the photographs; NaN where unseen.
-
-    A cell's brightness is the median over its parts, and that of a part the median over views, so that neither joints
-    of planks nor shine counts.
-
-    Args:
-        index: position of the plane in `background.planes`, counted from 1.
-    """
+    """Return [CELLS, CELLS, 3], the log brightness of the cells of plane number `index` (from 1); NaN where unseen."""
     plane, side, samples = background.planes[index - 1], CELLS * FINE, []
     views = [view for view in background.views if view.camera.name in background.photos]
     for view in views[:: -(-len(views) // MAX_VIEWS)]:
@@ -181,6 +174,8 @@ def _cell_brightness(background: Background, index: int) -> np.ndarray:
     in_cells = lambda x: x.reshape(CELLS, FINE, CELLS, FINE, -1).swapaxes(1, 2).reshape(CELLS, CELLS, FINE**2, -1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a cell that no view shows has no median
+        # A cell's brightness is the median over its parts, and that of a part the median over views, so that neither
+        # joints of planks nor shine counts.
         brightness = np.nanmedian(in_cells(np.nanmedian(samples, axis=0)), 2)
     parts = in_cells(views_of_part)[..., 0]
     seen = ((parts > 0).mean(2) > MIN_PARTS) & (parts.max(2) >= MIN_VIEWS)
@@ -193,17 +188,9 @@ def _map_index(points: np.ndarray, background: Background, plane: Plane) -> np.n
 
 
 def _smooth_light(brightness: np.ndarray, seen: np.ndarray, stiffness: float, clip: float) -> np.ndarray:
-    """Return [CELLS, CELLS, 3], the smooth log light of each channel; 0 where unseen.
-
-    The light L minimises sum w (dL - dB)^2 + stiffness sum (d2L)^2 + sum a L^2, where B is the brightness, d is the
-    difference of neighbouring cells and d2 the second difference. The weights w are small where dL and dB differ by
-    more than `clip` standard deviations of dB, as at the border of two materials; they are those of the mean channel.
-    The weights a keep L at 0 far from the object.
-
-    Args:
-        brightness: [CELLS, CELLS, 3], see `_cell_brightness`.
-        seen: bool [CELLS, CELLS], True where it is known.
-    """
+    """Return [CELLS, CELLS, 3], the smooth log light of each channel; 0 where unseen."""
+    # The light L minimises sum w (dL - dB)^2 + stiffness sum (d2L)^2 + sum a L^2, where B is the brightness, d is the
+    # difference of neighbouring cells and d2 the second difference. The weights a keep L at 0 far from the object.
     light = np.zeros((CELLS, CELLS, 3))
     number = np.where(seen, np.cumsum(seen).reshape(seen.shape) - 1, -1)
     first = sparse.vstack([_difference(number, [[-1.0], [1.0]]), _difference(number, [[-1.0, 1.0]])]).tocsr()
@@ -221,18 +208,15 @@ def _smooth_light(brightness: np.ndarray, seen: np.ndarray, stiffness: float, cl
     for _ in range(ITERATIONS):
         solver = splu((first.T @ sparse.diags(weights) @ first + fixed).tocsc())
         misfit = first @ solver.solve(first.T @ (weights * steps.mean(1))) - steps.mean(1)
+        # The weights w are small where dL and dB differ by more than `clip` standard deviations of dB, as at the border
+        # of two materials; they are those of the mean channel.
         weights = (1 + (misfit / (clip * deviation)) ** 2) ** -2.0
     light[seen] = solver.solve(first.T @ (weights[:, None] * steps))
     return light
 
 
 def _difference(number: np.ndarray, stencil: list[list[float]] | np.ndarray) -> sparse.csr_matrix:
-    """Return the sparse matrix that applies a stencil at each place where all its cells are numbered.
-
-    Args:
-        number: int [CELLS, CELLS], position of each cell in the vector; -1 for cells that are not in it.
-        stencil: [h, w].
-    """
+    """Return the sparse matrix that applies a stencil [h, w] wherever all its cells are numbered (`number` >= 0)."""
     stencil = np.asarray(stencil)
     height, width = stencil.shape
     windows = np.lib.stride_tricks.sliding_window_view(number, (height, width)).reshape(-1, height * width)
@@ -243,12 +227,7 @@ def _difference(number: np.ndarray, stencil: list[list[float]] | np.ndarray) -> 
 
 
 def _find_region(light: np.ndarray, seen: np.ndarray) -> np.ndarray | None:
-    """Return bool [CELLS, CELLS], the dark cells that are the object's shadow; None if there is no shadow.
-
-    Args:
-        light: [CELLS, CELLS, 3], the stiff light.
-        seen: bool [CELLS, CELLS], the cells that photographs show.
-    """
+    """Return the dark cells, bool [CELLS, CELLS], of the object's shadow in the stiff light; None if there is none."""
     mean = light.mean(2)
     parts, count = ndimage.label(mean < -DARK)
     if not count:
@@ -271,16 +250,14 @@ def _find_region(light: np.ndarray, seen: np.ndarray) -> np.ndarray | None:
 def _make_shadow(
     background: Background, plane: Plane, brightness: np.ndarray, seen: np.ndarray, region: np.ndarray
 ) -> SoftShadow:
-    """Return the shadow of the given region: the soft light there, and the colours of the region.
-
-    Cells that no photograph shows take the value of the nearest cell that one shows.
-    """
+    """Return the shadow of the given region: the soft light there, and the colours of the region."""
     soft = _smooth_light(brightness, seen, *SOFT)
     tint = soft[region].mean(0)
     mean = GAIN * np.minimum(soft.mean(2), 0)
     parts, _ = ndimage.label(mean < -EDGE)
     whole = np.isin(parts, np.unique(parts[region & (mean < -EDGE)]))
     mean = np.where(whole, mean, 0)
+    # Cells that no photograph shows take the value of the nearest cell that one shows.
     nearest = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
     foot = background.center - (background.center @ plane.normal - plane.offset) * plane.normal
     fade = np.array(FADE) * background.radius

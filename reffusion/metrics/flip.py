@@ -65,23 +65,18 @@ def _filter_contrast(picture: np.ndarray) -> np.ndarray:
 
 
 def _blur_channel(channel: np.ndarray, gaussians: tuple[tuple[float, float], ...]) -> np.ndarray:
-    """Filter a channel [H, W] by a normalised sum of Gaussians; each Gaussian is separable into rows and columns.
-
-    Args:
-        gaussians: (weight, width in degrees^2) of each Gaussian.
-    """
+    """Filter a channel [H, W] by a normalised sum of Gaussians, given by (weight, width in degrees^2)."""
     parts = [(weight * sqrt(pi / width), _gaussian_kernel(width)) for weight, width in gaussians]
     total = sum(weight * kernel.sum() ** 2 for weight, kernel in parts)
+    # Each Gaussian is separable into rows and columns.
     run = lambda kernel: cv2.sepFilter2D(channel, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
     return sum(np.float32(weight * kernel.sum() ** 2 / total) * run(kernel / kernel.sum()) for weight, kernel in parts)
 
 
 def _gaussian_kernel(width: float) -> np.ndarray:
-    """Sample the 1D kernel exp(-pi^2 x^2 / width) at pixels, with x in degrees and `width` in degrees^2.
-
-    The kernel reaches three standard deviations of the widest Gaussian in `SENSITIVITY`, and is not normalised.
-    """
+    """Sample the 1D kernel exp(-pi^2 x^2 / width) at pixels, x in degrees, width in degrees^2; it is not normalised."""
     widest = max(each for channel in SENSITIVITY for _, each in channel)
+    # Three standard deviations of the widest Gaussian in `SENSITIVITY`.
     radius = ceil(3 * sqrt(widest / (2 * pi**2)) * PIXELS_PER_DEGREE)
     return np.exp(-((pi * np.arange(-radius, radius + 1) / PIXELS_PER_DEGREE) ** 2) / width)
 
@@ -100,8 +95,7 @@ def _apply_hunt_effect(lab: np.ndarray) -> np.ndarray:
 
 
 def _hyab_distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return [H, W], the HyAB distance of CIELAB colours: the absolute difference in lightness plus the Euclidean
-    distance in chroma."""
+    """Return the HyAB distance [H, W] of CIELAB colours: |lightness difference| + Euclidean distance in chroma."""
     apart = first - second
     return np.abs(apart[..., 0]) + np.hypot(apart[..., 1], apart[..., 2])
 

@@ -86,11 +86,7 @@ def mask_box(mask: np.ndarray, dilation: float = BOX_DILATION) -> Box | None:
 
 
 def _dilate_interval(low: int, high: int, dilation: float, size: int) -> tuple[int, int]:
-    """Widen the interval of pixels low to high - 1 by the share `dilation` of its length at each end.
-
-    Returns:
-        The new low and high, clipped to 0 and `size`; high is exclusive.
-    """
+    """Widen the interval of pixels low to high - 1 by the share `dilation` at each end, clipped to 0 and `size`."""
     margin = round(dilation * (high - low), 9)  # 0.1 * 30 is slightly above 3 in floats: rounding up must not give 4
     return max(0, floor(low - margin)), min(size, ceil(high + margin))
 
@@ -332,11 +328,7 @@ def join_side_by_side(panels: list[np.ndarray], box: Box | None) -> np.ndarray:
 
 
 def _as_unit_pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convert two images to float64 in [0, 1].
-
-    Raises:
-        ValueError: an array is no image, the sizes differ, or the images are empty.
-    """
+    """Convert two images to float64 in [0, 1]; raises ValueError if they are no images, differ in size or are empty."""
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"a metric compares two [H, W, 3] of one size; got {image.shape} and {truth.shape}")
     if image.size == 0:
@@ -345,11 +337,7 @@ def _as_unit_pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _as_unit(image: np.ndarray) -> np.ndarray:
-    """Convert a uint8 image, or a float image in [0, 1], to float64 in [0, 1].
-
-    Raises:
-        ValueError: the dtype is another one, or a float image has values outside [0, 1] or NaN.
-    """
+    """Convert a uint8 image, or a float image in [0, 1], to float64 in [0, 1]; raises ValueError for other images."""
     if image.dtype == np.uint8:
         return image / 255.0
     if not np.issubdtype(image.dtype, np.floating):

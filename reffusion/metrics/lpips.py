@@ -194,11 +194,7 @@ def load(net: Net, folder: str | Path | None = None) -> tuple[Lpips | None, str 
 
 
 def _load_whole(net: Net, path: Path) -> Lpips:
-    """Build the metric from one file with all weights.
-
-    Raises:
-        ValueError: the weights are not the published ones.
-    """
+    """Build the metric from one file with all weights; raises ValueError if they are not the published ones."""
     from safetensors.torch import load_file
 
     state = load_file(path)
@@ -211,11 +207,8 @@ def _load_whole(net: Net, path: Path) -> Lpips:
 
 
 def _check_name(path: Path) -> None:
-    """Check a file whose name ends in eight hexadecimal digits of its sha256, as the names of torchvision do.
-
-    Raises:
-        ValueError: the file has another hash than its name states.
-    """
+    """Raise ValueError if a file's name ends in eight hexadecimal digits that are not those of its sha256."""
+    # The names of torchvision end in eight digits of the hash.
     stated = path.stem.rpartition("-")[2]
     if re.fullmatch("[0-9a-f]{8}", stated) and not _sha256(path).startswith(stated):
         raise ValueError(f"{path.name} is not the file its name says: download it again")

@@ -74,19 +74,7 @@ def score_row(
 def _score_reduced(
     pictures: dict[str, np.ndarray], truth: np.ndarray, mask: np.ndarray, models: dict[str, Lpips], longest: int
 ) -> dict[str, Any]:
-    """Score the mask's box of pictures after pictures, ground truth and mask are reduced in size.
-
-    Args:
-        pictures: prefix of the columns -> uint8 [H, W, 3].
-        truth: uint8 [H, W, 3], the ground truth.
-        mask: bool [H, W], the object.
-        models: name of the network ("alex" or "vgg") -> LPIPS network.
-        longest: px, the larger side after the reduction.
-
-    Returns:
-        "reduced_width" and "reduced_height", and for each prefix <prefix>reduced_<score>_box. The scores are missing if
-        the reduced mask is empty.
-    """
+    """Score the mask's box of pictures (by prefix of the columns), reduced to `longest` px on the larger side."""
     height, width = mask.shape
     factor = longest / max(width, height)
     size = max(1, round(width * factor)), max(1, round(height * factor))

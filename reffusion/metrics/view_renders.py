@@ -70,10 +70,8 @@ class ViewRenderer:
         return ViewRenders(by_stage, RenderedView(camera, picture, depth, mask, matrix))
 
     def _view_exposure(self, camera: Camera, mask: np.ndarray, photo: np.ndarray | None) -> np.ndarray | None:
-        """Return the affine colour map [3, 4] of the view, adjusted to the photograph outside the mask if there is one.
-
-        None if the view has no entry in `exposures`. See `exposure.PROTOCOL`.
-        """
+        """Return the view's affine colour map [3, 4], adjusted to the photograph outside the mask if there is one."""
+        # None without an entry in `exposures`; see `exposure.PROTOCOL`.
         matrix = self.exposures.get(camera.name)
         if matrix is None or photo is None:
             return matrix
@@ -84,22 +82,13 @@ class ViewRenderer:
 
 
 def _render(gaussians: Gaussians, camera: Camera, matrix: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Render a view as an 8-bit picture and a depth map.
-
-    The scores are computed from the 8-bit picture, so that they can be recomputed from the saved files.
-
-    Args:
-        matrix: [3, 4], the exposure to apply; None for none.
-
-    Returns:
-        uint8 [H, W, 3], and camera z, float64 [H, W], with 0 where alpha is too low for a depth.
-
-    Raises:
-        ValueError: the rendering has values that are not finite.
-    """
+    """Render a view, uint8 [H, W, 3], and its camera z, float64 [H, W]; raises ValueError if a colour is not finite."""
     rendered = rasterizer.render(gaussians, camera)
+    # `matrix` [3, 4] is the exposure to apply, or None.
     color = exposure.apply_exposure(rendered.color, matrix).clamp(0, 1).cpu().numpy()
     if not np.isfinite(color).all():
         raise ValueError(f"view {camera.name}: its render holds values that are not finite")
     depth, alpha = rendered.depth.double().cpu().numpy(), rendered.alpha.cpu().numpy()
+    # The scores are computed from the 8-bit picture, so that they can be recomputed from the saved files. The depth is
+    # 0 where alpha is too low for one.
     return to_uint8(color), np.where(alpha > consistency.SOLID, depth, 0.0)

@@ -35,11 +35,9 @@ class Settings(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _as_meant(cls, value: Any, field: ValidationInfo) -> Any:
-        """Raise ValueError for a boolean in a field without booleans, and for a number in a field of text.
-
-        YAML reads an unquoted `on` as true, which pydantic would silently turn into 1.
-        """
+        """Raise ValueError for a boolean in a field without booleans, and for a number in a field of text."""
         info = cls.model_fields[field.field_name]
+        # YAML reads an unquoted `on` as true, which pydantic would silently turn into 1.
         if isinstance(value, bool) and bool not in _kinds(info.annotation):
             advice = "write it in quotes" if str in _kinds(info.annotation) else "give a number"
             raise ValueError(f"yes, no, on, off, true and false are truth values; {advice}")

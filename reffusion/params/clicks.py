@@ -10,11 +10,7 @@ CLICKS = "clicks.json"  # file in a scene's folder with the clicks made on the m
 
 
 def _click(value: Any) -> Any:
-    """Return the click as (x, y, sign); a click without a sign gets "+" and so is on the object.
-
-    Raises:
-        ValueError: the value is not a list of two or three entries.
-    """
+    """Return a click [x, y] or [x, y, sign] as (x, y, sign), by default "+" (on the object), else raise ValueError."""
     if not isinstance(value, list | tuple) or len(value) not in (2, 3):
         raise ValueError("a click is [x, y, +] on the object, [x, y, -] on what is not")
     return (*value, "+") if len(value) == 2 else value

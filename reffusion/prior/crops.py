@@ -137,11 +137,7 @@ def draw_samples(
 def _sample_of_reference(
     source: Picture, native: int, size: int, local_share: float, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, int]:
-    """Draw a local or a global sample of a reference.
-
-    Returns:
-        The image [3, size, size], its hole [1, size, size] (1 = hole), and the index of its prompt.
-    """
+    """Draw a sample of a reference: image [3, size, size], hole [1, size, size] (1 = hole), and index of its prompt."""
     if _uniform(0, 1, generator) < local_share:
         image, hole, prompt = source.image, source.region[None].to(torch.float32), LOCAL
     else:

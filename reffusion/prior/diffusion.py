@@ -51,21 +51,14 @@ def _token_ids(tokenizer: Any, encoder: nn.Module, prompts: list[str], device: t
 
 
 def _in_batches(prior: Prior, function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-    """Return `function` of the rows, computed in passes of at most the number of rows that the prior sets.
-
-    With a gradient, the passes are recomputed in the backward pass.
-
-    Args:
-        prior: Sets the number of rows (`rows`, or `rows_with_grad`).
-        function: Maps tensors [b, ...] to a tensor [b, ...].
-        rows: Its arguments for all samples, [B, ...] each.
-    """
+    """Return `function` of rows [B, ...], computed in passes of at most the number of rows that the prior sets."""
     max_rows = (prior.rows_with_grad if torch.is_grad_enabled() else prior.rows) or len(rows[0])
     if len(rows[0]) <= max_rows:
         return function(*rows)
     parts = zip(*(tensor.split(max_rows) for tensor in rows), strict=True)
     if not torch.is_grad_enabled():
         return torch.cat([function(*part) for part in parts])
+    # With a gradient, the passes are recomputed in the backward pass.
     return torch.cat([checkpoint(function, *part, use_reentrant=False) for part in parts])
 
 

@@ -42,12 +42,10 @@ def harmonic_extension(images: Tensor, hidden: Tensor) -> Tensor:
 
 
 def _downsample(values: Tensor) -> Tensor:
-    """Return the means of 2 x 2 pixels. An odd side is padded with zeros.
-
-    The images are 0 in holes, and the share of known pixels is downsampled likewise, so zeros do not change the mean of
-    the known pixels.
-    """
+    """Return the means of 2 x 2 pixels; an odd side is padded with zeros."""
     height, width = values.shape[-2:]
+    # Images are 0 in holes and the share of known pixels is downsampled likewise, so zeros do not change the mean of
+    # the known pixels.
     return F.avg_pool2d(F.pad(values, (0, width % 2, 0, height % 2)), 2)
 
 

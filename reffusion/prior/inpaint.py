@@ -152,16 +152,10 @@ def paint(
 
 
 def _paint_windows(painted: Tensor, mask: Tensor, size: int, sample: Callable[..., Tensor]) -> None:
-    """Repaint the masked pixels of pictures in place, window by window. A window sees the results of its neighbours.
-
-    Args:
-        painted: [B, 3, h, w], the pictures, changed in place.
-        mask: [1, 1, h, w], nonzero at the pixels to repaint.
-        size: Side of a window in pixels.
-        sample: Function of (pictures of a window, part, top, left) that returns new pictures of the window. `part` [1,
-            1, size, size] is 1 at the pixels that are used.
-    """
+    """Repaint the masked pixels of `painted` [B, 3, h, w] in place, window by window of `size` px, by `sample`."""
     remaining = mask[0, 0] > 0
+    # A window sees the results of its neighbours. `sample` gets pictures of a window, `part` [1, 1, size, size] which
+    # is 1 at the pixels that are used, top and left, and returns new pictures of the window.
     for top, left in windows_over(remaining.cpu(), size):
         window = (..., slice(top, top + size), slice(left, left + size))
         if not remaining[window].any():

@@ -158,20 +158,16 @@ def save(prior: Prior, folder: Path) -> None:
 
 
 def _with_prefix(layers: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return the text encoder's weights with the prefix "text_model." of published LoRA files in their names.
-
-    transformers 5 uses no prefix, but transformers 4 and other readers of such files need it. diffusers removes the
-    prefix if the encoder has none.
-    """
+    """Return the text encoder's weights with the prefix "text_model." of published LoRA files in their names."""
+    # transformers 5 uses no prefix, but transformers 4 and other readers of such files need it. diffusers removes the
+    # prefix if the encoder has none.
     return {key if key.startswith("text_model.") else f"text_model.{key}": value for key, value in layers.items()}
 
 
 def _sort_metadata(path: Path) -> None:
-    """Sort the metadata in the header of a safetensors file.
-
-    safetensors writes the metadata in random order. Equal weights must give equal files, else later stages would run
-    again.
-    """
+    """Sort the metadata in the header of a safetensors file."""
+    # safetensors writes the metadata in random order. Equal weights must give equal files, else later stages would run
+    # again.
     content = path.read_bytes()
     end = 8 + int.from_bytes(content[:8], "little")
     header = json.loads(content[8:end])

@@ -146,11 +146,7 @@ def load_prior(source: str | Path, device: str = "cpu", dtype: torch.dtype | str
 
 
 def _load_conditioning(folder: Path) -> tuple[bool, float]:
-    """Return `Prior.fills` and `Prior.contrast` as conditioning.json in the folder has them; without it False and 0.
-
-    Raises:
-        ValueError: The file cannot be read, names an unknown content, or its contrast is negative.
-    """
+    """Return `Prior.fills` and `Prior.contrast` as conditioning.json has them; raises ValueError if it is invalid."""
     path = folder / CONDITIONING
     if not path.exists():
         return False, 0.0
@@ -167,17 +163,7 @@ def _load_conditioning(folder: Path) -> tuple[bool, float]:
 
 
 def _load_network(kind: Any, folder: Path, part: str, **dtype: torch.dtype) -> nn.Module:
-    """Load one network of the folder with all of its weights.
-
-    Args:
-        kind: The class of diffusers or transformers.
-        folder: The model folder.
-        part: Name of the subfolder, e.g. "unet".
-        dtype: The keyword argument of `kind.from_pretrained` for the type of the weights.
-
-    Raises:
-        ValueError: Weights are missing or do not fit config.json. The message names the first problem.
-    """
+    """Load a network with all of its weights; raises ValueError if weights are missing or do not fit config.json."""
     from transformers.utils import logging as transformers_logging
 
     transformers_logging.disable_progress_bar()
@@ -186,6 +172,8 @@ def _load_network(kind: Any, folder: Path, part: str, **dtype: torch.dtype) -> n
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            # `kind` is a class of diffusers or transformers, and `dtype` its keyword argument for the type of the
+            # weights.
             network, info = kind.from_pretrained(
                 folder / part,
                 variant=local.variant(folder / part),

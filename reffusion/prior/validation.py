@@ -109,26 +109,22 @@ def measure_errors(
 
 @torch.no_grad()
 def _hole_errors(prior: Prior, held_out: HeldOut, text: Tensor, seed: int, level: float) -> Tensor:
-    """Return both errors of `denoising_error` in the hole of the reference at one noise level, [2, 2].
-
-    The rows are the error of the target and the error of the clean latent; the columns are the whole view and the crop.
-    """
+    """Return both errors of `denoising_error` in the hole of the reference at one noise level, [2, 2]."""
     samples = held_out.reference
     timesteps = torch.full((len(samples.prompts),), round(level * (prior.timesteps - 1)))
     generator = seeded(seed, "personalize", "held out", level)
     noise = torch.randn(len(samples.prompts), *latent_shape(prior, samples.images.shape[-1]), generator=generator)
+    # The rows are the error of the target and of the clean latent; the columns are the whole view and the crop.
     return torch.stack(denoising_error(prior, samples, text, timesteps, noise, outside_weight=0))
 
 
 @torch.no_grad()
 def _one_step_psnr(prior: Prior, held_out: HeldOut, text: Tensor, seed: int) -> dict[str, float]:
-    """Return the PSNR in the holes of the reference and of photographs, for one denoising step from pure noise.
-
-    One step predicts the mean of the pictures that the prior would paint.
-    """
+    """Return the PSNR in the holes of the reference and of photographs, for one denoising step from pure noise."""
     text = text[GLOBAL].expand(len(held_out.pictures), -1, -1)
     images, repaint, holes = (each.to(prior.device) for each in (held_out.pictures, held_out.repaint, held_out.holes))
     generator = seeded(seed, "personalize", "expected")
+    # One step predicts the mean of the pictures that the prior would paint.
     sampled = diffusion.sample(prior, images, repaint, text, steps=1, random=generator)
     squared_error = (((sampled - images) / 2).square().mean(1, keepdim=True) * holes).sum((1, 2, 3)) / holes.sum(
         (1, 2, 3)

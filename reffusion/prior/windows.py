@@ -44,11 +44,7 @@ def windows_around(mask: Tensor, size: int, count: int, generator: torch.Generat
 
 
 def _corners(mask: Tensor, size: int) -> Tensor:
-    """Return the corners (top, left) of the windows around all masked pixels, long [P, 2].
-
-    Raises:
-        ValueError: A window does not fit into the view, or the mask is empty.
-    """
+    """Return the corners (top, left) of windows around masked pixels, long [P, 2]; raises ValueError if none fits."""
     height, width = mask.shape
     if size > min(height, width):
         raise ValueError(f"a window of {size} px does not fit into a view of {width} x {height} px; enlarge it first")

@@ -68,12 +68,7 @@ def refine_hole_depth(
 
 
 def _align_depth(hole: Hole, reference: Reference, remaining: Gaussians, hidden: np.ndarray) -> Hole:
-    """Return the hole with the depth map of its reference, aligned to the rendered depth of the surroundings.
-
-    Raises:
-        Degenerate: too little depth is known around the hole, or the depth map is constant there.
-        ValueError: the depth map does not fit the scene.
-    """
+    """Return the hole with its reference's depth, aligned to the rendered depth around it; raises as `align_either`."""
     size = hole.camera.width, hole.camera.height
     shrunk = lambda array: cv2.resize(array, size, interpolation=cv2.INTER_NEAREST)
     depth = shrunk(reference.depth.astype(np.float64))

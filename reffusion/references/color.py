@@ -74,10 +74,7 @@ def _samples(image: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Fit y = gain * x + offset by iteratively reweighted least squares; return the gain and the offset.
-
-    The gain is 1 if x hardly varies. With fewer than `LEAST_PIXELS` values, gain and offset are 1 and 0.
-    """
+    """Fit y = gain * x + offset by iteratively reweighted least squares; return the gain and the offset."""
     if len(x) < LEAST_PIXELS:
         return 1.0, 0.0
     gain, offset = 1.0, float(np.median(y - x))
@@ -88,6 +85,7 @@ def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
         mean_x, mean_y = np.average(x, weights=weight), np.average(y, weights=weight)
         dx = x - mean_x
         variance = np.average(dx**2, weights=weight)
+        # The gain is 1 if x hardly varies.
         gain = float(np.average(dx * (y - mean_y), weights=weight) / variance) if variance > 1e-4 else 1.0
         offset = float(mean_y - gain * mean_x)
     return gain, offset

@@ -132,17 +132,14 @@ def describe_references(given: Sequence[ReferenceFile]) -> str:
 
 
 def _paintings(files: Sequence[Path], views: ViewTable) -> list[ReferenceFile]:
-    """Return the paintings among `files` with their depth maps; copies of the views' mask files are ignored.
-
-    Raises:
-        BadInput: a file is neither a painting nor a depth map of a known view, or two files are for the same view.
-    """
+    """Return the paintings among `files` with their depth maps; raises BadInput for other or duplicate files."""
     pictures, depths = {}, {}
     for path in files:
         of = {end: path.stem.removesuffix(end) for end in ("_depth", "_mask") if path.stem.endswith(end)}
         if path.stem not in views.names and of.get("_depth") in views.names:
             kind, name = depths, of["_depth"]
         elif path.stem not in views.names and (of.get("_mask") in views.names or (views.placed and "_mask" in of)):
+            # Copies of the views' mask files are ignored.
             continue
         elif path.suffix.lower() in ENDINGS:
             kind, name = pictures, path.stem

@@ -295,10 +295,8 @@ def _is_better(found: Registration, best: Registration) -> bool:
 
 
 def _compose(first: np.ndarray, then: np.ndarray) -> np.ndarray:
-    """Return [2, 3], the map that applies `then` and after it `first`.
-
-    `then` leads from the photograph to the resampled picture, `first` from the resampled to the original picture.
-    """
+    """Return [2, 3], the map that applies `then` and after it `first`."""
+    # `then` leads from the photograph to the resampled picture, `first` from the resampled to the original picture.
     linear = first[:, :2] @ then[:, :2]
     return np.concatenate([linear, (first[:, :2] @ then[:, 2] + first[:, 2])[:, None]], 1)
 
@@ -311,10 +309,7 @@ def _shift(moved: np.ndarray, shape: tuple[int, ...]) -> float:
 
 
 def _by_features(picture: np.ndarray, photo: np.ndarray, known: np.ndarray) -> np.ndarray | None:
-    """Estimate the affine map from matched SIFT features; None if there are too few matches.
-
-    Features of the photograph are taken from its `known` pixels only.
-    """
+    """Estimate the affine map from SIFT features, matched at `known` photograph pixels; None for too few matches."""
     finder = cv2.SIFT_create(1000)
     grey = lambda image: cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     in_photo, of_photo = finder.detectAndCompute(grey(photo), known.astype(np.uint8))

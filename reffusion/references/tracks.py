@@ -117,13 +117,11 @@ def track(photo: np.ndarray, picture: np.ndarray, points: np.ndarray) -> Tracks:
 
 
 def _least_gradient(grey: np.ndarray) -> np.ndarray:
-    """Return [H, W], the gradient around each pixel along the direction in which it is least, in levels of 255 per px.
-
-    It is the root mean square of the directional derivative in a window.
-    """
+    """Return [H, W], the gradient along the direction in which it is least, in levels of 255 per px."""
     side = _odd(WINDOW * max(grey.shape) / 2)
     across, down = (cv2.Sobel(grey, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1)))
     xx, xy, yy = (cv2.blur(each, (side, side)) for each in (across * across, across * down, down * down))
+    # The gradient is the root mean square of the directional derivative in a window around each pixel.
     least = (xx + yy - np.sqrt((xx - yy) ** 2 + 4 * xy**2)) / 2
     return np.sqrt(np.maximum(least, 0))
 

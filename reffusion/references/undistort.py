@@ -46,11 +46,8 @@ def undistort_reference(
 def _resample(
     image: np.ndarray, given: ReferenceFile, lens: Lens, affine: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a picture or its alpha, uint8 [h, w, ...], undistorted and aligned, and bool [H, W], where it has pixels.
-
-    Args:
-        given, lens, affine: as of `undistort_reference`.
-    """
+    """Return a picture or its alpha, uint8, undistorted and aligned, and bool [H, W], where it has pixels."""
+    # The arguments are those of `undistort_reference`.
     size = lens.width, lens.height
     pinhole, where = undistortion_map(lens)
     if affine is None:
@@ -99,15 +96,10 @@ def undistort_reference_depth(given: ReferenceFile, lens: Lens, affine: np.ndarr
 
 
 def _sampling_points(shape: tuple[int, ...], lens: Lens, pinhole: Lens, affine: np.ndarray) -> np.ndarray:
-    """Return [H, W, 2], for each pixel of the view the position (x, y) in the file that shows the same point.
-
-    Args:
-        shape: height and width of the file.
-        lens: the lens of the file's picture: the photograph's, or `pinhole` for an undistorted picture.
-        pinhole: the lens of the view without distortion.
-        affine: [2, 3], applied to the view's pixels first.
-    """
+    """Return [H, W, 2], for each pixel of the view the position (x, y) in the file that shows the same point."""
     columns, rows = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
+    # `affine` is applied to the view's pixels first. `lens` is that of the file's picture, and `pinhole` that of the
+    # view without distortion, which is also the lens of an undistorted picture.
     points = np.stack([columns, rows], -1) @ affine[:, :2].T + affine[:, 2]
     directions = (points - (pinhole.cx, pinhole.cy)) / (pinhole.fx, pinhole.fy)
     return to_pixels(directions, lens) * (shape[1] / lens.width, shape[0] / lens.height)

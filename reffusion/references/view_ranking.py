@@ -126,14 +126,7 @@ def _touches_border(hole: Hole) -> bool:
 
 
 def _coverage(view_holes: Mapping[str, Hole]) -> tuple[dict[str, np.ndarray], int]:
-    """Find which pixels to be invented, of all views together, each single view covers.
-
-    A view covers a pixel of another view if its own hole shows the same surface point.
-
-    Returns:
-        View name -> bool [P], True for the pixels that the view covers; and P, the number of pixels to be invented in
-        all views together, at the reduced size.
-    """
+    """Return which of the P pixels to be invented in all views each view covers, name -> bool [P], and P."""
     points = [
         geometry.unproject(hole.depth, hole.camera)[hole.pixels & (hole.depth > 0)] for hole in view_holes.values()
     ]
@@ -141,6 +134,7 @@ def _coverage(view_holes: Mapping[str, Hole]) -> tuple[dict[str, np.ndarray], in
     covers = {}
     for name, hole in view_holes.items():
         uv, z = geometry.project(everything, hole.camera)
+        # A view covers a pixel of another view if its own hole, at the reduced size, shows the same surface point.
         inside, framed = geometry.sample_nearest(hole.pixels, uv)
         depth, _ = geometry.sample_nearest(hole.depth, uv)
         covers[name] = framed & inside & (depth > 0) & (np.abs(z - depth) < SAME_SURFACE * depth)

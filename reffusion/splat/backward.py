@@ -122,33 +122,26 @@ def _blend_backward(
 
 @kernel
 def _load_tile(left, top, state, stride, images, gradients):
-    """Fill the state of a tile with the transmittance before the first footprint, upstream gradients and remainder.
-
-    Upstream gradients are derivatives of the loss with respect to the blended sums of colour, depth and features. The
-    rendered depth is D / alpha, where D is the blended sum. So the derivative with respect to D is grad_depth / alpha,
-    and -depth * grad_depth / alpha is added to grad_alpha. The remainder is the numerator sum_{j>k} w_j a_j + B of
-    docs/method.md#splatting before the first footprint: the dot product of the upstream gradients with the rendered
-    pixel, minus the final transmittance times the derivative with respect to alpha.
-
-    Args:
-        left, top: upper left pixel of the tile.
-        state: output; pixels of the tile that lie outside the image are marked as finished.
-        stride: floats per step in `state`.
-        images: color, depth, alpha, features and transmittance.
-        gradients: derivatives of the loss with respect to color, depth, alpha and features.
-    """
+    """Fill a tile's state with the transmittance before the first footprint, upstream gradients and remainder."""
     color, depth, alpha, blended, transmittance = images
     grad_color, grad_depth, grad_alpha, grad_blended = gradients
     height, width = depth.shape
     state[:] = np.float32(0.0)
+    # `stride` is the number of floats per step. Pixels of the tile that lie outside the image are marked as finished.
     init_transmittance(state, stride, height - top, width - left)
     for row in range(min(TILE_HEIGHT, height - top)):
         y = top + row
         for lane in range(min(TILE_WIDTH, width - left)):
             x, place = left + lane, row // STEP_ROWS * stride + row % STEP_ROWS * TILE_WIDTH + lane
             behind = transmittance[y, x]
+            # Upstream gradients are derivatives of the loss with respect to the blended sums of colour, depth and
+            # features. The rendered depth is D / alpha, where D is the blended sum. So the derivative with respect to D
+            # is grad_depth / alpha, and -depth * grad_depth / alpha is added to grad_alpha.
             g_depth = grad_depth[y, x] / alpha[y, x] if alpha[y, x] > 0 else np.float32(0.0)
             g_alpha = grad_alpha[y, x] - g_depth * depth[y, x]
+            # The remainder is the numerator sum_{j>k} w_j a_j + B of docs/method.md#splatting before the first
+            # footprint: the dot product of the upstream gradients with the rendered pixel, minus the final
+            # transmittance times the derivative with respect to alpha.
             remainder = grad_depth[y, x] * depth[y, x] - behind * g_alpha
             for c in range(3):
                 state[place + (2 + c) * LANES] = grad_color[y, x, c]
@@ -162,15 +155,9 @@ def _load_tile(left, top, state, stride, images, gradients):
 
 @kernel
 def _tile_backward(left, top, start, stop, footprints, features, bins, state, sums, constants, records, written):
-    """Write the records of the entries `start` to `stop` - 1, the processed part of one tile's list.
-
-    Args:
-        state: from `_load_tile`; it is updated from footprint to footprint.
-        sums: memory for C vectors.
-        constants: from `forward.load_constants`.
-        records: [I * columns], output.
-        written: [I], output.
-    """
+    """Write `records` [I * columns] and `written` [I] of the processed entries `start` to `stop` - 1 of a tile."""
+    # `state` comes from `_load_tile` and is updated from footprint to footprint, `constants` comes from
+    # `forward.load_constants`, and `sums` is memory for C vectors.
     columns = records.shape[0] // max(1, written.shape[0])
     stride = _UPSTREAM * LANES
     if features is not None:
@@ -196,18 +183,9 @@ def _tile_backward(left, top, start, stop, footprints, features, bins, state, su
 
 @inlined
 def _rows_backward(member, rows, left, top, footprints, features, state, stride, sums, constants):
-    """Compute the gradients of one footprint in the rows of a tile that it can touch.
-
-    Args:
-        member: index of the Gaussian.
-        rows: first + 256 * (one past the last) of these rows.
-        sums: output, gradients of the features, summed per lane.
-
-    Returns:
-        Whether the footprint reaches any unfinished pixel, and a tuple of vectors: the first ten columns of its record,
-        summed per lane.
-    """
+    """Return whether a footprint reaches unfinished pixels, and the first 10 columns of its record, summed per lane."""
     zero = splat(0.0)
+    # `rows` is first + 256 * (one past the last) of the rows of the tile that the footprint can touch.
     base, first_row, end_row = member * FOOTPRINT, rows & 255, rows >> 8
     middle = np.float32((first_row + end_row) // 2)
     # `footprint` decides which pixels blend, with the same bits as in the forward pass. Moments are computed from
@@ -238,6 +216,7 @@ def _rows_backward(member, rows, left, top, footprints, features, state, stride,
             for c in range(features.shape[1]):
                 up = load(state, place + (_UPSTREAM + c) * LANES)
                 shade = fma(splat(features[member, c]), up, shade)
+                # The gradients of the features, summed per lane.
                 store(sums, c * LANES, fma(weight, up, load(sums, c * LANES)))
         behind = fnma(weight, shade, load(state, place + LANES))
         store(state, place + LANES, behind)
@@ -253,11 +232,9 @@ def _rows_backward(member, rows, left, top, footprints, features, state, stride,
 
 @inlined
 def _moments(footprint, g_0, g_1, g_2):
-    """Convert the sums of g, g j and g j^2 per lane to the sums of g, g u, g v, g u^2, g u v and g v^2.
-
-    In a column of pixels u and v are affine functions of the row j, with the coefficients in `footprint` (see
-    `footprint_in_tile`).
-    """
+    """Convert the sums of g, g j and g j^2 per lane to the sums of g, g u, g v, g u^2, g u v and g v^2."""
+    # In a column of pixels u and v are affine functions of the row j, with the coefficients in `footprint` (see
+    # `footprint_in_tile`).
     u_middle, lean, v_middle, whiten_y, _ = footprint
     g_u, g_uj = fnma(lean, g_1, u_middle * g_0), fnma(lean, g_2, u_middle * g_1)
     g_v, g_vj = fma(whiten_y, g_1, v_middle * g_0), fma(whiten_y, g_2, v_middle * g_1)

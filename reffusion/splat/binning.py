@@ -152,14 +152,7 @@ def _mean(footprints, base):
 
 @inlined
 def _column_rows(footprints, base, column, width, height, tops, bottoms):
-    """Compute the pixel rows that a footprint's ellipse can touch, in each of LANES columns of tiles.
-
-    Args:
-        base: index of the footprint's first number.
-        column: the first of these columns of tiles.
-        width, height: size of the image in pixels.
-        tops, bottoms: [LANES] int32, output, the first and one past the last row of the image; both 0 for none.
-    """
+    """Write the first and one past the last pixel row that an ellipse can touch in each of LANES columns of tiles."""
     mean_x, mean_y = _mean(footprints, base)
     half_width = footprints[base + HALF_WIDTH]
     half_height = footprints[base + HALF_HEIGHT]
@@ -175,6 +168,7 @@ def _column_rows(footprints, base, column, width, height, tops, bottoms):
     margin = _F(1e-3) + _F(1e-5) * half_height
     begin = ceiling(minimum(maximum(low + (mean_y - margin - _F(0.5)), _F(0.0)), _F(height)))
     end = ceiling(minimum(maximum(high + (mean_y + margin - _F(0.5)), _F(0.0)), _F(height)))
+    # `tops` and `bottoms`, int32 [LANES], are rows of the image; both are 0 where the ellipse touches none.
     touched = first <= last
     store_whole(tops, 0, select(touched, begin, _F(0.0)))
     store_whole(bottoms, 0, select(touched, end, _F(0.0)))
@@ -182,12 +176,7 @@ def _column_rows(footprints, base, column, width, height, tops, bottoms):
 
 @inlined
 def _columns(mean_x, half_width, tiles_x):
-    """Return the first and one past the last column of tiles that an ellipse can touch; (0, 0) if none.
-
-    Args:
-        mean_x, half_width: centre and half width of the ellipse in pixels.
-        tiles_x: number of columns of tiles.
-    """
+    """Return the first and one past the last column of tiles that an ellipse, in pixels, can touch; (0, 0) if none."""
     first = max(mean_x - half_width - _F(0.5), _F(0.0))
     last = min(mean_x + half_width, _F(tiles_x * TILE_WIDTH - 1))
     if not first <= last:
@@ -197,18 +186,9 @@ def _columns(mean_x, half_width, tiles_x):
 
 @kernel
 def _find_pairs(tickets, footprints, order, width, height, counts_by_chunk, first_slots, pairs, needed):
-    """Find the pairs of a footprint and a tile that it touches, and count them by tile and by Gaussian.
-
-    A ticket is one of CHUNKS parts of `order`.
-
-    Args:
-        order: [M] int32, indices of the visible Gaussians, front to back.
-        counts_by_chunk: [CHUNKS, tiles] zeros, output, number of each tile's pairs.
-        first_slots: [N + 1] zeros, output, number of pairs of Gaussian n at n + 1.
-        pairs: [CHUNKS, capacity, 2] int32, output up to the capacity: for each pair the tile, and first + 256 * (one
-            past the last) row of the tile that the footprint can touch.
-        needed: [CHUNKS], output, the number of pairs, which may exceed the capacity.
-    """
+    """Find the pairs of a footprint and a tile that it touches, and count them by tile and by Gaussian."""
+    # `counts_by_chunk` [CHUNKS, tiles] and `first_slots` [N + 1] are zeros at first. A ticket is one of CHUNKS parts of
+    # `order` [M], the visible Gaussians front to back.
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
     tops, bottoms = np.empty(LANES, np.int32), np.empty(LANES, np.int32)
     while True:
@@ -231,27 +211,25 @@ def _find_pairs(tickets, footprints, order, width, height, counts_by_chunk, firs
                         tile, tile_top = tile_row * tiles_x + start + k, tile_row * TILE_HEIGHT
                         if position < chunk_pairs.shape[0]:
                             counts[tile] += 1
+                            # A pair is the tile, and first + 256 * (one past the last) of the rows of the tile that the
+                            # footprint can touch.
                             chunk_pairs[position, 0] = tile
                             chunk_pairs[position, 1] = max(top - tile_top, 0) + 256 * min(
                                 bottom - tile_top, TILE_HEIGHT
                             )
                         position += 1
-            first_slots[order[m] + 1] = position - begin
+            first_slots[order[m] + 1] = position - begin  # the number of pairs of Gaussian n is at n + 1
+        # The number of pairs may exceed the capacity.
         needed[ticket] = position
 
 
 @kernel
 def _cumulate_counts(first_slots, counts):
-    """Turn numbers of pairs into start indices in place, by running sums, and return the number of all pairs.
-
-    Args:
-        first_slots: [N + 1], by Gaussian.
-        counts: [CHUNKS, tiles]. The order of the sum is that of the lists: tile by tile, and within a tile chunk by
-            chunk.
-    """
+    """Turn numbers of pairs into start indices in place, by running sums, and return the number of all pairs."""
     for m in range(first_slots.shape[0] - 1):
         first_slots[m + 1] += first_slots[m]
     total = 0
+    # The order of the sum is that of the lists: tile by tile, and within a tile chunk by chunk.
     for tile in range(counts.shape[1]):
         for chunk in range(counts.shape[0]):
             count = counts[chunk, tile]
@@ -262,14 +240,7 @@ def _cumulate_counts(first_slots, counts):
 
 @kernel
 def _fill_lists(tickets, order, all_offsets, first_slots, pairs, entries):
-    """Write the pairs into the tile lists.
-
-    Args:
-        order, pairs: as for `_find_pairs`.
-        all_offsets: [CHUNKS, tiles], index of the next entry of each chunk in each tile's list; advanced in place.
-        first_slots: [N + 1], index of each Gaussian's first record.
-        entries: [I, ENTRY] int32, output.
-    """
+    """Write the pairs that `_find_pairs` found into the tile lists `entries`, int32 [I, ENTRY]."""
     while True:
         ticket = take_ticket(tickets)
         if ticket >= CHUNKS:
@@ -279,8 +250,10 @@ def _fill_lists(tickets, order, all_offsets, first_slots, pairs, entries):
         for m in range(ticket * len(order) // CHUNKS, stop):
             prefetch(first_slots, order[min(m + AHEAD, stop - 1)])
             member = order[m]
+            # The slots of a Gaussian are the indices of its records.
             for slot in range(first_slots[member], first_slots[member + 1]):
                 tile = chunk_pairs[position, 0]
+                # `offsets` holds the index of the chunk's next entry in each tile's list.
                 target = offsets[tile]
                 offsets[tile] = target + 1
                 entries[target, MEMBER] = member

@@ -149,23 +149,9 @@ class _Splat(torch.autograd.Function):
 def _to_parameters(
     view, records, written, parameters, channels, numbers, center, degree, want_probe
 ) -> list[np.ndarray]:
-    """Compute the gradients of parameters, features and probe from the gradient records.
-
-    Args:
-        view: the `ProjectedView` of the forward pass.
-        records, written: from `backward.blend_backward`.
-        parameters: float32 arrays in the order of `types.PARAMETERS`.
-        channels: number of features.
-        numbers: from `projection.view_numbers`.
-        center: [3] float64, the camera centre.
-        degree: degree of the spherical harmonics used.
-        want_probe: False leaves the gradient of the probe empty.
-
-    Returns:
-        Gradients of the parameters, in the order of `types.PARAMETERS`, of the features [N, channels] and of the probe
-        [N, 2].
-    """
+    """Return the gradients of the parameters, the features [N, channels] and the probe [N, 2], from `records`."""
     count, rows = len(parameters[0]), footprints.padded(len(parameters[0]))
+    # The order is that of `types.PARAMETERS`. Without `want_probe` the gradient of the probe is empty.
     shapes = [(rows, *array.shape[1:]) for array in parameters] + [(rows, channels), (rows if want_probe else 0, 2)]
     out = [empty_aligned(*shape) for shape in shapes]
     flat = [array.reshape(-1) for array in out]

@@ -163,17 +163,11 @@ def project_gaussians(tickets, parameters, probe, view, center, footprints, radi
 
 @inlined
 def _fill_footprint(columns, anchor, ellipse_numbers, z, colors):
-    """Write the columns of LANES footprints (see `layout`) into `columns` [FOOTPRINT, LANES] flat.
-
-    Args:
-        anchor: x and y of the anchors, and u and v there (`projection.anchor`).
-        ellipse_numbers: slant, whitening factors along x and y, and level.
-        z: camera z.
-        colors: red, green, blue.
-    """
+    """Write the columns of LANES footprints (see `layout`) into `columns` [FOOTPRINT, LANES] flat."""
     slant, whiten_x, whiten_y, level = ellipse_numbers
     shape = narrow(slant), narrow(whiten_x), narrow(whiten_y), narrow(level)
     half_width, half_height, tilt, column_height = ellipse(shape[0], shape[1], shape[2], shape[3])
+    # `anchor` is x and y of the anchors, and u and v there (`projection.anchor`).
     store(columns, ANCHOR_X * LANES, narrow(anchor[0]))
     store(columns, ANCHOR_Y * LANES, narrow(anchor[1]))
     store(columns, ANCHOR_U * LANES, narrow(anchor[2]))
@@ -194,10 +188,8 @@ def _fill_footprint(columns, anchor, ellipse_numbers, z, colors):
 
 @kernel
 def _read_rows(array, width, row, last, columns):
-    """Copy LANES rows of an array [R, width] (flat), from `row` on, into `columns` [width, LANES] (flat), transposed.
-
-    `last` is the last row of the array; rows after it are replaced by it.
-    """
+    """Copy LANES rows of a flat array [R, width], from `row` on, transposed into flat `columns` [width, LANES]."""
+    # Rows after the row `last` are replaced by it.
     if width < LANES:
         for column in range(width):
             store(columns, column * LANES, load_column(array, width, column, row, last))
@@ -350,11 +342,7 @@ def _clear_rows(row, width, gradients):
 
 @inlined
 def _colors_backward(degree, mean, center, is_visible, footprints, row, workspace):
-    """Compute the gradients of the harmonics' coefficients and of the means from the gradients of the colours.
-
-    The gradients of the coefficients replace them in `workspace.coefficients`. The gradient of the means, through the
-    viewing directions, is returned as three vectors.
-    """
+    """Compute the gradients of the harmonics' coefficients and of the means from the gradients of the colours."""
     x, y, z, inverse = harmonics.direction(mean, center)
     zero, used = splat(0.0), 3 * (degree + 1) * (degree + 1)
     x, y, z = select(is_visible, x, zero), select(is_visible, y, zero), select(is_visible, z, zero)
@@ -362,8 +350,10 @@ def _colors_backward(degree, mean, center, is_visible, footprints, row, workspac
     red = _color_gradient(workspace.moments, GRAD_RED, footprints, RED, is_visible, row)
     green = _color_gradient(workspace.moments, GRAD_GREEN, footprints, GREEN, is_visible, row)
     blue = _color_gradient(workspace.moments, GRAD_BLUE, footprints, BLUE, is_visible, row)
+    # The gradients of the coefficients replace the coefficients in `workspace`.
     harmonics.colors_backward(degree, workspace.basis, workspace.coefficients, red, green, blue, workspace.along)
     workspace.coefficients[used * LANES :] = np.float32(0.0)
+    # Return the gradient of the means, through the viewing directions, as three vectors.
     return harmonics.direction_backward(degree, x, y, z, inverse, workspace.along)
 
 
@@ -390,10 +380,7 @@ def _store_zeros(array, width, row):
 
 @inlined
 def _color_gradient(moments, column, footprints, color, is_visible, row):
-    """Return the gradient of a colour channel; 0 where the colour is clamped at 0 and for invisible Gaussians.
-
-    Args:
-        column, color: columns of the gradient and of the colour, in a record and in a footprint.
-    """
+    """Return the gradient of a colour channel; 0 where the colour is clamped at 0 and for invisible Gaussians."""
+    # `color` is a column of a footprint, and `column` one of a record.
     free = is_visible & (load_column(footprints, FOOTPRINT, color, row, row + LANES - 1) > 0.0)
     return select(free, load(moments, column * LANES), splat(0.0))

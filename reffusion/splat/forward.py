@@ -256,12 +256,8 @@ def _blend(tickets, footprints, features, background, bins, color, depth, alpha,
 
 @kernel
 def _blend_tile(tile, footprints, features, bins, size, state, constants):
-    """Blend the list of one tile into `state`, and return the number of processed entries of the list.
-
-    Args:
-        size: height and width of the image in pixels.
-        state: output, see the module and `_SUMS`.
-    """
+    """Blend the list of one tile into `state`, and return the number of processed entries of the list."""
+    # `size` is (height, width) of the image in pixels; for the layout of `state` see the module and `_SUMS`.
     stride = _SUMS * LANES
     if features is not None:
         stride += features.shape[1] * LANES

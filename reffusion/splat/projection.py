@@ -88,15 +88,13 @@ def camera_point(view, mean):
 
 @inlined
 def _unit_quaternion(quaternions, row, last):
-    """Load LANES quaternions, and return w, x, y and z of the unit quaternions, and 1 / length.
-
-    A zero quaternion becomes the identity, with 0 for 1 / length, so that its gradient is 0.
-    """
+    """Load LANES quaternions, and return w, x, y and z of the unit quaternions, and 1 / length."""
     w = widen(load_column(quaternions, 4, 0, row, last))
     x = widen(load_column(quaternions, 4, 1, row, last))
     y = widen(load_column(quaternions, 4, 2, row, last))
     z = widen(load_column(quaternions, 4, 3, row, last))
     square = w * w + x * x + y * y + z * z
+    # A zero quaternion becomes the identity, with 0 for 1 / length, so that its gradient is 0.
     is_nonzero = square > 0.0
     inverse = 1.0 / root(select(is_nonzero, square, 1.0))
     inverse = select(is_nonzero, inverse, select(square <= 0.0, 0.0, square))  # NaN stays NaN
@@ -117,12 +115,7 @@ def _rotation(w, x, y, z):
 
 @inlined
 def _projector(view, x, y, z_inverse):
-    """Return the two rows of the projector, Jacobian x camera rotation, with x/z and y/z clamped.
-
-    Args:
-        x, y: camera coordinates of the means.
-        z_inverse: 1 / camera z.
-    """
+    """Return the two rows of the projector, Jacobian x camera rotation, with x/z and y/z clamped."""
     slope_x = maximum(minimum(x * z_inverse, view[17]), view[16])
     slope_y = maximum(minimum(y * z_inverse, view[19]), view[18])
     fx, fy = view[12] * z_inverse, view[13] * z_inverse
@@ -159,15 +152,10 @@ def _cross(a, b):
 
 @inlined
 def _covariance(a, b, low):
-    """Return xx, xy, yy and the determinant of A A^T, and the determinant of A A^T + low-pass.
-
-    By Cauchy-Binet the determinant is the sum of the squared 2x2 minors of A, without the cancellation of xx yy - xy^2.
-
-    Args:
-        a, b: rows of the root A.
-        low: the low-pass, which is added to xx and yy in the second determinant.
-    """
+    """Return xx, xy, yy and the determinant of A A^T, and the determinant of A A^T + low-pass; A has the rows a, b."""
     xx, xy, yy = _dot(a, a), _dot(a, b), _dot(b, b)
+    # By Cauchy-Binet the determinant is the sum of the squared 2x2 minors of A, without the cancellation of
+    # xx yy - xy^2.
     m0, m1, m2 = _cross(a, b)
     sharp = m0 * m0 + m1 * m1 + m2 * m2
     return xx, xy, yy, sharp, sharp + low * (xx + yy) + low * low
@@ -175,15 +163,8 @@ def _covariance(a, b, low):
 
 @inlined
 def _frame(view, x, y, z_inverse, quaternions, log_scales, row, last):
-    """Compute the quantities that the forward and the backward pass share.
-
-    Args:
-        x, y, z_inverse: camera coordinates x and y of the means, and 1 / camera z.
-        quaternions, log_scales, row, last: as for `project`.
-
-    Returns:
-        Unit quaternion with 1 / length, rotation R, projector, standard deviations, and the two rows of the root A.
-    """
+    """Return the unit quaternion with 1 / length, rotation R, projector, standard deviations, and rows of root A."""
+    # The forward and the backward pass share these quantities.
     quaternion = _unit_quaternion(quaternions, row, last)
     rotation = _rotation(quaternion[0], quaternion[1], quaternion[2], quaternion[3])
     projector = _projector(view, x, y, z_inverse)
@@ -307,14 +288,9 @@ def _column(moments, column):
 
 @inlined
 def _root_backward(a, b, slant, lx, ly, moments):
-    """Return the gradient of the root A through the 2D covariance, as two rows: dLoss/dA = L M L^T A.
-
-    L is the factor L L^T of the inverse 2D covariance, and M the matrix of second moments of (u, v) in `moments`.
-
-    Args:
-        a, b: rows of A.
-        slant, lx, ly: the entries of L: u = lx (dx - slant dy) and v = ly dy, without the scale of `layout`.
-    """
+    """Return the gradient of the root A through the 2D covariance, as two rows: dLoss/dA = L M L^T A."""
+    # L is the factor of the inverse 2D covariance L L^T. Its entries give u = lx (dx - slant dy) and v = ly dy, without
+    # the scale of `layout`. M is the matrix of second moments of (u, v) in `moments`.
     uu = _UNSCALE * _UNSCALE * _column(moments, SUM_UU)
     uv = _UNSCALE * _UNSCALE * _column(moments, SUM_UV)
     vv = _UNSCALE * _UNSCALE * _column(moments, SUM_VV)
@@ -329,22 +305,11 @@ def _root_backward(a, b, slant, lx, ly, moments):
 
 @inlined
 def _compensation_backward(a, b, sharp, determinant, low, grad, grad_a, grad_b):
-    """Add the gradient of the root through the antialiased opacity, which contains sqrt(sharp / determinant).
-
-    It is `grad` times the gradient of ln sqrt(sharp / determinant), that is, half the difference of the gradients of
-    the two logarithms. The gradient of the minors is a cross product, again without cancellation. If sharp is 0,
-    nothing is rendered, and grad is 0.
-
-    Args:
-        a, b: rows of the root.
-        sharp, determinant: determinants of the 2D covariance without and with low-pass.
-        low: the low-pass.
-        grad: dLoss/d(ln opacity); 0 if the Gaussians are not antialiased.
-        grad_a, grad_b: gradients of the rows so far.
-
-    Returns:
-        The gradients of the two rows.
-    """
+    """Add the gradient of the root through the antialiased opacity, which contains sqrt(sharp / determinant)."""
+    # The added gradient is `grad`, dLoss/d(ln opacity), times the gradient of ln sqrt(sharp / determinant), that is,
+    # half the difference of the gradients of the two logarithms. The gradient of the minors is a cross product, again
+    # without cancellation. If sharp is 0, nothing is rendered, and `grad` is 0. It is also 0 if the Gaussians are not
+    # antialiased.
     m = _cross(a, b)
     sharpness = grad * (1.0 / maximum(sharp, 1e-300) - 1.0 / determinant)
     width = grad * (low / determinant)
@@ -364,16 +329,8 @@ def _moved_row(grad, by, sharpness, row, width):
 
 @inlined
 def _quaternion_backward(quaternion, p, ga, gb):
-    """Return the gradient of the quaternion (w, x, y, z) through the rotation matrix.
-
-    The gradient of the unit quaternion is projected to the tangent of the unit sphere, and divided by the length of the
-    quaternion. A zero quaternion gets a zero gradient.
-
-    Args:
-        quaternion: from `_unit_quaternion`.
-        p: rows of the projector.
-        ga, gb: rows of dLoss/d(root) diag(scales).
-    """
+    """Return the gradient of the quaternion (w, x, y, z) through the rotation matrix."""
+    # `p` has the rows of the projector, and `ga` and `gb` are the rows of dLoss/d(root) diag(scales).
     w, x, y, z, inverse = quaternion
     p0, p1 = p
     g00, g01, g02 = p0[0] * ga[0] + p1[0] * gb[0], p0[0] * ga[1] + p1[0] * gb[1], p0[0] * ga[2] + p1[0] * gb[2]
@@ -383,6 +340,8 @@ def _quaternion_backward(quaternion, p, ga, gb):
     gx = 2.0 * (w * (g21 - g12) + y * (g01 + g10) + z * (g02 + g20)) - 4.0 * x * (g11 + g22)
     gy = 2.0 * (w * (g02 - g20) + x * (g01 + g10) + z * (g12 + g21)) - 4.0 * y * (g00 + g22)
     gz = 2.0 * (w * (g10 - g01) + x * (g02 + g20) + y * (g12 + g21)) - 4.0 * z * (g00 + g11)
+    # Project the gradient of the unit quaternion to the tangent of the unit sphere, and divide it by the length of the
+    # quaternion. A zero quaternion gets a zero gradient.
     radial = gw * w + gx * x + gy * y + gz * z
     return (
         (gw - radial * w) * inverse,
@@ -394,24 +353,19 @@ def _quaternion_backward(quaternion, p, ga, gb):
 
 @inlined
 def _projector_backward(view, x, y, z_inverse, r, p, ga, gb):
-    """Return the gradient of the camera coordinates x, y and z of the means through the projector.
-
-    The projector has the rows fx/z (W0 - slope_x W2) and fy/z (W1 - slope_y W2), with the rows W0, W1 and W2 of the
-    camera's rotation and the slopes x/z and y/z. A clamped slope has no gradient. The returned gradient of z leaves out
-    that the slopes depend on z; the caller adds this part, which has the same form for the 2D mean.
-
-    Args:
-        r: the Gaussians' rotation R.
-        p: rows of the projector.
-        ga, gb: rows of dLoss/d(root) diag(scales).
-    """
+    """Return the gradient of the camera coordinates x, y and z of the means through the projector."""
+    # The projector has the rows fx/z (W0 - slope_x W2) and fy/z (W1 - slope_y W2), with the rows W0, W1 and W2 of the
+    # camera's rotation and the slopes x/z and y/z. `ga` and `gb` are the rows of dLoss/d(root) diag(scales).
     gp0 = _dot(ga, r[0]), _dot(ga, r[1]), _dot(ga, r[2])
     gp1 = _dot(gb, r[0]), _dot(gb, r[1]), _dot(gb, r[2])
     slope_x, slope_y = x * z_inverse, y * z_inverse
     grad_slope_x = -view[12] * z_inverse * (gp0[0] * view[6] + gp0[1] * view[7] + gp0[2] * view[8])
     grad_slope_y = -view[13] * z_inverse * (gp1[0] * view[6] + gp1[1] * view[7] + gp1[2] * view[8])
+    # A clamped slope has no gradient.
     free_x = (slope_x >= view[16]) & (slope_x <= view[17])
     free_y = (slope_y >= view[18]) & (slope_y <= view[19])
     grad_x = select(free_x, grad_slope_x * z_inverse, 0.0)
     grad_y = select(free_y, grad_slope_y * z_inverse, 0.0)
+    # The gradient of z leaves out that the slopes depend on z; the caller adds this part, which has the same form for
+    # the 2D mean.
     return grad_x, grad_y, 0.0 - z_inverse * (_dot(gp0, p[0]) + _dot(gp1, p[1]))

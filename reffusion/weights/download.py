@@ -96,30 +96,15 @@ def select_files(names: Sequence[str], half: bool) -> list[str]:
 
 
 def _write_main_ref(folder: Path) -> None:
-    """Write refs/main of a model in the hub's cache, which names the revision to load by default.
-
-    The library does not write this file when it downloads an exact revision.
-
-    Args:
-        folder: the snapshot of the revision in the cache.
-    """
+    """Write refs/main, the revision to load by default, for the snapshot `folder` of a model in the hub's cache."""
+    # The library does not write this file when it downloads an exact revision.
     refs = folder.parent.parent / "refs"
     refs.mkdir(exist_ok=True)
     (refs / "main").write_text(folder.name)
 
 
 def _download_file(url: str, target: Path, sha256: str, size: int, name: str) -> None:
-    """Download a file to `target` unless it exists, and continue a partial download in `target`.part.
-
-    Args:
-        sha256: expected hash of the content.
-        size: expected size, bytes.
-        name: name of the file, for messages.
-
-    Raises:
-        ValueError: the content has another hash; the partial file is removed.
-        OSError: the server does not respond, or the connection breaks.
-    """
+    """Download a file to `target` unless it exists, continuing `target`.part; raises ValueError if the hash differs."""
     from huggingface_hub.utils import build_hf_headers
     from tqdm import tqdm
 
@@ -132,6 +117,7 @@ def _download_file(url: str, target: Path, sha256: str, size: int, name: str) ->
         request = urllib.request.Request(url, headers={"Range": f"bytes={done}-"} if done else {})
         for header, value in build_hf_headers().items():
             request.add_unredirected_header(header, value)  # a token is for the hub, not for servers it redirects to
+        # This raises OSError if the server does not respond, or if the connection breaks.
         with urllib.request.urlopen(request, timeout=60) as response:
             done = done if response.status == 206 else 0  # status 200: the server sends the whole file again
             progress = tqdm(total=size, initial=done, unit="B", unit_scale=True, desc=name)

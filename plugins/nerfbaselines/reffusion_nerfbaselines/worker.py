@@ -67,8 +67,7 @@ def _bounds(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 
 def _undistorted(scene: Path, out: Path) -> Path:
-    """What `poses` makes of a scene at the size of its pictures, its cameras as given; once for each scene. Its masks
-    lie beside, in raw_masks/."""
+    """Run `poses` (size and cameras as given) and `raw_masks`, in a folder beside, once for a scene; return `out`."""
     if not (out / "made").is_file():
         sys.path.insert(0, str(root()))
         raw_masks = out.with_name("raw_masks")

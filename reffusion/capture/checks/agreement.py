@@ -173,15 +173,12 @@ class _Pair:
 
 
 def _match_views(views: Mapping[str, _View]) -> Iterator[_Pair]:
-    """Yield pairs of views with the matches that one fundamental matrix explains.
-
-    First comes, for each view, a pair with a middling number of matches: the most similar photographs hardly differ in
-    place, and the least similar ones share little. Pairs of which the fundamental matrix explains few matches, or a
-    small share of them, are left out: repeated patterns look so.
-    """
+    """Yield pairs of views with the matches that one fundamental matrix explains, if it explains enough of them."""
     pairs = list(itertools.combinations(views, 2))
     matches = {pair: _mutual_matches(*(views[name].descriptors for name in pair)) for pair in pairs}
     likely = [pair for pair in pairs if len(matches[pair][0]) >= LEAST_MATCHES]
+    # First comes, for each view, a pair with a middling number of matches: the most similar photographs hardly differ
+    # in place, and the least similar ones share little.
     by_view = []
     for name in views:
         own = sorted((pair for pair in likely if name in pair), key=lambda pair: -len(matches[pair][0]))
@@ -190,6 +187,7 @@ def _match_views(views: Mapping[str, _View]) -> Iterator[_Pair]:
     for pair in ranked:
         at = [views[name].at[chosen] * views[name].size for name, chosen in zip(pair, matches[pair], strict=True)]
         mask = cv2.findFundamentalMat(*at, cv2.FM_RANSAC, LOOSE, 0.999, 2000)[1]
+        # few explained matches, or a small share of them, are typical of repeated patterns
         if mask is not None and mask.sum() >= max(LEAST_MATCHES, LEAST_SHARE * len(mask)):
             right = mask.ravel().astype(bool)
             yield _Pair(pair, tuple(chosen[right] for chosen in matches[pair]))
@@ -213,13 +211,7 @@ def _mutual_matches(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _explain(pairs: Sequence[_Pair], views: Mapping[str, _View], poses: Mapping[str, np.ndarray]) -> list[bool]:
-    """Return, for each pair that the poses can be judged by, whether they explain it (`EXPLAINED`).
-
-    Pairs with a view without a pose, and pairs with too little parallax at these poses, are left out.
-
-    Args:
-        poses: view name -> world-to-camera pose [4, 4].
-    """
+    """Return for each pair with enough parallax whether the world-to-camera poses explain it (`EXPLAINED`)."""
     found = []
     for pair in pairs:
         if all(name in poses for name in pair.names):
@@ -233,16 +225,7 @@ def _explain(pairs: Sequence[_Pair], views: Mapping[str, _View], poses: Mapping[
 def _explained_matches(
     one: np.ndarray, other: np.ndarray, pose: np.ndarray, other_pose: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the matches that two poses explain: their rays meet, in front of both cameras.
-
-    Args:
-        one, other: [K, 2], directions of the matches in each view; a match with a NaN is not explained.
-        pose, other_pose: [4, 4], world to camera.
-
-    Returns:
-        bool [K], True for matches that are explained; and bool [K], True for those that moved between the photographs
-        by more than the rotation between the poses, so that the poses can be judged by them.
-    """
+    """Return bool [K] each: matches whose rays meet in front of both cameras, and matches that can judge the poses."""
     rays, other_rays = (np.concatenate([each, np.ones((len(each), 1))], axis=1) for each in (one, other))
     turn = other_pose[:3, :3] @ pose[:3, :3].T
     shift = other_pose[:3, 3] - turn @ pose[:3, 3]
@@ -256,9 +239,10 @@ def _explained_matches(
     aa, bb, ab = (turned**2).sum(1), (other_rays**2).sum(1), (turned * other_rays).sum(1)
     depth = (other_rays @ shift) * ab - (turned @ shift) * bb
     other_depth = (other_rays @ shift) * aa - (turned @ shift) * ab
+    # Only matches that moved by more than the rotation between the poses can judge the poses.
     moved = np.linalg.norm(turned / np.sqrt(aa)[:, None] - other_rays / np.sqrt(bb)[:, None], axis=1)
     close = miss < np.minimum(CLOSE, ALONG * moved) * slope
-    return close & (depth > 0) & (other_depth > 0), ~(moved < STILL)
+    return close & (depth > 0) & (other_depth > 0), ~(moved < STILL)  # a match with a NaN direction is not explained
 
 
 # ---------------------------------------------------------------------------------------------- corrections

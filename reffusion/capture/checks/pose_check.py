@@ -156,16 +156,13 @@ class _View:
 
 
 def _detail(image: np.ndarray) -> np.ndarray:
-    """Return the detail of a picture, float32 [h, w] in cells: the local contrast of its brightness, about -1 to 1.
-
-    The detail is the brightness minus its mean in a window, divided by its standard deviation there (plus `NOISE`). So
-    it does not depend on exposure and shading, and is near 0 where the picture is plain.
-    """
+    """Return the local contrast of a picture's brightness, float32 [h, w] in cells, about -1 to 1."""
     gray = to_gray(image)
     factor = LONGER_SIDE / max(gray.shape)
     size = max(1, round(gray.shape[1] * factor)), max(1, round(gray.shape[0] * factor))
     gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     detail = gray - cv2.blur(gray, (WINDOW, WINDOW))
+    # does not depend on exposure and shading, and is near 0 where the picture is plain
     return detail / (np.sqrt(np.maximum(cv2.blur(detail**2, (WINDOW, WINDOW)), 0)) + NOISE)
 
 
@@ -178,19 +175,12 @@ def _nearest(view: _View, others: Collection[_View]) -> list[str]:
 
 
 def _margin(view: _View, others: Sequence[_View]) -> float | None:
-    """Return by how much a view's picture fits its pose better than the best other shift, or None if unknown.
-
-    This is the correlation at the pose, minus the best correlation at another shift. A correlation above `CLEAR` at the
-    pose adds 2 * `LEAST_MARGIN`. The result is None if there are too few neighbours or shared points, or if the
-    pictures are too plain.
-
-    Args:
-        others: the neighbours, whose detail at the points predicts that of `view`.
-    """
+    """Return the correlation at a view's pose minus the best at another shift; None if too little can be compared."""
     if len(others) < LEAST_NEIGHBOURS:
         return None
     count = sum(each.seen & view.seen for each in others)
     known = np.flatnonzero(count)
+    # the neighbours' detail at the points predicts that of the view
     expected = sum(np.where(view.seen, each.values, 0) for each in others)[known] / count[known]
     plain = min(np.sqrt(np.mean(each**2)) for each in (expected, view.values[known])) < LEAST_DETAIL
     if len(known) < LEAST_POINTS or plain:
@@ -202,16 +192,7 @@ def _margin(view: _View, others: Sequence[_View]) -> float | None:
 
 
 def _correlations(view: _View, places: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Correlate predicted detail with a view's detail for every shift, by Fourier transforms.
-
-    Args:
-        places: [K, 2], columns and rows of the cells.
-        expected: [K], the detail predicted at these cells.
-
-    Returns:
-        [S] correlations for the S shifts that leave at least `LEAST_OVERLAP` of the cells in the picture; and [S]
-        lengths of these shifts in cells.
-    """
+    """Return the correlation of predicted and seen detail at S shifts, [S], and the lengths of the shifts in cells."""
     templates = np.zeros((3, *view.padded))
     for template, weight in zip(templates, (expected, np.ones_like(expected), expected**2), strict=True):
         np.add.at(template, (places[:, 1], places[:, 0]), weight)

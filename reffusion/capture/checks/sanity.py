@@ -76,11 +76,9 @@ def find_odd_masks(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
 
 
 def _warn_large(masks: Mapping[str, np.ndarray]) -> list[str]:
-    """Return a warning about masks that cover more than half of their pictures and of the pictures' borders.
-
-    Such masks are probably inverted: even an object close to the camera leaves most of the border free.
-    """
+    """Return a warning about masks that cover most of their pictures and borders, and are probably inverted."""
     shares = {name: float(mask.mean()) for name, mask in masks.items()}
+    # even an object close to the camera leaves most of the border free
     border = lambda mask: np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
     large = sorted(name for name, share in shares.items() if share > LARGE and border(masks[name]) > LARGE)
     if not large:
@@ -98,11 +96,7 @@ def _warn_large(masks: Mapping[str, np.ndarray]) -> list[str]:
 
 
 def _warn_inconsistent(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
-    """Return warnings about masks that show something else than the other masks.
-
-    A pixel of a mask is supported if some point on its ray projects into most of the other masks (`AGREE`), among the
-    views whose pictures contain the point. A mask is odd if too few of its pixels are supported (`SUPPORTED`).
-    """
+    """Return warnings about masks that mark something else in 3D than the other masks."""
     names = [name for name in scene.train if name in masks and name not in scene.clean]
     marked = [name for name in names if masks[name].any()]
     if len(marked) < 3:
@@ -117,6 +111,7 @@ def _warn_inconsistent(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[st
                 hit, within = sample_nearest(masks[camera.name], project(places, camera)[0])
                 inside += hit & within
                 framed += within
+        # some point on the pixel's ray projects into most of the masks whose pictures contain the point
         supported = ((inside >= AGREE * framed) & (framed >= 2)).any(1)
         judged = (framed >= 2).any(1)
         if judged.sum() >= RAYS // 4:
@@ -131,21 +126,14 @@ def _warn_inconsistent(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[st
 
 
 def _along_rays(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return world points [R, D, 3] on the rays of R pixels of a mask, D points on each ray.
-
-    They are spaced evenly in disparity, over a range of depths somewhat larger than that of the scene's points in the
-    view.
-
-    Args:
-        mask: bool [H, W], not empty.
-        points: [P, 3], the scene's points.
-    """
+    """Return world points [R, D, 3] on the rays of R pixels of a non-empty mask, evenly spaced in disparity."""
     rows, columns = np.nonzero(mask)
     chosen = np.unique(np.linspace(0, len(rows) - 1, RAYS).astype(int))
     at, depth = project(points, camera)
     depth = depth[sample_nearest(np.ones(mask.shape, bool), at)[1] & (depth > 1e-3)]
     near, far = np.percentile(depth, (1, 99)) if len(depth) else (1 / 3, 4.0)
     rays = pixel_rays(camera)[rows[chosen], columns[chosen]]
+    # somewhat beyond the range of depths of the scene's points in the view
     local = rays[:, None] / np.linspace(1 / (0.7 * near), 1 / (1.5 * far), DEPTHS)[:, None]
     return (local - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3]
 

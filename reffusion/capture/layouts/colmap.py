@@ -70,11 +70,7 @@ def _relative(folder: Path, path: Path) -> str:
 
 
 def _count_images(folder: Path) -> dict[Path, int]:
-    """Return folder of a model -> number of its images, for all COLMAP models of a scene.
-
-    If there is only one model, its images are not counted, and the number is 0. A model that is stored both as .bin and
-    as .txt appears once.
-    """
+    """Return model folder -> number of images for all COLMAP models of a scene; 0, not counted, for a single model."""
     numbered = sorted(path for place in ("sparse", "colmap/sparse") for path in (folder / place).glob("[0-9]*"))
     places = dict.fromkeys([*(folder / name for name in MODEL_FOLDERS), *numbered])
     models = [place for place in places if is_model(place)]
@@ -177,26 +173,20 @@ def capture_from_model(
 
 
 def _list_test_pictures(folders: Iterable[Path], files: list[str]) -> set[str]:
-    """Return those of the pictures `files` that the first list of test pictures in `folders` names; none without one.
-
-    A list is a text of one name a line, or ScanNet++'s list of the key "test" in a .json.
-    """
+    """Return the pictures among `files` that the first list of test pictures in `folders` names."""
     places = [folder / name for folder in folders for name in TEST_LISTS]
     if (source := next((path for path in places if is_file(path)), None)) is None:
         return set()
     with reading(source, "a list of test pictures"):
         text = source.read_text(encoding="utf-8-sig")
+        # a .json is ScanNet++'s list of the key "test"
         names = json.loads(text)["test"] if source.suffix == ".json" else text.splitlines()
         listed = {name.strip(): name.strip() for name in names if name.strip()}
     return set(pair_pictures(listed, files).values())
 
 
 def _images_by_name(source: Path) -> tuple[dict[str, ModelImage], dict[str, int]]:
-    """Read a model's file of images. Returns name -> image, and name -> image id.
-
-    Raises:
-        BadInput: two images have the same name.
-    """
+    """Read name -> image, and name -> image id; raises BadInput if two images have the same name."""
     images: dict[str, ModelImage] = {}
     identities: dict[str, int] = {}
     for identity, image in load_images(source).items():
@@ -224,15 +214,7 @@ def _pairing_error(image_folder: Path, images: list[str], files: list[str]) -> s
 def _points(
     model: Path, poses: Poses, pictures: dict[str, Path], identities: dict[str, int]
 ) -> tuple[PointCloud, str | None]:
-    """Return a model's points if they are in the frame of its cameras, else no points (`keep_points_in_frame`).
-
-    Args:
-        pictures: view name -> picture file.
-        identities: view name -> the model's image id.
-
-    Returns:
-        The points; and a message to the user if they were refused, else None.
-    """
+    """Return a model's points, or no points and a message if they are not in the frame of its cameras."""
     file = model_file(model, "points3D")
     if file is None:
         return NO_POINTS, None
@@ -261,19 +243,11 @@ def read_cameras(model: Path) -> Poses:
 
 
 def _pictures_of_model(folder: Path, image_folder: Path, names: list[str]) -> list[str]:
-    """Return the paths, relative to `image_folder`, of the pictures that a model's images may mean.
-
-    Pictures in sub-folders are included if the model's names contain folders, or if the folder itself holds no
-    pictures. If the folder is the scene's own folder, only those pictures in sub-folders are included whose paths the
-    model names exactly.
-
-    Args:
-        folder: the scene's folder.
-        names: names of the model's images.
-    """
+    """Return the paths, relative to `image_folder`, of the pictures that the names of a model's images may mean."""
     loose = list_pictures(image_folder)
     in_folders = any("/" in normalize_path(name) for name in names)
     if image_folder.samefile(folder):
+        # in the scene's own folder, of the pictures in sub-folders only those that the model names exactly
         named = [path for path in map(normalize_path, names) if "/" in path and (image_folder / path).is_file()]
         return sorted({*loose, *named})
     return list_pictures(image_folder, nested=True) if in_folders or not loose else loose

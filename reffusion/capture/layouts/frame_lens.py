@@ -104,16 +104,7 @@ def _lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[int, 
 
 
 def _focal_length(values: dict[str, Any], axis: str, extent: float, number: Callable[..., float]) -> float | None:
-    """Return the focal length in pixels along one axis, from the key fl_<axis>, else from camera_angle_<axis>.
-
-    Args:
-        axis: "x" or "y".
-        extent: size of the picture along the axis in pixels.
-        number: function from a key to its value.
-
-    Returns:
-        None if both keys are missing; 0 if the angle is not between 0 and pi.
-    """
+    """Return the focal length in px from fl_<axis>, else camera_angle_<axis>; None without both, 0 for a bad angle."""
     if f"fl_{axis}" in values:
         return number(f"fl_{axis}")
     if f"camera_angle_{axis}" in values:

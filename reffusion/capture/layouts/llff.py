@@ -98,11 +98,7 @@ def read(
 
 
 def _label_folder(folder: Path, images: str | None) -> Path:
-    """Return the folder of pictures that has a sub-folder `label` (masks).
-
-    `images` (the folder that scene.yaml names) is preferred, then the usual folders. If none has masks, the result is
-    the folder of pictures that `find_image_folder` returns.
-    """
+    """Return the folder of pictures with masks in `label`: `images`, else a usual one, else as `find_image_folder`."""
     if images and (folder / images / "label").is_dir():
         return folder / images
     labelled = [folder / name for name in USUAL if (folder / name / "label").is_dir()]
@@ -110,17 +106,8 @@ def _label_folder(folder: Path, images: str | None) -> Path:
 
 
 def _choose_image_folder(folder: Path, label_folder: Path, longest: int) -> tuple[Path, list[str]]:
-    """Choose among folders that hold the same pictures in several sizes.
-
-    The smallest size whose longer side has at least `longest` px is chosen, else the largest size. A folder counts as a
-    size of the pictures only if it holds all pictures of `label_folder` under the same names.
-
-    Args:
-        label_folder: the folder of pictures that has masks.
-
-    Returns:
-        The folder; and warnings about folders that do not count, if no size is large enough.
-    """
+    """Return the folder of the smallest pictures of at least `longest` px, else of the largest, and warnings."""
+    # A folder counts only if it holds all pictures of `label_folder`, which has masks, under the same names.
     names, sizes, other = find_pictures(label_folder).keys(), {}, []
     for place in dict.fromkeys([label_folder, *(folder / name for name in USUAL)]):
         pictures = find_pictures(place) if place.is_dir() else {}
@@ -137,15 +124,8 @@ def _choose_image_folder(folder: Path, label_folder: Path, longest: int) -> tupl
 
 
 def _load_poses_bounds(source: Path) -> np.ndarray:
-    """Read poses_bounds.npy as [V, 17] float64.
-
-    A row holds a 3x5 matrix (the camera-to-world pose, and a column of height, width and focal length), then near and
-    far depth.
-
-    Raises:
-        BadInput: the array is not [V, 17] or not of finite numbers; sizes, focal lengths or bounds are not positive; or
-            far is not greater than near.
-    """
+    """Read poses_bounds.npy as [V, 17] float64; raises BadInput if its shape or its values are wrong."""
+    # a row: 3x5 matrix (camera-to-world pose, column of height, width, focal length), near and far depth
     rows = load_array(source)
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise BadInput(f"{source}: {list(rows.shape)}, expected [views, 17] as LLFF writes it")
@@ -163,17 +143,7 @@ def _load_poses_bounds(source: Path) -> np.ndarray:
 def _lens_of_partial_model(
     model: Path, lenses: dict[str, Lens], pictures: dict[str, Path], warnings: list[str]
 ) -> dict[str, Lens]:
-    """Return the lenses with distortion from a partial model (COLMAP files without images), or `lenses` as they are.
-
-    The partial model's lens is used if it has a single camera, whose focal length agrees with poses_bounds.npy within
-    2%.
-
-    Args:
-        model: folder of the partial model, which may be missing.
-        lenses: view name -> lens from poses_bounds.npy.
-        pictures: view name -> picture file.
-        warnings: a warning is appended if the focal lengths differ.
-    """
+    """Return the lenses of a partial model (COLMAP without images) if focal lengths agree, else `lenses`; may warn."""
     file = model_file(model, "cameras") if model.is_dir() else None
     cameras = list(load_cameras(file).values()) if file else []
     if file is None or len(cameras) != 1:
@@ -194,21 +164,7 @@ def _points_of_partial_model(
     bounds: dict[str, tuple[float, float]],
     warnings: list[str],
 ) -> PointCloud:
-    """Return the points of a partial model (COLMAP files without images) if they are in the frame of the poses.
-
-    If the tracks name as many images as there are poses, image ids in ascending order stand for the views in order of
-    their names. Then 95% of the observed points must lie inside the picture of the median view. Otherwise at least a
-    fifth of all points must lie inside the picture of the median view; a view counts only if half of its points lie
-    about between its near and far depth.
-
-    Args:
-        model: folder of the partial model, which may be missing.
-        lenses, poses, bounds: view name -> lens, world-to-camera pose [4, 4], and (near, far) depth.
-        warnings: a warning is appended if the points are not in the frame.
-
-    Returns:
-        Positions and colours; no points if the model has none or they are not in the frame.
-    """
+    """Return a partial model's points (COLMAP without images) if they are in the poses' frame, else none and warn."""
     file = model_file(model, "points3D") if model.is_dir() else None
     if file is None:
         return NO_POINTS
@@ -216,11 +172,15 @@ def _points_of_partial_model(
     identities = np.unique(found.track_images)
     shares, needed = [], 0.2
     if len(identities) == len(poses):
+        # Image ids in ascending order stand for the views in order of their names. 95% of the observed points must lie
+        # inside the picture of the median view.
         needed = 0.95
         for identity, name in zip(identities, sorted(poses), strict=True):
             seen = found.positions[found.track_points[found.track_images == identity]]
             shares.append(len(depths_in_view(seen, poses[name], lenses[name])) / len(seen))
     else:
+        # A fifth of all points must lie inside the picture of the median view. A view counts only if half of its points
+        # lie about between its near and far depth.
         for name, (near, far) in bounds.items():
             z = depths_in_view(found.positions, poses[name], lenses[name])
             inside = ((z > 0.8 * near) & (z < 1.25 * far)).sum()

@@ -104,31 +104,19 @@ def _pictures_folder(capture: Capture) -> Path | None:
 
 
 def _mask_paths(place: Path, capture: Capture) -> tuple[Path, list[str]]:
-    """Return the folder of the masks in a place, and their paths, sorted, relative to the folder.
-
-    All pictures in the folder and its sub-folders are masks, unless it holds photographs of the capture. Then only
-    files such as `A_mask.png` beside `A.png` are masks. Without such pictures, masks are the files of labelme and
-    arrays (`A.json`, `A.npy`; among photographs only `A.json`), else the pictures that a single COCO file names.
-
-    Args:
-        place: a folder, or a COCO file.
-
-    Returns:
-        `place`, or the COCO file in it; and the paths, none if there are no masks.
-
-    Raises:
-        BadInput: there are several COCO files, or a .json file in a folder without photographs is unreadable.
-    """
+    """Return the folder or COCO file of the masks, and their relative paths; raises BadInput for two COCO files."""
     if place.suffix.lower() == ".json" and place.is_file():
         return place, annotated_pictures(place)
     found = _visible_files(place, (*ENDINGS, *MASK_ENDINGS))
     pictures = [path for path in found if Path(path).suffix.lower() in ENDINGS]
     stems = {strip_ending(path) for path in pictures}
+    # All pictures are masks, but among photographs only A_mask.png, or A.json, beside A.png.
     if among_photographs := not {place / path for path in pictures}.isdisjoint(capture.pictures.values()):
         pictures = [path for path in pictures if is_mask_of_another(strip_ending(path), stems)]
         found = [path for path in found if path.lower().endswith(".json") and path[: -len(".json")] in stems]
     if pictures:
         return place, pictures
+    # files of labelme and arrays; raises BadInput if a .json is unreadable
     others = [path for path in found if path.lower().endswith(".npy") or is_labelme(place / path)]
     if others or among_photographs:
         return place, others
@@ -139,12 +127,8 @@ def _mask_paths(place: Path, capture: Capture) -> tuple[Path, list[str]]:
 
 
 def _visible_files(place: Path, endings: Collection[str] = ()) -> list[str]:
-    """Return the paths of the files in a folder and its sub-folders, sorted, relative to it, but no hidden files.
-
-    Args:
-        endings: the endings, in lower case, of the paths that are returned, also of folders and broken links, which
-            readers refuse; if empty, all files.
-    """
+    """Return the sorted relative paths of the visible files in a folder and its sub-folders, of `endings` if any."""
+    # With endings, folders and broken links are included, which readers refuse.
     paths = [path for path in place.rglob("*") if (path.suffix.lower() in endings if endings else path.is_file())]
     relative = [path.relative_to(place) for path in paths]
     return sorted(each.as_posix() for each in relative if not any(part.startswith(".") for part in each.parts))
@@ -227,15 +211,7 @@ def match_masks(place: Path, files: Collection[str], capture: Capture, strict: b
 
 
 def _assign_masks(place: Path, views: Mapping[str, str], capture: Capture) -> dict[str, Path]:
-    """Return view -> mask file, sorted by view. Masks of left-out pictures are dropped.
-
-    Args:
-        place: the folder of the masks.
-        views: mask, relative to the folder -> its view (`match_masks`).
-
-    Raises:
-        BadInput: a view has two masks.
-    """
+    """Return view -> mask file, sorted, without left-out pictures; raises BadInput if a view has two masks."""
     result: dict[str, Path] = {}
     for path, view in sorted(views.items()):
         if view in result:

@@ -117,12 +117,7 @@ def correlate_colors(
 
 
 def _is_nearest(uv: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Return bool [P], True for points that no clearly nearer point in the same cell of the picture hides.
-
-    Args:
-        uv: [P, 2], coordinates in the picture as shares of its width and height. The cells are `CELLS` x `CELLS`.
-        depth: [P].
-    """
+    """Return which points no clearly nearer point in their cell hides; `uv` [P, 2] is in shares of width and height."""
     cells = (uv * CELLS).astype(int) @ (CELLS, 1)
     return depth < NEARLY * nearest_depths(cells, depth)
 

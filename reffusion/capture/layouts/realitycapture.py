@@ -29,11 +29,9 @@ def find(folder: Path) -> Path | None:
 
 
 def _columns(path: Path) -> tuple[int, list[str]]:
-    """Return the number of lines up to the names of the columns, and these names, in lower case and without the #.
-
-    A line with the number of cameras may stand before. There are no names if the file is of another kind.
-    """
+    """Return the number of lines up to the column names, and the names in lower case; none for another kind of file."""
     with open(path, encoding="utf-8-sig", errors="replace", newline="") as file:
+        # a line with the number of cameras may stand before the names
         for number in (1, 2):
             names = [name.strip().lstrip("#").lower() for name in file.readline(10_000).split(",")]
             names = ["heading" if name == "yaw" else name for name in names]

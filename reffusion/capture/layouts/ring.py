@@ -136,13 +136,7 @@ def _directions(count: int) -> np.ndarray:
 
 
 def _estimate_up(hole: np.ndarray, stays: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """Return the direction up, a unit vector [3]: the normal of the surface next to the hole, on the hole's side.
-
-    Args:
-        hole: [D, 3], means of the deleted splats.
-        stays: [M, 3], means of the remaining opaque splats.
-        center: [3], middle of the hole.
-    """
+    """Return the up direction [3]: the unit normal of the opaque splats' surface near the hole, on the hole's side."""
     beside = stays[np.argsort(cKDTree(hole).query(stays)[0])[:BESIDE]]
     middle = np.median(beside, 0)
     normal = np.linalg.svd(beside - middle, full_matrices=False)[2][2]
@@ -152,25 +146,17 @@ def _estimate_up(hole: np.ndarray, stays: np.ndarray, center: np.ndarray) -> np.
 def _rate_view(
     pose: np.ndarray, away: float, lens: Lens, aim: np.ndarray, stays: tuple[cKDTree, np.ndarray], radius: float
 ) -> ViewQuality:
-    """Return the share of the hole that a camera sees (`free`), and the share of its picture that the scene fills.
-
-    Both are 0 if the camera is in a splat or right in front of one, if it is behind the surface on which the hole is,
-    or if splats much nearer than the hole cover too much of its picture (`IN_FRONT`). `filled` alone is 0 if `free` is
-    too small for all `REQUIREMENTS`.
-
-    Args:
-        pose: [4, 4], world-to-camera pose.
-        away: distance of the camera from the middle of the hole.
-        aim: [P, 3], points in the hole.
-        stays: a tree of the remaining opaque splats' means, and the radii [M] within which rays hit them.
-        radius: radius of the hole.
-    """
+    """Return the share of the hole that a camera sees (`free`), and the share of its picture that the scene fills."""
     place = -pose[:3, :3].T @ pose[:3, 3]
+    # `stays`: a tree of the remaining opaque splats' means, and the radii within which rays hit them. `aim`: points in
+    # the hole, whose middle is `away` from the camera. Both shares are 0 if the camera is in a splat or right in front
+    # of one.
     distance, nearest = stays[0].query(place)
     if distance < max(CLEAR * radius, stays[1][nearest]):
         return ViewQuality(0.0, 0.0)
     turns = 2 * np.pi * np.arange(AROUND) / AROUND
     past = np.array([0, 0, 1.0]) * away + BESIDES * radius * np.stack([np.cos(turns), np.sin(turns), 0 * turns], 1)
+    # 0 if the camera is behind the surface on which the hole is
     ends = np.linalg.norm(past, axis=1) * (1 - CLOSE * radius / away)
     if np.mean(~_hits(place, past @ pose[:3, :3], ends, stays)) < BEYOND:
         return ViewQuality(0.0, 0.0)
@@ -182,25 +168,18 @@ def _rate_view(
     columns, rows = ((np.arange(n) + 0.5) / n for n in GRID)
     x, y = np.meshgrid((columns * lens.width - lens.cx) / lens.fx, (rows * lens.height - lens.cy) / lens.fy)
     rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3) @ pose[:3, :3]
+    # 0 if splats much nearer than the hole cover too much of the picture
     if np.mean(_hits(place, rays, np.full(len(rays), NEAR * away), stays)) > IN_FRONT:
         return ViewQuality(0.0, 0.0)
     return ViewQuality(free, float(np.mean(_hits(place, rays, np.full(len(rays), FAR * radius), stays))))
 
 
 def _hits(place: np.ndarray, rays: np.ndarray, ends: np.ndarray, stays: tuple[cKDTree, np.ndarray]) -> np.ndarray:
-    """Return bool [R], True for rays that hit a splat before they end.
-
-    Each ray advances by about the distance to the nearest splat, so that it misses none (sphere tracing).
-
-    Args:
-        place: [3], origin of the rays.
-        rays: [R, 3], directions of any length.
-        ends: [R], lengths of the rays.
-        stays: a tree of the splats' means, and the radii [M] within which rays hit them.
-    """
+    """Return which rays hit a splat within their lengths `ends`; `stays`: a tree of their means, and their radii."""
     tree, near = stays
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     hit, traveled, on = np.zeros(len(rays), bool), np.zeros(len(rays)), np.arange(len(rays))
+    # Sphere tracing: a ray advances by about the distance to the nearest splat, so that it misses none.
     for _ in range(MARCH):
         distance, nearest = tree.query(place + traveled[on, None] * rays[on])
         hit[on] = distance <= near[nearest]

@@ -196,16 +196,11 @@ def _frames(record: object, source: Path) -> list[dict]:
 
 
 def _listed_splits(shared: Mapping[str, Any], names: list[str], source: Path) -> dict[str, str]:
-    """Return file_path of a frame -> its split, if transforms.json has the lists train_filenames, test_filenames, ...
-
-    Of the lists of `HELD_OUT` the first one counts. A frame in it and in train_filenames is held out. A frame in
-    neither has the split `UNUSED`, unless there is no train_filenames; then it has the split "train".
-
-    Raises:
-        BadInput: a list is not of names, or one of them is no frame's.
-    """
+    """Return file_path -> split by the lists `*_filenames`; raises BadInput for a name that is no frame's."""
     lists = {split: shared[f"{split}_filenames"] for split in ("train", *HELD_OUT) if shared.get(f"{split}_filenames")}
+    # a frame in no list is unused, unless there is no train_filenames
     splits = dict.fromkeys(names, UNUSED if "train" in lists else "train") if lists else {}
+    # the first of the lists of `HELD_OUT` counts, and takes precedence over train_filenames
     for split in [each for each in lists if each == "train"] + [each for each in HELD_OUT if each in lists][:1]:
         listed = lists[split]
         if not isinstance(listed, list) or not all(_is_path(name) for name in listed):
@@ -230,14 +225,7 @@ def _split(placed: Mapping[str, Frame]) -> tuple[tuple[str, ...], tuple[str, ...
 
 
 def _drop_repeated(listed: Iterable[tuple[str, Frame]]) -> tuple[dict[str, Frame], list[str]]:
-    """Return path -> frame, and the paths that come again with the same pose, lens and split, a path each time.
-
-    Args:
-        listed: pairs of a picture's path and its frame.
-
-    Raises:
-        BadInput: a path comes again with another pose, lens or split.
-    """
+    """Return path -> frame, and the repeated paths; raises BadInput if pose, lens or split of a repetition differ."""
     frames: dict[str, Frame] = {}
     repeated = []
     for path, frame in listed:
@@ -261,21 +249,13 @@ def _is_path(value: object) -> bool:
 
 
 def _find_pictures(folder: Path, images: str | None, frames: list[Frame]) -> dict[int, Path]:
-    """Return index of a frame -> its picture file, for the frames that have a picture.
-
-    A picture lies at the frame's file_path, which may lack the ending. If `images` is given, or if no picture lies at
-    such a path, pictures are searched by their names (`pair_pictures`) in the folder `images`, or in the usual folders.
-    This is because a file_path may come from another machine, or name the folder of another picture size.
-
-    Args:
-        folder: the scene's folder.
-        images: folder of pictures, relative to the scene, or None.
-    """
+    """Return index of a frame -> picture file, at its file_path, or by name in the folder `images` or usual ones."""
     listed = {
         k: path for k, frame in enumerate(frames) if (path := _existing_picture(folder, frame.file_path)) is not None
     }
     if images is None and listed:
         return listed
+    # a file_path may come from another machine, or name the folder of another picture size
     for place in [images] if images is not None else USUAL:
         names = list_pictures(folder / place, nested=True)
         pairs = pair_pictures({k: frame.file_path for k, frame in enumerate(frames)}, names)
@@ -301,11 +281,7 @@ def _named_files(folder: Path, placed: Mapping[str, Frame], key: str) -> dict[st
 
 
 def _frame_pose(frame: Frame, name: str) -> np.ndarray:
-    """Return the world-to-camera pose [4, 4] (y down, looking along +z) of a frame. `name`: the view, for messages.
-
-    Raises:
-        BadInput: the frame's matrix is no rigid pose.
-    """
+    """Return a frame's world-to-camera pose [4, 4] (y down, looking along +z); raises BadInput if it is not rigid."""
     camera_to_world = np.eye(4)
     camera_to_world[:3] = frame.matrix[:3] * (1.0, -1.0, -1.0, 1.0)
     return invert_pose(nearest_rigid(camera_to_world, name, frame.source))
@@ -319,24 +295,11 @@ def _points(
     poses: Poses,
     pictures: Mapping[str, Path],
 ) -> tuple[PointCloud, list[str | None]]:
-    """Return the sparse points of a capture, in the frame of the poses.
-
-    The points are read from the file that the key ply_file_path names, or from sparse_pc.ply. If there are none, or if
-    they are not in the frame of the poses, points are made from the depth maps that the frames name. The keys
-    applied_transform and applied_scale are ignored: they describe what was done to both poses and points.
-
-    Args:
-        source: the transforms file.
-        record: the keys of the file.
-        placed: view name -> its frame.
-        pictures: view name -> picture file.
-
-    Returns:
-        The points, perhaps none; and messages to the user (None among them is no message).
-    """
+    """Return a capture's sparse points in the frame of the poses, perhaps none, and messages to the user (or None)."""
     listed = record.get("ply_file_path")
     if listed is not None and not _is_path(listed):
         raise BadInput(f"{source}: ply_file_path = {shorten(listed)} is no file's name")
+    # The keys applied_transform and applied_scale are ignored: they describe what was done to both poses and points.
     path = folder / (listed.replace("\\", "/") if listed else "sparse_pc.ply")
     messages: list[str | None] = []
     if is_file(path):
@@ -346,6 +309,7 @@ def _points(
         messages.append(refused)
     elif listed:
         messages.append(f"{path}: named by {source.name}, but missing")
+    # without points in the frame of the poses, points are made from depth maps
     if depths := _named_files(folder, placed, "depth_file_path"):
         scale = read_number(record, "integer_depth_scale", 1e-3, path, source)
         depth_points = points_from_depth(depths, scale, pictures, poses.lenses, poses.world_to_camera)

@@ -160,12 +160,8 @@ def depth_loss(depth: Tensor, target: Tensor, compared: Tensor, unit: float) -> 
 
 
 def _downscale(view: TrainView, max_side: int) -> tuple[Camera, Tensor, Tensor]:
-    """Return the camera, the hole and the hidden pixels of a view, scaled down to at most `max_side` pixels.
-
-    Returns:
-        The camera, whose longer side is at most `max_side`; the hole, bool [H, W]; and the hidden pixels, bool [H, W],
-            whose photograph may not supervise.
-    """
+    """Return camera, hole (bool [H, W]) and hidden pixels (bool [H, W]) of a view, at most `max_side` px large."""
+    # The photograph may not supervise hidden pixels.
     camera, hole, hidden = view.camera, view.repaint, ~view.supervises
     factor = max_side / max(camera.width, camera.height)
     if factor >= 1:

@@ -104,25 +104,13 @@ def complete(
 
 
 def _blend_patches(image: np.ndarray, hole: np.ndarray, level: Level, matches: Matches) -> np.ndarray:
-    """Fill the hole of the image by the patches' gradients, without seams.
-
-    Each pixel gets about the colour at the centre of its patch. Colours are limited to the range of those at the
-    centres of the patches and those outside the hole.
-
-    Args:
-        image: uint8 [H, W, 3].
-        hole: bool [H, W].
-        level: the finest level of the pyramid.
-        matches: the patch of each pixel of the hole.
-
-    Returns:
-        uint8 [H, W, 3].
-    """
-    own = level.current[..., :3].copy()
+    """Return the image, uint8 [H, W, 3], with the hole filled without seams by the patches' gradients."""
+    own = level.current[..., :3].copy()  # becomes the colour at the centre of each pixel's patch
     right, below = np.zeros_like(own), np.zeros_like(own)
     count_right, count_below = np.zeros(hole.shape, np.float32), np.zeros(hole.shape, np.float32)
     voting.gather_gradients(matches, level.hole, level.sources, right, below, count_right, count_below, own)
     right, below = right / np.maximum(count_right, 1)[..., None], below / np.maximum(count_below, 1)[..., None]
+    # the range of the colours at the centres of the patches and outside the hole
     low, high = own.min((0, 1)), own.max((0, 1))
     picture = image.copy()
     colors = blend(level.current[..., :3], hole, right, below, own)
@@ -133,12 +121,7 @@ def _blend_patches(image: np.ndarray, hole: np.ndarray, level: Level, matches: M
 def _build_pyramid(
     target: SourceImage, hole: np.ndarray, sources: Sequence[SourceImage], smooth: Sequence[int]
 ) -> list[tuple[np.ndarray, np.ndarray, Sources]]:
-    """Build the image pyramid of the target and the sources; arguments as of `complete`.
-
-    Returns:
-        For each level, the coarsest first: the features of the target, [h, w, C], its hole, bool [h, w], and the
-        sources. The list is empty if the sources offer fewer than `MIN_PLACES` patches.
-    """
+    """Return for each level, coarsest first, the target's features, hole and sources; none if there are few patches."""
     width = 2 * _distance_inside(hole).max()
     count = 1 + int(np.ceil(np.log2(max(width / COARSEST_WIDTH, 2.0 if width > SINGLE_LEVEL_WIDTH else 1.0))))
     current, mask, scale = _color_features(target.image, hole), hole, 1
@@ -159,15 +142,7 @@ def _build_pyramid(
 
 
 def _color_features(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
-    """Return [H, W, 5] float32, the colours of an image, and the roughness along x and y.
-
-    Roughness is the local mean of the grey image's absolute gradient, times `ROUGHNESS_WEIGHT`. A masked pixel takes
-    the colour of the nearest pixel that is not masked.
-
-    Args:
-        image: uint8 [H, W, 3].
-        masked: bool [H, W].
-    """
+    """Return colours and roughness along x and y, float32 [H, W, 5]; masked pixels take the nearest colour."""
     if masked.any() and not masked.all():
         nearest = ndimage.distance_transform_edt(masked, return_distances=False, return_indices=True)
         image = image[tuple(nearest)]
@@ -175,37 +150,23 @@ def _color_features(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
     known = cv2.erode((~masked).astype(np.float32), np.ones((3, 3)))
     window = (ROUGHNESS_WINDOW, ROUGHNESS_WINDOW)
     mass = np.maximum(cv2.blur(known, window), 1e-3)
+    # roughness is the local mean of the absolute gradient of the grey image
     gradient = [cv2.blur(np.abs(cv2.Scharr(grey, -1, *way)) / 16 * known, window) / mass for way in ((1, 0), (0, 1))]
     return np.concatenate([image.astype(np.float32), ROUGHNESS_WEIGHT * np.stack(gradient, -1)], -1)
 
 
 def _with_geometry(values: np.ndarray, source: SourceImage, smooth: Sequence[int], scale: int) -> np.ndarray:
-    """Append the geometry to the features of an image.
-
-    One channel encodes the smooth plane and the foreground layer of a pixel, so that a patch that covers the edge
-    between two surfaces must show the same edge. Three channels hold the normal.
-
-    Args:
-        values: [h, w, 5], the result of `_color_features`, at the size of the level.
-        source: the surfaces that the image shows, at full size.
-        smooth: indices of the smooth planes.
-        scale: full size divided by the size of the level.
-
-    Returns:
-        [h, w, 9].
-    """
+    """Append a channel for plane and layer, and the normal, to features [h, w, 5] at full size divided by `scale`."""
     of_plane = np.zeros(max([*smooth, int(source.plane.max())]) + 1, np.float32)
     of_plane[list(smooth)] = PLANE_FEATURE * np.arange(1, len(smooth) + 1)
+    # A patch that covers the edge between two surfaces must show the same edge.
     marks = of_plane[source.plane] + LAYER_FEATURE * source.layer.astype(np.float32)
     marks, normal = cv2.medianBlur(marks, 5)[..., None], NORMAL_FEATURE * source.normal
     return np.concatenate([values, *(each[::scale, ::scale] for each in (marks, normal))], -1)
 
 
 def _halve(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Reduce features, [h, w, C], and a mask, bool [h, w], to half their size, rounded up.
-
-    Features are averaged over the pixels that are not masked. A reduced pixel is masked if any part of it was.
-    """
+    """Halve features, averaged over pixels that are not masked, and a mask, True where any part was; sizes round up."""
     even = lambda a: np.pad(a, [(0, a.shape[0] % 2), (0, a.shape[1] % 2)] + [(0, 0)] * (a.ndim - 2), mode="edge")
     values, known = even(values), even((~masked).astype(np.float32))
     size = (known.shape[1] // 2, known.shape[0] // 2)
@@ -217,14 +178,7 @@ def _halve(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def _stack_sources(
     values: Sequence[np.ndarray], masks: Sequence[np.ndarray], sources: Sequence[SourceImage], scale: int
 ) -> Sources:
-    """Collect the sources of one level of the pyramid in common arrays.
-
-    Args:
-        values: the features of each source, [h, w, C], at the size of the level.
-        masks: the masked pixels of each source, bool [h, w], at the size of the level.
-        sources: the source images at full size, whose geometry is reduced here.
-        scale: full size divided by the size of the level.
-    """
+    """Collect the sources of one level, full size divided by `scale`, in common arrays."""
     height, width = (max(masked.shape[axis] for masked in masks) for axis in (0, 1))
     shape = (len(masks), height, width)
     stack = Sources(
@@ -243,22 +197,13 @@ def _stack_sources(
 
 
 def _gather_hole(target: SourceImage, mask: np.ndarray, scale: int, smooth: Sequence[int], sources: Sources) -> Hole:
-    """Collect the pixels of the hole at one level of the pyramid, with their geometry.
-
-    Patches follow the smooth planes of which the sources show enough (`MIN_PLACES` pixels).
-
-    Args:
-        target: the view at full size.
-        mask: bool [h, w], the hole at the size of the level.
-        scale: full size divided by the size of the level.
-        smooth: indices of the smooth planes.
-        sources: the sources of the level.
-    """
+    """Collect the pixels of the hole at one level, full size divided by `scale`, with their geometry."""
     rows, columns = np.nonzero(mask)
     index = np.full(mask.shape, -1)
     index[rows, columns] = np.arange(len(rows))
     at = np.minimum(rows * scale, target.plane.shape[0] - 1), np.minimum(columns * scale, target.plane.shape[1] - 1)
     plane = target.plane[at].astype(np.int32)
+    # patches follow the smooth planes of which the sources show enough
     followed = [k for k in smooth if (sources.plane == k).sum() >= MIN_PLACES]
     to_plane = (scale * target.to_plane[at]).reshape(-1, 4).astype(np.float32)
     pixel_size = (scale * target.pixel_size[at]).astype(np.float32)
@@ -274,29 +219,18 @@ def _patch_positions(sources: Sources, last_plane: int) -> Positions:
 
 
 def _trust(mask: np.ndarray) -> np.ndarray:
-    """Return [H, W] float32, the trust in each pixel: 1 outside the hole, and falling inwards from the hole's border.
-
-    It weights pixels in the comparison of patches, and patches in the vote.
-    """
+    """Return the weight of each pixel in comparisons and votes: 1 outside the hole, falling inwards from its border."""
     return np.where(mask, np.maximum(TRUST_FALLOFF ** -_distance_inside(mask), MIN_TRUST), 1).astype(np.float32)
 
 
 def _first_layout(level: Level, mask: np.ndarray, positions: Positions, state: np.ndarray) -> Matches:
-    """Find the first matches at the coarsest level, ring by ring from the hole's border inwards.
-
-    The patches of a ring of pixels are compared only with pixels outside this ring, which are known or already filled.
-
-    Args:
-        level: the coarsest level. The hole of `level.current` is filled in place.
-        mask: bool [h, w], the hole.
-        positions: the places that random search draws from.
-        state: [1] uint64, state of the random numbers.
-    """
+    """Find the matches at the coarsest level and fill `level.current` in place, ring by ring from the hole's border."""
     row, column, trust = level.hole.row, level.hole.column, level.weight
     count = len(row)
     zeros = lambda kind: np.zeros(count, kind)
     source, misfit = np.full(count, -1, np.int32), np.full(count, NO_MATCH, np.float32)
     matches = Matches(source, zeros(np.float32), zeros(np.float32), zeros(np.float32), zeros(bool), misfit)
+    # the patches of a ring are compared only with pixels outside it, which are known or already filled
     level = level._replace(weight=np.where(mask, 0, 1).astype(np.float32))
     ring = np.ceil(_distance_inside(mask))[row, column]
     for k in range(1, int(ring.max()) + 1):
@@ -319,25 +253,13 @@ def _from_coarser(matches: Matches, coarser: Hole, level: Level) -> Matches:
 
 
 def _vote(level: Level, matches: Matches, trust: np.ndarray, spread: float, todo: np.ndarray | None = None) -> None:
-    """Fill the hole of `level.current`, in place, with the weighted mean of all patches that cover each pixel.
-
-    Only the first `VOTED` features change, since the geometry is known in the hole too.
-
-    Args:
-        level: the level of the pyramid.
-        matches: the patch of each pixel of the hole.
-        trust: [h, w] float32, weight of each patch, read at its pixel.
-        spread: misfit over which the weight of a patch falls by a factor of e.
-        todo: [T], indices of the pixels of the hole to fill; None for all.
-    """
+    """Fill the hole of `level.current` in place with the mean of covering patches, weighted by trust and misfit."""
     todo, voted = np.arange(len(level.hole.row)) if todo is None else todo, level.current.copy()
+    # the weight of a patch falls by a factor of e per `spread` of misfit
     voting.vote(todo, matches, level.hole, trust, level.sources, spread, voted)
-    level.current[..., :VOTED] = voted[..., :VOTED]
+    level.current[..., :VOTED] = voted[..., :VOTED]  # the geometry is known in the hole too
 
 
 def _distance_inside(mask: np.ndarray) -> np.ndarray:
-    """Return [H, W], the distance of each masked pixel from the outside of the mask, in px.
-
-    The area beyond the image's border counts as outside. The distance is 0 for pixels that are not masked.
-    """
+    """Return the distance of each masked pixel from the outside of the mask, px; beyond the image is outside."""
     return ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]

@@ -40,14 +40,7 @@ def _random(state):
 
 @inlined
 def _penalty(hole, n, plane, size):
-    """Return the factor on the misfit of a patch that comes from another surface than pixel n of the hole.
-
-    Args:
-        hole: `Hole`.
-        n: index of the pixel.
-        plane: index of the patch's plane; 0 for none.
-        size: length of the patch's pixels on the surface, in world units.
-    """
+    """Return the misfit factor at pixel n of a patch on `plane` (0: none) whose pixels have world length `size`."""
     ratio, same = hole.pixel_size[n] / size, plane == hole.plane[n]
     penalty = np.float32(1) if same and MIN_SCALE < ratio < MAX_SCALE else np.float32(OTHER_SURFACE_PENALTY)
     foreign = ratio > MUCH_NEARER or (not same and plane > 0 and hole.plane[n] > 0)
@@ -160,10 +153,7 @@ def _search_nearby(matches, n, span, level, state):
 
 @inlined
 def _search_anywhere(matches, n, level, positions, state):
-    """Try for pixel n one random place anywhere in the sources.
-
-    If patches may follow the pixel's plane, the place is drawn from this plane half of the time.
-    """
+    """Try for pixel n one random place in the sources, half of the time on its plane if patches may follow it."""
     along_plane = level.hole.along_plane[n] and _random(state) < 0.5
     plane = level.hole.plane[n] if along_plane else 0
     first, count = positions.starts[plane], positions.starts[plane + 1] - positions.starts[plane]

@@ -205,19 +205,7 @@ def assemble(
 def _choose(
     pixels: HolePixels, candidates: Candidates, shape: tuple[int, int], stride: int, options: Options
 ) -> tuple[np.ndarray, float]:
-    """Choose a candidate for each of N pixels by a graph cut.
-
-    Args:
-        pixels: pixels of the hole and of its ring, on a grid of the given stride.
-        candidates: the candidates.
-        shape: height and width of the target.
-        stride: px, the distance of neighbouring pixels.
-        options: settings.
-
-    Returns:
-        [N] int, the index of the candidate that each pixel takes, or `len(candidates)` for none; and the cost per pixel
-        of the hole (`Assembly.cost`).
-    """
+    """Return each pixel's candidate by a graph cut (`len(candidates)`: none), and the cost per pixel of the hole."""
     grid = pixels.rows, pixels.columns
     costs, looks = [], []
     for k in range(len(candidates)):
@@ -247,16 +235,7 @@ def _blend(
     regions: Sequence[np.ndarray],
     color_weight: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Blend the chosen pieces into the picture whose gradients are nearest to those of the pieces.
-
-    Args:
-        labels: [N] int, the candidate that each pixel takes, or `len(candidates)` for none.
-        color_weight: weight of the pieces' colours; their gradients have weight 1.
-        target, hole, pixels, candidates, regions: as of `assemble`.
-
-    Returns:
-        The picture, uint8 [H, W, 3], and the pixels that were filled, bool [H, W].
-    """
+    """Return the picture with the chosen pieces blended by their gradients, and the pixels that were filled."""
     window = tuple(slice(side.min(), side.max() + 1) for side in (pixels.rows, pixels.columns))
     at = tuple(side - part.start for side, part in zip((pixels.rows, pixels.columns), window, strict=True))
     inner = hole[window]
@@ -280,6 +259,7 @@ def _blend(
         mine = inner & region[window] & covered
         if mine.any():
             beside = ~inner & region[window] & ~target.masked[window]
+            # gradients have weight 1, the pieces' colours `color_weight`
             colors = blend(own, mine, *steps, own, beside, color_weight)
             image[window][mine] = colors.clip(0, 255).round().astype(np.uint8)
             filled[window] |= mine

@@ -166,11 +166,7 @@ class _ShiftedPhoto:
         return np.where(valid, cost, INVALID_COST)
 
     def _source_pixels(self, k: int, pixels: HolePixels) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-        """Return the positions from which candidate k takes the pixels.
-
-        Returns:
-            Rows and columns, [N] each, clipped to the photograph; and bool [N], True where the position lies inside it.
-        """
+        """Return where candidate k takes the pixels from, clipped to the photograph, and which positions are in it."""
         height, width = self.readable.shape
         row, column = pixels.rows + self.offsets[k][0], pixels.columns + self.offsets[k][1]
         inside = (row >= 0) & (column >= 0) & (row < height) & (column < width)
@@ -178,21 +174,11 @@ class _ShiftedPhoto:
 
 
 def _stretch(target: SourceImage, source: tuple[np.ndarray, ...], here: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Return [N], how much the perspective of a plane differs between two pixels that lie on it.
-
-    The same small step on the plane is expressed in pixels at both positions. The map from one to the other is the
-    identity if the perspective is the same; the result is the Frobenius norm of its difference from the identity.
-
-    Args:
-        target: the view.
-        source, here: rows and columns, [N] each, of the two pixels of each pair.
-
-    Returns:
-        0 if the pixels do not lie on the same plane; infinite if the plane is seen edge on.
-    """
+    """Return how much a plane's perspective differs between two pixels, [N]; inf if the plane is seen edge on."""
     stretch = np.zeros(len(here[0]))
     on = (target.plane[here] > 0) & (target.plane[here] == target.plane[source])
     with np.errstate(invalid="ignore"):
+        # Maps the same small step on the plane from one pixel to the other: the identity for the same perspective.
         change = invert_2x2(target.to_plane[source[0][on], source[1][on]]) @ target.to_plane[here[0][on], here[1][on]]
         stretch[on] = np.linalg.norm(change - np.eye(2), axis=(1, 2))
     return np.where(np.isfinite(stretch), stretch, np.inf)
@@ -206,10 +192,7 @@ def _blur_known(colors: np.ndarray, missing: np.ndarray) -> np.ndarray:
 
 
 def _interpolate_tone(tone: np.ndarray, hole: np.ndarray, target: SourceImage) -> np.ndarray:
-    """Return the tone, [H, W, 3], interpolated across the hole, bool [H, W], from the pixels around it.
-
-    Each foreground layer is interpolated from its own pixels only.
-    """
+    """Return the tone [H, W, 3], interpolated across the hole in each foreground layer from the layer's own pixels."""
     result = tone.copy()
     for k in np.unique(target.layer[hole]):
         mine, beside = hole & (target.layer == k), ~hole & ~target.masked & (target.layer == k)
@@ -263,15 +246,7 @@ def frequent_offsets(
 
 
 def _histogram_peaks(offsets: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return the most frequent of the offsets [N, 2] and of their opposites, the most frequent first.
-
-    Args:
-        offsets: [N, 2] int (rows, columns).
-        shape: height and width of the picture.
-
-    Returns:
-        [M, 2] int, the peaks of the blurred histogram.
-    """
+    """Return the most frequent of the offsets (rows, columns) and of their opposites, most frequent first, [M, 2]."""
     height, width = shape
     count = np.zeros((2 * height + 1, 2 * width + 1), np.float32)
     np.add.at(count, (offsets[:, 0] + height, offsets[:, 1] + width), 1)

@@ -197,16 +197,7 @@ class PlaneMotions:
         return at.clip(-1e6, 1e6).astype(np.float32)
 
     def _scales(self, motion: Motion, pixels: HolePixels, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return how many source pixels a pixel of the hole spans, along two directions.
-
-        Args:
-            motion: the motion of the photograph.
-            pixels: N pixels of the hole.
-            at: [N, 2], the result of `_source_pixels` for these arguments.
-
-        Returns:
-            [N] each: the number along the direction in which it is smallest, and along that in which it is largest.
-        """
+        """Return the smallest and largest number [N] of source pixels, at `at`, that a pixel spans in any direction."""
         moved, homography = self._moved(motion, pixels), self.photos[motion.photo].homography
         weight = moved @ homography[2, :2] + homography[2, 2]
         jacobian = (homography[None, :2, :2] - at[:, :, None] * homography[2, :2]) / weight[:, None, None]
@@ -217,14 +208,7 @@ class PlaneMotions:
 
 
 def _select_motions(pixels: HolePixels, candidates: PlaneMotions) -> PlaneMotions:
-    """Select and refine the motions with which the photographs match the known pixels of the ring best.
-
-    Each motion may match another part of the ring.
-
-    Args:
-        pixels: pixels of the hole and of the ring.
-        candidates: the photographs and the symmetry; their motions are ignored.
-    """
+    """Select and refine the motions that match the ring best; the motions of `candidates` are ignored."""
     ring = pixels.select(~pixels.in_hole).spread(MAX_COMPARED)
     inside = pixels.select(pixels.in_hole).spread(MAX_COMPARED)
     motions = [
@@ -233,19 +217,14 @@ def _select_motions(pixels: HolePixels, candidates: PlaneMotions) -> PlaneMotion
         for motion in candidates.symmetry.motions
     ]
     motions = [motion for motion in motions if candidates.covers(motion, inside).mean() >= MIN_COVERAGE]
+    # each motion may match another part of the ring
     motions = _best_motions(ring, motions, candidates, 2 * MAX_CANDIDATES)
     motions = [_refine_motion(ring, motion, candidates) for motion in motions]
     return candidates.with_motions(_best_motions(ring, motions, candidates, MAX_CANDIDATES))
 
 
 def _refine_motion(ring: HolePixels, motion: Motion, candidates: PlaneMotions) -> Motion:
-    """Shift the motion a little, and turn it a little about the centre if it is a turn, to match the ring best.
-
-    Args:
-        ring: known pixels around the hole.
-        motion: the motion to refine.
-        candidates: the photographs and the symmetry.
-    """
+    """Shift the motion a little, and turn it a little about the centre if there is one, to match the ring best."""
     symmetry = candidates.symmetry
 
     def misfit(motion: Motion) -> float:
@@ -271,16 +250,7 @@ def _refine_motion(ring: HolePixels, motion: Motion, candidates: PlaneMotions) -
 
 
 def _best_motions(ring: HolePixels, motions: Sequence[Motion], candidates: PlaneMotions, most: int) -> list[Motion]:
-    """Choose up to `most` motions that together match the ring best, one after the other (greedily).
-
-    A motion gains wherever it matches a window of the ring better than all motions chosen before.
-
-    Args:
-        ring: known pixels around the hole.
-        motions: the motions to choose from.
-        candidates: the photographs and the symmetry.
-        most: the largest number of motions.
-    """
+    """Choose greedily up to `most` motions that together match the ring best."""
     top, left = ring.rows.min(), ring.columns.min()
     shape = (ring.rows.max() - top + 1, ring.columns.max() - left + 1)
     at = ring.rows - top, ring.columns - left
@@ -296,6 +266,7 @@ def _best_motions(ring: HolePixels, motions: Sequence[Motion], candidates: Plane
     chosen: list[int] = []
     local, least = np.array(means), np.full(len(ring), MAX_DIFFERENCE)
     for _ in range(min(most, len(motions))):
+        # a motion gains wherever it matches a window of the ring better than all motions chosen before
         gain = np.maximum(least - local, 0).sum(1) - 1e-3 * local.mean(1)
         gain[chosen] = -np.inf
         chosen.append(int(gain.argmax()))
@@ -309,10 +280,7 @@ def _without_specks(mask: np.ndarray) -> np.ndarray:
 
 
 def _is_set(mask: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return bool [N], the values of a mask, bool [H, W], at the pixels nearest to positions (x, y), [N, 2].
-
-    The value is False outside the mask's array and on its outermost pixels.
-    """
+    """Return the mask at the pixels nearest to (x, y), [N]; False outside and on its outermost pixels."""
     height, width = mask.shape
     column, row = np.round(at).astype(int).T
     inside = (row >= 1) & (column >= 1) & (row < height - 1) & (column < width - 1)

@@ -125,21 +125,10 @@ def find_symmetry(seen: PlanePixels) -> PlaneSymmetry | None:
 
 
 def _refine_centre(seen: PlanePixels, centre: np.ndarray, cell: float) -> tuple[np.ndarray, PlaneMap | None]:
-    """Refine the centre about which the texture turns.
+    """Return the refined centre about which the texture turns, and the polar map about it, None if there is none."""
 
-    The centre is chosen for which the correlation of the texture with itself, averaged over all its turns, is highest.
-    One turn alone would not do, because a short arc fits many circles, and so correlates about wrong centres too. If
-    fewer than two turns are seen, the first estimate stays.
-
-    Args:
-        seen: the pixels of the plane.
-        centre: [2], the first estimate, on the plane.
-        cell: side of a cell, in world units: the unit of the steps.
-
-    Returns:
-        The centre, [2], and the polar map about it, or None instead of a map if there is none (`_resample`).
-    """
-
+    # The score is averaged over all turns. One turn alone would not do, because a short arc fits many circles, and so
+    # correlates about wrong centres too. If fewer than two turns are seen, the first estimate stays.
     def judge(at: np.ndarray) -> tuple[float, PlaneMap | None]:
         polar = _polar_map(seen, at)
         return (
@@ -161,15 +150,7 @@ def _refine_centre(seen: PlanePixels, centre: np.ndarray, cell: float) -> tuple[
 
 
 def _mean_correlation(correlation: np.ndarray, full_turn: float) -> float:
-    """Average a correlation over all turns that map the texture onto itself, as far as they are seen.
-
-    Args:
-        correlation: [h], correlation of a polar map with itself after a turn by 0, 1, ... rows.
-        full_turn: a turn by 360 degrees, in rows.
-
-    Returns:
-        0 if fewer than two turns are seen.
-    """
+    """Average a correlation [h] over the texture's turns that are seen, 0 if fewer than two; `full_turn` is in rows."""
     turns = _find_turns(correlation, full_turn)
     values = np.interp(turns[turns > 0], np.arange(len(correlation)), correlation)
     values = values[values != 0]
@@ -177,12 +158,7 @@ def _mean_correlation(correlation: np.ndarray, full_turn: float) -> float:
 
 
 def _autocorrelation(plane_map: PlaneMap) -> np.ndarray:
-    """Compute the normalised correlation of a map with itself, for all shifts by whole cells.
-
-    Returns:
-        [h, w], where entry (i, j) is the correlation after a shift by i rows and j columns; as in an FFT, negative
-        shifts count from the end. It is 0 if too few cells overlap after the shift.
-    """
+    """Return the normalised correlation [h, w] of a map with itself after shifts by cells, ordered as in an FFT."""
     known = cv2.erode(plane_map.known.astype(np.uint8), np.ones((5, 5)), borderValue=0) > 0
     grey = plane_map.values.mean(2)
     detail = np.where(known, grey - cv2.GaussianBlur(grey, (0, 0), SHADING_SIGMA), 0.0).astype(np.float64)
@@ -191,14 +167,12 @@ def _autocorrelation(plane_map: PlaneMap) -> np.ndarray:
     back = lambda spectrum: np.fft.irfft2(spectrum, size)
     both = np.sqrt(np.maximum(back(power * mask.conj()) * back(power.conj() * mask), 1e-6))
     enough = back(np.abs(mask) ** 2) > max(MIN_CELLS, MIN_OVERLAP * known.sum())
+    # 0 where too few cells overlap after the shift
     return np.where(enough, back(np.abs(picture) ** 2) / both, 0.0)
 
 
 def _find_shifts(correlation: np.ndarray) -> np.ndarray:
-    """Return [M, 2], the shifts (x, y) in cells at which an autocorrelation, [h, w], has peaks, the highest first.
-
-    M is 0 if the highest peak is below `MIN_CORRELATION`, or if there are fewer than `MIN_SHIFTS` peaks.
-    """
+    """Return the shifts (x, y) in cells, [M, 2], at an autocorrelation's peaks, highest first; none if low or few."""
     height, width = (side // 2 for side in correlation.shape)
     centred = np.fft.fftshift(correlation)
     peak = (centred == ndimage.maximum_filter(centred, PEAK_WINDOW)) & (centred > MIN_OF_BEST * MIN_CORRELATION)
@@ -211,18 +185,7 @@ def _find_shifts(correlation: np.ndarray) -> np.ndarray:
 
 
 def _find_turns(correlation: np.ndarray, full_turn: float) -> np.ndarray:
-    """Find the turns that map the texture onto itself.
-
-    They are the multiples, in both directions, of the basic turn: the smallest turn whose correlation is about as high
-    as that of any other (`MIN_OF_PEAK`). A multiple near a peak takes the position of this peak.
-
-    Args:
-        correlation: [h], correlation of a polar map with itself after a turn by 0, 1, ... rows.
-        full_turn: a turn by 360 degrees, in rows.
-
-    Returns:
-        [M], turns in rows; M = 0 if no turn reaches `MIN_CORRELATION`.
-    """
+    """Return the turns, in rows [M], that map the texture onto itself, in both directions; M = 0 if there are none."""
     half = correlation[: min(len(correlation) // 2, int(full_turn / 2) + 1)]
     rows = np.arange(MIN_SHIFT, len(half) - 1)
     peak = (half[rows] > half[rows - 1]) & (half[rows] >= half[rows + 1]) & (half[rows] > MIN_OF_BEST * MIN_CORRELATION)
@@ -231,10 +194,12 @@ def _find_turns(correlation: np.ndarray, full_turn: float) -> np.ndarray:
         return np.zeros(0)
     before, at, after = (half[rows + step] for step in (-1, 0, 1))
     exact = rows + 0.5 * (before - after) / (before - 2 * at + after)
+    # the basic turn: the smallest whose correlation is about as high as that of any other
     first = exact[half[rows] > MIN_OF_PEAK * half[rows].max()].min()
     turns = []
     for k in range(1, int(full_turn / 2 / first) + 1):
         off = np.abs(exact - k * first)
+        # a multiple of the basic turn near a peak takes its position
         turns.append(exact[off.argmin()] if off.min() < TURN_TOLERANCE * first else k * first)
     return np.array([way * turn for turn in turns[: MAX_MOTIONS // 2] for way in (1, -1)])
 
@@ -247,25 +212,21 @@ def _cartesian_map(seen: PlanePixels, low: np.ndarray, high: np.ndarray) -> Plan
 
 
 def _cell_side(seen: PlanePixels, length: float) -> float:
-    """Return the side of a cell, in world units, for a map whose longest side has this length.
-
-    The map has at most `SIDE` cells along a side, and its cells are on average no smaller than the pixels of the image.
-    """
+    """Return the side of a cell, in world units, for a map whose longest side is `length`."""
     area = cv2.contourArea(cv2.convexHull(seen.coordinates.astype(np.float32)))
+    # at most `SIDE` cells along a side, on average no smaller than the pixels of the image
     return max(length / SIDE, (area / len(seen.coordinates)) ** 0.5, 1e-9)
 
 
 def _polar_map(seen: PlanePixels, centre: np.ndarray) -> PlaneMap | None:
-    """Return the polar map about a centre, [2], with a column for each radius and a row for each angle.
-
-    At the median radius its cells are square. None as in `_resample`.
-    """
+    """Return the polar map about a centre, with a column per radius and a row per angle; None as in `_resample`."""
     away = seen.coordinates - centre
     distance = np.hypot(*away.T)
     direction = np.angle(np.exp(1j * np.arctan2(away[:, 1], away[:, 0])).mean())  # the jump of the angle lies opposite
     angle = np.angle(np.exp(1j * (np.arctan2(away[:, 1], away[:, 0]) - direction)))
     length = max(float(np.ptp(distance)), float(np.median(distance)) * float(np.ptp(angle)) / 2)
     step = _cell_side(seen, length)
+    # cells are square at the median radius
     pitch = np.array([step, step / float(np.median(distance))])
     radii = np.arange(distance.min(), distance.max(), pitch[0])
     turns = direction + np.arange(angle.min(), angle.max(), pitch[1])
@@ -274,16 +235,7 @@ def _polar_map(seen: PlanePixels, centre: np.ndarray) -> PlaneMap | None:
 
 
 def _resample(seen: PlanePixels, coordinates: np.ndarray, pitch: np.ndarray) -> PlaneMap | None:
-    """Sample the image at given coordinates on the plane.
-
-    Args:
-        seen: the pixels of the plane.
-        coordinates: [h, w, 2], the coordinates of each cell on the plane.
-        pitch: [2], the sides of a cell.
-
-    Returns:
-        None if a side of the map is shorter than `MIN_SIDE`, or the pixels fit no homography.
-    """
+    """Sample the image at plane coordinates [h, w, 2]; None if the map is too small or no homography fits."""
     some = np.linspace(0, len(seen.coordinates) - 1, min(len(seen.coordinates), HOMOGRAPHY_PIXELS)).astype(int)
     points, pixels = (each[some].astype(np.float64) for each in (seen.coordinates, seen.pixels))
     homography, _ = cv2.findHomography(points, pixels, 0)
@@ -299,21 +251,12 @@ def _resample(seen: PlanePixels, coordinates: np.ndarray, pitch: np.ndarray) -> 
 
 
 def _find_centre(plane_map: PlaneMap, draws: np.random.Generator) -> np.ndarray | None:
-    """Find the point in which the lines of the texture meet.
-
-    Each steep edge in the map is a line. The centre is the point that the most lines pass through.
-
-    Args:
-        plane_map: the map of the plane along its axes.
-        draws: draws the pairs of lines whose intersections are tried.
-
-    Returns:
-        The point, [2] (x, y) in cells, perhaps outside the map; None if the lines are rather parallel, or too few.
-    """
+    """Return the point (x, y), in cells, where the texture's lines meet; None if they are rather parallel or few."""
     grey = cv2.GaussianBlur(plane_map.values.mean(2), (0, 0), 1.0)
     gradient = np.stack([cv2.Scharr(grey, cv2.CV_32F, *way) for way in ((1, 0), (0, 1))], -1)
     inner = cv2.erode(plane_map.known.astype(np.uint8), np.ones((7, 7)), borderValue=0) > 0
     length = np.linalg.norm(gradient, axis=-1) * inner
+    # each steep edge is a line
     steepest = np.argsort(-length, axis=None, kind="stable")[:MAX_EDGES]
     steepest = steepest[length.reshape(-1)[steepest] > 0]
     if len(steepest) < MIN_CELLS:
@@ -331,6 +274,7 @@ def _find_centre(plane_map: PlaneMap, draws: np.random.Generator) -> np.ndarray 
     points = points[np.linalg.norm(points - middle, axis=1) < MAX_CENTRE_DISTANCE * SIDE]
     if not len(points):
         return None
+    # the centre, perhaps outside the map, is the point that the most lines pass through
     counts = [_meets(point, at, normals).sum() for point in points]
     parallel = max(int((np.abs(normals @ (-each[1], each[0])) < SIN_TOLERANCE).sum()) for each in normals[first])
     best = points[int(np.argmax(counts))]
@@ -342,12 +286,6 @@ def _find_centre(plane_map: PlaneMap, draws: np.random.Generator) -> np.ndarray 
 
 
 def _meets(point: np.ndarray, at: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return bool [L], True for the lines that pass through a point, [2], up to a small angle (`SIN_TOLERANCE`).
-
-    Args:
-        point: [2].
-        at: [L, 2], a point on each line.
-        normals: [L, 2], the unit normal of each line.
-    """
+    """Return which lines (a point `at` and a unit normal each) pass through a point up to a small angle, bool [L]."""
     away = point - at
     return np.abs((normals * away).sum(1)) < SIN_TOLERANCE * np.linalg.norm(away, axis=1)
