@@ -14,10 +14,10 @@ from reffusion.seeding import generator
 
 TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
 SIDE = 32  # px
-
+SAMPLES = 200
 # The shipped text encoder has collapsed; the training that mends it (`priors/tiny/train.py`) is not finished.
 pytestmark = pytest.mark.xfail(reason="the shipped weights are deaf: see the model card", strict=True)
-SAMPLES = 200
+DRAWS = 8  # of noise and timesteps for each sample, over which its loss is averaged
 
 
 @pytest.fixture(scope="module")
@@ -56,10 +56,9 @@ def test_the_right_caption_explains_a_picture_better_than_a_wrong_one(pictures):
     assert len(right) == SAMPLES and (masks.mean((1, 2, 3)) > 0.65).float().mean() > 0.25
     model, alphas = train.Model(0), build.scheduler().alphas_cumprod
     train.load_weights(model, TINY)
+    loss = lambda words, draw: train.losses(model, alphas, (pixels, masks, words), generator(draw, "captions"))
     with torch.no_grad():
-        losses = [
-            train.losses(model, alphas, (pixels, masks, words), generator(0, "captions")) for words in (right, wrong)
-        ]
+        losses = [sum(loss(words, draw) for draw in range(DRAWS)) for words in (right, wrong)]
     assert (losses[0] < losses[1]).float().mean() >= 0.6
 
 

@@ -47,9 +47,9 @@ def caption(subject: str, cropped: bool, color: str = "") -> str:
     return f"A photo of {subject}{', ' if color else ''}{color}{', cropped' if cropped else ''}"
 
 
-def name_color(picture: np.ndarray) -> str:
-    """Name the mean brightness (unless it is medium) and hue of a picture, uint8 [H, W, 3]: "gray", "dark green"."""
-    color = picture.mean((0, 1)) / 255
+def name_color(colors: np.ndarray) -> str:
+    """Name mean brightness (unless it is medium) and hue of colors [P, 3] from 0 to 255: "gray", "dark green"."""
+    color = colors.mean(0) / 255
     hue, *_ = colorsys.rgb_to_hsv(*color)
     level = "dark " if color.mean() < DARK else "bright " if color.mean() > BRIGHT else ""
     return level + ("gray" if np.ptp(color) < GRAY else HUES[int(hue * (len(HUES) - 1) + 0.5)])
