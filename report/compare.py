@@ -1,6 +1,6 @@
-"""Tables and pictures of all methods that `make scene=X compare` ran: runs/X/compare.md, .csv and .html.
+"""Tables and pictures of all methods that `make scene=X compare` ran: runs/X/compare.html and compare.csv.
 
-For a folder of scenes (`make data=FOLDER compare`) the files are runs/compare/compare.md, .csv and .html.
+For a folder of scenes (`make data=FOLDER compare`) the files are runs/compare/compare.html and compare.csv.
 
 A *method* is the full method or one of the variants. The *box* is the bounding box of a view's mask, 10% wider on each
 side, in which scores are measured. In many functions `table` is the result of `results.summarize_methods`: one
@@ -62,9 +62,9 @@ FACTS = {"inpainter": "2D inpainter", "perceptual": "perceptual distance"}  # ke
 
 
 def make(home: Path) -> dict[str, Path]:
-    """Write the table (.csv) and the pages (.md, .html) of a comparison; return their paths as {"csv", "md", "html"}.
+    """Write the table (.csv) and the page (.html) of a comparison; return their paths as {"csv", "html"}.
 
-    Pictures are written to `home`/compare/. The HTML page embeds the pictures, so that it needs no other file.
+    Pictures are written to `home`/compare/. The page embeds the pictures, so that it needs no other file.
 
     Args:
         home: folder of the comparison: runs/<scene>, or runs/compare for a folder of scenes.
@@ -78,14 +78,13 @@ def make(home: Path) -> dict[str, Path]:
     for chart in ("tradeoff", "differences"):  # an earlier call may have drawn a chart for which there is no data now
         (out / f"{chart}.png").unlink(missing_ok=True)
     table = summarize_methods(comparison)
-    paths = {kind: home / f"compare.{kind}" for kind in ("csv", "md", "html")}
+    paths = {kind: home / f"compare.{kind}" for kind in ("csv", "html")}
     save_csv(paths["csv"], table)
     charts_drawn = {
         "Error against run time": save_tradeoff(table, out / "tradeoff.png"),
         "Difference to the full method": save_forest(comparison, out / "differences.png"),
     }
     views = compare_pictures.save_sheets(comparison, out)
-    paths["md"].write_text(markdown(comparison, table, charts_drawn, views), encoding="utf-8")
     paths["html"].write_text(html(comparison, table, charts_drawn, views), encoding="utf-8")
     return paths
 
@@ -294,29 +293,11 @@ def explain_intervals(comparison: Comparison) -> str:
     )
 
 
-def markdown(
-    comparison: Comparison, table: list[dict], chart_paths: dict[str, Path | None], views: dict[str, Path]
-) -> str:
-    """Return the page in Markdown; the arguments are those of `html`."""
-    header, texts, bold = method_table(table)
-    strong = [[f"**{c}**" if b else c for c, b in zip(*line, strict=True)] for line in zip(texts, bold, strict=True)]
-    lines = [f"# {comparison.name}: methods compared", "", summary(comparison, table), ""]
-    lines += [page.markdown_table(header, strong)]
-    for title, further in extra_tables(comparison, table).items():
-        lines += [f"## {title}", "", page.markdown_table(*further)]
-    if differences := difference_table(table):
-        lines += [
-            "## Difference to the full method",
-            "",
-            explain_intervals(comparison),
-            "",
-            page.markdown_table(*differences),
-        ]
-    for title, path in chart_paths.items():
-        lines += [f"![{title}](compare/{path.name})", ""] if path else []
-    for view, path in views.items():
-        lines += [f"## {view}", "", f"![{view} by every method](compare/{path.name})", ""]
-    return "\n".join([*lines, "## Notes", "", *(f"- {note}" for note in table_notes(comparison, table)), ""])
+def terminal_text(comparison: Comparison) -> str:
+    """Return the summary and the main table as text for a terminal."""
+    table = summarize_methods(comparison)
+    header, texts, _ = method_table(table)
+    return f"{summary(comparison, table)}\n\n{page.markdown_table(header, texts)}"
 
 
 def html(comparison: Comparison, table: list[dict], chart_paths: dict[str, Path | None], views: dict[str, Path]) -> str:
@@ -354,11 +335,10 @@ def main() -> None:
     arguments = parser.parse_args()
     try:
         name = arguments.scene.expanduser().resolve().name if arguments.scene else FOLDER_COMPARISON
-        paths = make(arguments.runs / name)
+        paths = make(home := arguments.runs / name)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
-    text = paths["md"].read_text(encoding="utf-8")
-    print(text[: text.find("\n\n![")].split("## ")[0].strip(), "", *paths.values(), sep="\n")
+    print(terminal_text(load_comparison(home)), *paths.values(), sep="\n")
 
 
 if __name__ == "__main__":

@@ -37,9 +37,9 @@ def compare(
     """Run the full method, the scene's own run and the variants on one or more scenes.
 
     The scene's own run uses the profile of the scene. All other methods use the profile that `comparisons` of
-    pipeline.yaml names for that profile, if any. After each run, compare.json and a table of all runs are written to
-    runs/<scene>/ of the first scene, or to runs/compare/ for a folder of scenes. Artifacts that are up to date are
-    used, so the same command resumes after a kill. If a run fails, the other runs go on.
+    pipeline.yaml names for that profile, if any. After each run, compare.json with the mean scores of all runs is
+    written to runs/<scene>/ of the first scene, or to runs/compare/ for a folder of scenes. Artifacts that are up to
+    date are used, so the same command resumes after a kill. If a run fails, the other runs go on.
 
     Args:
         request: the scene and its options, without a variant.
@@ -81,7 +81,6 @@ def compare(
         run |= {"state": FAILED, "error": outcome.error} if outcome.error else {"state": DONE, "stages": folders}
         run |= {"mean": mean_scores(outcome.stages.get("evaluate"))}
         write_json(home / RECORD, record)
-        write_table(home / RECORD)
 
     write_json(home / RECORD, record)
     todo = []

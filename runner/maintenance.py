@@ -20,7 +20,7 @@ from runner.text import display_path, join_names
 
 # Files that the runner and report/ write to runs/<scene>/ besides artifacts.
 RECORDS = ("profile", "source", "plan.json", "output.log", "turntable.webm", "before_after.webp", "check.png")
-PAGES = (*(f"compare.{kind}" for kind in ("json", "csv", "md", "html")), "compare-runs.csv", "compare-runs.md",
+PAGES = (*(f"compare.{kind}" for kind in ("json", "csv", "html")),
          "compare/*.png", "study/index.html", "study/clips/*.webm", "study/clips/*.png", "study-key.json",
          "adapted/sheet.png", "adapted/*/*.png", "adapted/adapted.json",
          "sds-variance/sds_variance.json", "report.html", "report/index.html", "report/*.png",

@@ -66,7 +66,7 @@ def format_command(request: Request, command: str) -> str:
 
 
 def write_table(record: Path) -> None:
-    """Run report/table.py, which writes the table of a batch or a comparison to the folder of its record.
+    """Run report/table.py, which writes the table of a batch to the folder of its record.
 
     Args:
         record: the JSON file with the record.

@@ -39,6 +39,15 @@ def finished_stages(root: Path) -> list[str]:
     return sorted((root / "runs/ran.txt").read_text().splitlines())
 
 
+def read_page(made: dict[str, Path]) -> str:
+    """Return the HTML of a comparison's page without its pictures, which may contain any word."""
+    return unescape(re.sub(r'src="[^"]*"', "", made["html"].read_text()))
+
+
+def cells(*texts: str) -> str:
+    return "".join(f"<td>{text}</td>" for text in texts)
+
+
 def methods_by_name(job_folder: Path) -> dict[str, dict]:
     return {row["method"]: row for row in results.summarize_methods(results.load_comparison(job_folder))}
 
@@ -82,15 +91,15 @@ def test_a_failed_variant_shows_and_stops_no_other(compared_project, pages):
     table = methods_by_name(compared_project / "runs/toy")
     assert [name for name, row in table.items() if row["state"] == "failed"] == ["bad"]
     assert table["bad"]["psnr_box"] is None and table["bad"]["seconds"] is None and table["none"]["psnr_box"] == 22.5
-    assert "| bad (failed) |" in pages["md"].read_text()
-    assert all("a gain below 0 | cannot be" in pages[kind].read_text() for kind in ("md", "html"))
+    text = read_page(pages)
+    assert "<td>bad (failed)</td>" in text and "a gain below 0 | cannot be" in text
 
 
 def test_the_same_job_is_no_row_of_figures(compared_project, pages):
     twin = methods_by_name(compared_project / "runs/toy")["twin"]
     assert twin["same_as"] == "better" and twin["psnr_box"] is None and twin["seconds"] is None
-    text = pages["md"].read_text()
-    assert "| twin = better |" in text and "twin is the very same job as better here." in text
+    text = read_page(pages)
+    assert "<td>twin = better</td>" in text and "twin is the very same job as better here." in text
     assert "best in SSIM: better;" in text
 
 
@@ -121,8 +130,8 @@ def test_the_best_in_lpips_comes_first_and_ties_are_ties(job_folder):
         metrics["mean"]["lpips_vgg_box"] = value
         path.write_text(json.dumps(metrics))
     assert list(methods_by_name(job_folder)) == ["better", "none", "full", "bad", "twin"]
-    text = page.make(job_folder)["md"].read_text()
-    assert "best in LPIPS (vgg): better and none;" in text and text.count("**0.1000**") == 2
+    text = read_page(page.make(job_folder))
+    assert "best in LPIPS (vgg): better and none;" in text and text.count("<b>0.1000</b>") == 2
 
 
 def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path):
@@ -145,9 +154,6 @@ def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path
     before = [f"toy{end}" for end in (" distill", " evaluate", " poses", "@better distill", "@better evaluate")]
     assert finished_stages(root) == sorted([*before, "toy-1 poses"])
     home = root / "runs/compare"
-    partial = (home / "compare-runs.md").read_text().splitlines()  # the table is written after each run
-    assert "| full | toy | done | 23.6500 | 0.6000 |" in partial[2] and "not run yet" in partial[4]
-    assert "| full | mean of 1 |  | 23.6500 |" in partial[-2]
     assert methods_by_name(home)["full"]["state"] == "1 of 3 done"  # a partial comparison can be loaded
     slow.unlink()
     assert compare(make_request(root, ""), "better", data=root / "data") == 0
@@ -157,12 +163,12 @@ def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path
     assert row["scenes"] == 3 and row["psnr_box"] == pytest.approx(21.5 + 1.15 + (1 + 2 + 3) / 3)
     assert row["psnr_box_interval"] == pytest.approx(4.302653 / np.sqrt(3), rel=1e-6)  # deviation 1, Student's t of 2
     made = page.make(home)
-    text = made["md"].read_text()
-    assert text.startswith("# data, 3 scenes: methods compared") and "| full | 24.65 ± 2.48 |" in text
-    assert "| better | 25.95 | 27.95 | 26.95 | 26.95 |" in text  # the three scenes, and their mean
-    assert "| somebody | published | PSNR, dB | 19.5 | ten scenes, 1600 px |" in text
-    assert "| full | here | PSNR, dB | 24.65 ± 2.48 |" in text
-    assert len(list((home / "compare").glob("toy*.png"))) == 3 and "24.65 ± 2.48" in made["html"].read_text()
+    text = read_page(made)
+    assert "<h1>data, 3 scenes: methods compared</h1>" in text and cells("full", "24.65 ± 2.48") in text
+    assert cells("better", "25.95", "27.95", "26.95", "26.95") in text  # the three scenes, and their mean
+    assert cells("somebody", "published", "PSNR, dB", "19.5", "ten scenes, 1600 px") in text
+    assert cells("full", "here", "PSNR, dB", "24.65 ± 2.48") in text
+    assert len(list((home / "compare").glob("toy*.png"))) == 3
     for wrong, message in (("psnr_box,x", "'x' is no number"), ("psnr,1", "metric 'psnr' is none of")):
         (root / "data/published.csv").write_text(f"method,metric,value,protocol\na,{wrong},b\n")
         with pytest.raises(ValueError, match=re.escape(message)):
@@ -257,8 +263,6 @@ def test_the_page_needs_no_other_file(pages):
     assert "http" not in text and "<script" not in text and "@import" not in text
     assert html.count("no weights") == 1 and "2D inpainter a brush" in html and "perceptual" not in html
     assert "better *" in text and "full *" not in text and "OpenCV's brush stands in for LaMa" in unescape(text)
-    linked = re.findall(r"\]\((.*?)\)", pages["md"].read_text())
-    assert len(linked) == 5 and all((pages["md"].parent / name).stat().st_size > 1000 for name in linked)
 
 
 def test_without_ground_truth(job_folder):
@@ -287,9 +291,9 @@ def test_without_ground_truth_held_out_views_are_compared_outside_their_masks(jo
     row = methods_by_name(job_folder)["better"]
     assert row["psnr_outside"] == 32 and row["psnr_box"] is None
     assert row["psnr_outside_minus_full"] == pytest.approx(1.15) and row["psnr_outside_interval_views"] > 0
-    text = made["md"].read_text()
-    assert "outside: PSNR ↑" in text and "| +1.15 ± 0.21 |" in text and "best in PSNR outside: better" in text
-    assert "should leave as they are" in made["html"].read_text()
+    text = read_page(made)
+    assert "outside: PSNR ↑" in text and cells("+1.15 ± 0.21") in text and "best in PSNR outside: better" in text
+    assert "should leave as they are" in text
     runs = results.load_comparison(job_folder)
     title = lambda: compare_pictures._cells([runs.runs["full", "toy"]], runs.runs["full", "toy"], "a")[0][0]
     assert title() == "ground truth"
@@ -360,7 +364,7 @@ def test_several_scenes(job_folder):
     assert row["scenes"] == 2 and row["psnr_box_minus_full"] == pytest.approx(2.8)
     assert row["psnr_box_interval_views"] == pytest.approx(2.364624 * views.std(ddof=1) / np.sqrt(8), rel=1e-6)
     assert row["psnr_box_interval_scenes"] == pytest.approx(12.706205 * 0.5, rel=1e-6)
-    assert "+2.80 ± 0.49 (± 6.35)" in page.make(job_folder)["md"].read_text()
+    assert "+2.80 ± 0.49 (± 6.35)" in read_page(page.make(job_folder))
 
 
 # ------------------------------------------------------------------------------------------------------- statistics
