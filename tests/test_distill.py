@@ -195,6 +195,7 @@ def test_any_number_of_threads_gives_the_same_bits(prior, text, tmp_path, off):
 def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp_path, monkeypatch):
     monkeypatch.setattr(trace, "WORK_PER_CHECKPOINT", 0)  # write a checkpoint after every step
     monkeypatch.setattr(D, "REGION_EVERY", 2)
+    monkeypatch.setattr(D, "DENSIFIED_UNTIL", 1.0)
     whole, labels = run_distill(tmp_path / "whole", prior, text)
     assert labels.sum() > random_wall()[1].sum(), "densification added no masked Gaussian"
     real = D.take_step
@@ -224,10 +225,11 @@ def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp
 
 def test_densification_needs_large_gradients_and_is_bounded(prior, text, tmp_path, monkeypatch):
     monkeypatch.setattr(densification, "PRUNE_OPA", 0.0)
+    monkeypatch.setattr(D, "DENSIFIED_UNTIL", 1.0)
     masked = int(random_wall()[1].sum())
 
     def count_new(name, weight, every=2):
-        densify = {"every": every, "stop": 1.0, "max_growth": 1.25}
+        densify = {"every": every, "max_growth": 1.25}
         settings = with_changes(PLAIN, iterations=6, confined=False, sds={"weight": weight}, densify=densify)
         _, labels = run_distill(tmp_path / name, prior, text, settings)
         return int(labels.sum()) - masked

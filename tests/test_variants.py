@@ -158,7 +158,7 @@ def test_the_papers_profile_takes_every_variant(finished_capture):
 
 # ------------------------------------------------------------------------------------------ what the terms may reach
 
-MSE, PATCHES = LiftTerm(weight=1), LiftTerm(weight=1, loss="perceptual", patch=20)
+MSE, PATCHES = LiftTerm(weight=1), LiftTerm(weight=1, loss="perceptual")
 
 
 def lifted_view(name="a", shift=0.0):
@@ -365,7 +365,7 @@ def test_the_chain_of_lifted_pictures(masked_scene, lifted_views, tmp_path, monk
         monkeypatch.setenv(name, str(tmp_path / "nothing"))  # as on a machine without weights
     for loss, perceptual_name in (("mse", None), ("perceptual", "multi-scale D-SSIM")):
         without = {"sds": OFF, "adversarial": OFF, "depth": OFF}
-        params = distill.Params(iterations=4, lift={"weight": 1, "loss": loss, "patch": 24}, **without)
+        params = distill.Params(iterations=4, lift={"weight": 1, "loss": loss}, **without)
         out = tmp_path / loss
         out.mkdir()
         distill.run(params, out, **chain, lift=lifted_views)

@@ -43,6 +43,7 @@ from reffusion.types import PARAMETERS, Camera, Gaussians
 
 TERMS = sds, depth, adversarial, reference, lift, reconstruction  # in the order in which their gradients are added
 SNAPSHOTS = 4  # parts of the run; the masked Gaussians are saved at the end of each but the last
+DENSIFIED_UNTIL = 0.5  # fraction of a run after which no Gaussian is added, as in 3DGS
 AVERAGED_FROM = 2 / 3  # fraction of a run without densification after which the Gaussians of all steps are averaged
 REGION_EVERY = 50  # steps between prunings of Gaussians that changed region
 
@@ -250,7 +251,7 @@ def _gradient_norms(gaussians: Gaussians, masked: Tensor) -> Tensor:
 
 
 def _densifies_after(settings: Params, done: int) -> bool:
-    every, last = settings.densify.every, settings.densify.stop * settings.iterations
+    every, last = settings.densify.every, DENSIFIED_UNTIL * settings.iterations
     return bool(every) and done % every == 0 and done <= last
 
 

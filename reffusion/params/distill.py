@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -129,7 +129,7 @@ class LiftTerm(Settings):
     loss: Literal["mse", "perceptual"] = Field(
         "mse", description="squared error (NeRF-In), or perceptual distance of patches (SPIn-NeRF)"
     )
-    patch: int = Field(64, ge=16, description="side of a patch for the perceptual loss, px")
+    patch: ClassVar[int] = 64  # side of a patch for the perceptual loss, px: that of the adversarial term
 
 
 class LearningRates(Settings):
@@ -161,7 +161,6 @@ class Densify(Settings):
     """
 
     every: int = Field(0, ge=0, description="steps between densifications of masked Gaussians; 0: never")
-    stop: float = Field(0.5, ge=0, le=1, description="fraction of the run after which no Gaussian is added")
     grow_grad2d: float = Field(
         1e-3, gt=0, description="screen-space gradient for cloning or splitting, image in [-1, 1]; 3DGS: 2e-4"
     )

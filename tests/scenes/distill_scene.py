@@ -65,7 +65,7 @@ def has_gradient(gaussians):
 
 SETTINGS = Params(
     iterations=6, sds=SDS, depth={"weight": 0}, adversarial=ADVERSARIAL, reference={"weight": 0.5},
-    densify={"every": 2, "stop": 1, "grow_grad2d": 1e-6}, checkpoint_seconds=1e-9,
+    densify={"every": 2, "grow_grad2d": 1e-6}, checkpoint_seconds=1e-9,
 )  # fmt: skip
 OFF = {"weight": 0}
 PLAIN = with_changes(SETTINGS, adversarial=OFF, reference=OFF, densify={"every": 0})
