@@ -3,9 +3,9 @@
 The command is `describe` (answers questions about stages), `fetch` (downloads the weights that stages need), `frames`
 (extracts the frames of a video) or `run` (runs a stage). Input is read from the standard input.
 
-The description of a stage is a module with the class Params and optional functions (needed_weights, lacks, unavailable,
+The description of a stage is a module with the class Params and optional functions (needed_weights, unavailable,
 optional_weights, preview, scene_files, scene_facts, machine_facts). It is stages/plan/<stage>.py, which imports nothing
-heavy, or else stages/<stage>.py.
+heavy, or else stages/<stage>.py. The module stages/plan/cuda.py says for all stages what this machine lacks for CUDA.
 """
 
 import ast
@@ -34,6 +34,7 @@ from runner.files import list_files
 from runner.text import format_error
 
 INTERRUPTED = 130  # exit code after Ctrl-C
+CUDA_FILE = Path("stages/plan/cuda.py")  # relative to the root
 THREADS = ("OMP", "MKL", "NUMBA")  # <name>_NUM_THREADS is the number of threads of a library
 
 
@@ -96,8 +97,8 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
         answer["unavailable"] = planned.unavailable(resolved)
     if brings is not None and hasattr(planned, "needed_weights"):
         answer["needed"] = [asdict(need) for need in planned.needed_weights(resolved, frozenset(brings))]
-    if brings is not None and hasattr(planned, "lacks") and answer["params"].get("device") == "cuda":
-        answer["lacks"] = planned.lacks(resolved)  # what this machine lacks for CUDA
+    if brings is not None and answer["params"].get("device") == "cuda" and CUDA_FILE.is_file():
+        answer["lacks"] = _import_file(CUDA_FILE).find_missing(stage, resolved)
     if scene is not None and hasattr(planned, "scene_files"):
         files = planned.scene_files(resolved, Path(scene), list(list_files(Path(scene))))
         answer["reads"] = sorted(str(path) for path in files)

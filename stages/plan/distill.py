@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from reffusion.io import machine
 from reffusion.params.distill import Params
 from reffusion.weights import local
 
-__all__ = ["Params", "lacks", "needed_weights"]
+__all__ = ["Params", "needed_weights"]
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
@@ -19,8 +18,3 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     if params.depth.weight > 0 and params.depth.model:
         needs.append(local.model_need(params.depth.model, "float32"))
     return needs
-
-
-def lacks(params: Params) -> list[str]:
-    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
-    return machine.find_missing(machine.detect(), params.memory_gb, splats=True, memory_param="distill.memory_gb")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from reffusion.io import machine
 from reffusion.params.evaluate import Params
 from reffusion.weights import local, painters
 
@@ -32,8 +31,3 @@ def unavailable(params: Params) -> list[str]:
     The stage runs again once they can be computed.
     """
     return ["LPIPS"] if local.lpips_need().problem else []
-
-
-def lacks(params: Params) -> list[str]:
-    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
-    return machine.find_missing(machine.detect())

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from reffusion.io import machine
 from reffusion.params.fit import Params
 
-__all__ = ["Params", "lacks", "preview"]
+__all__ = ["Params", "preview"]
 
 
 def preview(params: Params, *, poses: Path | None, **_: Path | None) -> list[str]:
@@ -18,8 +17,3 @@ def preview(params: Params, *, poses: Path | None, **_: Path | None) -> list[str
     """
     has_gaussians = poses is not None and (poses / "gaussians.ply").exists() and params.pixels == "all"
     return ["takes over the scene's gaussians.ply: no optimisation"] if has_gaussians else []
-
-
-def lacks(params: Params) -> list[str]:
-    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
-    return machine.find_missing(machine.detect())

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from reffusion.io import machine
 from reffusion.params.initialize import Params
 from reffusion.weights import local, painters
 from reffusion.weights.published import DEPTH_ANYTHING, PAINTERS
 
-__all__ = ["Params", "lacks", "needed_weights", "preview"]
+__all__ = ["Params", "needed_weights", "preview"]
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
@@ -43,8 +42,3 @@ def preview(params: Params, **_: Path | None) -> list[str]:
     kind = painters.resolve_inpainter(params.inpainter).kind
     how = f"by {PAINTERS[kind].name}" if kind in PAINTERS else "from patches of the photographs"
     return [f"completes up to {params.extra_views} extra views {how}: what no reference shows"]
-
-
-def lacks(params: Params) -> list[str]:
-    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
-    return machine.find_missing(machine.detect())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from reffusion.io import machine
 from reffusion.params.lift import Params
 from reffusion.weights import local, painters
 
@@ -25,8 +24,3 @@ def machine_facts(params: Params) -> dict[str, str]:
     parameters name an inpainter that has no file, such as the diffusion prior.
     """
     return painters.inpainter_facts(params.inpainter)
-
-
-def lacks(params: Params) -> list[str]:
-    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
-    return machine.find_missing(machine.detect(), splats=False)

@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-from reffusion.io import machine
 from reffusion.params.masks import Params
 from reffusion.weights import local
 from reffusion.weights.segmenters import AUTO, NONE, segmenter_facts
 
-__all__ = ["Params", "lacks", "needed_weights", "optional_weights", "preview"]
+__all__ = ["Params", "needed_weights", "optional_weights", "preview"]
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
@@ -41,8 +40,3 @@ def preview(params: Params, **_: Path | None) -> list[str]:
     if not params.clicks or segmenter_facts(params.segmenter)["segmenter"] != NONE:
         return []
     return ["clicks are segmented by colours and surfaces; with the network of `make weights`, fewer clicks suffice"]
-
-
-def lacks(params: Params) -> list[str]:
-    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
-    return machine.find_missing(machine.detect())

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from reffusion.capture.views import load_placed_views
-from reffusion.io import machine
 from reffusion.params.inpainter import Inpainter
 from reffusion.params.reference import Params, reference_list
 from reffusion.references.files import (
@@ -90,8 +89,3 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
     if (kind := painters.resolve_inpainter(params.inpainter).kind) in PAINTERS:
         how = f"completes the reference by {PAINTERS[kind].name}, one picture"
     return [f"{how}: no diffusion here{unread}"]
-
-
-def lacks(params: Params) -> list[str]:
-    """Return what the stage needs on CUDA and this machine lacks, one line each with the remedy."""
-    return machine.find_missing(machine.detect(), params.memory_gb, splats=False, memory_param="reference.memory_gb")
