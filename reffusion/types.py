@@ -106,8 +106,8 @@ class Scene:
         points: [P, 3] float64 sparse points.
         point_colors: [P, 3] uint8.
         similarity: the map from the scene's own frame to the normalised frame.
-        blank: names of views that are neither training nor test views and have no photograph. They supervise nothing,
-            but are completed and distilled.
+        camera_only: names of views that are neither training nor test views and have no photograph. They supervise
+            nothing, but are completed and distilled.
         suspects: names of the views that are kept although their photographs contradict their poses.
         outliers: names of the views that were left out because their photographs contradict their poses. `cameras` has
             no entry for them.
@@ -120,7 +120,7 @@ class Scene:
     points: np.ndarray
     point_colors: np.ndarray
     similarity: Similarity
-    blank: tuple[str, ...] = ()
+    camera_only: tuple[str, ...] = ()
     suspects: tuple[str, ...] = ()
     outliers: tuple[str, ...] = ()
 

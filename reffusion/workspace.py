@@ -151,14 +151,14 @@ class Workspace:
 
         `center` and `radius` have their defaults (the origin, and infinity).
 
-        For a view without a photograph, a rendering of the Gaussians takes the place of the photograph. The pixels of
+        For a camera-only view, a rendering of the Gaussians takes the place of the photograph. The pixels of
         this view that no photograph shows are in its mask C, so they count as hidden.
         """
         scene = self.scene
-        names = (*scene.train, *scene.blank)
+        names = (*scene.train, *scene.camera_only)
         hidden = {name: self.hidden(name) for name in names}
         photos = self.load_photos(scene.train)
-        for name in scene.blank:
+        for name in scene.camera_only:
             everything = np.ones_like(hidden[name])
             nothing = np.zeros((1, 1, 3), np.uint8)
             photos[name] = inpaint.composite_background(
@@ -170,5 +170,5 @@ class Workspace:
             {name: each.consistent for name, each in self.mask_sets.items()},
             points=scene.points,
             unobserved={name: each.unobserved for name, each in self.mask_sets.items()},
-            without_photo=frozenset(scene.blank),
+            camera_only=frozenset(scene.camera_only),
         )

@@ -42,9 +42,9 @@ def run(
     counts = {stage: len(each) for stage, each in gaussians.items()}
     has_backdrop = params.backdrop and not (poses / "gaussians.ply").exists()
     if has_backdrop:
-        # If the stage `reference` ran, pixels were invented in views without photographs (`blank`), so that these views
-        # count as training views.
-        views = (*scene.train, *scene.blank) if reference else scene.train
+        # If the stage `reference` ran, pixels were invented in camera-only views, so that these views count as
+        # training views.
+        views = (*scene.train, *scene.camera_only) if reference else scene.train
         stages = [stage for stage in dict.fromkeys((result, "initialize")) if stage in gaussians]
         cameras = [scene.cameras[name] for name in views]
         extension = extend_planes(gaussians[result], cameras)

@@ -74,7 +74,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     region, (deleted, scattered) = load_region(raw_masks), load_deleted(poses, params.device)
     raw = {} if deleted is not None else collect_raw_masks(params, scene, gaussians, poses, raw_masks)
     fill = FillRequest(region, load_fill_masks(raw_masks)) if params.invent != "unobserved" else FillRequest(None, {})
-    if deleted is None and not raw and region is None and not fill.masks and not scene.blank:
+    if deleted is None and not raw and region is None and not fill.masks and not scene.camera_only:
         raise ValueError(f"{raw_masks}: neither masks nor a region say what is to be changed: add masks, or a region")
 
     empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
@@ -106,7 +106,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
 
     sets = consolidation.classify_pixels(params, scene, remaining, raw, consistent, background, fill)
     sets |= consolidation.add_uncaptured_pixels(params, scene, gaussians, hidden, sets)
-    repainted = (*scene.train, *scene.blank)
+    repainted = (*scene.train, *scene.camera_only)
     share = consolidation.unobserved_share(sets, repainted)
     sets = consolidation.drop_negligible(params, sets, repainted, fill)
     save_labels(out / "labels.npy", labels.cpu())

@@ -96,11 +96,11 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     lenses, pinholes = {}, {}
     for k in trace.progress(len(views), "poses"):
         lenses[views[k]], pinholes[views[k]] = save_undistorted_view(out, views[k], capture, longest)
-    for name in roles.blank:
+    for name in roles.camera_only:
         lenses[name], pinholes[name] = resized_lens(name, capture, longest)
     assert capture.poses is not None
     normalized = frame.normalize_scene(capture.poses, pinholes, roles.train, roles.test, roles.clean)
-    normalized, contradictions = _drop_outliers(params, roles, replace(normalized, blank=roles.blank), out)
+    normalized, contradictions = _drop_outliers(params, roles, replace(normalized, camera_only=roles.camera_only), out)
     views = [name for name in views if name in normalized.cameras]
     lenses, pinholes = ({n: each[n] for n in each if n in normalized.cameras} for each in (lenses, pinholes))
     save_lenses(out, lenses, capture.upright, {name: sizes[name] for name in lenses})
@@ -227,7 +227,7 @@ def _drop_outliers(params: Params, roles: Roles, scene: Scene, out: Path) -> tup
     """Return the scene without views that contradict their poses, cameras adjusted, and sentences about these views."""
     # The check compares views at shared points. A scene with too few sparse points gets points from optical flow first.
     connected = scene if len(scene.points) >= LEAST_POINTS else _adjust_cameras(params, scene, out)
-    shown = [camera for name, camera in connected.cameras.items() if name not in connected.blank]
+    shown = [camera for name, camera in connected.cameras.items() if name not in connected.camera_only]
     check = check_poses(shown, connected.points, lambda name: load_views(out, [name])[name])
     verdict = judge(check, connected, roles.keep, params.exclude)
     # Raises BadInput if scene.yaml uses a view that is left out, e.g. for a reference.
@@ -278,7 +278,7 @@ def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
 def _refine_cameras(scene: Scene, out: Path) -> Scene:
     """Adjust the cameras to optical flow if it shows a need; the residuals, px, are printed and go to refine.json."""
     # Test views are adjusted too, as in structure from motion.
-    shown = {name: camera for name, camera in scene.cameras.items() if name not in scene.blank}
+    shown = {name: camera for name, camera in scene.cameras.items() if name not in scene.camera_only}
     found = refine_cameras(list(shown.values()), load_views(out, shown))
     if np.isnan(found.before):
         print("cameras as given: optical flow matches nothing between the views", flush=True)

@@ -93,7 +93,7 @@ def test_rig_of_two_cameras_two_folders_deep(tmp_path):
     chosen = {"test": ["rig1/right/002.jpg"], "cameras_only": ["rig1/left/001.jpg", "rig1-right-000"]}
     scene, out, _ = run_with_messages(folder, **chosen)
     assert scene.train == ("rig1-left-000", "rig1-left-002", "rig1-right-001")
-    assert scene.test == ("rig1-right-002",) and scene.blank == ("rig1-left-001", "rig1-right-000")
+    assert scene.test == ("rig1-right-002",) and scene.camera_only == ("rig1-left-001", "rig1-right-000")
     views = {v: path.replace("/", "-") for v, path in paths.items()}
     assert_cameras(scene, rename_views(truth, views))
     assert list_objects(out) == [] and masked_share(out, "rig1-left-002") == pytest.approx(SHARE, abs=1e-3)

@@ -176,7 +176,7 @@ def test_folder_of_a_model_written_on_another_system(tmp_path):
         write_mask(folder / "masks" / f"{to_nfd(name)}.png")
     stems = {v: Path(name).name for v, name in names.items()}
     scene, out, _ = run_with_messages(folder, cameras_only=[to_nfd(names["v01"]) + ".jpg"])
-    assert [to_nfc(view) for view in scene.blank] == [to_nfc("Brücke_1")]
+    assert [to_nfc(view) for view in scene.camera_only] == [to_nfc("Brücke_1")]
     assert_cameras_by_nfc(scene, truth, stems)
     assert {to_nfc(view) for view in masked_views(out)} == {to_nfc(s) for v, s in stems.items() if v != "v01"}
 

@@ -109,13 +109,13 @@ def test_no_view_is_completed_from_behind_where_nobody_photographed():
     at = np.array([0.0, 0.0, 0.2])
     turns = {"photographed": 0, "beside": 40, "before the other": 205, "behind": 110, "the other": 180}
     cameras = [orbit_camera(name, angle, 0.5, 2.0, at, 32, 40.0) for name, angle in turns.items()]
-    blank = frozenset({"beside", "before the other", "behind"})
+    camera_only = frozenset({"beside", "before the other", "behind"})
     views = [type("View", (), {"camera": camera}) for camera in cameras]
-    background = Background(views, {}, without_photo=blank)
+    background = Background(views, {}, camera_only=camera_only)
     assert [camera.name for camera in coverage.cameras_near_photographs(background)] == [
         n for n in turns if n != "behind"
     ]
-    everywhere = replace(background, without_photo=frozenset())
+    everywhere = replace(background, camera_only=frozenset())
     assert coverage.cameras_near_photographs(everywhere) == cameras, "with photographs all views are"
 
 

@@ -99,7 +99,7 @@ def test_the_refit_is_not_supervised_where_an_object_is_drawn(tmp_path, monkeypa
     monkeypatch.setattr(draft_steps, "refit", lambda scene, exact, known, *_: found.update(known.hidden) or scene)
     masked, invent = np.eye(4, dtype=bool), np.eye(4, dtype=bool)[::-1]
     background = Background([type("View", (), {"camera": wall_camera(), "masked": masked})], {})
-    scene = type("Scene", (), {"clean": (), "blank": ()})
+    scene = type("Scene", (), {"clean": (), "camera_only": ()})
     sets = {"a": MaskSet(masked, masked, invent, invent)}
     draft = Draft(None, torch.zeros(0, dtype=torch.uint8))
     draft_steps.refit_draft(draft, 1, scene, background, [], sets, True, tmp_path)

@@ -136,14 +136,14 @@ def test_cameras_without_pixels_stay(tmp_path):
         shutil.rmtree(path)
     settings = {"train": ["v01"], "test": ["v04"], "clean": ["v01"], "cameras_only": "others"}
     scene, out = run_stages(folder, **settings)
-    assert scene.blank == ("v00", "v02", "v03", "v05") and scene.train == ("v01",)
+    assert scene.camera_only == ("v00", "v02", "v03", "v05") and scene.train == ("v01",)
     assert sorted(path.stem for path in (out / "images").iterdir()) == ["v01", "v04"]
     for name, camera in scene.cameras.items():
         np.testing.assert_allclose(camera.world_to_camera, everyone.cameras[name].world_to_camera, atol=1e-9)
     params = poses.Params(**settings)
     read = {path.name for path in plan.scene_files(params, folder, sorted(folder.rglob("*.*")))}
     assert {"v01.png", "v04.png"} <= read and "v00.png" not in read
-    assert "4 views are cameras only" in plan.preview(params, folder)
+    assert "4 views are camera-only" in plan.preview(params, folder)
     with pytest.raises(BadInput, match="cameras_only: v04 is a training or test view too"):
         plan.preview(poses.Params(**settings | {"cameras_only": ["v04"]}), folder)
 

@@ -37,7 +37,7 @@ class Background:
     """The surroundings of the removed object, as the photographs show them.
 
     Attributes:
-        views: depth of the training views, rendered with the object. Views without a photograph may be among them.
+        views: depth of the training views, rendered with the object. Camera-only views may be among them.
         photos: view name -> uint8 [H, W, 3], the photographs in the exposure of the Gaussians.
         masks: view name -> bool [H, W], the consistent masks C, True at pixels that show the object.
         planes: planes around the object, with the cells in which they continue behind the object.
@@ -46,7 +46,7 @@ class Background:
         radius: radius around the center that contains most of the object; infinite if nothing is removed.
         points: [P, 3], the scene's sparse points.
         unobserved: view name -> bool [H, W], True at pixels of C whose background no photograph shows.
-        without_photo: names of the views without a photograph.
+        camera_only: names of the camera-only views, which have no photograph.
         completed: the views that were completed earlier. For each, its depth without the object, and its picture, uint8
             [H, W, 3].
     """
@@ -60,7 +60,7 @@ class Background:
     radius: float = np.inf
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     unobserved: Mapping[str, np.ndarray] = field(default_factory=dict)
-    without_photo: frozenset[str] = frozenset()
+    camera_only: frozenset[str] = frozenset()
     completed: Sequence[tuple[DepthView, np.ndarray]] = ()
 
     @property

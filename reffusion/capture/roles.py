@@ -36,7 +36,7 @@ class Roles:
         test_masks: test view -> file of a mask of where the view shows the object, or would show it. Scores are
             computed in the bounding box of this mask.
         warnings: sentences for the user.
-        blank: names of the camera-only views. They are neither training nor test views.
+        camera_only: names of the camera-only views. They are neither training nor test views.
         values: the pixel values in `masks` that mark the object.
         fill: training view -> file of a mask of the pixels to fill, whatever the photograph shows there.
         keep: names of views that stay in the scene even if their photographs contradict their poses.
@@ -48,7 +48,7 @@ class Roles:
     masks: dict[str, dict[str, Path]]
     test_masks: dict[str, Path]
     warnings: tuple[str, ...]
-    blank: tuple[str, ...] = ()
+    camera_only: tuple[str, ...] = ()
     values: MaskValues = WHITE
     fill: dict[str, Path] = field(default_factory=dict)
     keep: frozenset[str] = frozenset()
@@ -74,12 +74,12 @@ class Roles:
             train=tuple(n for n in self.train if n in names),
             test=tuple(n for n in self.test if n in names),
             clean=self.clean & names,
-            blank=tuple(n for n in self.blank if n in names),
+            camera_only=tuple(n for n in self.camera_only if n in names),
             masks={thing: kept(files) for thing, files in self.masks.items()},
             test_masks=kept(self.test_masks),
             fill=kept(self.fill),
         )
-        _check_enough(roles.train, bool(roles.blank))
+        _check_enough(roles.train, bool(roles.camera_only))
         return roles
 
 
@@ -142,10 +142,10 @@ def load_roles(
     labelled = (
         None if label_files is None else _test_mask_views(capture, mask_files, label_folder, label_files, test_named)
     )
-    blank_named = None if cameras_only in (None, OTHERS) else _select_views(cameras_only, capture, "cameras_only")
-    train_named, test_views = _split_views(train_named, test_named, labelled, blank_named or [], capture)
+    named = None if cameras_only in (None, OTHERS) else _select_views(cameras_only, capture, "cameras_only")
+    train_named, test_views = _split_views(train_named, test_named, labelled, named or [], capture)
     _check_enough(train_named, cameras_only is not None)
-    blank = _camera_only_views(cameras_only, blank_named, {*train_named, *test_views}, capture)
+    camera_only = _camera_only_views(cameras_only, named, {*train_named, *test_views}, capture)
     clean_views = _clean_views(clean, train_named, capture)
     labels = None if labelled is None else dict(zip(labelled, label_files or (), strict=True))
     held_out, test_files = _split_masks(test_views, mask_files, labels or {})
@@ -157,7 +157,14 @@ def load_roles(
     warning = f"{len(unmasked)} training views have no mask: {', '.join(unmasked)}" if kept and unmasked else None
     messages = tuple(filter(None, (found.warning, warning)))
     return Roles(
-        tuple(train_named), tuple(test_views), clean_views, training_masks, test_files, messages, blank, found.values
+        tuple(train_named),
+        tuple(test_views),
+        clean_views,
+        training_masks,
+        test_files,
+        messages,
+        camera_only,
+        found.values,
     )
 
 
@@ -214,12 +221,16 @@ def _size_of(name: str, capture: Capture) -> tuple[int, int]:
 
 
 def _split_views(
-    train: list[str] | None, test: list[str] | None, labelled: list[str] | None, blank: list[str], capture: Capture
+    train: list[str] | None,
+    test: list[str] | None,
+    labelled: list[str] | None,
+    camera_only: list[str],
+    capture: Capture,
 ) -> tuple[list[str], list[str]]:
-    """Return the names of the training and test views, see `load_roles`; `labelled` are the views of the test masks."""
+    """Return the training and test views, see `load_roles`; `labelled` are the views of the test masks."""
     test_views = test if test is not None else (labelled or [*capture.test])
     if train is None:
-        train = [name for name in capture.pictures if name not in {*test_views, *blank, *capture.unused}]
+        train = [name for name in capture.pictures if name not in {*test_views, *camera_only, *capture.unused}]
     elif test is None:
         test_views = [name for name in test_views if name not in set(train)]
     both = sorted(set(train) & set(test_views))

@@ -68,10 +68,10 @@ def load_adapted_prior(params: Params, personalize: Path | None) -> tuple[Prior 
 def load_train_views(
     params: Params, space: Workspace, initialize: Path | None = None, lift: Path | None = None
 ) -> list[TrainView]:
-    """Load the training views, and after them the blank views, which have no photograph and supervise nothing.
+    """Load the training views, and after them the camera-only views, which supervise nothing.
 
     A view holds its photograph, the pixels that may supervise, the pixels to repaint, and its lifted image. The photo
-    of a blank view is black. Pixels that `initialize` found to be in the object's shadow do not supervise. If
+    of a camera-only view is black. Pixels that `initialize` found to be in the object's shadow do not supervise. If
     `initialize` reduced the invent mask of a view, the reduced mask is used.
 
     Args:
@@ -87,12 +87,12 @@ def load_train_views(
     shadows = find_masks("shadows")
     sets |= {name: replace(sets[name], invent=load_mask(path)) for name, path in find_masks("invent").items()}
     views = []
-    for name in (*scene.train, *scene.blank):
+    for name in (*scene.train, *scene.camera_only):
         clean, pixels = name in scene.clean, sets[name]
         hidden = pixels.consistent | pixels.invent  # a region to fill is part of the paper's mask m
         repaint = (pixels.invent if params.repaint == "invent" else hidden) & (not clean)
         # C shows the object. Pixels of I outside C are the place of an object to be inserted.
-        supervises = (~hidden | clean) & (name not in scene.blank)
+        supervises = (~hidden | clean) & (name not in scene.camera_only)
         if name in shadows:
             supervises &= ~load_mask(shadows[name])
         lifted = to_device(inpainted[name]) / 255 if name in inpainted else None

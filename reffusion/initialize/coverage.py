@@ -152,10 +152,10 @@ def cameras_near_photographs(background: Background) -> list[Camera]:
     and the invented surface might hide surfaces that photographs show.
     """
     axis = lambda camera: camera.world_to_camera[2, :3]
-    photographed = [camera for camera in background.cameras if camera.name not in background.without_photo]
+    photographed = [camera for camera in background.cameras if camera.name not in background.camera_only]
     axes = np.stack([axis(camera) for camera in photographed])
     is_near = lambda camera: float((axes @ axis(camera)).max()) > np.cos(np.radians(MAX_ANGLE))
-    return [camera for camera in background.cameras if camera.name not in background.without_photo or is_near(camera)]
+    return [camera for camera in background.cameras if camera.name not in background.camera_only or is_near(camera)]
 
 
 def least_covered_view(

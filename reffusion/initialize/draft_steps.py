@@ -98,7 +98,7 @@ def refit_draft(
         folder: receives the trace and the checkpoints.
     """
     invented = lambda name: sets[name].invent & (name not in scene.clean)  # no photograph shows these pixels
-    views = [view for view in background.views if view.camera.name not in scene.blank]
+    views = [view for view in background.views if view.camera.name not in scene.camera_only]
     hidden = {name: view.masked | sets[name].raw | invented(name) for view in views if (name := view.camera.name)}
     completed = [each for each in trusted if each.mask.any()]
     supervision = Supervision([view.camera for view in views], background.photos, hidden, completed)

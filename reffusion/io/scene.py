@@ -43,7 +43,7 @@ def save_scene(poses_dir: Path, scene: Scene) -> None:
     similarity = {"scale": float(scene.similarity.scale), "offset": [float(v) for v in scene.similarity.offset]}
     save_json(poses_dir / "transform.json", similarity)
     views = {"train": list(scene.train), "test": list(scene.test), "clean": sorted(scene.clean)}
-    more = {"cameras_only": scene.blank, "suspects": scene.suspects, "outliers": scene.outliers}
+    more = {"cameras_only": scene.camera_only, "suspects": scene.suspects, "outliers": scene.outliers}
     views |= {key: list(names) for key, names in more.items() if names}
     save_json(poses_dir / "views.json", views)
 
@@ -78,7 +78,7 @@ def load_scene(poses_dir: Path) -> Scene:
         points=points.positions,
         point_colors=points.colors,
         similarity=Similarity(similarity["scale"], np.array(similarity["offset"], np.float64)),
-        blank=tuple(views.get("cameras_only", ())),
+        camera_only=tuple(views.get("cameras_only", ())),
         suspects=tuple(views.get("suspects", ())),
         outliers=tuple(views.get("outliers", ())),
     )

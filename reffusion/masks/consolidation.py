@@ -168,13 +168,13 @@ def add_uncaptured_pixels(
         sets: view name -> pixel classes, as `classify_pixels` returns them.
 
     Returns:
-        View name -> extended pixel classes, of the views without a photograph only.
+        View name -> extended pixel classes, of the camera-only views.
     """
-    if not scene.blank:
+    if not scene.camera_only:
         return {}
     seen_by = training_coverage.render_coverage_views(gaussians, [scene.cameras[name] for name in scene.train], hidden)
     found = {}
-    for name in scene.blank:
+    for name in scene.camera_only:
         unseen = clean_mask(params, training_coverage.unseen_pixels(gaussians, scene.cameras[name], seen_by))
         each = sets[name]
         found[name] = MaskSet(each.raw, each.consistent | unseen, each.unobserved | unseen, each.invent | unseen)

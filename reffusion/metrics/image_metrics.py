@@ -94,7 +94,12 @@ def _dilate_interval(low: int, high: int, dilation: float, size: int) -> tuple[i
 def psnr(image: np.ndarray, truth: np.ndarray) -> float:
     """Return the peak signal-to-noise ratio in dB for a peak of 1; inf for identical images."""
     image, truth = _as_unit_pair(image, truth)
-    error = float(np.mean((image - truth) ** 2))
+    return _decibels(image - truth)
+
+
+def _decibels(difference: np.ndarray) -> float:
+    """Return the PSNR in dB for a peak of 1, from the differences of all values; inf if all are 0."""
+    error = float(np.mean(difference**2))
     return -10.0 * log10(error) if error > 0 else inf
 
 
@@ -291,8 +296,7 @@ def _masked_psnr(image: np.ndarray, truth: np.ndarray, pixels: np.ndarray) -> fl
     if not pixels.any():
         return None
     image, truth = _as_unit_pair(image, truth)
-    error = float(np.mean((image - truth)[pixels] ** 2))
-    return -10.0 * log10(error) if error > 0 else inf
+    return _decibels((image - truth)[pixels])
 
 
 def mean(values: list[float | None]) -> float | None:

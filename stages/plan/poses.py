@@ -40,7 +40,7 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
         capture, roles = read_scene(params, scene, params.longest)
     except ValueError:  # `preview` reports this error
         return others
-    shown = {path for name, path in capture.pictures.items() if name not in roles.blank}
+    shown = {path for name, path in capture.pictures.items() if name not in roles.camera_only}
     read = shown | brought | set(capture.depth_maps)
     masks = {file_of(path) for files in roles.mask_files.values() for path in files.values()}
     kept = [path for path in others if path.suffix.lower() not in NOT_READ or path.name == "poses_bounds.npy"]
@@ -50,7 +50,7 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
     """Return facts about the capture; {} without photographs.
 
-    They are "views": [training, test, clean, cameras-only], a list of view names each; "brings_poses": whether
+    They are "views": [training, test, clean, camera-only], a list of view names each; "brings_poses": whether
     structure from motion is left out; and "megapixels": the size of the first view, as it will be used. The stage
     depends on the roles of views, which may depend on the names of masks, while it does not read the masks.
 
@@ -63,7 +63,7 @@ def scene_facts(params: Params, scene: Path) -> dict[str, object]:
     if is_gaussians_only(params, scene):
         return {}
     capture, roles = read_scene(params, scene, params.longest)
-    views = [roles.train, roles.test, sorted(roles.clean), roles.blank]
+    views = [roles.train, roles.test, sorted(roles.clean), roles.camera_only]
     width, height = capture_views(capture, roles).size_of(next(iter(capture.pictures)))
     reduced = min(1.0, params.longest / max(width, height))
     megapixels = round(width * height * reduced**2 / 1e6, 6)
@@ -88,7 +88,7 @@ def preview(params: Params, scene: Path) -> list[str]:
     capture, roles = read_scene(params, scene, params.longest)
     given = load_reference_files(scene, capture_views(capture, roles), params.reference)
     notes = [describe_split(len(roles.train), len(roles.test))]
-    notes += [f"{len(roles.blank)} views are cameras only"] if roles.blank else []
+    notes += [f"{len(roles.camera_only)} views are camera-only"] if roles.camera_only else []
     notes += _describe_poses(capture, scene)
     notes += [f"the scene brings a reference of {describe_references(given)}"] if given else []
     return [*notes, *capture.warnings, *check_gaussian_files(params, scene)]

@@ -253,7 +253,7 @@ def judge(check: PoseCheck, scene: Scene, keep: Collection[str] = (), exclude: S
     clean = [name for name in wrong if name in scene.clean]
     test = [name for name in wrong if name in scene.test]
     train = [name for name in wrong if name not in {*clean, *test}]
-    least = 1 if scene.blank else LEAST_TRAINING_VIEWS
+    least = 1 if scene.camera_only else LEAST_TRAINING_VIEWS
     is_enough = len(scene.train) - len(train) >= least
     fate = "are left out" if is_enough else f"are used all the same, for fewer than {least} would be left"
     cases = (
