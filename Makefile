@@ -23,7 +23,8 @@
 ##                                (also for compare, all and stages)
 ## make data=FOLDER spinnerf      list SPIn-NeRF's published scenes in a folder, then batch
 ## make data=FOLDER study         after compare, or with scene=X: paired clips for people to judge
-## make weights [profile=paper]   fetch the weights of a profile; offline=1: only list what is missing
+## make weights [profile=paper]   fetch the weights of a profile; offline=1: only list what is missing;
+##                                painter=moebius: those of this painter too
 ## make demo [seed=N]             make the demo scene, or data/demo-N; others are made when they are named: demo-wide,
 ##                                -360, -seen, -photos, -behind, -beside, -table, -corner, -grass, -insert, -outpaint,
 ##                                -mono, -pair, -past, -sparse, each also with -N
@@ -49,7 +50,7 @@
 
 # The options. They are set here so that variables of the environment are ignored. Recipes read them as shell variables
 # in double quotes, so that neither the shell nor make expands what was typed.
-given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port gpu \
+given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline painter port gpu \
 	device dtype engine address cores yes cuda sog
 $(foreach each,$(given),$(eval $(each) :=))
 data := data
@@ -201,7 +202,8 @@ spinnerf batch: setup $(if $(engine),$(VENV)/.ready-cluster)
 	@$(RUN) batch --data="$$data" $(call flags,$(filter-out scene,$(options)) $(cluster))
 
 weights: setup
-	@$(RUN) weights $(call flags,$(options) offline)
+	@$(RUN) weights $(call flags,$(filter-out set,$(options)) offline) \
+		--set="$$set$(if $(painter), reference.inpainter=$$painter)"
 
 prior: runs/prior/photographs runs/prior/rooms
 	$(PY) -m priors.tiny.train --start priors/tiny --photographs runs/prior/photographs --rooms runs/prior/rooms $(call flags,steps)

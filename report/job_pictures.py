@@ -160,9 +160,8 @@ def _origin(facts: dict, folder: Path, name: str) -> str:
         return f"given; {facts.get('fits', {}).get(name, 'how well it fits was not recorded')}"
     path = folder / "candidates.json"
     record = load_json(path) if path.is_file() else {}
-    if "painter" in record:
-        return f"painted by {record['painter']}"
     way = "composed of patches of the photographs" if "misfits" in record else "painted by the diffusion model"
+    way = f"painted by {record['painter']}" if "painter" in record else way
     scores = record.get("misfits") or record.get("seams") or []
     return f"{way}, the best of {len(scores)} tries" if len(scores) > 1 else way
 

@@ -14,7 +14,7 @@ from reffusion.command import scene_name
 from runner import Refused
 from runner.files import list_files, read_text
 from runner.frames import FRAMES, update_frames
-from runner.keys import HASHES, Hashes, code_fingerprints, digest, files_outside, paths_outside
+from runner.keys import HASHES, Hashes, code_fingerprints, digest, files_outside, flatten_params, paths_outside
 from runner.parameters import Layers, parse_duration, parse_set, split_budget, stack_layers
 from runner.pipeline import (
     SCENE,
@@ -73,6 +73,7 @@ class StageInfo:
         params: all parameters, defaults included; groups are nested dicts.
         weights: dotted names of the parameters that name weights.
         unkeyed: dotted names of the parameters that do not change the artifact.
+        programs: dotted names of the parameters that name a program to run.
         reads: paths of the files of the scene that the stage reads; None for all.
         facts: facts about the scene on which the artifact depends besides the files in `reads`, e.g. names of files.
         machine: facts about this machine on which the artifact depends.
@@ -82,6 +83,7 @@ class StageInfo:
     params: dict[str, Any]
     weights: tuple[str, ...] = ()
     unkeyed: tuple[str, ...] = ()
+    programs: tuple[str, ...] = ()
     reads: tuple[str, ...] | None = None
     facts: dict[str, Any] = field(default_factory=dict)
     machine: dict[str, str] = field(default_factory=dict)
@@ -306,8 +308,20 @@ def _add_descriptions(job: ResolvedJob, questions: dict[str, dict[str, Any]], an
             broken[stage] = answer["broken"]
         else:
             stages[stage] = StageInfo(**answer)
+            _refuse_programs_of_scene(job, stage, stages[stage])
             del broken[stage]
     return replace(job, stages=stages, broken=broken)
+
+
+def _refuse_programs_of_scene(job: ResolvedJob, stage: str, info: StageInfo) -> None:
+    """Raise Refused if scene.yaml, which people get from others together with photographs, names a program to run."""
+    for name in info.programs:
+        origin, program = job.layers.origin(stage, name), flatten_params(info.params)[name]
+        if program and origin.startswith(str(job.folder / "scene.yaml")):
+            raise Refused(
+                f"{origin}: it names a program to run ({program!r:.80}), which a scene may not do; if you trust it, "
+                f'remove it there and give it by set="{stage}.{name}=..."'
+            )
 
 
 def _refusal(stage: str, error: dict[str, Any], known: list[str]) -> str:

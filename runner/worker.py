@@ -88,6 +88,7 @@ def _describe(question: dict[str, Any]) -> dict[str, Any]:
         "params": resolved.model_dump(mode="json"),
         "weights": [name for name, extra in marks.items() if extra.get("weights")],
         "unkeyed": [name for name, extra in marks.items() if extra.get("keyed") is False],
+        "programs": [name for name, extra in marks.items() if extra.get("program")],
     }
     if hasattr(planned, "machine_facts"):
         answer["machine"] = planned.machine_facts(resolved)

@@ -5,6 +5,7 @@ The references are pictures that the scene brings, or else one view that is inpa
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,20 +13,23 @@ import torch
 
 from reffusion import trace
 from reffusion.capture.views import load_placed_views
-from reffusion.inpaint import exemplar, feedforward
-from reffusion.io.arrays import save_json, save_text
-from reffusion.io.images import load_image, save_image, save_mask
+from reffusion.inpaint import command, exemplar, feedforward, moebius
+from reffusion.io.arrays import load_json, save_json, save_text
+from reffusion.io.images import load_image, replace_image, save_image, save_mask
 from reffusion.io.scene import save_references, save_teaching
 from reffusion.params.base import REFINED_FROM
+from reffusion.params.inpainter import SEEDED
 from reffusion.params.reference import Params
-from reffusion.prior import inpaint, memory
+from reffusion.prior import inpaint, memory, pipelines
 from reffusion.prior.model import load_prior
 from reffusion.references import view_ranking
 from reffusion.references.adoption import adopt_references
 from reffusion.references.files import list_teaching_files, load_reference_files
 from reffusion.types import MaskSet, Reference
+from reffusion.weights import painters
 from reffusion.workspace import Workspace
 
+CANDIDATES, CANDIDATES_RECORD = "candidates.png", "candidates.json"
 TO_PAINT, VIEWS_TO_PAINT = "to_paint", 4  # folder of templates for painting by hand, and the number of views in it
 
 
@@ -35,7 +39,8 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks
     Writes references/<view>.png, masks/<view>.png (the pixels that the reference fills), depth/<view>.exr (for
     references with a depth map), teaching/ (pictures that only personalize the prior) and facts.json. Writes also
     to_paint/ (`save_views_to_paint`) unless scene.yaml names references, and candidates.png and candidates.json if a
-    view is inpainted.
+    view is inpainted. Painters that take minutes also leave candidates/<number>.png; an interrupted run that goes on
+    does not paint these again.
 
     Args:
         out: folder of this stage.
@@ -53,6 +58,8 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks
     save_json(out / "facts.json", {"given": [each.camera.name for each in references] if files else [], "fits": fits})
     if params.reference is None:
         save_views_to_paint(out / TO_PAINT, [each.view for each in files], space)
+    if not files:
+        print(describe_choice(load_json(out / CANDIDATES_RECORD)), flush=True)
 
 
 def save_views_to_paint(folder: Path, painted: list[str], space: Workspace) -> None:
@@ -113,6 +120,8 @@ def inpaint_reference(params: Params, out: Path, space: Workspace) -> Reference:
     elif painter := feedforward.load_inpainter(params.inpainter, params.device):
         image = painter.paint(base, exemplar.mask_to_paint(masks.consistent, masks.invent))
         save_candidates(out, [image], {"view": name, "painter": painter.name, "chosen": 0})
+    elif params.inpainter.kind in SEEDED:
+        image = inpaint_by_seeds(params, out, base, name, masks)
     else:
         image = inpaint_by_patches(params, out, base, name, space)
     return Reference(camera, image, masks.invent)
@@ -180,7 +189,64 @@ def inpaint_by_prior(params: Params, out: Path, base: np.ndarray, name: str, mas
     return images[chosen]
 
 
+def inpaint_by_seeds(params: Params, out: Path, base: np.ndarray, name: str, masks: MaskSet) -> np.ndarray:
+    """Fill the hole of a view by Moebius, a pipeline or a program, once per seed, and return the chosen candidate.
+
+    The hole is that of `inpaint_by_patches`, and the choice that of `inpaint_by_prior`. Each candidate is written when
+    it is done, and is not painted again if its file exists.
+
+    Args:
+        out: folder of this stage, for the candidates.
+        base: uint8 [H, W, 3], the view without the object.
+        name: name of the view.
+        masks: pixel classes of the view.
+
+    Returns:
+        uint8 [H, W, 3].
+    """
+    hole = exemplar.mask_to_paint(masks.consistent, masks.invent)
+    files = [out / "candidates" / f"{number}.png" for number in params.painted_numbers]
+    paint = None
+    for index in trace.progress(len(files), "reference"):
+        if not files[index].exists():
+            paint = paint or load_seeded(params)
+            replace_image(files[index], paint(base, hole, params.seed + params.painted_numbers[index]))
+    images = [load_image(file) for file in files]
+    seams = inpaint.seam_score(torch.stack([inpaint.to_input(each) for each in images]), torch.from_numpy(hole))
+    best = int(seams.argmin())
+    facts = {"painter": painters.seeded_name(params.inpainter), "seams": seams.tolist()}
+    save_candidates(out, images, {"view": name, **facts, "chosen": params.painted_numbers[best]})
+    return images[best]
+
+
+def load_seeded(params: Params) -> Callable[[np.ndarray, np.ndarray, int], np.ndarray]:
+    """Return the function by which Moebius, a pipeline or a program paints: (image, hole, seed) -> image."""
+    asked = params.inpainter
+    if asked.kind == "moebius":
+        return moebius.load(painters.find_moebius(asked), asked.steps, asked.guidance_scale)
+    if asked.kind == "pipeline":
+        return pipelines.load_painter(asked, params.prompt, params.device, params.dtype)
+    template, program = view_ranking.painting_template, str(asked.command)
+    return lambda image, hole, seed: command.paint(program, template(image, hole), hole, params.prompt, seed)
+
+
+def describe_choice(record: dict) -> str:
+    """Return a line that names the sheet of candidates and says how to take another one.
+
+    Args:
+        record: the content of candidates.json.
+    """
+    count = len(record.get("seams") or record.get("misfits") or [0])
+    where = f"the painting of view {record['view']}: reference/{CANDIDATES}"
+    if count == 1:
+        return f"{where}; if it is wrong, save your own as painted/{record['view']}.png in the scene's folder"
+    return (
+        f"{where}, {count} candidates from left to right; number {record['chosen']} (counted from 0) is taken, "
+        'set="reference.choose=NUMBER" takes another'
+    )
+
+
 def save_candidates(out: Path, images: list[np.ndarray], facts: dict) -> None:
     """Write all candidates side by side as candidates.png, and `facts` about them as candidates.json."""
-    save_image(out / "candidates.png", np.concatenate(images, 1))
-    save_json(out / "candidates.json", facts)
+    save_image(out / CANDIDATES, np.concatenate(images, 1))
+    save_json(out / CANDIDATES_RECORD, facts)

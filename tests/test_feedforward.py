@@ -251,11 +251,11 @@ def test_auto_takes_the_best_available_model(empty_weight_cache):
 @pytest.mark.parametrize(
     ("params", "value", "said"),
     [
-        (Params, {"kind": "exemplar", "weights": "a.pt"}, "kind exemplar takes no `weights`, lama and migan do"),
-        (Params, {"kind": "diffusion", "weights": "a/model"}, "`prior` names a diffusion model"),
+        (Params, {"kind": "exemplar", "weights": "a.pt"}, "kind exemplar takes no `weights`, only lama, migan"),
+        (Params, {"kind": "diffusion", "weights": "a/model"}, "`prior` names the diffusion prior"),
         (Params, {"weights": "a.pt"}, "write a kind, such as lama, or {kind: lama, weights: FILE}"),
         (Params, ["lama"], "write a kind, such as lama, or {kind: lama, weights: FILE}"),
-        (Params, "fsr", "Input should be 'exemplar', 'diffusion', 'lama', 'migan' or 'auto'"),
+        (Params, "fsr", "Input should be 'exemplar', 'diffusion', 'lama', 'migan', 'auto', 'moebius'"),
         (lift.Params, "auto", "Input should be 'fsr', 'lama', 'migan' or 'diffusion'"),
         (evaluate.Params, {"kind": "diffusion"}, "Input should be 'fsr', 'lama' or 'migan'"),
     ],
@@ -278,7 +278,7 @@ def test_the_key_of_scene_yaml_reaches_references_and_further_views(empty_weight
 
     def machine():
         job = prepare_job(Request(ROOT, tmp_path / "runs", str(scene), profile="laptop"))
-        assert all(job.params[stage]["inpainter"] == inpainter_setting("auto") for stage in ("reference", "initialize"))
+        assert all(job.params[stage]["inpainter"]["kind"] == "auto" for stage in ("reference", "initialize"))
         return [job.stages[stage].machine for stage in ("reference", "initialize")]
 
     assert machine() == [{"inpainter": "exemplar"}] * 2
@@ -289,7 +289,7 @@ def test_the_key_of_scene_yaml_reaches_references_and_further_views(empty_weight
 
 def test_the_file_is_found_or_the_plan_says_where_people_get_it(empty_weight_cache, tmp_path):
     (need,) = needed_weights("lama")
-    assert (need.name, need.file, need.fetched) == ("Carve/LaMa-ONNX", "lama_fp32.onnx", True)
+    assert (need.name, need.files, need.fetched) == ("Carve/LaMa-ONNX", ("lama_fp32.onnx",), True)
     assert "Carve/LaMa-ONNX is not on this machine" in need.problem and "make weights" in need.problem
     (need,) = needed_weights("lama", tmp_path / "nowhere.onnx")
     assert not need.fetched and "is not on this machine; get lama_fp32.onnx (208 MB" in need.problem

@@ -64,10 +64,10 @@ def _read_side(session: Any, file: Path, dtype: str) -> int | None:
         and (one_size or not fixed)
     )
     if not fits:
-        described = ", ".join(f"{name} {_describe(*each)}" for name, each in inputs.items())
+        described = ", ".join(f"{name} {describe(*each)}" for name, each in inputs.items())
         raise ValueError(
             f"{file}: expected image {dtype} [1, 3, H, W], mask {dtype} [1, 1, H, W], of any or one square size, and "
-            f"one {dtype} picture; it takes {described} and gives {', '.join(_describe(*each) for each in outputs)}"
+            f"one {dtype} picture; it takes {described} and gives {', '.join(describe(*each) for each in outputs)}"
         )
     return fixed.pop() if fixed else None
 
@@ -79,7 +79,7 @@ def _type_and_channels(kind: str, shape: list[Any]) -> tuple[str, int] | None:
     return (types[kind], shape[1]) if batch and kind in types else None
 
 
-def _describe(kind: str, shape: list[Any]) -> str:
+def describe(kind: str, shape: list[Any]) -> str:
     """Return the type and shape of an input or output as text for messages, such as "float [1, 3, H, W]"."""
     return f"{kind.removeprefix('tensor(').removesuffix(')')} [{', '.join(map(str, shape))}]"
 
@@ -96,7 +96,7 @@ def _run(session: Any, file: Path, dtype: str, picture: np.ndarray, hole: np.nda
         (answer,) = session.run(None, inputs)
     except Exception as error:  # onnxruntime's exceptions have no common base class
         raise ValueError(
-            f"{file}: failed on a picture of {hole.shape[1]}x{hole.shape[0]} px ({_one_line(error)})"
+            f"{file}: failed on a picture of {hole.shape[1]}x{hole.shape[0]} px ({one_line(error)})"
         ) from None
     if answer.shape != (1, 3, *hole.shape) or not np.isfinite(answer).all():
         raise ValueError(f"{file}: its answer to {[1, 3, *hole.shape]} is {list(answer.shape)}, or not finite")
@@ -105,7 +105,7 @@ def _run(session: Any, file: Path, dtype: str, picture: np.ndarray, hole: np.nda
     return answer[0].transpose(1, 2, 0).round().clip(0, 255).astype(np.uint8)
 
 
-def _one_line(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
     """Return the error's text on one line of at most 160 characters."""
     text = " ".join(str(error).split())
     return text if len(text) <= 160 else text[:157] + "..."

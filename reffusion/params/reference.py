@@ -43,3 +43,12 @@ class Params(Settings):
     device: Device = "cpu"
     dtype: Dtype = "float32"
     memory_gb: float = memory_field()
+
+    @property
+    def painted_numbers(self) -> list[int]:
+        """Return the numbers of the candidates that an inpainter of the kinds `SEEDED` paints.
+
+        These are all, or only the one to choose, because each takes minutes. A command without {seed} paints one.
+        """
+        count = 1 if self.inpainter.command and "{seed}" not in self.inpainter.command else self.candidates
+        return list(range(count)) if self.choose is None else [self.choose]

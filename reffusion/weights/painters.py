@@ -1,4 +1,4 @@
-"""Files of feed-forward 2D inpainters (LaMa, MI-GAN) on this machine: which file a setting means, or why it is missing.
+"""What 2D inpainters need on this machine: the files of LaMa, MI-GAN and Moebius, pipelines, programs.
 
 The module imports no large libraries, so that `plan` can use it.
 """
@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import shutil
 from pathlib import Path
 
-from reffusion.params.inpainter import Inpainter
-from reffusion.weights.local import Need, explain_missing, locate
-from reffusion.weights.published import PAINTERS
+from reffusion.params.inpainter import Inpainter, split_command
+from reffusion.weights.local import Need, explain_missing, is_id, locate, pipeline_need
+from reffusion.weights.published import MOEBIUS, PAINTERS
 
 
 def resolve_inpainter(inpainter: Inpainter) -> Inpainter:
@@ -69,10 +70,81 @@ def weights_needs(inpainter: Inpainter, param: str = "inpainter") -> list[Need]:
     except ValueError as error:
         if inpainter.weights:
             return [Need(published.name, f"{param}: {error}", fetched=False)]
-        return [Need(published.repo, f"{param}: {error}", published.bytes, file=published.file)]
+        return [Need(published.repo, f"{param}: {error}", published.bytes, files=(published.file,))]
     lacks_runtime = file.suffix == ".onnx" and importlib.util.find_spec("onnxruntime") is None
     problem = f"{param}: {file.name} needs onnxruntime: `pip install onnxruntime`" if lacks_runtime else None
     return [Need(str(file), problem, file.stat().st_size, fetched=False)]
+
+
+def seeded_name(inpainter: Inpainter) -> str:
+    """Return the name of an inpainter of the kinds `SEEDED` for tables and messages, without folders."""
+    if inpainter.kind == "moebius":
+        return "Moebius"
+    if inpainter.kind == "pipeline":
+        source = str(inpainter.weights)
+        return f"the pipeline {source if is_id(source) else Path(source).name}"
+    return f"the program {Path(split_command(str(inpainter.command))[0]).name}"
+
+
+def find_moebius(inpainter: Inpainter) -> Path:
+    """Find the folder of Moebius that a setting means; raises ValueError if a file is not there."""
+    folder = Path(inpainter.weights).expanduser() if inpainter.weights else locate(MOEBIUS.repo)
+    if folder is None:
+        raise ValueError(f"Moebius: {explain_missing(MOEBIUS.repo)}")
+    if missing := [name for name in MOEBIUS.files if not (folder / name).is_file()]:
+        raise ValueError(f"Moebius: {folder} holds no {missing[0]}: it must hold {', '.join(MOEBIUS.files)}")
+    return folder
+
+
+def reference_needs(inpainter: Inpainter, dtype: str, param: str = "reference.inpainter") -> list[Need]:
+    """Return what an inpainter of any kind but "diffusion" needs: a list of one need, or an empty list.
+
+    Args:
+        dtype: the precision in which a pipeline is used.
+        param: name of the parameter that holds the setting, for messages.
+    """
+    if inpainter.kind == "pipeline":
+        return [pipeline_need(str(inpainter.weights), dtype)]
+    if inpainter.kind == "command":
+        program = split_command(str(inpainter.command))[0]
+        problem = None if shutil.which(program) else f"{param}: {program} is no program that can be started here"
+        return [Need(program, problem, fetched=False)]
+    if inpainter.kind != "moebius":
+        return weights_needs(inpainter, param)
+    lacks_runtime = importlib.util.find_spec("onnxruntime") is None
+    problem = f"{param}: Moebius needs onnxruntime: `pip install onnxruntime`" if lacks_runtime else None
+    try:
+        folder = find_moebius(inpainter)
+    except ValueError as error:
+        fetched = not (inpainter.weights or lacks_runtime)
+        return [Need(MOEBIUS.repo, problem or f"{param}: {error}", MOEBIUS.bytes, fetched, files=MOEBIUS.files)]
+    size = sum((folder / name).stat().st_size for name in MOEBIUS.files)
+    return [Need(str(folder), problem, size, fetched=False)]
+
+
+def reference_facts(inpainter: Inpainter) -> dict[str, str]:
+    """Return the facts about an inpainter of any kind on which results depend, as `inpainter_facts` does.
+
+    These are the hashes of Moebius' files, and of the files that a command names, which hold the program. The hash of a
+    pipeline's weights is known to the runner.
+    """
+    if inpainter.kind == "command":
+        found = [shutil.which(word) or word for word in split_command(str(inpainter.command))]
+        files = [Path(each) for each in found if Path(each).is_file()]
+    elif inpainter.kind == "moebius":
+        try:
+            files = [find_moebius(inpainter) / name for name in MOEBIUS.files]
+        except ValueError:
+            files = []
+    else:
+        return inpainter_facts(inpainter)
+    digests = "".join(map(_hash, files))
+    return {"inpainter": f"{inpainter.kind} {hashlib.sha256(digests.encode()).hexdigest()[:16]}"}
+
+
+def _hash(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def inpainter_facts(inpainter: Inpainter) -> dict[str, str]:
@@ -86,7 +158,6 @@ def inpainter_facts(inpainter: Inpainter) -> dict[str, str]:
     if resolved.kind not in PAINTERS:
         return {"inpainter": resolved.kind} if inpainter.kind == "auto" else {}
     try:
-        with open(find_file(resolved), "rb") as file:
-            return {"inpainter": f"{resolved.kind} {hashlib.file_digest(file, 'sha256').hexdigest()[:16]}"}
+        return {"inpainter": f"{resolved.kind} {_hash(find_file(resolved))[:16]}"}
     except (OSError, ValueError):
         return {"inpainter": resolved.kind}

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-NETWORKS = ("unet", "vae", "text_encoder", "text_encoder_2")
+NETWORKS = ("unet", "transformer", "vae", "text_encoder", "text_encoder_2", "text_encoder_3")
+TOKENIZERS = ("tokenizer", "tokenizer_2", "tokenizer_3")
 
 
 @dataclass(frozen=True)
@@ -177,3 +178,28 @@ PAINTERS = {  # the best inpainter first
         "migan_pipeline_v2.onnx (28 MB, MIT) from https://huggingface.co/andraniksargsyan/migan",
     ),
 }
+
+
+@dataclass(frozen=True)
+class Moebius:
+    """Moebius (hustvl, ECCV 2026), an inpainting diffusion model without a prompt, exported to ONNX (simonw).
+
+    Attributes:
+        repo: hub id of the model that `make weights` downloads.
+        encoder, unet, decoder: its files.
+        bytes: approximate size of the files, according to the model's page.
+    """
+
+    repo: str = "simonw/Moebius-ONNX"
+    encoder: str = "vae_encoder.onnx"
+    unet: str = "unet.onnx"
+    decoder: str = "vae_decoder.onnx"
+    bytes: int = 1_242_000_000
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Return the names of all files."""
+        return (self.encoder, self.unet, self.decoder)
+
+
+MOEBIUS = Moebius()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from reffusion.capture.views import load_placed_views
-from reffusion.params.inpainter import Inpainter
+from reffusion.params.inpainter import SEEDED, Inpainter
 from reffusion.params.reference import Params, reference_list
 from reffusion.references.files import (
     PAINTED,
@@ -31,7 +31,7 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
         return []
     if params.inpainter.kind == "diffusion":
         return [local.model_need(params.prior, params.dtype)]
-    return painters.weights_needs(params.inpainter, "reference.inpainter")
+    return painters.reference_needs(params.inpainter, params.dtype)
 
 
 def optional_weights(params: Params) -> list[local.Need]:
@@ -40,12 +40,12 @@ def optional_weights(params: Params) -> list[local.Need]:
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """Return facts about this machine on which the result depends: "inpainter" -> kind and hash of the file.
+    """Return facts about this machine on which the result depends: "inpainter" -> kind and hash of its files.
 
     If `inpainter: auto` selects an inpainter without a file, the value is its kind alone. The dict is empty if the
-    parameters name an inpainter that has no file, such as the diffusion prior.
+    parameters name an inpainter that has no file of its own, such as the diffusion prior.
     """
-    return painters.inpainter_facts(params.inpainter)
+    return painters.reference_facts(params.inpainter)
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
@@ -84,8 +84,18 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
     if params.inpainter.kind == "diffusion":
         has_effect = params.prompt or not params.sampler.guidance
         return [] if has_effect else ["reference.prompt is empty: reference.sampler.guidance has no effect"]
+    if params.inpainter.kind in SEEDED:
+        unread = params.prompt and (params.inpainter.kind == "moebius" or _is_blind(params.inpainter.command))
+        note = f"; the prompt '{params.prompt}' is not read" if unread else ""
+        name, count = painters.seeded_name(params.inpainter), len(params.painted_numbers)
+        return [f"paints the reference by {name}, {count} candidate{'s' if count > 1 else ''}{note}"]
     unread = f"; the prompt '{params.prompt}' is not read, reference.inpainter=diffusion would" if params.prompt else ""
     how = "puts the reference together from patches of the photographs"
     if (kind := painters.resolve_inpainter(params.inpainter).kind) in PAINTERS:
         how = f"completes the reference by {PAINTERS[kind].name}, one picture"
     return [f"{how}: no diffusion here{unread}"]
+
+
+def _is_blind(command: str | None) -> bool:
+    """Return whether a command takes no prompt; False without a command."""
+    return command is not None and "{prompt}" not in command
