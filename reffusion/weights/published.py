@@ -166,8 +166,8 @@ PAINTERS = {  # the best inpainter first
         "Carve/LaMa-ONNX",
         "lama_fp32.onnx",
         208_000_000,
-        "lama_fp32.onnx (208 MB, Apache-2.0) from https://huggingface.co/Carve/LaMa-ONNX or big-lama.pt (206 MB) from "
-        "https://github.com/enesmsahin/simple-lama-inpainting/releases",
+        "lama_fp32.onnx (208 MB; code Apache-2.0, weights unstated) from https://huggingface.co/Carve/LaMa-ONNX or "
+        "big-lama.pt (206 MB) from https://github.com/enesmsahin/simple-lama-inpainting/releases",
     ),
     "migan": PublishedPainter(
         "MI-GAN",
