@@ -13,8 +13,8 @@
 ## make scene=X turntable         a video around the finished scene: runs/X/turntable.webm
 ## make scene=X patch             fill what was deleted in an editor (scene.yaml: gaussians, cleaned): runs/X/patch/
 ##                                with two files only: reffusion patch before.ply after.ply --out patched.ply
-## make scene=X export            the finished scene for other tools, .ply, .spz, cameras, LoRA: runs/X/export/
-##                                sog=1: .sog, too, by Node's npm
+## make scene=X export            the finished scene for other tools, .ply, .spz, .glb, cameras, LoRA: runs/X/export/
+##                                sog=1: .sog and .html, too, by Node's npm
 ## make scene=X verify            hash all its results: are they as they were made?
 ## make scene=X clean             remove its results
 ## make gc                        list results that no plan uses, with sizes; remove them if you say so, or with yes=1

@@ -11,11 +11,12 @@ from reffusion.io.files import BadInput
 from reffusion.io.lora import save_portable
 from reffusion.io.ply import load_ply, save_ply, save_splats
 from reffusion.io.scene import has_photograph, load_scene
-from reffusion.io.sog import save_sog
+from reffusion.io.splat_transform import save_for_web
 from report import cli
 from report.sheet import stage_folder
 
-PLY, COMPRESSED, SPZ, SOG = "scene.ply", "scene.compressed.ply", "scene.spz", "scene.sog"
+PLY, COMPRESSED, SPZ, GLB = "scene.ply", "scene.compressed.ply", "scene.spz", "scene.glb"
+SOG, HTML = "scene.sog", "scene.html"
 WITH_OBJECT = "with_object.ply"
 CAMERAS, IMAGES, LORA = "cameras", "images", "lora"
 HEADER = 1000  # bytes of the header that contain the type of x
@@ -25,18 +26,19 @@ LORA_FILE = "pytorch_lora_weights.safetensors"
 def make(home: Path, sog: bool = False) -> list[str]:
     """Write the Gaussians, cameras, photographs and the LoRA in common formats to `home`/export/.
 
-    Gaussians and cameras are in the scene's own frame; in a .spz file y points up, as its format says. Photographs, the
+    Gaussians and cameras are in the scene's own frame; in a .spz and a .glb y points up, as their formats say. Photographs, the
     Gaussians of the fit (the scene with the object) and the LoRA are written if they exist.
 
     Args:
         home: runs/<scene> or runs/<scene>@<variant>, with a finished stage `evaluate`.
-        sog: True also writes a .sog file, which takes Node and minutes.
+        sog: True also writes a .sog and an .html file, which takes Node and minutes.
 
     Returns:
         Lines of text, one for each written file or folder with its path and a description.
 
     Raises:
-        ValueError: the stage `evaluate` has not run, gsply is not installed, or the .sog file cannot be written.
+        ValueError: the stage `evaluate` has not run, gsply is not installed, or the .sog or .html file cannot be
+            written.
     """
     result, out = home / "evaluate" / PLY, home / "export"
     if not result.exists():
@@ -55,6 +57,8 @@ def make(home: Path, sog: bool = False) -> list[str]:
         lines.append(f"{out / SPZ}: the same, quantised, {smaller(SPZ)}, in Niantic's format")
     except BadInput as error:  # coordinates too large for the format
         lines.append(f"not written: {error}")
+    save_splats(out / GLB, gaussians, scene.similarity)
+    lines.append(f"{out / GLB}: the same in glTF, by its extension KHR_gaussian_splatting")
     save_cameras(out / CAMERAS, scene, IMAGES)
     pictured = [name for name in scene.cameras if has_photograph(poses, name)]
     for name in pictured:
@@ -75,10 +79,12 @@ def make(home: Path, sog: bool = False) -> list[str]:
         save_portable(adapted, out / LORA / LORA_FILE)
         lines.append(f"{out / LORA / LORA_FILE}: the prior's LoRA, as diffusers' load_lora_weights reads it")
     if sog:  # last, since it may fail
-        save_sog(out / SOG, out / PLY)
+        for name in (SOG, HTML):
+            save_for_web(out / name, out / PLY, gaussians.antialiased)
         lines.append(f"{out / SOG}: the same, quantised, {smaller(SOG)}, in PlayCanvas's format for the web")
+        lines.append(f"{out / HTML}: a page that shows it in a browser, in one file, without a network")
     else:
-        lines.append(f"{out / SOG}: not written; `--sog` (make: `sog=1`) writes it, with Node, in minutes")
+        lines.append(f"{out / SOG}, {HTML}: not written; `--sog` (make: `sog=1`) writes both, with Node, in minutes")
     return lines
 
 
@@ -104,7 +110,7 @@ def viewer_caveats(path: Path, antialiased: bool) -> str:
 
 def main() -> None:
     parser = cli.scene_parser("export", __doc__)
-    parser.add_argument("--sog", action="store_true", help="also write a .sog file, by Node's npm (210 MB, minutes)")
+    parser.add_argument("--sog", action="store_true", help="also write .sog and .html, by Node's npm (210 MB, minutes)")
     arguments = parser.parse_args()
     try:
         print("\n".join(make(cli.run_folder(arguments), arguments.sog)))

@@ -9,9 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from reffusion.io.ply import load_property_names, save_ply
-from reffusion.io.scene import load_scene
 from report import cli, patch_files
 from report.patch_result import load_result, require_deleted
+from report.sheet import stage_folder
 
 WHOLE, NEW = "patched.ply", "new.ply"
 
@@ -19,7 +19,7 @@ WHOLE, NEW = "patched.ply", "new.ply"
 def make(home: Path) -> str:
     """Write patched.ply (the whole scene) and new.ply (the new Gaussians) to `home`/patch/; return a text to print.
 
-    Both files are in the scene's own frame, with properties in the order of the .ply file that the user gave.
+    Both files are where the user left the scene in the editor, with properties in the order of the user's .ply file.
 
     Args:
         home: runs/<scene> or runs/<scene>@<variant>, with a finished stage `evaluate`.
@@ -28,7 +28,7 @@ def make(home: Path) -> str:
         ValueError: the scene does not say what was deleted, or the stage `evaluate` has not run.
     """
     patch = load_result(home)
-    similarity, properties = load_scene(patch.poses).similarity, load_property_names(patch.poses / "gaussians.ply")
+    similarity, properties = patch.similarity, load_property_names(stage_folder(home, "poses") / "gaussians.ply")
     result, new, out = patch.gaussians, patch.new, home / "patch"
     save_ply(out / WHOLE, result, similarity, properties)
     save_ply(out / NEW, result.map(lambda parameter: parameter[new]), similarity, properties)
@@ -41,7 +41,7 @@ def make(home: Path) -> str:
 def main() -> None:
     parser = cli.scene_parser("patch", __doc__, needs_scene=False)
     parser.add_argument("--only-check", action="store_true", help="only check that the scene says what was deleted")
-    files = "two files of splats, before and after the object was deleted (.ply, compressed .ply, .spz, .splat)"
+    files = "two files of splats, before and after the object was deleted; the scene may be moved, turned and scaled"
     parser.add_argument("files", type=Path, nargs="*", metavar="BEFORE AFTER", help=f"instead of --scene: {files}")
     parser.add_argument(
         "--out", type=Path, help="for two files: where to write the filled scene; the ending selects the format"

@@ -19,7 +19,6 @@ from pathlib import Path
 from reffusion.io.arrays import save_text
 from reffusion.io.files import BadInput
 from reffusion.io.ply import check_can_save, load_property_names, save_splats
-from reffusion.io.scene import load_scene
 from reffusion.io.splats import summarize_splats
 from report.patch_result import load_result
 
@@ -97,8 +96,7 @@ def make(arguments: argparse.Namespace) -> str:
     run_stages(folder, arguments)
     home = arguments.runs / folder.name
     result = load_result(home)
-    similarity = load_scene(result.poses).similarity
-    save_splats(arguments.out, result.gaussians, similarity, load_property_names(arguments.files[0]))
+    save_splats(arguments.out, result.gaussians, result.similarity, load_property_names(arguments.files[0]))
     lost = result.gaussians.antialiased and arguments.out.suffix.lower() == ".splat"
     note = "; .splat cannot say that it is antialiased, as the scene before is: set that in the viewer" if lost else ""
     return (

@@ -2,45 +2,47 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from reffusion.io.arrays import load_labels
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from reffusion.gaussians.movement import Movement
+from reffusion.io.arrays import load_json, load_labels
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
+from reffusion.splat.rotation import rotate_gaussians
+from reffusion.types import Gaussians, Similarity
 from report.results import load_receipts
 from report.sheet import stage_folder
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from reffusion.types import Gaussians
-
 
 MOST_NEW = 100  # new Gaussians for each deleted one, above which a warning is given; an object takes about 30
 
 
 @dataclass(frozen=True)
 class PatchResult:
-    """Scene of Gaussians whose hole is filled.
+    """Scene of Gaussians whose hole is filled, where the user left it in the editor.
 
     Attributes:
-        gaussians: all N Gaussians of the result, in the normalised frame.
+        gaussians: all N Gaussians of the result, in the normalised frame, turned as the user turned the scene.
+        similarity: from the frame of the user's file to that of `gaussians`.
         new: bool [N], True for the Gaussians that fill the hole.
-        deleted: bool [M], True for those of the M Gaussians of the scene before that the user deleted.
-        poses: folder of the stage `poses`.
+        deleted: number of Gaussians of the scene before that the user deleted, but for those that were cropped.
+        others: number of further Gaussians that were removed.
     """
 
     gaussians: Gaussians
+    similarity: Similarity
     new: Tensor
-    deleted: Tensor
-    poses: Path
+    deleted: int
+    others: int
 
     def describe(self) -> str:
         """Return how many Gaussians were removed and added, with a warning if suspiciously many were added."""
-        before, deleted, new = len(self.deleted), int(self.deleted.sum()), int(self.new.sum())
-        more = before - deleted - (len(self.gaussians) - new)
+        deleted, new, more = self.deleted, int(self.new.sum()), self.others
         others = f"and {more} more, haze and floaters inside or behind the hole" if more > 0 else "and no others"
         text = f"removed: the {deleted} splats that you deleted, {others}; added: {new} new splats"
         if new <= MOST_NEW * deleted:
@@ -61,10 +63,28 @@ def load_result(home: Path) -> PatchResult:
     poses, result = stage_folder(home, "poses"), home / "evaluate" / "scene.ply"
     if not result.exists():
         raise ValueError(f"{result} is missing; `make scene={home.name.split('@')[0]} patch` makes it")
-    gaussians = load_ply(result, load_scene(poses).similarity)
-    return PatchResult(
-        gaussians, load_labels(result_stage_folder(home) / "labels.npy"), load_labels(poses / "deleted.npy"), poses
-    )
+    similarity = load_scene(poses).similarity
+    gaussians, new = load_ply(result, similarity), load_labels(result_stage_folder(home) / "labels.npy")
+    deleted = load_labels(poses / "deleted.npy")
+    count = int(deleted.sum())
+    others = len(deleted) - count - int((~new).sum())
+    if (poses / "cropped.npy").exists():
+        nearest = cKDTree(load_ply(poses / "gaussians.ply").means.numpy()).query(gaussians.means.numpy())[1]
+        kept = new | ~load_labels(poses / "cropped.npy")[torch.from_numpy(nearest)]
+        gaussians, new = gaussians.map(lambda values: values[kept]), new[kept]
+    if (poses / "added.ply").exists():
+        added = load_ply(poses / "added.ply")
+        width = gaussians.sh.shape[1]
+        missing = torch.zeros(len(added), max(0, width - added.sh.shape[1]), 3)
+        added = replace(added, sh=torch.cat([added.sh, missing], 1)[:, :width])
+        gaussians = gaussians.zip_map(added, lambda one, other: torch.cat([one, other]))
+        new = torch.cat([new, torch.zeros(len(added), dtype=torch.bool)])
+    if (poses / "movement.json").exists():
+        facts = load_json(poses / "movement.json")
+        movement = Movement(facts["scale"], np.array(facts["rotation"]), np.array(facts["shift"]))
+        gaussians = rotate_gaussians(gaussians, movement.rotation)
+        similarity = Similarity(similarity.scale / movement.scale, movement.apply(similarity.offset))
+    return PatchResult(gaussians, similarity, new, count, others)
 
 
 def require_deleted(home: Path) -> None:

@@ -33,11 +33,13 @@ from reffusion.capture.undistort import (
 )
 from reffusion.capture.views import check_outliers
 from reffusion.gaussians import matching
+from reffusion.gaussians.movement import Cloud, Movement
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
 from reffusion.io.ply import load_property_names, save_ply
 from reffusion.io.scene import WARNINGS, load_views, save_scene
+from reffusion.io.splat_rows import Rows, rotate_rows
 from reffusion.io.splats import Splats, load_splats
 from reffusion.params.poses import Params
 from reffusion.params.reference import reference_list
@@ -62,6 +64,9 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     - gaussians.ply (normalised frame), if the scene brings Gaussians;
     - deleted.npy, bool [N], if it also brings a file from which a user deleted some of them: True for the deleted ones;
     - scattered.npy, bool [N], if some of the deleted ones stood alone and leave no hole: True for these;
+    - cropped.npy, bool [N], if Gaussians around the scene were deleted, too: they stay until the result is written;
+    - added.ply (normalised frame), if the file has Gaussians that the scene had not;
+    - movement.json, if the user also scaled, turned or shifted the scene;
     - warnings.json, if something looks wrong.
 
     Args:
@@ -119,23 +124,39 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
 
 
 @dataclass(frozen=True)
+class Edit:
+    """What a user did to the N Gaussians of a scene in an editor.
+
+    Attributes:
+        deleted: bool [N], True for Gaussians that are missing from the file that the parameter `cleaned` names, but for
+            those that were cropped.
+        scattered: bool [N], True for deleted Gaussians that leave no hole to fill: they stood alone, or were filtered.
+        cropped: bool [N], True for Gaussians that were deleted around what stays.
+        movement: takes the scene to the place that it has in the file.
+        added: Gaussians that only the file has, in the scene's own frame; None without any.
+    """
+
+    deleted: np.ndarray
+    scattered: np.ndarray
+    cropped: np.ndarray
+    movement: Movement
+    added: Rows | None
+
+
+@dataclass(frozen=True)
 class OwnSplats:
     """The N Gaussians that a scene brings.
 
     Attributes:
         splats: the Gaussians in the scene's own frame.
         properties: names of the properties of the .ply, in order; empty for other formats.
-        deleted: bool [N], True for Gaussians that are missing from the file that the parameter `cleaned` names. None if
-            the scene has no such file.
-        scattered: bool [N], True for deleted Gaussians that leave no hole to fill (`matching.find_scattered`); None if
-            `deleted` is None.
+        edit: what the user did to them; None if the scene has no file that says so.
         notes: sentences about both files, for the user.
     """
 
     splats: Splats
     properties: tuple[str, ...]
-    deleted: np.ndarray | None
-    scattered: np.ndarray | None
+    edit: Edit | None
     notes: tuple[str, ...]
 
 
@@ -145,61 +166,80 @@ def _load_own_splats(params: Params, scene: Path) -> OwnSplats | None:
     if params.gaussians is None:
         return None
     path = scene / params.gaussians
-    splats, deleted, scattered = load_splats(path), None, None
+    splats, edit = load_splats(path), None
     notes = [f"{path.name}: {note}" for note in splats.notes]
     if params.cleaned is not None:
-        cleaned, messages = _load_positions(scene / params.cleaned)
-        notes += [f"{params.cleaned}: {note}" for note in messages]
-        deleted, scattered = _find_deleted((path, scene / params.cleaned), splats.rows.means, cleaned)
-    return OwnSplats(splats, load_property_names(path), deleted, scattered, tuple(notes))
+        cleaned = load_splats(scene / params.cleaned)
+        notes += [f"{params.cleaned}: {note}" for note in cleaned.notes]
+        edit = _find_edit((path, scene / params.cleaned), splats.rows, cleaned.rows)
+    return OwnSplats(splats, load_property_names(path), edit, tuple(notes))
 
 
-def _load_positions(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Read the positions [M, 3] of the Gaussians in a file, and the notes on what reading changed."""
-    splats = load_splats(path)
-    # The other parameters are freed on return, before positions are matched: a file may have millions of splats.
-    return splats.rows.means, splats.notes
+def _describe_looks(rows: Rows) -> Cloud:
+    """Return what is known of Gaussians to recognize them."""
+    opacities = 1 / (1 + np.exp(-rows.opacity_logits.astype(np.float64)))
+    return Cloud(rows.means, rows.log_scales, 0.5 + SH0 * rows.sh[:, 0], opacities)
 
 
-def _find_deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return bool [N] twice: Gaussians missing from the cleaned scene, and those of them that leave no hole to fill."""
-    match = matching.match_gaussians(whole, cleaned)  # positions [N, 3] and [M, 3]
-    if match.found < matching.MIN_MATCHED_SHARE:
+def _find_edit(files: tuple[Path, Path], whole: Rows, cleaned: Rows) -> Edit:
+    """Find what was done to the Gaussians of the whole scene; raises BadInput if this is not clear, or leaves no hole."""
+    cloud = _describe_looks(whole)
+    match = matching.match_gaussians(cloud, _describe_looks(cleaned))
+    if match.movement is None:
         raise BadInput(
-            f"{files[1]}: of its splats {match.found:.0%} are where {files[0].name} has one: it is another scene, or "
-            "was moved, turned or scaled; only delete, and save it where it was"
+            f"{files[1]}: of its splats {match.found:.0%} are where {files[0].name} has one, and too few look like one: "
+            "it is another scene, or was decimated, recolored or stretched; only delete, crop, move, turn and scale"
         )
+    if match.movement.mirrors:
+        raise BadInput(f"{files[1]}: it is {files[0].name} mirrored; save it again without mirroring")
     if not match.deleted.any():
         raise BadInput(f"{files[1]}: nothing was deleted: all splats of {files[0].name} are there")
-    count, scattered = np.count_nonzero(match.deleted), matching.find_scattered(whole, match.deleted)
-    alone = np.count_nonzero(scattered)
-    if alone == count:
+    filtered = matching.find_filtered(cloud.opacities, match.deleted)
+    regions = matching.find_regions(whole.means, match.deleted & ~filtered)
+    cropped = matching.find_cropped(whole.means, match.deleted, regions)
+    scattered = match.deleted & ((regions < 0) | filtered)
+    deleted = match.deleted & ~cropped
+    count, alone, around = (int(np.count_nonzero(each)) for each in (match.deleted, scattered, cropped))
+    crop = f", {around} of them around what stays: cropped, and not filled" if around else ""
+    if alone + around == count:
         raise BadInput(
-            f"{files[1]}: {count} scattered splats were deleted; no region to fill: each stood among splats that stay. "
-            f"Delete a whole object, or use {files[1].name} as it is"
+            f"{files[1]}: {alone} scattered splats were deleted{crop}; no region to fill: each stood among splats that "
+            f"stay. Delete a whole object, or use {files[1].name} as it is"
         )
     dust = f", {alone} of them scattered: they leave no region to fill" if alone else ""
-    turned = "" if min(match.turn) > 0 else ", and it was turned by 180 degrees"
-    strange = "" if match.found == 1 else f", and {1 - match.found:.1%} of its splats are new and left out"
-    print(f"{files[1].name}: {count} of {len(whole)} splats were deleted{dust}{turned}{strange}", flush=True)
-    return match.deleted, scattered
+    moved = "" if match.movement.is_still else f", and it was {match.movement.describe()}"
+    new = np.flatnonzero(match.places < 0)
+    more = f", and {len(new)} of its splats are new: they stay" if len(new) else ""
+    print(f"{files[1].name}: {count} of {len(whole)} splats were deleted{dust}{crop}{moved}{more}", flush=True)
+    if not len(new):
+        return Edit(deleted, scattered, cropped, match.movement, None)
+    turned = rotate_rows(cleaned.take(new), match.movement.rotation.T)
+    sizes = turned.log_scales - np.float32(np.log(match.movement.scale))
+    added = replace(turned, means=match.movement.invert(cleaned.means[new]), log_scales=sizes)
+    return Edit(deleted, scattered, cropped, match.movement, added)
 
 
 def _save_own_splats(out: Path, placed: Scene, own_splats: OwnSplats) -> None:
-    """Write gaussians.ply in the normalised frame, and deleted.npy and scattered.npy if there are such Gaussians."""
+    """Write gaussians.ply in the normalised frame, and what the user did to it."""
     # The properties have the order of the scene's file.
     save_ply(out / "gaussians.ply", own_splats.splats.gaussians(placed.similarity), properties=own_splats.properties)
-    if own_splats.deleted is not None:
-        save_labels(out / "deleted.npy", own_splats.deleted)
-    if own_splats.scattered is not None and own_splats.scattered.any():
-        save_labels(out / "scattered.npy", own_splats.scattered)
+    if (edit := own_splats.edit) is None:
+        return
+    save_labels(out / "deleted.npy", edit.deleted)
+    for name, labels in (("scattered", edit.scattered), ("cropped", edit.cropped)):
+        if labels.any():
+            save_labels(out / f"{name}.npy", labels)
+    if edit.added is not None:
+        save_ply(out / "added.ply", Splats(edit.added, False, ()).gaussians(placed.similarity))
+    if not edit.movement.is_still:
+        save_json(out / "movement.json", {key: np.asarray(each).tolist() for key, each in vars(edit.movement).items()})
 
 
 def _save_gaussians_only(params: Params, out: Path, scene: Path, own_splats: OwnSplats) -> None:
     """Write the stage's files, but no pictures, for a scene of Gaussians with a deleted object and no photographs."""
     rows, found = own_splats.splats.rows, cameras.read(scene)
-    assert own_splats.deleted is not None and own_splats.scattered is not None
-    hole = own_splats.deleted & ~own_splats.scattered
+    assert own_splats.edit is not None
+    hole = own_splats.edit.deleted & ~own_splats.edit.scattered
     means, opaque, sizes = rows.means, rows.opacity_logits > 0, np.exp(np.median(rows.log_scales, axis=1))
     # The cameras are those in the scene's folder; without any, some are placed around the hole.
     poses, source = found or (ring.place_cameras(means, sizes, opaque, hole, params.longest), None)

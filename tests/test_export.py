@@ -22,7 +22,7 @@ from reffusion.io.files import BadInput
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply, save_ply, save_splats
 from reffusion.io.scene import save_scene
-from reffusion.io.sog import PACKAGE, save_sog
+from reffusion.io.splat_transform import PACKAGE, save_for_web
 from reffusion.io.splats import summarize_splats
 from reffusion.types import Camera, Gaussians, Similarity
 from report import export
@@ -145,8 +145,8 @@ def test_export_writes_and_lists_all_files(tmp_path):
     save_ply(home / "evaluate" / "scene.ply", replace(random_gaussians(300, 1), antialiased=True), FRAME)
     lines = export.make(home)
     assert "300 Gaussians of degree 1" in lines[0] and "Mip-Splatting" in lines[0]
-    assert "3 pinholes" in lines[3] and "2 undistorted photographs" in lines[3] and len(lines) == 5
-    assert load_ply(home / "export/scene.spz", FRAME).antialiased and "scene.sog: not written" in lines[4]
+    assert "3 pinholes" in lines[4] and "2 undistorted photographs" in lines[4] and len(lines) == 6
+    assert load_ply(home / "export/scene.spz", FRAME).antialiased and "scene.html: not written" in lines[5]
     assert (home / "export/scene.ply").read_bytes() == (home / "evaluate/scene.ply").read_bytes()
     (home / "export/cameras/note.txt").write_text("mine")
     export.make(home)
@@ -226,7 +226,7 @@ def test_splat_transform_and_we_keep_that_splats_are_antialiased(tmp_path):
     for ending in (".ply", ".compressed.ply", ".spz"):
         save_splats(tmp_path / f"ours{ending}", made, FRAME)
     try:
-        save_sog(tmp_path / "ours.sog", tmp_path / "ours.ply")
+        save_for_web(tmp_path / "ours.sog", tmp_path / "ours.ply", True)
     except BadInput as error:
         pytest.skip(f"npm cannot fetch splat-transform: {error}")
     ours, theirs = (".ply", ".compressed.ply", ".spz", ".sog"), (".compressed.ply", ".spz")
@@ -247,7 +247,7 @@ def test_splat_transform_and_we_keep_that_splats_are_antialiased(tmp_path):
 def test_without_node_the_message_says_what_writes_sog(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(BadInput, match=r"scene\.sog: .*splat-transform.* needs Node; install Node 18 or later"):
-        save_sog(tmp_path / "scene.sog", tmp_path / "scene.ply")
+        save_for_web(tmp_path / "scene.sog", tmp_path / "scene.ply", False)
 
 
 def test_coordinates_too_large_for_spz_are_refused(tmp_path):

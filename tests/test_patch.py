@@ -20,6 +20,7 @@ from scenes.stage_runs import run_masks
 from reffusion.capture.layouts import ring
 from reffusion.fit import exposure
 from reffusion.gaussians import matching
+from reffusion.gaussians.movement import Cloud
 from reffusion.io.arrays import load_json, load_labels, save_labels
 from reffusion.io.cameras import save_cameras
 from reffusion.io.compressed import save_compressed
@@ -37,27 +38,38 @@ NEAR = 1.7  # depth of the square before the wall
 HERE = Similarity(1.0, np.zeros(3))
 
 
+def match_points(whole, cleaned):
+    """Match Gaussians that all look the same, so that only their positions tell them apart."""
+    clouds = [Cloud(each, np.zeros((len(each), 3)), np.zeros((len(each), 3)), np.ones(len(each))) for each in (whole, cleaned)]
+    return matching.match_gaussians(*clouds)
+
+
+def find_scattered(points, deleted):
+    return deleted & (matching.find_regions(points, deleted) < 0)
+
+
 @pytest.mark.parametrize("turn", matching.AXIS_FLIPS)
 def test_deleted_splats_are_found_in_any_order_quantised_and_turned(turn):
     points, deleted = plane_with_ball()
     draws = np.random.default_rng(1)
     rest = points[~deleted][draws.permutation(np.count_nonzero(~deleted))] * turn
-    found = matching.match_gaussians(points, rest.astype(np.float16).astype(np.float64))
-    assert found.turn == turn and found.found == 1
+    found = match_points(points, rest.astype(np.float16).astype(np.float64))
+    np.testing.assert_array_equal(found.movement.rotation, np.diag(turn))
+    assert found.found == 1
     assert np.count_nonzero(found.deleted != deleted) <= 0.002 * len(points)
-    exact = matching.match_gaussians(points, rest)
+    exact = match_points(points, rest)
     np.testing.assert_array_equal(exact.deleted, deleted)
 
 
 def test_splats_on_each_other_are_matched_one_to_one():
     points = np.repeat(plane_with_ball(500)[0], 2, axis=0)
-    assert matching.match_gaussians(points, np.delete(points, 7, axis=0)).deleted.nonzero()[0].tolist() in ([6], [7])
+    assert match_points(points, np.delete(points, 7, axis=0)).deleted.nonzero()[0].tolist() in ([6], [7])
 
 
 @pytest.mark.parametrize("moved", [lambda p: p + 0.3, lambda p: 1.3 * p, lambda p: p[:, [1, 2, 0]]])
-def test_splats_with_changed_pose_or_size_are_not_matched(moved):
+def test_moved_splats_that_all_look_the_same_are_not_matched(moved):
     points, deleted = plane_with_ball()
-    assert matching.match_gaussians(points, moved(points[~deleted])).found < matching.MIN_MATCHED_SHARE
+    assert match_points(points, moved(points[~deleted])).movement is None
 
 
 def test_splats_that_were_deleted_alone_are_scattered():
@@ -67,18 +79,18 @@ def test_splats_that_were_deleted_alone_are_scattered():
     alone[draws.choice(np.flatnonzero(away), 60, replace=False)] = True
     slab = np.zeros(len(points), bool)
     slab[np.argsort(np.abs(points[:, 1] - 0.7))[:40]] = True
-    assert not matching.find_scattered(points, ball).any()
+    assert not find_scattered(points, ball).any()
     for deleted in (alone, slab, points[:, 0] == points[7, 0]):
-        np.testing.assert_array_equal(matching.find_scattered(points, deleted), deleted)
-    np.testing.assert_array_equal(matching.find_scattered(points, ball | alone), alone)
-    np.testing.assert_array_equal(matching.find_scattered(1e4 * points, ball | alone), alone)
+        np.testing.assert_array_equal(find_scattered(points, deleted), deleted)
+    np.testing.assert_array_equal(find_scattered(points, ball | alone), alone)
+    np.testing.assert_array_equal(find_scattered(1e4 * points, ball | alone), alone)
 
 
 def test_one_layer_of_splats_on_a_wall_is_an_object():
     grid = np.stack([*np.meshgrid(np.linspace(-1, 1, 60), np.linspace(-1, 1, 60)), np.zeros((60, 60))], -1)
     poster = grid[20:30, 20:30] + (0.01, 0.01, 0.005)
     points = np.concatenate([grid.reshape(-1, 3), poster.reshape(-1, 3)])
-    assert not matching.find_scattered(points, np.arange(len(points)) >= 3600).any()
+    assert not find_scattered(points, np.arange(len(points)) >= 3600).any()
 
 
 # ---------------------------------------------------------------------------------------------- the stage `poses`
@@ -137,8 +149,10 @@ def test_refusals_say_what_is_wrong_with_the_cleaned_scene(tmp_path):
     assert_refusal(folder, r"cleaned\.ply: 4000 splats, and .*scene\.ply has 4000: nothing was deleted")
     change(rest.map(lambda p: p[:0]))
     assert_refusal(folder, r"cleaned\.ply: it holds no Gaussians: everything was deleted")
-    change(Gaussians(1.2 * rest.means, *(getattr(rest, name) for name in FIELDS[1:])))
-    assert_refusal(folder, r"cleaned\.ply: of its splats \d+% are where scene\.ply has one: .* moved, turned or scaled")
+    change(replace(rest, means=rest.means * torch.tensor([1.2, 1.0, 1.0])))
+    assert_refusal(folder, r"cleaned\.ply: of its splats \d+% are where scene\.ply has one, .* decimated, recolored or")
+    change(replace(rest, means=rest.means * torch.tensor([-1.0, 1.0, 1.0])))
+    assert_refusal(folder, r"cleaned\.ply: it is scene\.ply mirrored; save it again without mirroring")
     twice = whole.map(lambda p: torch.cat([p, p[:1]]))
     save_ply(folder / "scene.ply", twice)
     (folder / "cleaned.ply").unlink()

@@ -16,9 +16,9 @@ import torch
 from scenes.edited_capture import remove_pictures, write_edited_capture
 from scenes.processes import run_module
 from scenes.random_scene import random_gaussians
+from test_patch import match_points
 
 from reffusion.capture.layouts import ring
-from reffusion.gaussians import matching
 from reffusion.io.arrays import load_labels
 from reffusion.io.files import BadInput
 from reffusion.io.ply import check_can_save, load_ply, load_property_names, save_ply, save_splats
@@ -52,7 +52,7 @@ def parse_arguments(before, after, out, **others) -> argparse.Namespace:
 def test_errors_are_one_line(splat_files, tmp_path):
     before, after = splat_files
     out = tmp_path / "patched.ply"
-    (tmp_path / "s.ksplat").write_bytes(bytes(4096))
+    (tmp_path / "s.usdz").write_bytes(bytes(4096))
     for arguments, message in (
         ((), "name a scene (--scene), or two files: reffusion patch before.ply after.ply --out out.ply"),
         ((before,), f"{before}: name two files, the scene before and after the object was deleted"),
@@ -60,10 +60,10 @@ def test_errors_are_one_line(splat_files, tmp_path):
         ((before, after, "--out", out, "--scene", "x"), "--scene, --variant: a scene's folder names its files in "
          "scene.yaml; give it, or two files"),
         ((before, tmp_path / "no.ply", "--out", out), f"{tmp_path / 'no.ply'}: no such file"),
-        ((before, tmp_path / "s.ksplat", "--out", out), f"{tmp_path / 's.ksplat'}: .ksplat is not read; convert it to "
-         ".ply, as with `npx @playcanvas/splat-transform s.ksplat s.ply`"),
+        ((before, tmp_path / "s.usdz", "--out", out), f"{tmp_path / 's.usdz'}: .usdz is not read; save the scene as "
+         ".ply in the program that wrote it"),
         ((before, after, "--out", tmp_path / "x.obj"), f"{tmp_path / 'x.obj'}: .obj is not written; one of .ply, "
-         ".compressed.ply, .spz, .splat is"),
+         ".compressed.ply, .spz, .splat, .glb is"),
         ((before, after, "--out", tmp_path / "no" / "x.ply"), f"{tmp_path / 'no'}: no such folder"),
         ((before, after, "--out", out, "--cameras", tmp_path / "no"), f"{tmp_path / 'no'}: no such folder; --cameras "
          "names one with transforms.json or sparse/0"),
@@ -127,7 +127,7 @@ def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("ending", "within"), [(".ply", 1e-6), (".splat", 1e-6), (".spz", 2e-5), (".compressed.ply", 0.2)]
+    ("ending", "within"), [(".ply", 1e-6), (".splat", 1e-6), (".glb", 1e-6), (".spz", 2e-5), (".compressed.ply", 0.2)]
 )
 def test_the_suffix_chooses_the_format(tmp_path, ending, within):
     if ending in (".spz", ".compressed.ply"):
@@ -178,8 +178,8 @@ def test_many_splats_are_matched_by_their_exact_places():
     deleted = draws.random(len(points)) < 0.1
     deleted[[5, *range(1000, 1010)]], deleted[2000:2010] = False, True
     rest = points[~deleted][draws.permutation(np.count_nonzero(~deleted))] * (-1, -1, 1)
-    found = matching.match_gaussians(points, rest)
-    assert found.found == 1 and found.turn == (-1, -1, 1)
+    found = match_points(points, rest)
+    assert found.found == 1 and found.movement.rotation.diagonal().tolist() == [-1, -1, 1]
     twins = [*range(1000, 1010), *range(2000, 2010)]
     np.testing.assert_array_equal(np.delete(found.deleted, twins), np.delete(deleted, twins))
     assert found.deleted[twins].sum() == 10
@@ -191,7 +191,7 @@ def test_some_splats_that_moved_a_little_are_still_found():
     deleted = np.arange(len(points)) < 100
     rest = points[~deleted].copy()
     rest[:40] += 1e-5
-    found = matching.match_gaussians(points, rest)
+    found = match_points(points, rest)
     assert found.found == 1
     np.testing.assert_array_equal(found.deleted, deleted)
 

@@ -218,14 +218,14 @@ def test_splats_of_two_scales_are_not_antialiased(splat_file):
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("ending", [".ply", ".compressed.ply", ".spz", ".splat"])
+@pytest.mark.parametrize("ending", [".ply", ".compressed.ply", ".spz", ".splat", ".glb"])
 def test_every_format_but_splat_says_whether_splats_are_antialiased(tmp_path, ending, antialiased):
     gsply, path = pytest.importorskip("gsply"), tmp_path / f"g{ending}"
     save_splats(path, replace(random_gaussians(300, 1), antialiased=antialiased), HERE)
     assert load_ply(path).antialiased == (antialiased and ending != ".splat")
     if ending.endswith(".ply"):
         assert (b"\ncomment SplatRenderMode: mip\n" in path.read_bytes()) == antialiased
-    if ending != ".splat":
+    if ending not in (".splat", ".glb"):
         read = gsply.read_spz if ending == ".spz" else gsply.plyread
         assert len(read(str(path))) == 300, "other readers read it, too"
 
@@ -310,9 +310,8 @@ def test_splat_is_written_as_it_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(("ending", "remedy"), [
-    ("ksplat", "convert it to .ply, as with `npx @playcanvas/splat-transform scene.ksplat scene.ply`"),
-    ("sog", "convert it to .ply, as with `npx @playcanvas/splat-transform scene.sog scene.ply`"),
-    ("glb", "save the scene as .ply in the program that wrote it"),
+    ("usdz", "save the scene as .ply in the program that wrote it"),
+    ("gltf", "save the scene as .glb or .ply in the program that wrote it"),
     ("zip", "unpack it, and name a file of splats in it"),
     ("pt", "it is a checkpoint of gsplat; gsplat.export_splats writes a .ply of its `splats`"),
     ("ckpt", "it is a checkpoint of nerfstudio; `ns-export gaussian-splat --load-config config.yml --output-dir .` "

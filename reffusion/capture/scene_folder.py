@@ -84,17 +84,18 @@ def check_gaussian_files(params: SceneKeys, scene: Path) -> list[str]:
         A sentence for each thing that will be changed when the files are read.
 
     Raises:
-        BadInput: a file is missing or holds no Gaussians; `cleaned` is given without `gaussians`, or does not have
-            fewer Gaussians than `gaussians`, so that nothing was deleted.
+        BadInput: a file is missing or holds no Gaussians; `cleaned` is given without `gaussians`, or has as many
+            Gaussians as `gaussians`, so that nothing was deleted.
     """
-    counts, notes = {}, []
+    counts: dict[str, int | None] = {}
+    notes: list[str] = []
     for key, name in (("gaussians", params.gaussians), ("cleaned", params.cleaned)):
         if name is not None:
             if not is_file(scene / name):
                 raise BadInput(f"{scene / name}: no such file; correct `{key}` in scene.yaml")
             summary = summarize_splats(scene / name)
             counts[key], notes = summary.count, [*notes, *(f"{name}: {note}" for note in summary.notes)]
-            if not counts[key]:
+            if counts[key] == 0:
                 why = ": everything was deleted; delete the object only" if key == "cleaned" else ""
                 raise BadInput(f"{scene / name}: it holds no Gaussians{why}")
     if params.cleaned is None:
@@ -102,9 +103,11 @@ def check_gaussian_files(params: SceneKeys, scene: Path) -> list[str]:
     if params.gaussians is None:
         raise BadInput("scene.yaml: cleaned: name the scene before anything was deleted too, as `gaussians`")
     files = [scene / name for name in (params.gaussians, params.cleaned)]
-    if counts["cleaned"] >= counts["gaussians"]:  # recount without the rows that cannot be drawn
+    if counts["cleaned"] is not None and counts["cleaned"] == counts["gaussians"]:
+        # Only the rows that can be drawn count.
         counts["gaussians"], counts["cleaned"] = (len(load_splats(path).rows) for path in files)
-    if counts["cleaned"] >= counts["gaussians"]:
+        if counts["cleaned"] < counts["gaussians"]:
+            return notes
         raise BadInput(
             f"{files[1]}: {counts['cleaned']} splats, and {files[0]} has {counts['gaussians']}: nothing was deleted; "
             "delete the object in an editor, and save what is left"

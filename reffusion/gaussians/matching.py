@@ -6,12 +6,14 @@ matter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, cKDTree
+
+from reffusion.gaussians.movement import SAME_LOOKS, Cloud, Movement, find_movement
 
 CANDIDATES = 8  # nearest Gaussians of the whole scene with which a Gaussian of the cleaned scene is compared
 # Matching radius of a Gaussian of the whole scene, as a share of the distance to its nearest neighbour: within it a
@@ -21,11 +23,21 @@ MAX_DISTANCE = 0.5
 MIN_SPACING = 0.1
 SAMPLE_SIZE = 5000  # Gaussians of the cleaned scene by which axis flips and different scenes are detected
 QUERY_SIZE = 100_000  # points per query of neighbours
-MIN_MATCHED_SHARE = 0.95  # share of the cleaned scene's Gaussians that must be matched for both files to be one scene
+HULL_SIZE = 5_000  # points that are compared at once with the facets of a convex hull
+# Shares of a sample of the cleaned scene from which on it was not moved: of exact positions, and of positions nearby. A
+# scene that another one was merged into has less, but `find_movement` finds that it was not moved.
+MIN_EXACT_SHARE, MIN_MATCHED_SHARE = 0.05, 0.95
+MOSTLY_ALIKE = 0.5  # share of nearest pairs of one look above which all pairs must have one look
+MIN_FOUND_SHARE = 0.05  # share of the cleaned scene's Gaussians that must be matched for both files to be one scene
 # A deleted Gaussian is a core if so large a share of its NEIGHBORS nearest Gaussians was deleted, too. Connected cores
 # form a hole if there are at least LEAST_CORES. A deleted Gaussian belongs to the hole if it is at most REACH times as
 # far from the nearest core as that core's farthest neighbour is.
 NEIGHBORS, CORE_SHARE, LEAST_CORES, REACH = 16, 1 / 3, 16, 2.0
+# Gaussians less opaque than this quantile of those that stay were filtered, if they are so large a share of the scene.
+FILTER_RANK, LEAST_FILTERED = 0.001, 0.02
+# A region lies beyond what stays if so large a share of it is outside its convex hull. It is wide, and not an object, if
+# a tenth of it is farther from its middle direction than 35 degrees, seen from the center of what stays.
+BEYOND_SHARE, WIDE_COSINE = 0.8, 0.82
 # Signs of x, y and z: unchanged, or rotated by 180 degrees about x, y or z, as editors do with scenes that have y down.
 AXIS_FLIPS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
@@ -35,52 +47,66 @@ class Match:
     """Correspondence between a whole scene and a cleaned one.
 
     Attributes:
-        deleted: bool [N], True for the Gaussians of the whole scene that are not in the cleaned one. All False if the
-            scenes are different ones: less than `MIN_MATCHED_SHARE` of a sample of the cleaned scene is near Gaussians
-            of the whole scene.
-        found: share in [0, 1] of the cleaned scene's Gaussians that are matched; if the scenes are different ones, of
-            the sample.
-        turn: one of `AXIS_FLIPS`, the signs of x, y and z by which the cleaned scene was rotated.
+        places: int [M], for each Gaussian of the cleaned scene its index in the whole scene; -1 if it is not there.
+        deleted: bool [N], True for the Gaussians of the whole scene that are not in the cleaned one. All False if
+            `movement` is None.
+        found: share in [0, 1] of the cleaned scene's Gaussians that are in the whole scene.
+        movement: takes Gaussians of the whole scene to those of the cleaned one. None if the scenes are different ones.
+            If it mirrors, nothing is matched.
     """
 
+    places: np.ndarray
     deleted: np.ndarray
     found: float
-    turn: tuple[int, int, int]
+    movement: Movement | None
 
 
-def match_gaussians(whole: np.ndarray, cleaned: np.ndarray) -> Match:
+def match_gaussians(whole: Cloud, cleaned: Cloud) -> Match:
     """Match the Gaussians of a cleaned scene to those of the whole scene, one to one and the nearest pairs first.
 
-    Most editors keep positions to the last bit; equal positions are matched by sorting. Some editors quantise
+    Most editors keep positions to the last bit; equal positions are matched by sorting. Some editors quantize
     positions. This moves a Gaussian by far less than the distance to its neighbours, even in a compressed .ply, whose
-    steps are 1/2000 of the extent of 256 neighbours. Gaussians that were moved, scaled, or rotated other than by
-    `AXIS_FLIPS` are not matched.
+    steps are 1/2000 of the extent of 256 neighbours. Where neither is the case, the scene was moved, or another one was
+    added; `find_movement` then compares how Gaussians look.
 
     Args:
-        whole: [N, 3] positions, N >= 2.
-        cleaned: [M, 3] positions, M >= 1.
+        whole: N >= 2 Gaussians.
+        cleaned: M >= 1 Gaussians, of which some may be new.
     """
-    sample = cleaned[:: max(1, len(cleaned) // SAMPLE_SIZE)]
-    index = _ExactIndex(whole)
-    exact_share = {flip: float((index.find(sample * flip) >= 0).mean()) for flip in AXIS_FLIPS}
-    flip, near_index = max(AXIS_FLIPS, key=exact_share.__getitem__), None
-    if exact_share[flip] < MIN_MATCHED_SHARE:
+    sample = cleaned.take(slice(None, None, max(1, len(cleaned) // SAMPLE_SIZE)))
+    index, near_index = _ExactIndex(whole.means), None
+    exact = {flip: float((index.find(sample.means * flip) >= 0).mean()) for flip in AXIS_FLIPS}
+    flip = max(AXIS_FLIPS, key=exact.__getitem__)
+    movement: Movement | None = Movement(1.0, np.diag(np.array(flip, float)), np.zeros(3))
+    if exact[flip] < MIN_EXACT_SHARE:
         near_index = _NearIndex(whole)
-        near_share = {flip: near_index.share(sample * flip) for flip in AXIS_FLIPS}
-        flip = max(AXIS_FLIPS, key=near_share.__getitem__)
-        if near_share[flip] < MIN_MATCHED_SHARE:
-            return Match(np.zeros(len(whole), bool), near_share[flip], flip)
-    exact_matches = index.find(cleaned * flip)
-    unmatched = np.flatnonzero(exact_matches < 0)
-    is_kept = np.zeros(len(whole), bool)
-    is_kept[exact_matches[exact_matches >= 0]] = True
+        near = {flip: near_index.share(sample, flip) for flip in AXIS_FLIPS}
+        flip = max(AXIS_FLIPS, key=near.__getitem__)
+        movement = Movement(1.0, np.diag(np.array(flip, float)), np.zeros(3))
+        if near[flip] < MIN_MATCHED_SHARE:
+            movement = find_movement(whole, cleaned)
+            if movement is None or movement.mirrors:
+                return Match(np.full(len(cleaned), -1), np.zeros(len(whole), bool), near[flip], movement)
+    assert movement is not None
+    placed = replace(cleaned, means=movement.invert(cleaned.means))
+    places = index.find(placed.means)
+    unmatched = np.flatnonzero(places < 0)
     if len(unmatched):
-        is_kept |= _match_one_to_one(near_index or _NearIndex(whole), cleaned[unmatched] * flip, is_kept)
-    return Match(~is_kept, float(is_kept.sum() / len(cleaned)), flip)
+        taken = np.zeros(len(whole), bool)
+        taken[places[places >= 0]] = True
+        owners = _match_one_to_one(near_index or _NearIndex(whole), placed.take(unmatched), taken)
+        matched = np.flatnonzero(owners >= 0)
+        places[unmatched[owners[matched]]] = matched
+    found = float((places >= 0).mean())
+    if found < MIN_FOUND_SHARE:
+        return Match(np.full(len(cleaned), -1), np.zeros(len(whole), bool), found, None)
+    deleted = np.ones(len(whole), bool)
+    deleted[places[places >= 0]] = False
+    return Match(places, deleted, found, movement)
 
 
-def find_scattered(whole: np.ndarray, deleted: np.ndarray) -> np.ndarray:
-    """Find the deleted Gaussians that stood alone among others that stay, and so leave no hole to fill.
+def find_regions(whole: np.ndarray, deleted: np.ndarray) -> np.ndarray:
+    """Group the deleted Gaussians into regions, in which they lie close together.
 
     Only the nearest Gaussians are compared, so the result does not depend on the scale of the scene or on how densely
     it is sampled. An object may be a single layer on a surface that stays.
@@ -90,7 +116,8 @@ def find_scattered(whole: np.ndarray, deleted: np.ndarray) -> np.ndarray:
         deleted: bool [N], True for the Gaussians that were deleted.
 
     Returns:
-        bool [N], True for scattered Gaussians, all of which were deleted.
+        int [N], the number of the region; -1 for Gaussians that stay or are scattered, i.e. stood alone among others
+        that stay.
     """
     index, count = np.flatnonzero(deleted), min(NEIGHBORS, len(whole) - 1)
     distances, near = cKDTree(whole).query(whole[index], range(2, count + 2), workers=-1)  # the first is itself
@@ -101,12 +128,65 @@ def find_scattered(whole: np.ndarray, deleted: np.ndarray) -> np.ndarray:
     pairs = first, number[near[cores[first], column]]
     links = csr_array((np.ones(len(first), bool), pairs), shape=(len(cores), len(cores)))
     labels = connected_components(links, directed=False)[1]
-    cores = cores[np.bincount(labels)[labels] >= LEAST_CORES]
-    scattered = deleted.copy()
+    large = np.bincount(labels)[labels] >= LEAST_CORES
+    cores, labels = cores[large], labels[large]
+    regions = np.full(len(whole), -1)
     if len(cores):
         away, nearest = cKDTree(whole[index[cores]]).query(whole[index])
-        scattered[index] = away > REACH * distances[cores[nearest], -1]
-    return scattered
+        regions[index] = np.where(away <= REACH * distances[cores[nearest], -1], labels[nearest], -1)
+    return regions
+
+
+def find_filtered(opacities: np.ndarray, deleted: np.ndarray) -> np.ndarray:
+    """Find the Gaussians that were deleted because they are transparent: wherever they lie, they leave no hole.
+
+    Args:
+        opacities: [N], in [0, 1], of the whole scene.
+        deleted: bool [N].
+
+    Returns:
+        bool [N]. All False if no filter for opacity was used: if Gaussians as transparent stay.
+    """
+    filtered = deleted & (opacities < np.quantile(opacities[~deleted], FILTER_RANK))
+    return filtered if filtered.mean() > LEAST_FILTERED else np.zeros_like(filtered)
+
+
+def find_cropped(whole: np.ndarray, deleted: np.ndarray, regions: np.ndarray) -> np.ndarray:
+    """Find the Gaussians that were cropped: deleted around what stays.
+
+    Args:
+        whole: [N, 3] positions of the whole scene.
+        deleted: bool [N].
+        regions: int [N], from `find_regions`.
+
+    Returns:
+        bool [N]. All False if no region surrounds what stays. An object that stood beside it is not cropped.
+    """
+    cropped, kept = np.zeros(len(whole), bool), whole[~deleted]
+    numbers, number = np.unique(regions[regions >= 0], return_inverse=True)
+    if not len(numbers) or len(kept) < 4 or np.linalg.matrix_rank(kept - kept.mean(0), 1e-6 * np.ptp(kept)) < 3:
+        return cropped
+    index = np.flatnonzero(regions >= 0)
+    facets = ConvexHull(kept).equations
+    outside = np.zeros(len(index), bool)
+    for start in range(0, len(index), HULL_SIZE):
+        points = whole[index[start : start + HULL_SIZE]]
+        outside[start : start + HULL_SIZE] = (points @ facets[:, :3].T + facets[:, 3]).max(1) > 0
+    directions = whole[index] - np.median(kept, axis=0)
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-30)
+    beyond, wide = np.zeros(len(numbers), bool), np.zeros(len(numbers), bool)
+    for k in range(len(numbers)):
+        rows = number == k
+        middle = directions[rows].mean(0)
+        cosines = directions[rows] @ middle / max(np.linalg.norm(middle), 1e-30)
+        beyond[k] = outside[rows].mean() > BEYOND_SHARE
+        wide[k] = np.quantile(cosines, 0.1) < WIDE_COSINE
+    if not (beyond & wide).any():
+        return cropped
+    # If there is a hole within what stays, an editor cropped whatever lies beyond.
+    chosen = beyond if (~beyond).any() else beyond & wide
+    cropped[index[chosen[number]]] = True
+    return cropped
 
 
 class _ExactIndex:
@@ -147,8 +227,8 @@ def _hash_positions(points: np.ndarray) -> np.ndarray:
 class _NearIndex:
     """Index of a scene's Gaussians by position, with a matching radius for each that depends on its neighbours."""
 
-    def __init__(self, whole: np.ndarray):
-        self.tree = cKDTree(whole)
+    def __init__(self, whole: Cloud):
+        self.whole, self.tree = whole, cKDTree(whole.means)
         self._spacing = np.full(len(whole), np.nan, np.float32)  # distance to the nearest other one; computed on demand
         self._position = np.empty(len(whole), np.int32)
         self._position[self.tree.indices] = np.arange(len(whole))
@@ -170,9 +250,9 @@ class _NearIndex:
         self._spacing[unknown] = self.tree.query(self.tree.data[unknown], 2, workers=-1)[0][:, 1]
         return np.maximum(MAX_DISTANCE * self._spacing[splats], self._min_radius)
 
-    def share(self, points: np.ndarray) -> float:
-        """Return the share of the points [M, 3] that lie within the matching radius of their nearest Gaussian."""
-        distances, nearest = self.tree.query(points)
+    def share(self, sample: Cloud, flip: tuple[int, int, int]) -> float:
+        """Return the share of Gaussians that, flipped, lie within the matching radius of their nearest Gaussian."""
+        distances, nearest = self.tree.query(sample.means * flip)
         return float((distances <= self.radius(nearest)).mean())
 
 
@@ -193,11 +273,17 @@ def _find_candidates(index: _NearIndex, points: np.ndarray) -> tuple[np.ndarray,
     return distances, candidates
 
 
-def _match_one_to_one(index: _NearIndex, points: np.ndarray, excluded: np.ndarray) -> np.ndarray:
-    """Match points [M, 3] one to one, the nearest pairs first; return bool [N], the Gaussians that are matched."""
-    distances, candidates = _find_candidates(index, points)
+def _match_one_to_one(index: _NearIndex, points: Cloud, excluded: np.ndarray) -> np.ndarray:
+    """Match M Gaussians one to one, the nearest pairs first; return int [N], whom each Gaussian is matched with, or -1."""
+    distances, candidates = _find_candidates(index, points.means)
     # Gaussians that are `excluded`, bool [N], cannot be matched.
     distances[excluded[candidates]] = np.inf
+    # Where colors were not edited, Gaussians of another look are others that happen to lie there.
+    looks, whole_looks = points.looks(), index.whole.looks()
+    alike = np.stack([np.linalg.norm(whole_looks[each] - looks, axis=1) < SAME_LOOKS for each in candidates.T], axis=1)
+    near = np.isfinite(distances)
+    if alike[near[:, 0], 0].mean() > MOSTLY_ALIKE:
+        distances[~alike] = np.inf
     count = distances.shape[1]
     owner = np.full(index.tree.n, -1)
     owner_distance = np.full(index.tree.n, np.inf)  # distance to the owner
@@ -215,4 +301,4 @@ def _match_one_to_one(index: _NearIndex, points: np.ndarray, excluded: np.ndarra
         displaced = owner[proposed[order]]
         owner[proposed[order]], owner_distance[proposed[order]] = proposers[order], proposed_distance[order]
         proposers = np.setdiff1d(np.concatenate([proposers, displaced[displaced >= 0]]), owner)
-    return owner >= 0
+    return owner

@@ -12,6 +12,7 @@ import numpy as np
 from reffusion.io import compressed
 from reffusion.io.compressed import MIP_COMMENT, PACKED
 from reffusion.io.files import BadInput, reading
+from reffusion.io.glb import save_glb
 from reffusion.io.ply_table import load_header, load_vertices, save_vertices
 from reffusion.io.quantized import save_splat
 from reffusion.io.splat_rows import Rows
@@ -96,7 +97,7 @@ def check_can_save(path: Path) -> None:
 def save_splats(path: Path, gaussians: Gaussians, similarity: Similarity, properties: Sequence[str] = ()) -> None:
     """Write Gaussians in the scene's own frame, in the format that the file's ending names (see `splats.FORMATS`).
 
-    All formats but .splat store `Gaussians.antialiased`.
+    All formats but .splat store `Gaussians.antialiased`; that of a .glb only this project reads.
 
     Args:
         gaussians: in the normalised frame.
@@ -104,13 +105,15 @@ def save_splats(path: Path, gaussians: Gaussians, similarity: Similarity, proper
         properties: order of the properties of a plain .ply, as in `save_ply`; other formats ignore it.
     """
     name = Path(path).name.lower()
-    if name.endswith((".spz", ".splat")):
+    if name.endswith((".spz", ".splat", ".glb")):
         means, *others = (getattr(gaussians, field.name).detach().cpu().numpy() for field in fields(Rows))
         rows = Rows(means.astype(np.float64), *others)
         sizes = (rows.log_scales - np.log(similarity.scale)).astype(np.float32)
         rows = replace(rows, means=similarity.invert(rows.means), log_scales=sizes)
         if name.endswith(".spz"):
             compressed.save_spz(path, rows, gaussians.antialiased)
+        elif name.endswith(".glb"):
+            save_glb(path, rows, gaussians.antialiased)
         else:
             save_splat(path, rows)
     elif name.endswith(".compressed.ply"):
@@ -120,7 +123,7 @@ def save_splats(path: Path, gaussians: Gaussians, similarity: Similarity, proper
 
 
 def load_ply(path: Path, similarity: Similarity | None = None, device: str = "cpu") -> Gaussians:
-    """Read the Gaussians of a .ply, compressed .ply, .spz or .splat as float32 on `device`, see `splats.load_splats`.
+    """Read the Gaussians of a file as float32 on `device`, see `splats.load_splats`.
 
     Args:
         similarity: from the scene's own frame, in which the file then is, to the normalised frame, in which the result

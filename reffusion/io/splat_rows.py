@@ -52,6 +52,18 @@ class Rows:
         return Rows(*(array[chosen] for array in vars(self).values()))
 
 
+def rotate_rows(rows: Rows, rotation: np.ndarray) -> Rows:
+    """Return the rows rotated about the origin, with their spherical harmonics.
+
+    Args:
+        rotation: [3, 3].
+    """
+    from reffusion.splat.rotation import rotate_harmonics, rotate_quaternions
+
+    means, quaternions = rows.means @ rotation.T, rotate_quaternions(rows.quaternions, rotation)
+    return Rows(means, quaternions, rows.log_scales, rows.opacity_logits, rotate_harmonics(rows.sh, rotation))
+
+
 @dataclass(frozen=True)
 class Repairs:
     """The numbers of rows and values that `drop_invalid` dropped or changed.

@@ -1,4 +1,5 @@
-"""Reading of files of Gaussians: .ply of 3DGS and related tools, compressed .ply, .spz and .splat.
+"""Reading of files of Gaussians: .ply of 3DGS and related tools, compressed .ply, .spz, .splat, .glb and, by
+splat-transform, .sog, .ksplat, .lcc and .lcc2.
 
 A row is one Gaussian of a file. Rows are read and checked in blocks, so that memory holds only one block besides the
 result.
@@ -7,6 +8,7 @@ result.
 from __future__ import annotations
 
 import re
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from reffusion.io import compressed, quantized
+from reffusion.io import compressed, glb, quantized, splat_transform
 from reffusion.io.files import BadInput, is_file, reading
 from reffusion.io.ply_table import load_header, load_vertices
 from reffusion.io.splat_rows import BAD_SHARE, DEGREE, FLAT, Repairs, Rows, drop_invalid, fold_filter
@@ -32,11 +34,11 @@ FILTER = "filter_3D"  # property of Mip-Splatting: the standard deviation of the
 # Comments of a .ply that say whether the Gaussians are to be rendered with Mip-Splatting's 2D filter: first those of
 # Brush and splat-transform, then those of Postshot and, without a number, of earlier versions of this program.
 RENDERING = re.compile(r"splatrendermode: ?(\w+)|antialiased(?: ([01]))?", re.IGNORECASE)
-FORMATS = (".ply", ".compressed.ply", ".spz", ".splat")  # endings of the files that are read and written
+FORMATS = (".ply", ".compressed.ply", ".spz", ".splat", ".glb")  # endings of the files that are read and written
 BY_PROGRAM = "save the scene as .ply in the program that wrote it"
-UNREAD = {  # ending of a file that is not read: how to get a .ply from it; None: splat-transform converts it
-    **dict.fromkeys((".ksplat", ".sog", ".lcc", ".lcc2", ".json")),
-    **dict.fromkeys((".glb", ".gltf", ".usdz"), BY_PROGRAM),
+UNREAD = {  # ending of a file that is not read: how to get a file that is
+    **dict.fromkeys((".usdz", ".usd", ".usda", ".usdc"), BY_PROGRAM),
+    ".gltf": "save the scene as .glb or .ply in the program that wrote it",
     ".zip": "unpack it, and name a file of splats in it",
     ".gz": "unpack it, and name the file in it",
     ".ckpt": "it is a checkpoint of nerfstudio; `ns-export gaussian-splat --load-config config.yml --output-dir .` "
@@ -87,14 +89,13 @@ class Summary:
     """The contents of a file of Gaussians, as far as its header tells.
 
     Attributes:
-        count: the number of rows, valid or not.
+        count: the number of rows, valid or not; None if it is known only after the file was converted.
         notes: what reading the file will change, a sentence each, without the file's name.
-        properties: names of the vertex properties of a plain .ply, in order; empty for a quantised file (compressed
-            .ply, .spz or .splat).
+        properties: names of the vertex properties of a plain .ply, in order; empty for all other formats.
         antialiased: as in `Splats`.
     """
 
-    count: int
+    count: int | None
     notes: tuple[str, ...] = ()
     properties: tuple[str, ...] = ()
     antialiased: bool = False
@@ -104,14 +105,20 @@ def summarize_splats(path: Path) -> Summary:
     """Read the header of a file of Gaussians.
 
     Raises:
-        BadInput: the file is truncated, is no file of Gaussians, or has a format that is not read; or gsply is needed
-            and not installed.
+        BadInput: the file is truncated, is no file of Gaussians, or has a format that is not read; or gsply or Node is
+            needed and not installed.
     """
     path = Path(path)
     ending = path.suffix.lower()
+    if splat_transform.is_convertible(path):
+        splat_transform.check_node(path)
+        notes = (f"it is converted to .ply by {splat_transform.PACKAGE}, which npm downloads at its first use (210 MB)",)
+        return Summary(None, notes, antialiased=splat_transform.is_antialiased(path))
     if ending in UNREAD:
-        by_npm = f"convert it to .ply, as with `npx @playcanvas/splat-transform {path.name} {path.stem}.ply`"
-        raise BadInput(f"{path}: {ending} is not read; {UNREAD[ending] or by_npm}")
+        raise BadInput(f"{path}: {ending} is not read; {UNREAD[ending]}")
+    if ending == ".glb":
+        count, antialiased = glb.summarize_glb(path)
+        return Summary(count, antialiased=antialiased)
     if ending == ".splat":
         return Summary(quantized.count_splat(path))
     if ending == ".spz":
@@ -144,9 +151,15 @@ def load_splats(path: Path) -> Splats:
     path = Path(path)
     is_file(path)
     summary, ending = summarize_splats(path), path.suffix.lower()
+    if summary.count is None:
+        with tempfile.TemporaryDirectory() as folder:
+            converted = load_splats(splat_transform.convert_to_ply(path, Path(folder)))
+            return Splats(converted.rows, converted.antialiased or summary.antialiased, converted.notes)
     with reading(path, "a file of Gaussians"):
         if ending == ".splat":
             read = quantized.open_splat(path)
+        elif ending == ".glb":
+            read = glb.load_glb(path).take
         elif ending == ".spz":
             read = compressed.load_spz(path).take
         elif not summary.properties:

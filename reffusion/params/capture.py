@@ -78,7 +78,7 @@ class SceneKeys(Settings):
     exclude: list[str] = Field([], description="views to leave out of the scene")
     keep: list[str] = Field([], description="views that stay, even where their photographs contradict their poses")
     gaussians: str | None = Field(
-        None, description="a fitted scene of Gaussians in its own frame: .ply, .spz or .splat"
+        None, description="a fitted scene of Gaussians in its own frame: .ply, .spz, .splat, .glb, .sog"
     )
     cleaned: str | None = Field(None, description="the same file after splats were deleted: these are the object")
     region: RegionSpec | None = Field(

@@ -40,7 +40,9 @@ EXPORTS = {
         {
             "export/scene.compressed.ply": "the same, compressed (PlayCanvas, SuperSplat)",
             "export/scene.spz": "the same as .spz (Niantic)",
+            "export/scene.glb": "the same as .glb (glTF)",
             "export/scene.sog": "the same as .sog, small, for the web (PlayCanvas)",
+            "export/scene.html": "a page that shows it in a browser, in one file",
             "export/with_object.ply": "the scene with the object, for an editor: reffusion patch fills what you delete "
             "there",
             "export/cameras.zip": "cameras (COLMAP model, transforms.json) and undistorted photographs",
@@ -148,7 +150,7 @@ class Export:
         """Start in the background, unless it runs already.
 
         Args:
-            sog: True also makes a .sog file, which takes Node and minutes.
+            sog: True also makes a .sog and an .html file, which takes Node and minutes.
         """
         if not self.work:
             self.work, self.error = "begins", ""
@@ -156,7 +158,7 @@ class Export:
             threading.Thread(target=self._run, args=(scene, sog), daemon=True).start()
 
     def describe(self) -> dict[str, Any]:
-        """Return "work", "share" and "error"; and "has_npm", True if a .sog file can be made on this machine."""
+        """Return "work", "share" and "error"; and "has_npm", True if these can be made on this machine."""
         has_npm = shutil.which("npm") is not None
         return {"work": self.work, "share": self.share, "error": self.error, "has_npm": has_npm}
 

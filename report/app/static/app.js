@@ -677,7 +677,7 @@ function drawExport() {
   $('export-lead').textContent = 'Files for other tools, in the coordinates of the capture.';
   $('make').disabled = Boolean(work) || isBusy();
   $('sog').disabled = !npm;
-  $('sog-words').textContent = npm ? 'also .sog, for the web: takes minutes, and the first time downloads 210 MB' : 'also .sog: needs Node with npm, which is not installed here';
+  $('sog-words').textContent = npm ? 'also .sog and .html, for the web: takes minutes, and the first time downloads 210 MB' : 'also .sog and .html: needs Node with npm, which is not installed here';
   $('made').hidden = !work;
   if (share != null) $('made').value = share; else $('made').removeAttribute('value');
   $('make').textContent = made ? 'Make all formats again' : 'Make all formats';
