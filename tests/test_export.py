@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 from dataclasses import replace
@@ -207,6 +208,9 @@ def test_other_libraries_read_sog_and_spz(tmp_path):
         export.make(home, sog=True)
     except BadInput as error:
         pytest.skip(f"no npm, or no network: {error}")
+    page = (home / "export/scene.html").read_text()
+    assert "<canvas" in page or "canvas" in page
+    assert not re.search(r"""(?:src|href)=["']https?:""", page), "it needs no network"
     read = forge.convert((home / "export/scene.sog").read_bytes(), "sog", "ply")
     (tmp_path / "sog.ply").write_bytes(read["data"])
     command = ["npm", "exec", "--yes", f"--package={PACKAGE}", "--", "splat-transform"]

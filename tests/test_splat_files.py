@@ -27,6 +27,7 @@ from reffusion.io.files import BadInput
 from reffusion.io.ply import load_ply, load_points, save_ply, save_splats
 from reffusion.io.ply_table import load_header
 from reffusion.io.quantized import save_splat
+from reffusion.io.splat_transform import PACKAGE, save_for_web
 from reffusion.io.splats import load_splats, summarize_splats
 from reffusion.types import Gaussians, Similarity
 from stages import poses
@@ -412,7 +413,12 @@ def test_splat_transform_and_we_read_the_same(tmp_path):
     convert("ours.splat", "from_splat.ply")
     convert("ours.spz", "from_spz.ply")
     convert("made.ply", "theirs.spz")
-    for name, harmonics in (("from_splat.ply", 1), ("from_spz.ply", 16), ("theirs.spz", 16)):
+    files = [("from_splat.ply", 1), ("from_spz.ply", 16), ("theirs.spz", 16)]
+    if gaussforge := pytest.importorskip("gaussforge"):
+        written = gaussforge.GaussForge().convert((tmp_path / "made.ply").read_bytes(), "ply", "ksplat")
+        (tmp_path / "theirs.ksplat").write_bytes(written["data"])
+        files.append(("theirs.ksplat", 1))
+    for name, harmonics in files:
         read = load_ply(tmp_path / name)
         nearest = torch.cdist(made.means, read.means).argmin(1)
         assert sorted(nearest.tolist()) == list(range(300)), name
@@ -422,3 +428,48 @@ def test_splat_transform_and_we_read_the_same(tmp_path):
         theirs = torch.nn.functional.normalize(read.quaternions[nearest])
         assert (unit * theirs).sum(1).abs().min() > 0.999, name
         np.testing.assert_allclose(read.sh[nearest][:, :harmonics], made.sh[:, :harmonics], atol=0.07, err_msg=name)
+
+
+@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="asks npm; set REFFUSION_SLOW=1")
+@pytest.mark.parametrize("name", ["theirs.sog", "meta.json"])
+def test_sog_is_read_by_splat_transform(tmp_path, name):
+    made = random_gaussians(300, 2)
+    made = replace(made, sh=torch.cat([made.sh[:, :1], 0.1 * made.sh[:, 1:]], 1).clamp(-1, 1))
+    save_ply(tmp_path / "made.ply", made)
+    try:
+        save_for_web(tmp_path / name, tmp_path / "made.ply", False)
+    except BadInput as error:
+        pytest.skip(f"no npm, or no network: {error}")
+    (note,) = summarize_splats(tmp_path / name).notes
+    assert note == f"it is converted to .ply by {PACKAGE}, which npm downloads at its first use (210 MB)"
+    read = load_ply(tmp_path / name)
+    assert not read.antialiased
+    nearest = torch.cdist(made.means, read.means).argmin(1)
+    assert sorted(nearest.tolist()) == list(range(300))
+    np.testing.assert_allclose(read.means[nearest], made.means, atol=1e-3)
+    np.testing.assert_allclose(read.log_scales[nearest], made.log_scales, atol=0.05)
+    np.testing.assert_allclose(read.sh[nearest][:, 0], made.sh[:, 0], atol=0.05)
+    assert np.abs(render_color(read, VIEW) - render_color(made, VIEW)).mean() < 0.02
+    if name == "theirs.sog":
+        save_for_web(tmp_path / name, tmp_path / "made.ply", True)
+        assert load_ply(tmp_path / name).antialiased
+        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-300])
+        with pytest.raises(BadInput, match=r"theirs\.sog: not a \.sog file"):
+            summarize_splats(tmp_path / name)
+
+
+@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="asks npm; set REFFUSION_SLOW=1")
+def test_a_damaged_ksplat_is_refused_in_one_line(tmp_path):
+    (tmp_path / "s.ksplat").write_bytes(bytes(4096))
+    if not shutil.which("npm"):
+        pytest.skip("there is no npm")
+    with pytest.raises(BadInput, match=r"s\.ksplat: .*splat-transform@\S+ cannot convert it to \.ply: \S+") as error:
+        load_splats(tmp_path / "s.ksplat")
+    assert "\n" not in str(error.value)
+
+
+def test_without_node_the_message_says_what_reads_sog(tmp_path, monkeypatch):
+    (tmp_path / "s.sog").write_bytes(bytes(64))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(BadInput, match=r"s\.sog: .*splat-transform\S+ converts it, which needs Node; install Node 18"):
+        summarize_splats(tmp_path / "s.sog")

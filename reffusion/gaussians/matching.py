@@ -35,9 +35,10 @@ MIN_FOUND_SHARE = 0.05  # share of the cleaned scene's Gaussians that must be ma
 NEIGHBORS, CORE_SHARE, LEAST_CORES, REACH = 16, 1 / 3, 16, 2.0
 # Gaussians less opaque than this quantile of those that stay were filtered, if they are so large a share of the scene.
 FILTER_RANK, LEAST_FILTERED = 0.001, 0.02
-# A region lies beyond what stays if so large a share of it is outside its convex hull. It is wide, and not an object, if
-# a tenth of it is farther from its middle direction than 35 degrees, seen from the center of what stays.
-BEYOND_SHARE, WIDE_COSINE = 0.8, 0.82
+# A region lies beyond what stays if so large a share of it is outside its convex hull, and surrounds it if so large a
+# share is beyond either end of one of some directions.
+BEYOND_SHARE, SIDE_SHARE = 0.8, 0.02
+OPPOSITES = ((1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1), (0, 1, 1), (0, 1, -1))
 # Signs of x, y and z: unchanged, or rotated by 180 degrees about x, y or z, as editors do with scenes that have y down.
 AXIS_FLIPS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
@@ -172,21 +173,24 @@ def find_cropped(whole: np.ndarray, deleted: np.ndarray, regions: np.ndarray) ->
     for start in range(0, len(index), HULL_SIZE):
         points = whole[index[start : start + HULL_SIZE]]
         outside[start : start + HULL_SIZE] = (points @ facets[:, :3].T + facets[:, 3]).max(1) > 0
-    directions = whole[index] - np.median(kept, axis=0)
-    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-30)
-    beyond, wide = np.zeros(len(numbers), bool), np.zeros(len(numbers), bool)
-    for k in range(len(numbers)):
-        rows = number == k
-        middle = directions[rows].mean(0)
-        cosines = directions[rows] @ middle / max(np.linalg.norm(middle), 1e-30)
-        beyond[k] = outside[rows].mean() > BEYOND_SHARE
-        wide[k] = np.quantile(cosines, 0.1) < WIDE_COSINE
-    if not (beyond & wide).any():
+    numbered = [index[number == k] for k in range(len(numbers))]
+    beyond = np.array([outside[number == k].mean() > BEYOND_SHARE for k in range(len(numbers))])
+    if not beyond.any() or not _surrounds(np.concatenate([numbered[k] for k in np.flatnonzero(beyond)]), whole, kept):
         return cropped
-    # If there is a hole within what stays, an editor cropped whatever lies beyond.
-    chosen = beyond if (~beyond).any() else beyond & wide
-    cropped[index[chosen[number]]] = True
+    # If there is a hole within what stays, an editor cropped whatever lies beyond. Else an object may stand there.
+    within = not beyond.all()
+    for k in np.flatnonzero(beyond):
+        cropped[numbered[k]] = within or _surrounds(numbered[k], whole, kept)
     return cropped
+
+
+def _surrounds(chosen: np.ndarray, whole: np.ndarray, kept: np.ndarray) -> bool:
+    """Return whether chosen Gaussians reach beyond the kept ones [K, 3] on opposite sides."""
+    for direction in OPPOSITES:
+        along, range_ = whole[chosen] @ direction, kept @ direction
+        if min((along < range_.min()).mean(), (along > range_.max()).mean()) > SIDE_SHARE:
+            return True
+    return False
 
 
 class _ExactIndex:
@@ -281,8 +285,8 @@ def _match_one_to_one(index: _NearIndex, points: Cloud, excluded: np.ndarray) ->
     # Where colors were not edited, Gaussians of another look are others that happen to lie there.
     looks, whole_looks = points.looks(), index.whole.looks()
     alike = np.stack([np.linalg.norm(whole_looks[each] - looks, axis=1) < SAME_LOOKS for each in candidates.T], axis=1)
-    near = np.isfinite(distances)
-    if alike[near[:, 0], 0].mean() > MOSTLY_ALIKE:
+    near = np.isfinite(distances[:, 0])
+    if np.count_nonzero(alike[near, 0]) > MOSTLY_ALIKE * np.count_nonzero(near):
         distances[~alike] = np.inf
     count = distances.shape[1]
     owner = np.full(index.tree.n, -1)

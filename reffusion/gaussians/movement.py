@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 SAMPLE_SIZE = 20_000  # Gaussians of the moved scene for which a partner of the same looks is searched
 PAIRS = 2000  # most distinct pairs, with which movements are tried
 TRIPLES = 100_000  # triples of pairs that are drawn
-TRIALS = 1000  # most triples of consistent distances that are tried
+TRIALS = 300  # most triples of consistent distances that are tried
 DISTANCE_ERROR = 0.02  # relative difference up to which distances in a triple are consistent
 # Largest distance of a pair from a movement that explains it, as a share of the scene's extent: at first and at last.
 FIRST_ERROR, LAST_ERROR = 0.02, 0.002
