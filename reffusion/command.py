@@ -21,7 +21,10 @@ COMMANDS = {
     "view": ("report.view", "view the finished scene in a browser (extra `view`)"),
     "turntable": ("report.turntable", "a video of the finished scene"),
     "sheet": ("report.sheet", "images of test views side by side"),
-    "export": ("report.export", "export the finished scene: .ply, .spz, .glb, .sog, .html, cameras, LoRA (extra `export`)"),
+    "export": (
+        "report.export",
+        "export the finished scene: .ply, .spz, .glb, .sog, .html, cameras, LoRA (extra `export`)",
+    ),
     "patch": ("report.patch", "fill what was deleted in a splat editor (extra `export`)"),
     "compare": ("runner", "run the method, ablations and baselines on one scene or a folder of scenes"),
     "compare-page": ("report.compare", "draw the page of a comparison again"),

@@ -26,8 +26,8 @@ LORA_FILE = "pytorch_lora_weights.safetensors"
 def make(home: Path, sog: bool = False) -> list[str]:
     """Write the Gaussians, cameras, photographs and the LoRA in common formats to `home`/export/.
 
-    Gaussians and cameras are in the scene's own frame; in a .spz and a .glb y points up, as their formats say. Photographs, the
-    Gaussians of the fit (the scene with the object) and the LoRA are written if they exist.
+    Gaussians and cameras are in the scene's own frame; in a .spz and a .glb y points up, as their formats say.
+    Photographs, the Gaussians of the fit (the scene with the object) and the LoRA are written if they exist.
 
     Args:
         home: runs/<scene> or runs/<scene>@<variant>, with a finished stage `evaluate`.

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-import torch
-from scipy.spatial import cKDTree
-from torch import Tensor
-
-from reffusion.gaussians.movement import Movement
-from reffusion.io.arrays import load_json, load_labels
+from reffusion.io.arrays import load_labels
+from reffusion.io.edited_scene import repeat_edit
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
-from reffusion.splat.rotation import rotate_gaussians
-from reffusion.types import Gaussians, Similarity
 from report.results import load_receipts
 from report.sheet import stage_folder
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from reffusion.types import Gaussians, Similarity
+
 
 MOST_NEW = 100  # new Gaussians for each deleted one, above which a warning is given; an object takes about 30
 
@@ -63,27 +63,10 @@ def load_result(home: Path) -> PatchResult:
     poses, result = stage_folder(home, "poses"), home / "evaluate" / "scene.ply"
     if not result.exists():
         raise ValueError(f"{result} is missing; `make scene={home.name.split('@')[0]} patch` makes it")
-    similarity = load_scene(poses).similarity
-    gaussians, new = load_ply(result, similarity), load_labels(result_stage_folder(home) / "labels.npy")
-    deleted = load_labels(poses / "deleted.npy")
+    new, deleted = load_labels(result_stage_folder(home) / "labels.npy"), load_labels(poses / "deleted.npy")
     count = int(deleted.sum())
     others = len(deleted) - count - int((~new).sum())
-    if (poses / "cropped.npy").exists():
-        nearest = cKDTree(load_ply(poses / "gaussians.ply").means.numpy()).query(gaussians.means.numpy())[1]
-        kept = new | ~load_labels(poses / "cropped.npy")[torch.from_numpy(nearest)]
-        gaussians, new = gaussians.map(lambda values: values[kept]), new[kept]
-    if (poses / "added.ply").exists():
-        added = load_ply(poses / "added.ply")
-        width = gaussians.sh.shape[1]
-        missing = torch.zeros(len(added), max(0, width - added.sh.shape[1]), 3)
-        added = replace(added, sh=torch.cat([added.sh, missing], 1)[:, :width])
-        gaussians = gaussians.zip_map(added, lambda one, other: torch.cat([one, other]))
-        new = torch.cat([new, torch.zeros(len(added), dtype=torch.bool)])
-    if (poses / "movement.json").exists():
-        facts = load_json(poses / "movement.json")
-        movement = Movement(facts["scale"], np.array(facts["rotation"]), np.array(facts["shift"]))
-        gaussians = rotate_gaussians(gaussians, movement.rotation)
-        similarity = Similarity(similarity.scale / movement.scale, movement.apply(similarity.offset))
+    gaussians, similarity, new = repeat_edit(poses, load_ply(result, load_scene(poses).similarity), new)
     return PatchResult(gaussians, similarity, new, count, others)
 
 

@@ -182,13 +182,13 @@ def _describe_looks(rows: Rows) -> Cloud:
 
 
 def _find_edit(files: tuple[Path, Path], whole: Rows, cleaned: Rows) -> Edit:
-    """Find what was done to the Gaussians of the whole scene; raises BadInput if this is not clear, or leaves no hole."""
+    """Find what was done to the Gaussians of the whole scene; raises BadInput if it is unclear or leaves no hole."""
     cloud = _describe_looks(whole)
     match = matching.match_gaussians(cloud, _describe_looks(cleaned))
     if match.movement is None:
         raise BadInput(
-            f"{files[1]}: of its splats {match.found:.0%} are where {files[0].name} has one, and too few look like one: "
-            "it is another scene, or was decimated, recolored or stretched; only delete, crop, move, turn and scale"
+            f"{files[1]}: of its splats {match.found:.0%} are where {files[0].name} has one, and too few look like "
+            "one: it is another scene, or was decimated, recolored or stretched; only delete, crop, move, turn, scale"
         )
     if match.movement.mirrors:
         raise BadInput(f"{files[1]}: it is {files[0].name} mirrored; save it again without mirroring")

@@ -94,7 +94,14 @@ def test_nodes_move_quantized_and_interleaved_splats(tmp_path):
     view, first = len(document["bufferViews"]) - 1, len(document["accessors"])
     document["accessors"] += [
         {"bufferView": view, "componentType": 5122, "normalized": True, "type": "VEC4", "count": 200},
-        {"bufferView": view, "byteOffset": 8, "componentType": 5121, "normalized": True, "type": "SCALAR", "count": 200},
+        {
+            "bufferView": view,
+            "byteOffset": 8,
+            "componentType": 5121,
+            "normalized": True,
+            "type": "SCALAR",
+            "count": 200,
+        },
     ]
     attributes = {n: k for n, k in plain["attributes"].items() if "DEGREE" not in n or "DEGREE_0" in n}
     small = plain | {"attributes": attributes | {f"{KHR}:ROTATION": first, f"{KHR}:OPACITY": first + 1}}
@@ -135,15 +142,24 @@ def test_refusals_say_what_would_help(tmp_path):
         assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
 
     compression = {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}
-    refuse(lambda _, p, e: e.update(extensions=compression), "compressed by KHR_gaussian_splatting_compression_spz_2; save")
-    refuse(lambda _, p, e: e.update(colorSpace="lin_rec709_display"), "colors in the space 'lin_rec709_display'; save it in")
+    refuse(
+        lambda _, p, e: e.update(extensions=compression), "compressed by KHR_gaussian_splatting_compression_spz_2; save"
+    )
+    refuse(
+        lambda _, p, e: e.update(colorSpace="lin_rec709_display"),
+        "colors in the space 'lin_rec709_display'; save it in",
+    )
     refuse(lambda _, p, e: e.update(kernel="box"), "splats of the kernel 'box'; only the ellipse")
     refuse(lambda _, p, e: p["extensions"].clear(), f"it has no splats of {KHR}; export the Gaussians")
-    refuse(lambda _, p, e: p["attributes"].pop(f"{KHR}:SCALE"), f"its splats lack {KHR}:SCALE: a draft of the extension")
+    refuse(
+        lambda _, p, e: p["attributes"].pop(f"{KHR}:SCALE"), f"its splats lack {KHR}:SCALE: a draft of the extension"
+    )
     refuse(lambda _, p, e: p["attributes"].pop(f"{KHR}:SH_DEGREE_1_COEF_2"), "3 spherical harmonics; 1, 4, 9 or 16")
     refuse(lambda d, p, e: d["nodes"][0].update(scale=[1, 1, -1]), "a node mirrors or stretches its splats; apply")
     refuse(lambda d, p, e: d["nodes"][0].update(scale=[1, 2, 1]), "a node mirrors or stretches its splats; apply")
-    refuse(lambda d, p, e: d["buffers"][0].update(uri="data.bin"), "its splats are in another file; save it as one .glb")
+    refuse(
+        lambda d, p, e: d["buffers"][0].update(uri="data.bin"), "its splats are in another file; save it as one .glb"
+    )
     refuse(lambda d, p, e: d["accessors"][3].update(count=7), f"{KHR}:SCALE has 7 values for 20 splats")
     refuse(lambda d, p, e: d["bufferViews"][0].update(byteOffset=10**9), "not a .glb file")
     refuse(lambda d, p, e: d["scenes"][0].update(nodes=[7]), "not a .glb file")

@@ -40,7 +40,9 @@ HERE = Similarity(1.0, np.zeros(3))
 
 def match_points(whole, cleaned):
     """Match Gaussians that all look the same, so that only their positions tell them apart."""
-    clouds = [Cloud(each, np.zeros((len(each), 3)), np.zeros((len(each), 3)), np.ones(len(each))) for each in (whole, cleaned)]
+    clouds = [
+        Cloud(each, np.zeros((len(each), 3)), np.zeros((len(each), 3)), np.ones(len(each))) for each in (whole, cleaned)
+    ]
     return matching.match_gaussians(*clouds)
 
 

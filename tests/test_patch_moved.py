@@ -1,4 +1,4 @@
-"""`patch` for scenes that were moved, turned, scaled, cropped, filtered or merged in the editor, and quantized there."""
+"""`patch` for scenes that were moved, turned, scaled, cropped, filtered, merged or quantized in the editor."""
 
 from __future__ import annotations
 
@@ -175,7 +175,8 @@ def test_what_was_cropped_is_not_filled_and_not_given_back(tmp_path, name, spher
 def test_an_object_beside_the_rest_is_not_cropped(tmp_path):
     draws = np.random.default_rng(0)
     before, _ = room(5000, 0)
-    means = np.concatenate([draws.uniform((-1, -1, 0), (1, 1, 0.02), (4000, 3)), draws.uniform((-0.2, -0.2, 0.02), (0.2, 0.2, 0.8), (1000, 3))])  # fmt: skip
+    table = draws.uniform((-1, -1, 0), (1, 1, 0.02), (4000, 3))
+    means = np.concatenate([table, draws.uniform((-0.2, -0.2, 0.02), (0.2, 0.2, 0.8), (1000, 3))])
     before, vase = replace(before, means=torch.from_numpy(means).float()), np.arange(5000) >= 4000
     out = run_poses(tmp_path, before, take(before, ~vase))
     np.testing.assert_array_equal(load_labels(out / "deleted.npy"), vase)
@@ -197,7 +198,9 @@ def test_a_filter_for_opacity_leaves_no_hole(tmp_path):
 def test_a_scene_that_was_merged_in_is_given_back(tmp_path, name, capsys):
     before, ball = room()
     other = random_gaussians(9000, 1)
-    other = replace(other, means=other.means + torch.tensor([5.0, 0, 0]), sh=torch.cat([other.sh, torch.zeros(9000, 12, 3)], 1))
+    other = replace(
+        other, means=other.means + torch.tensor([5.0, 0, 0]), sh=torch.cat([other.sh, torch.zeros(9000, 12, 3)], 1)
+    )
     rest = take(before, ~ball)
     after = other.zip_map(rest, lambda one, two: torch.cat([one, two]))
     movement = MOVES.get(name, Movement(1.0, np.eye(3), np.zeros(3)))
@@ -231,7 +234,9 @@ def test_photographs_and_cameras_stay_in_the_frame_of_the_scene_before(tmp_path)
     remove_pictures(tmp_path / "s")
     draws = torch.Generator().manual_seed(3)
     # The capture's own splats look too much alike.
-    distinct = replace(whole, sh=torch.rand(whole.sh.shape, generator=draws), opacity_logits=torch.rand(len(whole), generator=draws))
+    distinct = replace(
+        whole, sh=torch.rand(whole.sh.shape, generator=draws), opacity_logits=torch.rand(len(whole), generator=draws)
+    )
     save_ply(tmp_path / "s" / "scene.ply", distinct)
     save_ply(tmp_path / "s" / "cleaned.ply", move(take(distinct, ~deleted), MOVES["all"]))
     (out := tmp_path / "out").mkdir()

@@ -278,7 +278,7 @@ def _find_candidates(index: _NearIndex, points: np.ndarray) -> tuple[np.ndarray,
 
 
 def _match_one_to_one(index: _NearIndex, points: Cloud, excluded: np.ndarray) -> np.ndarray:
-    """Match M Gaussians one to one, the nearest pairs first; return int [N], whom each Gaussian is matched with, or -1."""
+    """Match M Gaussians one to one, nearest pairs first; return int [N], the partner of each Gaussian or -1."""
     distances, candidates = _find_candidates(index, points.means)
     # Gaussians that are `excluded`, bool [N], cannot be matched.
     distances[excluded[candidates]] = np.inf

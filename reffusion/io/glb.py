@@ -1,7 +1,7 @@
 """Reading and writing of .glb files with splats: glTF 2.0 with the extension KHR_gaussian_splatting.
 
-A primitive of points holds an accessor for each parameter: rotations as xyzw, scales and opacities as plain numbers, and
-spherical harmonics in the order of 3DGS. In glTF y points up, in a .ply of splats down.
+A primitive of points holds an accessor for each parameter: rotations as xyzw, scales and opacities as plain numbers,
+and spherical harmonics in the order of 3DGS. In glTF y points up, in a .ply of splats down.
 """
 
 from __future__ import annotations
@@ -21,7 +21,13 @@ from reffusion.splat.conventions import SH0
 
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 EXTENSION, COMPRESSION = "KHR_gaussian_splatting", "EXT_meshopt_compression"
-TYPES = {5120: np.dtype("i1"), 5121: np.dtype("u1"), 5122: np.dtype("<i2"), 5123: np.dtype("<u2"), 5126: np.dtype("<f4")}
+TYPES = {
+    5120: np.dtype("i1"),
+    5121: np.dtype("u1"),
+    5122: np.dtype("<i2"),
+    5123: np.dtype("<u2"),
+    5126: np.dtype("<f4"),
+}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 POINTS = 0  # mode of a primitive
 Y_UP = np.diag([-1.0, -1.0, 1.0])  # rotation by 180 degrees about z from the frame of a .ply, as splat-transform does
@@ -60,7 +66,8 @@ class Glb:
         """Return the values [N, width] of an attribute, integers scaled to [-1, 1] or [0, 1] if they are normalized."""
         accessor = self.document["accessors"][primitive["attributes"][name]]
         view = self.document["bufferViews"][accessor["bufferView"]]
-        kind, width, count = TYPES[accessor["componentType"]], WIDTHS[accessor["type"]], self.count(primitive)
+        kind: np.dtype[Any] = TYPES[accessor["componentType"]]
+        width, count = WIDTHS[accessor["type"]], self.count(primitive)
         if COMPRESSION in view.get("extensions", {}) or "sparse" in accessor:
             raise BadInput(f"{self.path}: compressed or sparse values; save it without compression")
         if view["buffer"] or "uri" in self.document["buffers"][0]:
@@ -101,7 +108,7 @@ def open_glb(path: Path) -> Glb:
 
 
 def summarize_glb(path: Path) -> tuple[int, bool]:
-    """Return the number of splats, and whether they are antialiased, from the header; raises BadInput as `open_glb`."""
+    """Return the number of splats, and whether they are antialiased, from the header. Raises as `open_glb`."""
     glb = open_glb(path)
     with reading(path, "a .glb file"):
         primitives = [primitive for primitive, _ in glb.primitives()]
@@ -109,7 +116,7 @@ def summarize_glb(path: Path) -> tuple[int, bool]:
 
 
 def load_glb(path: Path) -> Rows:
-    """Read the splats of a .glb in the frame that a .ply would have; raises BadInput as `open_glb`, or if it is damaged.
+    """Read the splats of a .glb in the frame that a .ply would have; raises as `open_glb`, or if it is damaged.
 
     The transforms of nodes are applied; they may scale, rotate and shift.
     """
@@ -152,7 +159,9 @@ def save_glb(path: Path, rows: Rows, antialiased: bool = False) -> None:
     }
     accessors, views, at = [], [], 0
     for name, values in columns.items():
-        bounds = {"min": values.min(0).tolist(), "max": values.max(0).tolist()} if name == "POSITION" and len(rows) else {}
+        bounds = (
+            {"min": values.min(0).tolist(), "max": values.max(0).tolist()} if name == "POSITION" and len(rows) else {}
+        )
         kind = next(code for code, each in TYPES.items() if each == values.dtype)
         shape = next(word for word, width in WIDTHS.items() if width == values.shape[1])
         accessor = {"bufferView": len(views), "componentType": kind, "count": len(rows), "type": shape, **bounds}

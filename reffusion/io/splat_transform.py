@@ -1,4 +1,4 @@
-"""Conversion of splats by splat-transform, a program of the npm registry: from .sog, .ksplat and .lcc, to .sog and .html.
+"""Conversion of splats by splat-transform, a program of npm: from .sog, .ksplat and .lcc, to .sog and .html.
 
 SOG is PlayCanvas's format for the web. The .html is one file with a viewer and the scene, which needs no network.
 """

@@ -112,7 +112,9 @@ def summarize_splats(path: Path) -> Summary:
     ending = path.suffix.lower()
     if splat_transform.is_convertible(path):
         splat_transform.check_node(path)
-        notes = (f"it is converted to .ply by {splat_transform.PACKAGE}, which npm downloads at its first use (210 MB)",)
+        notes = (
+            f"it is converted to .ply by {splat_transform.PACKAGE}, which npm downloads at its first use (210 MB)",
+        )
         return Summary(None, notes, antialiased=splat_transform.is_antialiased(path))
     if ending in UNREAD:
         raise BadInput(f"{path}: {ending} is not read; {UNREAD[ending]}")

@@ -21,10 +21,13 @@ def rotate_gaussians(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:
         rotation: [3, 3].
     """
     means = gaussians.means.double().numpy() @ rotation.T
-    parts = means.astype(np.float32), rotate_quaternions(gaussians.quaternions.numpy(), rotation)
-    sh = rotate_harmonics(gaussians.sh.numpy(), rotation)
-    turned = {name: torch.from_numpy(each) for name, each in zip(("means", "quaternions", "sh"), (*parts, sh), strict=True)}
-    return replace(gaussians, **turned)
+    quaternions = rotate_quaternions(gaussians.quaternions.numpy(), rotation)
+    return replace(
+        gaussians,
+        means=torch.from_numpy(means.astype(np.float32)),
+        quaternions=torch.from_numpy(quaternions),
+        sh=torch.from_numpy(rotate_harmonics(gaussians.sh.numpy(), rotation)),
+    )
 
 
 def rotate_quaternions(quaternions: np.ndarray, rotation: np.ndarray) -> np.ndarray:
@@ -51,8 +54,6 @@ def rotate_harmonics(sh: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     if degree == 0 or not len(sh):
         return sh
     directions = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
-    after, before = (
-        harmonics(torch.from_numpy(each), degree).numpy() for each in (directions, directions @ rotation)
-    )
+    after, before = (harmonics(torch.from_numpy(each), degree).numpy() for each in (directions, directions @ rotation))
     # The harmonics of a degree are closed under rotation, so that the least squares have no residual.
     return np.einsum("jk,nkc->njc", np.linalg.lstsq(after, before, rcond=None)[0].astype(sh.dtype), sh)
